@@ -1,0 +1,1 @@
+"""Inverse model predictive control: the weights behind a recorded closed loop."""

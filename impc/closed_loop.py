@@ -1,0 +1,255 @@
+"""A plant under the constrained controller, simulated and differentiated in one pass.
+
+At most samples v = 0 keeps every bound and the controller is the gain; only elsewhere a
+least-distance problem is solved. There, with the active rows a (multipliers lam) and one direction
+of change, written d,
+
+    Gram_aa dlam = -N_a q + dM_a v - db_a + dT_a x + T_a dx,     q = dM'lam + dS v
+    dv = -S^-1 q - N_a' dlam
+
+follows from the stationarity S v + M'lam = 0 and the tight rows T_a x + M_a v = b_a. The derivative
+is that of the active set at hand. At a sample where the active set is about to change (a row that
+is tight without a multiplier) it is one-sided: the row counts as inactive there. Such samples are
+counted in the result.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc._closed_loop_kernel import LoopMatrices, run
+from impc.arrays import Array, finite_array, frozen
+from impc.bounds import bound_rows
+from impc.errors import DataError, InfeasibleError, SolverError
+from impc.prediction import RowDirections, build_rows, differentiate_rows, directions
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from impc.controller import Controller
+    from impc.plant import Plant
+    from impc.prediction import Directions, Rows
+
+__all__ = [
+    "Scenario",
+    "Sensitivity",
+    "Simulation",
+    "Status",
+    "require_complete",
+    "scenario",
+    "simulate",
+    "simulate_and_differentiate",
+]
+
+
+class Status(IntEnum):
+    """What happened at a sample."""
+
+    FREE = 0
+    ACTIVE = 1
+    SOFTENED = 2
+    INFEASIBLE = 3
+    ITERATION_LIMIT = 4
+    DIVERGED = 5
+    NOT_REACHED = 6
+
+    @property
+    def sentence(self) -> str:
+        """The status in words."""
+        return _SENTENCES[self]
+
+
+_SENTENCES = {
+    Status.FREE: "the gain keeps every bound",
+    Status.ACTIVE: "a bound is active",
+    Status.SOFTENED: "a soft bound was exceeded",
+    Status.INFEASIBLE: "no input sequence keeps the bounds",
+    Status.ITERATION_LIMIT: "the active-set method did not end",
+    Status.DIVERGED: "the state left every reasonable range",
+    Status.NOT_REACHED: "the simulation ended before this sample",
+}
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """What drives a simulation: the initial state (n,) and the disturbance (steps, d)."""
+
+    x0: Array
+    disturbance: Array
+
+    @property
+    def steps(self) -> int:
+        """Number of samples at which an input is applied."""
+        return len(self.disturbance)
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """A closed loop from its first state to its last.
+
+    Attributes
+    ----------
+    x : Array
+        States (steps + 1, n). Samples that were not reached repeat the last state.
+    u : Array
+        Inputs (steps, m).
+    status : Array of Status
+        (steps,).
+    weakly_active : int
+        Number of samples at which the active set is about to change, to 1e-8 of the bound.
+    failed_row : int
+        Row of `Rows` that proved the last problem inconsistent, -1 when none did.
+    """
+
+    x: Array
+    u: Array
+    status: np.ndarray[tuple[int], np.dtype[np.int8]]
+    weakly_active: int
+    failed_row: int
+
+    @property
+    def complete(self) -> bool:
+        """Whether every sample was reached."""
+        return bool(np.all(self.status <= Status.SOFTENED))
+
+    @property
+    def reached(self) -> int:
+        """Number of samples with an input."""
+        return int(np.count_nonzero(self.status <= Status.SOFTENED))
+
+
+@dataclass(frozen=True)
+class Sensitivity:
+    """Derivatives of a `Simulation` along p directions: x (steps + 1, n, p), u (steps, m, p)."""
+
+    x: Array
+    u: Array
+
+
+def scenario(
+    plant: Plant, x0: ArrayLike, steps: int | None = None, disturbance: ArrayLike | None = None
+) -> Scenario:
+    """Check and freeze an initial state with a number of steps or a disturbance.
+
+    Parameters
+    ----------
+    x0 : array_like
+        (n,).
+    steps : int, optional
+        Needed when there is no disturbance; otherwise its length is taken.
+    disturbance : array_like, optional
+        (steps, d), or (steps,) for a single disturbance.
+
+    Raises
+    ------
+    DataError
+        When something is not finite or of the wrong shape, or neither length is given.
+    """
+    start = finite_array("x0", x0, (plant.n,))
+    count = plant.E.shape[1]
+    if disturbance is None:
+        if steps is None or steps < 1:
+            raise DataError("steps", f"got {steps!r} without a disturbance", "give at least 1")
+        return Scenario(frozen(start), frozen(np.zeros((steps, count))))
+    columns = np.asarray(disturbance)
+    given = finite_array(
+        "disturbance", columns[:, None] if columns.ndim == 1 else columns, (steps, count)
+    )
+    return Scenario(frozen(start), frozen(given))
+
+
+def simulate(controller: Controller, given: Scenario) -> Simulation:
+    """Simulate the plant of the controller; never raises for what happens on the way.
+
+    Returns
+    -------
+    Simulation
+        With a status for each sample; `require_complete` turns a failure into an error.
+    """
+    simulation, _ = _run(controller, given, directions(controller, 0))
+    return simulation
+
+
+def simulate_and_differentiate(
+    controller: Controller, given: Scenario, along: Directions
+) -> tuple[Simulation, Sensitivity]:
+    """Simulate and differentiate in one pass; see `simulate` and the module's text."""
+    return _run(controller, given, along)
+
+
+def require_complete(controller: Controller, simulation: Simulation) -> Simulation:
+    """Return the simulation when every sample was reached.
+
+    Raises
+    ------
+    InfeasibleError
+        When a sample has no input that keeps the bounds: names the bound and the sample.
+    SolverError
+        When the loop diverged or the active-set method did not end.
+    """
+    if simulation.complete:
+        return simulation
+    sample = simulation.reached
+    status = Status(int(simulation.status[sample]))
+    if status is Status.INFEASIBLE:
+        rows = build_rows(controller)
+        name = bound_rows(controller.bounds, controller.plant).names[
+            rows.family[simulation.failed_row]
+        ]
+        stage = int(rows.stage[simulation.failed_row])
+        where = (
+            f"{stage} samples ahead"
+            if stage < controller.horizon
+            else f"in the terminal set, {stage} samples ahead"
+        )
+        raise InfeasibleError(
+            "x0" if sample == 0 else f"sample {sample}",
+            f"no input sequence keeps the bound {name} {where}",
+            "start nearer to the origin, lengthen the horizon, or soften the state bounds",
+        )
+    raise SolverError(
+        f"sample {sample}", status.sentence, "check the plant, the gain and the bounds"
+    )
+
+
+def _run(
+    controller: Controller, given: Scenario, along: Directions
+) -> tuple[Simulation, Sensitivity]:
+    plant = controller.plant
+    rows = build_rows(controller)
+    moved = differentiate_rows(controller, along) if along.count else _no_directions(rows)
+    steps, n, m, p = given.steps, plant.n, plant.m, along.count
+    x, u = np.zeros((steps + 1, n)), np.zeros((steps, m))
+    dx, du = np.zeros((steps + 1, n, p)), np.zeros((steps, m, p))
+    status = np.full(steps, Status.NOT_REACHED, dtype=np.int8)
+    x[0], dx[0] = given.x0, along.x0
+    weakly_active, failed_row = run(
+        LoopMatrices(plant.A, plant.B, plant.E, controller.K, np.linalg.inv(controller.S)),
+        LoopMatrices(along.A, along.B, along.E, along.K, along.S),
+        rows,
+        moved,
+        given.disturbance,
+        _divergence(plant, given),
+        x,
+        u,
+        dx,
+        du,
+        status,
+    )
+    return Simulation(x, u, status, weakly_active, failed_row), Sensitivity(dx, du)
+
+
+def _no_directions(rows: Rows) -> RowDirections:
+    return RowDirections(
+        np.zeros((*rows.T.shape, 0)), np.zeros((*rows.M.shape, 0)), np.zeros((len(rows.b), 0))
+    )
+
+
+def _divergence(plant: Plant, given: Scenario) -> float:
+    """State norm that ends a simulation: a million times what drives it, and at least that."""
+    pushes = plant.E @ given.disturbance.T
+    return 1e6 * max(1.0, float(np.max(np.abs(given.x0))), float(np.max(np.abs(pushes), initial=0)))

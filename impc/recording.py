@@ -1,0 +1,87 @@
+"""A recorded trial as the fits take it: outputs and disturbance on one clock, and where it began."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.arrays import Array, finite_array, frozen
+from impc.errors import DataError
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from impc.plant import Plant
+
+__all__ = ["Recording", "recording"]
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One trial.
+
+    Attributes
+    ----------
+    outputs : Array
+        (samples, p), in the units of the plant's outputs.
+    disturbance : Array
+        (samples, d); row k acts between samples k and k + 1, so that the last is not used.
+    x0 : Array
+        State at the first sample (n,).
+    """
+
+    outputs: Array
+    disturbance: Array
+    x0: Array
+
+    @property
+    def samples(self) -> int:
+        """Number of samples."""
+        return len(self.outputs)
+
+
+def recording(
+    plant: Plant,
+    outputs: ArrayLike,
+    disturbance: ArrayLike | None = None,
+    x0: ArrayLike | None = None,
+) -> Recording:
+    """Check a trial against the plant and freeze it.
+
+    Parameters
+    ----------
+    plant : Plant
+        Gives the number of outputs, disturbances and states.
+    outputs : array_like
+        (samples, p), or (samples,) for one output; at least two samples.
+    disturbance : array_like, optional
+        (samples, d), or (samples,) for one; zero by default.
+    x0 : array_like, optional
+        (n,). By default the first output, which must then be the full state; a plant with other
+        outputs starts at rest.
+
+    Raises
+    ------
+    DataError
+        When something is missing, not finite, or of the wrong shape.
+    """
+    y = finite_array("outputs", _columns(outputs), (None, len(plant.outputs)))
+    if len(y) < 2:
+        raise DataError("outputs", f"has {len(y)} samples", "give at least 2")
+    width = plant.E.shape[1]
+    d = np.zeros((len(y), width)) if disturbance is None else _columns(disturbance)
+    start = x0
+    if start is None:
+        full = plant.C.shape == (plant.n, plant.n) and np.array_equal(plant.C, np.eye(plant.n))
+        start = y[0] if full else np.zeros(plant.n)
+    return Recording(
+        frozen(y),
+        frozen(finite_array("disturbance", d, (len(y), width))),
+        frozen(finite_array("x0", start, (plant.n,))),
+    )
+
+
+def _columns(values: ArrayLike) -> ArrayLike:
+    return np.asarray(values)[:, None] if np.ndim(values) == 1 else values
