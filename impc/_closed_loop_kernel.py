@@ -18,7 +18,7 @@ __all__ = ["LoopMatrices", "run"]
 _KEPT = 1e-13
 _WEAK = 1e-8
 
-_FREE, _ACTIVE, _SOFTENED, _INFEASIBLE, _ITERATION_LIMIT, _DIVERGED = 0, 1, 2, 3, 4, 5
+_FREE, _ACTIVE, _SOFTENED, _INFEASIBLE, _UNSOLVED, _DIVERGED = 0, 1, 2, 3, 4, 5
 
 
 class LoopMatrices(NamedTuple):
@@ -48,7 +48,9 @@ def run(
     """Fill x, u, dx, du and status; return the count of weak samples and the inconsistent row."""
     count = len(rows.b)
     lam, slack = np.zeros(count), np.empty(count)
-    free, factor = np.empty(count + 1, dtype=np.int64), np.empty((count + 1, count + 1))
+    room = min(count, rows.W.shape[1]) + 1
+    free, factor = np.empty(room, dtype=np.int64), np.empty((room, room))
+    basis = np.empty((room, rows.W.shape[1]))
     kept = _KEPT * rows.b
     v, dv0 = np.zeros(rows.M.shape[1]), np.zeros(du.shape[1:])
     plant_moves = np.any(dloop.A) or np.any(dloop.B) or np.any(dloop.E)
@@ -62,9 +64,11 @@ def run(
         v[:horizon_inputs] = 0.0
         dv0[:] = 0.0
         if needs_qp:
-            code, active = solve_dual(rows.gram, slack, rows.limit, kept, lam, free, factor)
+            code, active = solve_dual(
+                rows.W, rows.gram, slack, rows.limit, kept, lam, free, factor, basis
+            )
             if code != CONVERGED:
-                status[t] = _INFEASIBLE if code == INCONSISTENT else _ITERATION_LIMIT
+                status[t] = _INFEASIBLE if code == INCONSISTENT else _UNSOLVED
                 _hold(x, dx, t)
                 return weakly_active, active if code == INCONSISTENT else -1
             _recover(rows, lam, v)

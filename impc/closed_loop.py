@@ -53,7 +53,7 @@ class Status(IntEnum):
     ACTIVE = 1
     SOFTENED = 2
     INFEASIBLE = 3
-    ITERATION_LIMIT = 4
+    UNSOLVED = 4
     DIVERGED = 5
     NOT_REACHED = 6
 
@@ -68,7 +68,7 @@ _SENTENCES = {
     Status.ACTIVE: "a bound is active",
     Status.SOFTENED: "a soft bound was exceeded",
     Status.INFEASIBLE: "no input sequence keeps the bounds",
-    Status.ITERATION_LIMIT: "the active-set method did not end",
+    Status.UNSOLVED: "the active-set method found no answer that keeps the rows",
     Status.DIVERGED: "the state left every reasonable range",
     Status.NOT_REACHED: "the simulation ended before this sample",
 }
@@ -189,7 +189,7 @@ def require_complete(controller: Controller, simulation: Simulation) -> Simulati
     InfeasibleError
         When a sample has no input that keeps the bounds: names the bound and the sample.
     SolverError
-        When the loop diverged or the active-set method did not end.
+        When the loop diverged or the active-set method found no answer.
     """
     if simulation.complete:
         return simulation
@@ -227,12 +227,13 @@ def _run(
     dx, du = np.zeros((steps + 1, n, p)), np.zeros((steps, m, p))
     status = np.full(steps, Status.NOT_REACHED, dtype=np.int8)
     x[0], dx[0] = given.x0, along.x0
+    # Copies, because read-only arrays are another type to numba and would be compiled again.
     weakly_active, failed_row = run(
-        LoopMatrices(plant.A, plant.B, plant.E, controller.K, np.linalg.inv(controller.S)),
-        LoopMatrices(along.A, along.B, along.E, along.K, along.S),
+        _writable(plant.A, plant.B, plant.E, controller.K, np.linalg.inv(controller.S)),
+        _writable(along.A, along.B, along.E, along.K, along.S),
         rows,
         moved,
-        given.disturbance,
+        np.array(given.disturbance),
         _divergence(plant, given),
         x,
         u,
@@ -241,6 +242,10 @@ def _run(
         status,
     )
     return Simulation(x, u, status, weakly_active, failed_row), Sensitivity(dx, du)
+
+
+def _writable(*matrices: Array) -> LoopMatrices:
+    return LoopMatrices(*(np.array(matrix, order="C") for matrix in matrices))
 
 
 def _no_directions(rows: Rows) -> RowDirections:

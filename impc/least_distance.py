@@ -11,7 +11,8 @@ with v = -S^-1 M' lam; the gradient d + G lam is the slack of the rows. The meth
 Goldfarb and Idnani (Math. Programming 27, 1983): start at v = 0, the answer without bounds, and
 raise the multiplier of the most violated row while the rows already active stay tight. A
 multiplier that would leave [0, limit] blocks the step; at its limit the row is given up softly. An
-unblocked step along which no slack changes proves the rows inconsistent.
+unblocked step along which the slack of the violated row does not change proves the rows
+inconsistent.
 """
 
 from __future__ import annotations
@@ -21,14 +22,17 @@ from numba import njit
 
 from impc.arrays import Array
 
-__all__ = ["CONVERGED", "INCONSISTENT", "ITERATION_LIMIT", "append_row", "solve_dual", "substitute"]
+__all__ = ["CONVERGED", "INCONSISTENT", "UNSOLVED", "solve_dual", "substitute"]
 
-CONVERGED, INCONSISTENT, ITERATION_LIMIT = 0, 1, 2
+CONVERGED, INCONSISTENT, UNSOLVED = 0, 1, 2
 
-# A row is dependent on the active ones when less than this share of its squared length is new.
-# Rounding of the subtraction leaves about 1e-15; genuine neighbours in the terminal sets of
-# tests/ differ by 1e-7 and more.
-_DEPENDENT = 1e-12
+# A row is dependent on the active ones when less than this share of its length is new. The part is
+# computed by orthogonalising twice, which leaves rounding of 1e-16; genuine neighbours in the
+# terminal sets of tests/ differ by 1e-5 and more.
+_DEPENDENT = 1e-9
+# The answer must keep every row to this share of the distance between v = 0 and the row, or it is
+# not given out.
+_CHECKED = 1e-8
 
 
 @njit(cache=True)
@@ -47,21 +51,43 @@ def substitute(factor: Array, count: int, right: Array) -> None:
 
 
 @njit(cache=True)
-def append_row(gram: Array, free: Array, count: int, row: int, factor: Array) -> float:
-    """Write the Cholesky row of `row` below the factor of the free rows; return its square."""
+def _append_row(
+    whitened: Array, row: int, count: int, factor: Array, basis: Array
+) -> float:
+    """Write the coefficients of a row in the basis of the active ones; return what is new of it.
+
+    The new part itself goes to basis[count], not normalised. Working with the rows instead of their
+    Gram matrix keeps twice as many digits of it.
+    """
+    width = whitened.shape[1]
+    new = basis[count]
+    new[:] = whitened[row]
     for i in range(count):
-        total = gram[free[i], row]
-        for k in range(i):
-            total -= factor[i, k] * factor[count, k]
-        factor[count, i] = total / factor[i, i]
-    square = gram[row, row]
-    for k in range(count):
-        square -= factor[count, k] ** 2
-    return square  # type: ignore[no-any-return]
+        factor[count, i] = 0.0
+    for _ in range(2):
+        for i in range(count):
+            part = 0.0
+            for k in range(width):
+                part += basis[i, k] * new[k]
+            factor[count, i] += part
+            for k in range(width):
+                new[k] -= part * basis[i, k]
+    length = 0.0
+    for k in range(width):
+        length += new[k] ** 2
+    return np.sqrt(length)  # type: ignore[no-any-return]
+
+
+@njit(cache=True)
+def _accept_row(count: int, length: float, factor: Array, basis: Array) -> None:
+    factor[count, count] = length
+    for k in range(basis.shape[1]):
+        basis[count, k] /= length
 
 
 @njit(cache=True)
 def solve_dual(
+    whitened: Array,
     gram: Array,
     d: Array,
     limit: Array,
@@ -69,28 +95,32 @@ def solve_dual(
     lam: Array,
     free: Array,
     factor: Array,
+    basis: Array,
 ) -> tuple[int, int]:
     """Solve the dual from lam = 0.
 
     Parameters
     ----------
-    gram, d, limit, tolerance : Array
-        G (r, r), d (r,), upper limits (r,) and the violation (r,) below which a row counts as
-        kept.
-    lam, free, factor : Array
+    whitened, gram : Array
+        W = M L^-T with S = L L', (r, N m), and W W', (r, r).
+    d, limit, tolerance : Array
+        Slack of the rows at v = 0, upper limits, and the violation below which a row counts as
+        kept, (r,) each.
+    lam, free, factor, basis : Array
         Written: multipliers (r,), the rows with 0 < lam < limit in the order of the factor, and
-        the Cholesky factor of their Gram matrix. Sizes r, r + 1 and (r + 1, r + 1).
+        the lower factor of their Gram matrix. Sizes r, a + 1, (a + 1, a + 1) and (a + 1, N m) with
+        a = min(r, N m).
 
     Returns
     -------
     status, count : int
-        One of the codes above, and the number of free rows.
+        CONVERGED and the number of free rows; INCONSISTENT and the row that proves it; UNSOLVED.
     """
     rows = len(d)
     slack = d.copy()
     at_limit = np.zeros(rows, dtype=np.bool_)
     is_free = np.zeros(rows, dtype=np.bool_)
-    step = np.empty(rows + 1)
+    step = np.empty(len(free))
     lam[:] = 0.0
     count = 0
     for _ in range(50 * (rows + 10)):
@@ -106,16 +136,19 @@ def solve_dual(
                     row, worst = r, distance
         if row < 0:
             _refine(gram, d, limit, at_limit, lam, free, count, factor)
-            return CONVERGED, count
+            kept = _verify(gram, d, tolerance, at_limit, lam)
+            return (CONVERGED if kept else UNSOLVED), count
         sign = -1.0 if at_limit[row] else 1.0
         while True:
-            square = append_row(gram, free, count, row, factor)
-            for i in range(count):
-                step[i] = gram[free[i], row]
-            substitute(factor, count, step)
+            new = _append_row(whitened, row, count, factor, basis)
+            for i in range(count - 1, -1, -1):
+                part = factor[count, i]
+                for k in range(i + 1, count):
+                    part -= factor[k, i] * step[k]
+                step[i] = part / factor[i, i]
             length = np.inf
-            if square > _DEPENDENT * gram[row, row]:
-                length = -sign * slack[row] / square
+            if new > _DEPENDENT * np.sqrt(gram[row, row]):
+                length = -sign * slack[row] / new**2
             blocked = -1
             room = lam[row] if sign < 0 else limit[row] - lam[row]
             if room <= length:
@@ -141,7 +174,7 @@ def solve_dual(
             for i in range(count):
                 lam[free[i]] -= sign * length * step[i]
             if blocked < 0:
-                factor[count, count] = np.sqrt(square)
+                _accept_row(count, new, factor, basis)
                 free[count] = row
                 is_free[row], at_limit[row] = True, False
                 count += 1
@@ -154,19 +187,34 @@ def solve_dual(
             is_free[leaving] = False
             at_limit[leaving] = -sign * step[blocked] > 0
             lam[leaving] = limit[leaving] if at_limit[leaving] else 0.0
-            count = _remove(gram, free, count, blocked, factor)
-    return ITERATION_LIMIT, count
+            count = _remove(whitened, free, count, blocked, factor, basis)
+    return UNSOLVED, count
 
 
 @njit(cache=True)
-def _remove(gram: Array, free: Array, count: int, place: int, factor: Array) -> int:
+def _remove(
+    whitened: Array, free: Array, count: int, place: int, factor: Array, basis: Array
+) -> int:
     """Drop the free row at `place` and factor the rows behind it again."""
     for i in range(place, count - 1):
         free[i] = free[i + 1]
-    for i in range(place, count - 1):
-        square = append_row(gram, free, i, free[i], factor)
-        factor[i, i] = np.sqrt(max(square, 1e-300))
+        _accept_row(i, _append_row(whitened, free[i], i, factor, basis), factor, basis)
     return count - 1
+
+
+@njit(cache=True)
+def _verify(gram: Array, d: Array, tolerance: Array, at_limit: Array, lam: Array) -> bool:
+    """Check the rows and the multipliers of the answer itself."""
+    for r in range(len(d)):
+        slack = d[r]
+        for i in range(len(d)):
+            if lam[i] != 0.0:
+                slack += gram[r, i] * lam[i]
+        if not at_limit[r] and slack < -max(tolerance[r], _CHECKED * abs(d[r])):
+            return False
+        if lam[r] * gram[r, r] < -_CHECKED * abs(d[r]):
+            return False
+    return True
 
 
 @njit(cache=True)

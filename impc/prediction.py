@@ -39,8 +39,10 @@ class Rows(NamedTuple):
         (r, N m), the columns of one stage beside each other.
     N : Array
         M S^-1, (r, N m), with the metric S of each stage.
+    W : Array
+        M L^-T with S = L L', (r, N m): the rows in coordinates in which S is the identity.
     gram : Array
-        M S^-1 M', (r, r).
+        W W' = M S^-1 M', (r, r).
     b : Array
         (r,).
     limit : Array
@@ -53,6 +55,7 @@ class Rows(NamedTuple):
     T: Array
     M: Array
     N: Array
+    W: Array
     gram: Array
     b: Array
     limit: Array
@@ -128,12 +131,15 @@ def build_rows(controller: Controller) -> Rows:
     bounds = bound_rows(controller.bounds, controller.plant)
     powers = _powers(controller, int(stage.max(initial=0)))
     M = _inputs(controller, family, stage, powers @ controller.plant.B, bounds.F)
-    horizon, m = controller.horizon, controller.plant.m
-    N = np.linalg.solve(controller.S, M.reshape(-1, m).T).T.reshape(len(M), horizon * m)
+    m = controller.plant.m
+    factor = np.linalg.cholesky(controller.S)
+    by_stage = M.reshape(-1, m).T
+    W = np.ascontiguousarray(np.linalg.solve(factor, by_stage).T).reshape(M.shape)
+    N = np.ascontiguousarray(np.linalg.solve(controller.S, by_stage).T).reshape(M.shape)
     b = bounds.b[family]
-    soft = bounds.on_state[family] | (stage >= horizon)
+    soft = bounds.on_state[family] | (stage >= controller.horizon)
     limit = np.where(soft, controller.penalty / b, np.inf)
-    return Rows(powers[stage, family], M, N, N @ M.T, b, limit, family, stage)
+    return Rows(powers[stage, family], M, N, W, W @ W.T, b, limit, family, stage)
 
 
 def differentiate_rows(controller: Controller, along: Directions) -> RowDirections:

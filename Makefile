@@ -1,0 +1,121 @@
+# impc: set-up, checks and runs. `make` alone lists the targets.
+# Needs GNU make and a Python from 3.11 to 3.13 with its venv module; for pytope, which is optional,
+# a C compiler and the GMP headers.
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.NOTPARALLEL:
+.PHONY: help env demo test check slow bench lock clean
+
+PYTHON ?= python3
+# Not to be set from outside: the environment is made with `venv --clear`.
+override VENV := .venv
+PY := $(VENV)/bin/python
+PIP := $(PY) -m pip --disable-pip-version-check -qq
+UV := $(shell command -v uv 2>/dev/null || echo $(VENV)/bin/uv)
+
+# Three stamps, each written last, so that a half-made environment is never taken as complete.
+LOCKED := $(VENV)/.stamp-locked
+PROJECT := $(VENV)/.stamp-project
+POLYTOPE := $(VENV)/.stamp-polytope
+POLYTOPE_LOG := $(VENV)/polytope-install.log
+
+SUPPORTED := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))
+
+# PYTHON=... on the command line or in the environment asks for that Python: an environment made
+# with another version is made again.
+ifneq ($(origin PYTHON),file)
+TELL := import sys; print(*sys.version_info[:2])
+ifneq ($(shell $(PYTHON) -c '$(TELL)' 2>/dev/null),$(shell $(PY) -c '$(TELL)' 2>/dev/null))
+$(LOCKED): remake
+endif
+CANDIDATES := $(PYTHON)
+else
+CANDIDATES := $(PYTHON) python3.13 python3.12 python3.11
+endif
+.PHONY: remake
+
+help:
+	@echo 'make demo    set up .venv and run the example:   impc example'
+	@echo 'make test    set up .venv, then check and pytest (without the slow tests)'
+	@echo 'make check   ruff check, ruff format --check, mypy --strict'
+	@echo 'make slow    the slow tests'
+	@echo 'make bench   the benchmarks:                     python -m experiments.benchmarks'
+	@echo 'make lock    compile both lock files again (needs uv); UPGRADE=--upgrade takes newer versions'
+	@echo 'make clean   remove caches and build products; .venv and results stay'
+	@echo 'PYTHON=python3.12 chooses the Python; the one used otherwise is the first of'
+	@echo 'python3, python3.13, python3.12, python3.11 that is of version 3.11 to 3.13.'
+
+demo: env
+	$(VENV)/bin/impc example
+
+test: check
+	$(PY) -m pytest -m "not slow"
+
+check: env
+	$(PY) -m ruff check .
+	$(PY) -m ruff format --check .
+	$(PY) -m mypy --strict impc plants experiments tests
+
+slow: env
+	$(PY) -m pytest -m slow
+
+bench: env
+	$(PY) -m experiments.benchmarks
+
+env: $(PROJECT) $(POLYTOPE)
+
+$(LOCKED): requirements.lock
+	@found=; for python in $(CANDIDATES); do \
+	  if "$$python" -c '$(SUPPORTED)' 2>/dev/null; then found=$$python; break; fi; \
+	done; \
+	if [ -z "$$found" ]; then \
+	  echo "impc needs Python 3.11, 3.12 or 3.13; $(PYTHON) is" \
+	    "$$($(PYTHON) --version 2>/dev/null || echo 'not on the PATH'). Install one, or name it: make PYTHON=python3.12" >&2; \
+	  exit 1; \
+	fi; \
+	echo "Making $(VENV) with $$($$found --version): about a minute, and 1 GB."; \
+	if ! "$$found" -m venv --clear $(VENV) >/dev/null 2>&1; then \
+	  echo "$$found cannot make a virtual environment. On Debian and Ubuntu:" \
+	    "apt install python$$($$found -c 'import sys; print("%d.%d" % sys.version_info[:2])')-venv" >&2; \
+	  exit 1; \
+	fi
+	@$(PIP) install --require-hashes -r requirements.lock
+	@touch $@
+
+# setuptools comes from the lock: nothing that is not pinned enters by way of the build.
+$(PROJECT): pyproject.toml $(LOCKED)
+	@$(PIP) install --no-deps --no-build-isolation --editable .
+	@touch $@
+
+# pytope and pycddlib: optional, built from source. A failure is told in one line, does not stop
+# make, and is tried again next time. Homebrew keeps its headers where no compiler looks.
+$(POLYTOPE): requirements-polytope.lock $(LOCKED)
+	@cc=$${CC:-cc}; has() { printf '#include <%s>\nint main(void) { return 0; }\n' "$$1" | \
+	  $$cc $$CPPFLAGS $$CFLAGS -I"$$($(PY) -c 'import sysconfig; print(sysconfig.get_path("include"))')" \
+	    -x c -c -o /dev/null - 2>/dev/null; }; \
+	if brew=$$(brew --prefix 2>/dev/null); then \
+	  export C_INCLUDE_PATH="$$brew/include:$$C_INCLUDE_PATH" LIBRARY_PATH="$$brew/lib:$$LIBRARY_PATH"; \
+	fi; \
+	if $(PY) -m pip install --require-hashes --no-deps --no-build-isolation --use-pep517 \
+	    -r requirements-polytope.lock >$(POLYTOPE_LOG) 2>&1; then touch $@; exit 0; fi; \
+	if ! has stdio.h; then what="no C compiler"; \
+	  how="Debian: apt install build-essential python3-dev libgmp-dev; Fedora: dnf install gcc python3-devel gmp-devel; Homebrew: xcode-select --install && brew install gmp"; \
+	elif ! has Python.h; then what="no Python.h"; \
+	  how="Debian: apt install python3-dev; Fedora: dnf install python3-devel; Homebrew: brew reinstall python3"; \
+	elif ! has gmp.h; then what="no gmp.h"; \
+	  how="Debian: apt install libgmp-dev; Fedora: dnf install gmp-devel; Homebrew: brew install gmp"; \
+	else what="the build failed"; how="the reason is in the log"; fi; \
+	echo "pytope is not installed: $$what ($$how). Everything but the pytope border still works; log: $(POLYTOPE_LOG)" >&2
+
+lock:
+	@$(UV) --version >/dev/null 2>&1 || { echo 'make lock needs uv: pip install uv' >&2; exit 1; }
+	UV_CUSTOM_COMPILE_COMMAND='make lock' $(UV) pip compile --quiet $(UPGRADE) --universal --python-version 3.11 \
+	  --extra dev --generate-hashes pyproject.toml -o requirements.lock
+	pair=$$(sed -n 's/^polytope = \[\(.*\)\]$$/\1/p' pyproject.toml | tr -d '",') && test -n "$$pair" && \
+	  printf '%s\n' $$pair | UV_CUSTOM_COMPILE_COMMAND='make lock' $(UV) pip compile --quiet $(UPGRADE) --universal \
+	  --python-version 3.11 --no-deps --generate-hashes - -o requirements-polytope.lock
+
+clean:
+	rm -rf build dist docs/_build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find . -name $(VENV) -prune -o -type d -name __pycache__ -prune -exec rm -rf {} +

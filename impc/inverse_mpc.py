@@ -1,0 +1,289 @@
+"""Inverse MPC: the weights of the constrained controller that made the recordings.
+
+`infer_weights` is Table 3.1 from end to end. Its last line is the direct form (3.6); the reduced
+form reaches the same weights through the gain: what the recordings determine is K (and S), and the
+weights of least condition number among all those with that gain are one semidefinite program.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.arrays import Array
+from impc.closed_loop import simulate
+from impc.conditioned_fit import ConditionedFit, Objective, Residual, conditioned_fit
+from impc.controller import mpc_controller
+from impc.equivalent_weights import gain_fibre, least_condition_weights
+from impc.errors import WeightsError
+from impc.gain import GainFit, fit_gain
+from impc.inverse_lqr import inverse_lqr_gradient, inverse_lqr_lmi
+from impc.inverse_problem import evaluate, scenarios, without_bounds
+from impc.weights import Weights, condition_number, normalised, stage_weights
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from impc.closed_loop import Simulation
+    from impc.equivalent_weights import EquivalentWeights
+    from impc.inverse_lqr import InverseLqr
+    from impc.inverse_problem import InverseProblem
+    from impc.lqr import LqrSolution
+    from impc.plant import Plant
+
+__all__ = [
+    "AUXILIARY_CONDITION_WEIGHT",
+    "CONDITION_WEIGHT",
+    "Inference",
+    "ReducedFit",
+    "Start",
+    "auxiliary_weights",
+    "infer_weights",
+    "inverse_mpc",
+    "inverse_mpc_reduced",
+    "output_penalty_weights",
+    "starting_point",
+    "verify_hard",
+]
+
+# c of (3.5) to (3.7) is lost. Small enough that the exact fit wins in the 2-norm (docs/theory.md).
+CONDITION_WEIGHT = 1e-4
+AUXILIARY_CONDITION_WEIGHT = 1e-3
+# Starting weights are kept this definite: the search takes the Cholesky factor of them.
+_LARGEST_START_CONDITION = 1e6
+
+
+@dataclass(frozen=True)
+class ReducedFit:
+    """Result of `inverse_mpc_reduced`.
+
+    Attributes
+    ----------
+    gain : GainFit
+        What the recordings determine.
+    equivalent : EquivalentWeights or None
+        Weights of least condition number with exactly that gain; None when there are none.
+    direct : ConditionedFit or None
+        The direct form, continued from there, when no weights have exactly that gain.
+    reason : str
+        Why the direct form was needed; empty when it was not.
+    """
+
+    gain: GainFit
+    equivalent: EquivalentWeights | None
+    direct: ConditionedFit | None
+    reason: str
+
+    @property
+    def weights(self) -> Weights:
+        """The weights found, scaled to R[0, 0] = 1."""
+        found = self.equivalent if self.direct is None else self.direct
+        assert found is not None  # one of the two is always there: see `inverse_mpc_reduced`
+        return found.weights
+
+
+@dataclass(frozen=True)
+class Start:
+    """Lines 1 to 8 of Table 3.1; what the branch taken did not need is None.
+
+    Attributes
+    ----------
+    gain : GainFit
+        Line 1: feedback gain without bounds.
+    lmi : InverseLqr
+        Line 2; whether it is feasible decides the branch.
+    gradient : InverseLqr or None
+        Line 4.
+    auxiliary : ConditionedFit or None
+        Line 5.
+    weights : Weights
+        Line 5 or 7: where (3.6) starts.
+    """
+
+    gain: GainFit
+    lmi: InverseLqr
+    gradient: InverseLqr | None
+    auxiliary: ConditionedFit | None
+    weights: Weights
+
+
+@dataclass(frozen=True)
+class Inference:
+    """Table 3.1 from end to end: where it started, and the fit of line 9."""
+
+    start: Start
+    fit: ConditionedFit
+
+
+def infer_weights(
+    problem: InverseProblem, *, condition_weight: float = CONDITION_WEIGHT
+) -> Inference:
+    """Table 3.1: from recordings to the weights of the constrained controller behind them.
+
+    Parameters
+    ----------
+    problem : InverseProblem
+    condition_weight : float
+        Weight of the condition number against the 2-norm of the misfit, in (3.6).
+
+    Raises
+    ------
+    WeightsError, SolverError
+        When no starting weights can be found, or the recordings cannot be simulated from them.
+    """
+    start = starting_point(problem)
+    return Inference(start, inverse_mpc(problem, start.weights, condition_weight=condition_weight))
+
+
+def starting_point(problem: InverseProblem) -> Start:
+    """Lines 1 to 8 of Table 3.1: a feedback gain, and the weights of a regulator like it.
+
+    Raises
+    ------
+    WeightsError, SolverError
+        As `infer_weights`.
+    """
+    plant = problem.plant
+    gain = fit_gain(without_bounds(problem))
+    lmi = inverse_lqr_lmi(plant, gain.K)
+    if lmi.weights is not None:
+        return Start(gain, lmi, None, None, lmi.weights)
+    gradient = inverse_lqr_gradient(plant, gain.K)
+    auxiliary = auxiliary_weights(plant, gain.K, gradient.weights)
+    return Start(gain, lmi, gradient, auxiliary, auxiliary.weights)
+
+
+def inverse_mpc(
+    problem: InverseProblem,
+    start: Weights,
+    *,
+    condition_weight: float = CONDITION_WEIGHT,
+    squared: bool = False,
+) -> ConditionedFit:
+    """Direct inverse MPC (3.6): misfit of the constrained closed loop plus condition number.
+
+    Terminal weight and terminal set follow (Q, R) at every iterate.
+
+    Parameters
+    ----------
+    start : Weights
+        Positive definite, from Table 3.1 for example.
+    condition_weight : float
+        Against a fit weight of 1.
+    squared : bool
+        Whether the misfit is the square of its 2-norm; see `Objective`.
+
+    Raises
+    ------
+    WeightsError, SolverError
+        As `conditioned_fit`.
+    """
+    objective = Objective(_closed_loop_residual(problem), 1.0, condition_weight, squared)
+    return conditioned_fit(problem.plant, objective, _definite(start))
+
+
+def inverse_mpc_reduced(
+    problem: InverseProblem,
+    gain: Array | None = None,
+    metric: Array | None = None,
+    *,
+    condition_weight: float = CONDITION_WEIGHT,
+) -> ReducedFit:
+    """Reduced inverse MPC: fit the gain through the constrained controller, then one program.
+
+    Parameters
+    ----------
+    gain, metric : Array, optional
+        Where the search for the gain starts, see `fit_gain`.
+    condition_weight : float
+        Of the direct form, for a gain that no weights have exactly.
+
+    Raises
+    ------
+    SolverError
+        When the recordings cannot be simulated from the start.
+    """
+    fit = fit_gain(problem, gain, metric)
+    fibre = gain_fibre(problem.plant, fit.K, fit.S if fit.metric_determined else None)
+    try:
+        equivalent = least_condition_weights(fibre)
+    except WeightsError as error:
+        nearest = inverse_lqr_gradient(problem.plant, fit.K)
+        start = auxiliary_weights(problem.plant, fit.K, nearest.weights).weights
+        direct = inverse_mpc(problem, start, condition_weight=condition_weight)
+        return ReducedFit(fit, None, direct, str(error))
+    return ReducedFit(fit, equivalent, None, "")
+
+
+def auxiliary_weights(
+    plant: Plant,
+    gain: Array,
+    start: Weights | None,
+    *,
+    condition_weight: float = AUXILIARY_CONDITION_WEIGHT,
+) -> ConditionedFit:
+    """Auxiliary problem (3.7): weights whose regulator is near the gain, and well conditioned.
+
+    minimise  ||K(Q, R) - gain||_2 + condition_weight kappa(blkdiag(Q, R))
+    """
+    size = gain.size
+    dK = np.eye(size).reshape(size, *gain.shape)
+    dS = np.zeros((size, plant.m, plant.m))
+
+    def distance(solution: LqrSolution) -> Residual:
+        return Residual((solution.K - gain).ravel(), dK, dS, usable=True)
+
+    begin = stage_weights(np.eye(plant.n), np.eye(plant.m)) if start is None else start
+    return conditioned_fit(
+        plant, Objective(distance, 1.0, condition_weight, squared=False), _definite(begin)
+    )
+
+
+def output_penalty_weights(
+    problem: InverseProblem,
+    start: Weights,
+    *,
+    condition_weight: float = CONDITION_WEIGHT,
+) -> ConditionedFit:
+    """Inverse LQR on the outputs (3.16): as `inverse_mpc`, but the loop is the plain regulator."""
+    return inverse_mpc(without_bounds(problem), start, condition_weight=condition_weight)
+
+
+def verify_hard(problem: InverseProblem, weights: Weights) -> list[Simulation]:
+    """Simulate every recording with hard state bounds and terminal set.
+
+    The search softens those rows; this says whether the controller found keeps them. Pass each
+    result to `require_complete` to turn a failure into an error.
+    """
+    controller = mpc_controller(
+        problem.plant,
+        weights,
+        problem.bounds,
+        problem.horizon,
+        terminal_set=problem.terminal_set,
+    )
+    return [simulate(controller, drive) for drive in scenarios(problem)]
+
+
+def _closed_loop_residual(problem: InverseProblem) -> Callable[[LqrSolution], Residual]:
+    def residual(solution: LqrSolution) -> Residual:
+        found = evaluate(problem, solution.K, solution.S)
+        return Residual(found.residual, found.dK, found.dS, usable=not found.reason)
+
+    return residual
+
+
+def _definite(weights: Weights) -> Weights:
+    """Lift the least eigenvalues of Q and R so that the condition number is at most 1e6."""
+    if condition_number(weights) <= _LARGEST_START_CONDITION:
+        return normalised(weights)
+    floor = float(np.linalg.eigvalsh(weights.block)[-1]) / _LARGEST_START_CONDITION
+    lifted = []
+    for matrix in (weights.Q, weights.R):
+        values, vectors = np.linalg.eigh(matrix)
+        lifted.append((vectors * np.maximum(values, floor)) @ vectors.T)
+    return normalised(stage_weights(*lifted))
+
+

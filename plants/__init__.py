@@ -1,0 +1,46 @@
+"""Plants: physics as `control.StateSpace`, with named signals, units and sources.
+
+This package knows nothing of `impc`; either can be used without the other.
+"""
+
+from plants.actuation import LinearSystem, delayed_muscle, pade_delay
+from plants.anthropometry import SeatLayout, from_anthropometry
+from plants.integration import runge_kutta_step
+from plants.named_examples import (
+    bbm_example,
+    cannon_example,
+    unstable_integrator_example,
+    yalmip_example,
+)
+from plants.seated_balance import (
+    body_dynamics,
+    continuous_seated_balance_plant,
+    mass_matrix,
+    nonlinear_dynamics,
+    seated_balance_plant,
+)
+from plants.seated_parameters import SeatedBalanceLimits, SeatedBalanceParameters
+from plants.ternary import maximal_recurrence, ternary_sequence, ternary_torque
+
+__all__ = [
+    "LinearSystem",
+    "SeatLayout",
+    "SeatedBalanceLimits",
+    "SeatedBalanceParameters",
+    "bbm_example",
+    "body_dynamics",
+    "cannon_example",
+    "continuous_seated_balance_plant",
+    "delayed_muscle",
+    "from_anthropometry",
+    "mass_matrix",
+    "maximal_recurrence",
+    "nonlinear_dynamics",
+    "pade_delay",
+    "runge_kutta_step",
+    "seated_balance_plant",
+    "ternary_sequence",
+    "ternary_torque",
+    "unstable_integrator_example",
+    "yalmip_example",
+]

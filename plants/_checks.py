@@ -1,0 +1,66 @@
+"""Checks shared by the plants: one-line errors that say what was given and what to do."""
+
+from __future__ import annotations
+
+import math
+from numbers import Integral, Real
+
+import numpy as np
+
+__all__ = ["Array", "finite_number", "whole_number"]
+
+Array = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
+
+
+def finite_number(
+    name: str,
+    value: object,
+    remedy: str,
+    *,
+    least: float = -math.inf,
+    above: float = -math.inf,
+    most: float = math.inf,
+) -> float:
+    """Return the value as a float when it is a finite number, ``above < value``, in [least, most].
+
+    Parameters
+    ----------
+    name : str
+        Name of the argument, for the message.
+    value : object
+        What the caller gave. Truth values are refused: they are a slip, not a quantity.
+    remedy : str
+        What to do, the end of the message.
+    least, above, most : float
+        Lower bound, strict lower bound and upper bound.
+
+    Raises
+    ------
+    ValueError
+        When the value is not such a number.
+    """
+    number = float(value) if isinstance(value, Real) and not isinstance(value, bool) else math.nan
+    if math.isfinite(number) and least <= number <= most and number > above:
+        return number
+    limits = [
+        f"{word} {bound:g}"
+        for word, bound in (("above", above), ("at least", least), ("at most", most))
+        if math.isfinite(bound)
+    ]
+    wanted = " ".join(["a finite number", " and ".join(limits)]).rstrip()
+    raise ValueError(f"{name}: expected {wanted}, got {value!r:.60}; {remedy}")
+
+
+def whole_number(name: str, value: object, remedy: str, *, least: int, most: int) -> int:
+    """Return the value as an int when it is a whole number in [least, most].
+
+    Raises
+    ------
+    ValueError
+        When it is not.
+    """
+    if isinstance(value, Integral) and not isinstance(value, bool) and least <= int(value) <= most:
+        return int(value)
+    raise ValueError(
+        f"{name}: expected a whole number from {least} to {most}, got {value!r:.60}; {remedy}"
+    )

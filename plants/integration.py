@@ -1,0 +1,46 @@
+"""Fixed-step integration of a plant, as a CasADi function that can be mapped and differentiated."""
+
+from __future__ import annotations
+
+import casadi as ca
+
+from plants._checks import finite_number, whole_number
+
+__all__ = ["runge_kutta_step"]
+
+
+def runge_kutta_step(dynamics: ca.Function, step: float, substeps: int = 1) -> ca.Function:
+    """Make one sample of the classical fourth-order Runge-Kutta method.
+
+    Parameters
+    ----------
+    dynamics : casadi.Function
+        (state (n), input (m)) -> state rate (n), in units per s.
+    step : float
+        Length of the sample in s, over which the input is held.
+    substeps : int
+        Runge-Kutta steps in the sample.
+
+    Returns
+    -------
+    casadi.Function
+        (state (n), input (m)) -> state at the end of the sample (n).
+
+    Raises
+    ------
+    ValueError
+        When the step is not positive or the substeps are not a whole number from 1 to 10000.
+    """
+    step = finite_number("step", step, "give it in seconds", above=0.0)
+    substeps = whole_number("substeps", substeps, "1 is usual", least=1, most=10_000)
+    start = ca.MX.sym("state", *dynamics.size_in(0))
+    held = ca.MX.sym("input", *dynamics.size_in(1))
+    h = step / substeps
+    state = start
+    for _ in range(substeps):
+        k1 = dynamics(state, held)
+        k2 = dynamics(state + h / 2 * k1, held)
+        k3 = dynamics(state + h / 2 * k2, held)
+        k4 = dynamics(state + h * k3, held)
+        state = state + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    return ca.Function("runge_kutta_step", [start, held], [state], ["state", "input"], ["next"])

@@ -1,0 +1,228 @@
+"""Balance on a seat that tilts sideways: equations (3.18) to (3.20) of the dissertation.
+
+Angles from the vertical, both absolute and in the same sense: theta1 of the lower body and seat,
+theta2 of the upper body. The lumbar torque u turns the upper body towards +theta2 and reacts on
+the lower body; d is the perturbation that the robot adds to the seat. With h = m2 l12 l2 and
+x = theta1 - theta2,
+
+    (J1 + m1 l1^2 + m2 l12^2) theta1'' + h cos(x) theta2'' = - h sin(x) theta2'^2
+        + (m1 l1 + m2 l12) g sin(theta1) - k_r theta1 - c_r theta1' - k_h x - c_h x' + d - u
+    (J2 + m2 l2^2) theta2'' + h cos(x) theta1'' = h sin(x) theta1'^2
+        + m2 g l2 sin(theta2) + k_h x + c_h x' + u
+
+The command reaches u through a delay and a muscle, `plants.actuation`. States, in this order:
+theta1, theta2 (rad), theta1_rate, theta2_rate (rad/s), delay_1 ... delay_n and muscle_torque
+(Nm). Ten states in all at the default order 5 of the delay. Inputs: command, perturbation (Nm).
+Outputs: theta1, theta2 (rad). That the command is the input means that a bound on it acts before
+delay and muscle.
+
+The coordinates of the delay states, and with them any weight on those states and the gain from
+them, depend on the realisation of the delay; the body states, the torque and their gains do not.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+import control
+import numpy as np
+import scipy.linalg
+
+from plants._checks import finite_number
+from plants.actuation import delayed_muscle
+from plants.seated_parameters import SeatedBalanceLimits, SeatedBalanceParameters
+
+__all__ = [
+    "SeatedBalanceLimits",
+    "SeatedBalanceParameters",
+    "body_dynamics",
+    "continuous_seated_balance_plant",
+    "mass_matrix",
+    "nonlinear_dynamics",
+    "seated_balance_plant",
+]
+
+_BODY = ("theta1", "theta2", "theta1_rate", "theta2_rate")
+_INPUTS = ("command", "perturbation")
+
+
+def seated_balance_plant(
+    parameters: SeatedBalanceParameters | None = None,
+    sample_time: float = 0.01,
+    delay_order: int = 5,
+) -> Any:
+    """Return the linear plant, sampled with its inputs held.
+
+    Parameters
+    ----------
+    parameters : SeatedBalanceParameters, optional
+        The defaults if omitted.
+    sample_time : float
+        s.
+    delay_order : int
+        Order of the Padé approximant of the delay, see `plants.actuation.pade_delay`.
+
+    Returns
+    -------
+    control.StateSpace
+        Discrete, with ``5 + delay_order`` states, the inputs command and perturbation in Nm, the
+        outputs theta1 and theta2 in rad; order and units in the module's text.
+
+    Raises
+    ------
+    ValueError
+        When the sample time or the order is out of range.
+    """
+    sample_time = finite_number("sample_time", sample_time, "give it in seconds", above=0.0)
+    plant = continuous_seated_balance_plant(parameters, delay_order)
+    n, m = plant.B.shape
+    # exp([A B; 0 0] T) = [Ad Bd; 0 I]: exact also where A is singular.
+    held = scipy.linalg.expm(np.block([[plant.A, plant.B], [np.zeros((m, n + m))]]) * sample_time)
+    return _named(held[:n, :n], held[:n, n:], sample_time, "seated_balance")
+
+
+def continuous_seated_balance_plant(
+    parameters: SeatedBalanceParameters | None = None, delay_order: int = 5
+) -> Any:
+    """Return the linear plant in continuous time: the exact Jacobian at upright rest.
+
+    Parameters
+    ----------
+    parameters : SeatedBalanceParameters, optional
+        The defaults if omitted.
+    delay_order : int
+        Order of the Padé approximant of the delay.
+
+    Returns
+    -------
+    control.StateSpace
+        Continuous (``dt`` 0), names and units as for `seated_balance_plant`.
+
+    Raises
+    ------
+    ValueError
+        When the order is out of range.
+    """
+    dynamics = nonlinear_dynamics(parameters, delay_order)
+    state = ca.SX.sym("state", dynamics.size1_in(0))
+    inputs = ca.SX.sym("input", dynamics.size1_in(1))
+    rate = dynamics(state, inputs)
+    jacobians = ca.Function(
+        "jacobians", [state, inputs], [ca.jacobian(rate, state), ca.jacobian(rate, inputs)]
+    )
+    A, B = (matrix.full() for matrix in jacobians(0, 0))
+    return _named(A, B, 0.0, "seated_balance_continuous")
+
+
+def nonlinear_dynamics(
+    parameters: SeatedBalanceParameters | None = None, delay_order: int = 5
+) -> ca.Function:
+    """Return the nonlinear bodies driven through the linear delay and muscle.
+
+    Parameters
+    ----------
+    parameters : SeatedBalanceParameters, optional
+        The defaults if omitted.
+    delay_order : int
+        Order of the Padé approximant of the delay.
+
+    Returns
+    -------
+    casadi.Function
+        (state (5 + delay_order), input (2)) -> state rate; order and units in the module's text.
+        `plants.integration.runge_kutta_step` makes samples of it.
+
+    Raises
+    ------
+    ValueError
+        When the order is out of range.
+    """
+    parameters = parameters or SeatedBalanceParameters()
+    chain = delayed_muscle(parameters.tau_d, parameters.tau_m, delay_order)
+    bodies = body_dynamics(parameters)
+    state = ca.SX.sym("state", 4 + len(chain.B))
+    inputs = ca.SX.sym("input", 2)
+    command, perturbation = inputs[0], inputs[1]
+    body, actuation = state[:4], state[4:]
+    torque = actuation[-1]
+    rate = ca.vertcat(
+        bodies(body, ca.vertcat(torque, perturbation)),
+        ca.DM(chain.A) @ actuation + ca.DM(chain.B) * command,
+    )
+    return ca.Function("seated_balance", [state, inputs], [rate], ["state", "input"], ["rate"])
+
+
+def body_dynamics(parameters: SeatedBalanceParameters | None = None) -> ca.Function:
+    """Return the nonlinear equations of the two bodies alone.
+
+    Parameters
+    ----------
+    parameters : SeatedBalanceParameters, optional
+        The defaults if omitted.
+
+    Returns
+    -------
+    casadi.Function
+        (state (4): angles in rad, then their rates in rad/s; input (2): lumbar torque u,
+        perturbation d in Nm) -> state rate (4).
+    """
+    p = parameters or SeatedBalanceParameters()
+    state = ca.SX.sym("state", 4)
+    inputs = ca.SX.sym("input", 2)
+    theta1, theta2, rate1, rate2 = ca.vertsplit(state)
+    u, d = inputs[0], inputs[1]
+    angle = theta1 - theta2
+    coupling = p.m2 * p.l12 * p.l2 * ca.sin(angle)
+    lumbar = p.k_h * angle + p.c_h * (rate1 - rate2)
+    robot = p.k_r * theta1 + p.c_r * rate1
+    gravity1 = (p.m1 * p.l1 + p.m2 * p.l12) * p.gravity * ca.sin(theta1)
+    gravity2 = p.m2 * p.l2 * p.gravity * ca.sin(theta2)
+    moments = ca.vertcat(
+        gravity1 - coupling * rate2**2 - robot - lumbar + d - u,
+        gravity2 + coupling * rate1**2 + lumbar + u,
+    )
+    acceleration = ca.solve(_mass(p, angle), moments)
+    rate = ca.vertcat(rate1, rate2, acceleration)
+    return ca.Function("bodies", [state, inputs], [rate], ["state", "input"], ["rate"])
+
+
+def mass_matrix(parameters: SeatedBalanceParameters | None = None) -> ca.Function:
+    """Return the mass matrix of the two bodies as a function of their angles.
+
+    Parameters
+    ----------
+    parameters : SeatedBalanceParameters, optional
+        The defaults if omitted.
+
+    Returns
+    -------
+    casadi.Function
+        (angles (2) in rad) -> M (2, 2) in kg m^2, symmetric and positive definite.
+    """
+    angles = ca.SX.sym("angles", 2)
+    matrix = _mass(parameters or SeatedBalanceParameters(), angles[0] - angles[1])
+    return ca.Function("mass_matrix", [angles], [matrix], ["angles"], ["M"])
+
+
+def _mass(p: SeatedBalanceParameters, angle: ca.SX) -> ca.SX:
+    lower = p.J1 + p.m1 * p.l1**2 + p.m2 * p.l12**2
+    upper = p.J2 + p.m2 * p.l2**2
+    shared = p.m2 * p.l12 * p.l2 * ca.cos(angle)
+    return ca.vertcat(ca.horzcat(lower, shared), ca.horzcat(shared, upper))
+
+
+def _named(A: Any, B: Any, sample_time: float, name: str) -> Any:
+    n = A.shape[0]
+    delays = [f"delay_{k}" for k in range(1, n - 4)]
+    return control.ss(
+        A,
+        B,
+        np.eye(2, n),
+        np.zeros((2, 2)),
+        dt=sample_time,
+        name=name,
+        states=[*_BODY, *delays, "muscle_torque"],
+        inputs=list(_INPUTS),
+        outputs=list(_BODY[:2]),
+    )

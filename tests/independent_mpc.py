@@ -1,0 +1,63 @@
+"""The controller (3.1) as a dense quadratic program in u, written without the package.
+
+It condenses the cost and the bounds in the inputs themselves (not in v = u + Kx) with numpy, and
+solves with Clarabel, so that it shares neither formulas nor solvers with what it checks.
+"""
+
+from __future__ import annotations
+
+import clarabel
+import numpy as np
+import scipy.linalg
+import scipy.sparse
+
+Matrix = np.ndarray
+
+
+def first_input(
+    A: Matrix,
+    B: Matrix,
+    Q: Matrix,
+    R: Matrix,
+    horizon: int,
+    x: Matrix,
+    u_max: float,
+    x_max: float = np.inf,
+    terminal: tuple[Matrix, Matrix] | None = None,
+) -> Matrix:
+    """The first input of (3.1) with P from scipy's Riccati solver; |u| <= u_max, |x| <= x_max."""
+    n, m = B.shape
+    P = scipy.linalg.solve_discrete_are(A, B, Q, R)
+    powers = [np.linalg.matrix_power(A, k) for k in range(horizon + 1)]
+    phi = np.vstack(powers)
+    gamma = np.zeros(((horizon + 1) * n, horizon * m))
+    for k in range(1, horizon + 1):
+        for i in range(k):
+            gamma[k * n : (k + 1) * n, i * m : (i + 1) * m] = powers[k - 1 - i] @ B
+    weight = scipy.linalg.block_diag(*[Q] * horizon, P)
+    H = gamma.T @ weight @ gamma + np.kron(np.eye(horizon), R)
+    f = gamma.T @ weight @ phi @ x
+    rows = [np.eye(horizon * m), -np.eye(horizon * m)]
+    limits = [np.full(2 * horizon * m, u_max)]
+    if np.isfinite(x_max):
+        inside = slice(n, horizon * n)
+        rows += [gamma[inside], -gamma[inside]]
+        free = phi[inside] @ x
+        limits += [x_max - free, x_max + free]
+    if terminal is not None:
+        rows.append(terminal[0] @ gamma[-n:])
+        limits.append(terminal[1] - terminal[0] @ phi[-n:] @ x)
+    G, h = np.vstack(rows), np.concatenate(limits)
+    settings = clarabel.DefaultSettings()
+    settings.verbose = False
+    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = 1e-12
+    scale = np.max(np.abs(H))
+    solution = clarabel.DefaultSolver(
+        scipy.sparse.csc_matrix(np.triu((H + H.T) / 2 / scale)),
+        f / scale,
+        scipy.sparse.csc_matrix(G),
+        h,
+        [clarabel.NonnegativeConeT(len(h))],
+        settings,
+    ).solve()
+    return np.array(solution.x)[:m]

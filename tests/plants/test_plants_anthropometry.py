@@ -1,0 +1,89 @@
+"""Parameters from mass and height: the table of fractions, and the default person."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from plants import SeatedBalanceParameters, SeatLayout, from_anthropometry
+from plants.anthropometry import DE_LEVA
+
+PAIRED = ("upper arm", "forearm", "hand", "thigh", "shank", "foot")
+
+
+@pytest.mark.parametrize("sex", ["male", "female"])
+def test_fractions_make_one_body(sex: str) -> None:
+    _, segments = DE_LEVA[sex]
+    total = sum(s.mass * (2 if name in PAIRED else 1) for name, s in segments.items())
+    assert total == pytest.approx(1.0, abs=2e-4)  # four printed digits
+    for segment in segments.values():
+        assert 0 < segment.centre < 1
+        assert 0 < segment.along < 1
+        assert 0 < segment.across < 1
+
+
+def test_default_person_has_the_default_parameters() -> None:
+    found = from_anthropometry(79.7, 1.66)
+    expected = SeatedBalanceParameters()
+    for name, digits in (("m1", 1), ("m2", 1), ("l1", 3), ("l2", 3), ("l12", 3), ("J1", 2)):
+        assert round(getattr(found, name), digits) == getattr(expected, name), name
+    assert round(found.J2, 2) == expected.J2
+    # What mass and height do not tell is left as it was.
+    for name in ("k_h", "c_h", "k_r", "c_r", "tau_d", "tau_m", "gravity"):
+        assert getattr(found, name) == getattr(expected, name)
+
+
+def test_masses_are_the_published_fractions() -> None:
+    found = from_anthropometry(100.0, 1.8, layout=SeatLayout(seat_mass=0.0))
+    assert found.m2 == pytest.approx(49.11)
+    assert found.m1 == pytest.approx(50.89)
+
+
+def test_scaling_with_mass_and_height() -> None:
+    seed = int(np.random.default_rng().integers(2**31))
+    print(f"seed {seed}")
+    mass, height = np.random.default_rng(seed).uniform([50.0, 1.5], [120.0, 2.0])
+    for sex in ("male", "female"):
+        base = from_anthropometry(mass, height, sex)
+        heavy = from_anthropometry(1.5 * mass, height, sex)
+        tall = from_anthropometry(mass, 1.1 * height, sex)
+        ratios = [heavy.J2 / base.J2, tall.J2 / base.J2]
+        assert ratios == pytest.approx([1.5, 1.1**2])
+        assert heavy.l2 == pytest.approx(base.l2)
+        assert tall.l2 == pytest.approx(1.1 * base.l2)
+        assert tall.m2 == base.m2
+        assert tall.l12 > base.l12
+
+
+def test_seat_adds_its_own_inertia() -> None:
+    bare = from_anthropometry(79.7, 1.66, layout=SeatLayout(seat_radius=0.0))
+    added = from_anthropometry(79.7, 1.66).J1 - bare.J1
+    assert added == pytest.approx(20 * 0.25**2)
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments"),
+    [
+        ("mass", (0.0, 1.66)),
+        ("mass", ("80", 1.66)),
+        ("height", (79.7, 166)),
+        ("sex", (79.7, 1.66, "man")),
+    ],
+)
+def test_bad_persons_are_refused_by_name(name: str, arguments: Any) -> None:
+    with pytest.raises(ValueError, match=rf"^{name}: expected .*, got .*; give ") as error:
+        from_anthropometry(*arguments)
+    assert "\n" not in str(error.value)
+
+
+def test_bad_layouts_are_refused_by_name() -> None:
+    with pytest.raises(ValueError, match=r"^seat_mass: "):
+        replace(SeatLayout(), seat_mass=-1.0)
+    with pytest.raises(ValueError, match=r"^l12: "):
+        from_anthropometry(79.7, 1.66, layout=SeatLayout(pivot_depth=-1.0))
+    for each in fields(SeatLayout):
+        assert SeatLayout.__doc__ is not None
+        assert each.name in SeatLayout.__doc__

@@ -1,0 +1,264 @@
+"""The seated-balance plant: its equations, its linearisation and the reference's numbers."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+import scipy.linalg
+
+from plants import (
+    SeatedBalanceLimits,
+    SeatedBalanceParameters,
+    body_dynamics,
+    continuous_seated_balance_plant,
+    delayed_muscle,
+    mass_matrix,
+    nonlinear_dynamics,
+    runge_kutta_step,
+    seated_balance_plant,
+    ternary_torque,
+)
+
+UNDAMPED = SeatedBalanceParameters(c_h=0.0, c_r=0.0)
+
+
+def random_numbers() -> np.random.Generator:
+    seed = int(np.random.default_rng().integers(2**31))
+    print(f"seed {seed}")
+    return np.random.default_rng(seed)
+
+
+def random_parameters(rng: np.random.Generator) -> SeatedBalanceParameters:
+    base = SeatedBalanceParameters()
+    factors = rng.uniform(0.5, 2.0, len(fields(base)))
+    return SeatedBalanceParameters(
+        **{f.name: getattr(base, f.name) * x for f, x in zip(fields(base), factors, strict=True)}
+    )
+
+
+def energies(p: SeatedBalanceParameters) -> tuple[ca.SX, ca.SX, ca.SX]:
+    """State, kinetic and potential energy, from the places of the two centres of mass alone."""
+    state = ca.SX.sym("state", 4)
+    angles, rates = state[:2], state[2:]
+    lower = p.l1 * ca.vertcat(ca.sin(angles[0]), ca.cos(angles[0]))
+    joint = p.l12 * ca.vertcat(ca.sin(angles[0]), ca.cos(angles[0]))
+    upper = joint + p.l2 * ca.vertcat(ca.sin(angles[1]), ca.cos(angles[1]))
+    speeds = [ca.jtimes(place, angles, rates) for place in (lower, upper)]
+    kinetic = 0.5 * sum(m * ca.sumsqr(v) for m, v in zip((p.m1, p.m2), speeds, strict=True))
+    kinetic += 0.5 * (p.J1 * rates[0] ** 2 + p.J2 * rates[1] ** 2)
+    potential = p.gravity * (p.m1 * lower[1] + p.m2 * upper[1])
+    potential += 0.5 * (p.k_r * angles[0] ** 2 + p.k_h * (angles[0] - angles[1]) ** 2)
+    return state, kinetic, potential
+
+
+def test_equations_are_those_of_lagrange() -> None:
+    rng = random_numbers()
+    for _ in range(5):
+        p = random_parameters(rng)
+        state, kinetic, potential = energies(p)
+        rates = state[2:]
+        momentum = ca.gradient(kinetic, state)[2:]
+        inputs = ca.SX.sym("input", 2)
+        u, d = inputs[0], inputs[1]
+        slip = rates[0] - rates[1]
+        forces = ca.vertcat(d - u - p.c_r * rates[0] - p.c_h * slip, u + p.c_h * slip)
+        slope = ca.gradient(kinetic - potential, state)[:2]
+        coriolis = ca.jtimes(momentum, state, ca.vertcat(rates, 0, 0))
+        acceleration = ca.solve(ca.jacobian(momentum, state)[:, 2:], forces + slope - coriolis)
+        lagrange = ca.Function("lagrange", [state, inputs], [ca.vertcat(rates, acceleration)])
+        x, w = rng.normal(size=4), rng.normal(size=2) * 10
+        np.testing.assert_allclose(
+            body_dynamics(p)(x, w).full(), lagrange(x, w).full(), rtol=1e-10, atol=1e-10
+        )
+
+
+def test_energy_of_the_free_undamped_bodies_is_conserved() -> None:
+    state, kinetic, potential = energies(UNDAMPED)
+    energy = ca.Function("energy", [state], [kinetic + potential])
+    step = runge_kutta_step(body_dynamics(UNDAMPED), 0.01, substeps=10)
+    x = np.array([0.15, -0.2, 0.5, -1.0])
+    before = float(energy(x))
+    moved = 0.0
+    for _ in range(200):
+        x = step(x, [0.0, 0.0]).full()[:, 0]
+        moved = max(moved, abs(float(ca.Function("k", [state], [kinetic])(x))))
+    assert moved > 1.0  # J: it did fall
+    assert float(energy(x)) == pytest.approx(before, abs=1e-7)
+
+
+def test_power_is_what_torque_perturbation_and_damping_give() -> None:
+    rng = random_numbers()
+    p = random_parameters(rng)
+    state, kinetic, potential = energies(p)
+    slope = ca.Function("slope", [state], [ca.gradient(kinetic + potential, state)])
+    for _ in range(20):
+        x, (u, d) = rng.normal(size=4), rng.normal(size=2) * 10
+        gained = float(slope(x).full()[:, 0] @ body_dynamics(p)(x, [u, d]).full()[:, 0])
+        slip = x[2] - x[3]
+        given = d * x[2] - u * slip - p.c_r * x[2] ** 2 - p.c_h * slip**2
+        assert gained == pytest.approx(given, rel=1e-9, abs=1e-9)
+
+
+def test_mass_matrix_is_symmetric_and_positive_definite() -> None:
+    rng = random_numbers()
+    for _ in range(50):
+        matrix = mass_matrix(random_parameters(rng))(rng.uniform(-np.pi, np.pi, 2)).full()
+        np.testing.assert_array_equal(matrix, matrix.T)
+        assert np.linalg.eigvalsh(matrix)[0] > 0
+
+
+def test_linearisation_is_the_central_difference_of_the_nonlinear_equations() -> None:
+    rng = random_numbers()
+    for p in (SeatedBalanceParameters(), random_parameters(rng)):
+        dynamics = nonlinear_dynamics(p)
+        plant = continuous_seated_balance_plant(p)
+        exact = np.hstack([plant.A, plant.B])
+        # Richardson's combination of two steps: the error of a single central difference at its
+        # best step is about 1e-10 of the largest entry, near the 1e-8 wanted.
+        for column in range(12):
+            unit = np.eye(12)[column]
+
+            def slope(h: float, unit: Any = unit, dynamics: Any = dynamics) -> Any:
+                ends = [dynamics(s * h * unit[:10], s * h * unit[10:]).full() for s in (1, -1)]
+                return (ends[0] - ends[1])[:, 0] / (2 * h)
+
+            difference = (4 * slope(1e-3) - slope(2e-3)) / 3
+            np.testing.assert_allclose(difference, exact[:, column], rtol=1e-8, atol=1e-8)
+
+
+def test_four_state_numbers_of_the_reference() -> None:
+    plant = continuous_seated_balance_plant()
+    A, Bu, Bd = plant.A[:4, :4], plant.A[:4, -1], plant.B[:4, 1]
+    np.testing.assert_allclose(
+        A[2:],
+        [[-7.959, -5.419, -2.478, 1.1419], [13.0633, 21.3689, 2.376, -1.4282]],
+        atol=5.1e-5,
+    )
+    np.testing.assert_allclose(Bu, [0, 0, -0.4568, 0.5713], atol=5e-5)
+    np.testing.assert_allclose(Bd, [0, 0, 0.2672, -0.1896], atol=5e-5)
+    poles = sorted(np.linalg.eigvals(A), key=lambda pole: (pole.real, pole.imag))
+    np.testing.assert_allclose(poles, [-5.376, -1.211 - 1.811j, -1.211 + 1.811j, 3.892], atol=6e-4)
+    p = SeatedBalanceParameters()
+    assert (p.m1 * p.l1 + p.m2 * p.l12) * p.gravity == pytest.approx(141.5, abs=0.05)
+    assert p.m2 * p.l2 * p.gravity == pytest.approx(100.9, abs=0.05)
+
+
+def test_ten_state_numbers_of_the_reference() -> None:
+    plant = seated_balance_plant()
+    assert np.abs(np.linalg.eigvals(plant.A)).max() == pytest.approx(1.0397, abs=5e-5)
+    B = plant.B[:, :1]
+    reach = np.hstack([np.linalg.matrix_power(plant.A, k) @ B for k in range(10)])
+    reach /= np.linalg.norm(reach, axis=1, keepdims=True)  # the units of the states differ
+    assert np.linalg.matrix_rank(reach) == 10
+
+
+def intent_gain(plant: Any, delay_weight: float) -> tuple[Any, float]:
+    """Gain and closed-loop radius of the reference's intent."""
+    direction = np.array([0.70, 0.65, 0.22, 0.20])
+    direction /= np.linalg.norm(direction)
+    Q = np.diag([2e4, 2e4, 500.0, 500.0, *[delay_weight] * 5, 1e-2])
+    Q[:4, :4] += 6e5 * np.outer(direction, direction)
+    B = plant.B[:, :1]
+    P = scipy.linalg.solve_discrete_are(plant.A, B, Q, np.eye(1))
+    K = np.linalg.solve(1 + B.T @ P @ B, B.T @ P @ plant.A)
+    return K[0], float(np.abs(np.linalg.eigvals(plant.A - B @ K)).max())
+
+
+def test_gain_of_the_intent_is_that_of_the_reference() -> None:
+    # The reference weights the delay states by 1e-2 in the companion form, where they are so
+    # small that this is no weight at all: 0 here. The same 1e-2 on these states moves the gain of
+    # the body by 8e-4 of itself.
+    plant = seated_balance_plant()
+    expected = [814.34, 1478.09, 325.57, 365.90]
+    K, radius = intent_gain(plant, 0.0)
+    np.testing.assert_allclose(K[:4], expected, atol=5.1e-3)
+    assert K[9] == pytest.approx(2.561, abs=5e-4)
+    assert radius == pytest.approx(0.9677, abs=5e-5)
+    K, radius = intent_gain(plant, 1e-2)
+    np.testing.assert_allclose(K[:4], expected, rtol=1e-3)
+    assert radius == pytest.approx(0.9677, abs=5e-5)
+
+
+def test_balance_under_the_ternary_torque_has_the_reference_extremes() -> None:
+    K, _ = intent_gain(seated_balance_plant(), 0.0)
+    step = runge_kutta_step(nonlinear_dynamics(), 0.01)
+    torque = ternary_torque()
+    states = np.zeros((len(torque) + 1, 10))
+    commands = np.zeros(len(torque))
+    for k, d in enumerate(torque):
+        commands[k] = -K @ states[k]
+        states[k + 1] = step(states[k], [commands[k], d]).full()[:, 0]
+    extremes = np.degrees(np.abs(states[:, :2]).max(axis=0))
+    np.testing.assert_allclose(extremes, [6.96, 5.20], atol=6e-3)
+    assert np.abs(commands).max() == pytest.approx(9.5, abs=0.05)
+    correlation = np.corrcoef(states[:, 0], states[:, 1])[0, 1]
+    assert correlation == pytest.approx(-0.984, abs=1e-3)
+
+
+def test_sampled_plant_is_the_nonlinear_plant_for_small_motions() -> None:
+    plant = seated_balance_plant(sample_time=0.02)
+    step = runge_kutta_step(nonlinear_dynamics(), 0.02, substeps=40)
+    rng = random_numbers()
+    x, w = 1e-4 * rng.normal(size=10), 1e-4 * rng.normal(size=2)
+    np.testing.assert_allclose(step(x, w).full()[:, 0], plant.A @ x + plant.B @ w, atol=1e-10)
+
+
+@pytest.mark.parametrize("order", [0, 1, 5, 8])
+def test_names_and_order_of_the_signals(order: int) -> None:
+    body = ["theta1", "theta2", "theta1_rate", "theta2_rate"]
+    delays = [f"delay_{k}" for k in range(1, order + 1)]
+    for plant, dt in (
+        (seated_balance_plant(delay_order=order), 0.01),
+        (continuous_seated_balance_plant(delay_order=order), 0.0),
+    ):
+        assert plant.state_labels == [*body, *delays, "muscle_torque"]
+        assert plant.input_labels == ["command", "perturbation"]
+        assert plant.output_labels == ["theta1", "theta2"]
+        assert plant.dt == dt
+        assert not np.any(plant.D)
+    # The command reaches the bodies only through the chain.
+    continuous = continuous_seated_balance_plant(delay_order=order)
+    chain = delayed_muscle(0.08, 0.06, order)
+    np.testing.assert_allclose(continuous.A[4:, 4:], chain.A, atol=1e-12)
+    np.testing.assert_allclose(continuous.B[4:, 0], chain.B, atol=1e-12)
+    assert not np.any(continuous.B[:4, 0])
+
+
+def test_each_parameter_is_documented_with_its_unit_and_origin() -> None:
+    for kind in (SeatedBalanceParameters, SeatedBalanceLimits):
+        assert kind.__doc__ is not None
+        for each in fields(kind):
+            assert each.metadata["origin"] in ("measured", "regressed", "chosen")
+            text = kind.__doc__.split("Attributes")[1].split(each.name, 1)[1].split(": float")[1]
+            assert each.metadata["unit"] in text
+            assert each.metadata["origin"] in text.lower()
+
+
+@pytest.mark.parametrize("value", [-1.0, float("nan"), float("inf"), "heavy", None, True])
+@pytest.mark.parametrize("name", [f.name for f in fields(SeatedBalanceParameters)])
+def test_bad_parameters_are_refused_by_name(name: str, value: Any) -> None:
+    if name == "l1" and value == -1.0:
+        assert replace(SeatedBalanceParameters(), l1=value).l1 == -1.0  # below the pivot
+        return
+    with pytest.raises(ValueError, match=rf"^{name}: expected .*, got .*; give it in ") as error:
+        replace(SeatedBalanceParameters(), **{name: value})
+    assert "\n" not in str(error.value)
+
+
+def test_limits_are_positive() -> None:
+    assert np.degrees(SeatedBalanceLimits().theta1) == pytest.approx(12.0)
+    with pytest.raises(ValueError, match=r"^command: expected .*, got -70; give it in Nm"):
+        SeatedBalanceLimits(command=-70)
+
+
+def test_bad_sample_time_and_order_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"^sample_time: "):
+        seated_balance_plant(sample_time=0.0)
+    with pytest.raises(ValueError, match=r"^order: "):
+        seated_balance_plant(delay_order=21)
+    with pytest.raises(ValueError, match=r"^substeps: "):
+        runge_kutta_step(nonlinear_dynamics(), 0.01, substeps=0)
