@@ -86,6 +86,16 @@ class GainFibre:
         """The basis as blkdiag(T'QT, G'RG), (k, n + m, n + m)."""
         return pair_blocks(self.T.T @ self.Q @ self.T, self.G.T @ self.R @ self.G)
 
+    def to_natural(self, weights: Weights) -> Array:
+        """blkdiag(T'QT, G'RG) of any weights."""
+        both = scipy.linalg.block_diag(self.T, self.G)
+        return np.asarray(both.T @ weights.block @ both)
+
+    def from_natural(self, X: Array) -> Weights:
+        """Weights in the units of the plant; inverse of `to_natural`."""
+        back = np.linalg.inv(scipy.linalg.block_diag(self.T, self.G))
+        return split_blocks(back.T @ X @ back, self.plant.n)
+
 
 def gain_fibre(plant: Plant, gain: ArrayLike, metric: ArrayLike | None = None) -> GainFibre:
     """Compute the space of the weights that have a given gain.

@@ -200,7 +200,7 @@ def gain_plant_differential(solution: LqrSolution, dA: Array, dB: Array) -> tupl
     dP = lyapunov_series(F.T, source + source.transpose(0, 2, 1))
     dBP = dB.transpose(0, 2, 1) @ P
     numerator = B.T @ dP @ F + dBP @ F + B.T @ P @ moved
-    dK = np.linalg.solve(S, numerator)
+    dK = np.asarray(np.linalg.solve(S, numerator), dtype=np.float64)
     dBPB = dBP @ B
     return dK, B.T @ dP @ B + dBPB + dBPB.transpose(0, 2, 1)
 

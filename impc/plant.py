@@ -149,15 +149,18 @@ def _sample_time(dt: object) -> float:
 def _require_stabilisable(plant: Plant) -> None:
     """Hautus test on the modes that do not decay: [A - s I, B] must keep full row rank.
 
-    The rank is decided at 1e-10 of the largest singular value; a mode that is stabilisable by
-    less would need gains beyond the reach of double precision.
+    The states are balanced and the inputs scaled first, so that units do not decide. The rank is
+    then taken at 1e-10 of the largest singular value; a mode that is stabilisable by less would
+    need gains beyond the reach of double precision.
     """
-    for mode in scipy.linalg.eigvals(plant.A):
+    A, scaling = scipy.linalg.matrix_balance(plant.A, permute=False)
+    B = np.linalg.solve(scaling, plant.B)
+    B = B / np.maximum(np.max(np.abs(B), axis=0), 1e-300) * max(1.0, np.max(np.abs(A)))
+    for mode in scipy.linalg.eigvals(A):
         decays = abs(mode) < 1 if plant.discrete else mode.real < 0
         if decays:
             continue
-        pencil = np.hstack([plant.A - mode * np.eye(plant.n), plant.B])
-        singular = scipy.linalg.svdvals(pencil)
+        singular = scipy.linalg.svdvals(np.hstack([A - mode * np.eye(plant.n), B]))
         if singular[plant.n - 1] <= 1e-10 * singular[0]:
             raise PlantError(
                 "plant",

@@ -90,20 +90,21 @@ def unit_directions(controller: Controller, wanted: list[tuple[str, tuple[int, .
 
 def problem(seed: int, softening: float | None) -> tuple[Controller, Scenario, Simulation]:
     """A random loop with input bounds, and mostly state bounds and a terminal set, at work."""
-    rng = np.random.default_rng(seed)
     n, m = 2 + seed % 3, 1 + seed % 3
-    plant = random_plant(rng, n, m, 1.1, d=1)
-    weights = stage_weights(random_weights(rng, n), random_weights(rng, m))
     x_max = 1.5 if seed % 2 else np.inf
-    bounds = box_bounds(plant, u_min=-0.4, u_max=0.5, x_min=-x_max, x_max=x_max)
-    controller = mpc_controller(plant, weights, bounds, 3, softening=softening)
-    push = 0.05 * rng.normal(size=25)
-    direction = rng.normal(size=n)
-    for size in 5 * 0.9 ** np.arange(60):
-        drive = scenario(plant, size * direction, disturbance=push)
-        run = simulate(controller, drive)
-        if run.complete and np.any(run.status > Status.FREE) and run.weakly_active == 0:
-            return controller, drive, run
+    for attempt in range(10):
+        rng = np.random.default_rng([seed, attempt])
+        plant = random_plant(rng, n, m, 1.1, d=1)
+        weights = stage_weights(random_weights(rng, n), random_weights(rng, m))
+        bounds = box_bounds(plant, u_min=-0.4, u_max=0.5, x_min=-x_max, x_max=x_max)
+        controller = mpc_controller(plant, weights, bounds, 3, softening=softening)
+        push = 0.05 * rng.normal(size=25)
+        direction = rng.normal(size=n)
+        for size in 5 * 0.9 ** np.arange(60):
+            drive = scenario(plant, size * direction, disturbance=push)
+            run = simulate(controller, drive)
+            if run.complete and np.any(run.status > Status.FREE) and run.weakly_active == 0:
+                return controller, drive, run
     raise AssertionError(f"seed {seed} has no active bound")
 
 
@@ -114,18 +115,18 @@ def test_jacobian_equals_central_differences(seed: int, softening: float | None)
     wanted = entries(controller)
     same, exact = simulate_and_differentiate(controller, drive, unit_directions(controller, wanted))
     np.testing.assert_array_equal(same.x, run.x)
-    step = 1e-7  # short, so that few differences reach across a change of the active set
     for column, (part, index) in enumerate(wanted):
-        up, down = (moved(controller, drive, part, index, s) for s in (step, -step))
-        if not np.array_equal(up.status, down.status):
-            continue  # an active set changes inside the difference: no derivative to compare
-        for quantity in ("x", "u"):
-            difference = (getattr(up, quantity) - getattr(down, quantity)) / (2 * step)
-            found = getattr(exact, quantity)[..., column]
-            scale = max(1.0, float(np.max(np.abs(difference))))
-            np.testing.assert_allclose(
-                found, difference, atol=1e-6 * scale, err_msg=f"{part}{index} {quantity}"
-            )
+        errors = []
+        # The longer differences may reach across a change of the active set, the shorter ones have
+        # more rounding: one of them must agree.
+        for step in (1e-5, 1e-6, 1e-7):
+            up, down = (moved(controller, drive, part, index, s) for s in (step, -step))
+            for quantity in ("x", "u"):
+                difference = (getattr(up, quantity) - getattr(down, quantity)) / (2 * step)
+                error = np.max(np.abs(getattr(exact, quantity)[..., column] - difference))
+                errors.append(error / max(1.0, float(np.max(np.abs(difference)))))
+        worst = np.reshape(errors, (3, 2)).max(axis=1)
+        assert worst.min() < 1e-6, f"seed {seed}: {part}{index}: {worst}"
 
 
 def test_soft_rows_are_part_of_the_comparison() -> None:
@@ -143,10 +144,11 @@ def test_active_terminal_rows_are_differentiated(example_plant: Plant) -> None:
     for x0 in np.ndindex(40, 40):
         drive = scenario(example_plant, np.array(x0) / 10, 12)
         run, without = simulate(controller, drive), simulate(bare, drive)
-        if run.complete and np.max(np.abs(run.x - without.x)) > 0.05:
+        differs = np.max(np.abs(run.x - without.x)) > 1e-3
+        if run.complete and differs and run.weakly_active == 0:
             break
-    assert np.max(np.abs(run.x - without.x)) > 0.05
-    assert run.weakly_active == 0
+    assert run.complete
+    assert differs
     wanted = [("K", (0, 0)), ("K", (0, 1)), ("bounds", (0,))]
     _, exact = simulate_and_differentiate(controller, drive, unit_directions(controller, wanted))
     step = 1e-7

@@ -1,0 +1,238 @@
+"""Inverse LQR: the weights (Q, R) whose regulator has a given gain, or the nearest one.
+
+Three ways, as in Table 3.1: the linear matrix inequality, which has an answer only when some
+weights have exactly the gain; the same with a cross term x'Su in the cost, which always has one;
+and the gradient of the distance between the gains. After Priess et al., IEEE TCST 23 (2015) 770.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy.linalg
+import scipy.optimize
+
+from impc.arrays import Array, finite_array, frozen
+from impc.equivalent_weights import gain_fibre, least_condition_weights, weights_margin
+from impc.errors import WeightsError
+from impc.gain_fibre import natural_coordinates
+from impc.lqr import gain_gradients, is_stable, solve_lqr
+from impc.semidefinite import matrix_inequality, norm_bound, solve_semidefinite
+from impc.step_program import block_basis
+from impc.weights import Weights, condition_number, normalised, stage_weights
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from impc.lqr import LqrSolution
+    from impc.plant import Plant
+
+__all__ = [
+    "CrossTerm",
+    "InverseLqr",
+    "inverse_lqr_cross_term",
+    "inverse_lqr_gradient",
+    "inverse_lqr_lmi",
+]
+
+
+@dataclass(frozen=True)
+class InverseLqr:
+    """Weights for a gain, or the finding that there are none.
+
+    Attributes
+    ----------
+    weights : Weights or None
+        Scaled to R[0, 0] = 1; None when the method found that there are none.
+    gain : Array or None
+        K(Q, R) of these weights, (m, n).
+    gain_error : float
+        ||K(Q, R) - K||_F; infinite without weights.
+    condition : float
+        Condition number of blkdiag(Q, R); infinite without weights.
+    feasible : bool
+        Whether weights with exactly this gain were found: a relative error of 1e-8 or less.
+    method : str
+        "lmi" or "gradient".
+    evaluations : int
+        Riccati equations solved.
+    status : str
+        Why the method ended.
+    """
+
+    weights: Weights | None
+    gain: Array | None
+    gain_error: float
+    condition: float
+    feasible: bool
+    method: str
+    evaluations: int
+    status: str
+
+
+@dataclass(frozen=True)
+class CrossTerm:
+    """Weights of  x'Qx + 2 x'Su + u'Ru  that have the gain exactly, with the least cross term.
+
+    Attributes
+    ----------
+    Q, R, S : Array
+        Shapes (n, n), (m, m), (n, m); R >= I sets the scale.
+    norm : float
+        ||S||_F.
+    status : str
+        The solver's word.
+    """
+
+    Q: Array
+    R: Array
+    S: Array
+    norm: float
+    status: str
+
+
+def inverse_lqr_lmi(plant: Plant, gain: ArrayLike) -> InverseLqr:
+    """Weights of least condition number with exactly the gain, if there are any.
+
+    Parameters
+    ----------
+    plant : Plant
+        Discrete or continuous.
+    gain : array_like
+        K (m, n) of u = -Kx.
+
+    Returns
+    -------
+    InverseLqr
+        Not feasible, and without weights, when no weights have the gain: because A - BK is not
+        stable, or because the fibre of the gain has no definite member.
+
+    Raises
+    ------
+    SolverError
+        When the semidefinite program ends without an answer.
+    """
+    K = finite_array("gain", gain, (plant.m, plant.n))
+    if not is_stable(plant.A - plant.B @ K, discrete=plant.discrete):
+        return _no_weights("A - BK is not stable")
+    fibre = gain_fibre(plant, K)
+    margin = weights_margin(fibre)
+    if not margin.exist:
+        return _no_weights(f"no definite weights have this gain, margin {margin.margin:.3g}")
+    found = least_condition_weights(fibre)
+    return _result(solve_lqr(plant, found.weights), K, "lmi", 1, found.status)
+
+
+def inverse_lqr_cross_term(plant: Plant, gain: ArrayLike) -> CrossTerm:
+    """Least cross term with which a quadratic cost has exactly the gain.
+
+    minimise ||S||_F subject to R >= I, [Q S; S' R] >= 0, where P and R are free and, with
+    F = A - BK,
+
+        discrete:    S' = RK - B'PF,    Q = P - F'PF + SK + K'S' - K'RK
+        continuous:  S' = RK - B'P,     Q = -F'P - PF + SK + K'S' - K'RK
+
+    P >= 0 follows, for F is stable. Dropping S gives a start for `inverse_lqr_gradient`.
+
+    Raises
+    ------
+    WeightsError
+        When A - BK is not stable: no quadratic cost has such a gain.
+    SolverError
+        When the semidefinite program ends without an answer.
+    """
+    n, m = plant.n, plant.m
+    K = finite_array("gain", gain, (m, n))
+    F = plant.A - plant.B @ K
+    if not is_stable(F, discrete=plant.discrete):
+        raise WeightsError("gain", "A - BK is not stable", "no quadratic cost has such a gain")
+    # Unknowns and the joint inequality in natural coordinates, the norm and R >= I in the plant's.
+    both = scipy.linalg.block_diag(*natural_coordinates(plant, K))
+    back = np.linalg.inv(both)
+    unknowns = back.T @ block_basis(n, m) @ back
+    P, R = unknowns[:, :n, :n], unknowns[:, n:, n:]
+    S = (R @ K - (plant.B.T @ P @ F if plant.discrete else plant.B.T @ P)).transpose(0, 2, 1)
+    decay = P - F.T @ P @ F if plant.discrete else -(F.T @ P + P @ F)
+    crossed = S @ K
+    Q = decay + crossed + crossed.transpose(0, 2, 1) - K.T @ R @ K
+    joint = np.concatenate(
+        [np.concatenate([Q, S], 2), np.concatenate([S.transpose(0, 2, 1), R], 2)], 1
+    )
+    bound = np.eye(len(unknowns) + 1)[-1]
+    cones = [
+        norm_bound(_padded(S.reshape(len(S), -1)), bound),
+        matrix_inequality(-np.eye(m), _padded(R)),
+        matrix_inequality(np.zeros((n + m, n + m)), _padded(both.T @ joint @ both)),
+    ]
+    found = solve_semidefinite(bound, cones)
+    total = np.tensordot(found.y[:-1], joint, 1)
+    total = (total + total.T) / 2
+    cross = total[:n, n:]
+    return CrossTerm(
+        frozen(total[:n, :n]),
+        frozen(total[n:, n:]),
+        frozen(cross),
+        float(np.linalg.norm(cross)),
+        found.status,
+    )
+
+
+def inverse_lqr_gradient(
+    plant: Plant,
+    gain: ArrayLike,
+    start: Weights | None = None,
+    *,
+    max_evaluations: int = 1000,
+    floor: float = 1e-9,
+) -> InverseLqr:
+    """Weights whose gain is nearest: minimise ||K(Q, R) - K||_F^2.
+
+    Levenberg-Marquardt in a trust region over the Cholesky factors of Q and R, with the exact
+    derivatives of K. The infimum need not be attained: Q then tends to a singular matrix, slowly,
+    and the condition number of the result tells. Two limits keep that orderly, neither of which
+    touches a problem whose minimum is attained: evaluations are capped, and Q = LL' + f I,
+    R = GG' + f I with f the floor times the mean eigenvalue of the start.
+
+    Parameters
+    ----------
+    gain : array_like
+        K (m, n); A - BK need not be stable.
+    start : Weights, optional
+        By default the cross-term weights without their cross term, or the identity when A - BK is
+        not stable.
+    max_evaluations : int
+    floor : float
+        Relative; 0 lets Q become singular to working precision.
+
+    Raises
+    ------
+    WeightsError
+        When the start has no stabilising Riccati solution.
+    """
+    K = finite_array("gain", gain, (plant.m, plant.n))
+    space = _FactorSpace.around(plant, _default_start(plant, K) if start is None else start, floor)
+
+    def difference(parameters: Array) -> Array:
+        # Where the Riccati equation fails, the trust region shrinks: it does so for infinity.
+        solution = space.solution(parameters)
+        return np.full(K.size, np.inf) if solution is None else (solution.K - K).ravel()
+
+    first = space.solution(space.start)
+    if first is None:
+        raise WeightsError("start", "has no stabilising Riccati solution", "give other weights")
+    found = scipy.optimize.least_squares(
+        difference,
+        space.start,
+        jac=space.jacobian,  # type: ignore[arg-type]
+        max_nfev=max_evaluations,
+        ftol=1e-15,
+        xtol=1e-15,
+        gtol=1e-15,
+    )
+    solution = space.solution(found.x)
+    last = first if solution is None else solution
+    return _result(last, K, "gradient", int(found.nfev), str(found.message))
+
+
