@@ -41,6 +41,11 @@ if TYPE_CHECKING:
 __all__ = ["ConditionedFit", "Objective", "Residual", "conditioned_fit", "weight_jacobian"]
 
 
+_STATIONARY = 1e-5
+# In units of the current weights: a step of 1 can double one direction or make it singular.
+_LARGEST_RADIUS = 2.0
+
+
 @dataclass(frozen=True)
 class Residual:
     """A residual (r,) with its derivatives with respect to K (r, m, n) and S (r, m, m)."""
@@ -89,8 +94,10 @@ class ConditionedFit:
     objective : float
     iterations, evaluations : int
         Steps solved, and residuals computed.
+    stationarity : float
+        Decrease that the last step promised, relative to the objective and to the step's size.
     converged : bool
-        Whether the last step could promise no decrease above the tolerance.
+        Whether that is at most 1e-5.
     """
 
     weights: Weights
@@ -100,6 +107,7 @@ class ConditionedFit:
     objective: float
     iterations: int
     evaluations: int
+    stationarity: float
     converged: bool
 
 
@@ -134,14 +142,13 @@ def conditioned_fit(
         raise SolverError(
             "start", "the closed loop cannot be simulated with these weights", "start elsewhere"
         )
-    radius, evaluations, converged = 0.5, 1, False
-    iteration = 0
+    radius, evaluations, iteration, stationarity = 0.5, 1, 0, np.inf
     for iteration in range(1, max_iterations + 1):
         program = _linearise(here, objective)
         step, predicted = solve_step(program, radius)
         decrease = here.objective - predicted
+        stationarity = max(decrease, 0.0) / (here.objective * min(radius, 1.0))
         if decrease <= tolerance * here.objective:
-            converged = True
             break
         there = _try(plant, objective, here, step)
         evaluations += 1
@@ -151,11 +158,9 @@ def conditioned_fit(
         if ratio > 1e-4 and there is not None:
             here = there
         if ratio > 0.75:
-            radius = min(2 * radius, 0.95 if np.linalg.norm(step) < radius else 4.0)
+            radius = min(2 * radius, _LARGEST_RADIUS)
         elif ratio < 0.25:
             radius = 0.25 * min(radius, float(np.linalg.norm(step)))
-        if radius < 1e-13:
-            break
     return ConditionedFit(
         normalised(here.weights),
         here.solution,
@@ -164,7 +169,8 @@ def conditioned_fit(
         here.objective,
         iteration,
         evaluations,
-        converged,
+        stationarity,
+        stationarity <= _STATIONARY,
     )
 
 

@@ -233,7 +233,7 @@ def _interior(fibre: GainFibre) -> Weights:
 
 
 def _centred_program(fibre: GainFibre, centre: Weights) -> tuple[Weights, float, str]:
-    """One program of `least_condition_weights`, its scale set by a member: weights, bound, status."""
+    """One program of `least_condition_weights`, scaled by a member: (found, bound, status)."""
     n, eigenvalues = fibre.plant.n, np.linalg.eigvalsh(centre.block)
     if eigenvalues[0] <= 0:
         raise SolverError(
@@ -298,5 +298,6 @@ def _member(
 ) -> EquivalentWeights:
     checked = normalised(stage_weights(weights.Q, weights.R))
     solution = solve_lqr(fibre.plant, checked)
-    error = float(np.linalg.norm(solution.K - fibre.gain) / max(np.linalg.norm(fibre.gain), 1e-300))
+    error = float(np.linalg.norm(solution.K - fibre.gain))
+    error /= max(float(np.linalg.norm(fibre.gain)), 1e-300)
     return EquivalentWeights(checked, solution.P, condition_number(checked), error, status, gap)

@@ -127,7 +127,7 @@ def gain_fibre(plant: Plant, gain: ArrayLike, metric: ArrayLike | None = None) -
     Q, R = units[:, : plant.n, : plant.n], units[:, plant.n :, plant.n :]
     P = _lyapunov(plant, F, Q + K_natural.T @ R @ K_natural)
     product = B.T @ P @ F if plant.discrete else B.T @ P
-    conditions = (product - R @ K_natural).reshape(len(units), -1)
+    conditions: Array = (product - R @ K_natural).reshape(len(units), -1)
     if metric is not None:
         conditions = _add_metric(conditions, R + B.T @ P @ B if plant.discrete else R, G, metric)
     _, singular, directions = np.linalg.svd(conditions.T)
@@ -149,12 +149,12 @@ def natural_coordinates(plant: Plant, K: Array) -> tuple[Array, Array]:
     """Natural coordinates x = T z, u = G v of a plant under a stabilising gain: (n, n), (m, m)."""
     F = plant.A - plant.B @ K
     input_factor = np.linalg.cholesky(_floored(_input_metric(plant, K, F)))
-    G = np.linalg.inv(input_factor).T
+    G = np.asarray(np.linalg.inv(input_factor).T, dtype=np.float64)
     # Continuous: noise of the same variance, correlated over the mean time constant of F.
     rate = 1.0 if plant.discrete else -float(np.trace(F)) / plant.n
     driven = plant.B @ G
     covariance = _lyapunov(plant, F.T, (driven @ driven.T / rate)[None])[0]
-    return np.linalg.cholesky(_floored(covariance)), G
+    return np.asarray(np.linalg.cholesky(_floored(covariance)), dtype=np.float64), G
 
 
 def pair_blocks(Q: Array, R: Array) -> Array:
@@ -190,7 +190,8 @@ def _floored(covariance: Array) -> Array:
     correlation = covariance / np.outer(scale, scale)
     np.fill_diagonal(correlation, 1.0)
     values, vectors = np.linalg.eigh((correlation + correlation.T) / 2)
-    return np.outer(scale, scale) * ((vectors * np.maximum(values, _FLOOR)) @ vectors.T)
+    floored: Array = (vectors * np.maximum(values, _FLOOR)) @ vectors.T
+    return np.outer(scale, scale) * floored
 
 
 def _lyapunov(plant: Plant, F: Array, stack: Array) -> Array:

@@ -2,7 +2,8 @@
 
 The closed loop depends on (Q, R) through K and the scale-free S only, so the derivative of the
 outputs with respect to the weights has at most n m + m (m + 1)/2 - 1 directions, whatever was
-recorded. The rest of the weights was chosen by the condition number.
+recorded (n m + m - 1 when A is invertible: docs/theory.md). The rest of the weights was chosen by
+the condition number.
 """
 
 from __future__ import annotations

@@ -184,7 +184,7 @@ def inverse_lqr_gradient(
     gain: ArrayLike,
     start: Weights | None = None,
     *,
-    max_evaluations: int = 1000,
+    max_evaluations: int = 300,
     floor: float = 1e-9,
 ) -> InverseLqr:
     """Weights whose gain is nearest: minimise ||K(Q, R) - K||_F^2.
@@ -225,7 +225,7 @@ def inverse_lqr_gradient(
     found = scipy.optimize.least_squares(
         difference,
         space.start,
-        jac=space.jacobian,  # type: ignore[arg-type]
+        jac=space.jacobian,
         max_nfev=max_evaluations,
         ftol=1e-15,
         xtol=1e-15,
@@ -236,3 +236,94 @@ def inverse_lqr_gradient(
     return _result(last, K, "gradient", int(found.nfev), str(found.message))
 
 
+@dataclass(frozen=True)
+class _FactorSpace:
+    """Q = LL' + f I and R = GG' + f I, the entries of L and G but G[0, 0] as parameters."""
+
+    plant: Plant
+    start: Array
+    fixed: float  # G[0, 0]
+    lift: float  # f
+
+    @classmethod
+    def around(cls, plant: Plant, weights: Weights, floor: float) -> _FactorSpace:
+        scaled = normalised(weights)
+        lift = floor * float(np.trace(scaled.block)) / (plant.n + plant.m)
+        factors = [
+            np.linalg.cholesky(matrix - lift * np.eye(len(matrix)))
+            for matrix in (_definite(scaled.Q, 2 * lift), _definite(scaled.R, 2 * lift))
+        ]
+        entries = [factor[np.tril_indices(len(factor))] for factor in factors]
+        return cls(
+            plant,
+            frozen(np.concatenate([entries[0], entries[1][1:]])),
+            float(entries[1][0]),
+            lift,
+        )
+
+    def factors(self, parameters: Array) -> tuple[Array, Array]:
+        n, m = self.plant.n, self.plant.m
+        L, G, count = np.zeros((n, n)), np.zeros((m, m)), n * (n + 1) // 2
+        L[np.tril_indices(n)] = parameters[:count]
+        G[np.tril_indices(m)] = np.concatenate([[self.fixed], parameters[count:]])
+        return L, G
+
+    def solution(self, parameters: Array) -> LqrSolution | None:
+        """The regulator, or None where the Riccati equation cannot be solved."""
+        L, G = self.factors(parameters)
+        Q, R = L @ L.T + self.lift * np.eye(len(L)), G @ G.T + self.lift * np.eye(len(G))
+        try:
+            return solve_lqr(self.plant, stage_weights(Q, R))
+        except WeightsError:
+            return None
+
+    def jacobian(self, parameters: Array) -> Array:
+        """d vec(K) / d parameters: dQ = EL' + LE' for the unit matrix E of an entry."""
+        solution = self.solution(parameters)
+        assert solution is not None  # asked for only where the difference is finite
+        L, G = self.factors(parameters)
+        gradients = gain_gradients(solution)
+        on_q = 2 * (gradients.Q @ L)[..., *np.tril_indices(len(L))]
+        on_r = 2 * (gradients.R @ G)[..., *np.tril_indices(len(G))][..., 1:]
+        return np.concatenate([on_q, on_r], axis=2).reshape(solution.K.size, -1)
+
+
+def _padded(stack: Array) -> Array:
+    """One more member, of zeros: the bound does not enter here."""
+    return np.concatenate([stack, np.zeros_like(stack[:1])])
+
+
+def _default_start(plant: Plant, K: Array) -> Weights:
+    if not is_stable(plant.A - plant.B @ K, discrete=plant.discrete):
+        return stage_weights(np.eye(plant.n), np.eye(plant.m))
+    found = inverse_lqr_cross_term(plant, K)
+    # The cross-term program touches its own boundary: Q is singular there more often than not.
+    return stage_weights(_definite(found.Q, 1e-4 * float(np.linalg.norm(found.Q, 2))), found.R)
+
+
+def _definite(matrix: Array, least: float) -> Array:
+    """Raise the eigenvalues to a least one."""
+    values, vectors = np.linalg.eigh(matrix)
+    raised: Array = (vectors * np.maximum(values, least)) @ vectors.T
+    return (raised + raised.T) / 2
+
+
+def _no_weights(status: str) -> InverseLqr:
+    return InverseLqr(None, None, np.inf, np.inf, False, "lmi", 0, status)
+
+
+def _result(
+    solution: LqrSolution, target: Array, method: str, evaluations: int, status: str
+) -> InverseLqr:
+    error = float(np.linalg.norm(solution.K - target))
+    weights = normalised(solution.weights)
+    return InverseLqr(
+        weights,
+        solution.K,
+        error,
+        condition_number(weights),
+        error <= 1e-8 * max(float(np.linalg.norm(target)), 1e-300),
+        method,
+        evaluations,
+        status,
+    )

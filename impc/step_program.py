@@ -118,7 +118,8 @@ def _semidefinite(
     program: StepProgram, kappa: float, width: int
 ) -> list[tuple[Array, Array, object]]:
     """The two matrix inequalities, one cone for each diagonal block."""
-    lower = np.linalg.inv(program.X)
+    inverse = scipy.linalg.solve_triangular(program.L, np.eye(len(program.L)), lower=True)
+    lower = inverse @ inverse.T
     upper = program.L @ program.basis @ program.L.T / kappa
     total = len(program.X)
     count = len(program.basis)
