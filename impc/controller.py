@@ -144,7 +144,7 @@ def gain_controller(
     """
     plant.require_discrete()
     K = finite_array("gain", gain, (plant.m, plant.n))
-    if not is_stable(plant.A - plant.B @ K, discrete=True):
+    if terminal_set and not is_stable(plant.A - plant.B @ K, discrete=True):
         raise InputError("gain", "does not stabilise the plant", "give one with |eig(A - BK)| < 1")
     S = np.eye(plant.m) if metric is None else symmetric_matrix("metric", metric, plant.m)
     if np.linalg.eigvalsh(S)[0] <= 0:

@@ -161,7 +161,7 @@ def run_case(
     runner.add_regulator(output.weights, output.evaluations)
     direct = runner.timed("inverse_mpc", lambda: inverse_mpc(problem, start))
     runner.add_constrained(direct.weights, direct.evaluations)
-    reduced = runner.timed("inverse_mpc_reduced", lambda: inverse_mpc_reduced(problem, gain.K))
+    reduced = runner.timed("inverse_mpc_reduced", lambda: inverse_mpc_reduced(problem))
     runner.add_constrained(reduced.weights, reduced.gain.evaluations)
     return CaseResult(
         name,

@@ -46,8 +46,9 @@ __all__ = [
 # Singular values of the gain condition below this, of the largest, are zero: exact gains leave
 # 1e-15 there (a singular A, or a metric given with its own gain), the seat's smallest is 4e-3.
 _RANK = 1e-10
-# A direction that the inputs hardly reach is stretched no further than this, in variance.
-_FLOOR = 1e-8
+# A direction that the inputs hardly reach is stretched no further than this, in variance; an input
+# direction that the loop hardly reproduces (always, when m > n) no further than that.
+_STATE_FLOOR, _INPUT_FLOOR = 1e-8, 1e-3
 
 
 @dataclass(frozen=True)
@@ -148,13 +149,13 @@ def gain_fibre(plant: Plant, gain: ArrayLike, metric: ArrayLike | None = None) -
 def natural_coordinates(plant: Plant, K: Array) -> tuple[Array, Array]:
     """Natural coordinates x = T z, u = G v of a plant under a stabilising gain: (n, n), (m, m)."""
     F = plant.A - plant.B @ K
-    input_factor = np.linalg.cholesky(_floored(_input_metric(plant, K, F)))
+    input_factor = np.linalg.cholesky(_floored(_input_metric(plant, K, F), _INPUT_FLOOR))
     G = np.asarray(np.linalg.inv(input_factor).T, dtype=np.float64)
     # Continuous: noise of the same variance, correlated over the mean time constant of F.
     rate = 1.0 if plant.discrete else -float(np.trace(F)) / plant.n
     driven = plant.B @ G
     covariance = _lyapunov(plant, F.T, (driven @ driven.T / rate)[None])[0]
-    return np.asarray(np.linalg.cholesky(_floored(covariance)), dtype=np.float64), G
+    return np.asarray(np.linalg.cholesky(_floored(covariance, _STATE_FLOOR)), dtype=np.float64), G
 
 
 def pair_blocks(Q: Array, R: Array) -> Array:
@@ -183,14 +184,14 @@ def _input_metric(plant: Plant, K: Array, F: Array) -> Array:
     return leading * m / trace if abs(trace) > 1e-12 else np.eye(m)
 
 
-def _floored(covariance: Array) -> Array:
-    """Make it definite: unit variance where there is none, correlations floored at 1e-8."""
+def _floored(covariance: Array, floor: float) -> Array:
+    """Make it definite: unit variance where there is none, floored correlations elsewhere."""
     variance = np.diag(covariance)
     scale = np.where(variance > 0, np.sqrt(np.maximum(variance, 1e-300)), 1.0)
     correlation = covariance / np.outer(scale, scale)
     np.fill_diagonal(correlation, 1.0)
     values, vectors = np.linalg.eigh((correlation + correlation.T) / 2)
-    floored: Array = (vectors * np.maximum(values, _FLOOR)) @ vectors.T
+    floored: Array = (vectors * np.maximum(values, floor)) @ vectors.T
     return np.outer(scale, scale) * floored
 
 

@@ -11,16 +11,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.linalg
 import scipy.optimize
 
 from impc.arrays import Array, finite_array, frozen
+from impc.cross_term import CrossTerm, inverse_lqr_cross_term
 from impc.equivalent_weights import gain_fibre, least_condition_weights, weights_margin
 from impc.errors import WeightsError
-from impc.gain_fibre import natural_coordinates
 from impc.lqr import gain_gradients, is_stable, solve_lqr
-from impc.semidefinite import matrix_inequality, norm_bound, solve_semidefinite
-from impc.step_program import block_basis
 from impc.weights import Weights, condition_number, normalised, stage_weights
 
 if TYPE_CHECKING:
@@ -72,27 +69,6 @@ class InverseLqr:
     status: str
 
 
-@dataclass(frozen=True)
-class CrossTerm:
-    """Weights of  x'Qx + 2 x'Su + u'Ru  that have the gain exactly, with the least cross term.
-
-    Attributes
-    ----------
-    Q, R, S : Array
-        Shapes (n, n), (m, m), (n, m); R >= I sets the scale.
-    norm : float
-        ||S||_F.
-    status : str
-        The solver's word.
-    """
-
-    Q: Array
-    R: Array
-    S: Array
-    norm: float
-    status: str
-
-
 def inverse_lqr_lmi(plant: Plant, gain: ArrayLike) -> InverseLqr:
     """Weights of least condition number with exactly the gain, if there are any.
 
@@ -123,60 +99,6 @@ def inverse_lqr_lmi(plant: Plant, gain: ArrayLike) -> InverseLqr:
         return _no_weights(f"no definite weights have this gain, margin {margin.margin:.3g}")
     found = least_condition_weights(fibre)
     return _result(solve_lqr(plant, found.weights), K, "lmi", 1, found.status)
-
-
-def inverse_lqr_cross_term(plant: Plant, gain: ArrayLike) -> CrossTerm:
-    """Least cross term with which a quadratic cost has exactly the gain.
-
-    minimise ||S||_F subject to R >= I, [Q S; S' R] >= 0, where P and R are free and, with
-    F = A - BK,
-
-        discrete:    S' = RK - B'PF,    Q = P - F'PF + SK + K'S' - K'RK
-        continuous:  S' = RK - B'P,     Q = -F'P - PF + SK + K'S' - K'RK
-
-    P >= 0 follows, for F is stable. Dropping S gives a start for `inverse_lqr_gradient`.
-
-    Raises
-    ------
-    WeightsError
-        When A - BK is not stable: no quadratic cost has such a gain.
-    SolverError
-        When the semidefinite program ends without an answer.
-    """
-    n, m = plant.n, plant.m
-    K = finite_array("gain", gain, (m, n))
-    F = plant.A - plant.B @ K
-    if not is_stable(F, discrete=plant.discrete):
-        raise WeightsError("gain", "A - BK is not stable", "no quadratic cost has such a gain")
-    # Unknowns and the joint inequality in natural coordinates, the norm and R >= I in the plant's.
-    both = scipy.linalg.block_diag(*natural_coordinates(plant, K))
-    back = np.linalg.inv(both)
-    unknowns = back.T @ block_basis(n, m) @ back
-    P, R = unknowns[:, :n, :n], unknowns[:, n:, n:]
-    S = (R @ K - (plant.B.T @ P @ F if plant.discrete else plant.B.T @ P)).transpose(0, 2, 1)
-    decay = P - F.T @ P @ F if plant.discrete else -(F.T @ P + P @ F)
-    crossed = S @ K
-    Q = decay + crossed + crossed.transpose(0, 2, 1) - K.T @ R @ K
-    joint = np.concatenate(
-        [np.concatenate([Q, S], 2), np.concatenate([S.transpose(0, 2, 1), R], 2)], 1
-    )
-    bound = np.eye(len(unknowns) + 1)[-1]
-    cones = [
-        norm_bound(_padded(S.reshape(len(S), -1)), bound),
-        matrix_inequality(-np.eye(m), _padded(R)),
-        matrix_inequality(np.zeros((n + m, n + m)), _padded(both.T @ joint @ both)),
-    ]
-    found = solve_semidefinite(bound, cones)
-    total = np.tensordot(found.y[:-1], joint, 1)
-    total = (total + total.T) / 2
-    cross = total[:n, n:]
-    return CrossTerm(
-        frozen(total[:n, :n]),
-        frozen(total[n:, n:]),
-        frozen(cross),
-        float(np.linalg.norm(cross)),
-        found.status,
-    )
 
 
 def inverse_lqr_gradient(
@@ -288,17 +210,13 @@ class _FactorSpace:
         return np.concatenate([on_q, on_r], axis=2).reshape(solution.K.size, -1)
 
 
-def _padded(stack: Array) -> Array:
-    """One more member, of zeros: the bound does not enter here."""
-    return np.concatenate([stack, np.zeros_like(stack[:1])])
-
-
 def _default_start(plant: Plant, K: Array) -> Weights:
     if not is_stable(plant.A - plant.B @ K, discrete=plant.discrete):
         return stage_weights(np.eye(plant.n), np.eye(plant.m))
     found = inverse_lqr_cross_term(plant, K)
-    # The cross-term program touches its own boundary: Q is singular there more often than not.
-    return stage_weights(_definite(found.Q, 1e-4 * float(np.linalg.norm(found.Q, 2))), found.R)
+    # Q is often singular there. A lift of 1e-4 would undo the start on the seat plant, where the
+    # eigenvalues span 1e8: a gain error of 7 % after 300 evaluations, from this one 6e-6.
+    return stage_weights(_definite(found.Q, 1e-8 * float(np.linalg.norm(found.Q, 2))), found.R)
 
 
 def _definite(matrix: Array, least: float) -> Array:

@@ -21,6 +21,7 @@ from impc.errors import WeightsError
 from impc.gain import GainFit, fit_gain
 from impc.inverse_lqr import inverse_lqr_gradient, inverse_lqr_lmi
 from impc.inverse_problem import evaluate, scenarios, without_bounds
+from impc.lqr import solve_lqr
 from impc.weights import Weights, condition_number, normalised, stage_weights
 
 if TYPE_CHECKING:
@@ -44,6 +45,7 @@ __all__ = [
     "inverse_mpc",
     "inverse_mpc_reduced",
     "output_penalty_weights",
+    "start_gains",
     "starting_point",
     "verify_hard",
 ]
@@ -137,6 +139,16 @@ def infer_weights(
     return Inference(start, inverse_mpc(problem, start.weights, condition_weight=condition_weight))
 
 
+def start_gains(start: Start, plant: Plant) -> list[tuple[Array, Array]]:
+    """The gains that Table 3.1 passed on its way, with their metrics, as starts for `fit_gain`."""
+    passed = [start.weights]
+    if start.gradient is not None and start.gradient.weights is not None:
+        passed.append(start.gradient.weights)
+    solutions = [solve_lqr(plant, weights) for weights in passed]
+    pairs = [(np.array(item.K), np.array(item.S)) for item in solutions]
+    return [(np.array(start.gain.K), pairs[0][1]), *pairs]
+
+
 def starting_point(problem: InverseProblem) -> Start:
     """Lines 1 to 8 of Table 3.1: a feedback gain, and the weights of a regulator like it.
 
@@ -186,17 +198,15 @@ def inverse_mpc(
 
 def inverse_mpc_reduced(
     problem: InverseProblem,
-    gain: Array | None = None,
-    metric: Array | None = None,
-    *,
+    *starts: tuple[Array, Array],
     condition_weight: float = CONDITION_WEIGHT,
 ) -> ReducedFit:
     """Reduced inverse MPC: fit the gain through the constrained controller, then one program.
 
     Parameters
     ----------
-    gain, metric : Array, optional
-        Where the search for the gain starts, see `fit_gain`.
+    starts : pairs of Array
+        Gains and metrics from which the search may start, see `fit_gain`.
     condition_weight : float
         Of the direct form, for a gain that no weights have exactly.
 
@@ -205,9 +215,9 @@ def inverse_mpc_reduced(
     SolverError
         When the recordings cannot be simulated from the start.
     """
-    fit = fit_gain(problem, gain, metric)
-    fibre = gain_fibre(problem.plant, fit.K, fit.S if fit.metric_determined else None)
+    fit = fit_gain(problem, *starts)
     try:
+        fibre = gain_fibre(problem.plant, fit.K, fit.S if fit.metric_determined else None)
         equivalent = least_condition_weights(fibre)
     except WeightsError as error:
         nearest = inverse_lqr_gradient(problem.plant, fit.K)

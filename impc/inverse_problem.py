@@ -159,7 +159,7 @@ def evaluate(problem: InverseProblem, gain: Array, metric: Array) -> Evaluation:
     """
     plant = problem.plant
     m, n = plant.m, plant.n
-    if not is_stable(plant.A - plant.B @ gain, discrete=True):
+    if problem.terminal_set and not is_stable(plant.A - plant.B @ gain, discrete=True):
         return _unusable(problem, "the gain does not stabilise the plant")
     try:
         controller = controller_for(problem, gain, metric)
@@ -175,7 +175,7 @@ def evaluate(problem: InverseProblem, gain: Array, metric: Array) -> Evaluation:
             difference[run.reached + 1 :] = _NOT_REACHED * _scale(trial)
             reason = f"sample {run.reached} was not passed"
         residuals.append(difference.ravel())
-        derivatives.append(np.tensordot(plant.C, sensitivity.x, (1, 1)).transpose(1, 0, 2))
+        derivatives.append(plant.C @ sensitivity.x)
     jacobian = np.concatenate([part.reshape(-1, along.count) for part in derivatives])
     dS = np.zeros((len(jacobian), m, m))
     rows, columns = np.tril_indices(m)

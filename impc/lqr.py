@@ -31,6 +31,7 @@ __all__ = [
     "LqrSolution",
     "gain_gradients",
     "gain_plant_differential",
+    "is_stable",
     "lyapunov_series",
     "metric_gradients",
     "solve_lqr",

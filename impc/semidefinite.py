@@ -21,7 +21,6 @@ from impc.errors import SolverError
 __all__ = [
     "Cone",
     "SemidefiniteSolution",
-    "equality",
     "matrix_inequality",
     "norm_bound",
     "solve_semidefinite",
@@ -61,11 +60,6 @@ def matrix_inequality(constant: Array, basis: Array) -> Cone:
     """constant + sum y_i basis_i >= 0, for symmetric matrices (d, d) and (k, d, d)."""
     kind = clarabel.PSDTriangleConeT(len(constant))
     return Cone(-_triangle(basis).T, _triangle(constant[None])[0], kind)
-
-
-def equality(row: Array, value: float) -> Cone:
-    """row @ y = value."""
-    return Cone(row[None], np.array([value]), clarabel.ZeroConeT(1))
 
 
 def norm_bound(vectors: Array, bound: Array) -> Cone:

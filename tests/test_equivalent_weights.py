@@ -156,13 +156,23 @@ def test_a_metric_narrows_the_fibre_to_weights_with_that_metric(seed: int, dt: f
     free = gain_fibre(plant, solution.K)
     # Only S up to scale may matter.
     fibre = gain_fibre(plant, solution.K, 3.0 * solution.S)
-    assert fibre.dimension == free.dimension - 2  # m (m + 1) / 2 - 1
+    assert fibre.dimension == free.dimension - 1  # m - 1: see the next test
     found = least_condition_weights(fibre)
     assert found.condition <= condition_number(truth) * (1 + 1e-8)
     S = solve_lqr(plant, found.weights).S
     np.testing.assert_allclose(
         S / np.trace(S), solution.S / np.trace(solution.S), rtol=1e-6, atol=1e-8
     )
+
+
+@pytest.mark.parametrize(("n", "m"), [(3, 2), (4, 2), (5, 3), (6, 3)])
+def test_gain_and_metric_determine_m_minus_1_numbers_more_than_the_gain(n: int, m: int) -> None:
+    """S K A^-1 B = B'PB is symmetric: of the m(m+1)/2 numbers of S, the gain leaves m free."""
+    plant, truth = random_case(1, n, m, 1.0)
+    solution = solve_lqr(plant, truth)
+    numbers = n * (n + 1) // 2 + m * (m + 1) // 2
+    assert gain_fibre(plant, solution.K).dimension == numbers - n * m
+    assert gain_fibre(plant, solution.K, solution.S).dimension == numbers - n * m - (m - 1)
 
 
 def test_seat_plant() -> None:
@@ -196,7 +206,7 @@ def test_margin_and_centre_do_not_depend_on_units_but_the_least_condition_does()
     centre, again = (analytic_centre(fibre).weights for fibre in fibres)
     np.testing.assert_allclose(scale @ centre.Q @ scale, again.Q, rtol=1e-5, atol=1e-6)
     lowest = [least_condition_weights(fibre).condition for fibre in fibres]
-    assert not np.isclose(*lowest, rtol=0.5)
+    assert not np.isclose(lowest[0], lowest[1], rtol=0.5)
 
 
 def test_analytic_centre_with_two_inputs_does_not_depend_on_their_coordinates() -> None:
@@ -244,6 +254,16 @@ def test_an_unbounded_fibre_has_a_least_condition_but_no_centre(A: object, B: ob
         analytic_centre(fibre)
 
 
+@pytest.mark.parametrize("seed", [55, 107, 199, 209, 306])
+def test_a_fibre_with_members_is_never_called_empty(seed: int) -> None:
+    """Clarabel stopped at its first iterations on these while the trace was an equality."""
+    size = {55: (8, 2, 1.0), 107: (6, 3, 1.0), 199: (8, 2, 1.0), 209: (8, 3, 1.0), 306: (8, 3, 0)}
+    plant, truth = random_case(seed, *size[seed])
+    found = weights_margin(gain_fibre(plant, solve_lqr(plant, truth).K))
+    assert found.exist
+    assert found.margin > 1e-6
+
+
 def test_others_are_unlike_and_a_single_member_has_none() -> None:
     fibre = gain_fibre(INTEGRATOR, [[0.434483, 1.028466]])
     found, others = least_condition_weights(fibre), other_weights(fibre)
@@ -253,8 +273,9 @@ def test_others_are_unlike_and_a_single_member_has_none() -> None:
         assert residual(member.weights, found.weights) > 0.5
         assert member.gain_error < 1e-14
     assert residual(others[0].weights, others[1].weights) > 0.5
-    single = as_plant(control.ss([[1.2]], [[1]], [[1]], 0, 1.0))
-    assert other_weights(gain_fibre(single, [[0.7]])) == ()
+    single = gain_fibre(as_plant(control.ss([[1.2]], [[1]], [[1]], 0, 1.0)), [[0.7]])
+    assert other_weights(single) == ()
+    assert residual(analytic_centre(single).weights, least_condition_weights(single).weights) < 1e-9
 
 
 def test_basis_is_orthonormal_in_natural_coordinates() -> None:
