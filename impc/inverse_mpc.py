@@ -158,7 +158,7 @@ def starting_point(problem: InverseProblem) -> Start:
         As `infer_weights`.
     """
     plant = problem.plant
-    gain = fit_gain(without_bounds(problem))
+    gain = fit_gain(without_bounds(problem), attempts=1)
     lmi = inverse_lqr_lmi(plant, gain.K)
     if lmi.weights is not None:
         return Start(gain, lmi, None, None, lmi.weights)
