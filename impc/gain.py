@@ -23,8 +23,9 @@ from impc.weights import stage_weights
 
 if TYPE_CHECKING:
     from impc.inverse_problem import Evaluation, InverseProblem
+    from impc.weights import Weights
 
-__all__ = ["GainFit", "bryson_starts", "fit_gain"]
+__all__ = ["GainFit", "bryson_starts", "bryson_weights", "fit_gain"]
 
 _EXPLAINED = 1e-9
 _PRICES = 10.0 ** np.arange(-6, 4)
@@ -111,21 +112,23 @@ def fit_gain(
     return replace(best, evaluations=evaluations, refused=tuple(refused))
 
 
-def bryson_starts(problem: InverseProblem) -> list[tuple[Array, Array]]:
-    """Gains and metrics of regulators that weigh each recorded output by its size.
+def bryson_weights(problem: InverseProblem) -> list[Weights]:
+    """Weights that price each recorded output by its size (Bryson's rule), over a range of efforts.
 
-    Q = C'diag(1/mean(y^2))C + 1e-8 I, R = rho I (Bryson's rule) for rho from 1e-6 to 1e3.
+    Q = C'diag(1/mean(y^2))C plus 1e-8 of its mean diagonal, R = rho I for rho from 1e-6 to 1e3.
     """
     plant = problem.plant
     recorded = np.concatenate([trial.outputs for trial in problem.recordings])
     power = np.maximum(np.mean(recorded**2, axis=0), 1e-300)
     Q = plant.C.T @ np.diag(1 / power) @ plant.C
     Q += 1e-8 * np.trace(Q) / plant.n * np.eye(plant.n)
-    starts = []
-    for rho in _PRICES:
-        solution = solve_lqr(plant, stage_weights(Q, rho * np.eye(plant.m)))
-        starts.append((np.array(solution.K), np.array(solution.S)))
-    return starts
+    return [stage_weights(Q, rho * np.eye(plant.m)) for rho in _PRICES]
+
+
+def bryson_starts(problem: InverseProblem) -> list[tuple[Array, Array]]:
+    """Gains and metrics of the regulators of `bryson_weights`."""
+    solutions = [solve_lqr(problem.plant, weights) for weights in bryson_weights(problem)]
+    return [(np.array(item.K), np.array(item.S)) for item in solutions]
 
 
 def _rank(

@@ -18,7 +18,7 @@ from impc.conditioned_fit import ConditionedFit, Objective, Residual, conditione
 from impc.controller import mpc_controller
 from impc.equivalent_weights import gain_fibre, least_condition_weights
 from impc.errors import WeightsError
-from impc.gain import GainFit, fit_gain
+from impc.gain import GainFit, bryson_weights, fit_gain
 from impc.inverse_lqr import inverse_lqr_gradient, inverse_lqr_lmi
 from impc.inverse_problem import evaluate, scenarios, without_bounds
 from impc.lqr import solve_lqr
@@ -216,15 +216,41 @@ def inverse_mpc_reduced(
         When the recordings cannot be simulated from the start.
     """
     fit = fit_gain(problem, *starts)
+    equivalent, reason = _least_condition(problem.plant, fit)
+    if equivalent is not None:
+        return ReducedFit(fit, equivalent, None, "")
+    # Weights stay weights along the direct search: it passes minima at gains that have none, and
+    # the gain is then fitted once more from where it ends.
+    nearest = inverse_lqr_gradient(problem.plant, fit.K)
+    near = auxiliary_weights(problem.plant, fit.K, nearest.weights).weights
+    start = _first_usable(problem, [near, *bryson_weights(problem)])
+    direct = inverse_mpc(problem, start, condition_weight=condition_weight)
+    again = fit_gain(
+        problem, (np.array(direct.solution.K), np.array(direct.solution.S)), attempts=1
+    )
+    if again.misfit <= fit.misfit:
+        equivalent, _ = _least_condition(problem.plant, again)
+        if equivalent is not None:
+            return ReducedFit(again, equivalent, None, "")
+    return ReducedFit(fit, None, direct, reason)
+
+
+def _first_usable(problem: InverseProblem, candidates: list[Weights]) -> Weights:
+    """The first weights with which every recording can be simulated; the last if none are."""
+    for weights in candidates:
+        solution = solve_lqr(problem.plant, weights)
+        if not evaluate(problem, solution.K, solution.S).reason:
+            return weights
+    return candidates[-1]
+
+
+def _least_condition(plant: Plant, fit: GainFit) -> tuple[EquivalentWeights | None, str]:
+    """The weights of least condition number with the fitted gain, or why there are none."""
     try:
-        fibre = gain_fibre(problem.plant, fit.K, fit.S if fit.metric_determined else None)
-        equivalent = least_condition_weights(fibre)
+        fibre = gain_fibre(plant, fit.K, fit.S if fit.metric_determined else None)
+        return least_condition_weights(fibre), ""
     except WeightsError as error:
-        nearest = inverse_lqr_gradient(problem.plant, fit.K)
-        start = auxiliary_weights(problem.plant, fit.K, nearest.weights).weights
-        direct = inverse_mpc(problem, start, condition_weight=condition_weight)
-        return ReducedFit(fit, None, direct, str(error))
-    return ReducedFit(fit, equivalent, None, "")
+        return None, str(error)
 
 
 def auxiliary_weights(

@@ -98,7 +98,7 @@ def inverse_problem(
     recordings: tuple[Recording, ...],
     *,
     terminal_set: bool = True,
-    softening: float = 1e4,
+    softening: float = 1e6,
 ) -> InverseProblem:
     """Check and gather an inverse problem.
 
