@@ -115,9 +115,7 @@ def _recover(rows: Rows, lam: Array, v: Array) -> None:
 
 
 @njit(cache=True)
-def _classify(
-    rows: Rows, slack: Array, lam: Array, v: Array, inputs: int
-) -> tuple[bool, bool]:
+def _classify(rows: Rows, slack: Array, lam: Array, v: Array, inputs: int) -> tuple[bool, bool]:
     """Whether a soft row was given up, and whether a row is tight without a multiplier."""
     soft, near = False, False
     for r in range(len(lam)):
@@ -227,9 +225,7 @@ def _advance(
     """x+ = A x + B u + E d and its derivative."""
     n, p = x.shape[1], dx.shape[2]
     for i in range(n):
-        x[t + 1, i] = (
-            _dot(loop.A[i], x[t]) + _dot(loop.B[i], u) + _dot(loop.E[i], disturbance)
-        )
+        x[t + 1, i] = _dot(loop.A[i], x[t]) + _dot(loop.B[i], u) + _dot(loop.E[i], disturbance)
         for j in range(n):
             for c in range(p):
                 dx[t + 1, i, c] += loop.A[i, j] * dx[t, j, c]

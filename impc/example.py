@@ -140,9 +140,7 @@ def run_case(
     bounds = box_bounds(plant, u_min=-BOUND, u_max=BOUND)
     truth_weights = stage_weights(np.eye(plant.n), np.eye(plant.m))
     controller = mpc_controller(plant, truth_weights, bounds, HORIZON)
-    truth = require_complete(
-        controller, simulate(controller, scenario(plant, CASES[name], STEPS))
-    )
+    truth = require_complete(controller, simulate(controller, scenario(plant, CASES[name], STEPS)))
     problem = inverse_problem(plant, bounds, HORIZON, (recording(plant, truth.x),))
     runner = _Runner(problem, truth_weights, progress)
 

@@ -321,5 +321,3 @@ def _definite(weights: Weights) -> Weights:
         values, vectors = np.linalg.eigh(matrix)
         lifted.append((vectors * np.maximum(values, floor)) @ vectors.T)
     return normalised(stage_weights(*lifted))
-
-

@@ -51,9 +51,7 @@ def substitute(factor: Array, count: int, right: Array) -> None:
 
 
 @njit(cache=True)
-def _append_row(
-    whitened: Array, row: int, count: int, factor: Array, basis: Array
-) -> float:
+def _append_row(whitened: Array, row: int, count: int, factor: Array, basis: Array) -> float:
     """Write the coefficients of a row in the basis of the active ones; return what is new of it.
 
     The new part itself goes to basis[count], not normalised. Working with the rows instead of their

@@ -104,7 +104,9 @@ def solve_lqr(plant: Plant, weights: Weights) -> LqrSolution:
             f"have shapes {weights.Q.shape} and {weights.R.shape}",
             f"the plant needs {(plant.n, plant.n)} and {(plant.m, plant.m)}",
         )
-    solver = scipy.linalg.solve_discrete_are if plant.discrete else scipy.linalg.solve_continuous_are
+    solver = (
+        scipy.linalg.solve_discrete_are if plant.discrete else scipy.linalg.solve_continuous_are
+    )
     try:
         P = np.asarray(solver(plant.A, plant.B, weights.Q, weights.R))
     except np.linalg.LinAlgError as error:

@@ -178,7 +178,11 @@ def solve_mpc(mpc: MpcSolver, x: ArrayLike) -> MpcStep:
     state = finite_array("x", x, (controller.plant.n,))
     width, slacks = rows.M.shape[1], int(mpc.soft.sum())
     answer = mpc.function(
-        p=state, lbx=np.r_[np.full(width, -np.inf), np.zeros(slacks)], ubx=np.inf, lbg=-np.inf, ubg=1
+        p=state,
+        lbx=np.r_[np.full(width, -np.inf), np.zeros(slacks)],
+        ubx=np.inf,
+        lbg=-np.inf,
+        ubg=1,
     )
     solved = bool(mpc.function.stats()["success"])
     decision = np.asarray(answer["x"]).ravel()

@@ -73,7 +73,9 @@ class Plant:
         """
         if not self.discrete:
             raise PlantError(
-                "plant", "is continuous, a discrete one is needed", "sample it: control.c2d(sys, dt)"
+                "plant",
+                "is continuous, a discrete one is needed",
+                "sample it: control.c2d(sys, dt)",
             )
         return self
 

@@ -103,7 +103,9 @@ def solve_step(program: StepProgram, radius: float) -> tuple[Array, float]:
 
 def _predict(program: StepProgram, step: Array) -> float:
     """The model's objective at the step, from the step itself and not from the solver's word."""
-    moved = program.L @ (np.eye(len(program.X)) + np.tensordot(step, program.basis, 1)) @ program.L.T
+    moved = (
+        program.L @ (np.eye(len(program.X)) + np.tensordot(step, program.basis, 1)) @ program.L.T
+    )
     eigenvalues = scipy.linalg.eigvalsh((moved + moved.T) / 2)
     size = float(np.hypot(np.linalg.norm(program.residual + program.jacobian @ step), program.rest))
     fit = size**2 if program.squared else size

@@ -159,9 +159,7 @@ def test_active_terminal_rows_are_differentiated(example_plant: Plant) -> None:
                 gain_controller(
                     example_plant,
                     controller.K + sign * step * _unit(part, index),
-                    box_bounds(
-                        example_plant, u_min=-1, u_max=1 + sign * step * (part == "bounds")
-                    ),
+                    box_bounds(example_plant, u_min=-1, u_max=1 + sign * step * (part == "bounds")),
                     2,
                 ),
                 drive,
@@ -184,7 +182,9 @@ def test_weights_with_the_same_gain_give_the_same_trajectories(
 ) -> None:
     """The two Q of the reference that have the gain of Q = I, R = 1 to its printed digits."""
     drive = scenario(example_plant, [2, 3], 20)
-    true = simulate(mpc_controller(example_plant, stage_weights(np.eye(2), 1), example_bounds, 3), drive)
+    true = simulate(
+        mpc_controller(example_plant, stage_weights(np.eye(2), 1), example_bounds, 3), drive
+    )
     for Q in ([[1.3, 0.06], [0.06, 0.712]], [[0.5, -0.1], [-0.1, 1.48]]):
         controller = mpc_controller(example_plant, stage_weights(Q, 1), example_bounds, 3)
         np.testing.assert_allclose(simulate(controller, drive).x, true.x, atol=1e-12)

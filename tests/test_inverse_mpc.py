@@ -129,9 +129,7 @@ def test_auxiliary_problem_reaches_what_a_derivative_free_search_reaches(
     for seed in range(3):
         start = np.random.default_rng(seed).normal(size=3)
         search = scipy.optimize.minimize(
-            lambda z: auxiliary_objective(
-                example_plant, gain, weights_from_parameters(z, 2, 1)
-            ),
+            lambda z: auxiliary_objective(example_plant, gain, weights_from_parameters(z, 2, 1)),
             start,
             method="Nelder-Mead",
             options={"maxfev": 2000, "xatol": 1e-9, "fatol": 1e-12},
@@ -251,9 +249,7 @@ def test_jacobian_in_the_weights_equals_central_differences(inputs: int) -> None
         errors = []
         for step in (1e-5, 1e-6):
             sides = [
-                solve_lqr(
-                    plant, stage_weights(Q + s * member[:3, :3], R + s * member[3:, 3:])
-                )
+                solve_lqr(plant, stage_weights(Q + s * member[:3, :3], R + s * member[3:, 3:]))
                 for s in (step, -step)
             ]
             up, down = (residual_only(problem, side.K, side.S) for side in sides)
@@ -271,7 +267,9 @@ def test_a_gain_no_weights_have_is_said_and_the_direct_form_continues(
 
     gain = np.array([[1.21183, -0.71277]])
     controller = gain_controller(example_plant, gain, example_bounds, 3)
-    run = require_complete(controller, simulate(controller, scenario(example_plant, [0.5, 0.7], 20)))
+    run = require_complete(
+        controller, simulate(controller, scenario(example_plant, [0.5, 0.7], 20))
+    )
     problem = inverse_problem(example_plant, example_bounds, 3, (recording(example_plant, run.x),))
     found = inverse_mpc_reduced(problem)
     np.testing.assert_allclose(found.gain.K, gain, atol=1e-7)

@@ -21,9 +21,7 @@ from impc.weights import stage_weights
 
 
 def continuous_plant(rng: np.random.Generator) -> Plant:
-    return as_plant(
-        control.ss(rng.normal(size=(3, 3)), rng.normal(size=(3, 2)), np.eye(3), 0)
-    )
+    return as_plant(control.ss(rng.normal(size=(3, 3)), rng.normal(size=(3, 2)), np.eye(3), 0))
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -68,9 +66,7 @@ def test_gradients_equal_central_differences(seed: int, discrete: bool) -> None:
     Q, R = random_weights(rng, 3), random_weights(rng, 2)
     dQ, dR = (part + part.T for part in (rng.normal(size=(3, 3)), rng.normal(size=(2, 2))))
     step = 1e-5
-    up, down = (
-        solve_lqr(plant, stage_weights(Q + s * dQ, R + s * dR)) for s in (step, -step)
-    )
+    up, down = (solve_lqr(plant, stage_weights(Q + s * dQ, R + s * dR)) for s in (step, -step))
     here = solve_lqr(plant, stage_weights(Q, R))
     pairs = [(gain_gradients(here), up.K - down.K)]
     if discrete:
@@ -93,9 +89,7 @@ def test_plant_differential_equals_central_differences() -> None:
         up, down = (
             solve_lqr(
                 as_plant(
-                    control.ss(
-                        plant.A + s * dA[index], plant.B + s * dB[index], np.eye(4), 0, True
-                    )
+                    control.ss(plant.A + s * dA[index], plant.B + s * dB[index], np.eye(4), 0, True)
                 ),
                 weights,
             )

@@ -11,7 +11,14 @@ from independent_mpc import first_input
 from impc.bounds import Bounds, bound_rows, box_bounds
 from impc.closed_loop import Status, require_complete, scenario, simulate
 from impc.controller import gain_controller, mpc_controller
-from impc.errors import BoundsError, DataError, InfeasibleError, InputError, PlantError, WeightsError
+from impc.errors import (
+    BoundsError,
+    DataError,
+    InfeasibleError,
+    InputError,
+    PlantError,
+    WeightsError,
+)
 from impc.mpc import SOLVERS, build_mpc, simulate_mpc, solve_mpc
 from impc.plant import Plant, as_plant
 from impc.weights import stage_weights

@@ -1,0 +1,46 @@
+"""Run every benchmark and write docs/benchmarks: results.md, results.json and growth.{png,pdf}.
+
+    python -m experiments.benchmarks [--runs 7]
+
+Every figure is a ratio of medians measured side by side in this run. About six minutes.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from tqdm import tqdm
+
+from experiments.benchmarks.fits import fit_rows
+from experiments.benchmarks.growth import growth_rows
+from experiments.benchmarks.layers import layer_rows
+from experiments.benchmarks.routes import route_rows
+from experiments.benchmarks.simulation import simulation_rows
+from experiments.benchmarks.table import write_tables
+
+_PARTS = {
+    "simulation": simulation_rows,
+    "fits": fit_rows,
+    "growth": growth_rows,
+    "routes": route_rows,
+    "layers": layer_rows,
+}
+
+
+def main() -> None:
+    """Measure and write."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--runs", type=int, default=7, help="runs of each case (default 7)")
+    parser.add_argument("--out", type=Path, default=Path("docs/benchmarks"))
+    chosen = parser.parse_args()
+    rows = []
+    with tqdm(_PARTS.items()) as parts:
+        for name, measure in parts:
+            parts.set_description(name)
+            rows += measure(chosen.runs, chosen.out)
+    print(write_tables(rows, chosen.out, chosen.runs))
+
+
+if __name__ == "__main__":
+    main()

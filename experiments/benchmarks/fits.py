@@ -1,0 +1,107 @@
+"""Whole fits: one and three trials of W2, a ten times longer one, W1 against a plain script."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from experiments.benchmarks.memory import peak_megabytes
+from experiments.benchmarks.peers import casadi_loop, cvxpy_nelder_mead
+from experiments.benchmarks.table import Row, compare
+from experiments.benchmarks.timing import side_by_side
+from experiments.benchmarks.workloads import example, seat
+from impc.inverse_mpc import (
+    CONDITION_WEIGHT,
+    inverse_mpc,
+    inverse_mpc_reduced,
+    start_gains,
+    starting_point,
+)
+from impc.weights import residual
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from impc.inverse_mpc import ReducedFit
+
+__all__ = ["fit_rows"]
+
+_NELDER_MEAD_BUDGET = 600
+
+
+def fit_rows(runs: int, _: Path) -> list[Row]:
+    """Time the fits; each must reach the true gain, or the true weights in W1."""
+    return [*_seat(runs), *_memory(), *_example(runs)]
+
+
+def _seat(runs: int) -> list[Row]:
+    one, three, long = seat(), seat(trials=3), seat(seconds=300.0)
+    start = starting_point(one.problem)
+    gains = start_gains(start, one.problem.plant)
+    loop = casadi_loop(one, "qpoases")
+    for work in (one, three, long):
+        _check(inverse_mpc_reduced(work.problem, *gains), work.controller.K)
+    timings = side_by_side(
+        {
+            "qpoases": lambda: loop(one.controller.K),
+            "start": lambda: starting_point(one.problem),
+            "one": lambda: inverse_mpc_reduced(one.problem, *gains),
+            "three": lambda: inverse_mpc_reduced(three.problem, *gains),
+            "long": lambda: inverse_mpc_reduced(long.problem, *gains),
+        },
+        runs,
+    )
+    unit = "one W2 simulation through CasADi conic qpOASES"
+    return [
+        compare("W2 fit from the Table 3.1 start, one trial", unit, timings["one"], timings["qpoases"], 45),
+        compare("the Table 3.1 start itself", unit, timings["start"], timings["qpoases"], None),
+        compare("W2 fit, three trials", unit, timings["three"], timings["qpoases"], 110),
+        compare("W2 fit, 300 s", "W2 fit, 30 s", timings["long"], timings["one"], 11),
+    ]
+
+
+def _check(found: ReducedFit, gain: np.ndarray) -> None:
+    if found.equivalent is None or np.linalg.norm(found.gain.K - gain) > 1e-6 * np.linalg.norm(gain):
+        raise AssertionError(f"the fit missed the true gain: misfit {found.gain.misfit:.3g}")
+
+
+def _memory() -> list[Row]:
+    empty, short, long = (peak_megabytes(seconds) for seconds in (0, 30, 300))
+    note = f"{empty:.0f} MB of it before the fit"
+    return [
+        Row("W2 fit, peak memory", "", short, 500, "MB", note),
+        Row("W2 fit, 300 s, peak memory", "30 s", long / short, 3, "", f"{long:.0f} / {short:.0f} MB"),
+    ]
+
+
+def _example(runs: int) -> list[Row]:
+    work = example()
+    start = starting_point(work.problem).weights
+    for found in (inverse_mpc(work.problem, start), inverse_mpc_reduced(work.problem)):
+        if residual(found.weights, work.weights) > 1e-6:
+            raise AssertionError("W1 missed the true weights")
+    timings = side_by_side(
+        {
+            "direct": lambda: inverse_mpc(work.problem, start),
+            "reduced": lambda: inverse_mpc_reduced(work.problem),
+        },
+        4 * runs,
+    )
+    reached: list[float] = []
+
+    def script() -> None:
+        weights, _ = cvxpy_nelder_mead(work, start, CONDITION_WEIGHT, _NELDER_MEAD_BUDGET)
+        reached.append(residual(weights, work.weights))
+
+    slow = side_by_side(
+        {"direct": lambda: inverse_mpc(work.problem, start), "script": script}, 1
+    )
+    return [
+        compare("W1 direct fit", "Nelder-Mead over cvxpy solves", slow["direct"], slow["script"], 1 / 100),
+        Row(
+            "the residual (3.10) that this Nelder-Mead reached", "", reached[-1], None, "", "own: < 1e-6"
+        ),
+        Row("W1 direct fit", "", timings["direct"].median, 0.1, "s", ""),
+        Row("W1 reduced fit", "", timings["reduced"].median, 0.1, "s", ""),
+    ]

@@ -1,0 +1,128 @@
+"""What a user would otherwise pick: the same closed loop in CasADi's own graph, and in cvxpy."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import cvxpy as cp
+import numpy as np
+import scipy.linalg
+import scipy.optimize
+
+from impc.bounds import bound_rows
+from impc.lqr import solve_lqr
+from impc.weights import Weights, condition_number, weights_from_parameters
+
+if TYPE_CHECKING:
+    from experiments.benchmarks.workloads import Workload
+    from impc.arrays import Array
+
+__all__ = ["casadi_loop", "cvxpy_nelder_mead"]
+
+_OPTIONS: dict[str, dict[str, Any]] = {
+    "daqp": {"error_on_fail": False},
+    "qpoases": {"printLevel": "none", "error_on_fail": False, "sparse": False},
+}
+
+
+def casadi_loop(work: Workload, solver: str) -> Any:
+    """The closed loop K -> states as one CasADi Function, a quadratic program at every sample.
+
+    The rows T(K), M(K) of the input bounds are computed once in the graph and given to every step
+    of a `mapaccum`; the program is in v = u + Kx, as in `impc`, so that only the machinery differs.
+    """
+    plant, controller = work.controller.plant, work.controller
+    n, horizon = plant.n, controller.horizon
+    disturbance = work.drives[0].disturbance
+    limit = float(controller.bounds.u_max[0])
+    K = ca.MX.sym("K", 1, n)
+    closed = ca.DM(plant.A) - ca.mtimes(ca.DM(plant.B), K)
+    power, rows_T, response = -K, [], []
+    for _ in range(horizon):
+        rows_T.append(power)
+        response.append(ca.mtimes(power, ca.DM(plant.B)))
+        power = ca.mtimes(power, closed)
+    T = ca.vertcat(*rows_T)
+    M = ca.vertcat(
+        *[
+            ca.horzcat(
+                *[response[k - 1 - i] for i in range(k)],
+                ca.MX(1),
+                *([ca.MX(1, horizon - 1 - k)] if k < horizon - 1 else []),
+            )
+            for k in range(horizon)
+        ]
+    )
+    M = ca.densify(M)
+    shapes = {"h": ca.Sparsity.dense(horizon, horizon), "a": ca.Sparsity.dense(horizon, horizon)}
+    program = ca.conic("qp", solver, shapes, _OPTIONS[solver])
+    x, d = ca.MX.sym("x", n), ca.MX.sym("d", plant.E.shape[1])
+    gain = ca.MX.sym("gain", 1, n)
+    t, m = ca.MX.sym("t", horizon, n), ca.MX.sym("m", horizon, horizon)
+    free = ca.mtimes(t, x)
+    v = program(h=ca.DM.eye(horizon), a=m, lba=-limit - free, uba=limit - free)["x"]
+    u = v[0] - ca.mtimes(gain, x)
+    following = ca.mtimes(plant.A, x) + ca.mtimes(plant.B, u) + ca.mtimes(plant.E, d)
+    step = ca.Function("step", [x, d, gain, t, m], [following])
+    steps = len(disturbance)
+    states = step.mapaccum(steps)(
+        work.drives[0].x0,
+        disturbance.T,
+        ca.repmat(K, 1, steps),
+        ca.repmat(T, 1, steps),
+        ca.repmat(M, 1, steps),
+    )
+    return ca.Function("loop", [K], [states])
+
+
+def cvxpy_nelder_mead(
+    work: Workload, start: Weights, condition_weight: float, budget: int
+) -> tuple[Weights, int]:
+    """Inverse MPC as a script would do it: Nelder-Mead over Cholesky entries, cvxpy inside.
+
+    Without a terminal set, whose computation at every iterate would cost more than all else.
+
+    Returns
+    -------
+    weights, simulations : Weights, int
+    """
+    plant, problem = work.controller.plant, work.problem
+    limit = float(bound_rows(problem.bounds, plant).b[0])
+    recorded = problem.recordings[0].outputs
+    n, horizon = plant.n, problem.horizon
+    x0 = cp.Parameter(n)
+    u, x = cp.Variable((horizon, 1)), cp.Variable((horizon + 1, n))
+    q, r, p = cp.Parameter((n, n)), cp.Parameter((1, 1)), cp.Parameter((n, n))
+    cost = cp.sum_squares(x[horizon] @ p)
+    constraints = [x[0] == x0, cp.abs(u) <= limit]
+    for k in range(horizon):
+        cost += cp.sum_squares(x[k] @ q) + cp.sum_squares(u[k] @ r)
+        constraints.append(x[k + 1] == plant.A @ x[k] + plant.B @ u[k])
+    program = cp.Problem(cp.Minimize(cost), constraints)
+    count = 0
+
+    def objective(parameters: Array) -> float:
+        nonlocal count
+        count += 1
+        weights = weights_from_parameters(parameters, n, 1)
+        solution = solve_lqr(plant, weights)
+        q.value = np.linalg.cholesky(weights.Q)
+        r.value = np.linalg.cholesky(weights.R)
+        p.value = np.linalg.cholesky(solution.P)
+        states = [recorded[0]]
+        for _ in range(len(recorded) - 1):
+            x0.value = states[-1]
+            program.solve(solver=cp.CLARABEL)
+            states.append(plant.A @ states[-1] + plant.B @ u.value[0])
+        misfit = float(np.linalg.norm(np.array(states) - recorded))
+        return misfit + condition_weight * condition_number(weights)
+
+    factor = scipy.linalg.cholesky(start.Q, lower=True)
+    found = scipy.optimize.minimize(
+        objective,
+        factor[np.tril_indices(n)],
+        method="Nelder-Mead",
+        options={"maxfev": budget, "xatol": 1e-7, "fatol": 1e-9},
+    )
+    return weights_from_parameters(found.x, n, 1), count

@@ -1,0 +1,47 @@
+"""Two routes of the upper level on the same problems: objective reached, simulations, seconds."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from experiments.benchmarks.table import Row
+from experiments.benchmarks.upper_level import Route, prox_linear, smooth_surrogate
+from experiments.benchmarks.workloads import example, seat
+from impc.inverse_mpc import starting_point
+from impc.weights import stage_weights
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+__all__ = ["route_rows"]
+
+
+def route_rows(_: int, __: Path) -> list[Row]:
+    """One run of each: what is compared is the objective, which does not vary."""
+    short, person = example(), seat()
+    cases = {
+        "W1 from the Table 3.1 start": (short, starting_point(short.problem).weights),
+        "W1 from diag(2, 0.2)": (short, stage_weights(np.diag([2.0, 0.2]), 1)),
+        "W2 from the Table 3.1 start": (person, starting_point(person.problem).weights),
+    }
+    rows = []
+    for name, (work, start) in cases.items():
+        own = prox_linear(work.problem, start)
+        other = smooth_surrogate(work.problem, start)
+        rows.append(
+            Row(
+                f"objective (3.6) of prox-linear, {name}",
+                "L-BFGS on a smooth surrogate",
+                own.objective / other.objective,
+                None,
+                "",
+                f"{_say(own)} / {_say(other)}",
+            )
+        )
+    return rows
+
+
+def _say(route: Route) -> str:
+    return f"{route.objective:.9g} in {route.simulations} simulations, {1e3 * route.seconds:.3g} ms"

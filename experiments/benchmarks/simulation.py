@@ -1,0 +1,72 @@
+"""W2: simulation with exact Jacobian, against CasADi's own graph."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from experiments.benchmarks.peers import casadi_loop
+from experiments.benchmarks.table import Row, compare
+from experiments.benchmarks.timing import side_by_side
+from experiments.benchmarks.workloads import seat
+from impc.closed_loop import simulate, simulate_and_differentiate
+from impc.prediction import directions
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+__all__ = ["simulation_rows"]
+
+
+def simulation_rows(runs: int, _: Path) -> list[Row]:
+    """Time and compare; the states and derivatives of all must agree to 1e-9."""
+    work = seat()
+    controller, drive = work.controller, work.drives[0]
+    n = controller.plant.n
+    along = directions(controller, n, K=np.eye(n)[None])
+    loops = {name: casadi_loop(work, name) for name in ("daqp", "qpoases")}
+    derivative = {name: loop.forward(n) for name, loop in loops.items()}
+    seeds = np.eye(n).reshape(1, -1)
+    run, exact = simulate_and_differentiate(controller, drive, along)
+    for name, loop in loops.items():
+        states = loop(controller.K)
+        np.testing.assert_allclose(states.full().T, run.x[1:], atol=1e-9)
+        by_graph = derivative[name](controller.K, states, seeds).full()
+        by_graph = by_graph.reshape(n, n, drive.steps).transpose(2, 0, 1)
+        np.testing.assert_allclose(by_graph, exact.x[1:], atol=1e-9)
+    timings = side_by_side(
+        {
+            "own simulation": lambda: simulate(controller, drive),
+            "own Jacobian": lambda: simulate_and_differentiate(controller, drive, along),
+            **{name: (lambda loop=loop: loop(controller.K)) for name, loop in loops.items()},  # type: ignore[misc]
+        },
+        4 * runs,
+    )
+    slow = side_by_side(
+        {
+            "own Jacobian": lambda: simulate_and_differentiate(controller, drive, along),
+            **{
+                name: (lambda f=f, s=loops[name](controller.K): f(controller.K, s, seeds))  # type: ignore[misc]
+                for name, f in derivative.items()
+            },
+        },
+        max(3, runs // 2),
+    )
+    what = "W2 simulation + exact Jacobian in K (ten directions)"
+    own = timings["own Jacobian"]
+    return [
+        compare(what, "CasADi conic qpOASES, simulation only", own, timings["qpoases"], 0.35),
+        compare(what, "CasADi conic DAQP, simulation only", own, timings["daqp"], None),
+        *(
+            compare(what, f"CasADi's forward derivatives, {name}", slow["own Jacobian"], slow[name], 1 / 60)
+            for name in derivative
+        ),
+        compare(
+            "W2 simulation alone",
+            "CasADi conic qpOASES, simulation only",
+            timings["own simulation"],
+            timings["qpoases"],
+            None,
+        ),
+    ]

@@ -1,0 +1,52 @@
+"""Timing side by side: every repeat runs all cases in turn, so that a busy machine slows them all."""
+
+from __future__ import annotations
+
+import gc
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+__all__ = ["Timing", "ratio", "side_by_side"]
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Seconds of one case over its runs."""
+
+    seconds: tuple[float, ...]
+
+    @property
+    def median(self) -> float:
+        """Median of the runs, in seconds."""
+        return float(np.median(self.seconds))
+
+    @property
+    def spread(self) -> tuple[float, float]:
+        """Lower and upper quartile of the runs, in seconds."""
+        low, high = np.percentile(self.seconds, [25, 75])
+        return float(low), float(high)
+
+
+def side_by_side(cases: dict[str, Callable[[], object]], repeats: int) -> dict[str, Timing]:
+    """Run all cases `repeats` times in turn, after one run of each that is not counted."""
+    seconds: dict[str, list[float]] = {name: [] for name in cases}
+    for repeat in range(repeats + 1):
+        for name, call in cases.items():
+            gc.collect()
+            begin = time.perf_counter()
+            call()
+            elapsed = time.perf_counter() - begin
+            if repeat:
+                seconds[name].append(elapsed)
+    return {name: Timing(tuple(values)) for name, values in seconds.items()}
+
+
+def ratio(timings: dict[str, Timing], name: str, to: str) -> float:
+    """Median of one case over the median of another."""
+    return timings[name].median / timings[to].median

@@ -1,0 +1,127 @@
+"""The problems that are timed: W1 is the simulation example, W2 the seated subject."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+import plants
+from impc.bounds import box_bounds
+from impc.closed_loop import Scenario, require_complete, scenario, simulate
+from impc.controller import Controller, mpc_controller
+from impc.inverse_problem import InverseProblem, inverse_problem
+from impc.plant import Plant, as_plant
+from impc.recording import recording
+from impc.weights import Weights, stage_weights
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+__all__ = ["Workload", "chain_of_masses", "example", "seat", "with_horizon"]
+
+_RATE = 100.0
+_DIRECTION = np.array([0.70, 0.65, 0.22, 0.20])
+
+
+@dataclass(frozen=True)
+class Workload:
+    """A true controller, what drives it, and the inverse problem of its recordings."""
+
+    weights: Weights
+    controller: Controller
+    drives: tuple[Scenario, ...]
+    problem: InverseProblem
+
+
+def example() -> Workload:
+    """W1: the example of section 3.4, case A."""
+    plant = as_plant(plants.yalmip_example())
+    bounds = box_bounds(plant, u_min=-1, u_max=1)
+    weights = stage_weights(np.eye(2), 1)
+    controller = mpc_controller(plant, weights, bounds, 3)
+    return _record(weights, controller, [scenario(plant, [1, 3], 20)], plant, terminal_set=True)
+
+
+def seat(trials: int = 1, seconds: float = 30.0, limit: float = 6.0) -> Workload:
+    """W2: the seated subject at 100 Hz under the 5 Nm ternary torque, |u| <= 6 Nm, N = 20.
+
+    The weights are the "true" intent of the reference, without weight on delay and muscle states
+    but 1e-2. Trials differ in the phase of the torque.
+    """
+    plant = as_plant(plants.seated_balance_plant(), ["command"])
+    v = _DIRECTION / np.linalg.norm(_DIRECTION)
+    Q = 1e-2 * np.eye(plant.n)
+    Q[:4, :4] = 6e5 * np.outer(v, v) + np.diag([2e4, 2e4, 500, 500])
+    weights = stage_weights(Q, 1)
+    bounds = box_bounds(plant, u_min=-limit, u_max=limit)
+    controller = mpc_controller(plant, weights, bounds, 20, terminal_set=False)
+    torques = [
+        plants.ternary_torque(duration=seconds, rate=_RATE, seed=None if k == 0 else k)
+        for k in range(trials)
+    ]
+    drives = [scenario(plant, np.zeros(plant.n), disturbance=torque) for torque in torques]
+    return _record(weights, controller, drives, plant, terminal_set=False)
+
+
+def with_horizon(work: Workload, horizon: int) -> Workload:
+    """The same workload with another horizon, recorded anew."""
+    controller = replace(work.controller, horizon=horizon)
+    return _record(work.weights, controller, work.drives, controller.plant, terminal_set=False)
+
+
+def chain_of_masses(states: int, steps: int = 3000, seed: int = 0) -> Workload:
+    """A chain of masses, springs and dampers whose first mass stands on an inverted spring.
+
+    `states` / 2 masses of 1 kg, springs of 40 N/m, dampers of 1 Ns/m between neighbours; the last
+    mass is tied to a wall, the first is pushed away from the origin by 5 N/m: one unstable mode. A
+    bounded force acts on the first mass, a random one, held for 0.25 s, on the last.
+    """
+    import control
+
+    masses = states // 2
+    laplacian = 2 * np.eye(masses) - np.eye(masses, k=1) - np.eye(masses, k=-1)
+    laplacian[0, 0] = 1.0
+    stiffness = 40.0 * laplacian
+    stiffness[0, 0] -= 40.0 / masses + 5.0  # overcomes the chain behind it: unstable
+    eye, zero = np.eye(masses), np.zeros((masses, masses))
+    A = np.block([[zero, eye], [-stiffness, -laplacian]])
+    B = np.zeros((states, 2))
+    B[masses, 0] = B[-1, 1] = 1.0
+    system = control.c2d(
+        control.ss(A, B, np.eye(states), 0, inputs=["force", "push"]), 1 / _RATE
+    )
+    plant = as_plant(system, ["force"])
+    weights = stage_weights(np.eye(states), 1e-2)
+    push = np.random.default_rng(seed).choice([-1.0, 0.0, 1.0], size=steps // 25 + 1)
+    controller = mpc_controller(plant, weights, box_bounds(plant), 20, terminal_set=False)
+    drive = scenario(plant, np.zeros(states), disturbance=np.repeat(push, 25)[:steps])
+    # A limit that about one sample in ten reaches.
+    free = require_complete(controller, simulate(controller, drive))
+    limit = float(np.quantile(np.abs(free.u), 0.9))
+    bounds = box_bounds(plant, u_min=-limit, u_max=limit)
+    return _record(weights, replace(controller, bounds=bounds), [drive], plant, terminal_set=False)
+
+
+def _record(
+    weights: Weights,
+    controller: Controller,
+    drives: Sequence[Scenario],
+    plant: Plant,
+    *,
+    terminal_set: bool,
+) -> Workload:
+    recordings = []
+    for drive in drives:
+        run = require_complete(controller, simulate(controller, drive))
+        disturbance = np.vstack([drive.disturbance, np.zeros((1, plant.E.shape[1]))])
+        recordings.append(recording(plant, run.x @ plant.C.T, disturbance, x0=drive.x0))
+    problem = inverse_problem(
+        plant,
+        controller.bounds,
+        controller.horizon,
+        tuple(recordings),
+        terminal_set=terminal_set,
+    )
+    return Workload(weights, controller, tuple(drives), problem)
