@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from impc.arrays import Array
+from impc.arrays import Buffer
 from impc.least_distance import CONVERGED, INCONSISTENT, solve_dual, substitute
 from impc.prediction import RowDirections, Rows
 
@@ -22,13 +22,13 @@ _FREE, _ACTIVE, _SOFTENED, _INFEASIBLE, _UNSOLVED, _DIVERGED = 0, 1, 2, 3, 4, 5
 
 
 class LoopMatrices(NamedTuple):
-    """Plant, gain and inverse metric; or their derivatives (those of S itself) along p directions."""
+    """Plant, gain and inverse metric; or derivatives (those of S itself) along p directions."""
 
-    A: Array
-    B: Array
-    E: Array
-    K: Array
-    S: Array
+    A: Buffer
+    B: Buffer
+    E: Buffer
+    K: Buffer
+    S: Buffer
 
 
 @njit(cache=True)
@@ -37,13 +37,13 @@ def run(
     dloop: LoopMatrices,
     rows: Rows,
     drows: RowDirections,
-    disturbance: Array,
+    disturbance: Buffer,
     divergence: float,
-    x: Array,
-    u: Array,
-    dx: Array,
-    du: Array,
-    status: Array,
+    x: Buffer,
+    u: Buffer,
+    dx: Buffer,
+    du: Buffer,
+    status: Buffer,
 ) -> tuple[int, int]:
     """Fill x, u, dx, du and status; return the count of weak samples and the inconsistent row."""
     count = len(rows.b)
@@ -53,7 +53,7 @@ def run(
     basis = np.empty((room, rows.W.shape[1]))
     kept = _KEPT * rows.b
     v, dv0 = np.zeros(rows.M.shape[1]), np.zeros(du.shape[1:])
-    plant_moves = np.any(dloop.A) or np.any(dloop.B) or np.any(dloop.E)
+    plant_moves = bool(np.any(dloop.A) or np.any(dloop.B) or np.any(dloop.E))
     weakly_active, horizon_inputs = 0, u.shape[1]
     for t in range(len(u)):
         needs_qp, soft, near = False, False, False
@@ -90,7 +90,7 @@ def run(
 
 
 @njit(cache=True, inline="always")
-def _dot(a: Array, b: Array) -> float:
+def _dot(a: Buffer, b: Buffer) -> float:
     total = 0.0
     for i in range(len(a)):
         total += a[i] * b[i]
@@ -98,14 +98,14 @@ def _dot(a: Array, b: Array) -> float:
 
 
 @njit(cache=True)
-def _hold(x: Array, dx: Array, t: int) -> None:
+def _hold(x: Buffer, dx: Buffer, t: int) -> None:
     """Repeat the last state, so that what was not reached is finite."""
     x[t + 1 :] = x[t]
     dx[t + 1 :] = 0.0
 
 
 @njit(cache=True)
-def _recover(rows: Rows, lam: Array, v: Array) -> None:
+def _recover(rows: Rows, lam: Buffer, v: Buffer) -> None:
     """v = -N' lam."""
     v[:] = 0.0
     for r in range(len(lam)):
@@ -115,7 +115,7 @@ def _recover(rows: Rows, lam: Array, v: Array) -> None:
 
 
 @njit(cache=True)
-def _classify(rows: Rows, slack: Array, lam: Array, v: Array, inputs: int) -> tuple[bool, bool]:
+def _classify(rows: Rows, slack: Buffer, lam: Buffer, v: Buffer, inputs: int) -> tuple[bool, bool]:
     """Whether a soft row was given up, and whether a row is tight without a multiplier."""
     soft, near = False, False
     for r in range(len(lam)):
@@ -134,14 +134,14 @@ def _differentiate(
     dloop: LoopMatrices,
     rows: Rows,
     drows: RowDirections,
-    lam: Array,
-    free: Array,
-    factor: Array,
+    lam: Buffer,
+    free: Buffer,
+    factor: Buffer,
     active: int,
-    v: Array,
-    x: Array,
-    dx: Array,
-    dv0: Array,
+    v: Buffer,
+    x: Buffer,
+    dx: Buffer,
+    dv0: Buffer,
 ) -> None:
     """Write the derivative of the first v; the module `closed_loop` has the equations."""
     width, p = len(v), dx.shape[1]
@@ -192,12 +192,12 @@ def _differentiate(
 def _apply(
     loop: LoopMatrices,
     dloop: LoopMatrices,
-    v: Array,
-    dv0: Array,
-    x: Array,
-    dx: Array,
-    u: Array,
-    du: Array,
+    v: Buffer,
+    dv0: Buffer,
+    x: Buffer,
+    dx: Buffer,
+    u: Buffer,
+    du: Buffer,
 ) -> None:
     """u = -K x + v_0 and its derivative."""
     p = dx.shape[1]
@@ -215,11 +215,11 @@ def _advance(
     loop: LoopMatrices,
     dloop: LoopMatrices,
     plant_moves: bool,
-    disturbance: Array,
-    x: Array,
-    dx: Array,
-    u: Array,
-    du: Array,
+    disturbance: Buffer,
+    x: Buffer,
+    dx: Buffer,
+    u: Buffer,
+    du: Buffer,
     t: int,
 ) -> None:
     """x+ = A x + B u + E d and its derivative."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -11,9 +11,11 @@ from impc.errors import DataError, InputError
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["Array", "finite_array", "frozen", "symmetric_matrix"]
+__all__ = ["Array", "Buffer", "finite_array", "frozen", "symmetric_matrix"]
 
 Array = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
+#: An array as compiled code takes it, of any element type.
+Buffer = np.ndarray[Any, np.dtype[Any]]
 
 
 def frozen(values: ArrayLike) -> Array:

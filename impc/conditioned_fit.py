@@ -44,6 +44,8 @@ __all__ = ["ConditionedFit", "Objective", "Residual", "conditioned_fit", "weight
 _STATIONARY = 1e-5
 # In units of the current weights: a step of 1 can double one direction or make it singular.
 _LARGEST_RADIUS = 2.0
+# Below this, relative to the weights, rounding decides whether a step is better.
+_LEAST_RADIUS = 1e-10
 
 
 @dataclass(frozen=True)
@@ -143,7 +145,8 @@ def conditioned_fit(
             "start", "the closed loop cannot be simulated with these weights", "start elsewhere"
         )
     radius, evaluations, iteration, stationarity = 0.5, 1, 0, np.inf
-    for iteration in range(1, max_iterations + 1):
+    while iteration < max_iterations:
+        iteration += 1
         program = _linearise(here, objective)
         step, predicted = solve_step(program, radius)
         decrease = here.objective - predicted
@@ -161,6 +164,8 @@ def conditioned_fit(
             radius = min(2 * radius, _LARGEST_RADIUS)
         elif ratio < 0.25:
             radius = 0.25 * min(radius, float(np.linalg.norm(step)))
+        if radius < _LEAST_RADIUS:
+            break
     return ConditionedFit(
         normalised(here.weights),
         here.solution,

@@ -36,7 +36,16 @@ if TYPE_CHECKING:
 
     from impc.plant import Plant
 
-__all__ = ["BOUND", "CASES", "HORIZON", "STEPS", "CaseResult", "MethodResult", "run_case"]
+__all__ = [
+    "BOUND",
+    "CASES",
+    "HORIZON",
+    "STEPS",
+    "CaseResult",
+    "MethodResult",
+    "run_case",
+    "true_weights",
+]
 
 _T = TypeVar("_T")
 
@@ -118,6 +127,11 @@ class CaseResult:
         return next(item for item in self.methods if item.name == name)
 
 
+def true_weights(plant: Plant) -> Weights:
+    """Return Q = I, R = 1, the weights that the methods are to find again, equation (3.9)."""
+    return stage_weights(np.eye(plant.n), np.eye(plant.m))
+
+
 def run_case(
     plant: Plant, name: str, *, progress: Callable[[str], None] = lambda _: None
 ) -> CaseResult:
@@ -138,7 +152,7 @@ def run_case(
         When a method fails.
     """
     bounds = box_bounds(plant, u_min=-BOUND, u_max=BOUND)
-    truth_weights = stage_weights(np.eye(plant.n), np.eye(plant.m))
+    truth_weights = true_weights(plant)
     controller = mpc_controller(plant, truth_weights, bounds, HORIZON)
     truth = require_complete(controller, simulate(controller, scenario(plant, CASES[name], STEPS)))
     problem = inverse_problem(plant, bounds, HORIZON, (recording(plant, truth.x),))

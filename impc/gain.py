@@ -196,6 +196,7 @@ def _compress(residual: Array, jacobian: Array) -> _Compressed:
         return _Compressed(residual, jacobian)
     (triangle,) = scipy.linalg.qr(both, mode="r", check_finite=False)[:1]
     triangle = triangle[: columns + 1]
+    triangle = np.asarray(triangle, dtype=np.float64)
     return _Compressed(triangle[:, -1], triangle[:, :-1])
 
 

@@ -20,7 +20,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from impc.arrays import Array
+from impc.arrays import Buffer
 
 __all__ = ["CONVERGED", "INCONSISTENT", "UNSOLVED", "solve_dual", "substitute"]
 
@@ -36,7 +36,7 @@ _CHECKED = 1e-8
 
 
 @njit(cache=True)
-def substitute(factor: Array, count: int, right: Array) -> None:
+def substitute(factor: Buffer, count: int, right: Buffer) -> None:
     """Solve L L' x = right in place for the leading count x count lower factor L."""
     for i in range(count):
         total = right[i]
@@ -51,7 +51,7 @@ def substitute(factor: Array, count: int, right: Array) -> None:
 
 
 @njit(cache=True)
-def _append_row(whitened: Array, row: int, count: int, factor: Array, basis: Array) -> float:
+def _append_row(whitened: Buffer, row: int, count: int, factor: Buffer, basis: Buffer) -> float:
     """Write the coefficients of a row in the basis of the active ones; return what is new of it.
 
     The new part itself goes to basis[count], not normalised. Working with the rows instead of their
@@ -77,7 +77,7 @@ def _append_row(whitened: Array, row: int, count: int, factor: Array, basis: Arr
 
 
 @njit(cache=True)
-def _accept_row(count: int, length: float, factor: Array, basis: Array) -> None:
+def _accept_row(count: int, length: float, factor: Buffer, basis: Buffer) -> None:
     factor[count, count] = length
     for k in range(basis.shape[1]):
         basis[count, k] /= length
@@ -85,26 +85,26 @@ def _accept_row(count: int, length: float, factor: Array, basis: Array) -> None:
 
 @njit(cache=True)
 def solve_dual(
-    whitened: Array,
-    gram: Array,
-    d: Array,
-    limit: Array,
-    tolerance: Array,
-    lam: Array,
-    free: Array,
-    factor: Array,
-    basis: Array,
+    whitened: Buffer,
+    gram: Buffer,
+    d: Buffer,
+    limit: Buffer,
+    tolerance: Buffer,
+    lam: Buffer,
+    free: Buffer,
+    factor: Buffer,
+    basis: Buffer,
 ) -> tuple[int, int]:
     """Solve the dual from lam = 0.
 
     Parameters
     ----------
-    whitened, gram : Array
+    whitened, gram : Buffer
         W = M L^-T with S = L L', (r, N m), and W W', (r, r).
-    d, limit, tolerance : Array
+    d, limit, tolerance : Buffer
         Slack of the rows at v = 0, upper limits, and the violation below which a row counts as
         kept, (r,) each.
-    lam, free, factor, basis : Array
+    lam, free, factor, basis : Buffer
         Written: multipliers (r,), the rows with 0 < lam < limit in the order of the factor, and
         the lower factor of their Gram matrix. Sizes r, a + 1, (a + 1, a + 1) and (a + 1, N m) with
         a = min(r, N m).
@@ -191,7 +191,7 @@ def solve_dual(
 
 @njit(cache=True)
 def _remove(
-    whitened: Array, free: Array, count: int, place: int, factor: Array, basis: Array
+    whitened: Buffer, free: Buffer, count: int, place: int, factor: Buffer, basis: Buffer
 ) -> int:
     """Drop the free row at `place` and factor the rows behind it again."""
     for i in range(place, count - 1):
@@ -201,7 +201,7 @@ def _remove(
 
 
 @njit(cache=True)
-def _verify(gram: Array, d: Array, tolerance: Array, at_limit: Array, lam: Array) -> bool:
+def _verify(gram: Buffer, d: Buffer, tolerance: Buffer, at_limit: Buffer, lam: Buffer) -> bool:
     """Check the rows and the multipliers of the answer itself."""
     for r in range(len(d)):
         slack = d[r]
@@ -217,14 +217,14 @@ def _verify(gram: Array, d: Array, tolerance: Array, at_limit: Array, lam: Array
 
 @njit(cache=True)
 def _refine(
-    gram: Array,
-    d: Array,
-    limit: Array,
-    at_limit: Array,
-    lam: Array,
-    free: Array,
+    gram: Buffer,
+    d: Buffer,
+    limit: Buffer,
+    at_limit: Buffer,
+    lam: Buffer,
+    free: Buffer,
     count: int,
-    factor: Array,
+    factor: Buffer,
 ) -> None:
     """Solve once more for the final active set, so that the steps leave no rounding behind."""
     right = np.empty(count)

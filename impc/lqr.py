@@ -1,6 +1,6 @@
-"""The linear quadratic regulator and its exact derivatives.
+"""The linear quadratic regulator, (3.3) and (3.4), and its exact derivatives.
 
-    discrete:    P = F'PF + Q + K'RK,        K = S^-1 B'PA,  S = R + B'PB,  F = A - BK   (3.3), (3.4)
+    discrete:    P = F'PF + Q + K'RK,        K = S^-1 B'PA,  S = R + B'PB,  F = A - BK
     continuous:  0 = F'P + PF + Q + K'RK,    K = R^-1 B'P,   S = R
 
 At the optimum the Riccati equation is stationary in K, so its differential keeps K fixed:

@@ -1,4 +1,4 @@
-"""A recorded trial as the fits take it: outputs and disturbance on one clock, and where it began."""
+"""A recorded trial as the fits take it: outputs and disturbance on one clock, and the start."""
 
 from __future__ import annotations
 

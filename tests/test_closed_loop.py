@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import random_plant, random_weights
 
 from impc.bounds import Bounds, bound_rows, box_bounds
 from impc.closed_loop import (
@@ -24,6 +23,7 @@ from impc.least_distance import CONVERGED, INCONSISTENT, solve_dual
 from impc.plant import Plant
 from impc.prediction import directions
 from impc.weights import stage_weights
+from tests.support import random_plant, random_weights
 
 
 def moved(controller: Controller, drive: Scenario, part: str, index: tuple[int, ...], step: float):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import scipy.optimize
-from conftest import random_plant, random_weights
 
 from impc.bounds import Bounds, box_bounds
 from impc.closed_loop import Status, require_complete, scenario, simulate
@@ -47,6 +46,7 @@ from impc.weights import (
     stage_weights,
     weights_from_parameters,
 )
+from tests.support import random_plant, random_weights
 
 IDENTITY = stage_weights(np.eye(2), 1)
 

@@ -6,7 +6,6 @@ import control
 import numpy as np
 import pytest
 import scipy.linalg
-from conftest import random_plant, random_weights
 
 from impc.errors import InputError, WeightsError
 from impc.lqr import (
@@ -18,6 +17,7 @@ from impc.lqr import (
 )
 from impc.plant import Plant, as_plant
 from impc.weights import stage_weights
+from tests.support import random_plant, random_weights
 
 
 def continuous_plant(rng: np.random.Generator) -> Plant:

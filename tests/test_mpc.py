@@ -5,8 +5,6 @@ from __future__ import annotations
 import control
 import numpy as np
 import pytest
-from conftest import random_plant, random_weights
-from independent_mpc import first_input
 
 from impc.bounds import Bounds, bound_rows, box_bounds
 from impc.closed_loop import Status, require_complete, scenario, simulate
@@ -22,6 +20,8 @@ from impc.errors import (
 from impc.mpc import SOLVERS, build_mpc, simulate_mpc, solve_mpc
 from impc.plant import Plant, as_plant
 from impc.weights import stage_weights
+from tests.independent_mpc import first_input
+from tests.support import random_plant, random_weights
 
 STEPS = 12
 

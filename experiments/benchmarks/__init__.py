@@ -1,1 +1,4 @@
-"""Benchmarks: ratios of medians measured side by side in one run. `python -m experiments.benchmarks`."""
+"""Benchmarks: ratios of medians measured side by side in one run.
+
+Run them with `python -m experiments.benchmarks`.
+"""

@@ -54,7 +54,13 @@ def _seat(runs: int) -> list[Row]:
     )
     unit = "one W2 simulation through CasADi conic qpOASES"
     return [
-        compare("W2 fit from the Table 3.1 start, one trial", unit, timings["one"], timings["qpoases"], 45),
+        compare(
+            "W2 fit from the Table 3.1 start, one trial",
+            unit,
+            timings["one"],
+            timings["qpoases"],
+            45,
+        ),
         compare("the Table 3.1 start itself", unit, timings["start"], timings["qpoases"], None),
         compare("W2 fit, three trials", unit, timings["three"], timings["qpoases"], 110),
         compare("W2 fit, 300 s", "W2 fit, 30 s", timings["long"], timings["one"], 11),
@@ -62,7 +68,9 @@ def _seat(runs: int) -> list[Row]:
 
 
 def _check(found: ReducedFit, gain: np.ndarray) -> None:
-    if found.equivalent is None or np.linalg.norm(found.gain.K - gain) > 1e-6 * np.linalg.norm(gain):
+    if found.equivalent is None or np.linalg.norm(found.gain.K - gain) > 1e-6 * np.linalg.norm(
+        gain
+    ):
         raise AssertionError(f"the fit missed the true gain: misfit {found.gain.misfit:.3g}")
 
 
@@ -71,7 +79,14 @@ def _memory() -> list[Row]:
     note = f"{empty:.0f} MB of it before the fit"
     return [
         Row("W2 fit, peak memory", "", short, 500, "MB", note),
-        Row("W2 fit, 300 s, peak memory", "30 s", long / short, 3, "", f"{long:.0f} / {short:.0f} MB"),
+        Row(
+            "W2 fit, 300 s, peak memory",
+            "30 s",
+            long / short,
+            3,
+            "",
+            f"{long:.0f} / {short:.0f} MB",
+        ),
     ]
 
 
@@ -94,13 +109,22 @@ def _example(runs: int) -> list[Row]:
         weights, _ = cvxpy_nelder_mead(work, start, CONDITION_WEIGHT, _NELDER_MEAD_BUDGET)
         reached.append(residual(weights, work.weights))
 
-    slow = side_by_side(
-        {"direct": lambda: inverse_mpc(work.problem, start), "script": script}, 1
-    )
+    slow = side_by_side({"direct": lambda: inverse_mpc(work.problem, start), "script": script}, 1)
     return [
-        compare("W1 direct fit", "Nelder-Mead over cvxpy solves", slow["direct"], slow["script"], 1 / 100),
+        compare(
+            "W1 direct fit",
+            "Nelder-Mead over cvxpy solves",
+            slow["direct"],
+            slow["script"],
+            1 / 100,
+        ),
         Row(
-            "the residual (3.10) that this Nelder-Mead reached", "", reached[-1], None, "", "own: < 1e-6"
+            "the residual (3.10) that this Nelder-Mead reached",
+            "",
+            reached[-1],
+            None,
+            "",
+            "own: < 1e-6",
         ),
         Row("W1 direct fit", "", timings["direct"].median, 0.1, "s", ""),
         Row("W1 reduced fit", "", timings["reduced"].median, 0.1, "s", ""),

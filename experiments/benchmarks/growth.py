@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -40,7 +41,10 @@ def growth_rows(runs: int, folder: Path) -> list[Row]:
             "",
             ", ".join(f"{size}: {1e3 * item.median:.3g}" for size, item in times.items()),
         )
-        for name, times in (("the horizon (W2)", horizons), ("the states (chain of masses)", states))
+        for name, times in (
+            ("the horizon (W2)", horizons),
+            ("the states (chain of masses)", states),
+        )
     ]
 
 
@@ -49,8 +53,8 @@ def _measure(works: dict[int, Workload], runs: int) -> dict[int, Timing]:
     for size, work in works.items():
         n = work.controller.plant.n
         along = directions(work.controller, n, K=np.eye(n)[None])
-        cases[str(size)] = lambda work=work, along=along: simulate_and_differentiate(  # type: ignore[misc]
-            work.controller, work.drives[0], along
+        cases[str(size)] = partial(
+            simulate_and_differentiate, work.controller, work.drives[0], along
         )
     return {int(name): timing for name, timing in side_by_side(cases, runs).items()}
 

@@ -1,7 +1,8 @@
-"""One closed loop of W1 with its gradient through a general differentiable layer, where installed."""
+"""One closed loop of W1 with its gradient through a general differentiable layer, if installed."""
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 from typing import TYPE_CHECKING, Any
 
@@ -40,8 +41,9 @@ def layer_rows(runs: int, _: Path) -> list[Row]:
 
 
 def _layer(work: Workload) -> Callable[[], Any]:
-    import torch
-    from cvxpylayers.torch import CvxpyLayer
+    # By name, because the pair is heavy and optional: `layer_rows` has looked for it.
+    torch = importlib.import_module("torch")
+    CvxpyLayer = importlib.import_module("cvxpylayers.torch").CvxpyLayer
 
     plant, horizon = work.controller.plant, work.controller.horizon
     n = plant.n

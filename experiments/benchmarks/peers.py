@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import cvxpy as cp
 import numpy as np
-import scipy.linalg
 import scipy.optimize
 
 from impc.bounds import bound_rows
+from impc.errors import SolverError
 from impc.lqr import solve_lqr
 from impc.weights import Weights, condition_number, weights_from_parameters
 
@@ -114,11 +114,13 @@ def cvxpy_nelder_mead(
         for _ in range(len(recorded) - 1):
             x0.value = states[-1]
             program.solve(solver=cp.CLARABEL)
+            if u.value is None:
+                raise SolverError("cvxpy", f"no answer: {program.status}", "start elsewhere")
             states.append(plant.A @ states[-1] + plant.B @ u.value[0])
         misfit = float(np.linalg.norm(np.array(states) - recorded))
         return misfit + condition_weight * condition_number(weights)
 
-    factor = scipy.linalg.cholesky(start.Q, lower=True)
+    factor = np.linalg.cholesky(start.Q)
     found = scipy.optimize.minimize(
         objective,
         factor[np.tril_indices(n)],

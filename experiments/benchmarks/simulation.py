@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -30,25 +31,26 @@ def simulation_rows(runs: int, _: Path) -> list[Row]:
     seeds = np.eye(n).reshape(1, -1)
     run, exact = simulate_and_differentiate(controller, drive, along)
     for name, loop in loops.items():
-        states = loop(controller.K)
-        np.testing.assert_allclose(states.full().T, run.x[1:], atol=1e-9)
-        by_graph = derivative[name](controller.K, states, seeds).full()
+        reached = loop(controller.K)
+        np.testing.assert_allclose(reached.full().T, run.x[1:], atol=1e-9)
+        by_graph = derivative[name](controller.K, reached, seeds).full()
         by_graph = by_graph.reshape(n, n, drive.steps).transpose(2, 0, 1)
         np.testing.assert_allclose(by_graph, exact.x[1:], atol=1e-9)
     timings = side_by_side(
         {
             "own simulation": lambda: simulate(controller, drive),
             "own Jacobian": lambda: simulate_and_differentiate(controller, drive, along),
-            **{name: (lambda loop=loop: loop(controller.K)) for name, loop in loops.items()},  # type: ignore[misc]
+            **{name: partial(loop, controller.K) for name, loop in loops.items()},
         },
         4 * runs,
     )
+    states = {name: loop(controller.K) for name, loop in loops.items()}
     slow = side_by_side(
         {
             "own Jacobian": lambda: simulate_and_differentiate(controller, drive, along),
             **{
-                name: (lambda f=f, s=loops[name](controller.K): f(controller.K, s, seeds))  # type: ignore[misc]
-                for name, f in derivative.items()
+                name: partial(graph, controller.K, states[name], seeds)
+                for name, graph in derivative.items()
             },
         },
         max(3, runs // 2),
@@ -59,7 +61,13 @@ def simulation_rows(runs: int, _: Path) -> list[Row]:
         compare(what, "CasADi conic qpOASES, simulation only", own, timings["qpoases"], 0.35),
         compare(what, "CasADi conic DAQP, simulation only", own, timings["daqp"], None),
         *(
-            compare(what, f"CasADi's forward derivatives, {name}", slow["own Jacobian"], slow[name], 1 / 60)
+            compare(
+                what,
+                f"CasADi's forward derivatives, {name}",
+                slow["own Jacobian"],
+                slow[name],
+                1 / 60,
+            )
             for name in derivative
         ),
         compare(

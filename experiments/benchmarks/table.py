@@ -45,9 +45,7 @@ class Row:
     note: str
 
 
-def compare(
-    what: str, compared: str, own: Timing, other: Timing, limit: float | None
-) -> Row:
+def compare(what: str, compared: str, own: Timing, other: Timing, limit: float | None) -> Row:
     """A ratio of medians, with both medians and quartiles in the note."""
     return Row(what, compared, own.median / other.median, limit, "", f"{_say(own)} / {_say(other)}")
 
@@ -65,7 +63,8 @@ def write_tables(rows: list[Row], folder: Path, runs: int) -> str:
         *(_line(row) for row in rows),
         "",
         f"{runs} runs; {platform.machine()}, {os.cpu_count()} cores, Python "
-        f"{platform.python_version()}, " + ", ".join(f"{name} {version(name)}" for name in _PACKAGES),
+        f"{platform.python_version()}, "
+        + ", ".join(f"{name} {version(name)}" for name in _PACKAGES),
         "",
     ]
     text = "\n".join(lines)

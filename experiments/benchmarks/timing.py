@@ -1,4 +1,4 @@
-"""Timing side by side: every repeat runs all cases in turn, so that a busy machine slows them all."""
+"""Timing side by side: every repeat runs all cases in turn, so a busy machine slows them all."""
 
 from __future__ import annotations
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+import control
 import numpy as np
 
 import plants
@@ -78,8 +79,6 @@ def chain_of_masses(states: int, steps: int = 3000, seed: int = 0) -> Workload:
     mass is tied to a wall, the first is pushed away from the origin by 5 N/m: one unstable mode. A
     bounded force acts on the first mass, a random one, held for 0.25 s, on the last.
     """
-    import control
-
     masses = states // 2
     laplacian = 2 * np.eye(masses) - np.eye(masses, k=1) - np.eye(masses, k=-1)
     laplacian[0, 0] = 1.0
@@ -89,9 +88,7 @@ def chain_of_masses(states: int, steps: int = 3000, seed: int = 0) -> Workload:
     A = np.block([[zero, eye], [-stiffness, -laplacian]])
     B = np.zeros((states, 2))
     B[masses, 0] = B[-1, 1] = 1.0
-    system = control.c2d(
-        control.ss(A, B, np.eye(states), 0, inputs=["force", "push"]), 1 / _RATE
-    )
+    system = control.c2d(control.ss(A, B, np.eye(states), 0, inputs=["force", "push"]), 1 / _RATE)
     plant = as_plant(system, ["force"])
     weights = stage_weights(np.eye(states), 1e-2)
     push = np.random.default_rng(seed).choice([-1.0, 0.0, 1.0], size=steps // 25 + 1)
