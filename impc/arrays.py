@@ -11,9 +11,10 @@ from impc.errors import DataError, InputError
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["Array", "Buffer", "finite_array", "frozen", "symmetric_matrix"]
+__all__ = ["Array", "Buffer", "IntArray", "finite_array", "frozen", "symmetric_matrix"]
 
 Array = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
+IntArray = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
 #: An array as compiled code takes it, of any element type.
 Buffer = np.ndarray[Any, np.dtype[Any]]
 

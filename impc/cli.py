@@ -1,62 +1,61 @@
-"""The `impc` command: it parses, calls and prints; there is no mathematics here."""
+"""The `impc` command: parses, calls, prints. No mathematics."""
 
 from __future__ import annotations
 
-import functools
 import importlib
+import importlib.metadata
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import click
 from tqdm import tqdm
 
 from impc.errors import ImpcError, InputError
-from impc.example import CASES, run_case
-from impc.plant import as_plant
-from impc.report.example_report import example_files
-from impc.report.table import determined, text_table
-from impc.report.write import write_files
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Sequence
+
+    from impc.example import CaseResult
+    from impc.plant import Plant
 
 __all__ = ["main"]
 
-_P = ParamSpec("_P")
-_T = TypeVar("_T")
-
-_METHODS = 7
+# The library knows no plant: the example's is named by its import path, ``module:function``.
 _EXAMPLE_PLANT = "plants:yalmip_example"
+_BAD_INPUT, _INTERRUPTED = 2, 130
 
 
-@click.group()
-@click.version_option(package_name="impc")
-def main() -> None:
-    """Inverse model predictive control: the weights behind a recorded closed loop."""
+class _Program(click.Group):
+    """Ends every expected failure with one line on stderr instead of a usage text or a traceback."""
 
-
-def _one_line_errors(command: Callable[_P, _T]) -> Callable[_P, _T]:
-    """End with one line and a status instead of a traceback: 2 for bad input, 130 for Ctrl-C."""
-
-    @functools.wraps(command)
-    def guarded(*args: _P.args, **kwargs: _P.kwargs) -> _T:
+    def main(self, *args: Any, **kwargs: Any) -> Any:
+        kwargs.pop("standalone_mode", None)
         try:
-            return command(*args, **kwargs)
-        except ImpcError as error:
-            click.echo(f"impc: error: {error}", err=True)
-            sys.exit(2)
-        except KeyboardInterrupt:
-            click.echo("impc: interrupted; nothing was written", err=True)
-            sys.exit(130)
+            status = super().main(*args, standalone_mode=False, **kwargs)
+        except (ImpcError, click.ClickException) as error:
+            message = error.format_message() if isinstance(error, click.ClickException) else error
+            click.echo(f"impc: error: {message}", err=True)
+            sys.exit(_BAD_INPUT)
+        except (KeyboardInterrupt, click.Abort):
+            click.echo("impc: interrupted", err=True)
+            sys.exit(_INTERRUPTED)
+        sys.exit(status)
 
-    return guarded
+
+@click.group(cls=_Program, invoke_without_command=True)
+@click.version_option(package_name="impc", prog_name="impc")
+@click.pass_context
+def main(context: click.Context) -> None:
+    """Inverse model predictive control: the weights behind a recorded closed loop."""
+    if context.invoked_subcommand is None:
+        click.echo(context.get_help())
 
 
 @main.command()
 @click.option(
     "--case",
-    type=click.Choice([*CASES, "all"]),
+    type=click.Choice(["A", "B", "C", "all"]),
     default="all",
     show_default=True,
     help="Initial state: A (1, 3), B (2, 3), C (2, 1).",
@@ -64,39 +63,75 @@ def _one_line_errors(command: Callable[_P, _T]) -> Callable[_P, _T]:
 @click.option(
     "--out",
     type=click.Path(path_type=Path),
-    default=Path("results/example"),
+    default=Path("results", "example"),
     show_default=True,
-    help="Folder for the report, the figures and result.json.",
+    help="Folder for report.html, result.json and the figures.",
 )
-@_one_line_errors
 def example(case: str, out: Path) -> None:
-    """Recover known weights from a simulated recording, by seven methods (section 3.4)."""
-    click.echo(
-        "Simulation example of section 3.4. The dissertation's own matrices are lost; this plant is "
-        "a stand-in\nwith what its text says: unstable, |u| <= 1, true weights Q = I, R = 1.\n"
-    )
-    plant = as_plant(_named_plant(_EXAMPLE_PLANT))
-    names = list(CASES) if case == "all" else [case]
-    results = []
-    with tqdm(total=_METHODS * len(names), unit="method", leave=False, disable=None) as bar:
-        for name in names:
-            bar.set_description(f"case {name}")
-            results.append(run_case(plant, name, progress=lambda _: bar.update()))
-    written = write_files(out, example_files(results))
-    for result in results:
-        start = ", ".join(f"{value:g}" for value in result.x0)
-        click.echo(f"case {result.name}, x0 = ({start}), {result.branch} branch of Table 3.1")
-        click.echo(text_table(result))
-        click.echo(determined(result) + "\n")
-    click.echo(f"{len(written)} files in {out}; open {out / 'report.html'}")
+    """Run the simulation example of section 3.4 of the dissertation.
+
+    The dissertation's own matrices, initial state and bound are lost; a plant that shows
+    everything its text says stands in for them.
+    """
+    # Imported here: the libraries take seconds to load, and --help and --version need none.
+    from impc.example import CASES  # noqa: PLC0415
+    from impc.report.example_report import example_files  # noqa: PLC0415
+    from impc.report.provenance import LOST, example_provenance  # noqa: PLC0415
+    from impc.report.write import require_writable, write_files  # noqa: PLC0415
+
+    require_writable(out)
+    plant = _load_plant(_EXAMPLE_PLANT)
+    cases = _run(plant, tuple(CASES) if case == "all" else (case,))
+    files = example_files(cases, example_provenance(_EXAMPLE_PLANT, plant))
+    written = write_files(out, files)
+    click.echo(LOST)
+    for result in cases:
+        _print_case(result)
+    _print_files(out, written)
 
 
-def _named_plant(path: str) -> Any:
-    """Import `module:function` and call it: the only code that a name can run."""
+def _run(plant: Plant, names: Sequence[str]) -> list[CaseResult]:
+    from impc.example import run_case  # noqa: PLC0415
+    from impc.report.table import METHODS  # noqa: PLC0415
+
+    total = len(names) * (len(METHODS) - 1)  # the truth is no method
+    # disable=None: no bar where stderr is a file.
+    with tqdm(total=total, unit="method", file=sys.stderr, disable=None, leave=False) as bar:
+
+        def step(method: str) -> None:
+            bar.set_postfix_str(method, refresh=False)
+            bar.update()
+
+        return [run_case(plant, name, progress=step) for name in names]
+
+
+def _load_plant(path: str) -> Plant:
+    from impc.plant import as_plant  # noqa: PLC0415
+
     module, _, function = path.partition(":")
     try:
-        return getattr(importlib.import_module(module), function)()
+        make = getattr(importlib.import_module(module), function)
     except (ImportError, AttributeError) as error:
         raise InputError(
-            "plant", f"{path!r} cannot be imported ({error})", "name it as module:function"
+            f"plant {path}", f"cannot be imported ({error})", "see impc/plants"
         ) from None
+    return as_plant(make())
+
+
+def _print_case(result: CaseResult) -> None:
+    from impc.report.table import determined_sentences, text_table  # noqa: PLC0415
+
+    start = ", ".join(f"{value:g}" for value in result.x0)
+    click.echo(f"\nCase {result.name}: start at ({start}), {result.branch} branch of Table 3.1\n")
+    click.echo(text_table(result) + "\n")
+    for line in determined_sentences(result.identifiability):
+        click.echo(line)
+
+
+def _print_files(out: Path, written: Sequence[Path]) -> None:
+    kinds: dict[str, list[str]] = {}
+    for path in written:
+        kinds.setdefault(path.stem, []).append(path.suffix)
+    click.echo(f"\nWritten to {out}:")
+    for stem, suffixes in kinds.items():
+        click.echo(f"  {stem}{' '.join(suffixes)}")

@@ -229,7 +229,7 @@ def _run(
     x[0], dx[0] = given.x0, along.x0
     # Copies, because read-only arrays are another type to numba and would be compiled again.
     weakly_active, failed_row = run(
-        _writable(plant.A, plant.B, plant.E, controller.K, np.linalg.inv(controller.S)),
+        _writable(plant.A, plant.B, plant.E, controller.K, np.array(np.linalg.inv(controller.S), dtype=np.float64)),
         _writable(along.A, along.B, along.E, along.K, along.S),
         rows,
         moved,

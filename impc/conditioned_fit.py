@@ -226,7 +226,7 @@ def _linearise(here: _Point, objective: Objective) -> StepProgram:
     """The step program in the coordinates D of dX = L D L'."""
     n = here.solution.plant.n
     X = here.weights.block
-    L = np.linalg.cholesky(X)
+    L: Array = np.asarray(np.linalg.cholesky(X), dtype=np.float64)
     basis = block_basis(n, len(X) - n)
     J = weight_jacobian(here.solution, here.residual, L @ basis @ L.T)
     # A tall residual enters through its triangular factor: same norm, few rows.

@@ -149,9 +149,9 @@ def _rank(
 def _search(problem: InverseProblem, gain: Array, metric: Array, budget: int) -> GainFit:
     space = _Coordinates(problem, gain, metric)
     found = scipy.optimize.least_squares(
-        lambda z: space.at(z).residual,
+        space.residual,
         space.pack(gain),
-        jac=lambda z: space.at(z).jacobian,
+        jac=space.derivative,
         ftol=1e-12,
         xtol=1e-12,
         gtol=1e-15,
@@ -194,9 +194,8 @@ def _compress(residual: Array, jacobian: Array) -> _Compressed:
     both = np.column_stack([jacobian, residual])
     if len(both) <= columns + 1:
         return _Compressed(residual, jacobian)
-    (triangle,) = scipy.linalg.qr(both, mode="r", check_finite=False)[:1]
-    triangle = triangle[: columns + 1]
-    triangle = np.asarray(triangle, dtype=np.float64)
+    (upper,) = scipy.linalg.qr(both, mode="r", check_finite=False)
+    triangle = np.asarray(upper[: columns + 1], dtype=np.float64)
     return _Compressed(triangle[:, -1], triangle[:, :-1])
 
 
@@ -227,7 +226,14 @@ class _Coordinates:
         m, n = self.problem.plant.m, self.problem.plant.n
         factor = np.zeros((m, m))
         factor[self.tril] = np.concatenate([[1.0], z[m * n :]])
-        return np.linalg.solve(self.T.T, z[: m * n].reshape(m, n).T).T, factor @ factor.T
+        gain = np.linalg.solve(self.T.T, z[: m * n].reshape(m, n).T).T
+        return np.asarray(gain, dtype=np.float64), factor @ factor.T
+
+    def residual(self, z: Array) -> Array:
+        return self.at(z).residual
+
+    def derivative(self, z: Array) -> Array:
+        return self.at(z).jacobian
 
     def at(self, z: Array) -> _Compressed:
         key = z.tobytes()
@@ -240,7 +246,9 @@ class _Coordinates:
 
     def jacobian(self, z: Array, evaluation: Evaluation) -> Array:
         m, n = self.problem.plant.m, self.problem.plant.n
-        dK = np.linalg.solve(self.T, evaluation.dK.reshape(-1, n).T).T.reshape(-1, m * n)
+        rows = evaluation.dK.reshape(-1, n)
+        whitened = np.linalg.solve(self.T, rows.T).T.reshape(-1, m * n)
+        dK = np.asarray(whitened, dtype=np.float64)
         if m == 1:
             return dK
         factor = np.zeros((m, m))

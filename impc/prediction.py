@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from impc.arrays import Array
+from impc.arrays import Array, IntArray
 from impc.bounds import bound_rows
 
 if TYPE_CHECKING:
@@ -59,8 +59,8 @@ class Rows(NamedTuple):
     gram: Array
     b: Array
     limit: Array
-    family: np.ndarray[tuple[int], np.dtype[np.int64]]
-    stage: np.ndarray[tuple[int], np.dtype[np.int64]]
+    family: IntArray
+    stage: IntArray
 
 
 class RowDirections(NamedTuple):
@@ -169,7 +169,7 @@ def differentiate_rows(controller: Controller, along: Directions) -> RowDirectio
     return RowDirections(dT, dM, along.bounds[family])
 
 
-def _pairs(controller: Controller) -> tuple[Array, Array]:
+def _pairs(controller: Controller) -> tuple[IntArray, IntArray]:
     """The pairs (family, stage) in order: the horizon first, then the terminal set.
 
     A state bound at stage 0 cannot be influenced. It stays while it is hard, so that a state
@@ -198,7 +198,7 @@ def _powers(controller: Controller, last: int) -> Array:
 
 
 def _inputs(
-    controller: Controller, family: Array, stage: Array, response: Array, direct: Array
+    controller: Controller, family: IntArray, stage: IntArray, response: Array, direct: Array
 ) -> Array:
     """Place the response H Phi^j B at column k - 1 - j, and the direct term at column k < N."""
     horizon, m = controller.horizon, controller.plant.m

@@ -62,14 +62,19 @@ def matrix_inequality(constant: Array, basis: Array) -> Cone:
     return Cone(-_triangle(basis).T, _triangle(constant[None])[0], kind)
 
 
-def norm_bound(vectors: Array, bound: Array) -> Cone:
-    """||sum y_i vectors_i|| <= bound @ y, for vectors (k, r)."""
+def norm_bound(
+    vectors: Array, bound: Array, *, offset: Array | None = None, constant: float = 0.0
+) -> Cone:
+    """||offset + sum y_i vectors_i|| <= constant + bound @ y, for vectors (k, r), offset (r,)."""
     rows = -np.vstack([bound, vectors.T])
-    return Cone(rows, np.zeros(len(rows)), clarabel.SecondOrderConeT(len(rows)))
+    right = np.concatenate([[constant], np.zeros(len(rows) - 1) if offset is None else offset])
+    return Cone(rows, right, clarabel.SecondOrderConeT(len(rows)))
 
 
-def solve_semidefinite(objective: Array, cones: list[Cone]) -> SemidefiniteSolution:
-    """Minimise objective @ y over the cones.
+def solve_semidefinite(
+    objective: Array, cones: list[Cone], *, squares: Array | None = None
+) -> SemidefiniteSolution:
+    """Minimise objective @ y + squares @ y^2 over the cones; no squares by default.
 
     Raises
     ------
@@ -81,8 +86,10 @@ def solve_semidefinite(objective: Array, cones: list[Cone]) -> SemidefiniteSolut
     settings.max_threads = 1
     # Tighter than the default 1e-8, which would be the error of the weights.
     settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = 1e-11
+    count = len(objective)
+    quadratic = np.zeros((count, count)) if squares is None else np.diag(2 * squares)
     found = clarabel.DefaultSolver(
-        scipy.sparse.csc_matrix((len(objective), len(objective))),
+        scipy.sparse.csc_matrix(quadratic),
         objective,
         scipy.sparse.csc_matrix(np.vstack([cone.rows for cone in cones])),
         np.concatenate([cone.right for cone in cones]),

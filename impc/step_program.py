@@ -1,12 +1,11 @@
-"""The semidefinite program of one prox-linear step, handed to Clarabel as it is.
+"""The semidefinite program of one prox-linear step.
 
-cvxpy would read better, but spends ten times as long on writing this program down as Clarabel does
-on solving it, at every step. In the coordinates d of dX = L D L', D = sum d_i basis_i,
+In the coordinates d of dX = L D L', D = sum d_i basis_i, with an epigraph f of the norm,
 
-    minimise    w_fit phi(residual + jacobian d) + w_cond kappa a
-    subject to  D + I - X^-1 >= 0                       (X + dX >= I, seen through L)
-                a I - (X + L D L') / kappa >= 0         (X + dX <= kappa a I)
-                ||d|| <= radius.
+    minimise    w_fit f (or w_fit f^2) + w_cond kappa a
+    subject to  ||(residual + jacobian d, rest)|| <= f,   ||d|| <= radius,
+                D + I - L^-1 L^-T >= 0                  (X + dX >= I, seen through L)
+                a I - (X + L D L') / kappa >= 0         (X + dX <= kappa a I).
 
 Both matrix inequalities have entries of order one whatever kappa is, because each is written in
 the coordinates in which it is well scaled.
@@ -16,21 +15,40 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
-import clarabel
 import numpy as np
 import scipy.linalg
-import scipy.sparse
 
-from impc.arrays import Array
-from impc.errors import SolverError
+from impc.arrays import Array, frozen
+from impc.semidefinite import matrix_inequality, norm_bound, solve_semidefinite
+
+if TYPE_CHECKING:
+    from impc.semidefinite import Cone
 
 __all__ = ["StepProgram", "block_basis", "solve_step"]
 
 
 @dataclass(frozen=True)
 class StepProgram:
-    """Data of the program in the module's text; `rest` is what no step can change of the residual."""
+    """Data of the program above.
+
+    Attributes
+    ----------
+    X, L : Array
+        blkdiag(Q, R) (n + m, n + m), scaled to a least eigenvalue of 1, and its Cholesky factor.
+    n : int
+        Size of Q.
+    basis : Array
+        (k, n + m, n + m), of `block_basis`.
+    jacobian, residual : Array
+        (r, k) and (r,).
+    rest : float
+        Norm of the part of the residual that no step changes.
+    fit_weight, condition_weight : float
+    squared : bool
+        Whether the fit counts by its square.
+    """
 
     X: Array
     L: Array
@@ -56,7 +74,7 @@ def block_basis(n: int, m: int) -> Array:
                 member[first + row, first + column] = value
                 member[first + column, first + row] = value
                 members.append(member)
-    return np.array(members)
+    return frozen(members)
 
 
 def solve_step(program: StepProgram, radius: float) -> tuple[Array, float]:
@@ -68,105 +86,53 @@ def solve_step(program: StepProgram, radius: float) -> tuple[Array, float]:
         When Clarabel returns no usable point; d = 0 is always feasible, so this is numerical.
     """
     count, kappa = len(program.basis), float(scipy.linalg.eigvalsh(program.X)[-1])
-    norm_form = not program.squared
-    width = count + 1 + norm_form  # d, a, and the epigraph of the norm
-    blocks: list[tuple[Array, Array, object]] = [
-        *_semidefinite(program, kappa, width),
-        _ball(count, width, radius),
-    ]
-    if norm_form:
-        blocks.append(_norm(program, count, width))
-    quadratic = np.zeros((width, width))
-    linear = np.zeros(width)
-    linear[count] = program.condition_weight * kappa
-    if norm_form:
-        linear[-1] = program.fit_weight
-    else:
-        weight = 2 * program.fit_weight
-        quadratic[:count, :count] = weight * program.jacobian.T @ program.jacobian
-        linear[:count] = weight * program.jacobian.T @ program.residual
-    scale = max(float(np.max(np.abs(linear))), 1e-300)
-    solution = clarabel.DefaultSolver(
-        scipy.sparse.csc_matrix(np.triu(quadratic) / scale),
-        linear / scale,
-        scipy.sparse.csc_matrix(np.vstack([block[0] for block in blocks])),
-        np.concatenate([block[1] for block in blocks]),
-        [block[2] for block in blocks],
-        _settings(),
-    ).solve()
-    step = np.asarray(solution.x)[:count]
-    if not np.all(np.isfinite(step)):
-        raise SolverError("step program", f"Clarabel: {solution.status}", "start elsewhere")
-    predicted = _predict(program, step)
-    return step, predicted
+    price, effort = program.condition_weight * kappa, program.fit_weight
+    scale = max(price, effort)
+    linear, squares = np.zeros(count + 2), np.zeros(count + 2)
+    linear[count] = price / scale
+    (squares if program.squared else linear)[-1] = effort / scale
+    cones = [*_inequalities(program, kappa), _ball(count, radius), _epigraph(program)]
+    step = solve_semidefinite(linear, cones, squares=squares).y[:count]
+    return step, _predict(program, step)
 
 
 def _predict(program: StepProgram, step: Array) -> float:
     """The model's objective at the step, from the step itself and not from the solver's word."""
-    moved = (
-        program.L @ (np.eye(len(program.X)) + np.tensordot(step, program.basis, 1)) @ program.L.T
-    )
+    inner = np.eye(len(program.X)) + np.tensordot(step, program.basis, 1)
+    moved = program.L @ inner @ program.L.T
     eigenvalues = scipy.linalg.eigvalsh((moved + moved.T) / 2)
-    size = float(np.hypot(np.linalg.norm(program.residual + program.jacobian @ step), program.rest))
-    fit = size**2 if program.squared else size
     if eigenvalues[0] <= 0:
         return float("inf")
-    return program.fit_weight * fit + program.condition_weight * float(
-        eigenvalues[-1] / eigenvalues[0]
-    )
+    size = float(np.hypot(np.linalg.norm(program.residual + program.jacobian @ step), program.rest))
+    fit = size**2 if program.squared else size
+    condition = float(eigenvalues[-1] / eigenvalues[0])
+    return program.fit_weight * fit + program.condition_weight * condition
 
 
-def _semidefinite(
-    program: StepProgram, kappa: float, width: int
-) -> list[tuple[Array, Array, object]]:
+def _inequalities(program: StepProgram, kappa: float) -> list[Cone]:
     """The two matrix inequalities, one cone for each diagonal block."""
-    inverse = scipy.linalg.solve_triangular(program.L, np.eye(len(program.L)), lower=True)
-    lower = inverse @ inverse.T
-    upper = program.L @ program.basis @ program.L.T / kappa
     total = len(program.X)
-    count = len(program.basis)
+    inverse = scipy.linalg.solve_triangular(program.L, np.eye(total), lower=True)
+    floor = np.eye(total) - inverse @ inverse.T
+    ceiling = -program.L @ program.basis @ program.L.T / kappa
+    unused = np.zeros((1, total, total))
+    below = np.concatenate([program.basis, unused, unused])
+    above = np.concatenate([ceiling, np.eye(total)[None], unused])
     cones = []
     for block in (slice(0, program.n), slice(program.n, total)):
-        eye = np.eye(block.stop - block.start)
-        below = np.zeros((len(_triangle(eye)), width))
-        below[:, :count] = -np.array([_triangle(item[block, block]) for item in program.basis]).T
-        cone = clarabel.PSDTriangleConeT(len(eye))
-        cones.append((below, _triangle(eye - lower[block, block]), cone))
-        above = np.zeros_like(below)
-        above[:, :count] = np.array([_triangle(item[block, block]) for item in upper]).T
-        above[:, count] = -_triangle(eye)
-        cones.append((above, _triangle(-program.X[block, block] / kappa), cone))
+        cones.append(matrix_inequality(floor[block, block], below[:, block, block]))
+        upper = -program.X[block, block] / kappa
+        cones.append(matrix_inequality(upper, above[:, block, block]))
     return cones
 
 
-def _ball(count: int, width: int, radius: float) -> tuple[Array, Array, object]:
-    rows = np.zeros((count + 1, width))
-    rows[1:, :count] = -np.eye(count)
-    right = np.zeros(count + 1)
-    right[0] = radius
-    return rows, right, clarabel.SecondOrderConeT(count + 1)
+def _ball(count: int, radius: float) -> Cone:
+    return norm_bound(np.eye(count + 2, count), np.zeros(count + 2), constant=radius)
 
 
-def _norm(program: StepProgram, count: int, width: int) -> tuple[Array, Array, object]:
-    size = len(program.residual) + 2
-    rows, right = np.zeros((size, width)), np.zeros(size)
-    rows[0, -1] = -1.0
-    rows[1:-1, :count] = -program.jacobian
-    right[1:-1] = program.residual
-    right[-1] = program.rest
-    return rows, right, clarabel.SecondOrderConeT(size)
-
-
-def _triangle(matrix: Array) -> Array:
-    """Upper triangle by columns, off-diagonals times sqrt(2): Clarabel's order."""
-    rows, columns = np.tril_indices(len(matrix))
-    return np.asarray(np.where(rows == columns, 1.0, np.sqrt(2.0)) * matrix[columns, rows])
-
-
-def _settings() -> object:
-    settings = clarabel.DefaultSettings()
-    settings.verbose = False
-    # Tighter than the default 1e-8: the step's error is the error of the answer at a kink.
-    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = 1e-11
-    settings.max_threads = 1
-    return settings
+def _epigraph(program: StepProgram) -> Cone:
+    count, size = len(program.basis), len(program.residual)
+    vectors, bound = np.zeros((count + 2, size + 1)), np.zeros(count + 2)
+    vectors[:count, :size] = program.jacobian.T
+    bound[-1] = 1.0
+    return norm_bound(vectors, bound, offset=np.append(program.residual, program.rest))

@@ -87,8 +87,8 @@ def _comparison(case: CaseResult) -> Figure:
         above.set_title(label[0].upper() + label[1:])
         for axes in (above, below):
             axes.label_outer()
-    for axes in grid[:, -1]:
-        axes.legend(loc="upper right", handlelength=2.0)
+    grid[0, -1].legend(loc="upper right", handlelength=2.0)
+    grid[1, -1].legend(loc="center right", bbox_to_anchor=(1.0, 0.36), handlelength=2.0)
     return figure
 
 
@@ -161,6 +161,8 @@ def _finish(above: Axes, below: Axes, case: CaseResult) -> None:
     for edge in (-1, 1):
         below.axhspan(edge * BOUND, edge * 2 * largest, color=FORBIDDEN, linewidth=0, zorder=0)
         below.axhline(edge * BOUND, color=INK, linewidth=0.8, linestyle=":", zorder=1)
+    middle = (BOUND + largest) / 2
+    below.text(len(case.truth.u), -middle, "beyond the bound", ha="right", va="center", size=7)
     above.set_ylabel("states (-)")
     below.set_ylabel("control $u$ (-)")
     below.set_xlabel("time (samples)")

@@ -1,0 +1,70 @@
+"""Where a result comes from: plant, settings, versions and date."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import platform
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING
+
+from impc.example import BOUND, HORIZON, STEPS
+from impc.inverse_mpc import AUXILIARY_CONDITION_WEIGHT, CONDITION_WEIGHT
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from impc.plant import Plant
+
+__all__ = ["LOST", "Provenance", "example_provenance"]
+
+LOST = (
+    "The dissertation's own plant (3.8), initial state and input bound are lost. "
+    "This plant stands in for them: it shows everything that the dissertation says of its own, "
+    "but its numbers are not the dissertation's."
+)
+_PACKAGES = ("impc", "casadi", "clarabel", "control", "cvxpy", "numba", "numpy", "scipy")
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """What a reader needs to make the result again.
+
+    Attributes
+    ----------
+    plant_name : str
+        Import path of the plant.
+    plant : Plant
+    settings : mapping of str to number
+    versions : mapping of str to str
+        Of Python and of the packages that compute.
+    made : str
+        Date and time, UTC, ISO 8601.
+    """
+
+    plant_name: str
+    plant: Plant
+    settings: Mapping[str, float]
+    versions: Mapping[str, str]
+    made: str
+
+
+def example_provenance(plant_name: str, plant: Plant) -> Provenance:
+    """Gather the provenance of a run of the example, now and with what is installed here."""
+    settings: dict[str, float] = {
+        "horizon": HORIZON,
+        "steps": STEPS,
+        "input_bound": BOUND,
+        "condition_weight": CONDITION_WEIGHT,
+        "auxiliary_condition_weight": AUXILIARY_CONDITION_WEIGHT,
+    }
+    versions = {"python": platform.python_version()} | {name: _version(name) for name in _PACKAGES}
+    made = datetime.now(UTC).isoformat(timespec="seconds")
+    return Provenance(plant_name, plant, settings, versions, made)
+
+
+def _version(package: str) -> str:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return "not installed"  # impc itself, run from a checkout by its path
