@@ -27,12 +27,11 @@ _BAD_INPUT, _INTERRUPTED = 2, 130
 
 
 class _Program(click.Group):
-    """Ends every expected failure with one line on stderr instead of a usage text or a traceback."""
+    """Ends every expected failure with one line on stderr: no usage text, no traceback."""
 
     def main(self, *args: Any, **kwargs: Any) -> Any:
-        kwargs.pop("standalone_mode", None)
         try:
-            status = super().main(*args, standalone_mode=False, **kwargs)
+            status = super().main(*args, **kwargs | {"standalone_mode": False})
         except (ImpcError, click.ClickException) as error:
             message = error.format_message() if isinstance(error, click.ClickException) else error
             click.echo(f"impc: error: {message}", err=True)
@@ -84,7 +83,7 @@ def example(case: str, out: Path) -> None:
     cases = _run(plant, tuple(CASES) if case == "all" else (case,))
     files = example_files(cases, example_provenance(_EXAMPLE_PLANT, plant))
     written = write_files(out, files)
-    click.echo(LOST)
+    click.echo(click.wrap_text(LOST, width=100))
     for result in cases:
         _print_case(result)
     _print_files(out, written)
@@ -113,7 +112,7 @@ def _load_plant(path: str) -> Plant:
         make = getattr(importlib.import_module(module), function)
     except (ImportError, AttributeError) as error:
         raise InputError(
-            f"plant {path}", f"cannot be imported ({error})", "see impc/plants"
+            f"plant {path}", f"cannot be imported ({error})", "install the whole checkout"
         ) from None
     return as_plant(make())
 
@@ -135,3 +134,7 @@ def _print_files(out: Path, written: Sequence[Path]) -> None:
     click.echo(f"\nWritten to {out}:")
     for stem, suffixes in kinds.items():
         click.echo(f"  {stem}{' '.join(suffixes)}")
+
+
+if __name__ == "__main__":
+    main()

@@ -35,11 +35,14 @@ if TYPE_CHECKING:
     from impc.prediction import Directions, Rows
 
 __all__ = [
+    "PreparedLoop",
     "Scenario",
     "Sensitivity",
     "Simulation",
     "Status",
+    "prepare_loop",
     "require_complete",
+    "run_loop",
     "scenario",
     "simulate",
     "simulate_and_differentiate",
@@ -130,6 +133,18 @@ class Sensitivity:
     u: Array
 
 
+@dataclass(frozen=True)
+class PreparedLoop:
+    """A controller with its rows and derivatives built; made by `prepare_loop`."""
+
+    controller: Controller
+    along: Directions
+    rows: Rows
+    row_directions: RowDirections
+    matrices: LoopMatrices
+    matrix_directions: LoopMatrices
+
+
 def scenario(
     plant: Plant, x0: ArrayLike, steps: int | None = None, disturbance: ArrayLike | None = None
 ) -> Scenario:
@@ -170,7 +185,7 @@ def simulate(controller: Controller, given: Scenario) -> Simulation:
     Simulation
         With a status for each sample; `require_complete` turns a failure into an error.
     """
-    simulation, _ = _run(controller, given, directions(controller, 0))
+    simulation, _ = run_loop(prepare_loop(controller, directions(controller, 0)), given)
     return simulation
 
 
@@ -178,7 +193,47 @@ def simulate_and_differentiate(
     controller: Controller, given: Scenario, along: Directions
 ) -> tuple[Simulation, Sensitivity]:
     """Simulate and differentiate in one pass; see `simulate` and the module's text."""
-    return _run(controller, given, along)
+    return run_loop(prepare_loop(controller, along), given)
+
+
+def prepare_loop(controller: Controller, along: Directions) -> PreparedLoop:
+    """Build all that does not depend on the recording, so that several trials share it."""
+    plant = controller.plant
+    rows = build_rows(controller)
+    moved = differentiate_rows(controller, along) if along.count else _no_directions(rows)
+    inverse = np.asarray(np.linalg.inv(controller.S), dtype=np.float64)
+    return PreparedLoop(
+        controller,
+        along,
+        rows,
+        moved,
+        _writable(plant.A, plant.B, plant.E, controller.K, inverse),
+        _writable(along.A, along.B, along.E, along.K, along.S),
+    )
+
+
+def run_loop(prepared: PreparedLoop, given: Scenario) -> tuple[Simulation, Sensitivity]:
+    """Simulate one recording of a prepared loop, with its derivatives."""
+    plant, along = prepared.controller.plant, prepared.along
+    steps, n, m, p = given.steps, plant.n, plant.m, along.count
+    x, u = np.zeros((steps + 1, n)), np.zeros((steps, m))
+    dx, du = np.zeros((steps + 1, n, p)), np.zeros((steps, m, p))
+    status = np.full(steps, Status.NOT_REACHED, dtype=np.int8)
+    x[0], dx[0] = given.x0, along.x0
+    weakly_active, failed_row = run(
+        prepared.matrices,
+        prepared.matrix_directions,
+        prepared.rows,
+        prepared.row_directions,
+        np.array(given.disturbance),
+        _divergence(plant, given),
+        x,
+        u,
+        dx,
+        du,
+        status,
+    )
+    return Simulation(x, u, status, weakly_active, failed_row), Sensitivity(dx, du)
 
 
 def require_complete(controller: Controller, simulation: Simulation) -> Simulation:
@@ -216,35 +271,8 @@ def require_complete(controller: Controller, simulation: Simulation) -> Simulati
     )
 
 
-def _run(
-    controller: Controller, given: Scenario, along: Directions
-) -> tuple[Simulation, Sensitivity]:
-    plant = controller.plant
-    rows = build_rows(controller)
-    moved = differentiate_rows(controller, along) if along.count else _no_directions(rows)
-    steps, n, m, p = given.steps, plant.n, plant.m, along.count
-    x, u = np.zeros((steps + 1, n)), np.zeros((steps, m))
-    dx, du = np.zeros((steps + 1, n, p)), np.zeros((steps, m, p))
-    status = np.full(steps, Status.NOT_REACHED, dtype=np.int8)
-    x[0], dx[0] = given.x0, along.x0
-    # Copies, because read-only arrays are another type to numba and would be compiled again.
-    weakly_active, failed_row = run(
-        _writable(plant.A, plant.B, plant.E, controller.K, np.array(np.linalg.inv(controller.S), dtype=np.float64)),
-        _writable(along.A, along.B, along.E, along.K, along.S),
-        rows,
-        moved,
-        np.array(given.disturbance),
-        _divergence(plant, given),
-        x,
-        u,
-        dx,
-        du,
-        status,
-    )
-    return Simulation(x, u, status, weakly_active, failed_row), Sensitivity(dx, du)
-
-
 def _writable(*matrices: Array) -> LoopMatrices:
+    """Copies, because read-only arrays are another type to numba and would be compiled again."""
     return LoopMatrices(*(np.array(matrix, order="C") for matrix in matrices))
 
 

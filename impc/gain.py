@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 __all__ = ["GainFit", "bryson_starts", "bryson_weights", "fit_gain"]
 
 _EXPLAINED = 1e-9
+_BLOCK = 4096
 _PRICES = 10.0 ** np.arange(-6, 4)
 
 
@@ -189,14 +190,24 @@ class _Compressed:
     jacobian: Array
 
 
-def _compress(residual: Array, jacobian: Array) -> _Compressed:
-    columns = jacobian.shape[1]
-    both = np.column_stack([jacobian, residual])
-    if len(both) <= columns + 1:
-        return _Compressed(residual, jacobian)
-    (upper,) = scipy.linalg.qr(both, mode="r", check_finite=False)
-    triangle = np.asarray(upper[: columns + 1], dtype=np.float64)
-    return _Compressed(triangle[:, -1], triangle[:, :-1])
+def _compress(evaluation: Evaluation, chain: Array) -> _Compressed:
+    """Factor derivative and residual together, block by block, then apply the chain rule.
+
+    Blocks of a few thousand rows stay in the processor's cache: a recording ten times as long
+    takes ten times the time, not fifteen.
+    """
+    _, m, n = evaluation.dK.shape
+    parts = [evaluation.dK.reshape(-1, m * n)]
+    if m > 1:
+        parts.append(evaluation.dS.reshape(-1, m * m))
+    width = sum(part.shape[1] for part in parts) + 1
+    triangle = np.zeros((0, width))
+    for first in range(0, len(evaluation.residual), _BLOCK):
+        rows = slice(first, first + _BLOCK)
+        block = np.column_stack([*(part[rows] for part in parts), evaluation.residual[rows]])
+        (upper,) = scipy.linalg.qr(np.vstack([triangle, block]), mode="r", check_finite=False)
+        triangle = np.asarray(upper[:width], dtype=np.float64)
+    return _Compressed(triangle[:, -1], triangle[:, :-1] @ chain)
 
 
 class _Coordinates:
@@ -241,16 +252,15 @@ class _Coordinates:
             evaluation = evaluate(self.problem, *self.unpack(z))
             if evaluation.reason:
                 self.refused.append(evaluation.reason)
-            self.last = (key, _compress(evaluation.residual, self.jacobian(z, evaluation)))
+            self.last = (key, _compress(evaluation, self.chain(z)))
         return self.last[1]
 
-    def jacobian(self, z: Array, evaluation: Evaluation) -> Array:
+    def chain(self, z: Array) -> Array:
+        """d (K, S) / d z, entries row by row: (m n + m m, k), or (n, n) for one input."""
         m, n = self.problem.plant.m, self.problem.plant.n
-        rows = evaluation.dK.reshape(-1, n)
-        whitened = np.linalg.solve(self.T, rows.T).T.reshape(-1, m * n)
-        dK = np.asarray(whitened, dtype=np.float64)
+        on_gain = np.kron(np.eye(m), np.linalg.inv(self.T).T)
         if m == 1:
-            return dK
+            return on_gain
         factor = np.zeros((m, m))
         factor[self.tril] = np.concatenate([[1.0], z[m * n :]])
         metric = factor @ factor.T
@@ -261,9 +271,8 @@ class _Coordinates:
             moved[row] = factor[:, column]
             moved = moved + moved.T
             # The controller scales the metric to a mean diagonal of 1.
-            scaled = scale * (moved - metric * np.trace(moved) / np.trace(metric))
-            columns.append(np.tensordot(evaluation.dS, scaled, 2))
-        return np.hstack([dK, np.column_stack(columns)])
+            columns.append(scale * (moved - metric * np.trace(moved) / np.trace(metric)).ravel())
+        return np.asarray(scipy.linalg.block_diag(on_gain, np.column_stack(columns)))
 
     def metric_determined(self, jacobian: Array) -> bool:
         size = self.problem.plant.m * self.problem.plant.n

@@ -17,7 +17,7 @@ from impc.closed_loop import simulate
 from impc.conditioned_fit import ConditionedFit, Objective, Residual, conditioned_fit
 from impc.controller import mpc_controller
 from impc.equivalent_weights import gain_fibre, least_condition_weights
-from impc.errors import WeightsError
+from impc.errors import SolverError, WeightsError
 from impc.gain import GainFit, bryson_weights, fit_gain
 from impc.inverse_lqr import inverse_lqr_gradient, inverse_lqr_lmi
 from impc.inverse_problem import evaluate, scenarios, without_bounds
@@ -249,7 +249,7 @@ def _least_condition(plant: Plant, fit: GainFit) -> tuple[EquivalentWeights | No
     try:
         fibre = gain_fibre(plant, fit.K, fit.S if fit.metric_determined else None)
         return least_condition_weights(fibre), ""
-    except WeightsError as error:
+    except (WeightsError, SolverError) as error:  # none, or none that could be certified
         return None, str(error)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from impc.arrays import Array
 from impc.bounds import bound_rows, box_bounds
-from impc.closed_loop import Scenario, simulate, simulate_and_differentiate
+from impc.closed_loop import Scenario, prepare_loop, run_loop, simulate
 from impc.controller import Controller, gain_controller
 from impc.errors import DataError, ImpcError
 from impc.lqr import is_stable
@@ -169,9 +169,10 @@ def evaluate(problem: InverseProblem, gain: Array, metric: Array) -> Evaluation:
     except ImpcError as error:
         return _unusable(problem, str(error))
     along = _gain_and_metric(controller)
+    prepared = prepare_loop(controller, along)
     residuals, derivatives, reason, weakly_active = [], [], "", 0
     for trial, drive in zip(problem.recordings, scenarios(problem), strict=True):
-        run, sensitivity = simulate_and_differentiate(controller, drive, along)
+        run, sensitivity = run_loop(prepared, drive)
         difference = run.x @ plant.C.T - trial.outputs
         weakly_active += run.weakly_active
         if not run.complete:

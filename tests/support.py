@@ -2,10 +2,23 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any
+
 import control
 import numpy as np
+import scipy.optimize
 
 from impc.plant import Plant, as_plant
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+
+def nelder_mead(objective: Callable[[Any], float], start: np.ndarray, budget: int) -> float:
+    """The least value that a derivative-free search finds: an oracle for the others."""
+    options: Any = {"maxfev": budget, "xatol": 1e-9, "fatol": 1e-12}
+    minimize: Any = scipy.optimize.minimize  # its stubs do not know the options of each method
+    return float(minimize(objective, start, method="Nelder-Mead", options=options).fun)
 
 
 def random_plant(rng: np.random.Generator, n: int, m: int, radius: float, d: int = 0) -> Plant:

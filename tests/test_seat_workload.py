@@ -1,4 +1,4 @@
-"""The seated subject (W2 of experiments/benchmarks): one answer by every path, and the whole fit."""
+"""The seated subject (W2 of experiments/benchmarks): every path agrees, and the whole fit."""
 
 from __future__ import annotations
 

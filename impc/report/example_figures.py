@@ -103,7 +103,9 @@ def _terminal_set(case: CaseResult) -> Figure:
     axes.plot(*case.truth.x.T, "o", color=INK, mfc="white", ms=4.5, label="recorded", zorder=4)
     for (_, name, label), mark in zip(FIGURES, _PATHS, strict=True):
         axes.plot(*_run(case, name).x.T, mark.line, color=mark.color, label=label, zorder=3)
-    axes.annotate("start", case.x0, xytext=(6, 2), textcoords="offset points", va="bottom")
+    axes.annotate(
+        "start", (case.x0[0], case.x0[1]), xytext=(6, 2), textcoords="offset points", va="bottom"
+    )
     axes.set_xlabel("state $x_1$ (-)")
     axes.set_ylabel("state $x_2$ (-)")
     axes.margins(0.08)

@@ -117,7 +117,7 @@ def _findings(case: CaseResult) -> tuple[str, ...]:
         worse = output.state_misfit > gain.state_misfit
         lines.append(
             f"{_label(output)} fits {'worse' if worse else 'no worse'} than the gain it starts "
-            f"from: misfit {output.state_misfit:.5g} against {gain.state_misfit:.5g}."
+            f"from: misfit {output.state_misfit:.6f} against {gain.state_misfit:.6f}."
         )
     return tuple(lines)
 

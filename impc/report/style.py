@@ -1,7 +1,8 @@
-"""How every figure looks: sizes of a journal, and marks that survive grey print and colour blindness.
+"""How every figure looks: sizes of a journal, marks that survive grey print and colour blindness.
 
-Colours are four of the set of Okabe and Ito. None of them carries a meaning alone: recorded data
-are open markers, models are lines; the first state is round and solid, the second square and dashed.
+Colours are three of the set of Okabe and Ito. None of them carries a meaning alone: recorded data
+are open markers, models are lines; the first state is round and solid, the second square and
+dashed.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 from contextlib import contextmanager
 from dataclasses import dataclass
 from io import BytesIO
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import matplotlib as mpl
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -46,7 +47,8 @@ SINGLE_COLUMN, DOUBLE_COLUMN = 3.5, 7.2
 # 700 pixels for one column: sharp on a telephone of 360 points at twice the density.
 _DPI = 200
 
-_RC = {
+# Any: matplotlib types its keys one by one, and each version has others.
+_RC: dict[Any, Any] = {
     "font.family": "DejaVu Sans",  # comes with matplotlib: the same picture on every machine
     "font.size": 8.0,
     "axes.labelsize": 8.0,

@@ -141,7 +141,7 @@ def determined_sentences(found: Identifiability) -> tuple[str, ...]:
     values = ", ".join(significant(value) for value in found.singular_values)
     first = (
         f"The recording determined {found.rank} of the {found.free} free directions of (Q, R); "
-        f"the condition number chose {found.chosen}. (Singular values: {values}.)"
+        f"the condition number chose {found.chosen}. (Singular values, with scale: {values}.)"
     )
     others = (
         f"Other weights that explain it as well: {compact_weights(item.weights)}, "
