@@ -36,10 +36,15 @@ class _Program(click.Group):
             message = error.format_message() if isinstance(error, click.ClickException) else error
             click.echo(f"impc: error: {message}", err=True)
             sys.exit(_BAD_INPUT)
-        except (KeyboardInterrupt, click.Abort):
-            click.echo("impc: interrupted", err=True)
-            sys.exit(_INTERRUPTED)
         sys.exit(status)
+
+    def invoke(self, ctx: click.Context) -> Any:
+        # Caught here, because click's own handling prints an empty line first.
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:
+            click.echo("impc: interrupted", err=True)
+            ctx.exit(_INTERRUPTED)
 
 
 @click.group(cls=_Program, invoke_without_command=True)

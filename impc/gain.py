@@ -44,6 +44,8 @@ class GainFit:
         Metric (m, m); the one it started from where the recordings do not determine it.
     misfit : float
         2-norm of the output residual.
+    explained : bool
+        Whether the gain stabilises and the misfit is at most 1e-9 of the recorded outputs.
     stabilises : bool
         Whether A - BK is stable. Without a terminal set the search may end where it is not.
     singular_values : Array
@@ -60,6 +62,7 @@ class GainFit:
     K: Array
     S: Array
     misfit: float
+    explained: bool
     stabilises: bool
     singular_values: Array
     metric_determined: bool
@@ -99,7 +102,6 @@ def fit_gain(
         raise SolverError(
             "gain", f"no start can be simulated: {refused[0]}", "give a start of your own"
         )
-    size = float(np.linalg.norm([np.linalg.norm(trial.outputs) for trial in problem.recordings]))
     best: GainFit | None = None
     for K, S in ranked[:attempts]:
         found = _search(problem, K, S, max_evaluations)
@@ -107,7 +109,7 @@ def fit_gain(
         refused += found.refused
         if best is None or _preference(found) < _preference(best):
             best = found
-        if found.stabilises and found.misfit <= _EXPLAINED * size:
+        if found.explained:
             break
     assert best is not None  # attempts >= 1 and something was ranked
     return replace(best, evaluations=evaluations, refused=tuple(refused))
@@ -161,11 +163,15 @@ def _search(problem: InverseProblem, gain: Array, metric: Array, budget: int) ->
     K, S = space.unpack(found.x)
     jacobian = space.at(found.x).jacobian
     plant = problem.plant
+    stabilises = is_stable(plant.A - plant.B @ K, discrete=True)
+    size = np.linalg.norm([np.linalg.norm(trial.outputs) for trial in problem.recordings])
+    misfit = float(np.linalg.norm(found.fun))
     return GainFit(
         frozen(K),
         frozen(S),
-        float(np.linalg.norm(found.fun)),
-        is_stable(plant.A - plant.B @ K, discrete=True),
+        misfit,
+        bool(stabilises and misfit <= _EXPLAINED * size),
+        stabilises,
         frozen(np.linalg.svd(jacobian, compute_uv=False)),
         space.metric_determined(jacobian),
         int(found.nfev),

@@ -53,6 +53,8 @@ __all__ = [
 # c of (3.5) to (3.7) is lost. Small enough that the exact fit wins in the 2-norm (docs/theory.md).
 CONDITION_WEIGHT = 1e-4
 AUXILIARY_CONDITION_WEIGHT = 1e-3
+# Steps of the direct form inside the reduced one: it need not end, only change the valley.
+_DETOUR = 60
 # Starting weights are kept this definite: the search takes the Cholesky factor of them.
 _LARGEST_START_CONDITION = 1e6
 
@@ -68,7 +70,7 @@ class ReducedFit:
     equivalent : EquivalentWeights or None
         Weights of least condition number with exactly that gain; None when there are none.
     direct : ConditionedFit or None
-        The direct form, continued from there, when no weights have exactly that gain.
+        Weights of the direct form, when none have exactly that gain.
     reason : str
         Why the direct form was needed; empty when it was not.
     """
@@ -173,6 +175,7 @@ def inverse_mpc(
     *,
     condition_weight: float = CONDITION_WEIGHT,
     squared: bool = False,
+    max_iterations: int = 200,
 ) -> ConditionedFit:
     """Direct inverse MPC (3.6): misfit of the constrained closed loop plus condition number.
 
@@ -186,6 +189,7 @@ def inverse_mpc(
         Against a fit weight of 1.
     squared : bool
         Whether the misfit is the square of its 2-norm; see `Objective`.
+    max_iterations : int
 
     Raises
     ------
@@ -193,7 +197,9 @@ def inverse_mpc(
         As `conditioned_fit`.
     """
     objective = Objective(_closed_loop_residual(problem), 1.0, condition_weight, squared)
-    return conditioned_fit(problem.plant, objective, _definite(start))
+    return conditioned_fit(
+        problem.plant, objective, _definite(start), max_iterations=max_iterations
+    )
 
 
 def inverse_mpc_reduced(
@@ -203,45 +209,52 @@ def inverse_mpc_reduced(
 ) -> ReducedFit:
     """Reduced inverse MPC: fit the gain through the constrained controller, then one program.
 
+    Three searches at most: two for a gain, and when neither explains the recordings, or no weights
+    have the gain found, one that stays among weights (the direct form) and goes on as a search for
+    a gain from where that ends. It passes local minima at gains that no weights have.
+
     Parameters
     ----------
     starts : pairs of Array
         Gains and metrics from which the search may start, see `fit_gain`.
     condition_weight : float
-        Of the direct form, for a gain that no weights have exactly.
+        Of the direct form.
 
     Raises
     ------
     SolverError
-        When the recordings cannot be simulated from the start.
+        When the recordings cannot be simulated from any start.
     """
-    fit = fit_gain(problem, *starts)
-    equivalent, reason = _least_condition(problem.plant, fit)
-    if equivalent is not None:
-        return ReducedFit(fit, equivalent, None, "")
-    # Weights stay weights along the direct search: it passes minima at gains that have none, and
-    # the gain is then fitted once more from where it ends.
-    nearest = inverse_lqr_gradient(problem.plant, fit.K)
-    near = auxiliary_weights(problem.plant, fit.K, nearest.weights).weights
-    start = _first_usable(problem, [near, *bryson_weights(problem)])
-    direct = inverse_mpc(problem, start, condition_weight=condition_weight)
-    again = fit_gain(
-        problem, (np.array(direct.solution.K), np.array(direct.solution.S)), attempts=1
+    first = fit_gain(problem, *starts, attempts=2)
+    equivalent, reason = _least_condition(problem.plant, first)
+    if equivalent is not None and first.explained:
+        return ReducedFit(first, equivalent, None, "")
+    direct = inverse_mpc(
+        problem,
+        _most_promising(problem),
+        condition_weight=condition_weight,
+        max_iterations=_DETOUR,
     )
-    if again.misfit <= fit.misfit:
-        equivalent, _ = _least_condition(problem.plant, again)
-        if equivalent is not None:
-            return ReducedFit(again, equivalent, None, "")
-    return ReducedFit(fit, None, direct, reason)
+    end = (np.array(direct.solution.K), np.array(direct.solution.S))
+    second = fit_gain(problem, end, attempts=1)
+    if equivalent is not None and first.misfit <= second.misfit:
+        return ReducedFit(first, equivalent, None, "")
+    again, _ = _least_condition(problem.plant, second)
+    if again is not None:
+        return ReducedFit(second, again, None, "")
+    if equivalent is not None:
+        return ReducedFit(first, equivalent, None, "")
+    return ReducedFit(first, None, direct, reason)
 
 
-def _first_usable(problem: InverseProblem, candidates: list[Weights]) -> Weights:
-    """The first weights with which every recording can be simulated; the last if none are."""
-    for weights in candidates:
+def _most_promising(problem: InverseProblem) -> Weights:
+    """Of `bryson_weights` those with the least misfit, whether or not every sample is reached."""
+
+    def distance(weights: Weights) -> float:
         solution = solve_lqr(problem.plant, weights)
-        if not evaluate(problem, solution.K, solution.S).reason:
-            return weights
-    return candidates[-1]
+        return float(np.linalg.norm(evaluate(problem, solution.K, solution.S).residual))
+
+    return min(bryson_weights(problem), key=distance)
 
 
 def _least_condition(plant: Plant, fit: GainFit) -> tuple[EquivalentWeights | None, str]:

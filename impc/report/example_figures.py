@@ -88,7 +88,7 @@ def _comparison(case: CaseResult) -> Figure:
         for axes in (above, below):
             axes.label_outer()
     grid[0, -1].legend(loc="upper right", handlelength=2.0)
-    grid[1, -1].legend(loc="center right", bbox_to_anchor=(1.0, 0.36), handlelength=2.0)
+    grid[1, -1].legend(loc="center", bbox_to_anchor=(0.5, 0.31), ncols=2, handlelength=2.0)
     return figure
 
 

@@ -1,0 +1,64 @@
+"""The README keeps its word: its Python runs and prints what it says, its table comes out."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import re
+from pathlib import Path
+
+import pytest
+
+from impc.example import run_case
+from impc.plant import Plant
+from impc.report.table import text_table
+
+ROOT = Path(__file__).parent.parent
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+BLOCKS = re.findall(r"^```(\w+)\n(.*?)^```$", README, flags=re.MULTILINE | re.DOTALL)
+
+
+def close(shown: str, found: str) -> bool:
+    """Whether two cells agree; numbers to a few digits, because solvers differ in the last ones."""
+    try:
+        return float(found) == pytest.approx(float(shown), rel=2e-2, abs=2e-3)
+    except ValueError:
+        return shown == found
+
+
+def test_the_first_lines_are_the_two_commands() -> None:
+    first = README.split("```")[1].split()
+    assert first[:3] == ["sh", "make", "demo"]
+    assert "make test" in README.split("```")[1]
+    assert README.index("make demo") < 200
+
+
+def test_python_blocks_run_and_print_what_the_readme_says() -> None:
+    names: dict[str, object] = {}
+    run = 0
+    for (kind, code), (_, expected) in zip(BLOCKS, [*BLOCKS[1:], ("", "")], strict=True):
+        if kind != "python":
+            continue
+        printed = io.StringIO()
+        with contextlib.redirect_stdout(printed):
+            exec(compile(code, "README.md", "exec"), names)
+        assert printed.getvalue() == expected
+        run += 1
+    assert run
+
+
+def test_the_table_is_what_comes_out(example_plant: Plant) -> None:
+    shown = next(text for kind, text in BLOCKS if kind == "text" and "feedback_gain" in text)
+    found = text_table(run_case(example_plant, "A"))
+    shown_rows, found_rows = shown.splitlines(), found.splitlines()
+    assert len(shown_rows) == len(found_rows)
+    assert shown_rows[0].split() == found_rows[0].split()
+    for shown_row, found_row in zip(shown_rows[1:], found_rows[1:], strict=True):
+        cells = list(zip(shown_row.split()[:-1], found_row.split()[:-1], strict=True))
+        assert all(close(*pair) for pair in cells), cells  # the last cell is a time
+
+
+def test_links_lead_somewhere() -> None:
+    links = re.findall(r"\]\(([^)#]+)\)", README)
+    assert links
+    assert [link for link in links if not (ROOT / link).exists()] == []
