@@ -144,6 +144,8 @@ def lyapunov_series(F: Array, right: Array) -> Array:
     WeightsError
         When F is not stable to working precision.
     """
+    if not is_stable(F, discrete=True):
+        raise _no_solution("the closed loop is not stable")
     power, total = np.array(F), np.array(right)
     for _ in range(60):  # 2^60 samples: beyond any loop that is stable in double precision
         update = power @ total @ power.T

@@ -16,6 +16,7 @@ from experiments.benchmarks.fits import fit_rows
 from experiments.benchmarks.growth import growth_rows
 from experiments.benchmarks.layers import layer_rows
 from experiments.benchmarks.routes import route_rows
+from experiments.benchmarks.search import search_rows
 from experiments.benchmarks.simulation import simulation_rows
 from experiments.benchmarks.table import write_tables
 
@@ -23,6 +24,7 @@ _PARTS = {
     "simulation": simulation_rows,
     "fits": fit_rows,
     "growth": growth_rows,
+    "search": search_rows,
     "routes": route_rows,
     "layers": layer_rows,
 }
