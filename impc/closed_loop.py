@@ -21,9 +21,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc._closed_loop_kernel import LoopMatrices, run
 from impc.arrays import Array, finite_array, frozen
 from impc.bounds import bound_rows
+from impc.compiled import LoopMatrices, run
 from impc.errors import DataError, InfeasibleError, SolverError
 from impc.prediction import RowDirections, build_rows, differentiate_rows, directions
 

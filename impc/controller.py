@@ -125,6 +125,7 @@ def gain_controller(
     metric: ArrayLike | None = None,
     terminal_set: bool = True,
     softening: float | None = None,
+    near: TerminalSet | None = None,
 ) -> Controller:
     """Controller that stays near u = -Kx; the gain must stabilise the plant.
 
@@ -134,6 +135,8 @@ def gain_controller(
         K (m, n).
     metric : array_like, optional
         S (m, m), positive definite; the identity by default, which is no choice for one input.
+    near : TerminalSet, optional
+        Set of a gain nearby: the same answer in less time, see `maximal_invariant_set`.
 
     Other parameters and errors as in `mpc_controller`.
 
@@ -153,6 +156,6 @@ def gain_controller(
         raise InputError("horizon", f"got {horizon!r}", "give a whole number of at least 1")
     if softening is not None and not 0 < softening < np.inf:
         raise InputError("softening", f"got {softening!r}", "give a positive number, or None")
-    terminal = maximal_invariant_set(plant, K, bounds) if terminal_set else None
+    terminal = maximal_invariant_set(plant, K, bounds, near=near) if terminal_set else None
     scaled = S * (plant.m / np.trace(S))
     return Controller(plant, frozen(K), frozen(scaled), bounds, int(horizon), terminal, softening)

@@ -23,6 +23,7 @@ from impc.weights import stage_weights
 
 if TYPE_CHECKING:
     from impc.inverse_problem import Evaluation, InverseProblem
+    from impc.terminal_set import TerminalSet
     from impc.weights import Weights
 
 __all__ = ["GainFit", "bryson_starts", "bryson_weights", "fit_gain"]
@@ -238,6 +239,7 @@ class _Coordinates:
         self.tril = np.tril_indices(problem.plant.m)
         self.refused: list[str] = []
         self.last: tuple[bytes, _Compressed] | None = None
+        self.near: TerminalSet | None = None
 
     def pack(self, gain: Array) -> Array:
         return np.concatenate([np.ravel(gain @ self.T), self.factor[self.tril][1:]])
@@ -258,7 +260,8 @@ class _Coordinates:
     def at(self, z: Array) -> _Compressed:
         key = z.tobytes()
         if self.last is None or self.last[0] != key:
-            evaluation = evaluate(self.problem, *self.unpack(z))
+            evaluation = evaluate(self.problem, *self.unpack(z), self.near)
+            self.near = evaluation.terminal or self.near
             if evaluation.reason:
                 self.refused.append(evaluation.reason)
             self.last = (key, _compress(evaluation, self.chain(z)))

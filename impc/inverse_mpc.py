@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from impc.inverse_problem import InverseProblem
     from impc.lqr import LqrSolution
     from impc.plant import Plant
+    from impc.terminal_set import TerminalSet
 
 __all__ = [
     "AUXILIARY_CONDITION_WEIGHT",
@@ -73,12 +74,16 @@ class ReducedFit:
         Weights of the direct form, when none have exactly that gain.
     reason : str
         Why the direct form was needed; empty when it was not.
+    kept_hard : bool
+        Whether the controller found reaches every sample with hard state bounds and terminal set,
+        which the search had softened; see `verify_hard`.
     """
 
     gain: GainFit
     equivalent: EquivalentWeights | None
     direct: ConditionedFit | None
     reason: str
+    kept_hard: bool
 
     @property
     def weights(self) -> Weights:
@@ -228,7 +233,7 @@ def inverse_mpc_reduced(
     first = fit_gain(problem, *starts, attempts=2)
     equivalent, reason = _least_condition(problem.plant, first)
     if equivalent is not None and first.explained:
-        return ReducedFit(first, equivalent, None, "")
+        return _with_gain(problem, first, equivalent)
     direct = inverse_mpc(
         problem,
         _most_promising(problem),
@@ -238,13 +243,19 @@ def inverse_mpc_reduced(
     end = (np.array(direct.solution.K), np.array(direct.solution.S))
     second = fit_gain(problem, end, attempts=1)
     if equivalent is not None and first.misfit <= second.misfit:
-        return ReducedFit(first, equivalent, None, "")
+        return _with_gain(problem, first, equivalent)
     again, _ = _least_condition(problem.plant, second)
     if again is not None:
-        return ReducedFit(second, again, None, "")
+        return _with_gain(problem, second, again)
     if equivalent is not None:
-        return ReducedFit(first, equivalent, None, "")
-    return ReducedFit(first, None, direct, reason)
+        return _with_gain(problem, first, equivalent)
+    kept = all(run.complete for run in verify_hard(problem, direct.weights))
+    return ReducedFit(first, None, direct, reason, kept)
+
+
+def _with_gain(problem: InverseProblem, fit: GainFit, equivalent: EquivalentWeights) -> ReducedFit:
+    kept = all(run.complete for run in verify_hard(problem, equivalent.weights))
+    return ReducedFit(fit, equivalent, None, "", kept)
 
 
 def _most_promising(problem: InverseProblem) -> Weights:
@@ -317,8 +328,12 @@ def verify_hard(problem: InverseProblem, weights: Weights) -> list[Simulation]:
 
 
 def _closed_loop_residual(problem: InverseProblem) -> Callable[[LqrSolution], Residual]:
+    near: TerminalSet | None = None
+
     def residual(solution: LqrSolution) -> Residual:
-        found = evaluate(problem, solution.K, solution.S)
+        nonlocal near
+        found = evaluate(problem, solution.K, solution.S, near)
+        near = found.terminal or near
         return Residual(found.residual, found.dK, found.dS, usable=not found.reason)
 
     return residual

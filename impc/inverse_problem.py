@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from impc.closed_loop import Simulation
     from impc.plant import Plant
     from impc.recording import Recording
+    from impc.terminal_set import TerminalSet
 
 __all__ = [
     "Evaluation",
@@ -82,6 +83,8 @@ class Evaluation:
         Why some samples were not reached; empty when all were.
     weakly_active : int
         Samples at which the derivative is one-sided.
+    terminal : TerminalSet or None
+        The terminal set, as a hint for the next evaluation nearby.
     """
 
     residual: Array
@@ -89,6 +92,7 @@ class Evaluation:
     dS: Array
     reason: str
     weakly_active: int
+    terminal: TerminalSet | None
 
 
 def inverse_problem(
@@ -118,8 +122,12 @@ def without_bounds(problem: InverseProblem) -> InverseProblem:
     return replace(problem, bounds=box_bounds(problem.plant), terminal_set=False)
 
 
-def controller_for(problem: InverseProblem, gain: Array, metric: Array) -> Controller:
+def controller_for(
+    problem: InverseProblem, gain: Array, metric: Array, near: TerminalSet | None = None
+) -> Controller:
     """Return the controller of the problem with that gain and metric.
+
+    `near` is the terminal set of a gain nearby: the same answer in less time.
 
     Raises
     ------
@@ -134,6 +142,7 @@ def controller_for(problem: InverseProblem, gain: Array, metric: Array) -> Contr
         metric=metric,
         terminal_set=problem.terminal_set,
         softening=problem.softening,
+        near=near,
     )
 
 
@@ -151,8 +160,10 @@ def misfit(problem: InverseProblem, simulations: list[Simulation]) -> float:
     return float(np.linalg.norm(np.concatenate([part.ravel() for part in parts])))
 
 
-def evaluate(problem: InverseProblem, gain: Array, metric: Array) -> Evaluation:
-    """Residual and exact derivatives at a gain and a metric.
+def evaluate(
+    problem: InverseProblem, gain: Array, metric: Array, near: TerminalSet | None = None
+) -> Evaluation:
+    """Residual and exact derivatives at a gain and a metric; `near` as in `controller_for`.
 
     A gain that does not stabilise the plant, or a loop that diverges, gives a large finite
     residual and its reason, so that a search can step back from it.
@@ -165,7 +176,7 @@ def evaluate(problem: InverseProblem, gain: Array, metric: Array) -> Evaluation:
     if bounded and not is_stable(plant.A - plant.B @ gain, discrete=True):
         return _unusable(problem, "the gain does not stabilise the plant")
     try:
-        controller = controller_for(problem, gain, metric)
+        controller = controller_for(problem, gain, metric, near)
     except ImpcError as error:
         return _unusable(problem, str(error))
     along = _gain_and_metric(controller)
@@ -189,7 +200,12 @@ def evaluate(problem: InverseProblem, gain: Array, metric: Array) -> Evaluation:
         dS[:, rows, columns] = jacobian[:, m * n :] * share
         dS[:, columns, rows] = dS[:, rows, columns]
     return Evaluation(
-        np.concatenate(residuals), jacobian[:, : m * n].reshape(-1, m, n), dS, reason, weakly_active
+        np.concatenate(residuals),
+        jacobian[:, : m * n].reshape(-1, m, n),
+        dS,
+        reason,
+        weakly_active,
+        controller.terminal,
     )
 
 
@@ -229,4 +245,4 @@ def _unusable(problem: InverseProblem, reason: str) -> Evaluation:
         [np.full(trial.outputs.size, _NOT_REACHED * _scale(trial)) for trial in problem.recordings]
     )
     size = len(residual)
-    return Evaluation(residual, np.zeros((size, m, n)), np.zeros((size, m, m)), reason, 0)
+    return Evaluation(residual, np.zeros((size, m, n)), np.zeros((size, m, m)), reason, 0, None)

@@ -19,9 +19,9 @@ from impc.closed_loop import (
     simulate,
     simulate_and_differentiate,
 )
+from impc.compiled import CONVERGED, INCONSISTENT, solve_dual
 from impc.controller import Controller, gain_controller, mpc_controller
 from impc.errors import SolverError
-from impc.least_distance import CONVERGED, INCONSISTENT, solve_dual
 from impc.plant import Plant
 from impc.prediction import Directions, directions
 from impc.weights import stage_weights

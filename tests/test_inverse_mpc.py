@@ -65,6 +65,7 @@ def test_table_3_1_recovers_the_weights(
     assert residual(found.fit.weights, IDENTITY) <= 1e-6
     reduced = inverse_mpc_reduced(problem, *start_gains(found.start, example_plant))
     assert residual(reduced.weights, IDENTITY) <= 1e-6
+    assert reduced.kept_hard
     squared = inverse_mpc(problem, found.start.weights, squared=True)
     assert residual(squared.weights, IDENTITY) <= 1e-6
     for run in verify_hard(problem, found.fit.weights):
@@ -293,3 +294,21 @@ def test_starting_point_alone_is_table_3_1_without_its_last_line(
     assert start.gradient is not None
     assert start.auxiliary is not None
     assert start.weights is start.auxiliary.weights
+
+
+def test_a_recording_that_breaks_a_state_bound_is_fitted_softly_and_said_so(
+    example_plant: Plant,
+) -> None:
+    """A push beyond the bound: no hard controller passes it, the soft one explains it."""
+    rng = np.random.default_rng(5)
+    plant = random_plant(rng, 3, 1, 1.1, d=1)
+    bounds = box_bounds(plant, u_min=-1, u_max=1, x_min=-0.5, x_max=0.5)
+    true = mpc_controller(plant, stage_weights(np.eye(3), 1), bounds, 6, softening=1e6)
+    push = 0.8 * rng.normal(size=40)
+    run = simulate(true, scenario(plant, 0.2 * np.ones(3), disturbance=push))
+    assert Status.SOFTENED in run.status
+    trial = recording(plant, run.x, np.append(push, 0.0))
+    problem = inverse_problem(plant, bounds, 6, (trial,), softening=1e6)
+    found = inverse_mpc_reduced(problem)
+    assert not found.kept_hard
+    np.testing.assert_allclose(found.gain.K, true.K, atol=1e-6)

@@ -81,7 +81,9 @@ def cvxpy_nelder_mead(
 ) -> tuple[Weights, int]:
     """Inverse MPC as a script would do it: Nelder-Mead over Cholesky entries, cvxpy inside.
 
-    Without a terminal set, whose computation at every iterate would cost more than all else.
+    Without a terminal set, whose computation at every iterate would cost more than all else. The
+    simplex collapses on the kinks of the objective; it is started anew from there, as such scripts
+    do, until the budget of simulations is spent.
 
     Returns
     -------
@@ -121,10 +123,13 @@ def cvxpy_nelder_mead(
         return misfit + condition_weight * condition_number(weights)
 
     factor = np.linalg.cholesky(start.Q)
-    found = scipy.optimize.minimize(
-        objective,
-        factor[np.tril_indices(n)],
-        method="Nelder-Mead",
-        options={"maxfev": budget, "xatol": 1e-7, "fatol": 1e-9},
-    )
-    return weights_from_parameters(found.x, n, 1), count
+    parameters: Array = np.asarray(factor[np.tril_indices(n)], dtype=np.float64)
+    while count < budget:
+        found = scipy.optimize.minimize(
+            objective,
+            parameters,
+            method="Nelder-Mead",
+            options={"maxfev": budget - count, "xatol": 1e-7, "fatol": 1e-9},
+        )
+        parameters = np.asarray(found.x, dtype=np.float64)
+    return weights_from_parameters(parameters, n, 1), count
