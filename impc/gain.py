@@ -272,7 +272,7 @@ class _Coordinates:
         m, n = self.problem.plant.m, self.problem.plant.n
         on_gain = np.kron(np.eye(m), np.linalg.inv(self.T).T)
         if m == 1:
-            return on_gain
+            return np.asarray(on_gain, dtype=np.float64)
         factor = np.zeros((m, m))
         factor[self.tril] = np.concatenate([[1.0], z[m * n :]])
         metric = factor @ factor.T

@@ -54,7 +54,7 @@ def test_solvers_fast_path_and_independent_program_agree(seed: int) -> None:
     terminal = (controller.terminal.H, controller.terminal.h)
     for x, u in zip(fast.x[:-1], fast.u, strict=True):
         other = first_input(plant.A, plant.B, Q, R, 5, x, 0.5, x_max, terminal)
-        np.testing.assert_allclose(u, other, atol=1e-6)
+        np.testing.assert_allclose(u, other, atol=1e-8)
 
 
 @pytest.mark.parametrize("name", SOLVERS)

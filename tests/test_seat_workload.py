@@ -12,6 +12,7 @@ from impc.identifiability import identifiability
 from impc.inverse_mpc import inverse_mpc_reduced, start_gains, starting_point
 from impc.mpc import build_mpc, simulate_mpc
 from impc.prediction import directions
+from tests.independent_mpc import first_input
 
 
 @pytest.fixture(scope="module")
@@ -34,6 +35,18 @@ def test_fast_path_equals_a_program_at_every_sample(work: Workload) -> None:
         slow = simulate_mpc(build_mpc(work.controller, name), work.drives[0])
         np.testing.assert_allclose(slow.x, fast.x, atol=1e-9)
         np.testing.assert_allclose(slow.u, fast.u, atol=1e-9 * 6)
+
+
+def test_inputs_are_those_of_an_independent_program(work: Workload) -> None:
+    """Formulated in u with (Q, R, P), condensed with the unstable A, solved by Clarabel."""
+    run = simulate(work.controller, work.drives[0])
+    plant = work.controller.plant
+    active = np.flatnonzero(run.status == Status.ACTIVE)
+    for sample in np.concatenate([active[::10], np.arange(0, 3000, 100)]):
+        other = first_input(
+            plant.A, plant.B, work.weights.Q, work.weights.R, 20, run.x[sample], u_max=6.0
+        )
+        np.testing.assert_allclose(run.u[sample], other, atol=1e-8 * 6)
 
 
 def test_jacobian_equals_central_differences(work: Workload) -> None:
