@@ -61,7 +61,7 @@ slow: env
 	$(PY) -m pytest -m slow
 
 bench: env
-	$(PY) -m experiments.benchmarks
+	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(PY) -m experiments.benchmarks
 
 env: $(PROJECT) $(POLYTOPE)
 

@@ -26,7 +26,7 @@ def layer_rows(runs: int, _: Path) -> list[Row]:
     """Compare with cvxpylayers; a row without a figure says that it is not installed."""
     what, against = "W1 simulation + gradient", "cvxpylayers, forward and backward"
     if not all(importlib.util.find_spec(name) for name in ("cvxpylayers", "torch")):
-        note = "not installed: pip install cvxpylayers torch"
+        note = "not installed: pip install '.[bench]'"
         return [Row(what, against, None, None, "", note)]
     work = example()
     solution = solve_lqr(work.problem.plant, work.weights)
