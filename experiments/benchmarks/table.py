@@ -57,8 +57,8 @@ def write_tables(rows: list[Row], folder: Path, runs: int) -> str:
         "",
         "Written by `make bench`. Ratios of medians measured side by side in one run; in brackets "
         "the quartiles. Times are of the machine named below; only the ratios travel. `make bench` "
-        "gives every method one BLAS thread: the matrices are small, and with two threads on a busy "
-        "machine one fit took six times as long (`OPENBLAS_NUM_THREADS=1`).",
+        "gives every method one BLAS thread: the matrices are small, and with two threads on a "
+        "busy machine one fit took six times as long (`OPENBLAS_NUM_THREADS=1`).",
         "",
         "| what | against | measured | at most | median [quartiles], ms |",
         "|---|---|---|---|---|",
