@@ -14,7 +14,7 @@ import numpy as np
 
 from impc.arrays import Array
 from impc.bounds import bound_rows, box_bounds
-from impc.closed_loop import Scenario, prepare_loop, run_loop, simulate
+from impc.closed_loop import Scenario, Status, prepare_loop, run_loop, simulate
 from impc.controller import Controller, gain_controller
 from impc.errors import DataError, ImpcError
 from impc.lqr import is_stable
@@ -188,7 +188,7 @@ def evaluate(
         weakly_active += run.weakly_active
         if not run.complete:
             difference[run.reached + 1 :] = _NOT_REACHED * _scale(trial)
-            reason = f"sample {run.reached} was not passed"
+            reason = f"sample {run.reached}: {Status(int(run.status[run.reached])).sentence}"
         residuals.append(difference.ravel())
         derivatives.append(plant.C @ sensitivity.x)
     jacobian = np.concatenate([part.reshape(-1, along.count) for part in derivatives])

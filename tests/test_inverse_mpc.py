@@ -312,3 +312,21 @@ def test_a_recording_that_breaks_a_state_bound_is_fitted_softly_and_said_so(
     found = inverse_mpc_reduced(problem)
     assert not found.kept_hard
     np.testing.assert_allclose(found.gain.K, true.K, atol=1e-6)
+
+
+def test_an_iterate_that_diverges_is_named_and_finite(
+    example_plant: Plant, example_bounds: Bounds
+) -> None:
+    """A gain that gives the bounded input too little to do, from a start that needs it."""
+    problem = example(example_plant, example_bounds, "A")
+    outputs = np.vstack([2.5 * problem.recordings[0].outputs, np.zeros((200, 2))])
+    far = inverse_problem(
+        example_plant,
+        example_bounds,
+        3,
+        (recording(example_plant, outputs),),
+        terminal_set=False,
+    )
+    found = evaluate(far, np.array([[1.02, -0.72]]), np.eye(1))
+    assert "the state left every reasonable range" in found.reason
+    assert np.all(np.isfinite(found.residual))
