@@ -11,10 +11,19 @@ from impc.errors import DataError, InputError
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["Array", "Buffer", "IntArray", "finite_array", "frozen", "symmetric_matrix"]
+__all__ = [
+    "Array",
+    "BoolArray",
+    "Buffer",
+    "IntArray",
+    "finite_array",
+    "frozen",
+    "symmetric_matrix",
+]
 
 Array = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
 IntArray = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
+BoolArray = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
 #: An array as compiled code takes it, of any element type.
 Buffer = np.ndarray[Any, np.dtype[Any]]
 

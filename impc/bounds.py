@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.arrays import Array, frozen
+from impc.arrays import Array, BoolArray, frozen
 from impc.errors import BoundsError
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ class BoundRows:
     ----------
     E, F, b : Array
         Shapes (c, n), (c, m) and (c,).
-    on_state : Array of bool
+    on_state : BoolArray
         Whether the row bounds a state (c,); the others bound an input.
     names : tuple of str
         One name a row, such as ``"u <= 1"``.
@@ -57,7 +57,7 @@ class BoundRows:
     E: Array
     F: Array
     b: Array
-    on_state: np.ndarray[tuple[int], np.dtype[np.bool_]]
+    on_state: BoolArray
     names: tuple[str, ...]
 
 

@@ -17,7 +17,7 @@ import casadi as ca
 import numpy as np
 import scipy.linalg
 
-from impc.arrays import Array, finite_array
+from impc.arrays import Array, BoolArray, finite_array
 from impc.closed_loop import Simulation, Status
 from impc.errors import InputError
 from impc.prediction import build_rows
@@ -74,7 +74,7 @@ class MpcSolver:
         Name of the CasADi plugin.
     function : casadi.Function
         The solver, taking the state as parameter ``p``.
-    soft : Array of bool
+    soft : BoolArray
         Which rows have a slack.
     """
 
@@ -82,7 +82,7 @@ class MpcSolver:
     rows: Rows
     name: str
     function: Any
-    soft: np.ndarray[tuple[int], np.dtype[np.bool_]]
+    soft: BoolArray
 
 
 @dataclass(frozen=True)

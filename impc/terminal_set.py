@@ -24,11 +24,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.arrays import Array, finite_array, frozen
+from impc.arrays import Array, IntArray, finite_array, frozen
 from impc.bounds import BoundRows, bound_rows
 from impc.errors import BoundsError, InputError, SolverError
-from impc.polygon import (
-    IntArray,
+from impc.halfspaces import (
     needed_rows,
     redundant_rows,
     seen_directions,

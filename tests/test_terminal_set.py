@@ -262,7 +262,7 @@ def test_a_near_set_of_the_same_gain_needs_no_programs(monkeypatch: pytest.Monke
     def refuse(*_: object, **__: object) -> None:
         pytest.fail("a linear program was solved")
 
-    monkeypatch.setattr("impc.polygon.linprog", refuse)
+    monkeypatch.setattr("impc.halfspaces.linprog", refuse)
     assert pairs(maximal_invariant_set(*cannon(), near=start)) == pairs(start)
 
 
@@ -416,6 +416,6 @@ def test_errors_say_what_is_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*arguments: Any, **options: Any) -> Any:
         return linprog(*arguments, **{**options, "options": {"maxiter": 0, "presolve": False}})
 
-    monkeypatch.setattr("impc.polygon.linprog", fail)
+    monkeypatch.setattr("impc.halfspaces.linprog", fail)
     with pytest.raises(SolverError, match="HiGHS ended"):
         maximal_invariant_set(plant, K, bounds)
