@@ -1,4 +1,4 @@
-"""A recorded trial as the fits take it: outputs and disturbance on one clock, and the start."""
+"""A recorded trial as the fits take it: outputs and disturbance on the plant's clock."""
 
 from __future__ import annotations
 
@@ -15,7 +15,21 @@ if TYPE_CHECKING:
 
     from impc.plant import Plant
 
-__all__ = ["Recording", "recording"]
+__all__ = ["Label", "Recording", "recording"]
+
+
+@dataclass(frozen=True)
+class Label:
+    """Whose trial it is; empty where the recording does not say."""
+
+    subject: str = ""
+    visit: str = ""
+    condition: str = ""
+    trial: str = ""
+
+    def __str__(self) -> str:
+        parts = (self.subject, self.visit, self.condition, self.trial)
+        return " ".join(part for part in parts if part)
 
 
 @dataclass(frozen=True)
@@ -29,12 +43,17 @@ class Recording:
     disturbance : Array
         (samples, d); row k acts between samples k and k + 1, so that the last is not used.
     x0 : Array
-        State at the first sample (n,).
+        State at the first sample (n,): known, or where a fit of it starts.
+    label : Label
+    findings : tuple of str
+        What the checks of its file found and let pass, one sentence each.
     """
 
     outputs: Array
     disturbance: Array
     x0: Array
+    label: Label = Label()
+    findings: tuple[str, ...] = ()
 
     @property
     def samples(self) -> int:
@@ -47,6 +66,9 @@ def recording(
     outputs: ArrayLike,
     disturbance: ArrayLike | None = None,
     x0: ArrayLike | None = None,
+    *,
+    label: Label | None = None,
+    findings: tuple[str, ...] = (),
 ) -> Recording:
     """Check a trial against the plant and freeze it.
 
@@ -61,6 +83,8 @@ def recording(
     x0 : array_like, optional
         (n,). By default the first output, which must then be the full state; a plant with other
         outputs starts at rest.
+    label : Label, optional
+    findings : tuple of str
 
     Raises
     ------
@@ -80,6 +104,8 @@ def recording(
         frozen(y),
         frozen(finite_array("disturbance", d, (len(y), width))),
         frozen(finite_array("x0", start, (plant.n,))),
+        label or Label(),
+        findings,
     )
 
 

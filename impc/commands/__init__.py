@@ -1,0 +1,1 @@
+"""The subcommands of `impc`: each parses, calls and prints; no mathematics."""

@@ -1,0 +1,23 @@
+"""What the commands print alike."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import click
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+__all__ = ["print_files"]
+
+
+def print_files(out: Path, written: Sequence[Path]) -> None:
+    """Name the files of a folder, one line for each name with its endings."""
+    kinds: dict[str, list[str]] = {}
+    for path in written:
+        kinds.setdefault(path.stem, []).append(path.suffix)
+    click.echo(f"\nWritten to {out}:")
+    for stem, suffixes in kinds.items():
+        click.echo(f"  {stem}{' '.join(suffixes)}")
