@@ -11,25 +11,27 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.linalg
 import scipy.optimize
 
 from impc.arrays import Array, frozen
 from impc.errors import SolverError
-from impc.gain_fibre import natural_coordinates
-from impc.inverse_problem import evaluate
+from impc.evaluation import evaluate
+from impc.gain_coordinates import Coordinates
+from impc.inverse_problem import moved
 from impc.lqr import is_stable, solve_lqr
 from impc.weights import stage_weights
 
 if TYPE_CHECKING:
-    from impc.inverse_problem import Evaluation, InverseProblem
-    from impc.terminal_set import TerminalSet
+    from impc.inverse_problem import InverseProblem
     from impc.weights import Weights
 
 __all__ = ["GainFit", "bryson_starts", "bryson_weights", "fit_gain"]
 
 _EXPLAINED = 1e-9
-_BLOCK = 4096
+_ROUNDS = 8
+# A round of a noisy search ends when the misfit falls by less than 1e-6 of itself; the rounds end
+# when one lowers it by less than 1e-3: the noise is then known to that.
+_NOISY_TOLERANCE, _SETTLED = 1e-6, 1e-3
 _PRICES = 10.0 ** np.arange(-6, 4)
 
 
@@ -43,6 +45,9 @@ class GainFit:
         (m, n).
     S : Array
         Metric (m, m); the one it started from where the recordings do not determine it.
+    problem : InverseProblem
+        The problem at the initial states and the parameters found; the given one when these are
+        known.
     misfit : float
         2-norm of the output residual.
     explained : bool
@@ -50,7 +55,8 @@ class GainFit:
     stabilises : bool
         Whether A - BK is stable. Without a terminal set the search may end where it is not.
     singular_values : Array
-        Of the residual's derivative with respect to K and S, largest first.
+        Of the residual's derivative with respect to K and S in natural coordinates, after initial
+        states and parameters have taken what they can; largest first.
     metric_determined : bool
         Whether the recordings determine S: every singular value of its part, after K has taken
         what it can, is above 1e-8 of the largest.
@@ -62,6 +68,7 @@ class GainFit:
 
     K: Array
     S: Array
+    problem: InverseProblem
     misfit: float
     explained: bool
     stabilises: bool
@@ -76,8 +83,11 @@ def fit_gain(
     *starts: tuple[Array, Array],
     attempts: int = 3,
     max_evaluations: int = 80,
+    spread: float = np.inf,
 ) -> GainFit:
     """Fit K, and S for several inputs, by trust-region least squares with exact derivatives.
+
+    Initial states and physical parameters that the problem does not know are fitted with them.
 
     The misfit has local minima, and beyond some of them the gain no longer stabilises the plant
     although the recording ends before that shows. So the search is made from the few most
@@ -92,6 +102,12 @@ def fit_gain(
         Number of searches at most. They end at a misfit of 1e-9 of the recorded outputs.
     max_evaluations : int
         Budget of simulations with derivatives of each search.
+    spread : float
+        Noisy recordings leave some directions of the gain all but free. A finite spread ends
+        the search where it started along those: each natural coordinate (`Coordinates`) is given
+        a normal prior of that standard deviation about the start of the search, weighed against
+        the noise that the fit itself leaves. Directions that the recordings determine to much less
+        than the spread do not feel it, and without noise nothing does.
 
     Raises
     ------
@@ -105,7 +121,7 @@ def fit_gain(
         )
     best: GainFit | None = None
     for K, S in ranked[:attempts]:
-        found = _search(problem, K, S, max_evaluations)
+        found = _search(problem, K, S, max_evaluations, spread)
         evaluations += found.evaluations
         refused += found.refused
         if best is None or _preference(found) < _preference(best):
@@ -153,144 +169,70 @@ def _rank(
     return [(K, S) for _, K, S in usable], len(starts), refused
 
 
-def _search(problem: InverseProblem, gain: Array, metric: Array, budget: int) -> GainFit:
-    space = _Coordinates(problem, gain, metric)
-    found = scipy.optimize.least_squares(
-        space.residual,
-        space.pack(gain),
-        jac=space.derivative,
-        ftol=1e-12,
-        xtol=1e-12,
-        gtol=1e-15,
-        max_nfev=budget,
-    )
-    K, S = space.unpack(found.x)
-    jacobian = space.at(found.x).jacobian
+def _search(
+    problem: InverseProblem, gain: Array, metric: Array, budget: int, spread: float
+) -> GainFit:
+    """One search; with a finite spread in rounds, each with the noise that the last one left.
+
+    While the misfit still falls by more than its square root, the fit is limited by the prior and
+    not by the recordings: the prior is too strong.
+    """
+    space = Coordinates(problem, gain, metric)
+    z, spent = space.start, 0
+    samples = sum(trial.outputs.size for trial in problem.recordings)
+    misfit = float(np.linalg.norm(space.at(z).residual))
+    for _ in range(_ROUNDS):
+        noise = 0.0 if np.isinf(spread) else misfit / np.sqrt(samples)
+        target = space.with_prior(noise / spread)
+        found = scipy.optimize.least_squares(
+            target.residual,
+            z,
+            jac=target.derivative,
+            ftol=1e-12 if noise == 0 else _NOISY_TOLERANCE,
+            xtol=1e-12,
+            gtol=1e-15,
+            max_nfev=max(budget - spent, 1),
+        )
+        z, spent = found.x, spent + int(found.nfev)
+        before, misfit = misfit, float(np.linalg.norm(space.at(z).residual))
+        if noise == 0 or misfit > (1 - _SETTLED) * before or spent >= budget:
+            break
+    return _gain_fit(space, z, spent)
+
+
+def _gain_fit(space: Coordinates, z: Array, evaluations: int) -> GainFit:
+    found = space.unpack(z)
+    problem = moved(space.problem, found.starts, found.logarithms)
     plant = problem.plant
-    stabilises = is_stable(plant.A - plant.B @ K, discrete=True)
-    size = np.linalg.norm([np.linalg.norm(trial.outputs) for trial in problem.recordings])
-    misfit = float(np.linalg.norm(found.fun))
+    stabilises = is_stable(plant.A - plant.B @ found.K, discrete=True)
+    size = np.linalg.norm(
+        [np.linalg.norm(trial.outputs / problem.output_scale) for trial in problem.recordings]
+    )
+    misfit = float(np.linalg.norm(space.at(z).residual))
+    jacobian = space.without_nuisance(z)
     return GainFit(
-        frozen(K),
-        frozen(S),
+        frozen(found.K),
+        frozen(found.S),
+        problem,
         misfit,
         bool(stabilises and misfit <= _EXPLAINED * size),
         stabilises,
         frozen(np.linalg.svd(jacobian, compute_uv=False)),
-        space.metric_determined(jacobian),
-        int(found.nfev),
+        _metric_determined(jacobian, plant.m * plant.n),
+        evaluations,
         tuple(space.refused),
     )
+
+
+def _metric_determined(jacobian: Array, size: int) -> bool:
+    if jacobian.shape[1] == size:
+        return False
+    basis, _ = np.linalg.qr(jacobian[:, :size])
+    rest = jacobian[:, size:] - basis @ (basis.T @ jacobian[:, size:])
+    values = np.linalg.svd(rest, compute_uv=False)
+    return bool(values[-1] > 1e-8 * np.linalg.norm(jacobian, 2))
 
 
 def _preference(found: GainFit) -> tuple[bool, float]:
     """Smaller is better. A gain that does not stabilise cannot be that of any weights."""
     return not found.stabilises, found.misfit
-
-
-@dataclass(frozen=True)
-class _Compressed:
-    """Residual and derivative in the basis of the derivative's QR factorisation.
-
-    The search uses their norms and inner products only, which are those of the full ones; a
-    recording of thousands of samples becomes a dozen rows.
-    """
-
-    residual: Array
-    jacobian: Array
-
-
-def _compress(evaluation: Evaluation, chain: Array) -> _Compressed:
-    """Factor derivative and residual together, block by block, then apply the chain rule.
-
-    Blocks of a few thousand rows stay in the processor's cache: a recording ten times as long
-    takes ten times the time, not fifteen.
-    """
-    _, m, n = evaluation.dK.shape
-    parts = [evaluation.dK.reshape(-1, m * n)]
-    if m > 1:
-        parts.append(evaluation.dS.reshape(-1, m * m))
-    width = sum(part.shape[1] for part in parts) + 1
-    triangle = np.zeros((0, width))
-    for first in range(0, len(evaluation.residual), _BLOCK):
-        rows = slice(first, first + _BLOCK)
-        block = np.column_stack([*(part[rows] for part in parts), evaluation.residual[rows]])
-        (upper,) = scipy.linalg.qr(np.vstack([triangle, block]), mode="r", check_finite=False)
-        triangle = np.asarray(upper[:width], dtype=np.float64)
-    return _Compressed(triangle[:, -1], triangle[:, :-1] @ chain)
-
-
-class _Coordinates:
-    """Unknowns of the search: the entries of K T, then those of the Cholesky factor of S but one.
-
-    T T' is the covariance of the states that the first gain gives when white noise enters at the
-    inputs, so that a step of length one moves the command by one unit of that noise, whatever the
-    units of the states. On the seat, at four torque limits, a trust region in these coordinates
-    reached the gain from 7 of 11 starts, in raw entries from 5, and in raw entries with columns
-    scaled by the Jacobian from 4 (experiments/benchmarks/search.py).
-
-    Caches the last evaluation, because the residual and its derivative come from one pass.
-    """
-
-    def __init__(self, problem: InverseProblem, gain: Array, metric: Array) -> None:
-        self.problem = problem
-        self.T, _ = natural_coordinates(problem.plant, gain)
-        self.factor = np.linalg.cholesky(metric / metric[0, 0])
-        self.tril = np.tril_indices(problem.plant.m)
-        self.refused: list[str] = []
-        self.last: tuple[bytes, _Compressed] | None = None
-        self.near: TerminalSet | None = None
-
-    def pack(self, gain: Array) -> Array:
-        return np.concatenate([np.ravel(gain @ self.T), self.factor[self.tril][1:]])
-
-    def unpack(self, z: Array) -> tuple[Array, Array]:
-        m, n = self.problem.plant.m, self.problem.plant.n
-        factor = np.zeros((m, m))
-        factor[self.tril] = np.concatenate([[1.0], z[m * n :]])
-        gain = np.linalg.solve(self.T.T, z[: m * n].reshape(m, n).T).T
-        return np.asarray(gain, dtype=np.float64), factor @ factor.T
-
-    def residual(self, z: Array) -> Array:
-        return self.at(z).residual
-
-    def derivative(self, z: Array) -> Array:
-        return self.at(z).jacobian
-
-    def at(self, z: Array) -> _Compressed:
-        key = z.tobytes()
-        if self.last is None or self.last[0] != key:
-            evaluation = evaluate(self.problem, *self.unpack(z), self.near)
-            self.near = evaluation.terminal or self.near
-            if evaluation.reason:
-                self.refused.append(evaluation.reason)
-            self.last = (key, _compress(evaluation, self.chain(z)))
-        return self.last[1]
-
-    def chain(self, z: Array) -> Array:
-        """d (K, S) / d z, entries row by row: (m n + m m, k), or (n, n) for one input."""
-        m, n = self.problem.plant.m, self.problem.plant.n
-        on_gain = np.kron(np.eye(m), np.linalg.inv(self.T).T)
-        if m == 1:
-            return np.asarray(on_gain, dtype=np.float64)
-        factor = np.zeros((m, m))
-        factor[self.tril] = np.concatenate([[1.0], z[m * n :]])
-        metric = factor @ factor.T
-        scale = m / np.trace(metric)
-        columns = []
-        for row, column in list(zip(*self.tril, strict=True))[1:]:
-            moved = np.zeros((m, m))
-            moved[row] = factor[:, column]
-            moved = moved + moved.T
-            # The controller scales the metric to a mean diagonal of 1.
-            columns.append(scale * (moved - metric * np.trace(moved) / np.trace(metric)).ravel())
-        return np.asarray(scipy.linalg.block_diag(on_gain, np.column_stack(columns)))
-
-    def metric_determined(self, jacobian: Array) -> bool:
-        size = self.problem.plant.m * self.problem.plant.n
-        if jacobian.shape[1] == size:
-            return False
-        basis, _ = np.linalg.qr(jacobian[:, :size])
-        rest = jacobian[:, size:] - basis @ (basis.T @ jacobian[:, size:])
-        values = np.linalg.svd(rest, compute_uv=False)
-        return bool(values[-1] > 1e-8 * np.linalg.norm(jacobian, 2))

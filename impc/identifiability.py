@@ -17,7 +17,8 @@ from impc.arrays import Array, frozen
 from impc.closed_loop import simulate
 from impc.conditioned_fit import Residual, weight_jacobian
 from impc.equivalent_weights import gain_fibre, other_weights
-from impc.inverse_problem import controller_for, evaluate, misfit, scenarios
+from impc.evaluation import evaluate
+from impc.inverse_problem import controller_for, misfit, scenarios
 from impc.lqr import solve_lqr
 from impc.step_program import block_basis
 from impc.weights import Weights, condition_number

@@ -18,9 +18,10 @@ from impc.conditioned_fit import ConditionedFit, Objective, Residual, conditione
 from impc.controller import mpc_controller
 from impc.equivalent_weights import gain_fibre, least_condition_weights
 from impc.errors import SolverError, WeightsError
+from impc.evaluation import evaluate
 from impc.gain import GainFit, bryson_weights, fit_gain
 from impc.inverse_lqr import inverse_lqr_gradient, inverse_lqr_lmi
-from impc.inverse_problem import evaluate, scenarios, without_bounds
+from impc.inverse_problem import scenarios, without_bounds
 from impc.lqr import solve_lqr
 from impc.weights import Weights, condition_number, normalised, stage_weights
 

@@ -1,8 +1,11 @@
 """The inverse problem: recordings, and the closed loop that is to explain them.
 
-For a gain K and a metric S the residual is vec(Y_sim - Y), all recordings in a row, and its
-derivatives with respect to K and S are exact. The weights enter through K and S only, so every
-method of the package is one of two searches over this residual: for a gain, or for weights.
+For a gain K and a metric S the residual is vec(Y_sim - Y), all recordings in a row and every output
+divided by its scale, and its derivatives with respect to K and S are exact. The weights enter
+through K and S only, so every method of the package is one of two searches over this residual: for
+a gain, or for weights. What else is not known of a recording, the state in which each trial starts
+and physical parameters of the plant, is searched together with the gain; `moved` gives the problem
+at other values of these.
 """
 
 from __future__ import annotations
@@ -12,34 +15,32 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.arrays import Array
-from impc.bounds import bound_rows, box_bounds
-from impc.closed_loop import Scenario, Status, prepare_loop, run_loop, simulate
+from impc.arrays import Array, finite_array, frozen
+from impc.bounds import box_bounds
+from impc.closed_loop import Scenario
 from impc.controller import Controller, gain_controller
-from impc.errors import DataError, ImpcError
-from impc.lqr import is_stable
-from impc.prediction import Directions, directions
+from impc.errors import DataError, InputError
+from impc.plant_family import plant_at
 
 if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
     from impc.bounds import Bounds
     from impc.closed_loop import Simulation
     from impc.plant import Plant
+    from impc.plant_family import PlantFamily
     from impc.recording import Recording
     from impc.terminal_set import TerminalSet
 
 __all__ = [
-    "Evaluation",
     "InverseProblem",
     "controller_for",
-    "evaluate",
     "inverse_problem",
     "misfit",
+    "moved",
     "scenarios",
     "without_bounds",
 ]
-
-# What a sample that a trial controller does not reach counts for, in root-mean-square outputs.
-_NOT_REACHED = 1e3
 
 
 @dataclass(frozen=True)
@@ -57,6 +58,14 @@ class InverseProblem:
     softening : float
         Price of exceeding a state bound or the terminal set during the search, see `Controller`.
         The rows are verified hard at the end.
+    output_scale : Array
+        What each output is divided by in the residual (p,), in its unit.
+    unknown_start : bool
+        Whether the initial states are searched too, from the `x0` of the recordings.
+    family : PlantFamily or None
+        Plants among which the search goes on; None when the plant is known.
+    logarithms : Array
+        Logarithms of the family's parameters over their nominal values at which `plant` is (k,).
     """
 
     plant: Plant
@@ -65,34 +74,10 @@ class InverseProblem:
     recordings: tuple[Recording, ...]
     terminal_set: bool
     softening: float
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """Residual at one gain and metric.
-
-    Attributes
-    ----------
-    residual : Array
-        (r,), simulated minus recorded outputs.
-    dK : Array
-        (r, m, n).
-    dS : Array
-        (r, m, m), with respect to the metric scaled as in `Controller`.
-    reason : str
-        Why some samples were not reached; empty when all were.
-    weakly_active : int
-        Samples at which the derivative is one-sided.
-    terminal : TerminalSet or None
-        The terminal set, as a hint for the next evaluation nearby.
-    """
-
-    residual: Array
-    dK: Array
-    dS: Array
-    reason: str
-    weakly_active: int
-    terminal: TerminalSet | None
+    output_scale: Array
+    unknown_start: bool
+    family: PlantFamily | None
+    logarithms: Array
 
 
 def inverse_problem(
@@ -103,18 +88,59 @@ def inverse_problem(
     *,
     terminal_set: bool = True,
     softening: float = 1e6,
+    output_scale: ArrayLike | None = None,
+    unknown_start: bool = False,
+    family: PlantFamily | None = None,
 ) -> InverseProblem:
     """Check and gather an inverse problem.
+
+    Parameters
+    ----------
+    plant : Plant
+        That of the family's nominal values, when there is one.
+    bounds : Bounds
+    horizon : int
+    recordings : tuple of Recording
+    terminal_set, softening, unknown_start, family
+        See `InverseProblem`.
+    output_scale : array_like, optional
+        (p,), positive; 1 by default.
 
     Raises
     ------
     PlantError, DataError, InputError
-        When the plant is continuous or there is no recording.
+        When the plant is continuous, there is no recording, or a scale is not positive.
     """
     plant.require_discrete()
     if not recordings:
         raise DataError("recordings", "there are none", "give at least one trial")
-    return InverseProblem(plant, bounds, horizon, tuple(recordings), terminal_set, softening)
+    p = len(plant.outputs)
+    scale = finite_array("output_scale", np.ones(p) if output_scale is None else output_scale, (p,))
+    if np.any(scale <= 0):
+        raise InputError("output_scale", f"got {scale.tolist()}", "give positive numbers")
+    return InverseProblem(
+        plant,
+        bounds,
+        horizon,
+        tuple(recordings),
+        terminal_set,
+        softening,
+        frozen(scale),
+        unknown_start,
+        family,
+        frozen(np.zeros(0 if family is None else len(family.names))),
+    )
+
+
+def moved(problem: InverseProblem, starts: Array, logarithms: Array) -> InverseProblem:
+    """Return the problem at other initial states (trials, n) and other parameters (k,)."""
+    recordings = tuple(
+        replace(trial, x0=frozen(x0)) for trial, x0 in zip(problem.recordings, starts, strict=True)
+    )
+    plant = problem.plant
+    if problem.family is not None and not np.array_equal(logarithms, problem.logarithms):
+        plant = plant_at(problem.family, logarithms)
+    return replace(problem, plant=plant, recordings=recordings, logarithms=frozen(logarithms))
 
 
 def without_bounds(problem: InverseProblem) -> InverseProblem:
@@ -152,97 +178,9 @@ def scenarios(problem: InverseProblem) -> list[Scenario]:
 
 
 def misfit(problem: InverseProblem, simulations: list[Simulation]) -> float:
-    """2-norm of all simulated minus recorded outputs."""
+    """2-norm of all simulated minus recorded outputs, each divided by its scale."""
     parts = [
-        run.x @ problem.plant.C.T - trial.outputs
+        (run.x @ problem.plant.C.T - trial.outputs) / problem.output_scale
         for run, trial in zip(simulations, problem.recordings, strict=True)
     ]
     return float(np.linalg.norm(np.concatenate([part.ravel() for part in parts])))
-
-
-def evaluate(
-    problem: InverseProblem, gain: Array, metric: Array, near: TerminalSet | None = None
-) -> Evaluation:
-    """Residual and exact derivatives at a gain and a metric; `near` as in `controller_for`.
-
-    A gain that does not stabilise the plant, or a loop that diverges, gives a large finite
-    residual and its reason, so that a search can step back from it.
-    """
-    plant = problem.plant
-    m, n = plant.m, plant.n
-    # Past the edge of stability lie local minima that a bounded input and a recording that ends
-    # hide; no weights have such a gain. A plain gain is left free: it goes there and comes back.
-    bounded = problem.terminal_set or len(bound_rows(problem.bounds, plant).b) > 0
-    if bounded and not is_stable(plant.A - plant.B @ gain, discrete=True):
-        return _unusable(problem, "the gain does not stabilise the plant")
-    try:
-        controller = controller_for(problem, gain, metric, near)
-    except ImpcError as error:
-        return _unusable(problem, str(error))
-    along = _gain_and_metric(controller)
-    prepared = prepare_loop(controller, along)
-    residuals, derivatives, reason, weakly_active = [], [], "", 0
-    for trial, drive in zip(problem.recordings, scenarios(problem), strict=True):
-        run, sensitivity = run_loop(prepared, drive)
-        difference = run.x @ plant.C.T - trial.outputs
-        weakly_active += run.weakly_active
-        if not run.complete:
-            difference[run.reached + 1 :] = _NOT_REACHED * _scale(trial)
-            reason = f"sample {run.reached}: {Status(int(run.status[run.reached])).sentence}"
-        residuals.append(difference.ravel())
-        derivatives.append(plant.C @ sensitivity.x)
-    jacobian = np.concatenate([part.reshape(-1, along.count) for part in derivatives])
-    dS = np.zeros((len(jacobian), m, m))
-    rows, columns = np.tril_indices(m)
-    if m > 1:
-        # Off-diagonal directions move two entries at once; half the derivative goes to each.
-        share = np.where(rows == columns, 1.0, 0.5)
-        dS[:, rows, columns] = jacobian[:, m * n :] * share
-        dS[:, columns, rows] = dS[:, rows, columns]
-    return Evaluation(
-        np.concatenate(residuals),
-        jacobian[:, : m * n].reshape(-1, m, n),
-        dS,
-        reason,
-        weakly_active,
-        controller.terminal,
-    )
-
-
-def residual_only(problem: InverseProblem, gain: Array, metric: Array) -> Array:
-    """Residual without derivatives, for differences and comparisons."""
-    controller = controller_for(problem, gain, metric)
-    runs = [simulate(controller, drive) for drive in scenarios(problem)]
-    return np.concatenate(
-        [
-            (run.x @ problem.plant.C.T - trial.outputs).ravel()
-            for run, trial in zip(runs, problem.recordings, strict=True)
-        ]
-    )
-
-
-def _gain_and_metric(controller: Controller) -> Directions:
-    m, n = controller.K.shape
-    rows, columns = np.tril_indices(m)
-    metric_count = len(rows) if m > 1 else 0
-    count = m * n + metric_count
-    dK = np.zeros((m * n, count))
-    dK[:, : m * n] = np.eye(m * n)
-    dS = np.zeros((m, m, count))
-    for index in range(metric_count):
-        dS[rows[index], columns[index], m * n + index] = 1.0
-        dS[columns[index], rows[index], m * n + index] = 1.0
-    return directions(controller, count, K=dK, S=dS)
-
-
-def _scale(trial: Recording) -> float:
-    return float(np.sqrt(np.mean(trial.outputs**2))) or 1.0
-
-
-def _unusable(problem: InverseProblem, reason: str) -> Evaluation:
-    m, n = problem.plant.m, problem.plant.n
-    residual = np.concatenate(
-        [np.full(trial.outputs.size, _NOT_REACHED * _scale(trial)) for trial in problem.recordings]
-    )
-    size = len(residual)
-    return Evaluation(residual, np.zeros((size, m, n)), np.zeros((size, m, m)), reason, 0, None)

@@ -10,6 +10,7 @@ from impc.closed_loop import Status, require_complete, scenario, simulate
 from impc.conditioned_fit import Residual, weight_jacobian
 from impc.controller import gain_controller, mpc_controller
 from impc.equivalent_weights import gain_fibre, least_condition_weights
+from impc.evaluation import evaluate, residual_only
 from impc.example import CASES, run_case
 from impc.gain import fit_gain
 from impc.identifiability import identifiability
@@ -25,14 +26,7 @@ from impc.inverse_mpc import (
     starting_point,
     verify_hard,
 )
-from impc.inverse_problem import (
-    InverseProblem,
-    controller_for,
-    evaluate,
-    inverse_problem,
-    residual_only,
-    without_bounds,
-)
+from impc.inverse_problem import InverseProblem, controller_for, inverse_problem, without_bounds
 from impc.lqr import solve_lqr
 from impc.plant import Plant
 from impc.recording import recording

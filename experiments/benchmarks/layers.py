@@ -12,7 +12,7 @@ import numpy as np
 from experiments.benchmarks.table import Row, compare
 from experiments.benchmarks.timing import side_by_side
 from experiments.benchmarks.workloads import Workload, example
-from impc.inverse_problem import evaluate
+from impc.evaluation import evaluate
 from impc.lqr import solve_lqr
 
 if TYPE_CHECKING:

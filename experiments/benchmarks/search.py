@@ -9,9 +9,9 @@ import scipy.optimize
 
 from experiments.benchmarks.table import Row
 from experiments.benchmarks.workloads import Workload, seat
+from impc.evaluation import evaluate
 from impc.gain_fibre import natural_coordinates
 from impc.inverse_mpc import start_gains, starting_point
-from impc.inverse_problem import evaluate
 from impc.lqr import is_stable
 
 if TYPE_CHECKING:

@@ -15,8 +15,8 @@ import numpy as np
 import scipy.optimize
 
 from impc.conditioned_fit import Residual, weight_jacobian
+from impc.evaluation import evaluate
 from impc.inverse_mpc import CONDITION_WEIGHT, inverse_mpc
-from impc.inverse_problem import evaluate
 from impc.lqr import solve_lqr
 from impc.weights import cholesky_parameters, condition_number, weights_from_parameters
 
