@@ -14,25 +14,23 @@ import numpy as np
 import scipy.optimize
 
 from impc.arrays import Array, frozen
+from impc.diagonal_weights import bryson_weights
 from impc.errors import SolverError
 from impc.evaluation import evaluate
 from impc.gain_coordinates import Coordinates
 from impc.inverse_problem import moved
 from impc.lqr import is_stable, solve_lqr
-from impc.weights import stage_weights
 
 if TYPE_CHECKING:
     from impc.inverse_problem import InverseProblem
-    from impc.weights import Weights
 
-__all__ = ["GainFit", "bryson_starts", "bryson_weights", "fit_gain"]
+__all__ = ["GainFit", "bryson_starts", "fit_gain"]
 
 _EXPLAINED = 1e-9
 _ROUNDS = 8
 # A round of a noisy search ends when the misfit falls by less than 1e-6 of itself; the rounds end
 # when one lowers it by less than 1e-3: the noise is then known to that.
 _NOISY_TOLERANCE, _SETTLED = 1e-6, 1e-3
-_PRICES = 10.0 ** np.arange(-6, 4)
 
 
 @dataclass(frozen=True)
@@ -130,19 +128,6 @@ def fit_gain(
             break
     assert best is not None  # attempts >= 1 and something was ranked
     return replace(best, evaluations=evaluations, refused=tuple(refused))
-
-
-def bryson_weights(problem: InverseProblem) -> list[Weights]:
-    """Weights that price each recorded output by its size (Bryson's rule), over a range of efforts.
-
-    Q = C'diag(1/mean(y^2))C plus 1e-8 of its mean diagonal, R = rho I for rho from 1e-6 to 1e3.
-    """
-    plant = problem.plant
-    recorded = np.concatenate([trial.outputs for trial in problem.recordings])
-    power = np.maximum(np.mean(recorded**2, axis=0), 1e-300)
-    Q = plant.C.T @ np.diag(1 / power) @ plant.C
-    Q += 1e-8 * np.trace(Q) / plant.n * np.eye(plant.n)
-    return [stage_weights(Q, rho * np.eye(plant.m)) for rho in _PRICES]
 
 
 def bryson_starts(problem: InverseProblem) -> list[tuple[Array, Array]]:

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from impc.inverse_problem import InverseProblem
     from impc.terminal_set import TerminalSet
 
-__all__ = ["Compressed", "Coordinates", "Point", "WithPrior"]
+__all__ = ["Compressed", "Coordinates", "Point", "WithPrior", "start_unit"]
 
 _BLOCK = 4096
 _PARAMETER_UNIT = 1 / 3
@@ -69,7 +69,7 @@ class Coordinates:
         plant = problem.plant
         self.m, self.n, self.trials = plant.m, plant.n, len(problem.recordings)
         self.T, _ = natural_coordinates(plant, gain)
-        self.start_unit = _output_size(problem, self.T) * self.T
+        self.start_unit = start_unit(problem, gain)
         self.factor = np.linalg.cholesky(metric / metric[0, 0])
         self.tril = np.tril_indices(self.m)
         self.refused: list[str] = []
@@ -203,12 +203,16 @@ class WithPrior:
         return np.vstack([data, self.weight * np.eye(len(z))])
 
 
-def _output_size(problem: InverseProblem, T: Array) -> float:
-    """Factor that makes white noise at the inputs as large as the recorded outputs."""
+def start_unit(problem: InverseProblem, gain: Array) -> Array:
+    """g T, (n, n): states of the size that white noise at the inputs gives them under a gain.
+
+    g enlarges that noise until the outputs are as large as those recorded.
+    """
+    T, _ = natural_coordinates(problem.plant, gain)
     scaled = np.concatenate([trial.outputs / problem.output_scale for trial in problem.recordings])
-    natural = np.linalg.norm(problem.plant.C @ T / problem.output_scale[:, None])
+    natural = float(np.linalg.norm(problem.plant.C @ T / problem.output_scale[:, None]))
     size = float(np.sqrt(np.sum(np.mean(scaled**2, axis=0))))
-    return size / float(natural) if size > 0 and natural > 0 else 1.0
+    return size / natural * T if size > 0 and natural > 0 else T
 
 
 def _triangle(columns: list[Array]) -> Array:

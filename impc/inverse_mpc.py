@@ -16,10 +16,11 @@ from impc.arrays import Array
 from impc.closed_loop import simulate
 from impc.conditioned_fit import ConditionedFit, Objective, Residual, conditioned_fit
 from impc.controller import mpc_controller
+from impc.diagonal_weights import bryson_weights
 from impc.equivalent_weights import gain_fibre, least_condition_weights
 from impc.errors import SolverError, WeightsError
 from impc.evaluation import evaluate
-from impc.gain import GainFit, bryson_weights, fit_gain
+from impc.gain import GainFit, fit_gain
 from impc.inverse_lqr import inverse_lqr_gradient, inverse_lqr_lmi
 from impc.inverse_problem import scenarios, without_bounds
 from impc.lqr import solve_lqr

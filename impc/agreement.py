@@ -1,0 +1,109 @@
+"""How well a simulation agrees with a recording: VAF (3.24), and whether what is left is noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from statsmodels.stats.diagnostic import acorr_ljungbox
+
+from impc.arrays import Array, frozen
+
+if TYPE_CHECKING:
+    from impc.closed_loop import Simulation
+    from impc.plant import Plant
+    from impc.recording import Recording
+
+__all__ = [
+    "TrialAgreement",
+    "agreement",
+    "centred_vaf",
+    "saturated_share",
+    "vaf",
+    "whiteness",
+]
+
+# One second of lags tells a rhythm that was missed; fewer than ten tell nothing.
+_LEAST_LAGS = 10
+
+
+@dataclass(frozen=True)
+class TrialAgreement:
+    """One trial against its simulation.
+
+    Attributes
+    ----------
+    vaf : Array
+        (3.24) of each output, % (p,).
+    centred_vaf : Array
+        The same with the means removed, 1 - var(y - y_sim)/var(y), % (p,).
+    whiteness : Array
+        p-value of Ljung and Box's test that the residual is white, one second of lags (p,).
+    rms : Array
+        Root-mean-square residual in the outputs' units (p,).
+    saturated : float
+        Share of the samples at which an input bound is reached.
+    """
+
+    vaf: Array
+    centred_vaf: Array
+    whiteness: Array
+    rms: Array
+    saturated: float
+
+
+def vaf(recorded: Array, simulated: Array) -> Array:
+    """Variance accounted for (3.24): (1 - sum (y - y_sim)^2 / sum y^2) 100 %, one for each column.
+
+    NaN where the recorded output is zero throughout.
+    """
+    left = np.sum((recorded - simulated) ** 2, axis=0)
+    total = np.sum(recorded**2, axis=0)
+    return 100 * (1 - np.divide(left, total, out=np.full_like(left, np.nan), where=total > 0))
+
+
+def centred_vaf(recorded: Array, simulated: Array) -> Array:
+    """As `vaf`, with the means removed from what was recorded and from what is left, %."""
+    left = np.var(recorded - simulated, axis=0)
+    total = np.var(recorded, axis=0)
+    return 100 * (1 - np.divide(left, total, out=np.full_like(left, np.nan), where=total > 0))
+
+
+def whiteness(residual: Array, lags: int) -> Array:
+    """p-values of Ljung and Box's test for each column; NaN where nothing is left to test."""
+    values = []
+    for column in residual.T:
+        if np.ptp(column) == 0:
+            values.append(np.nan)
+            continue
+        values.append(float(acorr_ljungbox(column, lags=[lags])["lb_pvalue"].iloc[0]))
+    return np.array(values)
+
+
+def agreement(
+    plant: Plant, trial: Recording, run: Simulation, u_min: Array, u_max: Array
+) -> TrialAgreement:
+    """Compare a trial with its simulation from the first sample to the last.
+
+    Parameters
+    ----------
+    u_min, u_max : Array
+        Input bounds (m,), for the share of saturated samples.
+    """
+    simulated = run.x @ plant.C.T
+    residual = trial.outputs - simulated
+    lags = min(max(round(1 / plant.dt), _LEAST_LAGS), trial.samples // 5)
+    return TrialAgreement(
+        frozen(vaf(trial.outputs, simulated)),
+        frozen(centred_vaf(trial.outputs, simulated)),
+        frozen(whiteness(residual, max(lags, 1))),
+        frozen(np.sqrt(np.mean(residual**2, axis=0))),
+        saturated_share(run.u, u_min, u_max),
+    )
+
+
+def saturated_share(u: Array, u_min: Array, u_max: Array) -> float:
+    """Share of samples at which any input stands on a bound, to 1e-6 of it."""
+    near = (u >= u_max - 1e-6 * np.abs(u_max)) | (u <= u_min + 1e-6 * np.abs(u_min))
+    return float(np.mean(np.any(near, axis=1)))

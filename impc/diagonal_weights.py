@@ -1,0 +1,143 @@
+"""The diagonal weights that fit recordings best: where a search for a gain starts.
+
+A regulator always stabilises, and n prices of states, with R = I, describe enough of them
+to come near any gain. So the search for the prices rarely leaves what can be simulated,
+and from its end the search for the gain itself has a short way. On the noisy seat at three torque
+limits it finds the right basin from here where it misses it from Bryson's rule
+(experiments/benchmarks/search.py).
+
+The unknowns are the logarithms of q_i, Q = diag(q_i (u / x_i)^2), where x_i and u are the sizes
+that states and command have under the best of `bryson_weights`; a normal prior of a factor e^3
+about that start keeps those prices where they are that the recordings do not see.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy.optimize
+
+from impc.arrays import Array
+from impc.closed_loop import simulate
+from impc.errors import SolverError, WeightsError
+from impc.evaluation import Evaluation, evaluate
+from impc.inverse_problem import controller_for, scenarios
+from impc.lqr import LqrSolution, gain_gradients, solve_lqr
+from impc.weights import Weights, stage_weights
+
+if TYPE_CHECKING:
+    from impc.inverse_problem import InverseProblem
+
+__all__ = ["bryson_weights", "diagonal_weights"]
+
+_PRICES = 10.0 ** np.arange(-6, 4)
+_SPREAD = 3.0
+# A price that no output tells of starts at this share of the cost of the command.
+_SMALL = 1e-2
+# The end is only a start: a decrease of 1e-4 of the misfit is not worth another step.
+_TOLERANCE = 1e-4
+
+
+def bryson_weights(problem: InverseProblem) -> list[Weights]:
+    """Weights that price each recorded output by its size (Bryson's rule), over a range of efforts.
+
+    Q = C'diag(1/mean(y^2))C plus 1e-8 of its mean diagonal, R = rho I for rho from 1e-6 to 1e3.
+    """
+    plant = problem.plant
+    recorded = np.concatenate([trial.outputs for trial in problem.recordings])
+    power = np.maximum(np.mean(recorded**2, axis=0), 1e-300)
+    Q = plant.C.T @ np.diag(1 / power) @ plant.C
+    Q += 1e-8 * np.trace(Q) / plant.n * np.eye(plant.n)
+    return [stage_weights(Q, rho * np.eye(plant.m)) for rho in _PRICES]
+
+
+def diagonal_weights(problem: InverseProblem, *, max_evaluations: int = 30) -> Weights:
+    """Fit the prices of the states, at given initial states, plant and R = I.
+
+    Raises
+    ------
+    SolverError
+        When none of `bryson_weights` can be simulated.
+    """
+    search = _Prices(problem, *_best(problem))
+    start = search.start
+    noise = float(np.linalg.norm(search.at(start).residual)) / np.sqrt(search.samples)
+    weight = noise / _SPREAD
+
+    def residual(z: Array) -> Array:
+        return np.concatenate([search.at(z).residual, weight * (z - start)])
+
+    def derivative(z: Array) -> Array:
+        return np.vstack([search.derivative(z), weight * np.eye(len(z))])
+
+    found = scipy.optimize.least_squares(
+        residual, start, jac=derivative, ftol=_TOLERANCE, max_nfev=max_evaluations
+    )
+    return search.weights(found.x)
+
+
+def _best(problem: InverseProblem) -> tuple[Weights, LqrSolution]:
+    """Of `bryson_weights` those with the least misfit."""
+    candidates, reason = [], ""
+    for weights in bryson_weights(problem):
+        try:
+            solution = solve_lqr(problem.plant, weights)
+        except WeightsError as error:
+            reason = str(error)
+            continue
+        found = evaluate(problem, solution.K, solution.S)
+        reason = reason or found.reason
+        if not found.reason:
+            candidates.append((float(np.linalg.norm(found.residual)), weights, solution))
+    if not candidates:
+        raise SolverError(
+            "gain", f"no regulator can be simulated: {reason}", "check the plant and the bounds"
+        )
+    _, weights, solution = min(candidates, key=lambda item: item[0])
+    return weights, solution
+
+
+@dataclass(frozen=True)
+class _Evaluated:
+    evaluation: Evaluation
+    solution: LqrSolution
+
+    @property
+    def residual(self) -> Array:
+        return self.evaluation.residual
+
+
+class _Prices:
+    """The residual as a function of the logarithms of the prices; keeps the last evaluation."""
+
+    def __init__(self, problem: InverseProblem, weights: Weights, solution: LqrSolution) -> None:
+        self.problem = problem
+        controller = controller_for(problem, solution.K, solution.S)
+        runs = [simulate(controller, drive) for drive in scenarios(problem)]
+        x, u = (np.concatenate([getattr(run, name) for run in runs]) for name in "xu")
+        state, command = np.sqrt(np.mean(x**2, axis=0)), np.sqrt(np.mean(u**2))
+        self.unit = (command / np.maximum(state, 1e-12 * np.max(state))) ** 2
+        self.samples = sum(trial.outputs.size for trial in problem.recordings)
+        priced = np.diag(weights.Q) / weights.R[0, 0] / self.unit
+        self.start = np.log(np.maximum(priced, _SMALL))
+        self.last: tuple[bytes, _Evaluated] | None = None
+
+    def weights(self, z: Array) -> Weights:
+        return stage_weights(np.diag(np.exp(z) * self.unit), np.eye(self.problem.plant.m))
+
+    def at(self, z: Array) -> _Evaluated:
+        key = z.tobytes()
+        if self.last is None or self.last[0] != key:
+            solution = solve_lqr(self.problem.plant, self.weights(z))
+            found = evaluate(self.problem, solution.K, solution.S)
+            self.last = (key, _Evaluated(found, solution))
+        return self.last[1]
+
+    def derivative(self, z: Array) -> Array:
+        """Through the gain alone: that of the metric is small, and this is a start."""
+        here = self.at(z)
+        change = gain_gradients(here.solution).Q  # (m, n, n, n)
+        diagonal = np.einsum("mnii->mni", change) * np.exp(z) * self.unit
+        return np.asarray(np.tensordot(here.evaluation.dK, diagonal, 2))

@@ -1,0 +1,119 @@
+"""From recordings to one controller: gain, weights, initial states, physical parameters.
+
+    diagonal weights  ->  gain with initial states and parameters  ->  weights with that gain, or
+                                                                       the direct form near it
+
+A gain that explains its recordings to 1e-9 has weights to find, and the reduced form finds them:
+one semidefinite program. With noise a fitted gain has none as a rule, and the direct form in
+natural coordinates (`natural_fit`) takes the weights that fit best.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.diagonal_weights import diagonal_weights
+from impc.equivalent_weights import least_condition_weights
+from impc.errors import WeightsError
+from impc.evaluation import residual_only
+from impc.gain import GainFit, fit_gain
+from impc.gain_fibre import gain_fibre
+from impc.initial_states import with_fitted_starts
+from impc.lqr import solve_lqr
+from impc.natural_fit import inverse_mpc_natural
+
+if TYPE_CHECKING:
+    from impc.inverse_problem import InverseProblem
+    from impc.lqr import LqrSolution
+    from impc.weights import Weights
+
+__all__ = ["FittedController", "fit_controller"]
+
+# Of the natural coordinates of the gain, see `fit_gain`: no optimal gain is far beyond 1.
+_SPREAD = 1.0
+
+
+@dataclass(frozen=True)
+class FittedController:
+    """Weights whose constrained controller explains recordings, and the gain that needs no weights.
+
+    Attributes
+    ----------
+    problem : InverseProblem
+        At the initial states and parameters found.
+    free : GainFit
+        The best gain of any kind, under the same bounds.
+    weights : Weights
+        Scaled to R[0, 0] = 1.
+    solution : LqrSolution
+        Their regulator.
+    misfit : float
+        2-norm of the residual with these weights.
+    exact : bool
+        Whether the weights have exactly the free gain.
+    converged : bool
+        Whether the search for the weights ended.
+    """
+
+    problem: InverseProblem
+    free: GainFit
+    weights: Weights
+    solution: LqrSolution
+    misfit: float
+    exact: bool
+    converged: bool
+
+
+def fit_controller(problem: InverseProblem, start: Weights | None = None) -> FittedController:
+    """Fit the weights of the constrained controller behind recordings.
+
+    Parameters
+    ----------
+    problem : InverseProblem
+    start : Weights, optional
+        Where the search begins; by default the best diagonal ones.
+
+    Raises
+    ------
+    WeightsError, SolverError
+        When no regulator can be simulated, or no weights can be found.
+    """
+    begin = diagonal_weights(problem) if start is None else start
+    free = _free_gain(problem, begin)
+    if free.explained:
+        try:
+            weights = least_condition_weights(gain_fibre(free.problem.plant, free.K)).weights
+        except WeightsError:
+            pass  # no weights have that gain: the direct form says which come near
+        else:
+            return _finish(free, free.problem, weights, exact=True, converged=True)
+    found = inverse_mpc_natural(free.problem, begin, _noise(free))
+    if found.misfit < free.misfit:  # the free gain stands in a local minimum
+        free = _free_gain(free.problem, found.weights)
+        found = inverse_mpc_natural(free.problem, found.weights, _noise(free))
+    settled = free.problem
+    if problem.unknown_start:
+        settled = with_fitted_starts(free.problem, found.solution.K, found.solution.S)
+    return _finish(free, settled, found.weights, exact=False, converged=found.converged)
+
+
+def _free_gain(problem: InverseProblem, begin: Weights) -> GainFit:
+    solution = solve_lqr(problem.plant, begin)
+    return fit_gain(problem, (solution.K, solution.S), attempts=1, spread=_SPREAD)
+
+
+def _noise(free: GainFit) -> float:
+    """Misfit of the free gain, at least that of rounding."""
+    outputs = [trial.outputs / free.problem.output_scale for trial in free.problem.recordings]
+    return max(free.misfit, 1e-9 * float(np.linalg.norm(np.concatenate(outputs))))
+
+
+def _finish(
+    free: GainFit, problem: InverseProblem, weights: Weights, *, exact: bool, converged: bool
+) -> FittedController:
+    solution = solve_lqr(problem.plant, weights)
+    misfit = float(np.linalg.norm(residual_only(problem, solution.K, solution.S)))
+    return FittedController(problem, free, weights, solution, misfit, exact, converged)

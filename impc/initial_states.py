@@ -1,0 +1,71 @@
+"""The states in which trials start, when the controller is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy.optimize
+
+from impc.arrays import Array, frozen
+from impc.evaluation import evaluate
+from impc.gain_coordinates import start_unit
+
+if TYPE_CHECKING:
+    from impc.evaluation import Evaluation
+    from impc.inverse_problem import InverseProblem
+
+__all__ = ["with_fitted_starts"]
+
+_EVALUATIONS = 20
+
+
+def with_fitted_starts(
+    problem: InverseProblem, gain: Array, metric: Array, samples: int | None = None
+) -> InverseProblem:
+    """Return the problem with each trial's x0 fitted to its first samples under a controller.
+
+    From the given x0, by trust-region least squares. Where the samples leave x0 free it stays: it
+    is given a normal prior of the size that white noise at the inputs, enlarged to the recorded
+    outputs, gives the states, which weighs as the residual's own noise does.
+
+    Parameters
+    ----------
+    samples : int, optional
+        How many samples of each trial may be looked at; all by default.
+    """
+    fitted = []
+    for trial in problem.recordings:
+        seen = trial.samples if samples is None else min(samples, trial.samples)
+        short = replace(trial, outputs=trial.outputs[:seen], disturbance=trial.disturbance[:seen])
+        one = replace(problem, recordings=(short,), unknown_start=True)
+        fitted.append(replace(trial, x0=frozen(_fit(one, gain, metric))))
+    return replace(problem, recordings=tuple(fitted))
+
+
+def _fit(problem: InverseProblem, gain: Array, metric: Array) -> Array:
+    unit = start_unit(problem, gain)
+    (trial,) = problem.recordings
+    n = problem.plant.n
+
+    def at(z: Array) -> Evaluation:
+        moved = replace(trial, x0=frozen(trial.x0 + unit @ z))
+        return evaluate(replace(problem, recordings=(moved,)), gain, metric)
+
+    # What no x0 explains is noise: to first order, the residual beside the derivative's columns.
+    first = at(np.zeros(n))
+    columns = first.dx0 @ unit
+    left = first.residual - columns @ np.linalg.lstsq(columns, first.residual)[0]
+    noise = float(np.linalg.norm(left)) / np.sqrt(len(left))
+
+    def residual(z: Array) -> Array:
+        return np.concatenate([at(z).residual, noise * z])
+
+    def derivative(z: Array) -> Array:
+        return np.vstack([at(z).dx0 @ unit, noise * np.eye(n)])
+
+    found = scipy.optimize.least_squares(
+        residual, np.zeros(n), jac=derivative, ftol=1e-10, max_nfev=_EVALUATIONS
+    )
+    return np.asarray(trial.x0 + unit @ found.x)

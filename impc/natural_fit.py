@@ -1,0 +1,144 @@
+"""Weights for noisy recordings: the direct form (3.6) in coordinates in which it is well posed.
+
+Noise moves a fitted gain off the gains that any weights have, so the reduced form has no answer.
+The direct form, misfit plus condition number, has one, but in the units of a plant such as the
+seat (radians beside the states of a delay) all weights near the answer have condition numbers of
+1e7, and a condition number that large outweighs any misfit. In natural coordinates (`gain_fibre`)
+the same weights have condition numbers of 10 to 100. There it is a mild regulariser, which is what
+(3.6) wants of it, and half a dozen prox-linear steps reach the answer.
+
+    minimise  ||r||^2 / ||r_free||^2 + share * kappa(blkdiag(T'QT, G'RG)) / kappa_start
+
+r_free is the residual of the gain without weights (`fit_gain`), which says how much is noise; T and
+G are the natural coordinates of the start and stay. What the share of 1e-3 costs in VAF against
+that gain is measured in docs/fitting.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.arrays import Array, frozen
+from impc.conditioned_fit import Objective, Residual, conditioned_fit
+from impc.equivalent_weights import least_condition_weights
+from impc.evaluation import evaluate
+from impc.gain_fibre import gain_fibre, natural_coordinates, pair_blocks, split_blocks
+from impc.lqr import solve_lqr
+from impc.weights import Weights, condition_number, normalised
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from impc.conditioned_fit import ConditionedFit
+    from impc.inverse_problem import InverseProblem
+    from impc.lqr import LqrSolution
+    from impc.plant import Plant
+    from impc.terminal_set import TerminalSet
+
+__all__ = ["CONDITION_SHARE", "inverse_mpc_natural"]
+
+CONDITION_SHARE = 1e-3
+# A step that promises less than this, of the objective, is below what the noise decides.
+_TOLERANCE = 1e-5
+
+
+def inverse_mpc_natural(
+    problem: InverseProblem,
+    start: Weights,
+    noise: float,
+    *,
+    condition_share: float = CONDITION_SHARE,
+    max_iterations: int = 40,
+) -> ConditionedFit:
+    """Direct inverse MPC in natural coordinates, at given initial states and plant.
+
+    Parameters
+    ----------
+    problem : InverseProblem
+    start : Weights
+        Positive definite. Their gain is kept and the weights of least condition number with it, in
+        natural coordinates, are where the search begins.
+    noise : float
+        2-norm of the residual that no weights are asked to explain; positive.
+    condition_share : float
+        What the condition number of the start counts, against a misfit of `noise`.
+
+    Returns
+    -------
+    ConditionedFit
+        Weights and solution in the units of the plant; `misfit` is the 2-norm of the residual,
+        `condition` and `objective` are those of the search, in natural coordinates.
+
+    Raises
+    ------
+    WeightsError, SolverError
+        When the start has no stabilising solution, or the recordings cannot be simulated with it.
+    """
+    plant = problem.plant
+    gain = solve_lqr(plant, start).K
+    T, G = natural_coordinates(plant, gain)
+    natural = _transformed(plant, T, G)
+    begin = least_condition_weights(gain_fibre(natural, np.linalg.solve(G, gain @ T))).weights
+    share = condition_share / condition_number(begin)
+    objective = Objective(_residual(problem, T, G, noise), 1.0, share, squared=True)
+    found = conditioned_fit(
+        natural, objective, begin, max_iterations=max_iterations, tolerance=_TOLERANCE
+    )
+    weights = normalised(_in_plant_units(found.weights, T, G))
+    return replace(
+        found,
+        weights=weights,
+        solution=solve_lqr(plant, weights),
+        misfit=found.misfit * noise,
+    )
+
+
+def _transformed(plant: Plant, T: Array, G: Array) -> Plant:
+    """The plant in z = T^-1 x, v = G^-1 u."""
+    back = np.linalg.inv(T)
+    return replace(
+        plant,
+        A=frozen(back @ plant.A @ T),
+        B=frozen(back @ plant.B @ G),
+        E=frozen(back @ plant.E),
+        C=frozen(plant.C @ T),
+    )
+
+
+def _in_plant_units(weights: Weights, T: Array, G: Array) -> Weights:
+    z, v = np.linalg.inv(T), np.linalg.inv(G)
+    block = pair_blocks((z.T @ weights.Q @ z)[None], (v.T @ weights.R @ v)[None])[0]
+    return split_blocks(block, len(T))
+
+
+def _residual(
+    problem: InverseProblem, T: Array, G: Array, noise: float
+) -> Callable[[LqrSolution], Residual]:
+    """Residual over noise of a regulator given in natural coordinates, u = -G K T^-1 x."""
+    known = replace(problem, unknown_start=False, family=None, logarithms=frozen(np.zeros(0)))
+    z, v = np.linalg.inv(T), np.linalg.inv(G)
+    near: TerminalSet | None = None
+
+    def residual(solution: LqrSolution) -> Residual:
+        nonlocal near
+        metric = v.T @ solution.S @ v
+        found = evaluate(known, G @ solution.K @ z, metric, near)
+        near = found.terminal or near
+        dS = v @ found.dS @ v.T * _scale_ratio(metric, solution.S)
+        dK = np.asarray(G.T @ found.dK @ z.T)
+        usable = not found.reason
+        return Residual(found.residual / noise, dK / noise, dS / noise, usable=usable)
+
+    return residual
+
+
+def _scale_ratio(metric: Array, natural: Array) -> float:
+    """Both metrics are scaled to a mean diagonal of 1 before they are differentiated.
+
+    The residual does not change along the metric's own scale, so the derivative with respect to
+    one scaled metric is that with respect to the other, times the ratio of their scales.
+    """
+    return float(np.trace(natural) / np.trace(metric))
