@@ -60,14 +60,16 @@ def vaf(recorded: Array, simulated: Array) -> Array:
     """
     left = np.sum((recorded - simulated) ** 2, axis=0)
     total = np.sum(recorded**2, axis=0)
-    return 100 * (1 - np.divide(left, total, out=np.full_like(left, np.nan), where=total > 0))
+    share = np.divide(left, total, out=np.full_like(left, np.nan), where=total > 0)
+    return np.asarray(100 * (1 - share))
 
 
 def centred_vaf(recorded: Array, simulated: Array) -> Array:
     """As `vaf`, with the means removed from what was recorded and from what is left, %."""
     left = np.var(recorded - simulated, axis=0)
     total = np.var(recorded, axis=0)
-    return 100 * (1 - np.divide(left, total, out=np.full_like(left, np.nan), where=total > 0))
+    share = np.divide(left, total, out=np.full_like(left, np.nan), where=total > 0)
+    return np.asarray(100 * (1 - share))
 
 
 def whiteness(residual: Array, lags: int) -> Array:

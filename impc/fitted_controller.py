@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from impc.lqr import LqrSolution
     from impc.weights import Weights
 
-__all__ = ["FittedController", "fit_controller"]
+__all__ = ["FittedController", "fit_controller", "free_gain", "noise_of"]
 
 # Of the natural coordinates of the gain, see `fit_gain`: no optimal gain is far beyond 1.
 _SPREAD = 1.0
@@ -82,7 +82,7 @@ def fit_controller(problem: InverseProblem, start: Weights | None = None) -> Fit
         When no regulator can be simulated, or no weights can be found.
     """
     begin = diagonal_weights(problem) if start is None else start
-    free = _free_gain(problem, begin)
+    free = free_gain(problem, begin)
     if free.explained:
         try:
             weights = least_condition_weights(gain_fibre(free.problem.plant, free.K)).weights
@@ -90,22 +90,23 @@ def fit_controller(problem: InverseProblem, start: Weights | None = None) -> Fit
             pass  # no weights have that gain: the direct form says which come near
         else:
             return _finish(free, free.problem, weights, exact=True, converged=True)
-    found = inverse_mpc_natural(free.problem, begin, _noise(free))
+    found = inverse_mpc_natural(free.problem, begin, noise_of(free))
     if found.misfit < free.misfit:  # the free gain stands in a local minimum
-        free = _free_gain(free.problem, found.weights)
-        found = inverse_mpc_natural(free.problem, found.weights, _noise(free))
+        free = free_gain(free.problem, found.weights)
+        found = inverse_mpc_natural(free.problem, found.weights, noise_of(free))
     settled = free.problem
     if problem.unknown_start:
         settled = with_fitted_starts(free.problem, found.solution.K, found.solution.S)
     return _finish(free, settled, found.weights, exact=False, converged=found.converged)
 
 
-def _free_gain(problem: InverseProblem, begin: Weights) -> GainFit:
+def free_gain(problem: InverseProblem, begin: Weights) -> GainFit:
+    """The best gain of any kind near that of some weights, with what else the problem lacks."""
     solution = solve_lqr(problem.plant, begin)
     return fit_gain(problem, (solution.K, solution.S), attempts=1, spread=_SPREAD)
 
 
-def _noise(free: GainFit) -> float:
+def noise_of(free: GainFit) -> float:
     """Misfit of the free gain, at least that of rounding."""
     outputs = [trial.outputs / free.problem.output_scale for trial in free.problem.recordings]
     return max(free.misfit, 1e-9 * float(np.linalg.norm(np.concatenate(outputs))))

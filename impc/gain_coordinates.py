@@ -1,6 +1,6 @@
 """The unknowns of a search for a gain, in coordinates in which a step of one is a large step.
 
-    z = (K T | Cholesky factor of S but its first entry | x0 of each trial in g T | parameters)
+    z = (K T | Cholesky factor of S but its first entry | x0 of each trial | parameters)
 
 T T' is the covariance of the states that the first gain gives when white noise enters at the
 inputs, so that a step of length one moves the command by one unit of that noise, whatever the
@@ -9,7 +9,8 @@ the gain from 7 of 11 starts, in raw entries from 5, and in raw entries with col
 Jacobian from 4 (experiments/benchmarks/search.py). No optimal regulator has a K T of norm above
 (tr(B'PB)/R)^(1/2), because white noise costs it tr(B'PB) a sample, of which R u^2 is a part.
 
-g T is T enlarged to the size of the recorded outputs, and a parameter's unit is a third of itself.
+Initial states are measured in those of the trials themselves (`start_unit`), and a parameter in
+thirds of itself.
 """
 
 from __future__ import annotations
@@ -21,9 +22,10 @@ import numpy as np
 import scipy.linalg
 
 from impc.arrays import Array
+from impc.closed_loop import simulate
 from impc.evaluation import evaluate
-from impc.gain_fibre import natural_coordinates
-from impc.inverse_problem import moved
+from impc.gain_fibre import floored_covariance, natural_coordinates
+from impc.inverse_problem import controller_for, moved, scenarios
 
 if TYPE_CHECKING:
     from impc.evaluation import Evaluation
@@ -34,6 +36,7 @@ __all__ = ["Compressed", "Coordinates", "Point", "WithPrior", "start_unit"]
 
 _BLOCK = 4096
 _PARAMETER_UNIT = 1 / 3
+_START_FLOOR = 1e-8
 
 
 @dataclass(frozen=True)
@@ -204,13 +207,21 @@ class WithPrior:
 
 
 def start_unit(problem: InverseProblem, gain: Array) -> Array:
-    """g T, (n, n): states of the size that white noise at the inputs gives them under a gain.
+    """Unit of initial states, (n, n): they are thought of as any other state of their trials.
 
-    g enlarges that noise until the outputs are as large as those recorded.
+    A factor of the second moments that the states have when the gain's controller is driven as the
+    recordings were. Where nothing drives it, white noise at the inputs of the size of the outputs.
     """
-    T, _ = natural_coordinates(problem.plant, gain)
+    plant = problem.plant
+    controller = controller_for(problem, gain, np.eye(plant.m))
+    runs = [simulate(controller, drive) for drive in scenarios(problem)]
+    x = np.concatenate([run.x[: run.reached + 1] for run in runs])
+    second = x.T @ x / len(x)
+    if np.all(np.isfinite(second)) and np.all(np.diag(second) > 0):
+        return np.asarray(np.linalg.cholesky(floored_covariance(second, _START_FLOOR)))
+    T, _ = natural_coordinates(plant, gain)
     scaled = np.concatenate([trial.outputs / problem.output_scale for trial in problem.recordings])
-    natural = float(np.linalg.norm(problem.plant.C @ T / problem.output_scale[:, None]))
+    natural = float(np.linalg.norm(plant.C @ T / problem.output_scale[:, None]))
     size = float(np.sqrt(np.sum(np.mean(scaled**2, axis=0))))
     return size / natural * T if size > 0 and natural > 0 else T
 

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "GainFibre",
+    "floored_covariance",
     "gain_fibre",
     "natural_coordinates",
     "pair_blocks",
@@ -149,13 +150,15 @@ def gain_fibre(plant: Plant, gain: ArrayLike, metric: ArrayLike | None = None) -
 def natural_coordinates(plant: Plant, K: Array) -> tuple[Array, Array]:
     """Natural coordinates x = T z, u = G v of a plant under a stabilising gain: (n, n), (m, m)."""
     F = plant.A - plant.B @ K
-    input_factor = np.linalg.cholesky(_floored(_input_metric(plant, K, F), _INPUT_FLOOR))
+    input_factor = np.linalg.cholesky(floored_covariance(_input_metric(plant, K, F), _INPUT_FLOOR))
     G = np.asarray(np.linalg.inv(input_factor).T, dtype=np.float64)
     # Continuous: noise of the same variance, correlated over the mean time constant of F.
     rate = 1.0 if plant.discrete else -float(np.trace(F)) / plant.n
     driven = plant.B @ G
     covariance = _lyapunov(plant, F.T, (driven @ driven.T / rate)[None])[0]
-    return np.asarray(np.linalg.cholesky(_floored(covariance, _STATE_FLOOR)), dtype=np.float64), G
+    return np.asarray(
+        np.linalg.cholesky(floored_covariance(covariance, _STATE_FLOOR)), dtype=np.float64
+    ), G
 
 
 def pair_blocks(Q: Array, R: Array) -> Array:
@@ -184,8 +187,11 @@ def _input_metric(plant: Plant, K: Array, F: Array) -> Array:
     return leading * m / trace if abs(trace) > 1e-12 else np.eye(m)
 
 
-def _floored(covariance: Array, floor: float) -> Array:
-    """Make it definite: unit variance where there is none, floored correlations elsewhere."""
+def floored_covariance(covariance: Array, floor: float) -> Array:
+    """Make a covariance (n, n) definite: unit variance where there is none, correlations floored.
+
+    The eigenvalues of the correlation are raised to the floor.
+    """
     variance = np.diag(covariance)
     scale = np.where(variance > 0, np.sqrt(np.maximum(variance, 1e-300)), 1.0)
     correlation = covariance / np.outer(scale, scale)

@@ -27,8 +27,8 @@ def with_fitted_starts(
     """Return the problem with each trial's x0 fitted to its first samples under a controller.
 
     From the given x0, by trust-region least squares. Where the samples leave x0 free it stays: it
-    is given a normal prior of the size that white noise at the inputs, enlarged to the recorded
-    outputs, gives the states, which weighs as the residual's own noise does.
+    is given a normal prior of the size of the trial's other states (`start_unit`), which weighs as
+    the residual's own noise does.
 
     Parameters
     ----------

@@ -27,6 +27,7 @@ from impc.equivalent_weights import least_condition_weights
 from impc.evaluation import evaluate
 from impc.gain_fibre import gain_fibre, natural_coordinates, pair_blocks, split_blocks
 from impc.lqr import solve_lqr
+from impc.plant import change_coordinates
 from impc.weights import Weights, condition_number, normalised
 
 if TYPE_CHECKING:
@@ -35,10 +36,9 @@ if TYPE_CHECKING:
     from impc.conditioned_fit import ConditionedFit
     from impc.inverse_problem import InverseProblem
     from impc.lqr import LqrSolution
-    from impc.plant import Plant
     from impc.terminal_set import TerminalSet
 
-__all__ = ["CONDITION_SHARE", "inverse_mpc_natural"]
+__all__ = ["CONDITION_SHARE", "in_plant_units", "inverse_mpc_natural"]
 
 CONDITION_SHARE = 1e-3
 # A step that promises less than this, of the objective, is below what the noise decides.
@@ -80,14 +80,14 @@ def inverse_mpc_natural(
     plant = problem.plant
     gain = solve_lqr(plant, start).K
     T, G = natural_coordinates(plant, gain)
-    natural = _transformed(plant, T, G)
+    natural = change_coordinates(plant, T, G)
     begin = least_condition_weights(gain_fibre(natural, np.linalg.solve(G, gain @ T))).weights
     share = condition_share / condition_number(begin)
     objective = Objective(_residual(problem, T, G, noise), 1.0, share, squared=True)
     found = conditioned_fit(
         natural, objective, begin, max_iterations=max_iterations, tolerance=_TOLERANCE
     )
-    weights = normalised(_in_plant_units(found.weights, T, G))
+    weights = in_plant_units(found.weights, T, G)
     return replace(
         found,
         weights=weights,
@@ -96,22 +96,11 @@ def inverse_mpc_natural(
     )
 
 
-def _transformed(plant: Plant, T: Array, G: Array) -> Plant:
-    """The plant in z = T^-1 x, v = G^-1 u."""
-    back = np.linalg.inv(T)
-    return replace(
-        plant,
-        A=frozen(back @ plant.A @ T),
-        B=frozen(back @ plant.B @ G),
-        E=frozen(back @ plant.E),
-        C=frozen(plant.C @ T),
-    )
-
-
-def _in_plant_units(weights: Weights, T: Array, G: Array) -> Weights:
+def in_plant_units(weights: Weights, T: Array, G: Array) -> Weights:
+    """Weights of z = T^-1 x and v = G^-1 u as weights of x and u, scaled to R[0, 0] = 1."""
     z, v = np.linalg.inv(T), np.linalg.inv(G)
     block = pair_blocks((z.T @ weights.Q @ z)[None], (v.T @ weights.R @ v)[None])[0]
-    return split_blocks(block, len(T))
+    return normalised(split_blocks(block, len(T)))
 
 
 def _residual(

@@ -9,7 +9,7 @@ disturbances has an E with no columns.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,7 +21,7 @@ from impc.errors import PlantError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-__all__ = ["Plant", "as_plant"]
+__all__ = ["Plant", "as_plant", "change_coordinates"]
 
 
 @dataclass(frozen=True)
@@ -138,6 +138,19 @@ def as_plant(system: Any, controls: Sequence[str] | None = None) -> Plant:
     )
     _require_stabilisable(plant)
     return plant
+
+
+def change_coordinates(plant: Plant, T: Array, G: Array | None = None) -> Plant:
+    """Return the plant in z = T^-1 x and v = G^-1 u, T (n, n) and G (m, m); names stay."""
+    back = np.linalg.inv(T)
+    inputs = np.eye(plant.m) if G is None else G
+    return replace(
+        plant,
+        A=frozen(back @ plant.A @ T),
+        B=frozen(back @ plant.B @ inputs),
+        E=frozen(back @ plant.E),
+        C=frozen(plant.C @ T),
+    )
 
 
 def _sample_time(dt: object) -> float:

@@ -1,0 +1,219 @@
+"""The same recordings as inverse LQR explains them, beside inverse MPC.
+
+    feedback_gain       any gain, no bounds (3.12)
+    inverse_lqr_gain    weights whose regulator is near that gain: Table 3.1, lines 2 to 7, (3.7)
+    inverse_lqr_output  weights whose regulator, without bounds, fits the outputs best (3.16)
+    clipped_lqr         the regulator of inverse MPC, its command cut off at the bounds
+    inverse_mpc         the constrained controller
+
+The inverse-LQR methods search in natural coordinates, as inverse MPC does (`natural_fit`); initial
+states are fitted for each method's own controller, physical parameters are those of inverse MPC.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.agreement import vaf
+from impc.arrays import Array, frozen
+from impc.bounds import box_bounds
+from impc.closed_loop import Simulation, simulate
+from impc.equivalent_weights import least_condition_weights
+from impc.errors import SolverError, WeightsError
+from impc.fitted_controller import free_gain, noise_of
+from impc.gain_fibre import gain_fibre, natural_coordinates
+from impc.initial_states import with_fitted_starts
+from impc.inverse_lqr import inverse_lqr_lmi
+from impc.inverse_mpc import auxiliary_weights
+from impc.inverse_problem import controller_for, scenarios, without_bounds
+from impc.lqr import is_stable, solve_lqr
+from impc.natural_fit import in_plant_units, inverse_mpc_natural
+from impc.plant import change_coordinates
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from impc.fitted_controller import FittedController
+    from impc.gain import GainFit
+    from impc.inverse_problem import InverseProblem
+    from impc.weights import Weights
+
+__all__ = ["MethodFit", "compare_methods"]
+
+
+@dataclass(frozen=True)
+class MethodFit:
+    """One method on all recordings.
+
+    Attributes
+    ----------
+    name : str
+    K : Array or None
+        (m, n); None when the method ended without one.
+    weights : Weights or None
+    runs : tuple of Simulation
+        One a trial; empty without a gain.
+    vaf : Array
+        (3.24) over all trials, % (p,); NaN when a simulation does not reach the end.
+    trial_vaf : Array
+        (trials, p), the same for each.
+    largest_input : Array
+        Largest magnitude of each input (m,).
+    keeps_bounds : bool
+        Whether no input bound is exceeded, to 1e-6 of it.
+    fell : tuple of float or None
+        For each trial the time in s at which the loop left every reasonable range.
+    seconds : float
+    reason : str
+        Why there is no gain; empty otherwise.
+    """
+
+    name: str
+    K: Array | None
+    weights: Weights | None
+    runs: tuple[Simulation, ...]
+    vaf: Array
+    trial_vaf: Array
+    largest_input: Array
+    keeps_bounds: bool
+    fell: tuple[float | None, ...]
+    seconds: float
+    reason: str
+
+
+def compare_methods(
+    fitted: FittedController, progress: Callable[[str], None] = lambda _: None
+) -> tuple[MethodFit, ...]:
+    """Run every method of the module's text on the recordings of a fit.
+
+    Parameters
+    ----------
+    fitted : FittedController
+        Inverse MPC, already done.
+    progress : callable
+        Told the name of each method when it is done.
+    """
+    known = replace(fitted.problem, unknown_start=False, family=None, logarithms=frozen([]))
+    loose = without_bounds(known)
+    begin, gain = fitted.weights, np.array(fitted.solution.K)
+    results = []
+
+    def add(name: str, problem: InverseProblem, find: Callable[[], _Found]) -> _Found:
+        started = time.perf_counter()
+        try:
+            found = find()
+        except (WeightsError, SolverError) as error:
+            found = _Found(None, None, str(error))
+        results.append(_judge(name, fitted, problem, found, time.perf_counter() - started))
+        progress(name)
+        return found
+
+    free: list[GainFit] = []
+
+    def feedback() -> _Found:
+        free.append(free_gain(loose, begin))
+        return _Found(np.array(free[0].K), None, "")
+
+    def output_penalty() -> _Found:
+        noise = noise_of(free[0] if free else fitted.free)
+        weights = inverse_mpc_natural(loose, begin, noise).weights
+        return _Found(np.array(solve_lqr(known.plant, weights).K), weights, "")
+
+    first = add("feedback_gain", loose, feedback)
+    add("inverse_lqr_gain", loose, lambda: _gain_penalty(known, first, begin))
+    add("inverse_lqr_output", loose, output_penalty)
+    add("clipped_lqr", _clipping(known), lambda: _Found(gain, fitted.weights, ""))
+    add("inverse_mpc", known, lambda: _Found(gain, fitted.weights, ""))
+    return tuple(results)
+
+
+@dataclass(frozen=True)
+class _Found:
+    K: Array | None
+    weights: Weights | None
+    reason: str
+
+
+def _gain_penalty(problem: InverseProblem, first: _Found, begin: Weights) -> _Found:
+    """Lines 2 to 7 of Table 3.1 in natural coordinates: the LMI, else the auxiliary problem."""
+    if first.K is None:
+        raise SolverError("gain", "none was found", "see the feedback gain")
+    plant = problem.plant
+    stable = is_stable(plant.A - plant.B @ first.K, discrete=True)
+    start = solve_lqr(plant, begin).K
+    T, G = natural_coordinates(plant, first.K if stable else start)
+    natural = change_coordinates(plant, T, G)
+    target: Array = np.asarray(np.linalg.solve(G, first.K @ T), dtype=np.float64)
+    lmi = inverse_lqr_lmi(natural, target)
+    weights = lmi.weights
+    if weights is None:
+        centre = least_condition_weights(gain_fibre(natural, np.linalg.solve(G, start @ T)))
+        weights = auxiliary_weights(natural, target, centre.weights).weights
+    found = in_plant_units(weights, T, G)
+    return _Found(np.array(solve_lqr(plant, found).K), found, "")
+
+
+def _clipping(problem: InverseProblem) -> InverseProblem:
+    """A horizon of one sample without state bounds or terminal set: cut off, no foresight."""
+    limits = box_bounds(problem.plant, u_min=problem.bounds.u_min, u_max=problem.bounds.u_max)
+    return replace(problem, bounds=limits, horizon=1, terminal_set=False)
+
+
+def _judge(
+    name: str, fitted: FittedController, problem: InverseProblem, found: _Found, seconds: float
+) -> MethodFit:
+    """Simulate all recordings with the gain found, from initial states fitted for it."""
+    p, m = len(problem.plant.outputs), problem.plant.m
+    if found.K is None:
+        nothing = frozen(np.full(p, np.nan))
+        empty = frozen(np.full((len(problem.recordings), p), np.nan))
+        none = (None,) * len(problem.recordings)
+        return MethodFit(
+            name, None, None, (), nothing, empty, frozen(np.full(m, np.nan)), False, none, seconds,
+            found.reason,
+        )  # fmt: skip
+    metric = np.array(fitted.solution.S)
+    settled = problem
+    if fitted.problem.unknown_start and name != "inverse_mpc":
+        settled = with_fitted_starts(problem, found.K, metric)
+    runs = _simulate(settled, found.K, metric)
+    largest = np.max([np.max(np.abs(run.u), axis=0) for run in runs], axis=0)
+    bounds = fitted.problem.bounds
+    limit = np.minimum(np.abs(bounds.u_max), np.abs(bounds.u_min))
+    return MethodFit(
+        name,
+        frozen(found.K),
+        found.weights,
+        runs,
+        frozen(_pooled_vaf(settled, runs)),
+        frozen([_trial_vaf(settled, index, run) for index, run in enumerate(runs)]),
+        frozen(largest),
+        bool(np.all(largest <= limit * (1 + 1e-6))),
+        tuple(None if run.complete else run.reached * problem.plant.dt for run in runs),
+        seconds,
+        "",
+    )
+
+
+def _simulate(problem: InverseProblem, gain: Array, metric: Array) -> tuple[Simulation, ...]:
+    controller = controller_for(problem, gain, metric)
+    return tuple(simulate(controller, drive) for drive in scenarios(problem))
+
+
+def _trial_vaf(problem: InverseProblem, index: int, run: Simulation) -> Array:
+    trial = problem.recordings[index]
+    if not run.complete:
+        return np.full(len(problem.plant.outputs), np.nan)
+    return vaf(trial.outputs, run.x @ problem.plant.C.T)
+
+
+def _pooled_vaf(problem: InverseProblem, runs: tuple[Simulation, ...]) -> Array:
+    if not all(run.complete for run in runs):
+        return np.full(len(problem.plant.outputs), np.nan)
+    recorded = np.concatenate([trial.outputs for trial in problem.recordings])
+    simulated = np.concatenate([run.x @ problem.plant.C.T for run in runs])
+    return vaf(recorded, simulated)

@@ -1,0 +1,138 @@
+"""Settings of a fit, as the [fit] table of a configuration gives them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+import numpy as np
+import scipy.signal
+
+from impc.bounds import box_bounds
+from impc.errors import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from impc.arrays import Array
+    from impc.bounds import Bounds
+    from impc.plant import Plant
+    from impc.recording import Recording
+
+__all__ = ["FitSettings", "fit_bounds", "fit_settings"]
+
+# A recorded angle is differentiated over this time, by a parabola: noise of 1 % of the largest
+# angle at 100 Hz then gives a rate of a few per cent of the largest.
+_RATE_WINDOW = 0.15
+
+
+@dataclass(frozen=True)
+class FitSettings:
+    """What a user may set of a fit.
+
+    Attributes
+    ----------
+    horizon : int
+        N, in samples.
+    u_max : float or list of float or None
+        Largest magnitude of each input, in its unit; None where there is no bound.
+    bounded_states : dict of str to float or "data"
+        Largest magnitude of states by name, in their SI units. "data" takes the largest recorded
+        value of an output of that name, or of the derivative of output y for a state `y_rate`,
+        times `margin` (3.22).
+    margin : float
+        At 1 the bound lies on the recorded maximum, and a controller that never met a bound would
+        meet one there: on the simulated seat a margin of 1 changes the angles by one to two
+        hundredths of a radian, 1.05 by nothing.
+    terminal_set : bool
+        Whether the controller ends in its maximal invariant set.
+    free : list of str
+        Physical parameters of the plant that are fitted with the gain (3.19).
+    settle : float
+        Seconds at the start of a left-out trial that serve to find its initial state and do not
+        count in its VAF.
+    held_out : bool
+        Whether each trial is predicted from the others.
+    """
+
+    horizon: int = 20
+    u_max: float | list[float] | None = None
+    bounded_states: dict[str, float | str] = field(default_factory=dict)
+    margin: float = 1.2
+    terminal_set: bool = False
+    free: list[str] = field(default_factory=list)
+    settle: float = 1.0
+    held_out: bool = True
+
+
+def fit_settings(table: Mapping[str, Any]) -> FitSettings:
+    """Read the [fit] table of a configuration.
+
+    Raises
+    ------
+    InputError
+        When a key is unknown or a value is of the wrong kind or out of range.
+    """
+    known = FitSettings.__dataclass_fields__
+    unknown = [key for key in table if key not in known]
+    if unknown:
+        raise InputError(f"[fit] {unknown[0]}", "is not a setting", f"known: {', '.join(known)}")
+    try:
+        settings = msgspec.convert(dict(table), FitSettings, strict=True)
+    except msgspec.ValidationError as error:
+        raise InputError("[fit]", str(error), "see docs/fitting.md") from None
+    for name, value, least in (
+        ("horizon", settings.horizon, 1),
+        ("margin", settings.margin, 1),
+        ("settle", settings.settle, 0),
+    ):
+        if not least <= value < np.inf:
+            raise InputError(f"[fit] {name}", f"got {value}", f"give at least {least}")
+    return settings
+
+
+def fit_bounds(plant: Plant, settings: FitSettings, recordings: Sequence[Recording]) -> Bounds:
+    """Bounds of the controller: inputs as set, states as set or from the data (3.22).
+
+    Raises
+    ------
+    InputError, BoundsError
+        When a state is unknown or its bound cannot be taken from the data.
+    """
+    x_max = np.full(plant.n, np.inf)
+    for name, value in settings.bounded_states.items():
+        if name not in plant.states:
+            raise InputError(
+                f"[fit] bounded_states {name}", "is not a state", f"known: {list(plant.states)}"
+            )
+        limit = value
+        if isinstance(value, str):
+            limit = settings.margin * _recorded_maximum(plant, name, value, recordings)
+        x_max[plant.states.index(name)] = limit
+    u_max = None if settings.u_max is None else np.asarray(settings.u_max)
+    u_min = None if u_max is None else -u_max
+    return box_bounds(plant, x_min=-x_max, x_max=x_max, u_min=u_min, u_max=u_max)
+
+
+def _recorded_maximum(plant: Plant, name: str, word: str, recordings: Sequence[Recording]) -> float:
+    if word != "data":
+        raise InputError(f"[fit] bounded_states {name}", f"got {word!r}", 'give a number or "data"')
+    if name in plant.outputs:
+        column = plant.outputs.index(name)
+        return max(float(np.max(np.abs(trial.outputs[:, column]))) for trial in recordings)
+    base = name.removesuffix("_rate")
+    if base != name and base in plant.outputs:
+        column = plant.outputs.index(base)
+        return max(_largest_rate(trial.outputs[:, column], plant.dt) for trial in recordings)
+    raise InputError(
+        f"[fit] bounded_states {name}", "is neither an output nor the rate of one", "give a number"
+    )
+
+
+def _largest_rate(values: Array, dt: float) -> float:
+    window = max(5, 2 * round(_RATE_WINDOW / dt / 2) + 1)
+    if len(values) < window:
+        raise InputError("recording", f"has {len(values)} samples", f"give at least {window}")
+    rate = scipy.signal.savgol_filter(values, window, 2, deriv=1, delta=dt)
+    return float(np.max(np.abs(rate)))
