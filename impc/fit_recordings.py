@@ -1,0 +1,248 @@
+"""Section 3.5 as one function: from the recordings of a subject to a `FitResult`.
+
+Preliminary gain and physical parameters (3.19), bounds (3.22), weights of the constrained
+controller over all trials at once with an initial state for each, VAF (3.24) in and out of sample,
+intent (3.23) to (3.26), and the same recordings by inverse LQR.
+"""
+
+from __future__ import annotations
+
+import functools
+import time
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.agreement import agreement, centred_vaf, vaf
+from impc.arrays import Array, frozen
+from impc.closed_loop import simulate
+from impc.comparison import compare_methods
+from impc.errors import DataError, SolverError
+from impc.fit_result import FitResult, FittedParameter, HeldOut
+from impc.fit_settings import FitSettings, fit_bounds
+from impc.fitted_controller import FittedController, fit_controller
+from impc.gain_covariance import gain_covariance
+from impc.identifiability import identifiability
+from impc.initial_states import with_fitted_starts
+from impc.intent import intent
+from impc.inverse_problem import InverseProblem, controller_for, inverse_problem, scenarios
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from impc.gain_covariance import GainCovariance
+    from impc.plant import Plant
+    from impc.plant_family import PlantFamily
+    from impc.recording import Recording
+
+__all__ = ["FitProgress", "fit_problem", "fit_recordings", "stages"]
+
+
+@dataclass(frozen=True)
+class FitProgress:
+    """What a caller wants to hear of a fit, and what it remembers of an earlier one.
+
+    Attributes
+    ----------
+    done : callable
+        Told the name of each stage when it is done.
+    remember : callable
+        (name of stage, function that computes its controller) -> that controller, from memory when
+        it is there. By default nothing is remembered.
+    """
+
+    done: Callable[[str], None] = lambda _: None
+    remember: Callable[[str, Callable[[], FittedController]], FittedController] = (
+        lambda _, compute: compute()
+    )
+
+
+def stages(trials: int, settings: FitSettings) -> int:
+    """Number of stages that `fit_recordings` reports: the fit, five methods, trials left out."""
+    return 6 + (trials if _leaves_out(trials, settings) else 0)
+
+
+def fit_problem(
+    plant: Plant,
+    recordings: Sequence[Recording],
+    settings: FitSettings,
+    family: PlantFamily | None = None,
+) -> InverseProblem:
+    """Pose the inverse problem of a subject: outputs scaled by their size, starts unknown.
+
+    Raises
+    ------
+    DataError, InputError, BoundsError
+        When there is no recording, an output is zero throughout, or a bound cannot be set.
+    """
+    if not recordings:
+        raise DataError("recordings", "there are none", "give at least one trial")
+    outputs = np.concatenate([trial.outputs for trial in recordings])
+    scale = np.sqrt(np.mean(outputs**2, axis=0))
+    for name, size in zip(plant.outputs, scale, strict=True):
+        if size == 0:
+            raise DataError(f"output {name}", "is zero in every trial", "check its column")
+    return inverse_problem(
+        plant,
+        fit_bounds(plant, settings, recordings),
+        settings.horizon,
+        tuple(recordings),
+        terminal_set=settings.terminal_set,
+        output_scale=scale,
+        unknown_start=True,
+        family=family,
+    )
+
+
+def fit_recordings(
+    problem: InverseProblem, settings: FitSettings, progress: FitProgress | None = None
+) -> FitResult:
+    """Fit a subject.
+
+    Parameters
+    ----------
+    problem : InverseProblem
+        Of `fit_problem`.
+    settings : FitSettings
+    progress : FitProgress, optional
+
+    Raises
+    ------
+    WeightsError, SolverError
+        When no regulator can be simulated on these recordings, or no weights are found.
+    """
+    progress = progress or FitProgress()
+    started = time.perf_counter()
+    fitted = progress.remember("fit", lambda: fit_controller(problem))
+    progress.done("inverse MPC")
+    methods = compare_methods(fitted, progress.done)
+    held_out = _held_out(problem, fitted, settings, progress)
+    covariance = _covariance(fitted)
+    known = replace(fitted.problem, unknown_start=False, family=None, logarithms=frozen([]))
+    plant = known.plant
+    runs = methods[-1].runs
+    sizes = _state_sizes(np.concatenate([run.x for run in runs]))
+    bounds = problem.bounds
+    return FitResult(
+        settings,
+        problem,
+        fitted,
+        covariance,
+        _parameters(fitted, covariance),
+        intent(plant, np.array(fitted.solution.K), sizes, fitted.weights),
+        identifiability(known, fitted.weights),
+        tuple(
+            agreement(plant, trial, run, np.array(bounds.u_min), np.array(bounds.u_max))
+            for trial, run in zip(known.recordings, runs, strict=True)
+        ),
+        held_out,
+        methods,
+        _terminal_set_difference(known, fitted),
+        time.perf_counter() - started,
+    )
+
+
+def _leaves_out(trials: int, settings: FitSettings) -> bool:
+    return settings.held_out and trials > 1
+
+
+def _held_out(
+    problem: InverseProblem,
+    fitted: FittedController,
+    settings: FitSettings,
+    progress: FitProgress,
+) -> tuple[HeldOut, ...]:
+    count = len(problem.recordings)
+    if not _leaves_out(count, settings):
+        return ()
+    found = []
+    for index in range(count):
+        others = problem.recordings[:index] + problem.recordings[index + 1 :]
+        part = replace(problem, recordings=others)
+        name = f"without trial {index + 1}"
+        controller = progress.remember(name, functools.partial(fit_controller, part))
+        found.append(_predict(problem, controller, fitted, index, settings))
+        progress.done(name)
+    return tuple(found)
+
+
+def _predict(
+    problem: InverseProblem,
+    controller: FittedController,
+    fitted: FittedController,
+    index: int,
+    settings: FitSettings,
+) -> HeldOut:
+    """Simulate the trial left out; its first second serves to find where it starts."""
+    trial = problem.recordings[index]
+    settle = round(settings.settle / problem.plant.dt)
+    if trial.samples <= settle + 1:
+        raise DataError(
+            f"trial {trial.label}", f"has {trial.samples} samples", "lower [fit] settle"
+        )
+    K, S = np.array(controller.solution.K), np.array(controller.solution.S)
+    alone = replace(controller.problem, recordings=(trial,))
+    started = with_fitted_starts(alone, K, S, max(settle, problem.plant.n))
+    run = simulate(controller_for(started, K, S), scenarios(started)[0])
+    p = len(problem.plant.outputs)
+    recorded, simulated = trial.outputs[settle:], (run.x @ started.plant.C.T)[settle:]
+    T = _covariance(fitted).T
+    full = np.array(fitted.solution.K)
+    change = float(np.linalg.norm((K - full) @ T) / np.linalg.norm(full @ T))
+    if not run.complete:
+        nothing = frozen(np.full(p, np.nan))
+        return HeldOut(nothing, nothing, change)
+    return HeldOut(
+        frozen(vaf(recorded, simulated)), frozen(centred_vaf(recorded, simulated)), change
+    )
+
+
+def _covariance(fitted: FittedController) -> GainCovariance:
+    """At the gain of the weights, which is the one that is reported."""
+    solution = fitted.solution
+    reported = replace(
+        fitted.free, K=frozen(solution.K), S=frozen(solution.S), problem=fitted.problem
+    )
+    return gain_covariance(reported)
+
+
+def _parameters(
+    fitted: FittedController, covariance: GainCovariance
+) -> tuple[FittedParameter, ...]:
+    family = fitted.problem.family
+    if family is None:
+        return ()
+    values = family.nominal * np.exp(fitted.problem.logarithms)
+    return tuple(
+        FittedParameter(name, float(nominal), float(value), float(value * deviation))
+        for name, nominal, value, deviation in zip(
+            family.names, family.nominal, values, covariance.parameters, strict=True
+        )
+    )
+
+
+def _state_sizes(x: Array) -> Array:
+    """Root-mean-square of each state; states that never move count as the least that does."""
+    sizes = np.sqrt(np.mean(x**2, axis=0))
+    moving = sizes[sizes > 0]
+    if len(moving) == 0:
+        raise SolverError("simulation", "no state moves", "check the disturbance's column")
+    return np.asarray(np.maximum(sizes, np.min(moving)))
+
+
+def _terminal_set_difference(problem: InverseProblem, fitted: FittedController) -> float:
+    K, S = np.array(fitted.solution.K), np.array(fitted.solution.S)
+    pair = [
+        [
+            simulate(controller_for(replace(problem, terminal_set=with_set), K, S), drive)
+            for drive in scenarios(problem)
+        ]
+        for with_set in (False, True)
+    ]
+    if not all(run.complete for runs in pair for run in runs):
+        return float("nan")
+    return max(
+        float(np.max(np.abs((a.x - b.x) @ problem.plant.C.T / problem.output_scale)))
+        for a, b in zip(*pair, strict=True)
+    )

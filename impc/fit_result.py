@@ -1,0 +1,105 @@
+"""Everything that a fit of a subject found, as values."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from impc.agreement import TrialAgreement
+    from impc.arrays import Array
+    from impc.comparison import MethodFit
+    from impc.fit_settings import FitSettings
+    from impc.fitted_controller import FittedController
+    from impc.gain_covariance import GainCovariance
+    from impc.identifiability import Identifiability
+    from impc.intent import Intent
+    from impc.inverse_problem import InverseProblem
+
+__all__ = ["FitResult", "FittedParameter", "HeldOut"]
+
+
+@dataclass(frozen=True)
+class FittedParameter:
+    """A physical parameter of the plant that was fitted with the gain.
+
+    Attributes
+    ----------
+    name : str
+    nominal, value : float
+        In its unit.
+    deviation : float
+        Standard deviation of the value, in its unit; infinite when nothing determines it.
+    """
+
+    name: str
+    nominal: float
+    value: float
+    deviation: float
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """One trial as the fit of the others predicts it.
+
+    Attributes
+    ----------
+    vaf : Array
+        (3.24) after the settling time, % (p,); NaN when the simulation does not reach the end.
+    centred_vaf : Array
+        The same with the means removed, % (p,).
+    gain_change : float
+        ||(K_others - K) T|| / ||K T||, T natural coordinates of the full fit.
+    """
+
+    vaf: Array
+    centred_vaf: Array
+    gain_change: float
+
+
+@dataclass(frozen=True)
+class FitResult:
+    """Result of `fit_recordings`.
+
+    Attributes
+    ----------
+    settings : FitSettings
+    given : InverseProblem
+        The problem as it was posed: nominal plant, trials at rest.
+    fitted : FittedController
+        Weights and gain; `fitted.problem` holds the initial states and the plant found.
+    covariance : GainCovariance
+        How far the gain is determined.
+    parameters : tuple of FittedParameter
+    intent : Intent
+    identifiability : Identifiability
+        Directions of the weights that the recordings determine, and how many they leave.
+    trials : tuple of TrialAgreement
+        Of inverse MPC, one a trial.
+    held_out : tuple of HeldOut
+        One a trial; empty for a single trial or when not asked for.
+    methods : tuple of MethodFit
+        `comparison.METHODS` in their order; the last is inverse MPC.
+    terminal_set_difference : float
+        Largest change of a scaled output when the terminal set is added (or taken away); NaN when
+        the loop with it does not reach the end.
+    seconds : float
+    """
+
+    settings: FitSettings
+    given: InverseProblem
+    fitted: FittedController
+    covariance: GainCovariance
+    parameters: tuple[FittedParameter, ...]
+    intent: Intent
+    identifiability: Identifiability
+    trials: tuple[TrialAgreement, ...]
+    held_out: tuple[HeldOut, ...]
+    methods: tuple[MethodFit, ...]
+    terminal_set_difference: float
+    seconds: float
+
+    @property
+    def inverse_mpc(self) -> MethodFit:
+        """The method that the page is about."""
+        return self.methods[-1]
