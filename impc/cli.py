@@ -14,7 +14,10 @@ __all__ = ["main"]
 
 _BAD_INPUT, _INTERRUPTED = 2, 130
 # One module a command, loaded when it is asked for: name -> module, which holds it as `command`.
-_COMMANDS = {"example": "impc.commands.example"}
+_COMMANDS = {
+    "example": "impc.commands.example",
+    "fit": "impc.commands.fit",
+}
 
 
 class _Program(click.Group):
@@ -43,8 +46,9 @@ class _Program(click.Group):
         # Caught here, because click's own handling prints an empty line first.
         try:
             return super().invoke(ctx)
-        except KeyboardInterrupt:
-            click.echo("impc: interrupted", err=True)
+        except KeyboardInterrupt as interruption:
+            kept = f"; {interruption}" if interruption.args else ""
+            click.echo(f"impc: interrupted{kept}", err=True)
             ctx.exit(_INTERRUPTED)
 
 

@@ -7,7 +7,6 @@ intent (3.23) to (3.26), and the same recordings by inverse LQR.
 
 from __future__ import annotations
 
-import functools
 import time
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -47,14 +46,14 @@ class FitProgress:
     ----------
     done : callable
         Told the name of each stage when it is done.
-    remember : callable
-        (name of stage, function that computes its controller) -> that controller, from memory when
-        it is there. By default nothing is remembered.
+    controller : callable
+        (name of stage, its problem) -> the controller fitted to it, from memory when it is there
+        (`impc.fit_memory`). By default every one is computed.
     """
 
     done: Callable[[str], None] = lambda _: None
-    remember: Callable[[str, Callable[[], FittedController]], FittedController] = (
-        lambda _, compute: compute()
+    controller: Callable[[str, InverseProblem], FittedController] = lambda _, problem: (
+        fit_controller(problem)
     )
 
 
@@ -114,7 +113,7 @@ def fit_recordings(
     """
     progress = progress or FitProgress()
     started = time.perf_counter()
-    fitted = progress.remember("fit", lambda: fit_controller(problem))
+    fitted = progress.controller("fit", problem)
     progress.done("inverse MPC")
     methods = compare_methods(fitted, progress.done)
     held_out = _held_out(problem, fitted, settings, progress)
@@ -161,7 +160,7 @@ def _held_out(
         others = problem.recordings[:index] + problem.recordings[index + 1 :]
         part = replace(problem, recordings=others)
         name = f"without trial {index + 1}"
-        controller = progress.remember(name, functools.partial(fit_controller, part))
+        controller = progress.controller(name, part)
         found.append(_predict(problem, controller, fitted, index, settings))
         progress.done(name)
     return tuple(found)

@@ -2,32 +2,44 @@
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING
-
-from impc.errors import InputError
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from impc.plant import Plant
+    from collections.abc import Mapping
 
-__all__ = ["load_plant"]
+    from impc.plant import Plant
+    from impc.plant_source import PlantSource
+
+__all__ = ["KNOWN", "find_plant", "load_plant"]
+
+#: Short names of plants, by their import paths: the library itself knows no plant.
+KNOWN = {
+    "seated-balance": "plants:seated_balance_for",
+    "cursor": "plants:cursor_plant",
+}
+
+
+def find_plant(name: str, arguments: Mapping[str, Any]) -> PlantSource:
+    """The plant of a short name, an import path ``module:function`` or a file.
+
+    Raises
+    ------
+    InputError
+        As `plant_source`.
+    """
+    from impc.plant_source import plant_source  # noqa: PLC0415
+
+    return plant_source(KNOWN.get(name, name), arguments)
 
 
 def load_plant(path: str) -> Plant:
-    """Make the plant of an import path ``module:function``.
+    """Make the plant of an import path ``module:function`` without arguments.
 
     Raises
     ------
     InputError
         When there is no such module or function.
     """
-    from impc.plant import as_plant  # noqa: PLC0415
+    from impc.plant_source import make_plant, plant_source  # noqa: PLC0415
 
-    module, _, function = path.partition(":")
-    try:
-        make = getattr(importlib.import_module(module), function)
-    except (ImportError, AttributeError) as error:
-        raise InputError(
-            f"plant {path}", f"cannot be imported ({error})", "install the whole checkout"
-        ) from None
-    return as_plant(make())
+    return make_plant(plant_source(path, {}), ())

@@ -1,0 +1,126 @@
+"""`impc fit`: the control intent of a subject from recordings in files."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+from tqdm import tqdm
+
+from impc.commands.output import print_files
+from impc.commands.plant import KNOWN, find_plant
+
+if TYPE_CHECKING:
+    from impc.fit_memory import FitMemory
+    from impc.fit_result import FitResult
+
+__all__ = ["command"]
+
+
+@click.command("fit")
+@click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option(
+    "--plant",
+    "plant_name",
+    required=True,
+    help=f"{', '.join(KNOWN)}; module:function of your own; or a .mat, .npz or .json state space.",
+)
+@click.option(
+    "--config",
+    required=True,
+    type=click.Path(path_type=Path),
+    help="What the columns mean, and settings; `impc inspect FILE` writes one.",
+)
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    default=Path("results", "fit"),
+    show_default=True,
+    help="Folder for report.html, result.json and the figures.",
+)
+def command(files: tuple[Path, ...], plant_name: str, config: Path, out: Path) -> None:
+    """Fit the controller behind the trials of one subject, one file a trial.
+
+    What is done when you interrupt it is kept in the folder: the same command goes on from there.
+    """
+    # Imported here: the libraries take seconds to load, and --help needs none.
+    from impc.files.configuration import read_configuration  # noqa: PLC0415
+    from impc.files.reading import read_recordings  # noqa: PLC0415
+    from impc.fit_memory import open_memory  # noqa: PLC0415
+    from impc.fit_recordings import (  # noqa: PLC0415
+        FitProgress,
+        fit_problem,
+        fit_recordings,
+        stages,
+    )
+    from impc.fit_settings import fit_settings  # noqa: PLC0415
+    from impc.plant_source import make_plant, plant_family_of  # noqa: PLC0415
+    from impc.report.fit_report import fit_files  # noqa: PLC0415
+    from impc.report.provenance import fit_provenance  # noqa: PLC0415
+    from impc.report.write import require_writable, write_files  # noqa: PLC0415
+
+    require_writable(out)
+    configuration = read_configuration(config)
+    settings = fit_settings(configuration.fit)
+    source = find_plant(plant_name, configuration.plant)
+    recorded = tuple(configuration.signals)
+    plant = make_plant(source, recorded)
+    family = plant_family_of(source, recorded, settings.free)
+    recordings = read_recordings(files, configuration, plant)
+    problem = fit_problem(plant, recordings, settings, family)
+    memory = open_memory(out, problem, settings)
+    with tqdm(
+        total=stages(len(recordings), settings),
+        unit="stage",
+        file=sys.stderr,
+        disable=None,  # no bar where stderr is a file
+        leave=False,
+    ) as bar:
+
+        def done(stage: str) -> None:
+            bar.set_postfix_str(stage, refresh=False)
+            bar.update()
+
+        try:
+            result = fit_recordings(problem, settings, FitProgress(done, memory.controller))
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(_kept(memory)) from None
+    written = write_files(out, fit_files(result, fit_provenance(source, files, result)))
+    memory.forget()
+    _print(result)
+    print_files(out, written)
+
+
+def _kept(memory: FitMemory) -> str:
+    if not memory.stages:
+        return "nothing was done yet"
+    names = ", ".join(memory.stages)
+    return f"kept in {memory.path}: {names}; the same command goes on from there"
+
+
+def _print(result: FitResult) -> None:
+    """The table of methods and the intent, as the page has them."""
+    from impc.intent import dominant_sentence  # noqa: PLC0415
+
+    plant = result.fitted.problem.plant
+    heads = "".join(f"{f'VAF {name}':>16}" for name in plant.outputs)
+    click.echo(f"{'method':<20}{heads}{'largest input':>16}  ")
+    for method in result.methods:
+        values = "".join(f"{value:16.2f}" for value in method.vaf)
+        largest = " ".join(f"{value:.3g}" for value in method.largest_input)
+        kept = "" if method.keeps_bounds else "  exceeds its bound"
+        fell = [time for time in method.fell if time is not None]
+        note = f"  falls at {min(fell):.1f} s" if fell else kept
+        click.echo(f"{method.name:<20}{values}{largest:>16}{note}")
+    if result.held_out:
+        for index, name in enumerate(plant.outputs):
+            each = ", ".join(f"{item.vaf[index]:.2f}" for item in result.held_out)
+            click.echo(f"VAF of trials left out, {name}: {each} %")
+    intent = result.intent
+    click.echo(dominant_sentence(intent.reported, plant, intent.sizes))
+    click.echo(
+        f"Other weights that explain the recordings equally well turn that direction by up to "
+        f"{intent.widest_angle:.0f} degrees: so far it is not the subject's."
+    )

@@ -1,0 +1,175 @@
+"""What an interrupted fit had done: the controllers of its stages, in one JSON file.
+
+The file belongs to one set of recordings, settings and plant, told by a digest of all of them; with
+any other it is not used and is written anew.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import json
+import os
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from impc.arrays import Array, frozen
+from impc.errors import OutputError
+from impc.fitted_controller import FittedController, fit_controller
+from impc.gain import GainFit
+from impc.inverse_problem import moved
+from impc.lqr import solve_lqr
+from impc.weights import stage_weights
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from impc.fit_settings import FitSettings
+    from impc.inverse_problem import InverseProblem
+
+__all__ = ["FitMemory", "open_memory"]
+
+_NAME = "fit-in-progress.json"
+
+
+@dataclass(frozen=True)
+class FitMemory:
+    """Controllers of the stages done so far.
+
+    Attributes
+    ----------
+    path : Path
+        The file; its folder is made when the first stage is done.
+    digest : str
+        Of recordings, settings and plant.
+    stages : dict
+        Name of stage -> what `_encode` keeps of it.
+    """
+
+    path: Path
+    digest: str
+    stages: dict[str, Any] = field(default_factory=dict)
+
+    def controller(self, name: str, problem: InverseProblem) -> FittedController:
+        """The controller of a stage, remembered or fitted now and then written down.
+
+        Raises
+        ------
+        WeightsError, SolverError
+            As `fit_controller`.
+        OutputError
+            When the file cannot be written.
+        """
+        if name in self.stages:
+            return _restore(problem, self.stages[name])
+        found = fit_controller(problem)
+        self.stages[name] = _encode(found)
+        self._write()
+        return found
+
+    def forget(self) -> None:
+        """Remove the file: the result has been written."""
+        self.path.unlink(missing_ok=True)
+
+    def _write(self) -> None:
+        staging = self.path.with_suffix(".part")
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            staging.write_text(json.dumps({"digest": self.digest, "stages": self.stages}))
+            os.replace(staging, self.path)
+        except OSError as error:
+            raise OutputError(
+                f"folder {self.path.parent}",
+                f"cannot be written to ({error.strerror})",
+                "give another folder",
+            ) from None
+
+
+def open_memory(folder: Path, problem: InverseProblem, settings: FitSettings) -> FitMemory:
+    """The memory of a fit in a folder, empty when there is none for this very fit."""
+    path, digest = folder / _NAME, _digest(problem, settings)
+    try:
+        found = json.loads(path.read_text())
+        stages = found["stages"] if found["digest"] == digest else {}
+    except (OSError, ValueError, KeyError, TypeError):  # none, or not ours: begin anew
+        stages = {}
+    return FitMemory(path, digest, stages)
+
+
+def _digest(problem: InverseProblem, settings: FitSettings) -> str:
+    text = hashlib.sha256(f"{importlib.metadata.version('impc')} {settings!r}".encode())
+    plant, bounds = problem.plant, problem.bounds
+    parts = [plant.A, plant.B, plant.E, plant.C, bounds.x_min, bounds.x_max, bounds.u_min]
+    parts += [bounds.u_max, problem.output_scale]
+    for trial in problem.recordings:
+        parts += [trial.outputs, trial.disturbance, trial.x0]
+    if problem.family is not None:
+        text.update(repr(problem.family.names).encode())
+        parts.append(problem.family.nominal)
+    for part in parts:
+        text.update(f"{part.shape}".encode() + np.ascontiguousarray(part).tobytes())
+    return text.hexdigest()
+
+
+def _encode(found: FittedController) -> dict[str, Any]:
+    free = found.free
+    return {
+        "Q": found.weights.Q.tolist(),
+        "R": found.weights.R.tolist(),
+        "misfit": found.misfit,
+        "exact": found.exact,
+        "converged": found.converged,
+        **_nuisance(found.problem),
+        "free": {
+            "K": free.K.tolist(),
+            "S": free.S.tolist(),
+            "misfit": free.misfit,
+            "explained": free.explained,
+            "stabilises": free.stabilises,
+            "singular_values": free.singular_values.tolist(),
+            "metric_determined": free.metric_determined,
+            "evaluations": free.evaluations,
+            "refused": list(free.refused),
+            **_nuisance(free.problem),
+        },
+    }
+
+
+def _nuisance(problem: InverseProblem) -> dict[str, Any]:
+    return {
+        "starts": [trial.x0.tolist() for trial in problem.recordings],
+        "logarithms": problem.logarithms.tolist(),
+    }
+
+
+def _restore(problem: InverseProblem, kept: dict[str, Any]) -> FittedController:
+    free = kept["free"]
+    here = _problem(problem, kept)
+    weights = stage_weights(kept["Q"], kept["R"])
+    return FittedController(
+        here,
+        GainFit(
+            frozen(free["K"]),
+            frozen(free["S"]),
+            _problem(problem, free),
+            free["misfit"],
+            free["explained"],
+            free["stabilises"],
+            frozen(free["singular_values"]),
+            free["metric_determined"],
+            free["evaluations"],
+            tuple(free["refused"]),
+        ),
+        weights,
+        solve_lqr(here.plant, weights),
+        kept["misfit"],
+        kept["exact"],
+        kept["converged"],
+    )
+
+
+def _problem(problem: InverseProblem, kept: dict[str, Any]) -> InverseProblem:
+    starts: Array = np.array(kept["starts"], dtype=np.float64)
+    return moved(problem, starts, np.array(kept["logarithms"], dtype=np.float64))
