@@ -283,7 +283,7 @@ class LoopMatrices(NamedTuple):
     S: Buffer
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)  # trials left out are fitted side by side
 def run(
     loop: LoopMatrices,
     dloop: LoopMatrices,

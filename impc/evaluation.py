@@ -16,7 +16,7 @@ from impc.arrays import Array
 from impc.bounds import bound_rows
 from impc.closed_loop import Status, prepare_loop, run_loop, simulate
 from impc.errors import ImpcError
-from impc.inverse_problem import controller_for, scenarios
+from impc.inverse_problem import controller_for, misfit, scenarios
 from impc.lqr import is_stable
 from impc.plant_family import plant_differential
 from impc.prediction import Directions, directions
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from impc.recording import Recording
     from impc.terminal_set import TerminalSet
 
-__all__ = ["Evaluation", "evaluate", "residual_only"]
+__all__ = ["Evaluation", "evaluate", "misfit_or_reason", "residual_only"]
 
 # What a sample that a trial controller does not reach counts for, in root-mean-square outputs.
 _NOT_REACHED = 1e3
@@ -117,6 +117,24 @@ def evaluate(
         weakly_active,
         controller.terminal,
     )
+
+
+def misfit_or_reason(problem: InverseProblem, gain: Array, metric: Array) -> tuple[float, str]:
+    """2-norm of the residual and an empty string, or infinity and why there is none.
+
+    A fifth of the time of `evaluate`, which also differentiates.
+    """
+    if not is_stable(problem.plant.A - problem.plant.B @ gain, discrete=True):
+        return np.inf, "the gain does not stabilise the plant"
+    try:
+        controller = controller_for(problem, gain, metric)
+    except ImpcError as error:
+        return np.inf, str(error)
+    runs = [simulate(controller, drive) for drive in scenarios(problem)]
+    for run in runs:
+        if not run.complete:
+            return np.inf, f"sample {run.reached}: {Status(int(run.status[run.reached])).sentence}"
+    return misfit(problem, runs), ""
 
 
 def residual_only(problem: InverseProblem, gain: Array, metric: Array) -> Array:

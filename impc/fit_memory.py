@@ -11,6 +11,7 @@ import importlib.metadata
 import json
 import os
 from dataclasses import dataclass, field
+from threading import Lock
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -46,11 +47,14 @@ class FitMemory:
         Of recordings, settings and plant.
     stages : dict
         Name of stage -> what `_encode` keeps of it.
+    writing : Lock
+        Held while a stage is written down: stages end in several threads.
     """
 
     path: Path
     digest: str
     stages: dict[str, Any] = field(default_factory=dict)
+    writing: Lock = field(default_factory=Lock)
 
     def controller(self, name: str, problem: InverseProblem) -> FittedController:
         """The controller of a stage, remembered or fitted now and then written down.
@@ -65,8 +69,9 @@ class FitMemory:
         if name in self.stages:
             return _restore(problem, self.stages[name])
         found = fit_controller(problem)
-        self.stages[name] = _encode(found)
-        self._write()
+        with self.writing:
+            self.stages[name] = _encode(found)
+            self._write()
         return found
 
     def forget(self) -> None:

@@ -8,6 +8,8 @@ intent (3.23) to (3.26), and the same recordings by inverse LQR.
 from __future__ import annotations
 
 import time
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -28,7 +30,7 @@ from impc.intent import intent
 from impc.inverse_problem import InverseProblem, controller_for, inverse_problem, scenarios
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from impc.gain_covariance import GainCovariance
     from impc.plant import Plant
@@ -36,6 +38,8 @@ if TYPE_CHECKING:
     from impc.recording import Recording
 
 __all__ = ["FitProgress", "fit_problem", "fit_recordings", "stages"]
+
+_THREADS = 2
 
 
 @dataclass(frozen=True)
@@ -82,6 +86,14 @@ def fit_problem(
     for name, size in zip(plant.outputs, scale, strict=True):
         if size == 0:
             raise DataError(f"output {name}", "is zero in every trial", "check its column")
+    shortest = min(trial.samples for trial in recordings)
+    least = round(settings.settle / plant.dt) + plant.n
+    if shortest <= least:
+        raise DataError(
+            "recordings",
+            f"the shortest has {shortest} samples, {least} serve to find where it starts",
+            "give longer ones, or lower [fit] settle",
+        )
     return inverse_problem(
         plant,
         fit_bounds(plant, settings, recordings),
@@ -115,9 +127,15 @@ def fit_recordings(
     started = time.perf_counter()
     fitted = progress.controller("fit", problem)
     progress.done("inverse MPC")
-    methods = compare_methods(fitted, progress.done)
-    held_out = _held_out(problem, fitted, settings, progress)
     covariance = _covariance(fitted)
+    with _left_out(problem, settings, progress) as others:
+        methods = compare_methods(fitted, progress.done)
+        held_out = []
+        for index, other in enumerate(others):
+            held_out.append(
+                _predict(problem, other.result(), fitted, covariance.T, index, settings)
+            )
+            progress.done(_without(index))
     known = replace(fitted.problem, unknown_start=False, family=None, logarithms=frozen([]))
     plant = known.plant
     runs = methods[-1].runs
@@ -135,7 +153,7 @@ def fit_recordings(
             agreement(plant, trial, run, np.array(bounds.u_min), np.array(bounds.u_max))
             for trial, run in zip(known.recordings, runs, strict=True)
         ),
-        held_out,
+        tuple(held_out),
         methods,
         _terminal_set_difference(known, fitted),
         time.perf_counter() - started,
@@ -146,51 +164,52 @@ def _leaves_out(trials: int, settings: FitSettings) -> bool:
     return settings.held_out and trials > 1
 
 
-def _held_out(
-    problem: InverseProblem,
-    fitted: FittedController,
-    settings: FitSettings,
-    progress: FitProgress,
-) -> tuple[HeldOut, ...]:
-    count = len(problem.recordings)
-    if not _leaves_out(count, settings):
-        return ()
-    found = []
-    for index in range(count):
-        others = problem.recordings[:index] + problem.recordings[index + 1 :]
-        part = replace(problem, recordings=others)
-        name = f"without trial {index + 1}"
-        controller = progress.controller(name, part)
-        found.append(_predict(problem, controller, fitted, index, settings))
-        progress.done(name)
-    return tuple(found)
+@contextmanager
+def _left_out(
+    problem: InverseProblem, settings: FitSettings, progress: FitProgress
+) -> Iterator[list[Future[FittedController]]]:
+    """Controllers fitted to all trials but one, one after the other, in a few threads.
+
+    The compiled loop, most of the work, lets other threads run. When the block is left early, by an
+    error or from the keyboard, those not begun are not begun.
+    """
+    pool = ThreadPoolExecutor(_THREADS)
+    try:
+        pending = []
+        for index in range(len(problem.recordings)):
+            if _leaves_out(len(problem.recordings), settings):
+                others = problem.recordings[:index] + problem.recordings[index + 1 :]
+                part = replace(problem, recordings=others)
+                pending.append(pool.submit(progress.controller, _without(index), part))
+        yield pending
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _without(index: int) -> str:
+    return f"without trial {index + 1}"
 
 
 def _predict(
     problem: InverseProblem,
     controller: FittedController,
     fitted: FittedController,
+    T: Array,
     index: int,
     settings: FitSettings,
 ) -> HeldOut:
     """Simulate the trial left out; its first second serves to find where it starts."""
     trial = problem.recordings[index]
     settle = round(settings.settle / problem.plant.dt)
-    if trial.samples <= settle + 1:
-        raise DataError(
-            f"trial {trial.label}", f"has {trial.samples} samples", "lower [fit] settle"
-        )
     K, S = np.array(controller.solution.K), np.array(controller.solution.S)
     alone = replace(controller.problem, recordings=(trial,))
     started = with_fitted_starts(alone, K, S, max(settle, problem.plant.n))
     run = simulate(controller_for(started, K, S), scenarios(started)[0])
-    p = len(problem.plant.outputs)
     recorded, simulated = trial.outputs[settle:], (run.x @ started.plant.C.T)[settle:]
-    T = _covariance(fitted).T
     full = np.array(fitted.solution.K)
     change = float(np.linalg.norm((K - full) @ T) / np.linalg.norm(full @ T))
     if not run.complete:
-        nothing = frozen(np.full(p, np.nan))
+        nothing = frozen(np.full(recorded.shape[1], np.nan))
         return HeldOut(nothing, nothing, change)
     return HeldOut(
         frozen(vaf(recorded, simulated)), frozen(centred_vaf(recorded, simulated)), change

@@ -16,7 +16,7 @@ import scipy.optimize
 from impc.arrays import Array, frozen
 from impc.diagonal_weights import bryson_weights
 from impc.errors import SolverError
-from impc.evaluation import evaluate
+from impc.evaluation import misfit_or_reason
 from impc.gain_coordinates import Coordinates
 from impc.inverse_problem import moved
 from impc.lqr import is_stable, solve_lqr
@@ -141,15 +141,12 @@ def _rank(
 ) -> tuple[list[tuple[Array, Array]], int, list[str]]:
     """The usable starts by their misfit, the evaluations spent, and why the others are not."""
     usable, refused = [], []
-    plant = problem.plant
     for K, S in starts:
-        found = evaluate(problem, K, S)
-        if not is_stable(plant.A - plant.B @ K, discrete=True):
-            refused.append("the gain does not stabilise the plant")
-        elif found.reason:
-            refused.append(found.reason)
+        size, reason = misfit_or_reason(problem, K, S)
+        if reason:
+            refused.append(reason)
         else:
-            usable.append((float(np.linalg.norm(found.residual)), K, S))
+            usable.append((size, K, S))
     usable.sort(key=lambda item: item[0])
     return [(K, S) for _, K, S in usable], len(starts), refused
 

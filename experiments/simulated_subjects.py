@@ -1,0 +1,125 @@
+"""Many simulated subjects with noise: does the fit reach the ceiling, and are its deviations right?
+
+The seat of W2, linear, three trials of 30 s, white noise on the angles that leaves a VAF of 90 % to
+reach. For each torque limit it prints how far the fit stays below the VAF of the true controller,
+and how often each entry of the true gain lies within three of its estimated standard deviations.
+
+    python -m experiments.simulated_subjects --subjects 100 --limits 70 6 4.5
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from tqdm import tqdm
+
+from experiments.benchmarks.workloads import seat
+from impc.fit_recordings import fit_problem
+from impc.fit_settings import FitSettings
+from impc.fitted_controller import fit_controller
+from impc.gain_covariance import gain_covariance
+from impc.recording import recording
+
+if TYPE_CHECKING:
+    from impc.arrays import Array
+    from impc.recording import Recording
+
+__all__ = ["Subject", "noisy_recordings", "simulated_subject"]
+
+
+@dataclass(frozen=True)
+class Subject:
+    """One fit against its truth.
+
+    Attributes
+    ----------
+    below_ceiling : float
+        VAF of the true controller minus that of the fit, in points of the scaled outputs together.
+    entries : Array
+        Error of each entry of K over its estimated standard deviation (n,).
+    directions : Array
+        The same along the directions of `GainCovariance` (n,).
+    """
+
+    below_ceiling: float
+    entries: Array
+    directions: Array
+
+
+def noisy_recordings(limit: float, seed: int, ceiling: float) -> tuple[Recording, ...]:
+    """Three trials of the seat whose true controller has a VAF of `ceiling`, a share."""
+    rng = np.random.default_rng(seed)
+    trials = []
+    work = seat(3, 30.0, limit)
+    for trial in work.problem.recordings:
+        size = np.sqrt((1 - ceiling) / ceiling * np.mean(trial.outputs**2, axis=0))
+        noisy = trial.outputs + size * rng.standard_normal(trial.outputs.shape)
+        trials.append(recording(work.problem.plant, noisy, trial.disturbance))
+    return tuple(trials)
+
+
+def simulated_subject(seed: int, limit: float, ceiling: float = 0.9) -> Subject:
+    """Fit one subject and compare."""
+    work = seat(3, 30.0, limit)
+    plant, truth = work.problem.plant, np.array(work.controller.K)
+    trials = noisy_recordings(limit, seed, ceiling)
+    problem = fit_problem(plant, trials, FitSettings(u_max=limit))
+    fitted = fit_controller(problem)
+    solution = fitted.solution
+    covariance = gain_covariance(
+        replace(fitted.free, K=solution.K, S=solution.S, problem=fitted.problem)
+    )
+    noise = sum(
+        float(np.sum(((noisy.outputs - clean.outputs) / problem.output_scale) ** 2))
+        for noisy, clean in zip(trials, work.problem.recordings, strict=True)
+    )
+    samples = sum(trial.outputs.size for trial in trials)
+    error = solution.K - truth
+    along = covariance.directions @ np.ravel(error @ covariance.T)
+    return Subject(
+        100 * (fitted.misfit**2 - noise) / samples,
+        np.ravel(error / covariance.entries),
+        along / covariance.deviations,
+    )
+
+
+def _study(limit: float, count: int) -> list[Subject]:
+    with ProcessPoolExecutor(2) as pool:
+        found = pool.map(functools.partial(simulated_subject, limit=limit), range(count))
+        return list(tqdm(found, total=count, desc=f"{limit:g} Nm", unit="subject", disable=None))
+
+
+def _print(limit: float, found: list[Subject], names: tuple[str, ...]) -> None:
+    below = np.array([item.below_ceiling for item in found])
+    entries = np.array([item.entries for item in found])
+    directions = np.array([item.directions for item in found])
+    print(f"\ntorque limit {limit:g} Nm, {len(found)} subjects (seeds 0 to {len(found) - 1})")
+    print(f"points below the ceiling: median {np.median(below):.3f}, most {np.max(below):.3f}")
+    print("entry of K           within 3 deviations   spread of error/deviation")
+    for index, name in enumerate(names):
+        share = np.mean(np.abs(entries[:, index]) <= 3)
+        print(f"  {name:<18} {100 * share:12.0f} % {np.std(entries[:, index]):22.2f}")
+    print("direction, best determined first")
+    for index in range(directions.shape[1]):
+        share = np.mean(np.abs(directions[:, index]) <= 3)
+        print(f"  {index + 1:<18} {100 * share:12.0f} % {np.std(directions[:, index]):22.2f}")
+
+
+def main() -> None:
+    """Run the study and print its tables."""
+    parser = argparse.ArgumentParser(description="Fits of simulated noisy subjects.")
+    parser.add_argument("--subjects", type=int, default=100)
+    parser.add_argument("--limits", type=float, nargs="+", default=[70.0, 6.0, 4.5])
+    given = parser.parse_args()
+    names = seat(1, 1.0).problem.plant.states
+    for limit in given.limits:
+        _print(limit, _study(limit, given.subjects), names)
+
+
+if __name__ == "__main__":
+    main()
