@@ -1,4 +1,4 @@
-"""Many simulated subjects with noise: does the fit reach the ceiling, and are its deviations right?
+"""Many simulated subjects with noise: is the ceiling reached, and are the deviations right?.
 
 The seat of W2, linear, three trials of 30 s, white noise on the angles that leaves a VAF of 90 % to
 reach. For each torque limit it prints how far the fit stays below the VAF of the true controller,

@@ -13,12 +13,16 @@ from impc.evaluation import evaluate
 from impc.gain_coordinates import start_unit
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from impc.evaluation import Evaluation
     from impc.inverse_problem import InverseProblem
 
 __all__ = ["with_fitted_starts"]
 
 _EVALUATIONS = 20
+# The first round also counts as noise what saturation keeps from being linear; the second does not.
+_ROUNDS = 2
 
 
 def with_fitted_starts(
@@ -53,10 +57,19 @@ def _fit(problem: InverseProblem, gain: Array, metric: Array) -> Array:
         moved = replace(trial, x0=frozen(trial.x0 + unit @ z))
         return evaluate(replace(problem, recordings=(moved,)), gain, metric)
 
+    z = np.zeros(n)
+    for _ in range(_ROUNDS):
+        z = _round(at, unit, z)
+    return np.asarray(trial.x0 + unit @ z)
+
+
+def _round(at: Callable[[Array], Evaluation], unit: Array, z: Array) -> Array:
+    """One fit from z, with the noise that is left there."""
+    n = len(z)
+    here = at(z)
+    columns = here.dx0 @ unit
     # What no x0 explains is noise: to first order, the residual beside the derivative's columns.
-    first = at(np.zeros(n))
-    columns = first.dx0 @ unit
-    left = first.residual - columns @ np.linalg.lstsq(columns, first.residual)[0]
+    left = here.residual - columns @ np.linalg.lstsq(columns, here.residual)[0]
     noise = float(np.linalg.norm(left)) / np.sqrt(len(left))
 
     def residual(z: Array) -> Array:
@@ -66,6 +79,6 @@ def _fit(problem: InverseProblem, gain: Array, metric: Array) -> Array:
         return np.vstack([at(z).dx0 @ unit, noise * np.eye(n)])
 
     found = scipy.optimize.least_squares(
-        residual, np.zeros(n), jac=derivative, ftol=1e-10, max_nfev=_EVALUATIONS
+        residual, z, jac=derivative, ftol=1e-10, xtol=1e-12, gtol=1e-15, max_nfev=_EVALUATIONS
     )
-    return np.asarray(trial.x0 + unit @ found.x)
+    return np.asarray(found.x)
