@@ -107,5 +107,5 @@ def agreement(
 
 def saturated_share(u: Array, u_min: Array, u_max: Array) -> float:
     """Share of samples at which any input stands on a bound, to 1e-6 of it."""
-    near = (u >= u_max - 1e-6 * np.abs(u_max)) | (u <= u_min + 1e-6 * np.abs(u_min))
+    near = (u >= u_max * (1 - 1e-6)) | (u <= u_min * (1 - 1e-6))  # the origin is strictly inside
     return float(np.mean(np.any(near, axis=1)))

@@ -135,4 +135,5 @@ def _largest_rate(values: Array, dt: float) -> float:
     if len(values) < window:
         raise InputError("recording", f"has {len(values)} samples", f"give at least {window}")
     rate = scipy.signal.savgol_filter(values, window, 2, deriv=1, delta=dt)
-    return float(np.max(np.abs(rate)))
+    half = window // 2  # at the ends the parabola is one-sided
+    return float(np.max(np.abs(rate[half:-half])))
