@@ -1,5 +1,6 @@
 """The same recordings as inverse LQR explains them, beside inverse MPC.
 
+    preliminary         gains on a few states and physical parameters (3.19), (3.20), if asked for
     feedback_gain       any gain, no bounds (3.12)
     inverse_lqr_gain    weights whose regulator is near that gain: Table 3.1, lines 2 to 7, (3.7)
     inverse_lqr_output  weights whose regulator, without bounds, fits the outputs best (3.16)
@@ -12,6 +13,7 @@ states are fitted for each method's own controller, physical parameters are thos
 
 from __future__ import annotations
 
+import functools
 import time
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -40,6 +42,7 @@ if TYPE_CHECKING:
     from impc.fitted_controller import FittedController
     from impc.gain import GainFit
     from impc.inverse_problem import InverseProblem
+    from impc.preliminary import PreliminaryGain
     from impc.weights import Weights
 
 __all__ = ["MethodFit", "compare_methods"]
@@ -86,7 +89,9 @@ class MethodFit:
 
 
 def compare_methods(
-    fitted: FittedController, progress: Callable[[str], None] = lambda _: None
+    fitted: FittedController,
+    progress: Callable[[str], None] = lambda _: None,
+    preliminary: Callable[[], PreliminaryGain] | None = None,
 ) -> tuple[MethodFit, ...]:
     """Run every method of the module's text on the recordings of a fit.
 
@@ -96,8 +101,10 @@ def compare_methods(
         Inverse MPC, already done.
     progress : callable
         Told the name of each method when it is done.
+    preliminary : callable, optional
+        Computes the preliminary estimate.
     """
-    known = replace(fitted.problem, unknown_start=False, family=None, logarithms=frozen([]))
+    known = _known(fitted.problem)
     loose = without_bounds(known)
     begin, gain = fitted.weights, np.array(fitted.solution.K)
     results = []
@@ -108,9 +115,14 @@ def compare_methods(
             found = find()
         except (WeightsError, SolverError) as error:
             found = _Found(None, None, str(error))
-        results.append(_judge(name, fitted, problem, found, time.perf_counter() - started))
+        seconds = time.perf_counter() - started
+        results.append(_judge(name, fitted, found.problem or problem, found, seconds))
         progress(name)
         return found
+
+    def first_estimate(find: Callable[[], PreliminaryGain]) -> _Found:
+        given = find()
+        return _Found(np.array(given.K), None, "", _known(given.problem))
 
     free: list[GainFit] = []
 
@@ -123,6 +135,8 @@ def compare_methods(
         weights = inverse_mpc_natural(loose, begin, noise).weights
         return _Found(np.array(solve_lqr(known.plant, weights).K), weights, "")
 
+    if preliminary is not None:
+        add("preliminary", loose, functools.partial(first_estimate, preliminary))
     first = add("feedback_gain", loose, feedback)
     add("inverse_lqr_gain", loose, lambda: _gain_penalty(known, first, begin))
     add("inverse_lqr_output", loose, output_penalty)
@@ -136,6 +150,12 @@ class _Found:
     K: Array | None
     weights: Weights | None
     reason: str
+    problem: InverseProblem | None = None  # when it is not the common one
+
+
+def _known(problem: InverseProblem) -> InverseProblem:
+    """The problem with what was fitted taken as known."""
+    return replace(problem, unknown_start=False, family=None, logarithms=frozen([]))
 
 
 def _gain_penalty(problem: InverseProblem, first: _Found, begin: Weights) -> _Found:

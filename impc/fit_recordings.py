@@ -7,6 +7,7 @@ intent (3.23) to (3.26), and the same recordings by inverse LQR.
 
 from __future__ import annotations
 
+import functools
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
@@ -28,6 +29,7 @@ from impc.identifiability import identifiability
 from impc.initial_states import with_fitted_starts
 from impc.intent import intent
 from impc.inverse_problem import InverseProblem, controller_for, inverse_problem, scenarios
+from impc.preliminary import PreliminaryGain, preliminary_gain
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -62,8 +64,9 @@ class FitProgress:
 
 
 def stages(trials: int, settings: FitSettings) -> int:
-    """Number of stages that `fit_recordings` reports: the fit, five methods, trials left out."""
-    return 6 + (trials if _leaves_out(trials, settings) else 0)
+    """Number of stages that `fit_recordings` reports: the fit, its methods, trials left out."""
+    methods = 6 if settings.feedback_states else 5
+    return 1 + methods + (trials if _leaves_out(trials, settings) else 0)
 
 
 def fit_problem(
@@ -129,7 +132,7 @@ def fit_recordings(
     progress.done("inverse MPC")
     covariance = _covariance(fitted)
     with _left_out(problem, settings, progress) as others:
-        methods = compare_methods(fitted, progress.done)
+        methods = compare_methods(fitted, progress.done, _preliminary(problem, settings))
         held_out = []
         for index, other in enumerate(others):
             held_out.append(
@@ -158,6 +161,14 @@ def fit_recordings(
         _terminal_set_difference(known, fitted),
         time.perf_counter() - started,
     )
+
+
+def _preliminary(
+    problem: InverseProblem, settings: FitSettings
+) -> Callable[[], PreliminaryGain] | None:
+    if not settings.feedback_states:
+        return None
+    return functools.partial(preliminary_gain, problem, settings.feedback_states)
 
 
 def _leaves_out(trials: int, settings: FitSettings) -> bool:

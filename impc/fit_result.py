@@ -79,7 +79,7 @@ class FitResult:
     held_out : tuple of HeldOut
         One a trial; empty for a single trial or when not asked for.
     methods : tuple of MethodFit
-        `comparison.METHODS` in their order; the last is inverse MPC.
+        Those of `impc.comparison` in their order; the last is inverse MPC.
     terminal_set_difference : float
         Largest change of a scaled output when the terminal set is added (or taken away); NaN when
         the loop with it does not reach the end.

@@ -49,6 +49,9 @@ class FitSettings:
         Whether the controller ends in its maximal invariant set.
     free : list of str
         Physical parameters of the plant that are fitted with the gain (3.19).
+    feedback_states : list of str
+        States whose gains the dissertation's preliminary estimate (3.19), (3.20) fits; it is left
+        out when there are none.
     settle : float
         Seconds at the start of a left-out trial that serve to find its initial state and do not
         count in its VAF.
@@ -62,6 +65,7 @@ class FitSettings:
     margin: float = 1.2
     terminal_set: bool = False
     free: list[str] = field(default_factory=list)
+    feedback_states: list[str] = field(default_factory=list)
     settle: float = 1.0
     held_out: bool = True
 
