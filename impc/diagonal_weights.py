@@ -59,7 +59,7 @@ def diagonal_weights(problem: InverseProblem, *, max_evaluations: int = 15) -> W
     Raises
     ------
     SolverError
-        When none of `bryson_weights` can be simulated.
+        When none of `bryson_weights` can be simulated, or nothing moves in the simulation.
     """
     known = replace(problem, unknown_start=False, family=None, logarithms=frozen([]))
     search = _Prices(known, *_best(known))
@@ -119,6 +119,10 @@ class _Prices:
         runs = [simulate(controller, drive) for drive in scenarios(problem)]
         x, u = (np.concatenate([getattr(run, name) for run in runs]) for name in "xu")
         state, command = np.sqrt(np.mean(x**2, axis=0)), np.sqrt(np.mean(u**2))
+        if not np.any(state) or command == 0:
+            raise SolverError(
+                "recordings", "nothing drives them", "record a disturbance, or give initial states"
+            )
         self.unit = (command / np.maximum(state, 1e-12 * np.max(state))) ** 2
         self.samples = sum(trial.outputs.size for trial in problem.recordings)
         priced = np.diag(weights.Q) / weights.R[0, 0] / self.unit

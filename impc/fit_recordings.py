@@ -101,7 +101,7 @@ def fit_problem(
         plant,
         fit_bounds(plant, settings, recordings),
         settings.horizon,
-        tuple(recordings),
+        tuple(_first_guess(plant, trial) for trial in recordings),
         terminal_set=settings.terminal_set,
         output_scale=scale,
         unknown_start=True,
@@ -161,6 +161,13 @@ def fit_recordings(
         _terminal_set_difference(known, fitted),
         time.perf_counter() - started,
     )
+
+
+def _first_guess(plant: Plant, trial: Recording) -> Recording:
+    """Where the search for x0 starts: at rest, or in the first output when nothing drives it."""
+    if np.any(trial.disturbance) or np.any(trial.x0):
+        return trial
+    return replace(trial, x0=frozen(np.linalg.pinv(plant.C) @ trial.outputs[0]))
 
 
 def _preliminary(

@@ -57,7 +57,7 @@ def _fit(problem: InverseProblem, gain: Array, metric: Array) -> Array:
         moved = replace(trial, x0=frozen(trial.x0 + unit @ z))
         return evaluate(replace(problem, recordings=(moved,)), gain, metric)
 
-    z = np.zeros(n)
+    z: Array = np.zeros(n)
     for _ in range(_ROUNDS):
         z = _round(at, unit, z)
     return np.asarray(trial.x0 + unit @ z)

@@ -45,7 +45,7 @@ def test_a_saved_state_space(tmp_path: Path, suffix: str) -> None:
         names = np.array(["force", "push"], dtype=object)
         scipy.io.savemat(path, {**matrices, "inputs": names})
     elif suffix == "npz":
-        np.savez(path, **{key: np.array(value) for key, value in matrices.items()})
+        np.savez(path, A=A, B=B, C=C, D=[[0.0, 0.0]], dt=0.1)
     else:
         path.write_text(json.dumps(matrices))
     given = {} if suffix == "mat" else {"inputs": ["force", "push"]}
