@@ -109,7 +109,7 @@ def solve_lqr(plant: Plant, weights: Weights) -> LqrSolution:
     )
     try:
         P = np.asarray(solver(plant.A, plant.B, weights.Q, weights.R))
-    except np.linalg.LinAlgError as error:
+    except (np.linalg.LinAlgError, ValueError) as error:  # ValueError: reordering that failed
         raise _no_solution(str(error).split(".")[0].lower()) from None
     P = (P + P.T) / 2
     if plant.discrete:
