@@ -26,6 +26,7 @@ __all__ = [
     "WeightsMargin",
     "analytic_centre",
     "gain_fibre",
+    "inverse_factor",
     "least_condition_weights",
     "other_weights",
     "weights_margin",
@@ -242,7 +243,7 @@ def _centred_program(fibre: GainFibre, centre: Weights) -> tuple[Weights, float,
             "scale the states",
         )
     largest = float(eigenvalues[-1] / eigenvalues[0])
-    inverse = _inverse_factor(fibre, centre) * np.sqrt(eigenvalues[0])
+    inverse = inverse_factor(fibre, centre) * np.sqrt(eigenvalues[0])
     lower = inverse @ inverse.T
     raw = pair_blocks(fibre.Q, fibre.R)
     # Orthonormal as seen from the centre: the program's own variables are well scaled too.
@@ -262,7 +263,7 @@ def _centred_program(fibre: GainFibre, centre: Weights) -> tuple[Weights, float,
 
 def _ends(fibre: GainFibre, centre: Weights, limit: float) -> list[Array]:
     """Ends of the rays, in natural coordinates; bisection, for the condition is quasiconvex."""
-    inverse = _inverse_factor(fibre, centre)
+    inverse = inverse_factor(fibre, centre)
     back = np.linalg.inv(inverse)
     seen = (inverse @ pair_blocks(fibre.Q, fibre.R) @ inverse.T).reshape(fibre.dimension, -1)
     # Across the centre itself, seen as I, so that every ray leaves the cone.
@@ -285,7 +286,7 @@ def _distance(X: Array, Y: Array) -> float:
     return float(np.std(np.log(np.maximum(ratios, 1e-12 * ratios[-1]))))  # rounding ends there
 
 
-def _inverse_factor(fibre: GainFibre, weights: Weights) -> Array:
+def inverse_factor(fibre: GainFibre, weights: Weights) -> Array:
     """L^-1 of blkdiag(Q, R) = LL', by way of the natural coordinates, where it is accurate."""
     factor = np.linalg.cholesky(fibre.to_natural(weights))
     return np.linalg.inv(factor) @ scipy.linalg.block_diag(fibre.T, fibre.G).T
