@@ -19,7 +19,7 @@ from impc.diagonal_weights import diagonal_weights
 from impc.equivalent_weights import least_condition_weights
 from impc.errors import WeightsError
 from impc.evaluation import residual_only
-from impc.gain import GainFit, fit_gain
+from impc.gain import GainFit, refine_gain
 from impc.gain_fibre import gain_fibre
 from impc.initial_states import with_fitted_starts
 from impc.lqr import solve_lqr
@@ -103,7 +103,7 @@ def fit_controller(problem: InverseProblem, start: Weights | None = None) -> Fit
 def free_gain(problem: InverseProblem, begin: Weights) -> GainFit:
     """The best gain of any kind near that of some weights, with what else the problem lacks."""
     solution = solve_lqr(problem.plant, begin)
-    return fit_gain(problem, (solution.K, solution.S), attempts=1, spread=_SPREAD)
+    return refine_gain(problem, np.array(solution.K), np.array(solution.S), spread=_SPREAD)
 
 
 def noise_of(free: GainFit) -> float:

@@ -24,7 +24,7 @@ from impc.lqr import is_stable, solve_lqr
 if TYPE_CHECKING:
     from impc.inverse_problem import InverseProblem
 
-__all__ = ["GainFit", "bryson_starts", "fit_gain"]
+__all__ = ["GainFit", "bryson_starts", "fit_gain", "refine_gain"]
 
 _EXPLAINED = 1e-9
 _ROUNDS = 8
@@ -128,6 +128,27 @@ def fit_gain(
             break
     assert best is not None  # attempts >= 1 and something was ranked
     return replace(best, evaluations=evaluations, refused=tuple(refused))
+
+
+def refine_gain(
+    problem: InverseProblem,
+    gain: Array,
+    metric: Array,
+    *,
+    max_evaluations: int = 80,
+    spread: float = np.inf,
+) -> GainFit:
+    """One search of `fit_gain` from a gain and a metric, without looking for better starts.
+
+    Raises
+    ------
+    SolverError
+        When the recordings cannot be simulated from there.
+    """
+    _, reason = misfit_or_reason(problem, gain, metric)
+    if reason:
+        raise SolverError("gain", f"the start cannot be simulated: {reason}", "start elsewhere")
+    return _search(problem, gain, metric, max_evaluations, spread)
 
 
 def bryson_starts(problem: InverseProblem) -> list[tuple[Array, Array]]:

@@ -1,15 +1,13 @@
 """How far a fitted gain is determined: standard deviations under noise of any colour.
 
-The residuals e_t of a fit are taken as stationary noise with autocovariances Gamma_l, (p, p). The
-least-squares estimate then has, to first order, the covariance (White's and Newey and West's
-"sandwich", here with a Jacobian that is known)
+To first order a least-squares estimate under stationary noise e_t has the covariance (White's and
+Newey and West's "sandwich", here with a Jacobian that is known)
 
-    H^-1 [ sum_trials sum_t sum_l w_l J_t' Gamma_l J_{t+l} ] H^-1,     H = sum J'J,
+    H^-1 cov( sum_t J_t' e_t ) H^-1,     H = sum_t J_t' J_t,
 
-J_t being the derivative of the outputs at sample t with respect to everything that was fitted.
-Gamma_l is estimated from the residuals of all trials; w_l is Parzen's window, which keeps the sum
-non-negative, with the bandwidth of Andrews (Econometrica 59, 1991, 817) for first-order residuals:
-few lags for white noise, a hundred for a correlation of 0.9.
+J_t being the derivative of the outputs at sample t with respect to everything that was fitted, and
+the middle as `residual_noise` estimates it from the residuals. With white noise it is the
+Cramér-Rao bound.
 
 The prior of a search (`fit_gain`) is left out: the result says what the recordings determine, and
 in a direction that they hardly do it is wide.
@@ -21,17 +19,19 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.signal
 
 from impc.arrays import Array, frozen
 from impc.evaluation import evaluate
 from impc.gain_fibre import natural_coordinates
+from impc.residual_noise import ResidualNoise, residual_noise, spread_of_sum
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from impc.gain import GainFit
     from impc.inverse_problem import InverseProblem
 
-__all__ = ["GainCovariance", "autocovariances", "gain_covariance"]
+__all__ = ["DETERMINED", "GainCovariance", "gain_covariance"]
 
 # A direction whose singular value is below this, of the largest, is not determined at all.
 DETERMINED = 1e-6
@@ -61,8 +61,8 @@ class GainCovariance:
         without a value takes part in it.
     parameters : Array
         Standard deviation of the logarithm of each physical parameter (k,).
-    bandwidth : int
-        Lags of the residuals that were used.
+    noise : ResidualNoise
+        The colour of the residuals.
     """
 
     T: Array
@@ -71,11 +71,21 @@ class GainCovariance:
     deviations: Array
     entries: Array
     parameters: Array
-    bandwidth: int
+    noise: ResidualNoise
 
 
-def gain_covariance(fit: GainFit) -> GainCovariance:
-    """Covariance of a fitted gain, of the parameters fitted with it and of what they leave free."""
+def gain_covariance(
+    fit: GainFit, noise: Callable[[list[Array], int], ResidualNoise] = residual_noise
+) -> GainCovariance:
+    """Covariance of a fitted gain, and of the parameters fitted with it.
+
+    Parameters
+    ----------
+    fit : GainFit
+    noise : callable
+        How the noise is estimated from residuals: `residual_noise`, or `white_noise` for the plain
+        Cramér-Rao bound.
+    """
     problem = fit.problem
     m, n = problem.plant.m, problem.plant.n
     T, _ = natural_coordinates(problem.plant, fit.K)
@@ -88,10 +98,11 @@ def gain_covariance(fit: GainFit) -> GainCovariance:
     seen = on_gain - left @ (left.T @ on_gain)
     _, values, directions = np.linalg.svd(seen, full_matrices=False)
     usable = values > DETERMINED * values[0]
-    trials = _by_trial(problem, found.residual)
-    bandwidth, gammas = autocovariances(trials)
+    colour = noise(
+        _by_trial(problem, found.residual), left.shape[1] + int(np.count_nonzero(usable))
+    )
     along = seen @ directions[usable].T / values[usable] ** 2
-    spread = _sandwich(problem, along, gammas)
+    spread = spread_of_sum(colour, _by_trial(problem, along))
     deviations = np.full(m * n, np.inf)
     deviations[usable] = np.sqrt(np.maximum(np.diag(spread), 0.0))
     back = np.kron(np.eye(m), np.linalg.inv(T).T) @ directions.T
@@ -106,64 +117,9 @@ def gain_covariance(fit: GainFit) -> GainCovariance:
         frozen(directions),
         frozen(deviations),
         frozen(entries.reshape(m, n)),
-        frozen(_parameter_deviations(problem, on_gain, nuisance, gammas)),
-        bandwidth,
+        frozen(_parameter_deviations(problem, on_gain, nuisance, colour)),
+        colour,
     )
-
-
-def autocovariances(trials: list[Array]) -> tuple[int, Array]:
-    """Tapered autocovariances of residuals (samples, p) each: (bandwidth, (lags, p, p)).
-
-    Entry l estimates w_l E[e_{t+l} e_t'], l = 0 .. bandwidth.
-    """
-    total = sum(len(trial) for trial in trials)
-    longest = min(len(trial) for trial in trials)
-    bandwidth = min(_andrews(trials, total), longest // 4)
-    gammas = []
-    for lag in range(bandwidth + 1):
-        products = [trial[lag:].T @ trial[: len(trial) - lag] for trial in trials]
-        gammas.append(_parzen(lag / (bandwidth + 1)) * np.sum(products, axis=0) / total)
-    return bandwidth, np.array(gammas)
-
-
-def _andrews(trials: list[Array], total: int) -> int:
-    """Bandwidth for Parzen's window: 2.6614 (alpha(2) T)^(1/5), Andrews 1991, (6.2) to (6.4)."""
-    above, below = 0.0, 0.0
-    for column in range(trials[0].shape[1]):
-        series = [trial[:, column] for trial in trials]
-        product = sum(float(part[1:] @ part[:-1]) for part in series)
-        power = sum(float(part[:-1] @ part[:-1]) for part in series)
-        rho = float(np.clip(product / power if power > 0 else 0.0, -0.99, 0.99))
-        variance = sum(float(np.sum((part[1:] - rho * part[:-1]) ** 2)) for part in series) / total
-        above += 4 * rho**2 * variance**2 / (1 - rho) ** 8
-        below += variance**2 / (1 - rho) ** 4
-    alpha = above / below if below > 0 else 0.0
-    return int(np.ceil(2.6614 * (alpha * total) ** 0.2))
-
-
-def _parzen(x: float) -> float:
-    return 1 - 6 * x**2 + 6 * x**3 if x <= 0.5 else 2 * (1 - x) ** 3
-
-
-def _sandwich(problem: InverseProblem, along: Array, gammas: Array) -> Array:
-    """sum_trials sum_{t,s} along_t' Gamma_{t-s} along_s, (k, k)."""
-    result = np.zeros((along.shape[1], along.shape[1]))
-    for part in _by_trial(problem, along):  # (samples, p, k)
-        result += np.tensordot(part, _colour(part, gammas), ((0, 1), (0, 1)))
-    return (result + result.T) / 2
-
-
-def _colour(columns: Array, gammas: Array) -> Array:
-    """sum_s Gamma_{t-s} columns_s for columns (samples, p, k), Gamma_{-l} = Gamma_l'."""
-    lags = len(gammas) - 1
-    both = np.concatenate([np.swapaxes(gammas[:0:-1], 1, 2), gammas])  # lags -L .. L
-    coloured = np.zeros_like(columns)
-    for i in range(columns.shape[1]):
-        for j in range(columns.shape[1]):
-            kernel = both[:, i, j][:, None]
-            full = scipy.signal.oaconvolve(columns[:, j], kernel, axes=0)
-            coloured[:, i] += full[lags : lags + len(columns)]
-    return coloured
 
 
 def _by_trial(problem: InverseProblem, rows: Array) -> list[Array]:
@@ -199,7 +155,7 @@ def _orthogonal(columns: Array) -> Array:
 
 
 def _parameter_deviations(
-    problem: InverseProblem, on_gain: Array, nuisance: Array, gammas: Array
+    problem: InverseProblem, on_gain: Array, nuisance: Array, colour: ResidualNoise
 ) -> Array:
     """Standard deviations of the logarithms, everything else being fitted too."""
     count = len(problem.logarithms)
@@ -212,4 +168,5 @@ def _parameter_deviations(
     if values[-1] <= DETERMINED * np.linalg.norm(own, 2):
         return np.full(count, np.inf)
     along = seen @ directions.T / values**2 @ directions
-    return np.sqrt(np.maximum(np.diag(_sandwich(problem, along, gammas)), 0.0))
+    spread = spread_of_sum(colour, _by_trial(problem, along))
+    return np.sqrt(np.maximum(np.diag(spread), 0.0))

@@ -19,13 +19,14 @@ from impc.fit_recordings import fit_problem
 from impc.fit_settings import FitSettings
 from impc.fitted_controller import FittedController, fit_controller
 from impc.gain_coordinates import Coordinates
-from impc.gain_covariance import autocovariances, gain_covariance
+from impc.gain_covariance import gain_covariance
 from impc.initial_states import with_fitted_starts
 from impc.inverse_problem import InverseProblem, moved
 from impc.lqr import solve_lqr
 from impc.plant import as_plant
 from impc.plant_family import plant_at, plant_differential, plant_family
 from impc.recording import recording
+from impc.residual_noise import ResidualNoise, residual_noise, spread_of_sum
 
 
 def clean_problem(limit: float, trials: int = 3) -> tuple[Workload, InverseProblem]:
@@ -199,16 +200,31 @@ def test_diagonal_weights_come_near() -> None:
     assert np.linalg.norm(found.residual) ** 2 / samples < 0.1
 
 
-def test_autocovariances_of_a_first_order_process() -> None:
-    """Seed 5: tapered sums over all lags give the spectral density at zero, 1/(1 - a)^2."""
+def test_colour_of_a_first_order_process() -> None:
+    """Seed 5: the spread of a plain sum is N times the spectral density at zero, 1/(1 - a)^2."""
     rng = np.random.default_rng(5)
     noise = rng.standard_normal((40000, 1))
-    for a, lags in ((0.0, (1, 12)), (0.9, (80, 400))):
+    for a in (0.0, 0.5, 0.9):
         series = scipy.signal.lfilter([1.0], [1.0, -a], noise, axis=0)
-        bandwidth, gammas = autocovariances([series])
-        assert lags[0] <= bandwidth <= lags[1]
-        density = gammas[0, 0, 0] + 2 * np.sum(gammas[1:, 0, 0])
-        assert density == pytest.approx(1 / (1 - a) ** 2, rel=0.15)
+        found = residual_noise([series])
+        assert found.root[0] == pytest.approx(a, abs=0.01)
+        spread = spread_of_sum(found, [np.ones((10000, 1, 1))])[0, 0]
+        assert spread / 10000 == pytest.approx(1 / (1 - a) ** 2, rel=0.05)
+
+
+def test_spread_of_a_weighted_sum_is_that_of_its_toeplitz_matrix() -> None:
+    """Known colour, two outputs: against the full covariance matrix of the noise."""
+    a, rng = np.array([0.6, -0.3]), np.random.default_rng(8)
+    mixing = np.array([[1.0, 0.4], [0.0, 0.8]])
+    found = ResidualNoise(a, (mixing @ mixing.T)[None])
+    samples, before = 30, 200
+    columns = rng.standard_normal((samples, 2, 3))
+    response = np.zeros((samples, 2, before + samples, 2))  # of e_t to eps_s
+    for t in range(samples):
+        for s in range(before + t + 1):
+            response[t, :, s, :] = np.diag(a ** (before + t - s)) @ mixing
+    weighted = np.tensordot(columns, response, ((0, 1), (0, 1))).reshape(3, -1)
+    np.testing.assert_allclose(spread_of_sum(found, [columns]), weighted @ weighted.T, rtol=1e-9)
 
 
 def test_standard_deviations_of_a_linear_model_are_those_of_theory() -> None:

@@ -1,0 +1,100 @@
+"""Coverage of 95 % intervals of the gain: how many of 400 recordings' intervals hold the truth.
+
+A cart on a falling track, |force| <= 1 and at its limit for a part of the time, pushed at random
+for 75 s; its position is recorded with noise of a fifth of its size, white or first-order (0.9).
+For each recording the gain is fitted and its intervals are taken twice: as if residuals were white
+(Cramér-Rao), and for the colour that they show (sandwich).
+
+    python -m experiments.coverage --recordings 400
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+from concurrent.futures import ProcessPoolExecutor
+
+import control
+import numpy as np
+import scipy.signal
+from tqdm import tqdm
+
+from impc.arrays import Array
+from impc.bounds import box_bounds
+from impc.closed_loop import require_complete, scenario, simulate
+from impc.controller import Controller, mpc_controller
+from impc.fit_recordings import fit_problem
+from impc.fit_settings import FitSettings
+from impc.gain import fit_gain
+from impc.gain_covariance import gain_covariance
+from impc.plant import Plant, as_plant
+from impc.recording import Recording, recording
+from impc.residual_noise import residual_noise, white_noise
+from impc.weights import stage_weights
+
+__all__ = ["cart", "covered", "true_controller"]
+
+_SAMPLES = 1500
+_NOISE = 0.2
+_HORIZON = 10
+_SETTINGS = FitSettings(horizon=_HORIZON, u_max=1.0)
+
+
+def cart(dt: float = 0.05) -> Plant:
+    """Position and speed on a falling track: a force commands, a push disturbs."""
+    A, B = [[0.0, 1.0], [2.0, -0.3]], [[0.0, 0.0], [1.0, 1.0]]
+    system = control.ss(A, B, [[1.0, 0.0]], 0, inputs=["force", "push"], outputs=["position"])
+    return as_plant(control.c2d(system, dt), ["force"])
+
+
+def true_controller() -> Controller:
+    """Q = diag(4, 1), R = 1."""
+    plant = cart()
+    bounds = box_bounds(plant, u_min=-1, u_max=1)
+    weights = stage_weights(np.diag([4.0, 1.0]), 1)
+    return mpc_controller(plant, weights, bounds, _HORIZON, terminal_set=False)
+
+
+def noisy_trial(seed: int, root: float) -> Recording:
+    """One recording; the noise is first-order with that root and the same size for every root."""
+    rng, controller = np.random.default_rng(seed), true_controller()
+    push = np.repeat(rng.choice([-0.4, 0.0, 0.4], _SAMPLES // 10), 10)
+    drive = scenario(controller.plant, np.zeros(2), disturbance=push)
+    run = require_complete(controller, simulate(controller, drive))
+    clean = (run.x @ controller.plant.C.T)[:_SAMPLES]
+    white = rng.standard_normal((_SAMPLES + 500, 1))
+    noise = scipy.signal.lfilter([np.sqrt(1 - root**2)], [1.0, -root], white, axis=0)[500:]
+    size = _NOISE * np.sqrt(np.mean(clean**2))
+    return recording(controller.plant, clean + size * noise, push)
+
+
+def covered(seed: int, root: float) -> Array:
+    """Error over standard deviation, (2, n): Cramér-Rao, then sandwich."""
+    problem = fit_problem(cart(), [noisy_trial(seed, root)], _SETTINGS)
+    fit = fit_gain(problem, attempts=1, spread=3.0)
+    error = fit.K - true_controller().K
+    rows = [
+        np.ravel(error / gain_covariance(fit, colour).entries)
+        for colour in (white_noise, residual_noise)
+    ]
+    return np.array(rows)
+
+
+def main() -> None:
+    """Print the shares of recordings whose interval holds the true entry."""
+    parser = argparse.ArgumentParser(description="Coverage of 95 % intervals of the gain.")
+    parser.add_argument("--recordings", type=int, default=400)
+    count = parser.parse_args().recordings
+    for root in (0.0, 0.9):
+        with ProcessPoolExecutor(2) as pool:
+            found = pool.map(functools.partial(covered, root=root), range(count), chunksize=8)
+            scores = np.array(list(tqdm(found, total=count, desc=f"root {root:g}", disable=None)))
+        print(f"\nnoise of root {root:g}, {count} recordings (seeds 0 to {count - 1})")
+        for row, name in enumerate(("Cramér-Rao", "sandwich")):
+            shares = 100 * np.mean(np.abs(scores[:, row]) <= 1.96, axis=0)
+            shown = "  ".join(f"K{i + 1}: {share:5.1f} %" for i, share in enumerate(shares))
+            print(f"  {name:<12} {shown}")
+
+
+if __name__ == "__main__":
+    main()
