@@ -17,6 +17,7 @@ _BAD_INPUT, _INTERRUPTED = 2, 130
 _COMMANDS = {
     "example": "impc.commands.example",
     "fit": "impc.commands.fit",
+    "inspect": "impc.commands.inspect",
 }
 
 

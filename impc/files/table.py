@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections import Counter
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.arrays import frozen
+from impc.errors import DataError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from impc.arrays import Array
 
-__all__ = ["Table"]
+__all__ = ["Table", "make_table"]
 
 
 @dataclass(frozen=True)
@@ -27,9 +33,51 @@ class Table:
         Units of the columns for which the file tells them, as it writes them.
     rate : float or None
         Samples per second, where the file tells it itself (TDMS, C3D).
+    skipped : mapping of str to str
+        What else the file holds, and why it is no column.
     """
 
     source: str
     columns: Mapping[str, Array]
     units: Mapping[str, str]
     rate: float | None
+    skipped: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def samples(self) -> int:
+        """Number of samples."""
+        return len(next(iter(self.columns.values())))
+
+
+def make_table(
+    source: str,
+    columns: Mapping[str, Array],
+    units: Mapping[str, str] | None = None,
+    rate: float | None = None,
+    skipped: Mapping[str, str] | None = None,
+) -> Table:
+    """Keep the columns of the length that most have; the others are named among the skipped.
+
+    Raises
+    ------
+    DataError
+        When no column of numbers is left.
+    """
+    left_out = dict(skipped or {})
+    lengths = Counter(len(values) for values in columns.values() if len(values) > 1)
+    if not lengths:
+        left_out |= {name: f"has {len(values)} values" for name, values in columns.items()}
+        found = next((f"{name} {reason}" for name, reason in left_out.items()), "nothing in it")
+        raise DataError(
+            source, f"holds no column of numbers ({found})", "save each signal as a column"
+        )
+    # The longer one where two are equally frequent.
+    usual = max(lengths, key=lambda length: (lengths[length], length))
+    kept = {}
+    for name, values in columns.items():
+        if len(values) == usual:
+            kept[name] = frozen(np.asarray(values, dtype=np.float64))
+        else:
+            left_out[name] = f"has {len(values)} values where most columns have {usual}"
+    told = {name: unit for name, unit in (units or {}).items() if name in kept and unit}
+    return Table(source, kept, told, rate, left_out)

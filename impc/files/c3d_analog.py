@@ -1,0 +1,97 @@
+"""The analog channels of C3D, by c3d (MIT, the extra `c3d`). Marker positions are not read."""
+
+from __future__ import annotations
+
+import io
+import warnings
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from impc.errors import DataError, OutputError
+from impc.files.table import make_table
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from impc.arrays import Array
+    from impc.files.table import Table
+
+__all__ = ["encode_c3d", "read_c3d"]
+
+_REMEDY = "install it: pip install 'impc[c3d]'"
+
+
+def read_c3d(path: Path) -> Table:
+    """Read the analog channels with their units and rate.
+
+    Raises
+    ------
+    DataError
+        When the file has no analog channels, or fewer frames than its header says.
+    """
+    try:
+        import c3d  # noqa: PLC0415
+    except ImportError:
+        raise DataError(str(path), "needs the package c3d", _REMEDY) from None
+    source = str(path)
+    # c3d warns of headers that contradict themselves in small things; what matters is checked here.
+    with warnings.catch_warnings(), path.open("rb") as handle:
+        warnings.simplefilter("ignore")
+        reader = c3d.Reader(handle)
+        expected = int(reader.last_frame) - int(reader.first_frame) + 1
+        if not reader.analog_used:
+            raise DataError(source, "has no analog channels", "export them; markers are not read")
+        frames = [analog for _, _, analog in reader.read_frames(copy=False)]
+        if len(frames) < expected:
+            raise DataError(
+                source, f"ends after {len(frames)} of {expected} frames", "copy or export it again"
+            )
+        labels = [str(label).strip() for label in reader.analog_labels]
+        units = _units(reader)
+        rate = float(reader.analog_rate)
+    values = np.concatenate(frames, axis=1)
+    repeated = next((label for label in labels if labels.count(label) > 1), None)
+    if repeated is not None or len(labels) < len(values):
+        problem = f"names two channels {repeated!r}" if repeated is not None else "lacks names"
+        raise DataError(source, problem, "give each analog channel its own label")
+    columns: dict[str, Array] = dict(zip(labels, values, strict=False))
+    return make_table(source, columns, dict(zip(labels, units, strict=False)), rate)
+
+
+def encode_c3d(table: Table) -> bytes:
+    """The bytes of a C3D file with the columns as analog channels, in single precision.
+
+    Raises
+    ------
+    OutputError
+        When c3d is not installed, or the table has no rate.
+    """
+    try:
+        import c3d  # noqa: PLC0415
+    except ImportError:
+        raise OutputError("C3D", "needs the package c3d", _REMEDY) from None
+    if table.rate is None:
+        raise OutputError("C3D", "needs the rate of the samples", "give the table a rate")
+    writer = c3d.Writer(point_rate=table.rate, analog_rate=table.rate, point_scale=-1.0)
+    names = list(table.columns)
+    writer.set_point_labels(["none"])  # the format has no file without a marker
+    writer.set_analog_labels(names)
+    writer.set_analog_scales(np.ones(len(names)))
+    writer.set_analog_offsets(np.zeros(len(names)))
+    packed, width = c3d.Writer.pack_labels([table.units.get(name, "") or " " for name in names])
+    writer.analog_group.add_str("UNITS", "Analog units.", packed, width, len(names))
+    samples = np.array(list(table.columns.values()))
+    marker = np.zeros((1, 5))
+    writer.add_frames([(marker, samples[:, index : index + 1]) for index in range(table.samples)])
+    content = io.BytesIO()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        writer.write(content)
+    return content.getvalue()
+
+
+def _units(reader: Any) -> list[str]:
+    group = reader.get("ANALOG")
+    units = group.get("UNITS") if group is not None else None
+    return [] if units is None else [str(unit).strip() for unit in units.string_array]

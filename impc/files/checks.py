@@ -1,0 +1,212 @@
+"""What can be wrong with a recorded channel, one small function a check.
+
+A check raises `DataError` when the channel cannot be used, and returns a finding, one sentence for
+the report, when it can. An empty string: nothing to say. Every message names file, signal and
+column, how many samples, and where the first is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.errors import DataError
+
+if TYPE_CHECKING:
+    from impc.arrays import Array, BoolArray
+    from impc.files.units import Unit
+
+__all__ = [
+    "Channel",
+    "beyond_the_stop",
+    "clipped",
+    "constant",
+    "degrees_for_radians",
+    "missing",
+    "too_few",
+    "unit_of_the_file",
+]
+
+# Share of samples that rest on an extreme value: above the first a finding, above the second no
+# use. A sinusoid that is recorded in steps of 5 % of its range rests for a tenth of its time on
+# each extreme, but not three times as long as on the next step.
+_CLIPPED, _TOO_CLIPPED = 0.01, 0.05
+_NEXT = 3.0
+# Largest deviations of an angle, rad: more than half a turn is no posture; 0.2 deg is the size of
+# 11.5 deg that were recorded in rad and called deg.
+_TURN, _WIDE, _TINY = np.pi, 1.0, np.deg2rad(0.2)
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One recorded signal, before it is resampled.
+
+    Attributes
+    ----------
+    source, signal, column : str
+        File, name in the plant, name in the file.
+    unit : Unit
+    time : Array
+        (samples,), s, on the file's clock.
+    values : Array
+        (samples,), in `unit`, after offset and sign.
+    """
+
+    source: str
+    signal: str
+    column: str
+    unit: Unit
+    time: Array
+    values: Array
+
+    @property
+    def name(self) -> str:
+        """File, signal and column, for messages."""
+        return f"{self.source}: {self.signal} (column {self.column!r})"
+
+    def at(self, index: int) -> str:
+        """Where a sample is, for messages."""
+        return f"sample {index + 1} ({self.time[index]:.6g} s)"
+
+
+def unit_of_the_file(channel: Channel, told: Unit | None) -> str:
+    """The unit that the file tells must be the one that the configuration gives."""
+    if told is None or (
+        told.base == channel.unit.base and np.isclose(told.factor, channel.unit.factor)
+    ):
+        return ""
+    raise DataError(
+        channel.name,
+        f"is in {channel.unit.written!r} by the configuration and in {told.written!r} by the file",
+        f"correct signals.{channel.signal}.unit, or the column's unit in the file",
+    )
+
+
+def missing(channel: Channel, fill_gaps: float) -> str:
+    """Samples that are missing or not finite; short runs may be filled.
+
+    Parameters
+    ----------
+    channel : Channel
+    fill_gaps : float
+        s; the longest time between two finite samples that may be bridged.
+    """
+    finite = np.isfinite(channel.values)
+    lost = np.flatnonzero(~finite)
+    if len(lost) == 0:
+        return ""
+    kept = np.flatnonzero(finite)
+    found = (
+        f"{len(lost)} of {len(finite)} samples are missing or not finite, the first "
+        f"{channel.at(lost[0])}"
+    )
+    remedy = "cut with recording.start and stop, or repair the file"
+    if len(kept) == 0 or not finite[0] or not finite[-1]:
+        raise DataError(channel.name, f"{found}, at an end of the recording", remedy)
+    times = channel.time[kept]
+    bridged = np.diff(times)[np.diff(kept) > 1]
+    if bridged.max() > fill_gaps * (1 + 1e-9):
+        raise DataError(
+            channel.name,
+            f"{found}, the longest stretch {bridged.max():.4g} s",
+            f"{remedy}, or allow recording.fill_gaps (now {fill_gaps:g} s)",
+        )
+    return f"{channel.name}: {found}; filled by interpolation"
+
+
+def constant(channel: Channel) -> str:
+    """A channel that never changes: an unplugged sensor, a perturbation that never acted."""
+    values = channel.values[np.isfinite(channel.values)]
+    if np.ptp(values) <= 1e-12 * np.max(np.abs(values)):
+        raise DataError(
+            channel.name,
+            f"is constant at {values[0]:.6g} {channel.unit.written} in all {len(values)} samples",
+            f"name the right column, or leave signals.{channel.signal} out",
+        )
+    return ""
+
+
+def clipped(channel: Channel) -> str:
+    """A response that rests on its extreme values: an amplifier or converter at its end."""
+    finite = channel.values[np.isfinite(channel.values)]
+    span = np.ptp(finite)
+    levels = np.unique(finite)
+    step = max(0.02 * span, 1.001 * (levels[-1] - levels[-2]), 1.001 * (levels[1] - levels[0]))
+    for extreme in (levels[-1], levels[0]):
+        resting = channel.values == extreme
+        near = (np.abs(channel.values - extreme) <= step) & ~resting
+        share = resting.sum() / len(resting)
+        if share < _CLIPPED or resting.sum() < _NEXT * near.sum() or not _rests(resting):
+            continue
+        first = int(np.argmax(resting))
+        found = (
+            f"is clipped at {extreme:.6g} {channel.unit.written} in {resting.sum()} of "
+            f"{len(resting)} samples, the first {channel.at(first)}"
+        )
+        if share > _TOO_CLIPPED:
+            raise DataError(channel.name, found, "record with a wider range")
+        return f"{channel.name} {found}"
+    return ""
+
+
+def beyond_the_stop(channel: Channel, limit: float) -> str:
+    """A value that the mechanical stop does not let happen; limit in the channel's unit."""
+    beyond = np.abs(channel.values) > limit * (1 + 1e-9)
+    if not beyond.any():
+        return ""
+    largest = float(np.nanmax(np.abs(channel.values)))
+    raise DataError(
+        channel.name,
+        f"is beyond its stop of {limit:g} {channel.unit.written} in {beyond.sum()} of "
+        f"{len(beyond)} samples, the first {channel.at(int(np.argmax(beyond)))}, "
+        f"at most {largest:.4g}",
+        f"correct unit, offset or limit in signals.{channel.signal}",
+    )
+
+
+def degrees_for_radians(channel: Channel) -> str:
+    """An angle that is too large for a posture, or too small for a movement."""
+    if not channel.unit.angle:
+        return ""
+    finite = channel.values[np.isfinite(channel.values)] * channel.unit.factor
+    span = float(np.ptp(finite))
+    written = channel.unit.written
+    where = channel.at(int(np.nanargmax(np.abs(channel.values))))
+    if span > _TURN:
+        raise DataError(
+            channel.name,
+            f"spans {span / channel.unit.factor:.4g} {written}, more than half a turn, largest in "
+            f"{where}",
+            "the column is in smaller units: degrees taken for radians?",
+        )
+    if channel.unit.factor < 1 and span < 2 * _TINY:
+        raise DataError(
+            channel.name,
+            f"spans {span / channel.unit.factor:.4g} {written} only",
+            'radians taken for degrees? write unit = "rad"',
+        )
+    if span > _WIDE:
+        return (
+            f"{channel.name} spans {span / channel.unit.factor:.4g} {written} "
+            f"({np.rad2deg(span):.0f} degrees), largest in {where}: check its unit"
+        )
+    return ""
+
+
+def too_few(source: str, samples: int, needed: int) -> str:
+    """Fewer samples at the analysis rate than a fit needs."""
+    if samples < needed:
+        raise DataError(
+            source,
+            f"has {samples} samples at the plant's rate, {needed} are needed",
+            "record longer, or widen recording.start and stop",
+        )
+    return ""
+
+
+def _rests(resting: BoolArray) -> bool:
+    """Whether the value is held over at least three samples in a row."""
+    held = resting[:-2] & resting[1:-1] & resting[2:]
+    return bool(held.any())

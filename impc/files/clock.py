@@ -1,0 +1,255 @@
+"""The clock of a recording: its period, its gaps, its jitter, and values on even instants."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy.interpolate
+
+from impc.errors import DataError
+from impc.files.units import si_unit
+
+if TYPE_CHECKING:
+    from impc.arrays import Array, BoolArray, IntArray
+    from impc.files.configuration import RecordingTable
+    from impc.files.table import Table
+
+__all__ = ["Clock", "column_of", "on_even_instants", "read_clock"]
+
+# An interval this many periods long has lost a sample.
+_GAP = 1.5
+# Deviation from an even clock, in periods, from which it is a finding and values are interpolated.
+_JITTER = 0.01
+# Two statements of the rate that differ by more than this contradict each other.
+_RATE = 1e-3
+
+
+@dataclass(frozen=True)
+class Clock:
+    """When the samples were taken.
+
+    Attributes
+    ----------
+    time : Array
+        (samples,), s, on the file's clock.
+    rows : slice
+        The rows of the file that are used, after the cut.
+    steps : IntArray
+        (samples,): even instant at which each sample was taken; 0 for the first.
+    start, period : float
+        s; the even instants are start + k period.
+    findings : tuple of str
+        Gaps and jitter that were let pass.
+    """
+
+    time: Array
+    rows: slice
+    steps: IntArray
+    start: float
+    period: float
+    findings: tuple[str, ...] = ()
+
+    @property
+    def even(self) -> bool:
+        """Whether the samples stand on the even instants, so that they need no interpolation."""
+        return not self.findings
+
+
+def read_clock(table: Table, recording: RecordingTable) -> Clock:
+    """Read the clock, cut the recording, and check that its instants are even.
+
+    Raises
+    ------
+    DataError
+        When the rate is unknown, a time is missing, repeated or before the last, when the cut
+        leaves nothing, or when a gap is longer than may be filled.
+    """
+    if recording.time is None:
+        rate = _told_rate(table, recording)
+        time = np.arange(table.samples) / rate
+        rows = _cut(table.source, time, recording)
+        steps = np.arange(rows.stop - rows.start)
+        return Clock(time[rows], rows, steps, float(time[rows.start]), 1 / rate)
+    name, values = column_of(table, recording.time, "recording.time")
+    subject = f"{table.source}: clock {name!r}"
+    unit = si_unit(recording.time_unit or table.units.get(name) or "s")
+    if unit.base != "second":
+        raise DataError(subject, f"has the unit {unit.written!r}", 'write time_unit = "s" or "ms"')
+    _require_rising(subject, values)
+    time = values * unit.factor
+    rows = _cut(table.source, time, recording)
+    return _measured(subject, time[rows], rows, recording.fill_gaps)
+
+
+def column_of(table: Table, name: str, place: str) -> tuple[str, Array]:
+    """A column by its name, with or without the unit that stands behind it in the heading.
+
+    Raises
+    ------
+    DataError
+        When there is none; the message names those that there are.
+    """
+    short = name.rpartition(" (")[0] or name.rpartition(" [")[0]
+    for known in (name, short):
+        if known in table.columns:
+            return known, table.columns[known]
+    skipped = next(
+        (
+            f"{known} {reason}"
+            for known, reason in table.skipped.items()
+            if name == known or name.startswith((f"{known}.", f"{known}_"))
+        ),
+        None,
+    )
+    if skipped is not None:
+        raise DataError(f"{table.source}: column {name!r}", "cannot be used", skipped)
+    names = ", ".join(list(table.columns)[:12])
+    more = ", ..." if len(table.columns) > 12 else ""
+    raise DataError(
+        f"{table.source}: column {name!r}", "is not in the file", f"{place} may be {names}{more}"
+    )
+
+
+def on_even_instants(clock: Clock, values: Array) -> Array:
+    """Values at start + k period; Akima's interpolation where samples are missing or late.
+
+    Parameters
+    ----------
+    clock : Clock
+    values : Array
+        (samples,), NaN where a sample is to be filled; the first and the last are finite.
+
+    Returns
+    -------
+    Array
+        (steps[-1] + 1,). The values themselves where the clock is even and all are finite.
+    """
+    finite = np.isfinite(values)
+    if clock.even and finite.all():
+        return values
+    instants = clock.start + clock.period * np.arange(clock.steps[-1] + 1)
+    # A late first sample is taken as it is; nothing is extrapolated.
+    inside = np.clip(instants, clock.time[0], clock.time[-1])
+    spline = scipy.interpolate.Akima1DInterpolator(
+        clock.time[finite], values[finite], method="makima"
+    )
+    return np.asarray(spline(inside), dtype=np.float64)
+
+
+def _told_rate(table: Table, recording: RecordingTable) -> float:
+    given, told = recording.rate, table.rate
+    if given is None and told is None:
+        raise DataError(
+            table.source,
+            "tells no clock and no rate",
+            "name the column with recording.time, or give recording.rate",
+        )
+    if given is not None and told is not None and abs(given - told) > _RATE * told:
+        raise DataError(
+            table.source,
+            f"says {told:g} samples per second and recording.rate {given:g}",
+            "correct recording.rate or leave it out",
+        )
+    rate = given if given is not None else told
+    assert rate is not None
+    return rate
+
+
+def _require_rising(subject: str, values: Array) -> None:
+    missing = ~np.isfinite(values)
+    if missing.any():
+        raise DataError(
+            subject,
+            f"has {missing.sum()} missing times, the first in sample {np.argmax(missing) + 1}",
+            "repair the clock, or give recording.rate instead",
+        )
+    backward = np.diff(values) <= 0
+    if backward.any():
+        first = int(np.argmax(backward))
+        step = values[first + 1] - values[first]
+        what = "is repeated" if step == 0 else "runs backward"
+        raise DataError(
+            subject,
+            f"{what} {backward.sum()} times, the first from sample {first + 1} to {first + 2} "
+            f"(at {values[first]:g})",
+            "remove the repeated rows, or give recording.rate instead",
+        )
+
+
+def _cut(source: str, time: Array, recording: RecordingTable) -> slice:
+    slack = 1e-9 * max(abs(time[0]), abs(time[-1]), 1.0)
+    start = -np.inf if recording.start is None else recording.start - slack
+    stop = np.inf if recording.stop is None else recording.stop + slack
+    kept = np.flatnonzero((time >= start) & (time <= stop))
+    if len(kept) < 2:
+        raise DataError(
+            source,
+            f"has {len(kept)} samples between recording.start and stop",
+            f"its clock runs from {time[0]:g} to {time[-1]:g} s",
+        )
+    for key, wanted, reached in (
+        ("start", recording.start, float(time[0])),
+        ("stop", recording.stop, float(time[-1])),
+    ):
+        spare = float(np.median(np.diff(time[kept])))
+        beyond = wanted is not None and (
+            wanted < reached - spare if key == "start" else wanted > reached + spare
+        )
+        if beyond:
+            raise DataError(
+                source,
+                f"does not reach recording.{key} = {wanted:g} s",
+                f"its clock runs from {time[0]:g} to {time[-1]:g} s",
+            )
+    return slice(int(kept[0]), int(kept[-1]) + 1)
+
+
+def _measured(subject: str, time: Array, rows: slice, fill_gaps: float) -> Clock:
+    """Period by least squares over the samples, with gaps counted as whole periods."""
+    intervals = np.diff(time)
+    usual = intervals[intervals < _GAP * np.median(intervals)]
+    rough = float(np.mean(usual))
+    counts = np.rint(intervals / rough).astype(np.int64)
+    if (counts == 0).any():
+        first = int(np.argmax(counts == 0))
+        raise DataError(
+            subject,
+            f"is uneven: an interval of {intervals[first]:.4g} s at {time[first]:.6g} s where "
+            f"{rough:.4g} s are usual",
+            "export with an even clock",
+        )
+    gaps = intervals > _GAP * rough
+    findings = _gaps(subject, time, intervals, gaps, fill_gaps)
+    steps = np.concatenate([[0], np.cumsum(counts)])
+    period, start = (float(value) for value in np.polyfit(steps, time - time[0], 1))
+    late = np.abs(time - time[0] - start - period * steps)
+    if late.max() > _JITTER * period:
+        worst = int(np.argmax(late))
+        findings.append(
+            f"{subject}: jitter, {np.sum(late > _JITTER * period)} of {len(time)} samples are off "
+            f"an even clock by more than 1 % of its period, at most by {late.max() / period:.0%} "
+            f"(at {time[worst]:.6g} s); values were interpolated"
+        )
+    return Clock(time, rows, steps, float(time[0]) + start, period, tuple(findings))
+
+
+def _gaps(
+    subject: str, time: Array, intervals: Array, gaps: BoolArray, fill_gaps: float
+) -> list[str]:
+    if not gaps.any():
+        return []
+    longest = int(np.argmax(intervals))
+    found = (
+        f"{gaps.sum()} gaps, the first at {time[np.argmax(gaps)]:.6g} s, the longest of "
+        f"{intervals[longest]:.4g} s at {time[longest]:.6g} s"
+    )
+    if intervals[longest] > fill_gaps * (1 + 1e-9):
+        raise DataError(
+            subject,
+            f"has {found}",
+            f"cut with recording.start and stop, or allow recording.fill_gaps "
+            f"(now {fill_gaps:g} s)",
+        )
+    return [f"{subject}: {found}; filled by interpolation"]

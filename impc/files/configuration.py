@@ -1,0 +1,252 @@
+"""What the columns of a recording mean: a short TOML file, checked at the door.
+
+[recording] says time or rate, label and cut; [signals.NAME], one table a signal of the plant, says
+column, unit, stop, offset and sign; [plant] and [fit] are arguments of the plant and settings of
+the fit, and not interpreted here.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import re
+import tomllib
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
+
+import msgspec
+
+from impc.errors import InputError
+from impc.files.units import si_unit
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+    from pathlib import Path
+
+__all__ = [
+    "UNKNOWN_UNIT",
+    "Configuration",
+    "RecordingTable",
+    "SignalTable",
+    "read_configuration",
+]
+
+#: What `impc inspect` writes where the file tells no unit; it has to be filled in.
+UNKNOWN_UNIT = "?"
+
+_LARGEST = 1_000_000
+_LABELS = ("subject", "visit", "condition", "trial")
+_TABLES = ("recording", "signals", "plant", "fit")
+
+
+class RecordingTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The [recording] table.
+
+    Attributes
+    ----------
+    time : str or None
+        Column with the clock.
+    time_unit : str or None
+        Its unit; None takes the one that the file tells, or seconds.
+    rate : float or None
+        Samples per second, where there is no clock. Neither is needed for TDMS and C3D.
+    subject, visit, condition, trial : str
+        The label of the trial; empty where it is not said.
+    pattern : str or None
+        Regular expression that the file's name without its ending must match as a whole; its named
+        groups subject, visit, condition and trial give the label.
+    fill_gaps : float
+        Seconds; the longest gap that may be filled by interpolation. 0 fills none.
+    start, stop : float or None
+        Seconds on the file's clock, which begins at 0 where there is only a rate.
+    """
+
+    time: str | None = None
+    time_unit: str | None = None
+    rate: float | None = None
+    subject: str = ""
+    visit: str = ""
+    condition: str = ""
+    trial: str = ""
+    pattern: str | None = None
+    fill_gaps: float = 0.0
+    start: float | None = None
+    stop: float | None = None
+
+
+class SignalTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A [signals.NAME] table: si value = sign * (column - offset) in SI base units.
+
+    Attributes
+    ----------
+    column : str
+        Column of the file.
+    unit : str
+        Its unit, as pint knows it.
+    limit : float or None
+        Mechanical stop in this unit: the largest magnitude after offset and sign.
+    offset : float
+        In this unit.
+    sign : int
+        1 or -1.
+    """
+
+    column: str
+    unit: str
+    limit: float | None = None
+    offset: float = 0.0
+    sign: Literal[1, -1] = 1
+
+
+class Configuration(msgspec.Struct, frozen=True):
+    """What a configuration file says.
+
+    Attributes
+    ----------
+    recording : RecordingTable
+    signals : dict of str to SignalTable
+        By the name of an output or disturbance of the plant.
+    plant : dict
+        Arguments of the plant's function; not interpreted here.
+    fit : dict
+        Settings of the fit; not interpreted here.
+    """
+
+    recording: RecordingTable
+    signals: dict[str, SignalTable]
+    plant: dict[str, Any] = {}
+    fit: dict[str, Any] = {}
+
+
+def read_configuration(path: Path) -> Configuration:
+    """Read a configuration.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read, is no TOML, or has a key or value that cannot be: the message
+        names it by its TOML path.
+    """
+    source = str(path)
+    content = _parsed(source, path)
+    _require_known(source, "", content, _TABLES)
+    tables = {name: content.get(name, {}) for name in _TABLES}
+    for name, table in tables.items():
+        if not isinstance(table, dict):
+            raise InputError(f"{source}: {name}", "is not a table", f"write [{name}]")
+    written = {
+        key: str(value) if key in _LABELS and type(value) is int else value
+        for key, value in tables["recording"].items()
+    }
+    recording = _convert(source, "recording", written, RecordingTable)
+    _check_recording(source, recording)
+    signals = {}
+    for name, table in tables["signals"].items():
+        signals[name] = _convert(source, f"signals.{name}", table, SignalTable)
+        _check_signal(source, f"signals.{name}", signals[name])
+    if not signals:
+        raise InputError(
+            f"{source}: signals", "names no signal", "write a table [signals.NAME] for each"
+        )
+    return Configuration(recording, signals, tables["plant"], tables["fit"])
+
+
+_Struct = TypeVar("_Struct", bound=msgspec.Struct)
+
+
+def _parsed(source: str, path: Path) -> dict[str, Any]:
+    try:
+        if path.stat().st_size > _LARGEST:
+            raise InputError(source, "is too large for a configuration", "give the TOML file")
+        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except FileNotFoundError:
+        raise InputError(source, "does not exist", "`impc inspect FILE --out` writes one") from None
+    except OSError as error:
+        reason = error.strerror or type(error).__name__
+        raise InputError(source, f"cannot be opened ({reason})", "check the path") from None
+    except UnicodeDecodeError:
+        raise InputError(source, "is not UTF-8 text", "save it as UTF-8") from None
+    except tomllib.TOMLDecodeError as error:
+        reason = str(error).splitlines()[0]
+        raise InputError(source, f"is not TOML ({reason})", "correct that line") from None
+    except RecursionError:
+        raise InputError(source, "is nested too deep", "give a plain TOML file") from None
+
+
+def _require_known(source: str, place: str, table: Mapping[str, Any], known: Iterable[str]) -> None:
+    names = list(known)
+    for key in table:
+        if key not in names:
+            near = difflib.get_close_matches(key, names, n=1, cutoff=0.5)
+            remedy = f"did you mean {near[0]}?" if near else f"known: {', '.join(names)}"
+            where = f"{place}.{key}" if place else key
+            raise InputError(f"{source}: {where}", "is not known", remedy)
+
+
+def _convert(source: str, place: str, table: Any, kind: type[_Struct]) -> _Struct:
+    if not isinstance(table, dict):
+        raise InputError(f"{source}: {place}", "is not a table", f"write [{place}]")
+    _require_known(source, place, table, kind.__struct_fields__)
+    try:
+        return msgspec.convert(table, kind)
+    except msgspec.ValidationError as error:
+        message, _, where = str(error).partition(" - at `$.")
+        where = f"{place}.{where.rstrip('`')}" if where else place
+        problem = message.replace("Object missing required field", "lacks").replace("`", "'")
+        raise InputError(f"{source}: {where}", problem, "correct it") from None
+
+
+def _check_recording(source: str, table: RecordingTable) -> None:
+    def refuse(key: str, problem: str, remedy: str) -> InputError:
+        return InputError(f"{source}: recording.{key}", problem, remedy)
+
+    if table.time is not None and table.rate is not None:
+        raise refuse("rate", "is given beside recording.time", "keep one of the two")
+    if table.rate is not None and not (math.isfinite(table.rate) and table.rate > 0):
+        raise refuse("rate", f"is {table.rate:g}", "give samples per second, above 0")
+    if not (math.isfinite(table.fill_gaps) and table.fill_gaps >= 0):
+        raise refuse("fill_gaps", f"is {table.fill_gaps:g}", "give seconds, 0 or more")
+    for key in ("start", "stop"):
+        value = getattr(table, key)
+        if value is not None and not math.isfinite(value):
+            raise refuse(key, f"is {value}", "give seconds")
+    if table.start is not None and table.stop is not None and table.stop <= table.start:
+        raise refuse("stop", f"is {table.stop:g} s, start {table.start:g} s", "give a later one")
+    if table.time_unit is not None and _unit(source, "recording.time_unit", table.time_unit) != (
+        "second"
+    ):
+        raise refuse("time_unit", f"{table.time_unit!r} is no time", 'write "s", "ms" or "us"')
+    if table.pattern is not None:
+        _check_pattern(refuse, table, table.pattern)
+
+
+def _check_pattern(refuse: Any, table: RecordingTable, pattern: str) -> None:
+    try:
+        groups = re.compile(pattern).groupindex
+    except (re.error, OverflowError, RecursionError) as error:
+        raise refuse("pattern", f"is no regular expression ({error})", "correct it") from None
+    if not groups or not set(groups) <= set(_LABELS):
+        named = ", ".join(f"(?P<{name}>...)" for name in _LABELS)
+        raise refuse("pattern", f"has the groups {list(groups)}", f"name some of {named}")
+    for name in groups:
+        if getattr(table, name):
+            raise refuse(name, "is given, and in recording.pattern too", "keep one of the two")
+
+
+def _check_signal(source: str, place: str, table: SignalTable) -> None:
+    if table.unit != UNKNOWN_UNIT:
+        _unit(source, f"{place}.unit", table.unit)
+    if not math.isfinite(table.offset):
+        raise InputError(f"{source}: {place}.offset", f"is {table.offset}", "give a number")
+    if table.limit is not None and not (math.isfinite(table.limit) and table.limit > 0):
+        raise InputError(
+            f"{source}: {place}.limit", f"is {table.limit:g}", "give a magnitude above 0"
+        )
+
+
+def _unit(source: str, place: str, written: str) -> str:
+    try:
+        return si_unit(written).base
+    except InputError as error:
+        raise InputError(
+            f"{source}: {place}", f"{error.subject} {error.problem}", error.remedy
+        ) from None

@@ -1,0 +1,192 @@
+"""The door: which format a file is in, by its ending and its first bytes, and who reads it."""
+
+from __future__ import annotations
+
+import os
+import re
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from impc.errors import DataError, ImpcError, InputError, OutputError
+from impc.files.c3d_analog import encode_c3d, read_c3d
+from impc.files.delimited import encode_delimited, read_delimited
+from impc.files.matlab import encode_matlab, read_matlab
+from impc.files.matlab73 import HDF5_SIGNATURE, matlab73_bytes, read_matlab73
+from impc.files.tdms import encode_tdms, read_tdms
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from impc.files.table import Table
+
+__all__ = ["LARGEST", "SUFFIXES", "read_table", "write_matlab73", "write_table"]
+
+SUFFIXES = (".csv", ".tsv", ".txt", ".mat", ".tdms", ".c3d")
+#: Bytes of a file, and of its arrays in memory: an hour of 16 channels at 2 kHz.
+LARGEST = 1_000_000_000
+
+# First bytes of what else may carry one of the endings, and what it is.
+_SIGNATURES = {
+    b"PK\x03\x04": "a zip archive or an Excel workbook",
+    b"\xd0\xcf\x11\xe0": "an old Excel workbook",
+    b"MATLAB ": "a MATLAB file",
+    b"TDSm": "a TDMS file",
+    b"TDSh": "a TDMS index",
+    HDF5_SIGNATURE: "an HDF5 file",
+    b"\x1f\x8b": "a gzip archive",
+    b"\x80\x04\x95": "a Python pickle",
+    b"\x93NUMPY": "a numpy file",
+    b"%PDF": "a PDF",
+}
+
+
+def read_table(path: Path, largest: int = LARGEST) -> Table:
+    """Read the columns of a recording.
+
+    Parameters
+    ----------
+    path : Path
+        A .csv, .tsv, .txt, .mat, .tdms or .c3d file.
+    largest : int
+        Bytes above which a file is refused before it is read.
+
+    Raises
+    ------
+    DataError
+        When the file is missing, empty, too large, damaged, not what its ending says, or holds no
+        column of numbers.
+    """
+    source = str(path)
+    read = _reader(source, _suffix(path, DataError), _head(path, largest))
+    try:
+        return read(path, largest)
+    except ImpcError:
+        raise
+    except MemoryError:
+        raise DataError(
+            source, "does not fit in memory", "save only the signals that are needed"
+        ) from None
+    # The libraries meet damaged files with any exception: struct.error, KeyError, AssertionError.
+    except Exception as error:
+        reason = re.sub(r"\s+", " ", str(error)).strip()[:120] or type(error).__name__
+        raise DataError(
+            source, f"is damaged and cannot be read ({reason})", "copy or export it again"
+        ) from None
+
+
+def write_table(path: Path, table: Table) -> None:
+    """Write a table in the format of the ending, whole or not at all; .mat is written as v5.
+
+    Raises
+    ------
+    OutputError
+        When the ending is not known, the format cannot hold the table, or the file cannot be
+        written.
+    """
+    suffix = _suffix(path, OutputError)
+    _write(path, _ENCODERS[suffix](table))
+
+
+def write_matlab73(path: Path, table: Table) -> None:
+    """Write a .mat file of version 7.3, whole or not at all.
+
+    Raises
+    ------
+    OutputError
+        When a column cannot be a MATLAB name, or the file cannot be written.
+    """
+    _write(path, matlab73_bytes(table))
+
+
+_ENCODERS: dict[str, Callable[[Table], bytes]] = {
+    ".csv": lambda table: encode_delimited(table, ".csv"),
+    ".tsv": lambda table: encode_delimited(table, ".tsv"),
+    ".txt": lambda table: encode_delimited(table, ".txt"),
+    ".mat": encode_matlab,
+    ".tdms": encode_tdms,
+    ".c3d": encode_c3d,
+}
+
+
+def _suffix(path: Path, error: type[InputError | OutputError]) -> str:
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        known = ", ".join(SUFFIXES)
+        remedy = "export it as one of these"
+        raise error(str(path), f"has the ending {suffix!r}, and not {known}", remedy)
+    return suffix
+
+
+def _head(path: Path, largest: int) -> bytes:
+    """The first bytes of a file that can be read and is neither empty nor too large."""
+    source = str(path)
+    try:
+        if path.is_dir():
+            raise DataError(source, "is a folder", "name the file in it")
+        if path.exists() and not path.is_file():
+            raise DataError(source, "is no ordinary file", "copy it to one")
+        size = path.stat().st_size
+        if size == 0:
+            raise DataError(source, "is empty (0 bytes)", "copy or export it again")
+        if size > largest:
+            raise DataError(
+                source,
+                f"has {size / 1e9:.1f} GB, and {largest / 1e9:.1f} GB is the most that is read",
+                "export only the signals and seconds that are needed",
+            )
+        with path.open("rb") as file:
+            return file.read(1024)
+    except FileNotFoundError:
+        raise DataError(source, "does not exist", "check the path") from None
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise DataError(source, f"cannot be opened ({reason})", "check the path") from None
+
+
+def _reader(source: str, suffix: str, head: bytes) -> Callable[[Path, int], Table]:
+    """Who reads a file of this ending; the first bytes must agree with the ending."""
+    found = next((what for mark, what in _SIGNATURES.items() if head.startswith(mark)), "")
+    if suffix == ".mat":
+        return _matlab_reader(source, head, found)
+    if suffix == ".tdms":
+        _require(source, head.startswith(b"TDSm"), suffix, found)
+        return read_tdms
+    if suffix == ".c3d":
+        _require(source, head[1:2] == b"\x50", suffix, found)
+        return lambda path, _: read_c3d(path)
+    _require(source, not found, suffix, found)
+    return lambda path, _: read_delimited(path)
+
+
+def _matlab_reader(source: str, head: bytes, found: str) -> Callable[[Path, int], Table]:
+    """v5 or v7.3: the version in the header and the HDF5 signature behind it must agree."""
+    hdf5 = HDF5_SIGNATURE in (head[:8], head[512:520])
+    version = int.from_bytes(head[124:126], "big" if head[126:128] == b"MI" else "little") >> 8
+    if hdf5 and (version == 2 or head.startswith(HDF5_SIGNATURE)):
+        return read_matlab73
+    _require(source, head.startswith(b"MATLAB "), ".mat", found)
+    if version == 1 and not hdf5:
+        return read_matlab
+    inside, said = ("7.3", "5") if hdf5 else ("5", "7.3")
+    if hdf5 or version == 2:
+        problem = f"says that it is version {said} and holds version {inside} or damaged data"
+        raise DataError(source, problem, "save it again in MATLAB: save(..., '-v7')")
+    raise DataError(source, "is of no version that MATLAB writes", "save it again with '-v7'")
+
+
+def _require(source: str, agrees: bool, suffix: str, found: str) -> None:
+    if not agrees:
+        what = f"is {found}" if found else "does not begin as such a file"
+        raise DataError(source, f"ends in {suffix} and {what}", "export it again")
+
+
+def _write(path: Path, content: bytes) -> None:
+    try:
+        with tempfile.TemporaryDirectory(prefix=".impc-", dir=path.parent) as staging:
+            new = Path(staging, path.name)
+            new.write_bytes(content)
+            os.replace(new, path)
+    except OSError as error:
+        reason = error.strerror or type(error).__name__
+        raise OutputError(str(path), f"cannot be written ({reason})", "give another path") from None

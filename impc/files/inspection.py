@@ -1,0 +1,195 @@
+"""What a file holds, and a first configuration for it."""
+
+from __future__ import annotations
+
+import difflib
+import json
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.errors import InputError
+from impc.files.configuration import UNKNOWN_UNIT
+from impc.files.units import si_unit
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from impc.arrays import Array
+    from impc.files.table import Table
+
+__all__ = ["clock_column", "draft_configuration", "summary"]
+
+_CLOCKS = ("time", "t", "zeit", "temps", "tiempo", "timestamp", "clock", "seconds", "sec")
+
+
+def summary(table: Table) -> str:
+    """A table of the columns: unit, samples, range, mean, missing, and a rate where it rises."""
+    heads = ("column", "unit", "samples", "min", "max", "mean", "not finite", "rate")
+    rows = [heads, *(_row(table, name) for name in table.columns)]
+    widths = [max(len(row[index]) for row in rows) for index in range(len(heads))]
+    lines = [
+        "  ".join(
+            item.ljust(width) if index < 2 else item.rjust(width)
+            for index, (item, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in rows
+    ]
+    if table.rate is not None:
+        lines.append(f"The file says {table.rate:g} samples per second.")
+    lines += [f"Not read: {name} {reason}" for name, reason in table.skipped.items()]
+    return "\n".join(lines)
+
+
+def clock_column(table: Table) -> str | None:
+    """The column that is a clock: rising throughout, by its name or else with even steps."""
+    rising = [name for name, values in table.columns.items() if _rate(values) is not None]
+    named = [name for name in rising if _base(name) in _CLOCKS]
+    return next(iter(named or rising), None)
+
+
+def draft_configuration(
+    table: Table, outputs: Sequence[str] = (), disturbances: Sequence[str] = ()
+) -> str:
+    """A commented TOML file that `read_configuration` reads.
+
+    Parameters
+    ----------
+    table : Table
+    outputs, disturbances : sequence of str
+        Names of the plant's signals; without them every column becomes a signal by its own name.
+    """
+    lines = [
+        f"# What the columns of {table.source.rpartition('/')[2]} mean. Check every line; units",
+        f'# that the file does not tell are "{UNKNOWN_UNIT}" and must be filled in.',
+        "",
+        "[recording]",
+        *_clock_lines(table),
+        'subject = ""              # whose recording it is',
+        '# visit = "1"',
+        '# condition = "eyes open"',
+        '# trial = "1"             # by default the name of the file',
+        "# pattern = '(?P<subject>[^_]+)_(?P<trial>[0-9]+)'  # or the label from the file's name",
+        "# fill_gaps = 0.0         # s, the longest gap that may be filled by interpolation",
+        "# start = 0.0             # s, cut on the file's clock",
+        "# stop = 30.0",
+    ]
+    clock = clock_column(table)
+    rest = [name for name in table.columns if name != clock] or list(table.columns)
+    if outputs:
+        pairs = _guessed((*outputs, *disturbances), rest)
+    else:
+        pairs = [(name, name) for name in rest]
+        lines += ["", "# Name each table [signals.NAME] by an output or disturbance of the plant;"]
+        lines += ["# remove the columns that are none."]
+    for signal, column in pairs:
+        lines += ["", *_signal_lines(table, signal, column, signal in disturbances)]
+    lines += ["", "[plant]", "# arguments of the plant's function", ""]
+    lines += ["[fit]", "# settings of the fit"]
+    return "\n".join(lines) + "\n"
+
+
+def _row(table: Table, name: str) -> tuple[str, ...]:
+    values = table.columns[name]
+    finite = values[np.isfinite(values)]
+    numbers = (
+        tuple(f"{value:.6g}" for value in (finite.min(), finite.max(), finite.mean()))
+        if len(finite)
+        else ("-", "-", "-")
+    )
+    rate = _rate(values)
+    return (
+        name,
+        table.units.get(name, ""),
+        str(len(values)),
+        *numbers,
+        str(len(values) - len(finite)),
+        "" if rate is None else f"{rate:.6g}",
+    )
+
+
+def _rate(values: Array) -> float | None:
+    """Steps per unit of a column that rises evenly; None for the others."""
+    steps = np.diff(values)
+    if not np.isfinite(values).all() or (steps <= 0).any():
+        return None
+    median = float(np.median(steps))
+    even = np.abs(steps - median) < 0.5 * median
+    return 1 / median if even.mean() > 0.9 else None
+
+
+def _base(name: str) -> str:
+    return name.rpartition(".")[2].rpartition("/")[2].strip().lower()
+
+
+def _clock_lines(table: Table) -> list[str]:
+    clock = clock_column(table)
+    if clock is None and table.rate is not None:
+        return [f"# rate = {table.rate!r}       # samples per second: the file tells it itself"]
+    if clock is None:
+        return [
+            '# time = "..."            # no column rises evenly: name the one with the clock,',
+            "# rate = 1000.0           # or give the samples per second",
+        ]
+    values = table.columns[clock]
+    step = float(np.median(np.diff(values)))
+    told = table.units.get(clock)
+    unit, why = _time_unit(told, step)
+    seconds = (values[0], values[-1])
+    return [
+        f"time = {json.dumps(clock, ensure_ascii=False)}            # from {seconds[0]:.6g} to "
+        f"{seconds[1]:.6g}, in steps of {step:.6g}",
+        f"time_unit = {json.dumps(unit, ensure_ascii=False)}          # {why}",
+    ]
+
+
+def _time_unit(told: str | None, step: float) -> tuple[str, str]:
+    try:
+        if told and si_unit(told).base == "second":
+            return told, "as the file says"
+    except InputError:
+        pass
+    if step >= 0.5:
+        return "ms", "a guess: steps of half a second or more would be long; a counter needs rate"
+    return "s", "a guess"
+
+
+def _guessed(signals: Sequence[str], columns: Sequence[str]) -> list[tuple[str, str]]:
+    """A column for each signal, the most alike first, none twice while others are left."""
+    alike = sorted(
+        (
+            (-difflib.SequenceMatcher(None, signal.lower(), column.lower()).ratio(), signal, column)
+            for signal in signals
+            for column in columns
+        ),
+        key=lambda item: item[0],
+    )
+    chosen: dict[str, str] = {}
+    for _, signal, column in alike:
+        if signal not in chosen and column not in chosen.values():
+            chosen[signal] = column
+    return [(signal, chosen.get(signal, columns[0])) for signal in signals]
+
+
+def _signal_lines(table: Table, signal: str, column: str, acts: bool) -> list[str]:
+    told = table.units.get(column)
+    try:
+        unit, why = (told, "as the file says") if told and si_unit(told) else (UNKNOWN_UNIT, "")
+    except InputError:
+        unit, why = UNKNOWN_UNIT, f"the file says {told!r}, which is not known"
+    values = table.columns[column][np.isfinite(table.columns[column])]
+    span = f"from {values.min():.4g} to {values.max():.4g}" if len(values) else "all missing"
+    key = signal if signal.isidentifier() and signal.isascii() else _quoted(signal)
+    kind = "a disturbance: may be left out where none acts" if acts else f"recorded {span}"
+    return [
+        f"[signals.{key}]         # {kind}",
+        f"column = {_quoted(column)}",
+        f"unit = {_quoted(unit)}               # {why or 'fill in: deg, rad, N*m, ...'}",
+        "# limit = 12.0            # mechanical stop, in this unit",
+        "# offset = 0.0            # subtracted, in this unit",
+        "# sign = -1               # where the sensor counts the other way",
+    ]
+
+
+def _quoted(text: str) -> str:
+    return json.dumps(text, ensure_ascii=False)

@@ -1,0 +1,147 @@
+"""MATLAB .mat files of version 7.3: HDF5 behind a block of 512 bytes, by h5py."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from impc.errors import DataError
+from impc.files.matlab import array_columns, nested_columns
+from impc.files.table import make_table
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from impc.arrays import Array
+    from impc.files.table import Table
+
+__all__ = ["HDF5_SIGNATURE", "matlab73_bytes", "read_matlab73"]
+
+HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
+_USER_BLOCK = 512
+_DEPTH = 8
+_NUMERIC = {"double", "single", "logical"} | {
+    f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)
+}
+_AS_STRUCT = 'save a struct of vectors: s = table2struct(T, "ToScalar", true)'
+
+
+@dataclass
+class _Found:
+    """What a file holds, while it is read."""
+
+    source: str
+    left: int  # bytes that may still be read
+    columns: dict[str, Array] = field(default_factory=dict)
+    skipped: dict[str, str] = field(default_factory=dict)
+
+
+def read_matlab73(path: Path, largest: int) -> Table:
+    """Read a .mat file of version 7.3.
+
+    Parameters
+    ----------
+    path : Path
+    largest : int
+        The most bytes that its arrays may take once they are unpacked.
+
+    Raises
+    ------
+    DataError
+        When it holds no numeric vector or matrix, or refers to another file.
+    """
+    import h5py  # noqa: PLC0415  # a fifth of a second, for who reads text only
+
+    found = _Found(str(path), largest)
+    with h5py.File(path, "r") as file:
+        _collect(found, "", file, 0)
+    return make_table(found.source, found.columns, None, None, found.skipped)
+
+
+def matlab73_bytes(table: Table) -> bytes:
+    """The bytes of a v7.3 .mat file with one column vector for each column.
+
+    Raises
+    ------
+    OutputError
+        When a column cannot be the name of a MATLAB variable.
+    """
+    import h5py  # noqa: PLC0415
+
+    content = io.BytesIO()
+    with h5py.File(content, "w", userblock_size=_USER_BLOCK) as file:
+        _write(file, nested_columns(table.source, table.columns))
+    text = b"MATLAB 7.3 MAT-file, written by impc. HDF5 schema 1.00 ."
+    header = text.ljust(116) + bytes(8) + b"\x00\x02IM"
+    return header.ljust(_USER_BLOCK, b"\0") + content.getvalue()[_USER_BLOCK:]
+
+
+def _write(group: Any, values: Mapping[str, Any]) -> None:
+    for name, value in values.items():
+        if isinstance(value, dict):
+            made = group.create_group(name)
+            _write(made, value)
+            kind = b"struct"
+        else:
+            made = group.create_dataset(name, data=value[None, :])  # HDF5 has rows, MATLAB columns
+            kind = b"double"
+        made.attrs["MATLAB_class"] = np.bytes_(kind)
+
+
+def _collect(found: _Found, prefix: str, group: Any, depth: int) -> None:
+    import h5py  # noqa: PLC0415
+
+    for name in group:
+        if not prefix and name in ("#refs#", "#subsystem#"):
+            continue
+        full = f"{prefix}{name}"
+        if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+            raise DataError(found.source, f"{full} points elsewhere", "save the signals themselves")
+        item = group[name]
+        kind = _class_of(item)
+        if isinstance(item, h5py.Group):
+            if "MATLAB_object_decode" in item.attrs or kind not in ("struct", ""):
+                found.skipped[full] = f"is a MATLAB {kind}; {_AS_STRUCT}, or writetable"
+            elif depth >= _DEPTH:
+                raise DataError(found.source, f"{full} is nested too deep", "save plain vectors")
+            else:
+                _collect(found, f"{full}.", item, depth + 1)
+        elif isinstance(item, h5py.Dataset):
+            _add(found, full, item, kind)
+
+
+def _add(found: _Found, name: str, dataset: Any, kind: str) -> None:
+    """Read one dataset, when it is numeric."""
+    if dataset.external or dataset.is_virtual:
+        raise DataError(found.source, f"{name} lies in another file", "save the signals themselves")
+    if "MATLAB_object_decode" in dataset.attrs or kind not in (*_NUMERIC, ""):
+        reasons = {"char": "is text", "cell": f"is a cell array; {_AS_STRUCT}, or cell2mat"}
+        found.skipped[name] = reasons.get(kind, f"is a MATLAB {kind}; {_AS_STRUCT}, or writetable")
+        return
+    if dataset.attrs.get("MATLAB_empty", 0):
+        found.skipped[name] = "is empty"
+        return
+    if dataset.dtype.names is not None:
+        found.skipped[name] = "is complex"
+        return
+    found.left -= 8 * int(dataset.size or 0)
+    if found.left < 0:
+        raise DataError(
+            found.source,
+            f"is too large once it is unpacked (at {name})",
+            "save only the signals that are needed",
+        )
+    columns = array_columns(name, np.asarray(dataset[()]).T)
+    if isinstance(columns, str):
+        found.skipped[name] = columns
+    else:
+        found.columns.update(columns)
+
+
+def _class_of(item: Any) -> str:
+    kind = item.attrs.get("MATLAB_class", b"")
+    return kind.decode("ascii", "replace") if isinstance(kind, bytes) else str(kind)

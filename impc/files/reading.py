@@ -1,0 +1,220 @@
+"""Recordings from files: columns by the configuration, checked, on the plant's clock."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.errors import DataError, InputError
+from impc.files import checks
+from impc.files.alignment import misaligned
+from impc.files.clock import column_of, on_even_instants, read_clock
+from impc.files.configuration import UNKNOWN_UNIT
+from impc.files.formats import read_table
+from impc.files.resampling import held_means, instants, same_rate
+from impc.files.units import si_unit
+from impc.recording import Label, recording
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from impc.arrays import Array
+    from impc.files.clock import Clock
+    from impc.files.configuration import Configuration, RecordingTable, SignalTable
+    from impc.files.table import Table
+    from impc.files.units import Unit
+    from impc.plant import Plant
+    from impc.recording import Recording
+
+__all__ = ["read_recordings", "recording_of"]
+
+# Samples for each state of the plant below which nothing can be fitted.
+_SAMPLES_A_STATE = 5
+
+
+def read_recordings(
+    paths: Sequence[Path], configuration: Configuration, plant: Plant
+) -> tuple[Recording, ...]:
+    """Read one trial from each file, in the order given.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+    configuration : Configuration
+        Names a column for each output of the plant, and for the disturbances that were recorded;
+        the others are zero.
+    plant : Plant
+        Discrete; gives the names and the rate.
+
+    Returns
+    -------
+    tuple of Recording
+        In SI base units; initial states zero; findings of the checks beside each.
+
+    Raises
+    ------
+    InputError
+        When the configuration does not name the plant's signals, or a file is given twice.
+    DataError
+        When a file cannot be read or a check fails. Nothing is returned then.
+    """
+    plant.require_discrete()
+    _require_names(configuration, plant)
+    _require_distinct(paths)
+    if not paths:
+        raise InputError("recordings", "no file is given", "name at least one")
+    trials = [recording_of(read_table(path), configuration, plant) for path in paths]
+    longest = max(trial.samples for trial in trials)
+    return tuple(
+        trial
+        if trial.samples == longest
+        else replace(trial, findings=(*trial.findings, _shorter(path, trial.samples, longest)))
+        for path, trial in zip(paths, trials, strict=True)
+    )
+
+
+def recording_of(table: Table, configuration: Configuration, plant: Plant) -> Recording:
+    """Make the trial of one table: checks, even clock, plant's rate.
+
+    Raises
+    ------
+    DataError
+        When a check fails.
+    """
+    entry = configuration.recording
+    label = _label(table.source, entry)
+    clock = read_clock(table, entry)
+    findings = list(clock.findings)
+    acting = [name for name in plant.disturbances if name in configuration.signals]
+    series: dict[str, Array] = {}
+    for name in (*plant.outputs, *acting):
+        channel = _channel(table, clock, name, configuration.signals[name])
+        response = name in plant.outputs
+        findings += _checked(table, channel, configuration.signals[name], entry, response)
+        even = on_even_instants(clock, channel.values * channel.unit.factor)
+        resample = instants if response else held_means
+        series[name] = resample(even, clock.period, plant.dt)
+    samples = len(series[plant.outputs[0]])
+    checks.too_few(table.source, samples, _SAMPLES_A_STATE * plant.n)
+    findings += _slower(table.source, clock, plant)
+    disturbance = np.zeros((samples, len(plant.disturbances)))
+    for index, name in enumerate(plant.disturbances):
+        if name in series:
+            disturbance[:, index] = series[name]
+            findings += _order(table.source, series, name, plant)
+    outputs = np.column_stack([series[name] for name in plant.outputs])
+    return recording(
+        plant, outputs, disturbance, np.zeros(plant.n), label=label, findings=tuple(findings)
+    )
+
+
+def _require_names(configuration: Configuration, plant: Plant) -> None:
+    known = (*plant.outputs, *plant.disturbances)
+    for name in configuration.signals:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, n=1)
+            remedy = f"did you mean {near[0]}?" if near else f"the plant has {', '.join(known)}"
+            raise InputError(f"signals.{name}", "is no output or disturbance of the plant", remedy)
+    absent = [name for name in plant.outputs if name not in configuration.signals]
+    if absent:
+        raise InputError(
+            f"signals.{absent[0]}",
+            f"is missing: the plant's outputs are {', '.join(plant.outputs)}",
+            "write a table [signals.NAME] for each",
+        )
+    for name, entry in configuration.signals.items():
+        if entry.unit == UNKNOWN_UNIT:
+            raise InputError(
+                f"signals.{name}.unit", f"is still {UNKNOWN_UNIT!r}", "fill in the column's unit"
+            )
+
+
+def _require_distinct(paths: Sequence[Path]) -> None:
+    seen: set[Path] = set()
+    for path in paths:
+        place = Path(path).resolve()
+        if place in seen:
+            raise InputError(str(path), "is given twice", "name each trial once")
+        seen.add(place)
+
+
+def _label(source: str, entry: RecordingTable) -> Label:
+    stem = Path(source).stem
+    groups: dict[str, str | None] = {}
+    if entry.pattern is not None:
+        found = re.fullmatch(entry.pattern, stem)
+        if found is None:
+            raise DataError(
+                source,
+                f"the name {stem!r} does not match recording.pattern {entry.pattern!r}",
+                "rename the file or correct the pattern",
+            )
+        groups = found.groupdict()
+    return Label(
+        subject=groups.get("subject") or entry.subject,
+        visit=groups.get("visit") or entry.visit,
+        condition=groups.get("condition") or entry.condition,
+        trial=groups.get("trial") or entry.trial or stem,
+    )
+
+
+def _channel(table: Table, clock: Clock, name: str, entry: SignalTable) -> checks.Channel:
+    column, values = column_of(table, entry.column, f"signals.{name}.column")
+    used = entry.sign * (values[clock.rows] - entry.offset)
+    return checks.Channel(table.source, name, column, si_unit(entry.unit), clock.time, used)
+
+
+def _checked(
+    table: Table,
+    channel: checks.Channel,
+    entry: SignalTable,
+    recorded: RecordingTable,
+    response: bool,
+) -> list[str]:
+    """Every check of one channel, those first whose fault would explain the others."""
+    found = [
+        checks.unit_of_the_file(channel, _told_unit(table, channel.column)),
+        checks.missing(channel, recorded.fill_gaps),
+        checks.constant(channel),
+        checks.degrees_for_radians(channel) if response else "",
+        "" if entry.limit is None else checks.beyond_the_stop(channel, entry.limit),
+        # A perturbation of two or three levels rests on its extremes by design.
+        checks.clipped(channel) if response else "",
+    ]
+    return [finding for finding in found if finding]
+
+
+def _told_unit(table: Table, column: str) -> Unit | None:
+    try:
+        return si_unit(table.units[column])
+    except (KeyError, InputError):
+        return None  # the file tells none, or one that only its maker knows
+
+
+def _slower(source: str, clock: Clock, plant: Plant) -> list[str]:
+    samples = len(clock.time)
+    if clock.period < plant.dt or same_rate(samples, clock.period, plant.dt):
+        return []
+    return [
+        f"{source}: recorded at {1 / clock.period:.4g} samples per second and analysed at "
+        f"{1 / plant.dt:.4g}: nothing above {0.5 / clock.period:.4g} Hz is known"
+    ]
+
+
+def _order(source: str, series: dict[str, Array], name: str, plant: Plant) -> list[str]:
+    """The response that follows a disturbance most must not come before it."""
+    found = [misaligned(series[name], series[output], plant.dt) for output in plant.outputs]
+    return [
+        f"{source}: {output} {reason} ({name})"
+        for output, reason in zip(plant.outputs, found, strict=True)
+        if reason
+    ]
+
+
+def _shorter(path: Path, samples: int, longest: int) -> str:
+    return f"{path}: trials of unequal length, {samples} samples where the longest has {longest}"

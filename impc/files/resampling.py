@@ -1,0 +1,139 @@
+"""From the recorded clock to the plant's: outputs at instants, disturbances as means.
+
+The plant holds its inputs over a sample. An output is wanted as its value at the instant k dt,
+after what the new rate cannot show has been removed; a disturbance as its mean over
+[k dt, (k + 1) dt), so that the plant receives the same impulse. With x_j recorded at t_j = j T,
+
+    y_k = sum_j h(k dt - t_j) x_j / sum_j h(k dt - t_j)
+    d_k = (1 / dt) integral of x from k dt to (k + 1) dt, x linear between its samples
+
+h is a sinc under a Kaiser window, even, so that no phase is added; see docs/recordings.md. Before
+the first and behind the last sample x is continued by its point reflection 2 x_0 - x_j.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy.signal
+
+if TYPE_CHECKING:
+    from impc.arrays import Array
+
+__all__ = ["edge", "held_means", "instants", "resampled_samples", "same_rate"]
+
+# Attenuation in dB of what would alias, and the largest ripple below: 10^(-70/20) = 3e-4.
+_ATTENUATION = 70.0
+# What is kept ends here, as a part of the lower of the two Nyquist frequencies; what is removed
+# begins at that frequency itself.
+_PASS = 0.8
+# Rates are the same when the clocks differ by less than this part of a sample at the end.
+_SAME = 0.05
+_CHUNK = 2_000_000  # numbers in memory at a time: 16 MB
+
+
+def same_rate(samples: int, period: float, dt: float) -> bool:
+    """Whether two clocks stay together over a recording."""
+    return samples * abs(period - dt) <= _SAME * dt
+
+
+def resampled_samples(samples: int, period: float, dt: float) -> int:
+    """Number of instants k dt within a recording of that many samples."""
+    return int(np.floor((samples - 1) * period / dt + 1e-6)) + 1
+
+
+def edge(period: float, dt: float) -> float:
+    """Seconds at either end in which the filter sees continued samples."""
+    return _half_width(period, dt)
+
+
+def instants(values: Array, period: float, dt: float) -> Array:
+    """Values at the instants k dt, without what the lower of the two rates cannot show.
+
+    Parameters
+    ----------
+    values : Array
+        (samples,), recorded every `period` seconds.
+    period, dt : float
+        s.
+
+    Returns
+    -------
+    Array
+        (resampled samples,). The values themselves when the rates are the same.
+    """
+    if same_rate(len(values), period, dt):
+        return values
+    half = int(np.ceil(_half_width(period, dt) / period))
+    padded = _continued(values, half + 1)
+    positions = np.arange(resampled_samples(len(values), period, dt)) * dt / period
+    whole = np.floor(positions + 1e-9).astype(np.int64)
+    # Equal phases share their weights: for a rational ratio there are few.
+    phases, which = np.unique(np.round(positions - whole, 9), return_inverse=True)
+    offsets = np.arange(-half, half + 2)
+    result = np.empty(len(positions))
+    for part in np.array_split(
+        np.argsort(which, kind="stable"), 1 + len(positions) * len(offsets) // _CHUNK
+    ):
+        used, local = np.unique(which[part], return_inverse=True)
+        weights = _kernel(np.asarray((phases[used, None] - offsets) * period), period, dt)
+        weights /= weights.sum(axis=1, keepdims=True)  # a constant stays what it is
+        taken = padded[whole[part, None] + offsets + half + 1]
+        result[part] = np.einsum("ij,ij->i", weights[local], taken)
+    return result
+
+
+def held_means(values: Array, period: float, dt: float) -> Array:
+    """Means over [k dt, (k + 1) dt) of a signal that is linear between its samples.
+
+    The last interval reaches beyond the recording; there the last value is held.
+
+    Parameters
+    ----------
+    values : Array
+        (samples,), recorded every `period` seconds.
+    period, dt : float
+        s.
+
+    Returns
+    -------
+    Array
+        (resampled samples,). The values themselves when the rates are the same.
+    """
+    if same_rate(len(values), period, dt):
+        return values
+    extra = int(np.ceil(dt / period)) + 1
+    held = np.concatenate([values, np.full(extra, values[-1])])
+    areas = np.concatenate([[0.0], np.cumsum((held[1:] + held[:-1]) / 2)])
+    borders = np.arange(resampled_samples(len(values), period, dt) + 1) * dt / period
+    whole = np.minimum(np.floor(borders).astype(np.int64), len(held) - 2)
+    part = borders - whole
+    slope = held[whole + 1] - held[whole]
+    integral = areas[whole] + held[whole] * part + slope * part**2 / 2
+    return np.asarray(np.diff(integral) * period / dt)
+
+
+def _half_width(period: float, dt: float) -> float:
+    """Half the length of the filter, s: Kaiser's formula for its attenuation and transition."""
+    nyquist = 0.5 / max(period, dt)
+    transition = 2 * np.pi * (1 - _PASS) * nyquist  # rad/s
+    return float((_ATTENUATION - 7.95) / (2.285 * transition) / 2)
+
+
+def _kernel(time: Array, period: float, dt: float) -> Array:
+    """h at these times: a sinc under a Kaiser window."""
+    cut = (1 + _PASS) / 2 * 0.5 / max(period, dt)  # Hz, the middle of the transition
+    inside = 1 - (time / _half_width(period, dt)) ** 2
+    beta = scipy.signal.kaiser_beta(_ATTENUATION)
+    window = np.where(inside > 0, np.i0(beta * np.sqrt(np.maximum(inside, 0))), 0.0)
+    return np.asarray(np.sinc(2 * cut * time) * window)
+
+
+def _continued(values: Array, width: int) -> Array:
+    """Point reflection at both ends; a recording shorter than the filter is held beyond it."""
+    inner = min(width, len(values) - 1)
+    left = 2 * values[0] - values[inner:0:-1]
+    right = 2 * values[-1] - values[-2 : -inner - 2 : -1]
+    reflected = np.concatenate([left, values, right])
+    return np.pad(reflected, width - inner, mode="edge")

@@ -1,0 +1,93 @@
+"""A recording to begin with: a seat that is pushed, and files of it by other means than impc's."""
+
+from __future__ import annotations
+
+import io
+from typing import TYPE_CHECKING, Any
+
+import h5py
+import numpy as np
+import scipy.io
+import scipy.signal
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from impc.arrays import Array
+
+__all__ = ["CONFIGURATION", "csv_text", "hdf5_mat", "pushed_seat", "save_mat", "settings"]
+
+#: Columns of `pushed_seat` as signals of `plants:seated_balance_plant`.
+CONFIGURATION = """
+[recording]
+time = "time"
+subject = "S01"
+
+[signals.theta1]
+column = "seat"
+unit = "deg"
+limit = 12.0
+
+[signals.theta2]
+column = "trunk"
+unit = "deg"
+
+[signals.perturbation]
+column = "push"
+unit = "Nm"
+"""
+
+
+def settings(*changes: tuple[str, str]) -> str:
+    """`CONFIGURATION` with pieces replaced; each must be there."""
+    text = CONFIGURATION
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    return text
+
+
+def pushed_seat(samples: int = 600, rate: float = 100.0, seed: int = 1) -> dict[str, Array]:
+    """Clock in s, two angles in deg that follow a push of two levels in Nm; one random seed."""
+    rng = np.random.default_rng(seed)
+    hold = max(1, round(0.2 * rate))
+    push = np.repeat(rng.choice([-10.0, 10.0], samples // hold + 1), hold)[:samples]
+    mode = scipy.signal.cont2discrete(([[4.0]], [1.0, 2.0, 9.0]), 1 / rate)
+    numerator, denominator = np.ravel(mode[0]), mode[1]
+    seat = scipy.signal.lfilter(numerator, denominator, push)
+    trunk = scipy.signal.lfilter(numerator, denominator, -push) / 2
+    noise = 0.02 * rng.normal(size=(2, samples))
+    return {
+        "time": np.arange(samples) / rate,
+        "seat": seat + noise[0],
+        "trunk": trunk + noise[1],
+        "push": push,
+    }
+
+
+def csv_text(columns: Mapping[str, Array], delimiter: str = ",", decimal: str = ".") -> str:
+    """Columns as delimited text, 10 digits."""
+    rows = zip(*(values.tolist() for values in columns.values()), strict=True)
+    lines = [delimiter.join(f"{value:.10g}".replace(".", decimal) for value in row) for row in rows]
+    return "\n".join([delimiter.join(columns), *lines]) + "\n"
+
+
+def save_mat(path: Path, values: Mapping[str, Any], **options: Any) -> None:
+    """A v5 .mat file by scipy."""
+    content = io.BytesIO()
+    save: Any = scipy.io.savemat
+    save(content, dict(values), **options)
+    path.write_bytes(content.getvalue())
+
+
+def hdf5_mat(
+    path: Path, values: Mapping[str, Any], classes: Mapping[str, str] | None = None
+) -> Any:
+    """A v7.3 .mat file by h5py, as MATLAB lays it out: transposed, with a user block."""
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name, value in values.items():
+            made = file.create_dataset(name, data=np.atleast_2d(value))
+            made.attrs["MATLAB_class"] = np.bytes_((classes or {}).get(name, "double"))
+    with path.open("r+b") as plain:
+        plain.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(116) + bytes(8) + b"\0\2IM")
