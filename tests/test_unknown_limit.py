@@ -1,0 +1,70 @@
+"""The input limit is found where it shows, and said not to show where it does not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from experiments.benchmarks.workloads import seat
+from experiments.coverage import cart, noisy_trial, true_controller
+from experiments.simulated_subjects import noisy_recordings
+from impc.closed_loop import scenario, simulate
+from impc.errors import InputError
+from impc.fit_recordings import fit_problem
+from impc.fit_settings import FitSettings
+from impc.fitted_controller import FittedController, fit_controller
+from impc.recording import Recording, recording
+from impc.unknown_limit import input_limit, with_limit
+
+SEED = 3
+
+
+def fitted_cart(trial: Recording, limit: float | None) -> FittedController:
+    return fit_controller(fit_problem(cart(), [trial], FitSettings(horizon=10, u_max=limit)))
+
+
+def gentle_trial() -> Recording:
+    """Pushed so little that the limit of 1 is never met; noise of a fifth."""
+    rng, controller = np.random.default_rng(SEED), true_controller()
+    push = np.repeat(rng.choice([-0.1, 0.0, 0.1], 150), 10)
+    run = simulate(controller, scenario(controller.plant, np.zeros(2), disturbance=push))
+    assert np.max(np.abs(run.u)) < 0.8
+    clean = (run.x @ controller.plant.C.T)[:1500]
+    noise = rng.standard_normal(clean.shape)
+    return recording(controller.plant, clean + 0.2 * np.std(clean) * noise, push)
+
+
+@pytest.mark.parametrize("assumed", [None, 1.4])
+def test_a_limit_that_is_met_is_found(assumed: float | None) -> None:
+    """Seed 3: within 2 %, the truth inside the interval, whatever was assumed before."""
+    found = input_limit(fitted_cart(noisy_trial(SEED, 0.0), assumed))
+    assert found.value == pytest.approx(1.0, rel=0.02)
+    assert found.low < 1.0 < found.high
+    assert found.against_none > found.quantile
+    assert np.min(found.distances) >= -1e-6
+
+
+def test_a_limit_that_is_never_met_is_not_determined() -> None:
+    found = input_limit(fitted_cart(gentle_trial(), None))
+    assert found.value is None
+    assert found.high == np.inf
+    assert found.against_none <= found.quantile
+    assert "no limit explains the recordings as well as any" in found.reason
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(5))
+def test_limits_of_noisy_subjects(seed: int) -> None:
+    """The seat at 6 Nm, an eighth of its samples saturated: within 2 %; at 70 Nm: not told."""
+    plant = seat(1, 1.0).problem.plant
+    for true, value in ((6.0, pytest.approx(6.0, rel=0.02)), (70.0, None)):
+        trials = noisy_recordings(true, seed, 0.9)
+        assert input_limit(fit_controller(fit_problem(plant, trials, FitSettings()))).value == value
+
+
+def test_with_limit_changes_one_input_only() -> None:
+    fitted = fitted_cart(gentle_trial(), 1.0)
+    assert with_limit(fitted.problem, 2.0).bounds.u_max.tolist() == [2.0]
+    assert np.isinf(with_limit(fitted.problem, np.inf).bounds.u_min[0])
+    with pytest.raises(InputError, match="control"):
+        input_limit(fitted, 1)
