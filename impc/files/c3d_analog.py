@@ -40,7 +40,7 @@ def read_c3d(path: Path) -> Table:
         warnings.simplefilter("ignore")
         reader = c3d.Reader(handle)
         expected = int(reader.last_frame) - int(reader.first_frame) + 1
-        if not reader.analog_used:
+        if not reader.analog_used or reader.analog_per_frame < 1:
             raise DataError(source, "has no analog channels", "export them; markers are not read")
         frames = [analog for _, _, analog in reader.read_frames(copy=False)]
         if len(frames) < expected:

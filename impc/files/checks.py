@@ -30,8 +30,8 @@ __all__ = [
 ]
 
 # Share of samples that rest on an extreme value: above the first a finding, above the second no
-# use. A sinusoid that is recorded in steps of 5 % of its range rests for a tenth of its time on
-# each extreme, but not three times as long as on the next step.
+# use. A sinusoid in coarse steps rests on its extremes too, but at most 2.4 times as long as on the
+# next step (square roots of 2 and 4 steps); so three times is asked for.
 _CLIPPED, _TOO_CLIPPED = 0.01, 0.05
 _NEXT = 3.0
 # Largest deviations of an angle, rad: more than half a turn is no posture; 0.2 deg is the size of
@@ -133,7 +133,7 @@ def clipped(channel: Channel) -> str:
     finite = channel.values[np.isfinite(channel.values)]
     span = np.ptp(finite)
     levels = np.unique(finite)
-    step = max(0.02 * span, 1.001 * (levels[-1] - levels[-2]), 1.001 * (levels[1] - levels[0]))
+    step = max(0.01 * span, 1.001 * (levels[-1] - levels[-2]), 1.001 * (levels[1] - levels[0]))
     for extreme in (levels[-1], levels[0]):
         resting = channel.values == extreme
         near = (np.abs(channel.values - extreme) <= step) & ~resting

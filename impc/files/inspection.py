@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 __all__ = ["clock_column", "draft_configuration", "summary"]
 
 _CLOCKS = ("time", "t", "zeit", "temps", "tiempo", "timestamp", "clock", "seconds", "sec")
+_ALIKE = 0.6  # theta1 and theta_2 are, push and perturbation are not
 
 
 def summary(table: Table) -> str:
@@ -60,19 +61,13 @@ def draft_configuration(
         Names of the plant's signals; without them every column becomes a signal by its own name.
     """
     lines = [
-        f"# What the columns of {table.source.rpartition('/')[2]} mean. Check every line; units",
-        f'# that the file does not tell are "{UNKNOWN_UNIT}" and must be filled in.',
+        f"# What the columns of {table.source.rpartition('/')[2]} mean. Check every line; units that",
+        f'# the file does not tell are "{UNKNOWN_UNIT}" and must be filled in.',
         "",
         "[recording]",
         *_clock_lines(table),
-        'subject = ""              # whose recording it is',
-        '# visit = "1"',
-        '# condition = "eyes open"',
-        '# trial = "1"             # by default the name of the file',
-        "# pattern = '(?P<subject>[^_]+)_(?P<trial>[0-9]+)'  # or the label from the file's name",
-        "# fill_gaps = 0.0         # s, the longest gap that may be filled by interpolation",
-        "# start = 0.0             # s, cut on the file's clock",
-        "# stop = 30.0",
+        _line('subject = ""', "whose recording it is"),
+        *_OPTIONS,
     ]
     clock = clock_column(table)
     rest = [name for name in table.columns if name != clock] or list(table.columns)
@@ -122,25 +117,35 @@ def _base(name: str) -> str:
     return name.rpartition(".")[2].rpartition("/")[2].strip().lower()
 
 
+def _line(setting: str, comment: str) -> str:
+    return f"{setting:<26}# {comment}"
+
+
+_OPTIONS = (
+    '# visit = "1"',
+    '# condition = "eyes open"',
+    _line('# trial = "1"', "by default the name of the file"),
+    "# pattern = '(?P<subject>[^_]+)_(?P<trial>[0-9]+)'  # or the label from the file's name",
+    _line("# fill_gaps = 0.0", "s, the longest gap that may be filled by interpolation"),
+    _line("# start = 0.0", "s, cut on the file's clock"),
+    "# stop = 30.0",
+)
+
+
 def _clock_lines(table: Table) -> list[str]:
     clock = clock_column(table)
     if clock is None and table.rate is not None:
-        return [f"# rate = {table.rate!r}       # samples per second: the file tells it itself"]
+        return [_line(f"# rate = {table.rate!r}", "samples per second; the file tells it itself")]
     if clock is None:
         return [
-            '# time = "..."            # no column rises evenly: name the one with the clock,',
-            "# rate = 1000.0           # or give the samples per second",
+            _line('# time = "..."', "no column rises evenly: name the one with the clock,"),
+            _line("# rate = 1000.0", "or give the samples per second"),
         ]
     values = table.columns[clock]
     step = float(np.median(np.diff(values)))
-    told = table.units.get(clock)
-    unit, why = _time_unit(told, step)
-    seconds = (values[0], values[-1])
-    return [
-        f"time = {json.dumps(clock, ensure_ascii=False)}            # from {seconds[0]:.6g} to "
-        f"{seconds[1]:.6g}, in steps of {step:.6g}",
-        f"time_unit = {json.dumps(unit, ensure_ascii=False)}          # {why}",
-    ]
+    unit, why = _time_unit(table.units.get(clock), step)
+    span = f"from {values[0]:.6g} to {values[-1]:.6g}, in steps of {step:.6g}"
+    return [_line(f"time = {_quoted(clock)}", span), _line(f"time_unit = {_quoted(unit)}", why)]
 
 
 def _time_unit(told: str | None, step: float) -> tuple[str, str]:
@@ -155,20 +160,22 @@ def _time_unit(told: str | None, step: float) -> tuple[str, str]:
 
 
 def _guessed(signals: Sequence[str], columns: Sequence[str]) -> list[tuple[str, str]]:
-    """A column for each signal, the most alike first, none twice while others are left."""
-    alike = sorted(
-        (
-            (-difflib.SequenceMatcher(None, signal.lower(), column.lower()).ratio(), signal, column)
-            for signal in signals
-            for column in columns
-        ),
-        key=lambda item: item[0],
-    )
+    """A column for each signal: the most alike first, then by order."""
+    likeness = {
+        (signal, column): difflib.SequenceMatcher(None, signal.lower(), column.lower()).ratio()
+        for signal in signals
+        for column in columns
+    }
     chosen: dict[str, str] = {}
-    for _, signal, column in alike:
-        if signal not in chosen and column not in chosen.values():
+    for signal, column in sorted(likeness, key=lambda pair: -likeness[pair]):
+        alike = likeness[signal, column] >= _ALIKE
+        if alike and signal not in chosen and column not in chosen.values():
             chosen[signal] = column
-    return [(signal, chosen.get(signal, columns[0])) for signal in signals]
+    left = [column for column in columns if column not in chosen.values()]
+    for signal in signals:
+        if signal not in chosen:
+            chosen[signal] = left.pop(0) if left else columns[0]
+    return [(signal, chosen[signal]) for signal in signals]
 
 
 def _signal_lines(table: Table, signal: str, column: str, acts: bool) -> list[str]:
@@ -182,12 +189,12 @@ def _signal_lines(table: Table, signal: str, column: str, acts: bool) -> list[st
     key = signal if signal.isidentifier() and signal.isascii() else _quoted(signal)
     kind = "a disturbance: may be left out where none acts" if acts else f"recorded {span}"
     return [
-        f"[signals.{key}]         # {kind}",
+        _line(f"[signals.{key}]", kind),
         f"column = {_quoted(column)}",
-        f"unit = {_quoted(unit)}               # {why or 'fill in: deg, rad, N*m, ...'}",
-        "# limit = 12.0            # mechanical stop, in this unit",
-        "# offset = 0.0            # subtracted, in this unit",
-        "# sign = -1               # where the sensor counts the other way",
+        _line(f"unit = {_quoted(unit)}", why or "fill in: deg, rad, N*m, ..."),
+        _line("# limit = 12.0", "mechanical stop, in this unit"),
+        _line("# offset = 0.0", "subtracted, in this unit"),
+        _line("# sign = -1", "where the sensor counts the other way"),
     ]
 
 

@@ -46,7 +46,8 @@ def read_tdms(path: Path, largest: int) -> Table:
     except ImportError:
         raise DataError(str(path), "needs the package nptdms", _REMEDY) from None
     source = str(path)
-    with _silent(), TdmsFile.open(path) as file:
+    # Opened here, because nptdms leaves a file open when its head is damaged.
+    with _silent(), path.open("rb") as handle, TdmsFile.open(handle) as file:
         if file.file_status.incomplete_final_segment:
             raise DataError(
                 source, "ends in the middle of its data", "copy it again, or close it in LabVIEW"

@@ -21,7 +21,7 @@ _UNCLEAR = {
 }
 # Letters, products, quotients and one-digit exponents. Longer numbers would be computed by pint,
 # and 9**9**9 takes as long as it likes.
-_WRITTEN = re.compile(r"[A-Za-zµμ°Ω%_·⋅*/^ ()0-9²³-]{1,40}")
+_WRITTEN = re.compile(r"[A-Za-zµμ°Ω%_·⋅.*/^ ()0-9²³-]{1,40}")
 _HOSTILE = re.compile(r"[0-9)²³] *(\*\*|\^)|[0-9²³]{2}")
 
 
@@ -67,6 +67,7 @@ def si_unit(written: str) -> Unit:
         raise _unknown(written)
     text = text.replace("⋅", "*").replace("²", "^2").replace("³", "^3")
     text = _TORQUE.sub(lambda found: f"{found[1]}N*{found[2]}m", text)
+    text = re.sub(r"(?<=[A-Za-z0-9])\.(?=[A-Za-z])", "*", text)
     for spelling in (text, re.sub(r"(?<=[a-z])(\d)", r"^\1", text), text.lower()):
         found = _base(spelling)
         if found is not None:

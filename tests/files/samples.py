@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import struct
 from typing import TYPE_CHECKING, Any
 
 import h5py
@@ -16,7 +17,15 @@ if TYPE_CHECKING:
 
     from impc.arrays import Array
 
-__all__ = ["CONFIGURATION", "csv_text", "hdf5_mat", "pushed_seat", "save_mat", "settings"]
+__all__ = [
+    "CONFIGURATION",
+    "csv_text",
+    "hdf5_mat",
+    "opaque_variable",
+    "pushed_seat",
+    "save_mat",
+    "settings",
+]
 
 #: Columns of `pushed_seat` as signals of `plants:seated_balance_plant`.
 CONFIGURATION = """
@@ -91,3 +100,19 @@ def hdf5_mat(
             made.attrs["MATLAB_class"] = np.bytes_((classes or {}).get(name, "double"))
     with path.open("r+b") as plain:
         plain.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(116) + bytes(8) + b"\0\2IM")
+
+
+def opaque_variable(name: bytes, kind: bytes) -> bytes:
+    """A variable of a v5 file that is an object of a class of MATLAB's, such as table.
+
+    Class 17 (opaque), then name, kind of object, class, and a reference.
+    """
+    sizes = _element(6, struct.pack("<II", 13, 0)) + _element(5, struct.pack("<ii", 6, 1))
+    reference = _element(14, sizes + _element(1, b"") + _element(6, bytes(24)))
+    names = b"".join(_element(1, text) for text in (name, b"MCOS", kind))
+    return _element(14, _element(6, struct.pack("<II", 17, 0)) + names + reference)
+
+
+def _element(kind: int, content: bytes) -> bytes:
+    """One element of a v5 file: its type, its length, its bytes, filled up to eight."""
+    return struct.pack("<II", kind, len(content)) + content + bytes(-len(content) % 8)

@@ -1,0 +1,126 @@
+"""The TOML file: what it becomes, and what is said of a wrong one."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from impc.errors import InputError
+from impc.files.configuration import RecordingTable, SignalTable, read_configuration
+from tests.files.samples import settings
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+WHOLE = """
+[recording]
+time = "t"
+time_unit = "ms"
+subject = 7
+visit = "1"
+condition = "eyes open"
+trial = 3
+fill_gaps = 0.1
+start = 0
+stop = 30
+
+[signals.theta1]
+column = "seat angle"
+unit = "deg"
+limit = 12
+offset = 0.5
+sign = -1
+
+[plant]
+sample_time = 0.01
+[plant.nested]
+mass = 70
+
+[fit]
+horizon = 20
+free = ["J2"]
+"""
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "subject.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_every_key(tmp_path: Path) -> None:
+    configuration = read_configuration(written(tmp_path, WHOLE))
+    assert configuration.recording == RecordingTable(
+        time="t",
+        time_unit="ms",
+        subject="7",
+        visit="1",
+        condition="eyes open",
+        trial="3",
+        fill_gaps=0.1,
+        start=0.0,
+        stop=30.0,
+    )
+    assert configuration.signals == {"theta1": SignalTable("seat angle", "deg", 12.0, 0.5, -1)}
+    assert configuration.plant == {"sample_time": 0.01, "nested": {"mass": 70}}
+    assert configuration.fit == {"horizon": 20, "free": ["J2"]}
+    with pytest.raises(AttributeError):
+        configuration.recording.rate = 5.0  # type: ignore[misc]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "phrase"),
+    [
+        ("[recording]", "[recordings]", "recordings: is not known; did you mean recording?"),
+        ('subject = "S01"', "subjekt = 1", "recording.subjekt: is not known; did you mean subject"),
+        ('time = "time"', "rate = 0.0", "recording.rate: is 0; give samples per second"),
+        ('time = "time"', "rate = nan", "recording.rate: is nan"),
+        ('time = "time"', 'rate = "1000"', "recording.rate: Expected 'float | null', got 'str'"),
+        ('time = "time"', 'time = "time"\nrate = 10.0', "recording.rate: is given beside"),
+        ('time = "time"', "fill_gaps = -1.0", "recording.fill_gaps: is -1"),
+        ('time = "time"', "start = inf", "recording.start: is inf"),
+        ('time = "time"', "start = 3.0\nstop = 2.0", "recording.stop: is 2 s, start 3 s"),
+        ('time = "time"', 'time_unit = "mm"', "recording.time_unit: 'mm' is no time"),
+        ('time = "time"', "time = 1", "recording.time: Expected 'str | null', got 'int'"),
+        ('time = "time"', "pattern = '(.+)'", "recording.pattern: has the groups []"),
+        ('time = "time"', "pattern = '(?P<name>.+)'", "recording.pattern: has the groups ['name']"),
+        ('time = "time"', "pattern = '(?P<subject>.+)'", "recording.subject: is given, and in"),
+        ("limit = 12.0", "limit = -12.0", "signals.theta1.limit: is -12"),
+        ("limit = 12.0", "offset = nan", "signals.theta1.offset: is nan"),
+        ("limit = 12.0", "sign = 2", "signals.theta1.sign: Invalid enum value 2"),
+        ("limit = 12.0", "sign = 1.0", "signals.theta1.sign: Expected 'int', got 'float'"),
+        ('column = "seat"', "", "signals.theta1: lacks 'column'"),
+        ('unit = "Nm"', 'unit = "g"', "signals.perturbation.unit: unit 'g' can be read in two"),
+        ("[signals.theta1]", "[signals.theta1]\n[signals.theta1]", "is not TOML"),
+        ("[recording]", "plant = 3\n[recording]", "plant: is not a table"),
+        ("[recording]", "signals.x = 3\n[recording]", "signals.x: is not a table"),
+    ],
+)
+def test_one_line_with_the_path_of_the_fault(
+    tmp_path: Path, old: str, new: str, phrase: str
+) -> None:
+    with pytest.raises(InputError) as caught:
+        read_configuration(written(tmp_path, settings((old, new))))
+    assert phrase in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_files_that_are_no_configuration(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="does not exist"):
+        read_configuration(tmp_path / "none.toml")
+    with pytest.raises(InputError, match="cannot be opened"):
+        read_configuration(tmp_path)
+    with pytest.raises(InputError, match="names no signal"):
+        read_configuration(written(tmp_path, "[recording]\nrate = 5.0\n"))
+    with pytest.raises(InputError, match="is not a table"):
+        read_configuration(written(tmp_path, "signals.x = 3\n"))
+    with pytest.raises(InputError, match="nested too deep"):
+        read_configuration(written(tmp_path, "x = " + "[" * 5000 + "]" * 5000))
+    (tmp_path / "binary.toml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(InputError, match="is not UTF-8"):
+        read_configuration(tmp_path / "binary.toml")
+    with (tmp_path / "large.toml").open("wb") as file:
+        file.truncate(2_000_000)
+    with pytest.raises(InputError, match="is too large"):
+        read_configuration(tmp_path / "large.toml")

@@ -1,0 +1,337 @@
+"""Every format, written by other means than impc's and read back; and written by impc."""
+
+from __future__ import annotations
+
+import importlib.util
+import warnings
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import c3d
+import h5py
+import numpy as np
+import pytest
+import scipy.io
+from nptdms import ChannelObject, TdmsFile, TdmsWriter
+
+from impc.errors import DataError, OutputError
+from impc.files.delimited import split_heading
+from impc.files.formats import read_table, write_matlab73, write_table
+from impc.files.table import Table, make_table
+from tests.files.samples import csv_text, hdf5_mat, opaque_variable, pushed_seat, save_mat
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import ArrayLike
+
+SEAT = pushed_seat(200)
+
+
+def assert_columns(table: Table, expected: Mapping[str, ArrayLike], tolerance: float = 0.0) -> None:
+    assert list(table.columns) == list(expected)
+    for name, values in expected.items():
+        exact = np.asarray(values, dtype=np.float64)
+        np.testing.assert_allclose(table.columns[name], exact, rtol=0, atol=tolerance)
+
+
+# Delimited text -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("ending", "delimiter", "decimal"),
+    [
+        (".csv", ",", "."),
+        (".csv", ";", "."),
+        (".csv", ";", ","),
+        (".csv", "\t", ","),
+        (".tsv", "\t", "."),
+        (".txt", "\t", ","),
+        (".txt", "   ", "."),
+        (".TXT", ";", ","),
+    ],
+)
+def test_delimiters_and_decimal_signs(
+    tmp_path: Path, ending: str, delimiter: str, decimal: str
+) -> None:
+    path = tmp_path / f"trial{ending}"
+    path.write_text(csv_text(SEAT, delimiter, decimal))
+    assert_columns(read_table(path), SEAT, 1e-9)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "latin-1", "utf-16"])
+@pytest.mark.parametrize("newline", ["\n", "\r\n", "\r"])
+def test_encodings_and_line_ends(tmp_path: Path, encoding: str, newline: str) -> None:
+    text = "Zeit (s),Winkel ä (°)\n0,1.5\n0.1,-2\n0.2,3\n".replace("\n", newline)
+    path = tmp_path / "trial.csv"
+    path.write_bytes(text.encode(encoding))
+    table = read_table(path)
+    assert_columns(table, {"Zeit": np.array([0, 0.1, 0.2]), "Winkel ä": np.array([1.5, -2, 3])})
+    assert table.units == {"Zeit": "s", "Winkel ä": "°"}
+
+
+def test_what_stands_above_the_numbers(tmp_path: Path) -> None:
+    path = tmp_path / "trial.csv"
+    path.write_text("sep=;\nSubject: S01\n\ntime;seat;push\ns;deg;N*m\n0;1;2\n1;3;4\n")
+    table = read_table(path)
+    assert_columns(table, {"time": [0.0, 1.0], "seat": [1.0, 3.0], "push": [2.0, 4.0]})
+    assert table.units == {"time": "s", "seat": "deg", "push": "N*m"}
+    path.write_text("# time, seat [rad]\n0,1\n1,3\n")  # as numpy.savetxt writes it
+    assert read_table(path).units == {"seat": "rad"}
+
+
+def test_columns_without_a_name_and_values_that_are_missing(tmp_path: Path) -> None:
+    path = tmp_path / "trial.csv"
+    path.write_text("0,1,NaN\n1,,5e-3\n2,inf,NA\n")
+    columns = read_table(path).columns
+    assert list(columns) == ["column_1", "column_2", "column_3"]
+    np.testing.assert_array_equal(columns["column_2"], [1, np.nan, np.inf])
+    np.testing.assert_array_equal(columns["column_3"], [np.nan, 5e-3, np.nan])
+
+
+def test_one_column_a_quoted_field_and_a_delimiter_at_the_end(tmp_path: Path) -> None:
+    path = tmp_path / "trial.csv"
+    path.write_text("angle (deg)\n1.5\n2.5\n")
+    assert_columns(read_table(path), {"angle": np.array([1.5, 2.5])})
+    path.write_text('"seat, left","push",\n"1","2",\n"3","4",\n')
+    assert_columns(read_table(path), {"seat, left": np.array([1.0, 3]), "push": np.array([2.0, 4])})
+
+
+def test_headings() -> None:
+    assert split_heading("seat angle (deg)") == ("seat angle", "deg")
+    assert split_heading("torque[Nm]") == ("torque", "Nm")
+    assert split_heading("angle (left)") == ("angle (left)", "")
+    assert split_heading("g (g)") == ("g", "g")
+
+
+# MATLAB ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_vectors_matrices_and_structs(tmp_path: Path, packed: bool) -> None:
+    path = tmp_path / "trial.mat"
+    angles = np.column_stack([SEAT["seat"], SEAT["trunk"]])
+    values = {
+        "time": SEAT["time"][None, :],
+        "angles": angles,
+        "wide": angles.T,
+        "s": {"push": SEAT["push"][:, None], "inner": {"x": np.arange(200, dtype=np.int16)}},
+        "fs": 100.0,
+        "subject": "S01",
+        "short": np.arange(7.0),
+    }
+    save_mat(path, values, do_compression=packed)
+    table = read_table(path)
+    expected = {
+        "time": SEAT["time"],
+        **{f"{name}_{i + 1}": angles[:, i] for name in ("angles", "wide") for i in (0, 1)},
+        "s.push": SEAT["push"],
+        "s.inner.x": np.arange(200.0),
+    }
+    assert_columns(table, expected)
+    assert table.skipped["fs"] == "is one number (100)"
+    assert table.skipped["subject"] == "is text"
+    assert table.skipped["short"] == "has 7 values where most columns have 200"
+
+
+def test_version_73_by_h5py(tmp_path: Path) -> None:
+    path = tmp_path / "trial.mat"
+    hdf5_mat(path, {**SEAT, "note": np.arange(3, dtype=np.uint16)}, {"note": "char"})
+    table = read_table(path)
+    assert_columns(table, {name: SEAT[name] for name in sorted(SEAT)})  # the order of HDF5
+    assert table.skipped == {"note": "is text"}
+
+
+def matlab_file(name: str) -> Path:
+    """A file that MATLAB wrote, from the tests of scipy."""
+    spec = importlib.util.find_spec("scipy.io.matlab")
+    assert spec is not None
+    assert spec.origin is not None
+    path = Path(spec.origin).parent / "tests" / "data" / name
+    if not path.exists():
+        pytest.skip("this scipy came without its tests")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "column"),
+    [("testdouble_7.4_GLNX86.mat", "testdouble"), ("testhdf5_7.4_GLNX86.mat", "testdouble")],
+)
+def test_files_that_matlab_wrote(name: str, column: str) -> None:
+    np.testing.assert_allclose(
+        read_table(matlab_file(name)).columns[column], np.linspace(0, 2 * np.pi, 9), atol=1e-14
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "phrase"),
+    [
+        ("testcell_7.4_GLNX86.mat", "is a cell array"),
+        ("testobject_7.4_GLNX86.mat", "is a MATLAB object of class inline"),
+        ("testsparse_7.4_GLNX86.mat", "is sparse"),
+        ("testcomplex_7.4_GLNX86.mat", "is complex"),
+        ("testfunc_7.4_GLNX86.mat", "is not numeric"),
+        ("testvec_4_GLNX86.mat", "does not begin as such a file"),
+        ("corrupted_zlib_data.mat", "is damaged"),
+    ],
+)
+def test_files_that_matlab_wrote_and_cannot_be_read(name: str, phrase: str) -> None:
+    with pytest.raises(DataError, match=phrase):
+        read_table(matlab_file(name))
+
+
+def test_the_names_of_columns_in_matlab(tmp_path: Path) -> None:
+    table = make_table("trial", {"seat angle": np.arange(5.0)})
+    for write in (write_table, write_matlab73):
+        with pytest.raises(OutputError, match="cannot be the name of a variable"):
+            write(tmp_path / "trial.mat", table)
+    assert list(tmp_path.iterdir()) == []
+
+
+# TDMS and C3D ---------------------------------------------------------------------------------
+
+
+def test_tdms_by_nptdms(tmp_path: Path) -> None:
+    path = tmp_path / "trial.tdms"
+    stamps = np.datetime64("2026-01-01T00:00:00") + 10_000 * np.arange(200).astype("m8[us]")
+    waveform = {"wf_increment": 0.01, "unit_string": "deg"}
+    with TdmsWriter(str(path)) as writer:
+        for part in (slice(0, 120), slice(120, 200)):
+            writer.write_segment(
+                [
+                    ChannelObject("a", "stamp", stamps[part]),
+                    ChannelObject("a", "seat", SEAT["seat"][part], waveform),
+                    ChannelObject("b", "seat", SEAT["push"][part].astype(np.float32)),
+                    ChannelObject("b", "event", ["start"]),
+                ]
+            )
+    table = read_table(path)
+    expected = {"stamp": SEAT["time"], "a/seat": SEAT["seat"], "b/seat": SEAT["push"]}
+    assert_columns(table, expected, 1e-12)
+    assert table.units == {"stamp": "s", "a/seat": "deg"}
+    assert table.rate == 100.0
+    assert table.skipped == {"event": "is text"}
+
+
+def test_c3d_by_c3d(tmp_path: Path) -> None:
+    path = tmp_path / "trial.c3d"
+    analog = np.array([SEAT["seat"], SEAT["push"]])
+    writer = c3d.Writer(point_rate=50.0, analog_rate=200.0)
+    writer.set_point_labels(["head"])
+    writer.set_analog_labels(["seat angle", "push"])
+    writer.set_analog_scales([0.5, 2.0])  # number = value / scale + offset
+    writer.set_analog_offsets([0, 3])
+    writer.add_frames(
+        [(np.zeros((1, 5)), analog[:, first : first + 4]) for first in range(0, 200, 4)]
+    )
+    with path.open("wb") as file, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        writer.write(file)
+    table = read_table(path)
+    assert_columns(table, {"seat angle": analog[0], "push": analog[1]}, 1e-6)
+    assert table.rate == 200.0
+
+
+# Written by impc ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("ending", [".csv", ".tsv", ".txt", ".mat", ".tdms", ".c3d"])
+def test_written_and_read_again(tmp_path: Path, ending: str) -> None:
+    path = tmp_path / f"trial{ending}"
+    units = {"seat": "deg", "push": "N*m"}
+    write_table(path, make_table("trial", SEAT, units, 100.0))
+    again = read_table(path)
+    kept = np.float32 if ending == ".c3d" else np.float64
+    assert_columns(again, {name: values.astype(kept) for name, values in SEAT.items()})
+    if ending != ".mat":
+        assert again.units == units
+    if ending in (".tdms", ".c3d"):
+        assert again.rate == 100.0
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_what_others_read_in_what_impc_writes(tmp_path: Path) -> None:
+    columns = {"time": SEAT["time"], "s.seat": SEAT["seat"]}
+    table = make_table("trial", columns, {"s.seat": "deg"}, 100.0)
+    write_table(tmp_path / "a.mat", table)
+    five = scipy.io.loadmat(tmp_path / "a.mat", simplify_cells=True)
+    np.testing.assert_array_equal(five["s"]["seat"], SEAT["seat"])
+    write_matlab73(tmp_path / "b.mat", table)
+    with h5py.File(tmp_path / "b.mat") as file:
+        assert file.userblock_size == 512
+        assert file["s"].attrs["MATLAB_class"] == b"struct"
+        assert file["s/seat"].attrs["MATLAB_class"] == b"double"
+        np.testing.assert_array_equal(file["s/seat"][0], SEAT["seat"])
+    assert_columns(read_table(tmp_path / "b.mat"), {"s.seat": SEAT["seat"], "time": SEAT["time"]})
+    write_table(tmp_path / "c.tdms", table)
+    channel = TdmsFile.read(tmp_path / "c.tdms")["recording"]["s.seat"]
+    np.testing.assert_array_equal(channel[:], SEAT["seat"])
+    assert channel.properties["unit_string"] == "deg"
+
+
+def test_a_file_that_cannot_be_written_leaves_the_old_one(tmp_path: Path) -> None:
+    path = tmp_path / "trial.c3d"
+    path.write_bytes(b"old")
+    with pytest.raises(OutputError, match="needs the rate"):
+        write_table(path, make_table("trial", SEAT))
+    with pytest.raises(OutputError, match="cannot be written"):
+        write_table(tmp_path / "none" / "trial.csv", make_table("trial", SEAT))
+    with pytest.raises(OutputError, match="has the ending"):
+        write_table(tmp_path / "trial.xyz", make_table("trial", SEAT))
+    assert path.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def read_or_reason(path: Path) -> Table | str:
+    """What is read; or the one line of why not."""
+    try:
+        return read_table(path)
+    except DataError as error:
+        return str(error)
+
+
+@pytest.mark.parametrize("ending", [".csv", ".mat", ".tdms", ".c3d"])
+def test_files_cut_anywhere_give_no_wrong_number(tmp_path: Path, ending: str) -> None:
+    path = tmp_path / f"trial{ending}"
+    write_table(path, make_table("trial", SEAT, {"seat": "deg"}, 100.0))
+    content = path.read_bytes()
+    whole = read_table(path)
+    refused = 0
+    for size in range(1, len(content), len(content) // 60):
+        path.write_bytes(content[:size])
+        found = read_or_reason(path)
+        if isinstance(found, str):
+            refused += 1
+            assert "\n" not in found
+            continue
+        # Text that is cut behind the last comma of a row cannot be told from a shorter recording,
+        # but for its last number; a .mat between two variables, from a file with fewer of them.
+        for name, values in found.columns.items():
+            rows = len(values) - 1 if ending == ".csv" else len(values)
+            np.testing.assert_array_equal(values[:rows], whole.columns[name][:rows])
+    assert refused > (25 if ending == ".csv" else 55)
+
+
+@pytest.mark.parametrize("ending", [".csv", ".mat", ".tdms", ".c3d"])
+def test_files_with_wrong_bytes_end_in_one_line(tmp_path: Path, ending: str) -> None:
+    rng = np.random.default_rng(5)  # seed 5
+    path = tmp_path / f"trial{ending}"
+    write_table(path, make_table("trial", SEAT, {"seat": "deg"}, 100.0))
+    content = np.frombuffer(path.read_bytes(), dtype=np.uint8)
+    for _ in range(60):
+        changed = content.copy()
+        changed[rng.integers(0, min(len(content), 2000), 3)] = rng.integers(0, 256, 3)
+        path.write_bytes(changed.tobytes())
+        found = read_or_reason(path)
+        assert isinstance(found, Table) or "\n" not in found
+
+
+def test_strings_of_matlab_beside_signals(tmp_path: Path) -> None:
+    # MATLAB saves each string as an object without a name that scipy can tell.
+    path = tmp_path / "trial.mat"
+    save_mat(path, {"seat": SEAT["seat"]})
+    with path.open("ab") as file:
+        file.write(opaque_variable(b"note", b"string") + opaque_variable(b"who", b"string"))
+    table = read_table(path)
+    assert_columns(table, {"seat": SEAT["seat"]})
+    assert "is a MATLAB string" in next(iter(table.skipped.values()))

@@ -1,0 +1,147 @@
+"""`impc inspect`: what it prints, and that what it writes can be read."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from impc.cli import main
+from impc.errors import InputError
+from impc.files.configuration import UNKNOWN_UNIT, read_configuration
+from impc.files.formats import write_table
+from impc.files.reading import read_recordings
+from impc.files.table import make_table
+from impc.plant import as_plant
+from plants import seated_balance_plant
+from tests.files.damaged import PLANT
+from tests.files.samples import csv_text, pushed_seat, settings
+
+ROOT = Path(__file__).parent.parent.parent
+
+
+def inspect(*arguments: object) -> Result:
+    return CliRunner().invoke(main, ["inspect", *map(str, arguments)])
+
+
+@pytest.fixture
+def trial(tmp_path: Path) -> Path:
+    columns = pushed_seat(600)
+    columns["theta 2"] = columns.pop("trunk")
+    columns["push"][5] = np.nan
+    text = csv_text(columns).replace("time,seat", "time (s),theta1 (deg)", 1)
+    header, *rows = text.strip().split("\n")
+    path = tmp_path / "trial.csv"
+    path.write_text("\n".join([header + ",side", *(row + ",left" for row in rows)]) + "\n")
+    return path
+
+
+def test_the_table_of_columns(trial: Path) -> None:
+    result = inspect(trial)
+    assert result.exit_code == 0
+    lines = result.stdout.split("\n")
+    heads = ["column", "unit", "samples", "min", "max", "mean", "not", "finite", "rate"]
+    assert lines[0].split() == heads
+    assert lines[1].split() == ["time", "s", "600", "0", "5.99", "2.995", "0", "100"]
+    assert lines[3].split()[:2] == ["push", "600"]
+    assert lines[3].split()[-1] == "1"
+    assert "Not read: side is text, such as 'left' in line 2" in result.stdout
+
+
+@pytest.mark.parametrize("plant", [(), ("--plant", PLANT)])
+def test_what_it_writes_only_needs_units_filled_in(
+    trial: Path, tmp_path: Path, plant: tuple[str, ...]
+) -> None:
+    out = tmp_path / "new.toml"
+    result = inspect(trial, "--out", out, *plant)
+    assert result.exit_code == 0
+    configuration = read_configuration(out)
+    assert configuration.recording.time == "time"
+    assert configuration.recording.time_unit == "s"
+    columns = {name: entry.column for name, entry in configuration.signals.items()}
+    if plant:
+        assert columns == {"theta1": "theta1", "theta2": "theta 2", "perturbation": "push"}
+        assert configuration.signals["theta1"].unit == "deg"
+    else:
+        assert columns == {name: name for name in ("theta1", "push", "theta 2")}
+    assert configuration.signals["theta1"].unit == "deg"
+    shown = inspect(trial, *plant).stdout
+    assert out.read_text(encoding="utf-8") in shown
+
+
+def test_from_a_file_never_seen_to_a_recording(tmp_path: Path) -> None:
+    path, out = tmp_path / "trial.csv", tmp_path / "new.toml"
+    columns = pushed_seat(600)
+    names = ["t", "theta1", "theta2", "torque"]
+    path.write_text(csv_text(dict(zip(names, columns.values(), strict=True))))
+    assert inspect(path, "--out", out, "--plant", PLANT).exit_code == 0
+    plant = as_plant(seated_balance_plant(), ["command"])
+    with pytest.raises(InputError, match="is still '\\?'"):
+        read_recordings([path], read_configuration(out), plant)
+    text = out.read_text(encoding="utf-8")
+    for unit in ("deg", "deg", "Nm"):
+        text = text.replace(f'"{UNKNOWN_UNIT}"  ', f'"{unit}"  ', 1)
+    out.write_text(text, encoding="utf-8")
+    (found,) = read_recordings([path], read_configuration(out), plant)
+    np.testing.assert_allclose(found.outputs[:, 0], np.deg2rad(columns["seat"]), atol=1e-10)
+    result = inspect(path, "--config", out, "--plant", PLANT)
+    assert result.stdout == "trial: 600 samples at 100 per second\nNothing was found.\n"
+
+
+def test_names_that_toml_must_quote_and_units_nobody_knows(tmp_path: Path) -> None:
+    path, out = tmp_path / "trial.tdms", tmp_path / "new.toml"
+    names = ['say "so"', "back\\slash", "Winkel ä", "a.b", "# no"]
+    columns = {name: np.random.default_rng(0).normal(size=50) for name in names}
+    write_table(path, make_table("trial", columns, {"a.b": "furlongs!", "# no": "mV"}, 250.0))
+    result = inspect(path, "--out", out)
+    assert result.exit_code == 0
+    assert "The file says 250 samples per second." in result.stdout
+    configuration = read_configuration(out)
+    assert configuration.recording.rate is None
+    assert list(configuration.signals) == names
+    assert [entry.column for entry in configuration.signals.values()] == names
+    assert configuration.signals["# no"].unit == "mV"
+    assert configuration.signals["a.b"].unit == UNKNOWN_UNIT
+
+
+def test_it_writes_over_nothing(trial: Path, tmp_path: Path) -> None:
+    out = tmp_path / "old.toml"
+    out.write_text("old")
+    result = inspect(trial, "--out", out)
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert "exists already" in result.stderr
+    assert out.read_text() == "old"
+    assert "cannot be written" in inspect(trial, "--out", tmp_path / "none" / "x.toml").stderr
+
+
+def test_findings_are_shown_and_a_plant_is_needed(tmp_path: Path) -> None:
+    columns = pushed_seat(600)
+    columns["trunk"] *= 20
+    (tmp_path / "trial.csv").write_text(csv_text(columns))
+    (tmp_path / "subject.toml").write_text(settings())
+    call = (tmp_path / "trial.csv", "--config", tmp_path / "subject.toml")
+    assert "check its unit" in inspect(*call, "--plant", PLANT).stdout
+    assert "is given without --plant" in inspect(*call).stderr
+
+
+def test_help_loads_no_heavy_library() -> None:
+    code = (
+        "import sys, click.testing, impc.cli as c;"
+        "r = click.testing.CliRunner().invoke(c.main, ['inspect', '--help']);"
+        "heavy = {'pandas', 'scipy', 'pint', 'h5py', 'casadi', 'cvxpy'} & set(sys.modules);"
+        "sys.exit(str(heavy) if heavy or r.exit_code else 0)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        check=False,
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
