@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import stat
 import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -122,26 +123,34 @@ def _head(path: Path, largest: int) -> bytes:
     """The first bytes of a file that can be read and is neither empty nor too large."""
     source = str(path)
     try:
-        if path.is_dir():
-            raise DataError(source, "is a folder", "name the file in it")
-        if path.exists() and not path.is_file():
-            raise DataError(source, "is no ordinary file", "copy it to one")
-        size = path.stat().st_size
-        if size == 0:
-            raise DataError(source, "is empty (0 bytes)", "copy or export it again")
-        if size > largest:
-            raise DataError(
-                source,
-                f"has {size / 1e9:.1f} GB, and {largest / 1e9:.1f} GB is the most that is read",
-                "export only the signals and seconds that are needed",
-            )
-        with path.open("rb") as file:
-            return file.read(1024)
+        found = path.stat()
     except FileNotFoundError:
         raise DataError(source, "does not exist", "check the path") from None
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-        raise DataError(source, f"cannot be opened ({reason})", "check the path") from None
+    except (OSError, ValueError) as error:  # ValueError: a zero byte in the name
+        raise _unopened(source, error) from None
+    if stat.S_ISDIR(found.st_mode):
+        raise DataError(source, "is a folder", "name the file in it")
+    if not stat.S_ISREG(found.st_mode):
+        raise DataError(source, "is no ordinary file", "copy it to one")
+    if found.st_size == 0:
+        raise DataError(source, "is empty (0 bytes)", "copy or export it again")
+    if found.st_size > largest:
+        raise DataError(
+            source,
+            f"has {found.st_size / 1e9:.1f} GB, and {largest / 1e9:.1f} GB is the most that is "
+            "read",
+            "export only the signals and seconds that are needed",
+        )
+    try:
+        with path.open("rb") as file:
+            return file.read(1024)
+    except OSError as error:
+        raise _unopened(source, error) from None
+
+
+def _unopened(source: str, error: OSError | ValueError) -> DataError:
+    reason = getattr(error, "strerror", None) or str(error)
+    return DataError(source, f"cannot be opened ({reason})", "check the path")
 
 
 def _reader(source: str, suffix: str, head: bytes) -> Callable[[Path, int], Table]:

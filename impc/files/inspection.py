@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import json
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -61,8 +62,8 @@ def draft_configuration(
         Names of the plant's signals; without them every column becomes a signal by its own name.
     """
     lines = [
-        f"# What the columns of {table.source.rpartition('/')[2]} mean. Check every line; units that",
-        f'# the file does not tell are "{UNKNOWN_UNIT}" and must be filled in.',
+        f"# What the columns of {Path(table.source).name!r} mean. Check every line; units",
+        f'# that the file does not tell are "{UNKNOWN_UNIT}" and must be filled in.',
         "",
         "[recording]",
         *_clock_lines(table),
@@ -199,4 +200,4 @@ def _signal_lines(table: Table, signal: str, column: str, acts: bool) -> list[st
 
 
 def _quoted(text: str) -> str:
-    return json.dumps(text, ensure_ascii=False)
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")  # TOML forbids it

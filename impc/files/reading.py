@@ -68,7 +68,7 @@ def read_recordings(
     _require_distinct(paths)
     if not paths:
         raise InputError("recordings", "no file is given", "name at least one")
-    trials = [recording_of(read_table(path), configuration, plant) for path in paths]
+    trials = [recording_of(read_table(Path(path)), configuration, plant) for path in paths]
     longest = max(trial.samples for trial in trials)
     return tuple(
         trial

@@ -63,7 +63,9 @@ def make_table(
     DataError
         When no column of numbers is left.
     """
-    left_out = dict(skipped or {})
+    columns = {_one_line(name): values for name, values in columns.items()}
+    units = {_one_line(name): unit for name, unit in (units or {}).items()}
+    left_out = {_one_line(name): reason for name, reason in (skipped or {}).items()}
     lengths = Counter(len(values) for values in columns.values() if len(values) > 1)
     if not lengths:
         left_out |= {name: f"has {len(values)} values" for name, values in columns.items()}
@@ -79,5 +81,10 @@ def make_table(
             kept[name] = frozen(np.asarray(values, dtype=np.float64))
         else:
             left_out[name] = f"has {len(values)} values where most columns have {usual}"
-    told = {name: unit for name, unit in (units or {}).items() if name in kept and unit}
+    told = {name: unit for name, unit in units.items() if name in kept and unit}
     return Table(source, kept, told, rate, left_out)
+
+
+def _one_line(name: str) -> str:
+    """A name without line breaks and control characters, which would break messages and TOML."""
+    return "".join(character if character.isprintable() else " " for character in name).strip()

@@ -40,6 +40,7 @@ def test_one_line_from_the_library(name: str, tmp_path: Path, seat: Plant) -> No
     message = str(caught.value)
     assert DAMAGED[name].phrase in message
     assert "\n" not in message
+    assert message.count(path.name) <= 1  # no message within a message
     assert all((caught.value.subject, caught.value.problem, caught.value.remedy))
     assert len(message) - len(str(tmp_path)) < 420
 

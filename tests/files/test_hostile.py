@@ -1,0 +1,57 @@
+"""Files that mean harm: names, links, and what would take all memory or all time."""
+
+from __future__ import annotations
+
+import os
+import time
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from impc.errors import DataError
+from impc.files.configuration import read_configuration
+from impc.files.formats import read_table, write_table
+from impc.files.inspection import draft_configuration, summary
+from impc.files.table import make_table
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+def test_a_sparse_file_of_two_gigabytes_is_refused_at_once(tmp_path: Path) -> None:
+    for ending in (".csv", ".mat", ".tdms", ".c3d"):
+        path = tmp_path / f"trial{ending}"
+        with path.open("wb") as file:
+            file.truncate(2_000_000_000)
+        begin = time.perf_counter()
+        with pytest.raises(DataError, match=r"has 2\.0 GB"):
+            read_table(path)
+        assert time.perf_counter() - begin < 0.1
+        path.unlink()
+
+
+def test_a_limit_of_ones_own(tmp_path: Path) -> None:
+    write_table(tmp_path / "trial.csv", make_table("trial", {"x": np.arange(100.0)}))
+    assert read_table(tmp_path / "trial.csv").samples == 100
+    with pytest.raises(DataError, match="is the most that is read"):
+        read_table(tmp_path / "trial.csv", largest=100)
+
+
+def test_pipes_and_names_that_no_file_can_have(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.csv")
+    with pytest.raises(DataError, match="is no ordinary file"):
+        read_table(tmp_path / "pipe.csv")
+    with pytest.raises(DataError, match="cannot be opened"):
+        read_table(tmp_path / ("x" * 300 + ".csv"))
+
+
+def test_names_of_columns_cannot_write_toml(tmp_path: Path) -> None:
+    name = 'x"\n[plant]\nevil = 1\n#\x7f\x1b[2J'
+    table = make_table("trial", {name: np.arange(9.0), "y": np.arange(9.0) ** 2}, {"y": 'm"\nz=1'})
+    assert "\x1b" not in summary(table)
+    path = tmp_path / "subject.toml"
+    path.write_text(draft_configuration(table), encoding="utf-8")
+    configuration = read_configuration(path)
+    assert configuration.plant == {}
+    assert list(configuration.signals) == ["y"]
