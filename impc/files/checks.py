@@ -123,7 +123,7 @@ def constant(channel: Channel) -> str:
         raise DataError(
             channel.name,
             f"is constant at {values[0]:.6g} {channel.unit.written} in all {len(values)} samples",
-            f"name the right column, or leave signals.{channel.signal} out",
+            "name the right column; a disturbance may be left out",
         )
     return ""
 

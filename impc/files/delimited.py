@@ -134,7 +134,9 @@ def _layout(source: str, suffix: str, head: Sequence[str]) -> _Layout:
     between = next((mark for mark in others if _share_of_numbers(head, mark, ".")[0] > 0.9), None)
     expected = " or ".join(_NAMES[mark] for mark in _DELIMITERS[suffix])
     if between is None:
-        problem = f"has no rows of numbers divided by {expected} in its first {len(head)} lines"
+        problem = (
+            f"has no rows of numbers divided by {expected} in the first {len(head)} of its lines"
+        )
     else:
         problem = f"is divided by {_NAMES[between]}, and a {suffix} file is by {expected}"
     raise DataError(source, problem, "export it again, one signal a column")
