@@ -18,6 +18,7 @@ _COMMANDS = {
     "example": "impc.commands.example",
     "fit": "impc.commands.fit",
     "inspect": "impc.commands.inspect",
+    "simulate": "impc.commands.simulate",
 }
 
 

@@ -5,6 +5,7 @@ This package knows nothing of `impc`; either can be used without the other.
 
 from plants.actuation import LinearSystem, delayed_muscle, pade_delay
 from plants.anthropometry import SeatLayout, from_anthropometry
+from plants.cursor import cursor_plant
 from plants.integration import runge_kutta_step
 from plants.named_examples import (
     bbm_example,
@@ -20,6 +21,11 @@ from plants.seated_balance import (
     seated_balance_plant,
 )
 from plants.seated_parameters import SeatedBalanceLimits, SeatedBalanceParameters
+from plants.seated_subject import (
+    seated_balance_for,
+    seated_balance_step_for,
+    seated_parameters_for,
+)
 from plants.ternary import maximal_recurrence, ternary_sequence, ternary_torque
 
 __all__ = [
@@ -31,6 +37,7 @@ __all__ = [
     "body_dynamics",
     "cannon_example",
     "continuous_seated_balance_plant",
+    "cursor_plant",
     "delayed_muscle",
     "from_anthropometry",
     "mass_matrix",
@@ -38,7 +45,10 @@ __all__ = [
     "nonlinear_dynamics",
     "pade_delay",
     "runge_kutta_step",
+    "seated_balance_for",
     "seated_balance_plant",
+    "seated_balance_step_for",
+    "seated_parameters_for",
     "ternary_sequence",
     "ternary_torque",
     "unstable_integrator_example",

@@ -21,7 +21,14 @@ if TYPE_CHECKING:
 
     from impc.files.table import Table
 
-__all__ = ["LARGEST", "SUFFIXES", "read_table", "write_matlab73", "write_table"]
+__all__ = [
+    "LARGEST",
+    "SUFFIXES",
+    "encode_table",
+    "read_table",
+    "write_matlab73",
+    "write_table",
+]
 
 SUFFIXES = (".csv", ".tsv", ".txt", ".mat", ".tdms", ".c3d")
 #: Bytes of a file, and of its arrays in memory: an hour of 16 channels at 2 kHz.
@@ -87,6 +94,17 @@ def write_table(path: Path, table: Table) -> None:
     """
     suffix = _suffix(path, OutputError)
     _write(path, _ENCODERS[suffix](table))
+
+
+def encode_table(ending: str, table: Table) -> bytes:
+    """The bytes of a table in the format of an ending, one of `SUFFIXES`; .mat is v5.
+
+    Raises
+    ------
+    OutputError
+        When the ending is not known or the format cannot hold the table.
+    """
+    return _ENCODERS[_suffix(Path(f"table{ending}"), OutputError)](table)
 
 
 def write_matlab73(path: Path, table: Table) -> None:

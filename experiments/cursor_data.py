@@ -1,0 +1,67 @@
+"""Recordings of human target tracking (Bonnen et al., Journal of Vision 15(3):14, 2015).
+
+They are not part of the project. The file is looked for beside it, or where IMPC_CURSOR_DATA says.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import scipy.io
+
+from impc.arrays import Array
+from impc.errors import DataError
+
+__all__ = ["ARCMIN_A_PIXEL", "RATE", "Condition", "data_file", "read_conditions"]
+
+RATE = 60.0
+ARCMIN_A_PIXEL = 1.32
+
+
+@dataclass(frozen=True)
+class Condition:
+    """All trials with one blur of the target.
+
+    Attributes
+    ----------
+    blur : float
+        Width of the target, px.
+    target, response : Array
+        Positions of target and cursor, px, (trials, samples) at 60 Hz.
+    """
+
+    blur: float
+    target: Array
+    response: Array
+
+
+def data_file() -> Path:
+    """Where the recordings would be."""
+    beside = Path(__file__).resolve().parents[2] / "shared/data/cursor-tracking/bonnen2015.mat"
+    return Path(os.environ.get("IMPC_CURSOR_DATA", beside))
+
+
+def read_conditions(path: Path) -> list[Condition]:
+    """Read the conditions from the sharpest target to the most blurred.
+
+    Raises
+    ------
+    DataError
+        When the file is absent or is not that of the recordings.
+    """
+    try:
+        found = scipy.io.loadmat(path, variable_names=["sigma", "target", "response"])
+        blur = np.ravel(found["sigma"]).astype(float)
+        target, response = (found[name].astype(float) for name in ("target", "response"))
+    except (OSError, ValueError, KeyError, NotImplementedError) as error:
+        reason = "is not there" if isinstance(error, FileNotFoundError) else f"({error})"
+        raise DataError(
+            f"recordings {path.name}", reason, "name the file in IMPC_CURSOR_DATA"
+        ) from None
+    return [
+        Condition(float(width), target[blur == width], response[blur == width])
+        for width in np.unique(blur)
+    ]

@@ -1,0 +1,112 @@
+"""The figure of the cursor experiment: trials, VAF by blur, gain and price by blur."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from experiments.cursor_data import ARCMIN_A_PIXEL, RATE
+from impc.report.style import (
+    BLUE,
+    DOUBLE_COLUMN,
+    GREEN,
+    INK,
+    VERMILLION,
+    journal_style,
+    new_figure,
+    render,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from matplotlib.axes import Axes
+
+    from experiments.cursor_tracking import ConditionResult
+
+__all__ = ["cursor_figure"]
+
+
+def cursor_figure(results: Sequence[ConditionResult]) -> dict[str, bytes]:
+    """Draw it: ``cursor-tracking.png`` and ``.pdf``."""
+    with journal_style():
+        figure = new_figure(DOUBLE_COLUMN, 5.6)
+        axes = figure.subplot_mosaic([["A", "A"], ["B", "B"], ["C", "D"]])
+        for letter, item in (("A", results[0]), ("B", results[-1])):
+            _trial(axes[letter], item, letter)
+        axes["A"].legend(ncols=3, loc="upper left", bbox_to_anchor=(0, 1.32))
+        _vaf(axes["C"], results)
+        _prices(axes["D"], results)
+        return {f"cursor-tracking.{kind}": content for kind, content in render(figure).items()}
+
+
+def _trial(axes: Axes, item: ConditionResult, letter: str) -> None:
+    time = np.arange(len(item.recorded)) / RATE
+    axes.plot(time, item.target, color="#9A9A9A", linewidth=0.9, label="target")
+    axes.plot(time, item.recorded, color=INK, linewidth=1.0, label="cursor, recorded")
+    axes.plot(
+        time,
+        item.simulated,
+        color=VERMILLION,
+        linestyle="--",
+        linewidth=1.2,
+        label="cursor, simulated from the target (trial left out)",
+    )
+    blur = item.blur * ARCMIN_A_PIXEL
+    axes.set_title(f"({letter}) blur {item.blur:.0f} px ({blur:.0f} arcmin)", loc="right")
+    axes.set_xlabel("time (s)")
+    axes.set_ylabel("position (px)")
+    axes.set_xlim(0, time[-1])
+
+
+def _vaf(axes: Axes, results: Sequence[ConditionResult]) -> None:
+    blur = [item.blur for item in results]
+    for item in results:
+        axes.plot([item.blur] * item.trials, item.vaf_out, ".", color="#BBBBBB", markersize=3)
+    axes.plot(
+        blur,
+        [np.mean(item.vaf_out) for item in results],
+        "o-",
+        color=BLUE,
+        label="inverse MPC, trials left out",
+    )
+    axes.plot(
+        blur,
+        [np.mean(item.baseline_out) for item in results],
+        "s--",
+        color=INK,
+        markerfacecolor="white",
+        label="delayed feedback, trials left out",
+    )
+    axes.set_ylim(0, 100)
+    axes.set_xlabel("blur (px)")
+    axes.set_ylabel("VAF (%)")
+    axes.set_title("(C)", loc="left")
+    axes.legend(loc="lower left")
+
+
+def _prices(axes: Axes, results: Sequence[ConditionResult]) -> None:
+    blur = [item.blur for item in results]
+    axes.errorbar(
+        blur,
+        [item.gain[0] for item in results],
+        yerr=[1.96 * item.gain_deviation[0] for item in results],
+        fmt="o-",
+        color=BLUE,
+        capsize=2,
+        label="gain of the error (1/s$^2$)",
+    )
+    middle = np.array([item.price_of_error for item in results])
+    low = np.array([item.price_low for item in results])
+    high = np.array([item.price_high for item in results])
+    axes.plot(
+        blur, middle, "D:", color=GREEN, markerfacecolor="white", label="price of the error, R = 1"
+    )
+    axes.fill_between(
+        blur, low, high, color=GREEN, alpha=0.2, linewidth=0, label="the same, equivalent weights"
+    )
+    axes.set_yscale("log")
+    axes.set_xlabel("blur (px)")
+    axes.set_title("(D)", loc="left")
+    axes.legend(loc="lower left")

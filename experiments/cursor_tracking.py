@@ -1,0 +1,232 @@
+"""People following a blurred target: inverse MPC of each condition, from the target alone.
+
+For every blur the controller, the delay and the lag of the hand are fitted to all trials at once
+(section 3.5 of the dissertation on other data), and again without each trial, which is then
+predicted. VAF is of the cursor's position, mean removed, without the first second. Beside it stands
+delayed feedback of error and velocity, fitted in the same way (`experiments.cursor_baseline`).
+
+    python -m experiments.cursor_tracking --out results/cursor-tracking
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import json
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from experiments.cursor_baseline import delayed_feedback, fit_delayed_feedback
+from experiments.cursor_data import RATE, Condition, data_file, read_conditions
+from experiments.cursor_figure import cursor_figure
+from impc.agreement import centred_vaf
+from impc.arrays import Array, frozen
+from impc.closed_loop import simulate
+from impc.fit_recordings import fit_problem
+from impc.fit_settings import FitSettings
+from impc.fitted_controller import FittedController, fit_controller
+from impc.gain_covariance import gain_covariance
+from impc.gain_fibre import gain_fibre
+from impc.inverse_problem import InverseProblem, controller_for, scenarios
+from impc.plant import Plant, as_plant
+from impc.plant_family import plant_family
+from impc.recording import recording
+from impc.report.write import write_files
+from impc.unknown_limit import LimitEstimate, input_limit
+from impc.weights_set import linear_range, weights_set
+from plants import cursor_plant
+
+__all__ = ["ConditionResult", "condition_problem", "fit_condition", "left_out_vaf"]
+
+_SECOND = round(RATE)
+_NOMINAL = (0.15, 0.08)
+# Weights count as alike up to this multiple of the least condition number.
+_RATIO = 10.0
+
+
+@dataclass(frozen=True)
+class ConditionResult:
+    """One blur.
+
+    Attributes
+    ----------
+    blur : float
+        px.
+    trials : int
+    delay, lag : float
+        s.
+    vaf_in, vaf_out : list of float
+        Of each trial, from all and from the others, %.
+    baseline_out : list of float
+        The same of delayed feedback, %.
+    gain, gain_deviation : list of float
+        Of error (1/s^2) and velocity (1/s).
+    price_of_error, price_low, price_high : float
+        Q_ee at R = 1 in the least conditioned weights, and its range over all weights with the same
+        gain and a condition number up to ten times the least.
+    limit : str
+        What the recordings say of an acceleration limit.
+    recorded, simulated, target : list of float
+        One trial, left out of the fit that predicts it, px.
+    """
+
+    blur: float
+    trials: int
+    delay: float
+    lag: float
+    vaf_in: list[float]
+    vaf_out: list[float]
+    baseline_out: list[float]
+    gain: list[float]
+    gain_deviation: list[float]
+    price_of_error: float
+    price_low: float
+    price_high: float
+    limit: str
+    recorded: list[float]
+    simulated: list[float]
+    target: list[float]
+
+
+def condition_problem(condition: Condition) -> InverseProblem:
+    """The inverse problem of a condition: the error starts as recorded, the hand at rest."""
+
+    def make(values: Array) -> Plant:
+        return as_plant(cursor_plant(float(values[0]), float(values[1])), ["command"])
+
+    family = plant_family(make, ["delay", "lag"], _NOMINAL)
+    plant = make(np.array(_NOMINAL))
+    trials = []
+    for target, response in zip(condition.target, condition.response, strict=True):
+        error = response - target
+        increments = np.append(np.diff(target), 0.0) * RATE
+        trials.append(recording(plant, error, increments, [error[0], *np.zeros(plant.n - 1)]))
+    problem = fit_problem(plant, trials, FitSettings(), family)
+    return replace(problem, unknown_start=False)
+
+
+def left_out_vaf(condition: Condition, index: int) -> tuple[float, float, Array]:
+    """VAF of one trial predicted from the others: ours, delayed feedback's, and our cursor."""
+    others = np.arange(len(condition.target)) != index
+    problem = condition_problem(condition)
+    kept = tuple(trial for trial, keep in zip(problem.recordings, others, strict=True) if keep)
+    fitted = fit_controller(replace(problem, recordings=kept))
+    cursor = _cursor(fitted, problem, condition, index)
+    gains, delay = fit_delayed_feedback(condition.target[others], condition.response[others])
+    baseline = delayed_feedback(condition.target[index][None], gains, delay)[0]
+    recorded = condition.response[index]
+    return _vaf(recorded, cursor), _vaf(recorded, baseline), cursor
+
+
+def fit_condition(condition: Condition) -> ConditionResult:
+    """Fit a condition, predict each of its trials, and say what the weights say."""
+    problem = condition_problem(condition)
+    fitted = fit_controller(problem)
+    count = len(condition.target)
+    inside = [
+        _vaf(condition.response[k], _cursor(fitted, problem, condition, k)) for k in range(count)
+    ]
+    outside = [left_out_vaf(condition, index) for index in range(count)]
+    solution = fitted.solution
+    covariance = gain_covariance(
+        replace(fitted.free, K=solution.K, S=solution.S, problem=fitted.problem)
+    )
+    plant = fitted.problem.plant
+    found = weights_set(gain_fibre(plant, solution.K), _RATIO)
+    of_error = np.zeros((plant.n + 1, plant.n + 1))
+    of_error[0, 0] = 1.0
+    price = linear_range(found, of_error)
+    delay, lag = _parameters(fitted)
+    shown = int(np.argsort([item[0] for item in outside])[count // 2])
+    return ConditionResult(
+        condition.blur,
+        count,
+        delay,
+        lag,
+        inside,
+        [item[0] for item in outside],
+        [item[1] for item in outside],
+        solution.K[0, :2].tolist(),
+        covariance.entries[0, :2].tolist(),
+        float(found.least.weights.Q[0, 0]),
+        price.low,
+        price.high,
+        _limit(input_limit(fitted)),
+        condition.response[shown].tolist(),
+        outside[shown][2].tolist(),
+        condition.target[shown].tolist(),
+    )
+
+
+def _limit(found: LimitEstimate) -> str:
+    if found.value is None:
+        return f"not determined, at least {found.low:.3g} px/s^2"
+    return f"{found.value:.3g} px/s^2 ({found.low:.3g} to {found.high:.3g})"
+
+
+def _parameters(fitted: FittedController) -> tuple[float, float]:
+    family = fitted.problem.family
+    assert family is not None
+    delay, lag = family.nominal * np.exp(fitted.problem.logarithms)
+    return float(delay), float(lag)
+
+
+def _cursor(
+    fitted: FittedController, problem: InverseProblem, condition: Condition, index: int
+) -> Array:
+    """Cursor of one trial, simulated from its target."""
+    one = replace(fitted.problem, recordings=(problem.recordings[index],))
+    known = replace(one, family=None, logarithms=frozen([]))
+    controller = controller_for(known, np.array(fitted.solution.K), np.array(fitted.solution.S))
+    run = simulate(controller, scenarios(known)[0])
+    return np.asarray(run.x[:, 0] + condition.target[index])
+
+
+def _vaf(recorded: Array, cursor: Array) -> float:
+    return float(centred_vaf(recorded[_SECOND:, None], cursor[_SECOND:, None])[0])
+
+
+def _table(results: list[ConditionResult]) -> str:
+    lines = [
+        "blur px  trials  delay ms  lag ms  VAF in %  VAF out % (least)  delayed feedback %"
+        "  K error 1/s^2  K velocity 1/s  price of error (range)  acceleration limit"
+    ]
+    for item in results:
+        lines.append(
+            f"{item.blur:7.0f} {item.trials:7d} {1e3 * item.delay:9.0f} {1e3 * item.lag:7.0f} "
+            f"{np.mean(item.vaf_in):9.1f} {np.mean(item.vaf_out):10.1f} ({min(item.vaf_out):5.1f}) "
+            f"{np.mean(item.baseline_out):17.1f}  "
+            f"{item.gain[0]:8.1f} +- {item.gain_deviation[0]:.1f} "
+            f"{item.gain[1]:9.2f} +- {item.gain_deviation[1]:.2f} "
+            f"{item.price_of_error:10.3g} ({item.price_low:.3g} to {item.price_high:.3g})  "
+            f"{item.limit}"
+        )
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Fit every condition; print the table, write figure and result.json."""
+    parser = argparse.ArgumentParser(description="Inverse MPC of human target tracking.")
+    parser.add_argument("--out", type=Path, default=Path("results", "cursor-tracking"))
+    given = parser.parse_args()
+    if not data_file().exists():
+        print(f"{data_file().name} is not there: nothing to fit. IMPC_CURSOR_DATA may name it.")
+        return
+    conditions = read_conditions(data_file())
+    with ProcessPoolExecutor(2) as pool:
+        found = pool.map(functools.partial(fit_condition), conditions)
+        results = list(tqdm(found, total=len(conditions), unit="condition", disable=None))
+    print(_table(results))
+    content: dict[str, Any] = {f"{item.blur:g} px": asdict(item) for item in results}
+    files = {"result.json": (json.dumps(content, indent=1) + "\n").encode()}
+    write_files(given.out, files | cursor_figure(results))
+    print(f"\nwritten to {given.out}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,79 @@
+"""Following a target with a cursor: the tracking error as a plant.
+
+The hand moves the cursor with an acceleration that answers the command after a delay and a lag,
+
+    c'' = a,    tau_m a' + a = u(t - tau_d),    e = c - target,    e' = c' - target',
+
+so that the target's velocity disturbs the error as the torque on a seat disturbs the angles.
+States: error (px), velocity of the cursor (px/s), the states of the delay
+(`plants.actuation.pade_delay`), acceleration (px/s^2). Inputs: command (px/s^2) and target_rate
+(px/s), which is held between samples: give it the increments of the target over the sample time.
+Output: error (px). Any unit of length may stand for the pixel.
+
+Its parameters were not measured by anybody: delay and lag are fitted, the defaults are where a fit
+starts. A bound on the command is a bound on the acceleration before delay and lag.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import control
+import numpy as np
+import scipy.linalg
+
+from plants._checks import finite_number
+from plants.actuation import delayed_muscle
+
+__all__ = ["cursor_plant"]
+
+
+def cursor_plant(
+    delay: float = 0.15, lag: float = 0.08, sample_time: float = 1 / 60, delay_order: int = 4
+) -> Any:
+    """Return the linear plant, sampled with its inputs held.
+
+    Parameters
+    ----------
+    delay : float
+        tau_d in s: from what is seen to what the hand does. Chosen; to be fitted.
+    lag : float
+        tau_m in s: first-order lag of the hand's acceleration. Chosen; to be fitted.
+    sample_time : float
+        s; a screen of 60 Hz by default.
+    delay_order : int
+        Order of the Padé approximant of the delay.
+
+    Returns
+    -------
+    control.StateSpace
+        Discrete, ``3 + delay_order`` states; order and units in the module's text.
+
+    Raises
+    ------
+    ValueError
+        When an argument is out of range.
+    """
+    sample_time = finite_number("sample_time", sample_time, "give it in seconds", above=0.0)
+    lag = finite_number("lag", lag, "give it in seconds", above=0.0)
+    chain = delayed_muscle(delay, lag, delay_order)
+    n = 2 + len(chain.B)
+    A, B = np.zeros((n, n)), np.zeros((n, 2))
+    A[0, 1] = A[1, -1] = 1.0
+    A[2:, 2:] = chain.A
+    B[2:, 0] = chain.B
+    B[0, 1] = -1.0
+    # exp([A B; 0 0] T) = [Ad Bd; 0 I]: exact also where A is singular, as here.
+    held = scipy.linalg.expm(np.block([[A, B], [np.zeros((2, n + 2))]]) * sample_time)
+    delays = [f"delay_{k}" for k in range(1, delay_order + 1)]
+    return control.ss(
+        held[:n, :n],
+        held[:n, n:],
+        np.eye(1, n),
+        np.zeros((1, 2)),
+        dt=sample_time,
+        name="cursor",
+        states=["error", "velocity", *delays, "acceleration"],
+        inputs=["command", "target_rate"],
+        outputs=["error"],
+    )

@@ -1,0 +1,84 @@
+"""The seated-balance plant of a person, by the arguments that a configuration file gives."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from typing import Any
+
+import casadi as ca
+
+from plants.anthropometry import Sex, from_anthropometry
+from plants.integration import runge_kutta_step
+from plants.seated_balance import nonlinear_dynamics, seated_balance_plant
+from plants.seated_parameters import SeatedBalanceParameters
+
+__all__ = ["seated_balance_for", "seated_balance_step_for", "seated_parameters_for"]
+
+
+def seated_parameters_for(
+    mass: float = 79.7, height: float = 1.66, sex: Sex = "male", **parameters: float
+) -> SeatedBalanceParameters:
+    """Parameters regressed on body mass (kg) and height (m), but for those given by name.
+
+    Raises
+    ------
+    ValueError
+        When an argument is out of range or no parameter has that name.
+    """
+    known = [item.name for item in fields(SeatedBalanceParameters)]
+    unknown = [name for name in parameters if name not in known]
+    if unknown:
+        raise ValueError(f"{unknown[0]}: is no parameter of the seat; known: {', '.join(known)}")
+    return replace(from_anthropometry(mass, height, sex), **parameters)
+
+
+def seated_balance_for(
+    mass: float = 79.7,
+    height: float = 1.66,
+    sex: Sex = "male",
+    sample_time: float = 0.01,
+    delay_order: int = 5,
+    **parameters: float,
+) -> Any:
+    """Return the linear plant of a person as a discrete control.StateSpace.
+
+    Parameters
+    ----------
+    mass, height : float
+        kg, m.
+    sex : {"male", "female"}
+    sample_time : float
+        s.
+    delay_order : int
+        Of the Padé approximant.
+    **parameters : float
+        Fields of `SeatedBalanceParameters` that are known better, in their units.
+
+    Raises
+    ------
+    ValueError
+        As `seated_parameters_for` and `seated_balance_plant`.
+    """
+    found = seated_parameters_for(mass, height, sex, **parameters)
+    return seated_balance_plant(found, sample_time, delay_order)
+
+
+def seated_balance_step_for(
+    mass: float = 79.7,
+    height: float = 1.66,
+    sex: Sex = "male",
+    sample_time: float = 0.001,
+    delay_order: int = 5,
+    **parameters: float,
+) -> ca.Function:
+    """Return one sample of the nonlinear plant of a person, by Runge and Kutta's method.
+
+    The arguments are those of `seated_balance_for`, with a sample of 1 ms.
+
+    Returns
+    -------
+    casadi.Function
+        (state (5 + delay_order), input (2): command and perturbation in Nm) -> next state.
+    """
+    found = seated_parameters_for(mass, height, sex, **parameters)
+    return runge_kutta_step(nonlinear_dynamics(found, delay_order), sample_time)

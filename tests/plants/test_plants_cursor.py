@@ -1,0 +1,51 @@
+"""The cursor plant against closed forms."""
+
+from __future__ import annotations
+
+import control
+import numpy as np
+import pytest
+import scipy.integrate
+
+import plants
+
+
+def test_names_and_size() -> None:
+    system = plants.cursor_plant()
+    assert system.state_labels == [
+        "error", "velocity", "delay_1", "delay_2", "delay_3", "delay_4", "acceleration",
+    ]  # fmt: skip
+    assert system.input_labels == ["command", "target_rate"]
+    assert system.dt == pytest.approx(1 / 60)
+
+
+def test_target_moves_the_error_and_nothing_else() -> None:
+    system = plants.cursor_plant(sample_time=0.02)
+    np.testing.assert_allclose(system.B[:, 1], [-0.02, *np.zeros(6)], atol=1e-15)
+
+
+def test_a_step_command_gives_the_position_of_a_delayed_lag() -> None:
+    """c(t) of a'' = (1 - exp(-s/lag)), s = t - delay, by the integral; Padé's error is 1e-3."""
+    delay, lag, dt = 0.1, 0.08, 0.005
+    system = plants.cursor_plant(delay, lag, dt, 8)
+    time = np.arange(400) * dt
+    response = control.forced_response(
+        system, time, np.vstack([np.ones_like(time), np.zeros_like(time)])
+    )
+
+    def position(t: float) -> float:
+        s = max(t - delay, 0.0)
+        return s**2 / 2 - lag * s + lag**2 * (1 - np.exp(-s / lag))
+
+    exact = np.array([position(t) for t in time])
+    np.testing.assert_allclose(response.outputs[0], exact, atol=2e-3 * exact[-1])
+    check, _ = scipy.integrate.quad(lambda s: (1 - s) * (1 - np.exp(-s / lag)), 0, 1)
+    assert position(1 + delay) == pytest.approx(check)
+
+
+@pytest.mark.parametrize(
+    "arguments", [{"delay": 0}, {"lag": -1}, {"sample_time": 0}, {"delay_order": -1}]
+)
+def test_bad_arguments(arguments: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match=next(iter(arguments)).replace("delay_order", "order")):
+        plants.cursor_plant(**arguments)  # type: ignore[arg-type]
