@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 import sys
 from typing import Any
 
@@ -36,6 +37,9 @@ class _Program(click.Group):
         return found
 
     def main(self, *args: Any, **kwargs: Any) -> Any:
+        # Matrices of ten rows: a second thread of the linear algebra costs more than it does. Before
+        # numpy is imported, and only in this program; a value of the user's own stands.
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         try:
             status = super().main(*args, **kwargs | {"standalone_mode": False})
         except (ImpcError, click.ClickException) as error:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from impc.lqr import solve_lqr
+
 if TYPE_CHECKING:
     from impc.agreement import TrialAgreement
     from impc.arrays import Array
@@ -98,6 +100,11 @@ class FitResult:
     methods: tuple[MethodFit, ...]
     terminal_set_difference: float
     seconds: float
+
+    @property
+    def reported_P(self) -> Array:  # noqa: N802
+        """Terminal weight (3.4) of the reported weights (n, n)."""
+        return solve_lqr(self.fitted.problem.plant, self.intent.reported.weights).P
 
     @property
     def inverse_mpc(self) -> MethodFit:

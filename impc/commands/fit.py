@@ -87,7 +87,10 @@ def command(files: tuple[Path, ...], plant_name: str, config: Path, out: Path) -
             result = fit_recordings(problem, settings, FitProgress(done, memory.controller))
         except KeyboardInterrupt:
             raise KeyboardInterrupt(_kept(memory)) from None
-    written = write_files(out, fit_files(result, fit_provenance(source, files, result)))
+    names = " ".join(path.name for path in files)
+    line = f"impc fit {names} --plant {plant_name} --config {config.name}"
+    provenance = fit_provenance(source, files, line)
+    written = write_files(out, fit_files(result, provenance))
     memory.forget()
     _print(result)
     print_files(out, written)

@@ -5,15 +5,12 @@ Sentences that compare methods are made from the numbers of the run, never writt
 
 from __future__ import annotations
 
-import base64
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
-
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from impc.report.example_figures import FIGURES
 from impc.report.provenance import LOST
+from impc.report.rendering import embedded, render_template
 from impc.report.table import (
     METHODS,
     Row,
@@ -65,14 +62,8 @@ def render_page(
         PNG files of every case by name, as `example_figures` makes them.
     provenance : Provenance
     """
-    environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    return environment.get_template("page.html").render(
+    return render_template(
+        "page.html",
         cases=[_view(case, figures) for case in cases],
         lost=LOST,
         methods=METHODS,
@@ -130,7 +121,7 @@ def _label(method: MethodResult) -> str:
 def _pictures(case: CaseResult, figures: Mapping[str, bytes]) -> tuple[_Picture, ...]:
     pictures = [
         _Picture(
-            _embedded(figures[f"figure-{number}-case-{case.name}.png"]),
+            embedded(figures[f"figure-{number}-case-{case.name}.png"]),
             f"States and control over time: recorded, and as the {label} explains them",
             f"Counterpart of figure {number}, {label}. (A) The two states and (B) the control. "
             "Open markers: recorded. Lines: as this method explains them. "
@@ -139,7 +130,7 @@ def _pictures(case: CaseResult, figures: Mapping[str, bytes]) -> tuple[_Picture,
         for number, method, label in FIGURES
     ]
     terminal = _Picture(
-        _embedded(figures[f"terminal-set-case-{case.name}.png"]),
+        embedded(figures[f"terminal-set-case-{case.name}.png"]),
         "The terminal set in the plane of the two states, with the trajectories",
         "The terminal set: from any state inside it the true gain alone never exceeds the "
         "bound. At every sample the controller plans so that it arrives there within its "
@@ -152,7 +143,3 @@ def _control_sentence(method: MethodResult) -> str:
     if method.bound_kept:
         return "The control stays inside its bound (white)."
     return f"The control reaches {method.max_abs_u:.3f}, beyond its bound (grey)."
-
-
-def _embedded(png: bytes) -> str:
-    return "data:image/png;base64," + base64.b64encode(png).decode("ascii")

@@ -12,11 +12,13 @@ from impc.example import BOUND, HORIZON, STEPS
 from impc.inverse_mpc import AUXILIARY_CONDITION_WEIGHT, CONDITION_WEIGHT
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
 
     from impc.plant import Plant
+    from impc.plant_source import PlantSource
 
-__all__ = ["LOST", "Provenance", "example_provenance"]
+__all__ = ["LOST", "FitProvenance", "Provenance", "example_provenance", "fit_provenance"]
 
 LOST = (
     "The dissertation's own plant (3.8), initial state and input bound are lost. "
@@ -49,6 +51,32 @@ class Provenance:
     made: str
 
 
+@dataclass(frozen=True)
+class FitProvenance:
+    """What a reader needs to make a fit again.
+
+    Attributes
+    ----------
+    plant_name : str
+        Import path or file.
+    plant_arguments : mapping
+    files : tuple of str
+        Names of the recordings, without their folders.
+    command : str
+        Command line that made the result.
+    versions : mapping of str to str
+    made : str
+        Date and time, UTC, ISO 8601.
+    """
+
+    plant_name: str
+    plant_arguments: Mapping[str, object]
+    files: tuple[str, ...]
+    command: str
+    versions: Mapping[str, str]
+    made: str
+
+
 def example_provenance(plant_name: str, plant: Plant) -> Provenance:
     """Gather the provenance of a run of the example, now and with what is installed here."""
     settings: dict[str, float] = {
@@ -58,9 +86,27 @@ def example_provenance(plant_name: str, plant: Plant) -> Provenance:
         "condition_weight": CONDITION_WEIGHT,
         "auxiliary_condition_weight": AUXILIARY_CONDITION_WEIGHT,
     }
-    versions = {"python": platform.python_version()} | {name: _version(name) for name in _PACKAGES}
-    made = datetime.now(UTC).isoformat(timespec="seconds")
-    return Provenance(plant_name, plant, settings, versions, made)
+    return Provenance(plant_name, plant, settings, _versions(), _now())
+
+
+def fit_provenance(source: PlantSource, files: Sequence[Path], command: str) -> FitProvenance:
+    """Gather the provenance of a fit, now and with what is installed here."""
+    return FitProvenance(
+        source.name,
+        dict(source.arguments),
+        tuple(path.name for path in files),
+        command,
+        _versions(),
+        _now(),
+    )
+
+
+def _versions() -> dict[str, str]:
+    return {"python": platform.python_version()} | {name: _version(name) for name in _PACKAGES}
+
+
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="seconds")
 
 
 def _version(package: str) -> str:

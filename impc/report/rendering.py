@@ -1,0 +1,54 @@
+"""What the pages share: the template environment, pictures inside a page, numbers in a cell."""
+
+from __future__ import annotations
+
+import base64
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+__all__ = ["embedded", "number", "plain", "render_template"]
+
+
+def render_template(name: str, **values: Any) -> str:
+    """Render a template of this folder; everything that enters it is escaped."""
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template(name).render(**values)
+
+
+def embedded(png: bytes) -> str:
+    """A picture as the address of an <img> that needs no other file."""
+    return "data:image/png;base64," + base64.b64encode(png).decode("ascii")
+
+
+def number(value: float, digits: int = 3) -> str:
+    """A number for a table cell; words where there is none."""
+    if np.isnan(value):
+        return "-"
+    if np.isinf(value):
+        return "not determined"
+    return f"{value:.{digits}g}"
+
+
+def plain(value: Any) -> Any:
+    """Arrays and numpy numbers as lists and numbers, at every depth; what is no number as None.
+
+    JSON knows neither NaN nor infinity: both become null.
+    """
+    if isinstance(value, dict):
+        return {key: plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    if isinstance(value, (np.ndarray, np.generic)):
+        return plain(value.tolist())
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    return value
