@@ -37,7 +37,7 @@ class _Program(click.Group):
         return found
 
     def main(self, *args: Any, **kwargs: Any) -> Any:
-        # Matrices of ten rows: a second thread of the linear algebra costs more than it does. Before
+        # Matrices of ten rows: a second thread of linear algebra costs more than it does. Before
         # numpy is imported, and only in this program; a value of the user's own stands.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         try:

@@ -70,7 +70,8 @@ def inverse_mpc_natural(
     -------
     ConditionedFit
         Weights and solution in the units of the plant; `misfit` is the 2-norm of the residual,
-        `condition` and `objective` are those of the search, in natural coordinates.
+        `condition` and `objective` are those of the search, in natural coordinates; `converged`
+        says that the last step promised less than 1e-5 of the objective.
 
     Raises
     ------
@@ -93,6 +94,7 @@ def inverse_mpc_natural(
         weights=weights,
         solution=solve_lqr(plant, weights),
         misfit=found.misfit * noise,
+        converged=found.iterations < max_iterations,
     )
 
 

@@ -90,7 +90,11 @@ def _agreement(result: FitResult) -> _Table:
         row = [trial_name(result, index)]
         for column in range(len(outputs)):
             held = result.held_out[index].vaf[column] if result.held_out else np.nan
-            row += [number(told.vaf[column], 5), number(held, 5), number(told.whiteness[column], 2)]
+            row += [
+                number(told.vaf[column], 5),
+                number(held, 5),
+                _probability(told.whiteness[column]),
+            ]
         rows.append((*row, f"{100 * told.saturated:.1f}"))
     caption = (
         "Variance accounted for (3.24). Left out: predicted from the other trials, after the time "
@@ -98,6 +102,10 @@ def _agreement(result: FitResult) -> _Table:
         "residual; a small one says that something regular is left."
     )
     return _Table(caption, (*heads, "at the bound %"), tuple(rows))
+
+
+def _probability(value: float) -> str:
+    return "< 0.001" if value < 1e-3 else number(value, 2)
 
 
 def _methods(result: FitResult) -> _Table:
