@@ -88,13 +88,11 @@ def _vaf(axes: Axes, results: Sequence[ConditionResult]) -> None:
 
 def _prices(axes: Axes, results: Sequence[ConditionResult]) -> None:
     blur = [item.blur for item in results]
-    axes.errorbar(
+    axes.plot(
         blur,
         [item.gain[0] for item in results],
-        yerr=[1.96 * item.gain_deviation[0] for item in results],
-        fmt="o-",
+        "o-",
         color=BLUE,
-        capsize=2,
         label="gain of the error (1/s$^2$)",
     )
     middle = np.array([item.price_of_error for item in results])
@@ -104,7 +102,13 @@ def _prices(axes: Axes, results: Sequence[ConditionResult]) -> None:
         blur, middle, "D:", color=GREEN, markerfacecolor="white", label="price of the error, R = 1"
     )
     axes.fill_between(
-        blur, low, high, color=GREEN, alpha=0.2, linewidth=0, label="the same, equivalent weights"
+        blur,
+        low,
+        high,
+        color=GREEN,
+        alpha=0.2,
+        linewidth=0,
+        label="the same over equivalent weights",
     )
     axes.set_yscale("log")
     axes.set_xlabel("blur (px)")

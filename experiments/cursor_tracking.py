@@ -27,6 +27,7 @@ from experiments.cursor_figure import cursor_figure
 from impc.agreement import centred_vaf
 from impc.arrays import Array, frozen
 from impc.closed_loop import simulate
+from impc.evaluation import misfit_or_reason
 from impc.fit_recordings import fit_problem
 from impc.fit_settings import FitSettings
 from impc.fitted_controller import FittedController, fit_controller
@@ -36,8 +37,9 @@ from impc.inverse_problem import InverseProblem, controller_for, scenarios
 from impc.plant import Plant, as_plant
 from impc.plant_family import plant_family
 from impc.recording import recording
+from impc.report.rendering import plain
 from impc.report.write import write_files
-from impc.unknown_limit import LimitEstimate, input_limit
+from impc.unknown_limit import with_limit
 from impc.weights_set import linear_range, weights_set
 from plants import cursor_plant
 
@@ -64,8 +66,10 @@ class ConditionResult:
         Of each trial, from all and from the others, %.
     baseline_out : list of float
         The same of delayed feedback, %.
-    gain, gain_deviation : list of float
+    gain : list of float
         Of error (1/s^2) and velocity (1/s).
+    gain_determined : int
+        Directions of the gain, of 7, that are known to better than their natural size.
     price_of_error, price_low, price_high : float
         Q_ee at R = 1 in the least conditioned weights, and its range over all weights with the same
         gain and a condition number up to ten times the least.
@@ -83,7 +87,7 @@ class ConditionResult:
     vaf_out: list[float]
     baseline_out: list[float]
     gain: list[float]
-    gain_deviation: list[float]
+    gain_determined: int
     price_of_error: float
     price_low: float
     price_high: float
@@ -152,21 +156,37 @@ def fit_condition(condition: Condition) -> ConditionResult:
         [item[0] for item in outside],
         [item[1] for item in outside],
         solution.K[0, :2].tolist(),
-        covariance.entries[0, :2].tolist(),
+        int(np.count_nonzero(np.array(covariance.deviations) < 1)),
         float(found.least.weights.Q[0, 0]),
         price.low,
         price.high,
-        _limit(input_limit(fitted)),
+        _limit(fitted),
         condition.response[shown].tolist(),
         outside[shown][2].tolist(),
         condition.target[shown].tolist(),
     )
 
 
-def _limit(found: LimitEstimate) -> str:
-    if found.value is None:
-        return f"not determined, at least {found.low:.3g} px/s^2"
-    return f"{found.value:.3g} px/s^2 ({found.low:.3g} to {found.high:.3g})"
+def _limit(fitted: FittedController) -> str:
+    """What a bound on the command would change, everything else held.
+
+    From the largest command of the fit downwards: the least bound that costs less than 1 % of the
+    misfit, and whether any bound lowers it by as much.
+    """
+    known = replace(fitted.problem, family=None, logarithms=frozen([]))
+    K, S = np.array(fitted.solution.K), np.array(fitted.solution.S)
+    controller = controller_for(known, K, S)
+    peak = max(float(np.max(np.abs(simulate(controller, d).u))) for d in scenarios(known))
+    free, _ = misfit_or_reason(known, K, S)
+    least, best = peak, free
+    for share in np.linspace(0.95, 0.2, 16):
+        misfit, reason = misfit_or_reason(with_limit(known, float(share * peak)), K, S)
+        best = min(best, misfit)
+        if reason or misfit > 1.01 * free:
+            break
+        least = float(share * peak)
+    told = "no bound fits better" if best > 0.99 * free else "a bound fits better"
+    return f"peak {peak:.0f}; {told}; bounds above {least:.0f} fit as well"
 
 
 def _parameters(fitted: FittedController) -> tuple[float, float]:
@@ -194,16 +214,15 @@ def _vaf(recorded: Array, cursor: Array) -> float:
 def _table(results: list[ConditionResult]) -> str:
     lines = [
         "blur px  trials  delay ms  lag ms  VAF in %  VAF out % (least)  delayed feedback %"
-        "  K error 1/s^2  K velocity 1/s  price of error (range)  acceleration limit"
+        "  K error 1/s^2  K velocity 1/s  gain determined  price of error (range)  acceleration, px/s^2"
     ]
     for item in results:
         lines.append(
             f"{item.blur:7.0f} {item.trials:7d} {1e3 * item.delay:9.0f} {1e3 * item.lag:7.0f} "
             f"{np.mean(item.vaf_in):9.1f} {np.mean(item.vaf_out):10.1f} ({min(item.vaf_out):5.1f}) "
             f"{np.mean(item.baseline_out):17.1f}  "
-            f"{item.gain[0]:8.1f} +- {item.gain_deviation[0]:.1f} "
-            f"{item.gain[1]:9.2f} +- {item.gain_deviation[1]:.2f} "
-            f"{item.price_of_error:10.3g} ({item.price_low:.3g} to {item.price_high:.3g})  "
+            f"{item.gain[0]:11.1f} {item.gain[1]:15.2f} {item.gain_determined:16d} of 7"
+            f"{item.price_of_error:12.3g} ({item.price_low:.3g} to {item.price_high:.3g})  "
             f"{item.limit}"
         )
     return "\n".join(lines)
@@ -222,7 +241,7 @@ def main() -> None:
         found = pool.map(functools.partial(fit_condition), conditions)
         results = list(tqdm(found, total=len(conditions), unit="condition", disable=None))
     print(_table(results))
-    content: dict[str, Any] = {f"{item.blur:g} px": asdict(item) for item in results}
+    content: Any = plain({f"{item.blur:g} px": asdict(item) for item in results})
     files = {"result.json": (json.dumps(content, indent=1) + "\n").encode()}
     write_files(given.out, files | cursor_figure(results))
     print(f"\nwritten to {given.out}")

@@ -29,7 +29,12 @@ def least_radius(seed: int, reach: float = 10.0) -> tuple[float, list[float]]:
         return float(np.max(np.abs(np.linalg.eigvals(plant.A - plant.B @ gain))))
 
     found = scipy.optimize.differential_evolution(
-        radius, [(-reach, reach)] * 4, seed=seed, maxiter=600, popsize=20, tol=1e-8
+        radius,
+        scipy.optimize.Bounds([-reach] * 4, [reach] * 4),
+        seed=seed,
+        maxiter=600,
+        popsize=20,
+        tol=1e-8,
     )
     return float(found.fun), [float(value) for value in found.x * truth]
 

@@ -46,7 +46,7 @@ class SubjectTrial:
     saturated : float
         Share of the controller's samples at which its command stands on a bound.
     fell : float or None
-        Time in s at which no command kept the bounds or a state left every reasonable range; what
+        Time in s at which no command kept the bounds or an output went beyond `largest`; what
         follows repeats the last state.
     """
 
@@ -87,7 +87,7 @@ def simulate_subject(
     sensor : array_like
         Standard deviation of the sensor noise, in the outputs' units, one or (p,).
     largest : float
-        A state beyond this, in its unit, is a fall.
+        An output beyond this, in its unit, is a fall.
     seed : int or SeedSequence
 
     Raises
@@ -129,7 +129,7 @@ def simulate_subject(
         x[first:last] = np.vstack([state, ahead[:-1]])[: last - first]
         u[first:last] = command
         state = ahead[-1]
-        if not np.all(np.isfinite(state)) or np.max(np.abs(state)) > largest:
+        if not np.all(np.isfinite(state)) or np.max(np.abs(plant.C @ state)) > largest:
             fell = last / rate
             x[last:], u[last:] = x[last - 1], command
             break

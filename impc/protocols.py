@@ -1,0 +1,171 @@
+"""How a laboratory normalises the seat to a subject: the two protocols of chapter 2.
+
+A protocol asks for trials and decides by their outcome, so each takes the subject as a function.
+
+Stiffness: from a stiff seat downwards without perturbation, coarse steps until balance is lost,
+twice, the lower kept; fine steps from a little above, three times, their mean. The seat is then
+used at twice that critical stiffness. The level that counts is the first at which balance is lost.
+
+Torque: one-second pulses of rising size until the seat reaches a given angle; then trials like the
+real ones at that amplitude, smaller by a step after each loss, until two in a row are passed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from impc.errors import InputError, SolverError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+__all__ = ["CriticalStiffness", "TorqueAmplitude", "critical_stiffness", "torque_amplitude"]
+
+
+@dataclass(frozen=True)
+class CriticalStiffness:
+    """Result of the stiffness protocol, all in Nm/rad.
+
+    Attributes
+    ----------
+    coarse : float
+        Lower of the two coarse searches.
+    fine : float
+        Mean of the fine searches: the critical stiffness.
+    levels : tuple of float
+        First failing level of every search, coarse ones first.
+    trials : int
+        Trials that the subject did.
+    """
+
+    coarse: float
+    fine: float
+    levels: tuple[float, ...]
+    trials: int
+
+    @property
+    def experimental(self) -> float:
+        """Stiffness of the seat in the experiment: twice the critical one."""
+        return 2 * self.fine
+
+
+@dataclass(frozen=True)
+class TorqueAmplitude:
+    """Result of the torque protocol, in Nm.
+
+    Attributes
+    ----------
+    coarse : float
+        Least pulse at which the seat reached the angle.
+    amplitude : float
+        Largest amplitude of the trials that were passed.
+    trials : int
+        Trials that the subject did, pulses included.
+    """
+
+    coarse: float
+    amplitude: float
+    trials: int
+
+
+def critical_stiffness(
+    balances: Callable[[float], bool],
+    *,
+    start: float = 250.0,
+    coarse_step: float = 10.0,
+    fine_step: float = 5.0,
+    margin: float = 50.0,
+    coarse_searches: int = 2,
+    fine_searches: int = 3,
+) -> CriticalStiffness:
+    """Run the stiffness protocol.
+
+    Parameters
+    ----------
+    balances : callable
+        Stiffness in Nm/rad -> whether the subject kept the seat inside its stops for a trial.
+    start, coarse_step, fine_step, margin : float
+        Nm/rad; the fine searches begin `margin` above the coarse result.
+    coarse_searches, fine_searches : int
+
+    Raises
+    ------
+    InputError
+        When a step is not positive.
+    SolverError
+        When balance is lost at the first level already, or never.
+    """
+    if coarse_step <= 0 or fine_step <= 0:
+        raise InputError("step", f"got {min(coarse_step, fine_step):g}", "give positive ones")
+    levels, trials = [], 0
+    for _ in range(coarse_searches):
+        level, count = _descend(balances, start, coarse_step)
+        levels.append(level)
+        trials += count
+    coarse = min(levels)
+    for _ in range(fine_searches):
+        level, count = _descend(balances, coarse + margin, fine_step)
+        levels.append(level)
+        trials += count
+    fine = sum(levels[coarse_searches:]) / fine_searches
+    return CriticalStiffness(coarse, fine, tuple(levels), trials)
+
+
+def torque_amplitude(
+    pulse_angle: Callable[[float], float],
+    keeps_balance: Callable[[float], bool],
+    *,
+    angle: float,
+    step: float = 1.0,
+    largest: float = 100.0,
+) -> TorqueAmplitude:
+    """Run the torque protocol.
+
+    Parameters
+    ----------
+    pulse_angle : callable
+        Size of a one-second pulse in Nm -> largest angle of the seat, in the unit of `angle`.
+    keeps_balance : callable
+        Amplitude in Nm -> whether a trial like the real ones was passed.
+    angle : float
+        Angle that the coarse search goes up to; 8 degrees in the dissertation.
+    step, largest : float
+        Nm.
+
+    Raises
+    ------
+    SolverError
+        When no pulse reaches the angle, or no amplitude is passed twice.
+    """
+    coarse, trials = step, 1
+    while pulse_angle(coarse) < angle:
+        coarse += step
+        trials += 1
+        if coarse > largest:
+            raise SolverError("pulses", f"none up to {largest:g} Nm reaches the angle", "raise it")
+    amplitude, passed = coarse, 0
+    while passed < 2:
+        trials += 1
+        if keeps_balance(amplitude):
+            passed += 1
+            continue
+        amplitude, passed = amplitude - step, 0
+        if amplitude <= 0:
+            raise SolverError("trials", "no amplitude is passed twice", "check the subject")
+    return TorqueAmplitude(coarse, amplitude, trials)
+
+
+def _descend(balances: Callable[[float], bool], start: float, step: float) -> tuple[float, int]:
+    """First failing level and the number of trials."""
+    level, trials = start, 1
+    while balances(level):
+        level -= step
+        trials += 1
+        if level < 0:
+            raise SolverError("stiffness", "balance is never lost", "begin with a harder task")
+    if trials == 1:
+        raise SolverError(
+            "stiffness", f"balance is lost at {start:g} already", "begin with a stiffer seat"
+        )
+    return level, trials
