@@ -52,14 +52,15 @@ def read_conditions(path: Path) -> list[Condition]:
     DataError
         When the file is absent or is not that of the recordings.
     """
+    if not path.is_file():
+        raise DataError(f"recordings {path.name}", "is not there", "name it in IMPC_CURSOR_DATA")
     try:
         found = scipy.io.loadmat(path, variable_names=["sigma", "target", "response"])
         blur = np.ravel(found["sigma"]).astype(float)
         target, response = (found[name].astype(float) for name in ("target", "response"))
     except (OSError, ValueError, KeyError, NotImplementedError) as error:
-        reason = "is not there" if isinstance(error, FileNotFoundError) else f"({error})"
         raise DataError(
-            f"recordings {path.name}", reason, "name the file in IMPC_CURSOR_DATA"
+            f"recordings {path.name}", f"cannot be read ({error})", "name another file"
         ) from None
     return [
         Condition(float(width), target[blur == width], response[blur == width])

@@ -87,30 +87,26 @@ def _vaf(axes: Axes, results: Sequence[ConditionResult]) -> None:
 
 
 def _prices(axes: Axes, results: Sequence[ConditionResult]) -> None:
+    """Gain and price; the price is the same for all weights with that gain, so it has no band."""
     blur = [item.blur for item in results]
+    axes.plot(
+        blur,
+        [item.price_of_error for item in results],
+        "D:",
+        color=GREEN,
+        markerfacecolor="white",
+        label="price of the error (s$^{-4}$), R = 1",
+    )
     axes.plot(
         blur,
         [item.gain[0] for item in results],
         "o-",
         color=BLUE,
-        label="gain of the error (1/s$^2$)",
-    )
-    middle = np.array([item.price_of_error for item in results])
-    low = np.array([item.price_low for item in results])
-    high = np.array([item.price_high for item in results])
-    axes.plot(
-        blur, middle, "D:", color=GREEN, markerfacecolor="white", label="price of the error, R = 1"
-    )
-    axes.fill_between(
-        blur,
-        low,
-        high,
-        color=GREEN,
-        alpha=0.2,
-        linewidth=0,
-        label="the same over equivalent weights",
+        label="gain of the error (s$^{-2}$)",
     )
     axes.set_yscale("log")
+    axes.set_ylim(1, 1e9)
     axes.set_xlabel("blur (px)")
+    axes.set_ylabel("gain, price")
     axes.set_title("(D)", loc="left")
-    axes.legend(loc="lower left")
+    axes.legend(loc="upper right")

@@ -214,7 +214,8 @@ def _vaf(recorded: Array, cursor: Array) -> float:
 def _table(results: list[ConditionResult]) -> str:
     lines = [
         "blur px  trials  delay ms  lag ms  VAF in %  VAF out % (least)  delayed feedback %"
-        "  K error 1/s^2  K velocity 1/s  gain determined  price of error (range)  acceleration, px/s^2"
+        "  K error 1/s^2  K velocity 1/s  gain determined  price of error (range)"
+        "  acceleration, px/s^2"
     ]
     for item in results:
         lines.append(

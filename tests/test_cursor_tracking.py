@@ -1,0 +1,81 @@
+"""Human target tracking: what inverse MPC reaches on trials that it has not seen."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments.cursor_baseline import delayed_feedback, fit_delayed_feedback
+from experiments.cursor_data import RATE, Condition, data_file, read_conditions
+from experiments.cursor_tracking import left_out_vaf
+from impc.errors import DataError
+
+#: Leave-one-trial-out VAF of a delayed second-order feedback, from the sharpest target on.
+REFERENCE = (86.7, 82.7, 84.3, 80.1, 57.8, 48.4)
+
+recorded = [
+    pytest.mark.recordings,
+    pytest.mark.skipif(
+        not data_file().exists(), reason=f"{data_file().name} is not there (IMPC_CURSOR_DATA)"
+    ),
+]
+
+
+def mean_left_out(condition: Condition) -> tuple[float, float]:
+    found = [left_out_vaf(condition, index)[:2] for index in range(len(condition.target))]
+    ours, baseline = np.mean(found, axis=0)
+    return float(ours), float(baseline)
+
+
+def test_delayed_feedback_is_its_difference_equation() -> None:
+    """Step by step, against the filter; seed 0."""
+    target = np.cumsum(np.random.default_rng(0).standard_normal((2, 200)), axis=1)
+    k1, k2, delay, dt = 20.0, 6.0, 5, 1 / RATE
+    moved = target - target[:, :1]
+    cursor = np.zeros_like(moved)
+    for k in range(199):
+        past = k - delay
+        error = (cursor - moved)[:, past] if past >= 0 else 0.0
+        speed = (cursor[:, past] - cursor[:, past - 1]) / dt if past >= 1 else 0.0
+        before = cursor[:, k - 1] if k >= 1 else 0.0
+        cursor[:, k + 1] = 2 * cursor[:, k] - before - dt**2 * (k1 * error + k2 * speed)
+    found = delayed_feedback(target, np.array([k1, k2]), delay)
+    # The filter takes the speed between the samples `delay` and `delay + 1` ago.
+    np.testing.assert_allclose(found, cursor, atol=1e-9 * np.max(np.abs(cursor)))
+
+
+def test_delayed_feedback_is_found_again() -> None:
+    target = np.cumsum(np.random.default_rng(1).standard_normal((3, 600)), axis=1)
+    response = delayed_feedback(target, np.array([15.0, 5.0]), 9)
+    gains, delay = fit_delayed_feedback(target, response)
+    assert delay == 9
+    np.testing.assert_allclose(gains, [15.0, 5.0], rtol=1e-4)
+
+
+def test_an_absent_file_is_said(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="is not there"):
+        read_conditions(tmp_path / "nothing.mat")
+
+
+@pytest.mark.parametrize("index", [0, 5])
+class TestRecordings:
+    pytestmark = recorded
+
+    def test_left_out_trials_are_predicted(self, index: int) -> None:
+        """At least the reference less a point, and as well as our own delayed feedback."""
+        ours, baseline = mean_left_out(read_conditions(data_file())[index])
+        assert ours >= REFERENCE[index] - 1.0
+        assert ours >= baseline - 1.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("index", range(6))
+class TestAllRecordings:
+    pytestmark = recorded
+
+    def test_left_out_trials_are_predicted(self, index: int) -> None:
+        ours, baseline = mean_left_out(read_conditions(data_file())[index])
+        assert ours >= REFERENCE[index] - 1.0
+        assert ours >= baseline - 1.0
