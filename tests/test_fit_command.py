@@ -60,7 +60,7 @@ def test_the_subject_is_written_in_every_format(subject: Path) -> None:
     assert np.array(truth["K"]).shape == (1, 10)
     configuration = read_configuration(subject / "subject.toml")
     plant = make_plant(
-        plant_source("plants:seated_balance_for", configuration.plant), configuration.signals
+        plant_source("plants:seated_balance_for", configuration.plant), tuple(configuration.signals)
     )
     first = read_recordings([subject / "trial_1.csv"], configuration, plant)[0]
     for ending in (".tsv", ".mat", "_v73.mat", ".tdms", ".c3d"):
@@ -84,7 +84,7 @@ def test_result_json_is_the_fit(fitted: tuple[Result, Path], subject: Path) -> N
     found = json.loads((fitted[1] / "result.json").read_text())
     configuration = read_configuration(subject / "subject.toml")
     plant = make_plant(
-        plant_source("plants:seated_balance_for", configuration.plant), configuration.signals
+        plant_source("plants:seated_balance_for", configuration.plant), tuple(configuration.signals)
     )
     files = [subject / f"trial_{number}.csv" for number in (1, 2, 3)]
     recordings = read_recordings(files, configuration, plant)

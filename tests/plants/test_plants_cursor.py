@@ -35,7 +35,7 @@ def test_a_step_command_gives_the_position_of_a_delayed_lag() -> None:
 
     def position(t: float) -> float:
         s = max(t - delay, 0.0)
-        return s**2 / 2 - lag * s + lag**2 * (1 - np.exp(-s / lag))
+        return float(s**2 / 2 - lag * s + lag**2 * (1 - np.exp(-s / lag)))
 
     exact = np.array([position(t) for t in time])
     np.testing.assert_allclose(response.outputs[0], exact, atol=2e-3 * exact[-1])
