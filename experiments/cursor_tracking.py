@@ -22,6 +22,7 @@ import numpy as np
 from tqdm import tqdm
 
 from experiments.cursor_baseline import delayed_feedback, fit_delayed_feedback
+from experiments.cursor_ceiling import fit_step_response, follow
 from experiments.cursor_data import RATE, Condition, data_file, read_conditions
 from experiments.cursor_figure import cursor_figure
 from impc.agreement import centred_vaf
@@ -64,8 +65,8 @@ class ConditionResult:
         s.
     vaf_in, vaf_out : list of float
         Of each trial, from all and from the others, %.
-    baseline_out : list of float
-        The same of delayed feedback, %.
+    baseline_out, ceiling_out : list of float
+        The same of delayed feedback, and of a free linear response (`cursor_ceiling`), %.
     gain : list of float
         Of error (1/s^2) and velocity (1/s).
     gain_determined : int
@@ -86,6 +87,7 @@ class ConditionResult:
     vaf_in: list[float]
     vaf_out: list[float]
     baseline_out: list[float]
+    ceiling_out: list[float]
     gain: list[float]
     gain_determined: int
     price_of_error: float
@@ -155,6 +157,7 @@ def fit_condition(condition: Condition) -> ConditionResult:
         inside,
         [item[0] for item in outside],
         [item[1] for item in outside],
+        [_ceiling(condition, index) for index in range(count)],
         solution.K[0, :2].tolist(),
         int(np.count_nonzero(np.array(covariance.deviations) < 1)),
         float(found.least.weights.Q[0, 0]),
@@ -165,6 +168,13 @@ def fit_condition(condition: Condition) -> ConditionResult:
         outside[shown][2].tolist(),
         condition.target[shown].tolist(),
     )
+
+
+def _ceiling(condition: Condition, index: int) -> float:
+    """VAF of one trial from the free linear response of the others, %."""
+    others = np.arange(len(condition.target)) != index
+    response = fit_step_response(condition.target[others], condition.response[others])
+    return _vaf(condition.response[index], follow(condition.target[index], response))
 
 
 def _limit(fitted: FittedController) -> str:
@@ -213,7 +223,7 @@ def _vaf(recorded: Array, cursor: Array) -> float:
 
 def _table(results: list[ConditionResult]) -> str:
     lines = [
-        "blur px  trials  delay ms  lag ms  VAF in %  VAF out % (least)  delayed feedback %"
+        "blur px  trials  delay ms  lag ms  VAF in %  VAF out % (least)  delayed feedback %  free response %"
         "  K error 1/s^2  K velocity 1/s  gain determined  price of error (range)"
         "  acceleration, px/s^2"
     ]
@@ -221,7 +231,7 @@ def _table(results: list[ConditionResult]) -> str:
         lines.append(
             f"{item.blur:7.0f} {item.trials:7d} {1e3 * item.delay:9.0f} {1e3 * item.lag:7.0f} "
             f"{np.mean(item.vaf_in):9.1f} {np.mean(item.vaf_out):10.1f} ({min(item.vaf_out):5.1f}) "
-            f"{np.mean(item.baseline_out):17.1f}  "
+            f"{np.mean(item.baseline_out):17.1f} {np.mean(item.ceiling_out):15.1f}  "
             f"{item.gain[0]:11.1f} {item.gain[1]:15.2f} {item.gain_determined:16d} of 7"
             f"{item.price_of_error:12.3g} ({item.price_low:.3g} to {item.price_high:.3g})  "
             f"{item.limit}"

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from experiments.cursor_baseline import delayed_feedback, fit_delayed_feedback
+from experiments.cursor_ceiling import fit_step_response, follow
 from experiments.cursor_data import RATE, Condition, data_file, read_conditions
 from experiments.cursor_tracking import left_out_vaf
 from impc.errors import DataError
@@ -52,6 +53,15 @@ def test_delayed_feedback_is_found_again() -> None:
     gains, delay = fit_delayed_feedback(target, response)
     assert delay == 9
     np.testing.assert_allclose(gains, [15.0, 5.0], rtol=1e-4)
+
+
+def test_the_free_response_finds_that_of_delayed_feedback() -> None:
+    """By superposition, against the recursion, which settles within the two seconds; seed 2."""
+    target = np.cumsum(np.random.default_rng(2).standard_normal((8, 1200)), axis=1)
+    response = delayed_feedback(target, np.array([20.0, 8.0]), 3)
+    found = fit_step_response(target[1:], response[1:])
+    error = follow(target[0], found) - response[0]
+    assert np.std(error) < 5e-3 * np.std(response[0])
 
 
 def test_an_absent_file_is_said(tmp_path: Path) -> None:
