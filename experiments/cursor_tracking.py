@@ -223,7 +223,8 @@ def _vaf(recorded: Array, cursor: Array) -> float:
 
 def _table(results: list[ConditionResult]) -> str:
     lines = [
-        "blur px  trials  delay ms  lag ms  VAF in %  VAF out % (least)  delayed feedback %  free response %"
+        "blur px  trials  delay ms  lag ms  VAF in %  VAF out % (least)  delayed feedback %"
+        "  free response %"
         "  K error 1/s^2  K velocity 1/s  gain determined  price of error (range)"
         "  acceleration, px/s^2"
     ]
