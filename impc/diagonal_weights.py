@@ -123,7 +123,8 @@ class _Prices:
             raise SolverError(
                 "recordings", "nothing drives them", "record a disturbance, or give initial states"
             )
-        self.unit = (command / np.maximum(state, 1e-12 * np.max(state))) ** 2
+        moving = state > 1e-12 * np.max(state)
+        self.unit = (command / np.where(moving, state, np.min(state[moving]))) ** 2
         self.samples = sum(trial.outputs.size for trial in problem.recordings)
         priced = np.diag(weights.Q) / weights.R[0, 0] / self.unit
         self.start = np.log(np.maximum(priced, _SMALL))

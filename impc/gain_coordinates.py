@@ -32,10 +32,11 @@ if TYPE_CHECKING:
     from impc.inverse_problem import InverseProblem
     from impc.terminal_set import TerminalSet
 
-__all__ = ["Compressed", "Coordinates", "Point", "WithPrior", "start_unit"]
+__all__ = ["PARAMETER_UNIT", "Compressed", "Coordinates", "Point", "WithPrior", "start_unit"]
 
 _BLOCK = 4096
-_PARAMETER_UNIT = 1 / 3
+#: A parameter's coordinate counts thirds of itself.
+PARAMETER_UNIT = 1 / 3
 _START_FLOOR = 1e-8
 
 
@@ -98,7 +99,7 @@ class Coordinates:
             np.asarray(gain, dtype=np.float64),
             self._metric(factor),
             given,
-            self.problem.logarithms + _PARAMETER_UNIT * parameters,
+            self.problem.logarithms + PARAMETER_UNIT * parameters,
         )
 
     def at(self, z: Array) -> Compressed:
@@ -150,7 +151,7 @@ class Coordinates:
             row = mine.stop
             blocks = [part[mine] for part in parts]
             blocks += [found.dx0[mine] @ self.start_unit] if found.dx0.shape[1] else []
-            blocks += [found.dparameters[mine] * _PARAMETER_UNIT, found.residual[mine, None]]
+            blocks += [found.dparameters[mine] * PARAMETER_UNIT, found.residual[mine, None]]
             triangle = _triangle(blocks)
             placed = np.zeros((len(triangle), width + 1))
             placed[:, self._columns(index)] = triangle

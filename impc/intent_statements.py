@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.arrays import Array
-from impc.weights_set import linear_range
+from impc.weights_set import linear_maximum, linear_range
 
 if TYPE_CHECKING:
     from impc.weights import Weights
@@ -130,7 +130,7 @@ def _frank_wolfe(found: WeightsSet, D: Array, centre: Array, start: Array) -> Ar
     for _ in range(_FRANK_WOLFE):
         gradient = np.zeros_like(X)
         gradient[:n, :n] = D @ _turning(D @ X[:n, :n] @ D, centre) @ D
-        end = linear_range(found, gradient).high_weights.block
+        end = linear_maximum(found, gradient).weights.block
         shares = np.linspace(0.0, 1.0, 21)
         angles = [_angle(centre, _dominant(D @ (X + s * (end - X))[:n, :n] @ D)) for s in shares]
         step = shares[int(np.argmax(angles))]

@@ -72,9 +72,16 @@ def norm_bound(
 
 
 def solve_semidefinite(
-    objective: Array, cones: list[Cone], *, squares: Array | None = None
+    objective: Array,
+    cones: list[Cone],
+    *,
+    squares: Array | None = None,
+    tolerance: float = 1e-11,
 ) -> SemidefiniteSolution:
     """Minimise objective @ y + squares @ y^2 over the cones; no squares by default.
+
+    The tolerance is Clarabel's, on gap and feasibility. Its own default of 1e-8 would be the error
+    of the weights.
 
     Raises
     ------
@@ -84,8 +91,7 @@ def solve_semidefinite(
     settings = clarabel.DefaultSettings()
     settings.verbose = False
     settings.max_threads = 1
-    # Tighter than the default 1e-8, which would be the error of the weights.
-    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = 1e-11
+    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = tolerance
     count = len(objective)
     quadratic = np.zeros((count, count)) if squares is None else np.diag(2 * squares)
     found = clarabel.DefaultSolver(

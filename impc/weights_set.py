@@ -15,7 +15,7 @@ order one although the condition numbers of plant units may be 1e8 (`least_condi
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -24,14 +24,31 @@ from impc.arrays import Array
 from impc.equivalent_weights import inverse_factor, least_condition_weights
 from impc.errors import InputError
 from impc.gain_fibre import pair_blocks, split_blocks
-from impc.semidefinite import Cone, matrix_inequality, solve_semidefinite
+from impc.semidefinite import Cone, matrix_inequality, norm_bound, solve_semidefinite
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from impc.equivalent_weights import EquivalentWeights
     from impc.gain_fibre import GainFibre
     from impc.weights import Weights
 
-__all__ = ["Range", "WeightsSet", "entry_ranges", "linear_range", "trace_range", "weights_set"]
+__all__ = [
+    "End",
+    "Range",
+    "WeightsSet",
+    "entry_ranges",
+    "extreme_eigenvalue",
+    "linear_maximum",
+    "linear_range",
+    "nearest_diagonal",
+    "trace_range",
+    "weights_set",
+]
+
+
+# Relative gap of the programs, and halvings that draw their points inside.
+_GAP, _HALVINGS = 1e-8, 50
 
 
 @dataclass(frozen=True)
@@ -58,6 +75,14 @@ class WeightsSet:
     first: Array
     level: Array
     inverse: Array
+
+
+class End(NamedTuple):
+    """The member at which a program ends, its value, and what no member goes beyond."""
+
+    value: float
+    bound: float
+    weights: Weights
 
 
 @dataclass(frozen=True)
@@ -114,17 +139,31 @@ def linear_range(found: WeightsSet, direction: Array) -> Range:
     SolverError
         When a program returns no finite point.
     """
-    low, low_bound, low_weights = _minimum(found, direction)
-    high, high_bound, high_weights = _minimum(found, -direction)
-    return Range(low, -high, low_bound, -high_bound, low_weights, high_weights)
+    low, high = _minimum(found, direction), linear_maximum(found, direction)
+    return Range(low.value, high.value, low.bound, high.bound, low.weights, high.weights)
 
 
-def entry_ranges(found: WeightsSet) -> dict[tuple[int, int], Range]:
-    """Range of every entry Q_ij, i >= j."""
-    n, size = found.fibre.plant.n, len(found.first)
+def linear_maximum(found: WeightsSet, direction: Array) -> End:
+    """Largest trace(direction blkdiag(Q, R)) over the set, direction symmetric (n + m, n + m).
+
+    Raises
+    ------
+    SolverError
+        When the program returns no finite point.
+    """
+    end = _minimum(found, -direction)
+    return End(-end.value, -end.bound, end.weights)
+
+
+def entry_ranges(
+    found: WeightsSet, states: Sequence[int] | None = None
+) -> dict[tuple[int, int], Range]:
+    """Range of every entry Q_ij, i >= j, of the given states (indices), of all by default."""
+    size = len(found.first)
+    chosen = sorted(range(found.fibre.plant.n) if states is None else states)
     ranges = {}
-    for i in range(n):
-        for j in range(i + 1):
+    for position, i in enumerate(chosen):
+        for j in chosen[: position + 1]:
             direction = np.zeros((size, size))
             direction[i, j] = direction[j, i] = 1.0 if i == j else 0.5
             ranges[i, j] = linear_range(found, direction)
@@ -138,21 +177,97 @@ def trace_range(found: WeightsSet, scaling: Array) -> Range:
     return linear_range(found, np.diag(size))
 
 
-def _minimum(found: WeightsSet, direction: Array) -> tuple[float, float, Weights]:
-    """(value at the member found, dual bound, the member)."""
+def nearest_diagonal(found: WeightsSet, scaling: Array) -> End:
+    """Member whose D Q D, D = diag(scaling) (n,), has the least off-diagonal part (Frobenius).
+
+    Raises
+    ------
+    SolverError
+        When the program returns no finite point.
+    """
+    n = found.fibre.plant.n
+    rows, columns = np.tril_indices(n, -1)
+    size = np.sqrt(2.0) * np.outer(scaling, scaling)[rows, columns]
+    offset = found.first[rows, columns] * size
+    unit = float(np.linalg.norm(found.least.weights.Q[rows, columns] * size))
+    if unit == 0 or len(found.level) == 0:  # diagonal as it is, or there is but one
+        return End(unit, unit, found.least.weights)
+    vectors = found.level[:, rows, columns] * size / unit
+    # Variables (y, t, s): s bounds the norm.
+    count = len(found.level)
+    spread = norm_bound(
+        np.vstack([vectors, np.zeros((2, len(rows)))]),
+        np.append(np.zeros(count + 1), 1.0),
+        offset=offset / unit,
+    )
+    solved = solve_semidefinite(
+        np.append(np.zeros(count + 1), 1.0), [*_cones(found, 1), spread], tolerance=_GAP
+    )
+    X = _member(found, solved.y)
+    value = float(np.linalg.norm(X[rows, columns] * size))
+    return End(value, unit * solved.bound, split_blocks(X, n))
+
+
+def extreme_eigenvalue(found: WeightsSet, *, largest: bool) -> End:
+    """Least largest eigenvalue of Q over the set, or its largest least one.
+
+    Raises
+    ------
+    SolverError
+        When the program returns no finite point.
+    """
+    n, count, sign = found.fibre.plant.n, len(found.level), 1.0 if largest else -1.0
+    unit = float(np.linalg.eigvalsh(found.least.weights.Q)[-1 if largest else 0])
+    # Variables (y, t, s): sign (s unit I - Q) >= 0.
+    levels = np.concatenate([-found.level[:, :n, :n] / unit, np.zeros((1, n, n)), np.eye(n)[None]])
+    bound = matrix_inequality(-sign * found.first[:n, :n] / unit, sign * levels)
+    objective = np.append(np.zeros(count + 1), sign)
+    solved = solve_semidefinite(objective, [*_cones(found, 1), bound], tolerance=_GAP)
+    X = _member(found, solved.y)
+    value = float(np.linalg.eigvalsh(X[:n, :n])[-1 if largest else 0])
+    return End(value, sign * unit * solved.bound, split_blocks(X, n))
+
+
+def _minimum(found: WeightsSet, direction: Array) -> End:
     constant = float(np.sum(direction * found.first))
     slopes = np.tensordot(found.level, direction, 2)
     scale = float(np.linalg.norm(slopes))
     if scale == 0:  # the same for every member, or there is but one
-        return constant, constant, found.least.weights
-    solved = solve_semidefinite(np.append(slopes / scale, 0.0), _cones(found))
-    X = found.first + np.tensordot(solved.y[:-1], found.level, 1)
+        return End(constant, constant, found.least.weights)
+    solved = solve_semidefinite(np.append(slopes / scale, 0.0), _cones(found), tolerance=_GAP)
+    X = _member(found, solved.y)
     bound = constant + scale * solved.bound
-    return float(np.sum(direction * X)), bound, split_blocks(X, found.fibre.plant.n)
+    return End(float(np.sum(direction * X)), bound, split_blocks(X, found.fibre.plant.n))
 
 
-def _cones(found: WeightsSet) -> list[Cone]:
-    """t l I <= X <= limit t l I in the variables (y, t), l the least eigenvalue of the centre."""
+def _member(found: WeightsSet, y: Array) -> Array:
+    """The point of a program, drawn towards the centre until it is a member beyond doubt.
+
+    A program's error, 1e-8 of the largest weight, can outweigh the least eigenvalue.
+    """
+    X = found.first + np.tensordot(y[: len(found.level)], found.level, 1)
+    n = found.fibre.plant.n
+    centre = found.least.weights.block
+    centre = centre * ((len(centre) - n) / np.trace(centre[n:, n:]))
+    # The condition number is quasiconvex along the segment.
+    inside, outside = 0.0, 2.0
+    for _ in range(_HALVINGS):
+        share = (inside + outside) / 2  # 1, the point itself, comes first
+        values = np.linalg.eigvalsh(centre + share * (X - centre))
+        if values[0] > 0 and values[-1] <= found.limit * values[0]:
+            inside = share
+        else:
+            outside = share
+        if inside == 1:
+            break
+    return np.asarray(centre + inside * (X - centre))
+
+
+def _cones(found: WeightsSet, more: int = 0) -> list[Cone]:
+    """t l I <= X <= limit t l I in the variables (y, t), l the least eigenvalue of the centre.
+
+    `more` variables follow that do not occur here.
+    """
     n, size = found.fibre.plant.n, len(found.first)
     eigenvalues = np.linalg.eigvalsh(found.least.weights.block)
     unit = float(eigenvalues[0])
@@ -163,9 +278,11 @@ def _cones(found: WeightsSet) -> list[Cone]:
     top = found.limit * unit
     cones = []
     for block in (slice(0, n), slice(n, size)):
-        below = np.concatenate([seen[:, block, block], -floor[None, block, block]])
+        width = block.stop - block.start
+        others = np.zeros((more, width, width))
+        below = np.concatenate([seen[:, block, block], -floor[None, block, block], others])
         cones.append(matrix_inequality(seen_first[block, block], below))
         eye = np.eye(size)[None, block, block]
-        above = np.concatenate([-found.level[:, block, block] / top, eye])
+        above = np.concatenate([-found.level[:, block, block] / top, eye, others])
         cones.append(matrix_inequality(-found.first[block, block] / top, above))
     return cones

@@ -1,0 +1,144 @@
+"""What the recordings leave open of the weights of one gain, in a form that a page can print.
+
+Every number is over all weights with the gain whose condition number, in the units of the plant, is
+at most a multiple of the least (`weights_set`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.arrays import Array, frozen
+from impc.eigenvalue_ranges import eigenvalue_ranges
+from impc.gain_fibre import gain_fibre
+from impc.intent_statements import order_statements, sense_statements, widest_dominant_angle
+from impc.weights import normalised, stage_weights
+from impc.weights_set import entry_ranges, nearest_diagonal, trace_range, weights_set
+
+if TYPE_CHECKING:
+    from impc.eigenvalue_ranges import EigenvalueRange
+    from impc.intent_statements import Statement
+    from impc.plant import Plant
+    from impc.weights import Weights
+
+__all__ = ["EntryRange", "WeightsSummary", "summarise_weights"]
+
+#: Multiple of the least condition number up to which weights are taken as equally good.
+RATIO = 10.0
+# States whose entries and statements are computed: those that cost most at their typical size.
+_NAMED = 5
+
+
+@dataclass(frozen=True)
+class EntryRange:
+    """Range of Q_ij over the set, i and j by name.
+
+    Attributes
+    ----------
+    first, second : str
+    low, high : float
+        At trace R = m.
+    """
+
+    first: str
+    second: str
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class WeightsSummary:
+    """The set of weights of a gain.
+
+    Attributes
+    ----------
+    dimension : int
+        Free directions of the weights that have the gain, scale not counted.
+    least_condition, limit : float
+        Condition numbers: the least, and the largest in the set.
+    entries : tuple of EntryRange
+        Of the states that cost most.
+    eigenvalues : tuple of EigenvalueRange
+        Of Q, ascending.
+    statements : tuple of Statement
+        Order and sense of the states that cost most.
+    widest_angle : float
+        Widest angle found between the dominant direction of D Q D in the least conditioned member
+        and in another, degrees; D the typical sizes of the states.
+    least_trace, nearest_diagonal : Weights
+        Members with the least trace of D Q D and its least off-diagonal part, at R[0, 0] = 1.
+    """
+
+    dimension: int
+    least_condition: float
+    limit: float
+    entries: tuple[EntryRange, ...]
+    eigenvalues: tuple[EigenvalueRange, ...]
+    statements: tuple[Statement, ...]
+    widest_angle: float
+    least_trace: Weights
+    nearest_diagonal: Weights
+
+
+def summarise_weights(
+    plant: Plant, gain: Array, sizes: Array, ratio: float = RATIO
+) -> WeightsSummary:
+    """Run the programs over the set of weights of a gain.
+
+    Parameters
+    ----------
+    plant : Plant
+    gain : Array
+        K (m, n).
+    sizes : Array
+        Typical size of each state (n,), positive, in its unit.
+    ratio : float
+        The set's condition number, in multiples of the least.
+
+    Raises
+    ------
+    WeightsError, SolverError
+        When no weights have the gain, or a program fails.
+    """
+    found = weights_set(gain_fibre(plant, gain), ratio)
+    named = _costliest(found.least.weights, sizes)
+    names = tuple(plant.states[index] for index in named)
+    ranges = entry_ranges(found, named)
+    trace = trace_range(found, sizes)
+    diagonal = nearest_diagonal(found, sizes).weights
+    members = [trace.low_weights.block, trace.high_weights.block, diagonal.block]
+    for item in ranges.values():
+        members += [item.low_weights.block, item.high_weights.block]
+    angle, widest = widest_dominant_angle(found, sizes)
+    statements = order_statements(found, sizes, names) + sense_statements(found, sizes, names)
+    return WeightsSummary(
+        found.fibre.dimension - 1,
+        found.least.condition,
+        found.limit,
+        tuple(
+            EntryRange(plant.states[i], plant.states[j], item.low, item.high)
+            for (i, j), item in ranges.items()
+        ),
+        eigenvalue_ranges(found, [*members, _at_trace(widest, plant.m)]),
+        statements,
+        angle,
+        _scaled(trace.low_weights),
+        _scaled(diagonal),
+    )
+
+
+def _costliest(weights: Weights, sizes: Array) -> list[int]:
+    prices = np.diag(weights.Q) * np.asarray(sizes) ** 2
+    return sorted(int(index) for index in np.argsort(-prices, kind="stable")[:_NAMED])
+
+
+def _at_trace(weights: Weights, m: int) -> Array:
+    return np.asarray(weights.block * (m / np.trace(weights.R)))
+
+
+def _scaled(weights: Weights) -> Weights:
+    checked = normalised(stage_weights(weights.Q, weights.R))
+    return type(checked)(frozen(checked.Q), frozen(checked.R))

@@ -1,0 +1,158 @@
+"""Bootstrap and profile likelihood beside the covariance, on the cart and on known noise."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import control
+import numpy as np
+import pytest
+import scipy.linalg
+import scipy.signal
+
+from experiments.coverage import cart, noisy_trial
+from impc.arrays import Array
+from impc.bootstrap import (
+    block_length,
+    block_residuals,
+    bootstrap,
+    bootstrap_intervals,
+    model_residuals,
+    replicate,
+)
+from impc.errors import InputError
+from impc.evaluation import misfit_or_reason
+from impc.fit_recordings import fit_problem
+from impc.fit_settings import FitSettings
+from impc.fitted_controller import FittedController, fit_controller
+from impc.gain_covariance import gain_covariance
+from impc.intervals import Interval, covariance_intervals, entry_names, white_covariance
+from impc.plant import as_plant
+from impc.profile_likelihood import profile_likelihood
+from impc.recording import recording
+
+SEED = 4
+
+
+@pytest.fixture(scope="module", params=[0.0, 0.9], ids=["white", "coloured"])
+def fitted(request: pytest.FixtureRequest) -> FittedController:
+    trial = noisy_trial(SEED, request.param)
+    return fit_controller(fit_problem(cart(), [trial], FitSettings(horizon=10, u_max=1.0)))
+
+
+def first_order(root: float, samples: int, seed: int) -> Array:
+    rng = np.random.default_rng(seed)
+    white = rng.standard_normal((samples + 500, 2)) @ np.array([[1.0, 0.6], [0.0, 0.8]])
+    return np.asarray(scipy.signal.lfilter([1.0], [1.0, -root], white, axis=0)[500:])
+
+
+def width(found: tuple[Interval, ...]) -> Array:
+    return np.array([item.high - item.low for item in found])
+
+
+def test_bootstrap_agrees_with_the_sandwich(fitted: FittedController) -> None:
+    """60 replicates, seed 4: widths within a third of the sandwich's, for both ways to draw."""
+    sandwich = width(covariance_intervals(fitted, gain_covariance(fitted.free), "sandwich"))
+    for draw in (block_residuals, model_residuals):
+        found = bootstrap(fitted, 60, SEED, draw)
+        ratio = width(bootstrap_intervals(fitted, found, "bootstrap", 0.95)) / sandwich
+        assert np.all(np.abs(np.log(ratio)) < np.log(1.5)), ratio
+
+
+def test_profile_agrees_with_the_sandwich(fitted: FittedController) -> None:
+    """Nearly quadratic, so nearly the same ends."""
+    covariance = gain_covariance(fitted.free)
+    for item in covariance_intervals(fitted, covariance, "sandwich"):
+        found = profile_likelihood(fitted, item.name).interval
+        assert found.low == pytest.approx(item.low, abs=0.15 * (item.high - item.low))
+        assert found.high == pytest.approx(item.high, abs=0.15 * (item.high - item.low))
+        assert found.low < found.value < found.high  # type: ignore[operator]
+
+
+def test_plain_intervals_are_narrower_with_coloured_noise() -> None:
+    trial = noisy_trial(SEED, 0.9)
+    fit = fit_controller(fit_problem(cart(), [trial], FitSettings(horizon=10, u_max=1.0)))
+    plain = width(covariance_intervals(fit, white_covariance(fit), "cramer-rao"))
+    sandwich = width(covariance_intervals(fit, gain_covariance(fit.free), "sandwich"))
+    assert np.all(sandwich > 2 * plain)
+
+
+def test_profile_against_brute_force(fitted: FittedController) -> None:
+    """D at one value against a dense search over the only other entry, initial state refitted."""
+    problem = dataclasses.replace(fitted.free.problem, unknown_start=False)
+    known = dataclasses.replace(
+        fitted, problem=problem, free=dataclasses.replace(fitted.free, problem=problem)
+    )
+    name = entry_names(problem.plant)[0]
+    profile = profile_likelihood(known, name)
+    value, distance = profile.values[0], profile.distances[0]
+    S = np.array(fitted.free.S)
+
+    def squared(first: float, second: float) -> float:
+        return misfit_or_reason(problem, np.array([[first, second]]), S)[0] ** 2
+
+    K = np.array(fitted.free.K)[0]
+    grid = K[1] + np.linspace(-0.5, 0.5, 401)
+    held = min(squared(value, second) for second in grid)
+    best = profile.values[int(np.argmin(profile.distances))]
+    least = min(squared(best, second) for second in grid)
+    variance = least / sum(trial.outputs.size for trial in problem.recordings)
+    covariance, white = gain_covariance(known.free), white_covariance(known)
+    factor = max((covariance.entries[0, 0] / white.entries[0, 0]) ** 2, 1.0)
+    assert distance == pytest.approx((held - least) / (variance * factor), rel=0.05, abs=0.05)
+
+
+def test_what_is_not_determined_has_no_end() -> None:
+    """A third state that nothing reaches: its entry of the gain shows nowhere."""
+    base = cart()
+    A, B = scipy.linalg.block_diag(base.A, 0.5), np.vstack([np.hstack([base.B, base.E]), [0, 0]])
+    system = control.ss(A, B, np.hstack([base.C, [[0]]]), 0, base.dt, inputs=["force", "push"])
+    plant = as_plant(system, ["force"])
+    trial = noisy_trial(SEED, 0.0)
+    again = recording(plant, trial.outputs, trial.disturbance)
+    problem = fit_problem(plant, [again], FitSettings(horizon=10, u_max=1.0))
+    fitted = fit_controller(problem)
+    names = entry_names(plant)
+    assert np.isinf(profile_likelihood(fitted, names[2]).interval.high)
+    assert np.isfinite(profile_likelihood(fitted, names[0]).interval.high)
+
+
+def test_an_unknown_name_is_told(fitted: FittedController) -> None:
+    with pytest.raises(InputError, match=r"known: K\.force"):
+        profile_likelihood(fitted, "mass")
+    with pytest.raises(InputError, match="at least 2"):
+        bootstrap(fitted, 1, 0, block_residuals)
+
+
+def test_a_replicate_depends_on_seed_and_number_only(fitted: FittedController) -> None:
+    alone = replicate(fitted, 3, SEED, block_residuals)
+    among = bootstrap(fitted, 5, SEED, block_residuals)[3]
+    np.testing.assert_array_equal(alone.K, among.K)
+    assert not np.array_equal(replicate(fitted, 3, SEED + 1, block_residuals).K, alone.K)
+
+
+@pytest.mark.parametrize("draw", [block_residuals, model_residuals])
+@pytest.mark.parametrize("root", [0.0, 0.9])
+def test_drawn_residuals_have_the_colour_of_the_given(draw, root: float) -> None:  # type: ignore[no-untyped-def]
+    """Variance, correlation of the outputs and of neighbours; 40 draws of 2 x 2000 samples."""
+    given = [first_order(root, 2000, SEED), first_order(root, 1500, SEED + 1)]
+    rng = np.random.default_rng(SEED)
+    drawn = [draw(given, rng) for _ in range(40)]
+    assert [part.shape for part in drawn[0]] == [(2000, 2), (1500, 2)]
+
+    def moments(trials: list[Array]) -> Array:
+        lagged = sum(part[1:].T @ part[:-1] for part in trials) / sum(map(len, trials))
+        return np.concatenate([np.cov(np.concatenate(trials).T).ravel(), np.ravel(lagged)])
+
+    found = np.mean([moments(part) for part in drawn], axis=0)
+    expected = moments([part - part.mean(axis=0) for part in given])
+    np.testing.assert_allclose(found, expected, atol=0.08 * np.max(np.abs(expected)))
+
+
+def test_block_length_of_first_order_noise() -> None:
+    """The closed form of Politis and White at the estimated root."""
+    given = [first_order(0.9, 4000, SEED)]
+    assert block_length(given) == pytest.approx(
+        np.cbrt(6 * 0.81 / (1 - 0.81) ** 2 * 4000), rel=0.15
+    )
+    assert block_length([np.zeros((50, 1))]) == 1
