@@ -20,10 +20,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.agreement import vaf
 from impc.arrays import Array, frozen
 from impc.bounds import box_bounds
-from impc.closed_loop import Simulation, simulate
 from impc.equivalent_weights import least_condition_weights
 from impc.errors import SolverError, WeightsError
 from impc.fitted_controller import free_gain, noise_of
@@ -31,8 +29,9 @@ from impc.gain_fibre import gain_fibre, natural_coordinates
 from impc.initial_states import with_fitted_starts
 from impc.inverse_lqr import inverse_lqr_lmi
 from impc.inverse_mpc import auxiliary_weights
-from impc.inverse_problem import controller_for, scenarios, without_bounds
+from impc.inverse_problem import without_bounds
 from impc.lqr import is_stable, solve_lqr
+from impc.method_fit import MethodFit, judge, without_gain
 from impc.natural_fit import in_plant_units, inverse_mpc_natural
 from impc.plant import change_coordinates
 
@@ -45,47 +44,7 @@ if TYPE_CHECKING:
     from impc.preliminary import PreliminaryGain
     from impc.weights import Weights
 
-__all__ = ["MethodFit", "compare_methods"]
-
-
-@dataclass(frozen=True)
-class MethodFit:
-    """One method on all recordings.
-
-    Attributes
-    ----------
-    name : str
-    K : Array or None
-        (m, n); None when the method ended without one.
-    weights : Weights or None
-    runs : tuple of Simulation
-        One a trial; empty without a gain.
-    vaf : Array
-        (3.24) over all trials, % (p,); NaN when a simulation does not reach the end.
-    trial_vaf : Array
-        (trials, p), the same for each.
-    largest_input : Array
-        Largest magnitude of each input (m,).
-    keeps_bounds : bool
-        Whether no input bound is exceeded, to 1e-6 of it.
-    fell : tuple of float or None
-        For each trial the time in s at which the loop left every reasonable range.
-    seconds : float
-    reason : str
-        Why there is no gain; empty otherwise.
-    """
-
-    name: str
-    K: Array | None
-    weights: Weights | None
-    runs: tuple[Simulation, ...]
-    vaf: Array
-    trial_vaf: Array
-    largest_input: Array
-    keeps_bounds: bool
-    fell: tuple[float | None, ...]
-    seconds: float
-    reason: str
+__all__ = ["compare_methods"]
 
 
 def compare_methods(
@@ -187,53 +146,11 @@ def _judge(
     name: str, fitted: FittedController, problem: InverseProblem, found: _Found, seconds: float
 ) -> MethodFit:
     """Simulate all recordings with the gain found, from initial states fitted for it."""
-    p, m = len(problem.plant.outputs), problem.plant.m
     if found.K is None:
-        nothing = frozen(np.full(p, np.nan))
-        empty = frozen(np.full((len(problem.recordings), p), np.nan))
-        none = (None,) * len(problem.recordings)
-        return MethodFit(
-            name, None, None, (), nothing, empty, frozen(np.full(m, np.nan)), False, none, seconds,
-            found.reason,
-        )  # fmt: skip
+        return without_gain(name, problem, seconds, found.reason)
     metric = np.array(fitted.solution.S)
     settled = problem
     if fitted.problem.unknown_start and name != "inverse_mpc":
         settled = with_fitted_starts(problem, found.K, metric)
-    runs = _simulate(settled, found.K, metric)
-    largest = np.max([np.max(np.abs(run.u), axis=0) for run in runs], axis=0)
     bounds = fitted.problem.bounds
-    limit = np.minimum(np.abs(bounds.u_max), np.abs(bounds.u_min))
-    return MethodFit(
-        name,
-        frozen(found.K),
-        found.weights,
-        runs,
-        frozen(_pooled_vaf(settled, runs)),
-        frozen([_trial_vaf(settled, index, run) for index, run in enumerate(runs)]),
-        frozen(largest),
-        bool(np.all(largest <= limit * (1 + 1e-6))),
-        tuple(None if run.complete else run.reached * problem.plant.dt for run in runs),
-        seconds,
-        "",
-    )
-
-
-def _simulate(problem: InverseProblem, gain: Array, metric: Array) -> tuple[Simulation, ...]:
-    controller = controller_for(problem, gain, metric)
-    return tuple(simulate(controller, drive) for drive in scenarios(problem))
-
-
-def _trial_vaf(problem: InverseProblem, index: int, run: Simulation) -> Array:
-    trial = problem.recordings[index]
-    if not run.complete:
-        return np.full(len(problem.plant.outputs), np.nan)
-    return vaf(trial.outputs, run.x @ problem.plant.C.T)
-
-
-def _pooled_vaf(problem: InverseProblem, runs: tuple[Simulation, ...]) -> Array:
-    if not all(run.complete for run in runs):
-        return np.full(len(problem.plant.outputs), np.nan)
-    recorded = np.concatenate([trial.outputs for trial in problem.recordings])
-    simulated = np.concatenate([run.x @ problem.plant.C.T for run in runs])
-    return vaf(recorded, simulated)
+    return judge(name, settled, bounds, found.K, metric, weights=found.weights, seconds=seconds)

@@ -1,4 +1,4 @@
-"""What an interrupted fit had done: the controllers of its stages, in one JSON file.
+"""What an interrupted command had done: the results of its stages, in one JSON file.
 
 The file belongs to one set of recordings, settings and plant, told by a digest of all of them; with
 any other it is not used and is written anew.
@@ -17,27 +17,29 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from impc.arrays import Array, frozen
+from impc.bootstrap import Replicate
 from impc.errors import OutputError
 from impc.fitted_controller import FittedController, fit_controller
 from impc.gain import GainFit
 from impc.inverse_problem import moved
 from impc.lqr import solve_lqr
+from impc.method_estimates import decode_estimate, encode_estimate
 from impc.weights import stage_weights
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
     from impc.fit_settings import FitSettings
     from impc.inverse_problem import InverseProblem
+    from impc.method_estimates import Estimate
 
 __all__ = ["FitMemory", "open_memory"]
-
-_NAME = "fit-in-progress.json"
 
 
 @dataclass(frozen=True)
 class FitMemory:
-    """Controllers of the stages done so far.
+    """Controllers and estimates of the stages done so far.
 
     Attributes
     ----------
@@ -69,14 +71,46 @@ class FitMemory:
         if name in self.stages:
             return _restore(problem, self.stages[name])
         found = fit_controller(problem)
-        with self.writing:
-            self.stages[name] = _encode(found)
-            self._write()
+        self._keep(name, _encode(found))
         return found
+
+    def estimate(self, name: str, compute: Callable[[], Estimate]) -> Estimate:
+        """An estimate of `method_estimates`, remembered or computed now and then written down.
+
+        Raises
+        ------
+        OutputError
+            When the file cannot be written.
+        """
+        if name in self.stages:
+            return decode_estimate(self.stages[name])
+        found = compute()
+        self._keep(name, encode_estimate(found))
+        return found
+
+    def replicate(self, name: str, compute: Callable[[], Replicate]) -> Replicate:
+        """A bootstrap replicate, in the same way."""
+        if name in self.stages:
+            kept = self.stages[name]
+            return Replicate(frozen(kept["K"]), frozen(kept["parameters"]))
+        found = compute()
+        self._keep(name, {"K": found.K.tolist(), "parameters": found.parameters.tolist()})
+        return found
+
+    def kept(self) -> str:
+        """What to tell whoever interrupts the command."""
+        if not self.stages:
+            return "nothing was done yet"
+        return f"kept in {self.path}: {', '.join(self.stages)}; the same command goes on from there"
 
     def forget(self) -> None:
         """Remove the file: the result has been written."""
         self.path.unlink(missing_ok=True)
+
+    def _keep(self, name: str, value: dict[str, Any]) -> None:
+        with self.writing:
+            self.stages[name] = value
+            self._write()
 
     def _write(self) -> None:
         staging = self.path.with_suffix(".part")
@@ -92,9 +126,11 @@ class FitMemory:
             ) from None
 
 
-def open_memory(folder: Path, problem: InverseProblem, settings: FitSettings) -> FitMemory:
-    """The memory of a fit in a folder, empty when there is none for this very fit."""
-    path, digest = folder / _NAME, _digest(problem, settings)
+def open_memory(
+    folder: Path, problem: InverseProblem, settings: FitSettings, command: str = "fit"
+) -> FitMemory:
+    """The memory of a command in a folder, empty when there is none for this very problem."""
+    path, digest = folder / f"{command}-in-progress.json", _digest(problem, settings)
     try:
         found = json.loads(path.read_text())
         stages = found["stages"] if found["digest"] == digest else {}

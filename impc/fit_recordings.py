@@ -16,17 +16,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.agreement import agreement, centred_vaf, vaf
+from impc.agreement import agreement
 from impc.arrays import Array, frozen
 from impc.closed_loop import simulate
 from impc.comparison import compare_methods
 from impc.errors import DataError, SolverError
-from impc.fit_result import FitResult, FittedParameter, HeldOut
+from impc.fit_result import FitResult, FittedParameter
 from impc.fit_settings import FitSettings, fit_bounds
 from impc.fitted_controller import FittedController, fit_controller
 from impc.gain_covariance import gain_covariance
+from impc.held_out import predict
 from impc.identifiability import identifiability
-from impc.initial_states import with_fitted_starts
 from impc.intent import intent
 from impc.inverse_problem import InverseProblem, controller_for, inverse_problem, scenarios
 from impc.preliminary import PreliminaryGain, preliminary_gain
@@ -135,9 +135,7 @@ def fit_recordings(
         methods = compare_methods(fitted, progress.done, _preliminary(problem, settings))
         held_out = []
         for index, other in enumerate(others):
-            held_out.append(
-                _predict(problem, other.result(), fitted, covariance.T, index, settings)
-            )
+            held_out.append(predict(problem, other.result(), fitted, index, settings.settle))
             progress.done(_without(index))
     known = replace(fitted.problem, unknown_start=False, family=None, logarithms=frozen([]))
     plant = known.plant
@@ -206,32 +204,6 @@ def _left_out(
 
 def _without(index: int) -> str:
     return f"without trial {index + 1}"
-
-
-def _predict(
-    problem: InverseProblem,
-    controller: FittedController,
-    fitted: FittedController,
-    T: Array,
-    index: int,
-    settings: FitSettings,
-) -> HeldOut:
-    """Simulate the trial left out; its first second serves to find where it starts."""
-    trial = problem.recordings[index]
-    settle = round(settings.settle / problem.plant.dt)
-    K, S = np.array(controller.solution.K), np.array(controller.solution.S)
-    alone = replace(controller.problem, recordings=(trial,))
-    started = with_fitted_starts(alone, K, S, max(settle, problem.plant.n))
-    run = simulate(controller_for(started, K, S), scenarios(started)[0])
-    recorded, simulated = trial.outputs[settle:], (run.x @ started.plant.C.T)[settle:]
-    full = np.array(fitted.solution.K)
-    change = float(np.linalg.norm((K - full) @ T) / np.linalg.norm(full @ T))
-    if not run.complete:
-        nothing = frozen(np.full(recorded.shape[1], np.nan))
-        return HeldOut(nothing, nothing, change)
-    return HeldOut(
-        frozen(vaf(recorded, simulated)), frozen(centred_vaf(recorded, simulated)), change
-    )
 
 
 def _covariance(fitted: FittedController) -> GainCovariance:

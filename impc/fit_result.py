@@ -10,15 +10,16 @@ from impc.lqr import solve_lqr
 if TYPE_CHECKING:
     from impc.agreement import TrialAgreement
     from impc.arrays import Array
-    from impc.comparison import MethodFit
     from impc.fit_settings import FitSettings
     from impc.fitted_controller import FittedController
     from impc.gain_covariance import GainCovariance
+    from impc.held_out import HeldOut
     from impc.identifiability import Identifiability
     from impc.intent import Intent
     from impc.inverse_problem import InverseProblem
+    from impc.method_fit import MethodFit
 
-__all__ = ["FitResult", "FittedParameter", "HeldOut"]
+__all__ = ["FitResult", "FittedParameter"]
 
 
 @dataclass(frozen=True)
@@ -38,25 +39,6 @@ class FittedParameter:
     nominal: float
     value: float
     deviation: float
-
-
-@dataclass(frozen=True)
-class HeldOut:
-    """One trial as the fit of the others predicts it.
-
-    Attributes
-    ----------
-    vaf : Array
-        (3.24) after the settling time, % (p,); NaN when the simulation does not reach the end.
-    centred_vaf : Array
-        The same with the means removed, % (p,).
-    gain_change : float
-        ||(K_others - K) T|| / ||K T||, T natural coordinates of the full fit.
-    """
-
-    vaf: Array
-    centred_vaf: Array
-    gain_change: float
 
 
 @dataclass(frozen=True)

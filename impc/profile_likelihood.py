@@ -118,12 +118,15 @@ class _Search:
                 start = np.zeros(self.null.shape[1])
             unit = self.direction / float(self.direction @ self.direction)
             base = self.space.start + offset * unit
+
+            def residual(w: Array) -> Array:
+                return self.target.residual(base + self.null @ w)
+
+            def derivative(w: Array) -> Array:
+                return np.asarray(self.target.derivative(base + self.null @ w) @ self.null)
+
             found = scipy.optimize.least_squares(
-                lambda w: self.target.residual(base + self.null @ w),
-                start,
-                jac=lambda w: self.target.derivative(base + self.null @ w) @ self.null,
-                ftol=1e-8,
-                max_nfev=40,
+                residual, start, jac=derivative, ftol=1e-8, max_nfev=40
             )
             z = base + self.null @ found.x
             self.tried[offset] = (float(np.sum(self.space.at(z).residual ** 2)), z)
@@ -135,7 +138,7 @@ class _Search:
     def distance(self, offset: float) -> float:
         """D."""
         least = self.tried[self.best_offset()][0]
-        return (self.squared(offset) - least) / (self.noise**2 * self.factor)
+        return float((self.squared(offset) - least) / (self.noise**2 * self.factor))
 
     def end(self, sign: float, quantile: float) -> float:
         """Offset at which D passes the quantile, infinite when it does not."""

@@ -10,10 +10,9 @@ import click
 from tqdm import tqdm
 
 from impc.commands.output import print_files
-from impc.commands.plant import KNOWN, find_plant
+from impc.commands.plant import KNOWN
 
 if TYPE_CHECKING:
-    from impc.fit_memory import FitMemory
     from impc.fit_result import FitResult
 
 __all__ = ["command"]
@@ -46,33 +45,23 @@ def command(files: tuple[Path, ...], plant_name: str, config: Path, out: Path) -
     What is done when you interrupt it is kept in the folder: the same command goes on from there.
     """
     # Imported here: the libraries take seconds to load, and --help needs none.
-    from impc.files.configuration import read_configuration  # noqa: PLC0415
-    from impc.files.reading import read_recordings  # noqa: PLC0415
+    from impc.commands.subject import read_subject  # noqa: PLC0415
     from impc.fit_memory import open_memory  # noqa: PLC0415
     from impc.fit_recordings import (  # noqa: PLC0415
         FitProgress,
-        fit_problem,
         fit_recordings,
         stages,
     )
-    from impc.fit_settings import fit_settings  # noqa: PLC0415
-    from impc.plant_source import make_plant, plant_family_of  # noqa: PLC0415
     from impc.report.fit_report import fit_files  # noqa: PLC0415
     from impc.report.provenance import fit_provenance  # noqa: PLC0415
     from impc.report.write import require_writable, write_files  # noqa: PLC0415
 
     require_writable(out)
-    configuration = read_configuration(config)
-    settings = fit_settings(configuration.fit)
-    source = find_plant(plant_name, configuration.plant)
-    recorded = tuple(configuration.signals)
-    plant = make_plant(source, recorded)
-    family = plant_family_of(source, recorded, settings.free)
-    recordings = read_recordings(files, configuration, plant)
-    problem = fit_problem(plant, recordings, settings, family)
+    subject = read_subject(files, plant_name, config)
+    problem, settings = subject.problem, subject.settings
     memory = open_memory(out, problem, settings)
     with tqdm(
-        total=stages(len(recordings), settings),
+        total=stages(len(problem.recordings), settings),
         unit="stage",
         file=sys.stderr,
         disable=None,  # no bar where stderr is a file
@@ -86,21 +75,14 @@ def command(files: tuple[Path, ...], plant_name: str, config: Path, out: Path) -
         try:
             result = fit_recordings(problem, settings, FitProgress(done, memory.controller))
         except KeyboardInterrupt:
-            raise KeyboardInterrupt(_kept(memory)) from None
+            raise KeyboardInterrupt(memory.kept()) from None
     names = " ".join(path.name for path in files)
     line = f"impc fit {names} --plant {plant_name} --config {config.name}"
-    provenance = fit_provenance(source, files, line)
+    provenance = fit_provenance(subject.source, files, line)
     written = write_files(out, fit_files(result, provenance))
     memory.forget()
     _print(result)
     print_files(out, written)
-
-
-def _kept(memory: FitMemory) -> str:
-    if not memory.stages:
-        return "nothing was done yet"
-    names = ", ".join(memory.stages)
-    return f"kept in {memory.path}: {names}; the same command goes on from there"
 
 
 def _print(result: FitResult) -> None:

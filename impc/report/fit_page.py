@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,7 +15,7 @@ from impc.report.fit_sentences import (
     method_note,
     trial_name,
 )
-from impc.report.rendering import embedded, number, render_template
+from impc.report.rendering import TextTable, embedded, number, render_template
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -25,15 +25,6 @@ if TYPE_CHECKING:
     from impc.report.provenance import FitProvenance
 
 __all__ = ["fit_page"]
-
-
-@dataclass(frozen=True)
-class _Table:
-    """A table of texts: a caption, heads, and rows whose first cell is a head of its own."""
-
-    caption: str
-    heads: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
 
 
 def fit_page(result: FitResult, figures: Mapping[str, bytes], provenance: FitProvenance) -> str:
@@ -80,7 +71,7 @@ def fit_page(result: FitResult, figures: Mapping[str, bytes], provenance: FitPro
     )
 
 
-def _agreement(result: FitResult) -> _Table:
+def _agreement(result: FitResult) -> TextTable:
     outputs = result.fitted.problem.plant.outputs
     heads = ["trial"]
     for name in outputs:
@@ -101,14 +92,14 @@ def _agreement(result: FitResult) -> _Table:
         "that serves to find where the trial starts. White: p-value of Ljung and Box's test of the "
         "residual; a small one says that something regular is left."
     )
-    return _Table(caption, (*heads, "at the bound %"), tuple(rows))
+    return TextTable(caption, (*heads, "at the bound %"), tuple(rows))
 
 
 def _probability(value: float) -> str:
     return "< 0.001" if value < 1e-3 else number(value, 2)
 
 
-def _methods(result: FitResult) -> _Table:
+def _methods(result: FitResult) -> TextTable:
     outputs = result.fitted.problem.plant.outputs
     heads = ("method", *(f"VAF {name} %" for name in outputs), "largest input", "", "seconds")
     rows = tuple(
@@ -122,10 +113,10 @@ def _methods(result: FitResult) -> _Table:
         for item in result.methods
     )
     caption = "Every method on the same recordings, all trials at once."
-    return _Table(caption, heads, rows)
+    return TextTable(caption, heads, rows)
 
 
-def _readings(result: FitResult) -> _Table:
+def _readings(result: FitResult) -> TextTable:
     states = result.fitted.problem.plant.states
     rows = tuple(
         (
@@ -139,10 +130,10 @@ def _readings(result: FitResult) -> _Table:
     )
     heads = ("rule", "largest eigenvalue", "dominant direction", "turned by, degrees", "kappa")
     caption = "Weights with exactly the same gain, so with the same behaviour, by several rules."
-    return _Table(caption, heads, rows)
+    return TextTable(caption, heads, rows)
 
 
-def _gain(result: FitResult) -> _Table:
+def _gain(result: FitResult) -> TextTable:
     plant, K = result.fitted.problem.plant, result.fitted.solution.K
     rows = []
     for row, control in enumerate(plant.controls):
@@ -155,10 +146,10 @@ def _gain(result: FitResult) -> _Table:
         "The gain K of u = -Kx with standard deviations. Entries share directions that hardly show "
         "in the recordings; the table of directions tells which combinations are well determined."
     )
-    return _Table(caption, ("entry", "value", "standard deviation"), tuple(rows))
+    return TextTable(caption, ("entry", "value", "standard deviation"), tuple(rows))
 
 
-def _directions(result: FitResult) -> _Table:
+def _directions(result: FitResult) -> TextTable:
     plant, covariance = result.fitted.problem.plant, result.covariance
     names = tuple(
         state if plant.m == 1 else f"{state} to {control}"
@@ -186,10 +177,10 @@ def _directions(result: FitResult) -> _Table:
         "deviation is relative to the natural size of a gain, so that 1 means all but unknown."
     )
     heads = ("", "direction", "singular value / largest", "standard deviation")
-    return _Table(caption, heads, tuple(rows))
+    return TextTable(caption, heads, tuple(rows))
 
 
-def _parameters(result: FitResult) -> _Table | None:
+def _parameters(result: FitResult) -> TextTable | None:
     if not result.parameters:
         return None
     rows = tuple(
@@ -197,15 +188,17 @@ def _parameters(result: FitResult) -> _Table | None:
         for item in result.parameters
     )
     caption = "Physical parameters fitted with the gain (3.19), in SI units."
-    return _Table(caption, ("parameter", "nominal", "fitted", "standard deviation"), rows)
+    return TextTable(caption, ("parameter", "nominal", "fitted", "standard deviation"), rows)
 
 
-def _matrix(caption: str, values: Array, rows: tuple[str, ...], columns: tuple[str, ...]) -> _Table:
+def _matrix(
+    caption: str, values: Array, rows: tuple[str, ...], columns: tuple[str, ...]
+) -> TextTable:
     body = tuple(
         (name, *(number(float(value)) for value in line))
         for name, line in zip(rows, values, strict=True)
     )
-    return _Table(caption, ("", *columns), body)
+    return TextTable(caption, ("", *columns), body)
 
 
 def _terminal_set(result: FitResult) -> str:

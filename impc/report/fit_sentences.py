@@ -11,8 +11,8 @@ from impc.intent import dominant_sentence
 from impc.report.rendering import number
 
 if TYPE_CHECKING:
-    from impc.comparison import MethodFit
     from impc.fit_result import FitResult
+    from impc.method_fit import MethodFit
 
 __all__ = ["METHOD_LABELS", "direction_name", "findings", "method_note", "trial_name"]
 
@@ -21,7 +21,13 @@ METHOD_LABELS = {
     "feedback_gain": "feedback gain, no bounds (3.12)",
     "inverse_lqr_gain": "inverse LQR, gain penalty (3.7)",
     "inverse_lqr_output": "inverse LQR, output penalty (3.16)",
+    "inverse_lqr_lmi": "inverse LQR, LMI",
+    "inverse_lqr_gradient": "inverse LQR, gradient",
+    "inverse_lqr_auxiliary": "inverse LQR, gain penalty (3.7)",
+    "inverse_kkt": "inverse KKT",
     "clipped_lqr": "LQR of inverse MPC, clipped",
+    "inverse_mpc_reduced": "inverse MPC, reduced",
+    "inverse_mpc_direct": "inverse MPC, direct (3.6)",
     "inverse_mpc": "inverse MPC",
 }
 # Parts of a direction below this are not named.

@@ -3,13 +3,23 @@
 from __future__ import annotations
 
 import base64
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-__all__ = ["embedded", "number", "plain", "render_template"]
+__all__ = ["TextTable", "embedded", "number", "plain", "render_template"]
+
+
+@dataclass(frozen=True)
+class TextTable:
+    """A table of texts: a caption, heads, and rows whose first cell is a head of its own."""
+
+    caption: str
+    heads: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
 
 
 def render_template(name: str, **values: Any) -> str:

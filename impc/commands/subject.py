@@ -1,0 +1,50 @@
+"""What the commands for one subject do first: files and configuration to an inverse problem."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from impc.commands.plant import find_plant
+from impc.files.configuration import read_configuration
+from impc.files.reading import read_recordings
+from impc.fit_recordings import fit_problem
+from impc.fit_settings import fit_settings
+from impc.plant_source import make_plant, plant_family_of
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from impc.fit_settings import FitSettings
+    from impc.inverse_problem import InverseProblem
+    from impc.plant_source import PlantSource
+
+__all__ = ["Subject", "read_subject"]
+
+
+@dataclass(frozen=True)
+class Subject:
+    """The recordings of a subject as an inverse problem."""
+
+    problem: InverseProblem
+    settings: FitSettings
+    source: PlantSource
+
+
+def read_subject(files: Sequence[Path], plant_name: str, config: Path) -> Subject:
+    """Read recordings, one file a trial.
+
+    Raises
+    ------
+    ImpcError
+        When a file, the configuration or the plant cannot be used; nothing has been written.
+    """
+    configuration = read_configuration(config)
+    settings = fit_settings(configuration.fit)
+    source = find_plant(plant_name, configuration.plant)
+    recorded = tuple(configuration.signals)
+    plant = make_plant(source, recorded)
+    family = plant_family_of(source, recorded, settings.free)
+    recordings = read_recordings(files, configuration, plant)
+    return Subject(fit_problem(plant, recordings, settings, family), settings, source)
