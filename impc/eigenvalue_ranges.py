@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 __all__ = ["EigenvalueRange", "eigenvalue_ranges"]
 
-_STEPS = 4
+_STEPS = 3
 _SHARES = np.linspace(0.0, 1.0, 11)
 
 
@@ -57,7 +57,8 @@ def eigenvalue_ranges(
     ----------
     found : WeightsSet
     members : sequence of Array
-        blkdiag(Q, R) of members known already, at the scale of the set (trace R = m).
+        blkdiag(Q, R) of members known already, at the scale of the set (trace R = m): where the
+        searches begin. By default the ends along the eigenvectors of the centre's Q.
 
     Raises
     ------
@@ -70,9 +71,10 @@ def eigenvalue_ranges(
     least_top = extreme_eigenvalue(found, largest=True)
     most_bottom = extreme_eigenvalue(found, largest=False)
     known += [least_top.weights.block, most_bottom.weights.block]
-    for vector in np.linalg.eigh(centre[:n, :n])[1].T:
-        ends = linear_range(found, _on_states(found, vector))
-        known += [ends.low_weights.block, ends.high_weights.block]
+    if not members:
+        for vector in np.linalg.eigh(centre[:n, :n])[1].T:
+            ends = linear_range(found, _on_states(found, vector))
+            known += [ends.low_weights.block, ends.high_weights.block]
     values = np.array([np.linalg.eigvalsh(X[:n, :n]) for X in known])
     ranges = []
     for index in range(n):

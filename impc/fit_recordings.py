@@ -18,6 +18,7 @@ import numpy as np
 
 from impc.agreement import agreement
 from impc.arrays import Array, frozen
+from impc.certainty import assess, count_stages
 from impc.closed_loop import simulate
 from impc.comparison import compare_methods
 from impc.errors import DataError, SolverError
@@ -30,10 +31,12 @@ from impc.identifiability import identifiability
 from impc.intent import intent
 from impc.inverse_problem import InverseProblem, controller_for, inverse_problem, scenarios
 from impc.preliminary import PreliminaryGain, preliminary_gain
+from impc.weights_summary import weights_summary_or_reason
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
+    from impc.bootstrap import Replicate
     from impc.gain_covariance import GainCovariance
     from impc.plant import Plant
     from impc.plant_family import PlantFamily
@@ -55,18 +58,23 @@ class FitProgress:
     controller : callable
         (name of stage, its problem) -> the controller fitted to it, from memory when it is there
         (`impc.fit_memory`). By default every one is computed.
+    replicate : callable
+        (name of stage, compute) -> a bootstrap replicate, in the same way.
     """
 
     done: Callable[[str], None] = lambda _: None
     controller: Callable[[str, InverseProblem], FittedController] = lambda _, problem: (
         fit_controller(problem)
     )
+    replicate: Callable[[str, Callable[[], Replicate]], Replicate] = lambda _, compute: compute()
 
 
-def stages(trials: int, settings: FitSettings) -> int:
-    """Number of stages that `fit_recordings` reports: the fit, its methods, trials left out."""
+def stages(problem: InverseProblem, settings: FitSettings) -> int:
+    """Number of stages that `fit_recordings` reports."""
     methods = 6 if settings.feedback_states else 5
-    return 1 + methods + (trials if _leaves_out(trials, settings) else 0)
+    trials = len(problem.recordings)
+    left_out = trials if _leaves_out(trials, settings) else 0
+    return 1 + methods + left_out + count_stages(problem, settings)
 
 
 def fit_problem(
@@ -131,25 +139,32 @@ def fit_recordings(
     fitted = progress.controller("fit", problem)
     progress.done("inverse MPC")
     covariance = _covariance(fitted)
-    with _left_out(problem, settings, progress) as others:
+    known = replace(fitted.problem, unknown_start=False, family=None, logarithms=frozen([]))
+    plant, K = known.plant, np.array(fitted.solution.K)
+    sizes = _state_sizes(known, fitted)
+    with _threads() as pool:
+        others = _left_out(pool, problem, settings, progress)
+        whole_set = pool.submit(weights_summary_or_reason, plant, K, sizes)
         methods = compare_methods(fitted, progress.done, _preliminary(problem, settings))
         held_out = []
         for index, other in enumerate(others):
             held_out.append(predict(problem, other.result(), fitted, index, settings.settle))
             progress.done(_without(index))
-    known = replace(fitted.problem, unknown_start=False, family=None, logarithms=frozen([]))
-    plant = known.plant
-    runs = methods[-1].runs
-    sizes = _state_sizes(np.concatenate([run.x for run in runs]))
-    bounds = problem.bounds
+        weights_found = whole_set.result()
+        progress.done("set of weights")
+    runs, bounds = methods[-1].runs, problem.bounds
+    certainty = assess(
+        problem, fitted, covariance, weights_found, settings, progress.done, progress.replicate
+    )
     return FitResult(
         settings,
         problem,
         fitted,
         covariance,
         _parameters(fitted, covariance),
-        intent(plant, np.array(fitted.solution.K), sizes, fitted.weights),
+        intent(plant, K, sizes, fitted.weights),
         identifiability(known, fitted.weights),
+        certainty,
         tuple(
             agreement(plant, trial, run, np.array(bounds.u_min), np.array(bounds.u_max))
             for trial, run in zip(known.recordings, runs, strict=True)
@@ -181,25 +196,29 @@ def _leaves_out(trials: int, settings: FitSettings) -> bool:
 
 
 @contextmanager
-def _left_out(
-    problem: InverseProblem, settings: FitSettings, progress: FitProgress
-) -> Iterator[list[Future[FittedController]]]:
-    """Controllers fitted to all trials but one, one after the other, in a few threads.
+def _threads() -> Iterator[ThreadPoolExecutor]:
+    """A few threads: the compiled loop and the semidefinite solver let others run.
 
-    The compiled loop, most of the work, lets other threads run. When the block is left early, by an
-    error or from the keyboard, those not begun are not begun.
+    When the block is left early, by an error or from the keyboard, what is not begun is not begun.
     """
     pool = ThreadPoolExecutor(_THREADS)
     try:
-        pending = []
-        for index in range(len(problem.recordings)):
-            if _leaves_out(len(problem.recordings), settings):
-                others = problem.recordings[:index] + problem.recordings[index + 1 :]
-                part = replace(problem, recordings=others)
-                pending.append(pool.submit(progress.controller, _without(index), part))
-        yield pending
+        yield pool
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+def _left_out(
+    pool: ThreadPoolExecutor, problem: InverseProblem, settings: FitSettings, progress: FitProgress
+) -> list[Future[FittedController]]:
+    """Controllers fitted to all trials but one."""
+    pending = []
+    for index in range(len(problem.recordings)):
+        if _leaves_out(len(problem.recordings), settings):
+            others = problem.recordings[:index] + problem.recordings[index + 1 :]
+            part = replace(problem, recordings=others)
+            pending.append(pool.submit(progress.controller, _without(index), part))
+    return pending
 
 
 def _without(index: int) -> str:
@@ -230,8 +249,10 @@ def _parameters(
     )
 
 
-def _state_sizes(x: Array) -> Array:
+def _state_sizes(known: InverseProblem, fitted: FittedController) -> Array:
     """Root-mean-square of each state; states that never move count as the least that does."""
+    controller = controller_for(known, np.array(fitted.solution.K), np.array(fitted.solution.S))
+    x = np.concatenate([simulate(controller, drive).x for drive in scenarios(known)])
     sizes = np.sqrt(np.mean(x**2, axis=0))
     moving = sizes[sizes > 0]
     if len(moving) == 0:

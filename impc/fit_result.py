@@ -10,6 +10,7 @@ from impc.lqr import solve_lqr
 if TYPE_CHECKING:
     from impc.agreement import TrialAgreement
     from impc.arrays import Array
+    from impc.certainty import Certainty
     from impc.fit_settings import FitSettings
     from impc.fitted_controller import FittedController
     from impc.gain_covariance import GainCovariance
@@ -58,6 +59,8 @@ class FitResult:
     intent : Intent
     identifiability : Identifiability
         Directions of the weights that the recordings determine, and how many they leave.
+    certainty : Certainty
+        Intervals, the set of weights with this gain, and what else was asked for.
     trials : tuple of TrialAgreement
         Of inverse MPC, one a trial.
     held_out : tuple of HeldOut
@@ -77,6 +80,7 @@ class FitResult:
     parameters: tuple[FittedParameter, ...]
     intent: Intent
     identifiability: Identifiability
+    certainty: Certainty
     trials: tuple[TrialAgreement, ...]
     held_out: tuple[HeldOut, ...]
     methods: tuple[MethodFit, ...]
@@ -87,6 +91,13 @@ class FitResult:
     def reported_P(self) -> Array:  # noqa: N802
         """Terminal weight (3.4) of the reported weights (n, n)."""
         return solve_lqr(self.fitted.problem.plant, self.intent.reported.weights).P
+
+    @property
+    def widest_angle(self) -> float:
+        """How far other weights with this gain turn the dominant direction, degrees."""
+        found = self.certainty.weights
+        over_set = 0.0 if found is None else found.widest_angle
+        return max(self.intent.widest_angle, over_set)
 
     @property
     def inverse_mpc(self) -> MethodFit:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import msgspec
 import numpy as np
@@ -25,6 +25,8 @@ __all__ = ["FitSettings", "fit_bounds", "fit_settings"]
 # A recorded angle is differentiated over this time, by a parabola: noise of 1 % of the largest
 # angle at 100 Hz then gives a rate of a few per cent of the largest.
 _RATE_WINDOW = 0.15
+# Percentiles of 95 % lie between replicates only from 20 on.
+_FEWEST = 20
 
 
 @dataclass(frozen=True)
@@ -57,6 +59,19 @@ class FitSettings:
         count in its VAF.
     held_out : bool
         Whether each trial is predicted from the others.
+    replicates : int
+        Bootstrap replicates; 0 for none, else at least 20.
+    bootstrap : "block" or "model"
+        How residuals are drawn (`impc.bootstrap`).
+    seed : int
+        Of the bootstrap.
+    profiles : list of str
+        Entries of the gain, K.<control>.<state>, and free parameters whose profile likelihood is
+        wanted.
+    unknown_limit : bool
+        Whether the limit of each input is estimated too.
+    horizons : list of int
+        Other horizons, in samples, to compare with; and the fit without limit beside them.
     """
 
     horizon: int = 20
@@ -68,6 +83,12 @@ class FitSettings:
     feedback_states: list[str] = field(default_factory=list)
     settle: float = 1.0
     held_out: bool = True
+    replicates: int = 0
+    bootstrap: Literal["block", "model"] = "block"
+    seed: int = 0
+    profiles: list[str] = field(default_factory=list)
+    unknown_limit: bool = False
+    horizons: list[int] = field(default_factory=list)
 
 
 def fit_settings(table: Mapping[str, Any]) -> FitSettings:
@@ -93,6 +114,12 @@ def fit_settings(table: Mapping[str, Any]) -> FitSettings:
     ):
         if not least <= value < np.inf:
             raise InputError(f"[fit] {name}", f"got {value}", f"give at least {least}")
+    if 0 < settings.replicates < _FEWEST or settings.replicates < 0:
+        raise InputError(
+            "[fit] replicates", f"got {settings.replicates}", f"give 0 or at least {_FEWEST}"
+        )
+    if any(length < 1 for length in settings.horizons):
+        raise InputError("[fit] horizons", f"got {settings.horizons}", "give at least 1")
     return settings
 
 

@@ -8,6 +8,7 @@ between their directions says how much of v was chosen by the rule and not by th
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -17,18 +18,18 @@ from impc.arrays import Array, frozen
 from impc.equivalent_weights import (
     analytic_centre,
     least_condition_weights,
-    other_weights,
 )
 from impc.errors import SolverError, WeightsError
 from impc.gain_fibre import gain_fibre
 from impc.plant import change_coordinates
 from impc.weights import Weights, condition_number, normalised, stage_weights
+from impc.weights_set import nearest_diagonal, trace_range, weights_set
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from impc.gain_fibre import GainFibre
     from impc.plant import Plant
+    from impc.weights_set import WeightsSet
 
 __all__ = ["Intent", "Reading", "dominant_sentence", "intent"]
 
@@ -160,6 +161,11 @@ def _rules(
 ) -> list[tuple[str, Callable[[], list[Weights]]]]:
     fibre = gain_fibre(plant, gain)
 
+    @functools.cache
+    def members() -> WeightsSet:
+        """Up to ten times the least condition number: the infimum of a trace is not attained."""
+        return weights_set(fibre)
+
     def in_units(T: Array) -> list[Weights]:
         scaled = gain_fibre(change_coordinates(plant, T), gain @ T)
         found = least_condition_weights(scaled).weights
@@ -171,12 +177,16 @@ def _rules(
         ("least condition number, states over their size", lambda: in_units(np.diag(sizes))),
         ("least condition number, natural coordinates", lambda: in_units(np.array(fibre.T))),
         ("analytic centre (no units)", lambda: [analytic_centre(fibre).weights]),
-        ("far from the first, at ten times its condition number", lambda: _far(fibre)),
+        (
+            "least trace, states over their size",
+            lambda: [trace_range(members(), sizes).low_weights],
+        ),
+        ("nearest to diagonal, states over their size", lambda: [_diagonal(members(), sizes)]),
     ]
 
 
-def _far(fibre: GainFibre) -> list[Weights]:
-    return [item.weights for item in other_weights(fibre, 2)]
+def _diagonal(found: WeightsSet, sizes: Array) -> Weights:
+    return nearest_diagonal(found, sizes).weights
 
 
 def _reading(rule: str, weights: Weights, before: list[Reading]) -> Reading:

@@ -21,8 +21,10 @@ from impc.arrays import Array
 from impc.weights_set import linear_maximum, linear_range
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from impc.weights import Weights
-    from impc.weights_set import WeightsSet
+    from impc.weights_set import Range, WeightsSet
 
 __all__ = ["Statement", "order_statements", "sense_statements", "widest_dominant_angle"]
 
@@ -77,24 +79,34 @@ def order_statements(
             direction = np.zeros((total, total))
             direction[i, i], direction[j, j] = sizes[i] ** 2, -(sizes[j] ** 2)
             says = f"a typical {one} costs more than a typical {other}"
-            statements.append(_statement(found, direction, one, other, says, sizes[i]))
+            ends = linear_range(found, direction)
+            span = (ends.low, ends.high)
+            statements.append(_statement(found, span, one, other, says, sizes[i]))
     return tuple(statements)
 
 
 def sense_statements(
-    found: WeightsSet, sizes: Array, states: tuple[str, ...]
+    found: WeightsSet,
+    sizes: Array,
+    states: tuple[str, ...],
+    ranges: Mapping[tuple[int, int], Range],
 ) -> tuple[Statement, ...]:
-    """Whether two states are priced together (Q_ij > 0: the same sign costs more)."""
+    """Whether two states are priced together (Q_ij > 0: the same sign costs more).
+
+    Parameters
+    ----------
+    ranges : mapping
+        Of `entry_ranges`, for these states at least.
+    """
     names = found.fibre.plant.states
-    total = len(found.first)
     statements = []
     for position, one in enumerate(states):
         for other in states[position + 1 :]:
             i, j = names.index(one), names.index(other)
-            direction = np.zeros((total, total))
-            direction[i, j] = direction[j, i] = sizes[i] * sizes[j] / 2
+            ends, scale = ranges[max(i, j), min(i, j)], sizes[i] * sizes[j]
             says = f"{one} and {other} of the same sign cost more than of opposite signs"
-            statements.append(_statement(found, direction, one, other, says, sizes[i]))
+            span = (scale * ends.low, scale * ends.high)
+            statements.append(_statement(found, span, one, other, says, sizes[i]))
     return tuple(statements)
 
 
@@ -161,11 +173,11 @@ def _angle(one: Array, other: Array) -> float:
 
 
 def _statement(
-    found: WeightsSet, direction: Array, one: str, other: str, says: str, size: float
+    found: WeightsSet, span: tuple[float, float], one: str, other: str, says: str, size: float
 ) -> Statement:
-    ends = linear_range(found, direction)
+    low, high = span
     index = found.fibre.plant.states.index(one)
     unit = float(found.least.weights.Q[index, index] * size**2)
-    touches = _TOUCHES * max(abs(ends.low), abs(ends.high))
-    holds = True if ends.low > touches else False if ends.high < -touches else None
-    return Statement(one, other, says, holds, ends.low / unit, ends.high / unit)
+    touches = _TOUCHES * max(abs(low), abs(high))
+    holds = True if low > touches else False if high < -touches else None
+    return Statement(one, other, says, holds, low / unit, high / unit)

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.arrays import Array, frozen
+from impc.arrays import Array
 from impc.eigenvalue_ranges import eigenvalue_ranges
+from impc.errors import SolverError, WeightsError
 from impc.gain_fibre import gain_fibre
 from impc.intent_statements import order_statements, sense_statements, widest_dominant_angle
-from impc.weights import normalised, stage_weights
-from impc.weights_set import entry_ranges, nearest_diagonal, trace_range, weights_set
+from impc.weights_set import entry_ranges, weights_set
 
 if TYPE_CHECKING:
     from impc.eigenvalue_ranges import EigenvalueRange
@@ -24,12 +24,12 @@ if TYPE_CHECKING:
     from impc.plant import Plant
     from impc.weights import Weights
 
-__all__ = ["EntryRange", "WeightsSummary", "summarise_weights"]
+__all__ = ["EntryRange", "WeightsSummary", "summarise_weights", "weights_summary_or_reason"]
 
 #: Multiple of the least condition number up to which weights are taken as equally good.
 RATIO = 10.0
 # States whose entries and statements are computed: those that cost most at their typical size.
-_NAMED = 5
+_NAMED = 4
 
 
 @dataclass(frozen=True)
@@ -68,8 +68,6 @@ class WeightsSummary:
     widest_angle : float
         Widest angle found between the dominant direction of D Q D in the least conditioned member
         and in another, degrees; D the typical sizes of the states.
-    least_trace, nearest_diagonal : Weights
-        Members with the least trace of D Q D and its least off-diagonal part, at R[0, 0] = 1.
     """
 
     dimension: int
@@ -79,8 +77,6 @@ class WeightsSummary:
     eigenvalues: tuple[EigenvalueRange, ...]
     statements: tuple[Statement, ...]
     widest_angle: float
-    least_trace: Weights
-    nearest_diagonal: Weights
 
 
 def summarise_weights(
@@ -107,13 +103,15 @@ def summarise_weights(
     named = _costliest(found.least.weights, sizes)
     names = tuple(plant.states[index] for index in named)
     ranges = entry_ranges(found, named)
-    trace = trace_range(found, sizes)
-    diagonal = nearest_diagonal(found, sizes).weights
-    members = [trace.low_weights.block, trace.high_weights.block, diagonal.block]
-    for item in ranges.values():
-        members += [item.low_weights.block, item.high_weights.block]
+    members = [
+        weights.block
+        for item in ranges.values()
+        for weights in (item.low_weights, item.high_weights)
+    ]
     angle, widest = widest_dominant_angle(found, sizes)
-    statements = order_statements(found, sizes, names) + sense_statements(found, sizes, names)
+    statements = order_statements(found, sizes, names) + sense_statements(
+        found, sizes, names, ranges
+    )
     return WeightsSummary(
         found.fibre.dimension - 1,
         found.least.condition,
@@ -125,9 +123,17 @@ def summarise_weights(
         eigenvalue_ranges(found, [*members, _at_trace(widest, plant.m)]),
         statements,
         angle,
-        _scaled(trace.low_weights),
-        _scaled(diagonal),
     )
+
+
+def weights_summary_or_reason(
+    plant: Plant, gain: Array, sizes: Array
+) -> tuple[WeightsSummary | None, str]:
+    """The summary, or None and why there is none."""
+    try:
+        return summarise_weights(plant, gain, sizes), ""
+    except (WeightsError, SolverError) as error:
+        return None, str(error)
 
 
 def _costliest(weights: Weights, sizes: Array) -> list[int]:
@@ -137,8 +143,3 @@ def _costliest(weights: Weights, sizes: Array) -> list[int]:
 
 def _at_trace(weights: Weights, m: int) -> Array:
     return np.asarray(weights.block * (m / np.trace(weights.R)))
-
-
-def _scaled(weights: Weights) -> Weights:
-    checked = normalised(stage_weights(weights.Q, weights.R))
-    return type(checked)(frozen(checked.Q), frozen(checked.R))

@@ -105,7 +105,10 @@ def test_profile_against_brute_force(fitted: FittedController) -> None:
 def test_what_is_not_determined_has_no_end() -> None:
     """A third state that nothing reaches: its entry of the gain shows nowhere."""
     base = cart()
-    A, B = scipy.linalg.block_diag(base.A, 0.5), np.vstack([np.hstack([base.B, base.E]), [0, 0]])
+    A, B = (
+        scipy.linalg.block_diag(base.A, np.array([[0.5]])),
+        np.vstack([np.hstack([base.B, base.E]), [0, 0]]),
+    )
     system = control.ss(A, B, np.hstack([base.C, [[0]]]), 0, base.dt, inputs=["force", "push"])
     plant = as_plant(system, ["force"])
     trial = noisy_trial(SEED, 0.0)

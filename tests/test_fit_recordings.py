@@ -161,7 +161,7 @@ def small() -> tuple[InverseProblem, FitSettings]:
 def test_a_plant_of_ones_own_with_one_output(small: tuple[InverseProblem, FitSettings]) -> None:
     heard: list[str] = []
     result = fit_recordings(*small, FitProgress(heard.append))
-    assert len(heard) == stages(3, small[1])
+    assert len(heard) == stages(small[0], small[1])
     # Noise of 20 % leaves 1 / 1.04 to explain.
     assert np.all(np.abs(result.inverse_mpc.vaf - 100 / 1.04) < 1.5)
     assert result.identifiability.rank == 2

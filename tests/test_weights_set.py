@@ -116,7 +116,7 @@ def test_statements_agree_with_sampled_members() -> None:
     sampled = random_members(found, 300)
     for statement, values in (
         (order_statements(found, sizes, names)[0], [X[0, 0] - 9 * X[1, 1] for X in sampled]),
-        (sense_statements(found, sizes, names)[0], [X[0, 1] for X in sampled]),
+        (sense_statements(found, sizes, names, entry_ranges(found))[0], [X[0, 1] for X in sampled]),
     ):
         signs = {bool(value > 0) for value in values}
         if statement.holds is None:

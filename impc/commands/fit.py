@@ -61,7 +61,7 @@ def command(files: tuple[Path, ...], plant_name: str, config: Path, out: Path) -
     problem, settings = subject.problem, subject.settings
     memory = open_memory(out, problem, settings)
     with tqdm(
-        total=stages(len(problem.recordings), settings),
+        total=stages(problem, settings),
         unit="stage",
         file=sys.stderr,
         disable=None,  # no bar where stderr is a file
@@ -73,7 +73,9 @@ def command(files: tuple[Path, ...], plant_name: str, config: Path, out: Path) -
             bar.update()
 
         try:
-            result = fit_recordings(problem, settings, FitProgress(done, memory.controller))
+            result = fit_recordings(
+                problem, settings, FitProgress(done, memory.controller, memory.replicate)
+            )
         except KeyboardInterrupt:
             raise KeyboardInterrupt(memory.kept()) from None
     names = " ".join(path.name for path in files)
@@ -107,5 +109,5 @@ def _print(result: FitResult) -> None:
     click.echo(dominant_sentence(intent.reported, plant, intent.sizes))
     click.echo(
         f"Other weights that explain the recordings equally well turn that direction by up to "
-        f"{intent.widest_angle:.0f} degrees: so far it is not the subject's."
+        f"{result.widest_angle:.0f} degrees: so far it is not the subject's."
     )

@@ -8,6 +8,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.gain_covariance import DETERMINED
+from impc.report.certainty_tables import (
+    alternatives_table,
+    eigenvalues_table,
+    entries_table,
+    intervals_table,
+    limit_sentences,
+    set_sentences,
+    statements_table,
+)
 from impc.report.fit_sentences import (
     METHOD_LABELS,
     direction_name,
@@ -45,7 +54,11 @@ def fit_page(result: FitResult, figures: Mapping[str, bytes], provenance: FitPro
         agreement=_agreement(result),
         methods=_methods(result),
         readings=_readings(result),
-        gain=_gain(result),
+        weights_set=_weights_set(result),
+        weights_reason=result.certainty.weights_reason,
+        gain=intervals_table(result.certainty),
+        limits=limit_sentences(result.certainty),
+        alternatives=alternatives_table(result.certainty),
         directions=_directions(result),
         parameters=_parameters(result),
         matrices=[
@@ -133,20 +146,12 @@ def _readings(result: FitResult) -> TextTable:
     return TextTable(caption, heads, rows)
 
 
-def _gain(result: FitResult) -> TextTable:
-    plant, K = result.fitted.problem.plant, result.fitted.solution.K
-    rows = []
-    for row, control in enumerate(plant.controls):
-        for column, state in enumerate(plant.states):
-            deviation = float(result.covariance.entries[row, column])
-            rows.append(
-                (f"{control} from {state}", number(float(K[row, column]), 4), number(deviation, 2))
-            )
-    caption = (
-        "The gain K of u = -Kx with standard deviations. Entries share directions that hardly show "
-        "in the recordings; the table of directions tells which combinations are well determined."
-    )
-    return TextTable(caption, ("entry", "value", "standard deviation"), tuple(rows))
+def _weights_set(result: FitResult) -> tuple[tuple[str, ...], tuple[TextTable, ...]]:
+    summary = result.certainty.weights
+    if summary is None:
+        return (), ()
+    tables = (statements_table(summary), entries_table(summary), eigenvalues_table(summary))
+    return set_sentences(summary), tables
 
 
 def _directions(result: FitResult) -> TextTable:

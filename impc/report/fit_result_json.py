@@ -82,7 +82,7 @@ def _found(result: FitResult) -> dict[str, Any]:
             "vectors": intent.reported.vectors,
             "dominant": intent.reported.dominant,
             "sentence": dominant_sentence(intent.reported, plant, np.array(intent.sizes)),
-            "widest_angle": intent.widest_angle,
+            "widest_angle": result.widest_angle,
             "state_sizes": intent.sizes,
             "readings": [
                 {
@@ -103,6 +103,7 @@ def _found(result: FitResult) -> dict[str, Any]:
             "chosen": found.chosen,
             "singular_values": found.singular_values,
         },
+        **_certainty(result),
         "parameters": {item.name: asdict(item) for item in result.parameters},
         "trials": [_trial(result, index) for index in range(len(result.trials))],
         "methods": {
@@ -120,6 +121,21 @@ def _found(result: FitResult) -> dict[str, Any]:
             }
             for item in result.methods
         },
+    }
+
+
+def _certainty(result: FitResult) -> dict[str, Any]:
+    found = result.certainty
+    preferred: dict[str, Any] = {}
+    for item in found.intervals:  # the sandwich's come first
+        told = {key: value for key, value in asdict(item).items() if key != "name"}
+        preferred.setdefault(item.name, told)
+    return {
+        "intervals": preferred,
+        "all_intervals": [asdict(item) for item in found.intervals],
+        "weights_set": None if found.weights is None else asdict(found.weights),
+        "limits": [asdict(item) for item in found.limits],
+        "alternatives": [asdict(item) for item in found.alternatives],
     }
 
 

@@ -124,10 +124,10 @@ def _against_inverse_lqr(result: FitResult) -> list[str]:
 
 
 def _how_sure(result: FitResult) -> str:
-    angle = result.intent.widest_angle
     return (
-        f"Other weights with exactly the same behaviour turn that direction by up to {angle:.0f} "
-        f"degrees: so far it was chosen by a rule and not by the subject (section 4)."
+        f"Other weights with exactly the same behaviour turn that direction by up to "
+        f"{result.widest_angle:.0f} degrees: so far it was chosen by a rule and not by the "
+        f"subject (section 4)."
     )
 
 

@@ -1,0 +1,146 @@
+"""How far the numbers of a fit can be trusted: what came from the recordings and what did not.
+
+Always: intervals of the gain and the parameters from their covariance, and the set of weights with
+the fitted gain. When the settings ask for them: bootstrap, profile likelihoods, the input limit as
+an unknown, other horizons.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.alternatives import fit_alternatives
+from impc.bootstrap import block_residuals, bootstrap_intervals, model_residuals, replicate
+from impc.intervals import LEVEL, Interval, covariance_intervals, white_covariance
+from impc.profile_likelihood import profile_likelihood
+from impc.unknown_limit import input_limit
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from impc.alternatives import Alternative
+    from impc.bootstrap import Replicate
+    from impc.fit_settings import FitSettings
+    from impc.fitted_controller import FittedController
+    from impc.gain_covariance import GainCovariance
+    from impc.inverse_problem import InverseProblem
+    from impc.unknown_limit import LimitEstimate
+    from impc.weights_summary import WeightsSummary
+
+__all__ = ["Certainty", "assess", "count_stages"]
+
+_DRAW = {"block": block_residuals, "model": model_residuals}
+
+
+@dataclass(frozen=True)
+class Certainty:
+    """What is known beside the fit itself.
+
+    Attributes
+    ----------
+    intervals : tuple of Interval
+        By every method that was asked for; the sandwich's come first.
+    weights : WeightsSummary or None
+        The set of weights with the fitted gain; None when its programs fail.
+    weights_reason : str
+        Why there is none; empty otherwise.
+    limits : tuple of LimitEstimate
+        One an input, when asked for.
+    alternatives : tuple of Alternative
+        Other horizons and no limit, when horizons are given; the fit itself comes first.
+    """
+
+    intervals: tuple[Interval, ...]
+    weights: WeightsSummary | None
+    weights_reason: str
+    limits: tuple[LimitEstimate, ...]
+    alternatives: tuple[Alternative, ...]
+
+
+def count_stages(problem: InverseProblem, settings: FitSettings) -> int:
+    """Number of stages that `assess` reports, and one for the set of weights."""
+    limited = int(np.any(np.isfinite(problem.bounds.u_max)))
+    others = [length for length in settings.horizons if length != problem.horizon]
+    return (
+        1
+        + settings.replicates
+        + len(settings.profiles)
+        + (problem.plant.m if settings.unknown_limit else 0)
+        + (1 + limited + len(others) if settings.horizons else 0)
+    )
+
+
+def assess(
+    problem: InverseProblem,
+    fitted: FittedController,
+    covariance: GainCovariance,
+    weights: tuple[WeightsSummary | None, str],
+    settings: FitSettings,
+    done: Callable[[str], None],
+    remember: Callable[[str, Callable[[], Replicate]], Replicate],
+) -> Certainty:
+    """Run what the settings ask for.
+
+    Parameters
+    ----------
+    problem : InverseProblem
+        As it was posed.
+    fitted, covariance
+        Its fit, and the covariance at the reported gain.
+    weights : tuple
+        Of `weights_summary_or_reason`.
+    settings : FitSettings
+    done : callable
+        Told each stage.
+    remember : callable
+        (name, compute) -> a replicate, from memory or computed now.
+
+    Raises
+    ------
+    InputError
+        When a profile names no number of this fit.
+    WeightsError, SolverError
+        When a replicate or the limit cannot be fitted.
+    """
+    intervals = [
+        *covariance_intervals(fitted, covariance, "sandwich"),
+        *covariance_intervals(fitted, white_covariance(fitted), "cramer-rao"),
+    ]
+    for name in settings.profiles:
+        intervals.append(profile_likelihood(fitted, name).interval)
+        done(f"profile of {name}")
+    limits = []
+    for control in range(problem.plant.m if settings.unknown_limit else 0):
+        limits.append(input_limit(fitted, control))
+        intervals.append(_limit_interval(limits[-1], problem.plant.controls[control]))
+        done(f"limit of {problem.plant.controls[control]}")
+    alternatives: tuple[Alternative, ...] = ()
+    if settings.horizons:
+        alternatives = fit_alternatives(problem, fitted, settings.horizons, settings.settle, done)
+    intervals += _bootstrap(fitted, settings, done, remember)
+    return Certainty(tuple(intervals), *weights, tuple(limits), alternatives)
+
+
+def _limit_interval(found: LimitEstimate, control: str) -> Interval:
+    return Interval(f"u_max.{control}", "profile", found.level, found.value, found.low, found.high)
+
+
+def _bootstrap(
+    fitted: FittedController,
+    settings: FitSettings,
+    done: Callable[[str], None],
+    remember: Callable[[str, Callable[[], Replicate]], Replicate],
+) -> tuple[Interval, ...]:
+    if not settings.replicates:
+        return ()
+    draw = _DRAW[settings.bootstrap]
+    found = []
+    for index in range(settings.replicates):
+        name = f"replicate {index + 1}"
+        compute = lambda index=index: replicate(fitted, index, settings.seed, draw)  # noqa: E731
+        found.append(remember(name, compute))
+        done(name)
+    return bootstrap_intervals(fitted, found, settings.bootstrap, LEVEL)

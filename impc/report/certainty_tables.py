@@ -1,0 +1,156 @@
+"""What a fit can and cannot tell, as tables and sentences of its page."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from impc.alternatives import verdict
+from impc.report.rendering import TextTable, number
+
+if TYPE_CHECKING:
+    from impc.certainty import Certainty
+    from impc.intent_statements import Statement
+    from impc.weights_summary import WeightsSummary
+
+__all__ = [
+    "alternatives_table",
+    "eigenvalues_table",
+    "entries_table",
+    "intervals_table",
+    "limit_sentences",
+    "set_sentences",
+    "statements_table",
+]
+
+_METHODS = {
+    "sandwich": "colour of the residuals",
+    "cramer-rao": "as if they were white",
+    "block": "block bootstrap",
+    "model": "model bootstrap",
+    "profile": "profile likelihood",
+}
+
+
+def intervals_table(certainty: Certainty) -> TextTable:
+    """Intervals of every number, a column for each method."""
+    methods = [key for key in _METHODS if any(item.method == key for item in certainty.intervals)]
+    found = {(item.name, item.method): item for item in certainty.intervals}
+    names = list(dict.fromkeys(item.name for item in certainty.intervals))
+    rows = []
+    for name in names:
+        known = [found[name, method] for method in methods if (name, method) in found]
+        value = known[0].value
+        cells = []
+        for method in methods:
+            item = found.get((name, method))
+            cells.append("-" if item is None else _range(item.low, item.high))
+        rows.append((name, "not determined" if value is None else number(value, 4), *cells))
+    level = certainty.intervals[0].level
+    caption = (
+        f"Intervals of {100 * level:.0f} %. Where residuals are coloured, as those of people are, "
+        "the second column is too narrow. Entries of the gain share directions that hardly show in "
+        "the recordings; the table of directions tells which combinations are well determined."
+    )
+    heads = ("number", "value", *(_METHODS[method] for method in methods))
+    return TextTable(caption, heads, tuple(rows))
+
+
+def set_sentences(summary: WeightsSummary) -> tuple[str, ...]:
+    """What the set of weights is, and what becomes of the dominant direction over it."""
+    kept = "survives" if summary.widest_angle < 10 else "does not survive"
+    return (
+        f"The recordings give the gain. Weights with exactly that gain form a convex set of "
+        f"{summary.dimension} dimensions, all with the same behaviour; the ranges below are over "
+        f"its members with a condition number up to {summary.limit:.2g}, ten times the least.",
+        f"The dominant direction {kept} over the set: it turns by up to "
+        f"{summary.widest_angle:.0f} degrees (found by search; more may be possible).",
+        "The condition number depends on the units of the states, and so does the member that it "
+        "chooses. The analytic centre does not.",
+    )
+
+
+def statements_table(summary: WeightsSummary) -> TextTable:
+    """Statements that hold for every member, and those that members disagree on."""
+    order = {True: 0, False: 0, None: 1}
+    rows = tuple(
+        (item.says, _verdict(item), f"{item.low:.3g} to {item.high:.3g}")
+        for item in sorted(summary.statements, key=lambda item: order[item.holds])
+    )
+    caption = (
+        "Statements on the states that cost most, at the size that they have in the recordings. "
+        "One that holds for all weights may be said of the subject. The range is that of the "
+        "difference, or of the mixed price, over the price of the state named first."
+    )
+    return TextTable(caption, ("statement", "over all weights", "range"), rows)
+
+
+def entries_table(summary: WeightsSummary) -> TextTable:
+    """Ranges of entries of Q."""
+    rows = tuple(
+        (f"Q {item.first}, {item.second}", number(item.low), number(item.high))
+        for item in summary.entries
+    )
+    caption = "Range of entries of Q over the set, at trace R = m, by semidefinite programs."
+    return TextTable(caption, ("entry", "least", "most"), rows)
+
+
+def eigenvalues_table(summary: WeightsSummary) -> TextTable:
+    """Ranges of eigenvalues of Q."""
+    count = len(summary.eigenvalues)
+    rows = tuple(
+        (
+            str(count - index),
+            number(item.low) + (" (proved)" if item.low_proved else ""),
+            number(item.high) + (" (proved)" if item.high_proved else ""),
+        )
+        for index, item in reversed(list(enumerate(summary.eigenvalues)))
+    )
+    caption = (
+        "Range of the eigenvalues of Q over the set, largest first. Ends that are not proved are "
+        "values that some member has; others may go farther."
+    )
+    return TextTable(caption, ("eigenvalue", "least", "most"), rows)
+
+
+def limit_sentences(certainty: Certainty) -> tuple[str, ...]:
+    """What the recordings say of the input limit."""
+    return tuple(
+        item.reason[0].upper()
+        + item.reason[1:]
+        + f" (distance of no limit {item.against_none:.1f}, threshold {item.quantile:.1f}; "
+        + f"interval {_range(item.low, item.high)})."
+        for item in certainty.limits
+    )
+
+
+def alternatives_table(certainty: Certainty) -> TextTable | None:
+    """The fit beside other horizons and no limit."""
+    if not certainty.alternatives:
+        return None
+    first = certainty.alternatives[0]
+    rows = []
+    for item in certainty.alternatives:
+        said = "" if item is first else verdict(first, item)
+        rows.append(
+            (item.name, str(item.horizon), number(item.aic), number(item.held_out, 5), said)
+        )
+    caption = (
+        "The same recordings with other horizons and without limit. AIC is above the least, for "
+        "the innovations of the residuals; VAF is of trials left out."
+    )
+    heads = ("fit", "horizon", "AIC above the least", "left out VAF %", "the recordings say")
+    return TextTable(caption, heads, tuple(rows))
+
+
+def _verdict(item: Statement) -> str:
+    if item.holds is None:
+        return "undecided"
+    return "true for all" if item.holds else "false for all"
+
+
+def _range(low: float, high: float) -> str:
+    if low == -float("inf") and high == float("inf"):
+        return "not determined"
+    left = "no end" if low == -float("inf") else number(low, 4)
+    right = "no end" if high == float("inf") else number(high, 4)
+    return f"{left} to {right}"
