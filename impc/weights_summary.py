@@ -28,7 +28,8 @@ __all__ = ["EntryRange", "WeightsSummary", "summarise_weights", "weights_summary
 
 #: Multiple of the least condition number up to which weights are taken as equally good.
 RATIO = 10.0
-# States whose entries and statements are computed: those that cost most at their typical size.
+# States whose entries and statements are computed: the recorded ones, then those that cost most at
+# their typical size.
 _NAMED = 4
 
 
@@ -60,11 +61,11 @@ class WeightsSummary:
     least_condition, limit : float
         Condition numbers: the least, and the largest in the set.
     entries : tuple of EntryRange
-        Of the states that cost most.
+        Of the states that are recorded or cost most.
     eigenvalues : tuple of EigenvalueRange
         Of Q, ascending.
     statements : tuple of Statement
-        Order and sense of the states that cost most.
+        Order and sense of these states.
     widest_angle : float
         Widest angle found between the dominant direction of D Q D in the least conditioned member
         and in another, degrees; D the typical sizes of the states.
@@ -100,7 +101,7 @@ def summarise_weights(
         When no weights have the gain, or a program fails.
     """
     found = weights_set(gain_fibre(plant, gain), ratio)
-    named = _costliest(found.least.weights, sizes)
+    named = _shown(plant, found.least.weights, sizes)
     names = tuple(plant.states[index] for index in named)
     ranges = entry_ranges(found, named)
     members = [
@@ -136,9 +137,12 @@ def weights_summary_or_reason(
         return None, str(error)
 
 
-def _costliest(weights: Weights, sizes: Array) -> list[int]:
+def _shown(plant: Plant, weights: Weights, sizes: Array) -> list[int]:
+    """States that are recorded, then those that cost most."""
     prices = np.diag(weights.Q) * np.asarray(sizes) ** 2
-    return sorted(int(index) for index in np.argsort(-prices, kind="stable")[:_NAMED])
+    recorded = [index for index, name in enumerate(plant.states) if name in plant.outputs]
+    others = [int(index) for index in np.argsort(-prices, kind="stable")]
+    return sorted(list(dict.fromkeys([*recorded, *others]))[:_NAMED])
 
 
 def _at_trace(weights: Weights, m: int) -> Array:

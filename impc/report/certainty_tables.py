@@ -77,7 +77,8 @@ def statements_table(summary: WeightsSummary) -> TextTable:
         for item in sorted(summary.statements, key=lambda item: order[item.holds])
     )
     caption = (
-        "Statements on the states that cost most, at the size that they have in the recordings. "
+        "Statements on the states that are recorded or cost most, at the size that they have in "
+        "the recordings. "
         "One that holds for all weights may be said of the subject. The range is that of the "
         "difference, or of the mixed price, over the price of the state named first."
     )
