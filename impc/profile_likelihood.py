@@ -44,6 +44,7 @@ _WIDTH = 100.0
 # the recordings set no end.
 _STEPS = (1.0, 2.0, 3.0, 5.0, 8.0, 12.0, 20.0)
 _END = 1e-3
+_ROUNDS = 6
 
 
 @dataclass(frozen=True)
@@ -81,7 +82,7 @@ def profile_likelihood(fitted: FittedController, name: str, level: float = LEVEL
     """
     search = _Search(fitted, name)
     quantile = float(scipy.stats.chi2.ppf(level, 1))
-    ends = [search.end(sign, quantile) for sign in (-1.0, 1.0)]
+    ends = search.ends(quantile)
     tried = sorted(search.tried)
     low, high = (search.number(offset) for offset in ends)
     best = search.number(search.best_offset())
@@ -140,13 +141,42 @@ class _Search:
         least = self.tried[self.best_offset()][0]
         return float((self.squared(offset) - least) / (self.noise**2 * self.factor))
 
-    def end(self, sign: float, quantile: float) -> float:
+    def ends(self, quantile: float) -> list[float]:
+        """Offsets at which D passes the quantile on either side of its minimum.
+
+        The search itself had a prior, which the profile does not feel: its minimum may be
+        elsewhere, and a walk may find it. Then the walks begin again from there.
+        """
+        ends: list[float] = []
+        for _ in range(_ROUNDS):
+            self._refine()
+            origin = self.best_offset()
+            ends = [self._end(origin, sign, quantile) for sign in (-1.0, 1.0)]
+            if self.best_offset() == origin:
+                break
+        return ends
+
+    def _refine(self) -> None:
+        """Look for the minimum between the neighbours of the best offset so far."""
+        if not np.isfinite(self.deviation):
+            return
+        tried, best = sorted(self.tried), self.best_offset()
+        below = max([item for item in tried if item < best], default=best - self.deviation)
+        above = min([item for item in tried if item > best], default=best + self.deviation)
+        scipy.optimize.minimize_scalar(
+            self.squared,
+            bounds=(below, above),
+            method="bounded",
+            options={"xatol": 0.02 * self.deviation},
+        )
+
+    def _end(self, origin: float, sign: float, quantile: float) -> float:
         """Offset at which D passes the quantile, infinite when it does not."""
         if not np.isfinite(self.deviation):
             return sign * np.inf
-        inside = 0.0
+        inside = origin
         for step in _STEPS:
-            outside = sign * step * self.deviation
+            outside = origin + sign * step * self.deviation
             if self.distance(outside) > quantile:
                 return _crossing(self.distance, inside, outside, quantile)
             inside = outside
@@ -203,6 +233,6 @@ def _crossing(
         lambda offset: distance(offset) - quantile,
         inside,
         outside,
-        xtol=_END * abs(outside),
+        xtol=_END * abs(outside - inside),
     )
     return float(found)
