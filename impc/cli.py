@@ -16,10 +16,12 @@ __all__ = ["main"]
 _BAD_INPUT, _INTERRUPTED = 2, 130
 # One module a command, loaded when it is asked for: name -> module, which holds it as `command`.
 _COMMANDS = {
+    "cohort": "impc.commands.cohort",
     "compare": "impc.commands.compare",
     "example": "impc.commands.example",
     "fit": "impc.commands.fit",
     "inspect": "impc.commands.inspect",
+    "reliability": "impc.commands.reliability",
     "simulate": "impc.commands.simulate",
 }
 

@@ -22,7 +22,7 @@ import scipy.optimize
 from impc.arrays import Array, frozen
 from impc.closed_loop import simulate
 from impc.errors import SolverError, WeightsError
-from impc.evaluation import Evaluation, evaluate, misfit_or_reason
+from impc.evaluation import Evaluation, evaluate, misfit_or_reason, unusable
 from impc.inverse_problem import controller_for, scenarios
 from impc.lqr import LqrSolution, gain_gradients, solve_lqr
 from impc.weights import Weights, stage_weights
@@ -114,7 +114,7 @@ class _Prices:
     """The residual as a function of the logarithms of the prices; keeps the last evaluation."""
 
     def __init__(self, problem: InverseProblem, weights: Weights, solution: LqrSolution) -> None:
-        self.problem = problem
+        self.problem, self.solution = problem, solution
         controller = controller_for(problem, solution.K, solution.S)
         runs = [simulate(controller, drive) for drive in scenarios(problem)]
         x, u = (np.concatenate([getattr(run, name) for run in runs]) for name in "xu")
@@ -136,7 +136,11 @@ class _Prices:
     def at(self, z: Array) -> _Evaluated:
         key = z.tobytes()
         if self.last is None or self.last[0] != key:
-            solution = solve_lqr(self.problem.plant, self.weights(z))
+            try:
+                solution = solve_lqr(self.problem.plant, self.weights(z))
+            except WeightsError as error:  # a trial step too far: the search steps back from it
+                self.last = (key, _Evaluated(unusable(self.problem, str(error)), self.solution))
+                return self.last[1]
             found = evaluate(self.problem, solution.K, solution.S)
             self.last = (key, _Evaluated(found, solution))
         return self.last[1]

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from impc.recording import Recording
     from impc.terminal_set import TerminalSet
 
-__all__ = ["Evaluation", "evaluate", "misfit_or_reason", "residual_only"]
+__all__ = ["Evaluation", "evaluate", "misfit_or_reason", "residual_only", "unusable"]
 
 # What a sample that a trial controller does not reach counts for, in root-mean-square outputs.
 _NOT_REACHED = 1e3
@@ -83,11 +83,11 @@ def evaluate(
     # hide; no weights have such a gain. A plain gain is left free: it goes there and comes back.
     bounded = problem.terminal_set or len(bound_rows(problem.bounds, plant).b) > 0
     if bounded and not is_stable(plant.A - plant.B @ gain, discrete=True):
-        return _unusable(problem, "the gain does not stabilise the plant")
+        return unusable(problem, "the gain does not stabilise the plant")
     try:
         controller = controller_for(problem, gain, metric, near)
     except ImpcError as error:
-        return _unusable(problem, str(error))
+        return unusable(problem, str(error))
     layout = _layout(problem)
     differential = _plant_differential(problem)
     prepared = prepare_loop(controller, _all_directions(controller, layout, differential))
@@ -220,7 +220,8 @@ def _scale(problem: InverseProblem, trial: Recording) -> float:
     return float(np.sqrt(np.mean((trial.outputs / problem.output_scale) ** 2))) or 1.0
 
 
-def _unusable(problem: InverseProblem, reason: str) -> Evaluation:
+def unusable(problem: InverseProblem, reason: str) -> Evaluation:
+    """A large finite residual with its reason, for a search to step back from."""
     m, n = problem.plant.m, problem.plant.n
     residual = np.concatenate(
         [

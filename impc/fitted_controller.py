@@ -17,15 +17,18 @@ import numpy as np
 
 from impc.diagonal_weights import diagonal_weights
 from impc.equivalent_weights import least_condition_weights
-from impc.errors import WeightsError
+from impc.errors import SolverError, WeightsError
 from impc.evaluation import residual_only
 from impc.gain import GainFit, refine_gain
-from impc.gain_fibre import gain_fibre
+from impc.gain_fibre import gain_fibre, natural_coordinates
 from impc.initial_states import with_fitted_starts
+from impc.inverse_mpc import auxiliary_weights
 from impc.lqr import solve_lqr
-from impc.natural_fit import inverse_mpc_natural
+from impc.natural_fit import in_plant_units, inverse_mpc_natural
+from impc.plant import change_coordinates
 
 if TYPE_CHECKING:
+    from impc.conditioned_fit import ConditionedFit
     from impc.inverse_problem import InverseProblem
     from impc.lqr import LqrSolution
     from impc.weights import Weights
@@ -34,6 +37,9 @@ __all__ = ["FittedController", "fit_controller", "free_gain", "noise_of"]
 
 # Of the natural coordinates of the gain, see `fit_gain`: no optimal gain is far beyond 1.
 _SPREAD = 1.0
+# Weights that leave this much more than the free gain are looked for again. On 30 noisy seats the
+# ratio is 1.01 at most where the search ends well; where it ended in another basin it was 2.3.
+_POOR = 1.05
 
 
 @dataclass(frozen=True)
@@ -94,10 +100,31 @@ def fit_controller(problem: InverseProblem, start: Weights | None = None) -> Fit
     if found.misfit < free.misfit:  # the free gain stands in a local minimum
         free = free_gain(free.problem, found.weights)
         found = inverse_mpc_natural(free.problem, found.weights, noise_of(free))
+    elif found.misfit > _POOR * free.misfit:  # the weights stand in one
+        found = _again(free, begin, found)
     settled = free.problem
     if problem.unknown_start:
         settled = with_fitted_starts(free.problem, found.solution.K, found.solution.S)
     return _finish(free, settled, found.weights, exact=False, converged=found.converged)
+
+
+def _again(free: GainFit, begin: Weights, found: ConditionedFit) -> ConditionedFit:
+    """The direct form from the weights whose regulator is nearest to the free gain, if better."""
+    plant = free.problem.plant
+    if not free.stabilises:
+        return found
+    T, G = natural_coordinates(plant, free.K)
+    natural = change_coordinates(plant, T, G)
+    target, near = (
+        np.asarray(np.linalg.solve(G, gain @ T)) for gain in (free.K, solve_lqr(plant, begin).K)
+    )
+    try:
+        centre = least_condition_weights(gain_fibre(natural, near)).weights
+        start = in_plant_units(auxiliary_weights(natural, target, centre).weights, T, G)
+        other = inverse_mpc_natural(free.problem, start, noise_of(free))
+    except (WeightsError, SolverError):  # no better start: the first answer stands
+        return found
+    return other if other.misfit < found.misfit else found
 
 
 def free_gain(problem: InverseProblem, begin: Weights) -> GainFit:

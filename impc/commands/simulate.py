@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from impc.commands.output import print_files
+from impc.commands.simulate_cohort import cohort
+from impc.commands.simulate_reliability import reliability_study
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -253,3 +255,7 @@ sex = "{person["sex"]}"
 horizon = {_HORIZON}                 # samples of 0.01 s
 u_max = {given["torque_limit"]}                  # N m
 """
+
+
+command.add_command(cohort)
+command.add_command(reliability_study)

@@ -109,16 +109,19 @@ class Configuration(msgspec.Struct, frozen=True):
         Arguments of the plant's function; not interpreted here.
     fit : dict
         Settings of the fit; not interpreted here.
+    study : dict
+        The [study] table of a study; not interpreted here.
     """
 
     recording: RecordingTable
     signals: dict[str, SignalTable]
     plant: dict[str, Any] = {}
     fit: dict[str, Any] = {}
+    study: dict[str, Any] = {}
 
 
-def read_configuration(path: Path) -> Configuration:
-    """Read a configuration.
+def read_configuration(path: Path, *more: str) -> Configuration:
+    """Read a configuration; `more` names tables that it may have besides.
 
     Raises
     ------
@@ -128,8 +131,9 @@ def read_configuration(path: Path) -> Configuration:
     """
     source = str(path)
     content = _parsed(source, path)
-    _require_known(source, "", content, _TABLES)
-    tables = {name: content.get(name, {}) for name in _TABLES}
+    known = (*_TABLES, *more)
+    _require_known(source, "", content, known)
+    tables = {name: content.get(name, {}) for name in (*_TABLES, "study")}
     for name, table in tables.items():
         if not isinstance(table, dict):
             raise InputError(f"{source}: {name}", "is not a table", f"write [{name}]")
@@ -147,7 +151,7 @@ def read_configuration(path: Path) -> Configuration:
         raise InputError(
             f"{source}: signals", "names no signal", "write a table [signals.NAME] for each"
         )
-    return Configuration(recording, signals, tables["plant"], tables["fit"])
+    return Configuration(recording, signals, tables["plant"], tables["fit"], tables["study"])
 
 
 _Struct = TypeVar("_Struct", bound=msgspec.Struct)

@@ -23,9 +23,13 @@ class TextTable:
 
 
 def render_template(name: str, **values: Any) -> str:
-    """Render a template of this folder; everything that enters it is escaped."""
+    """Render a template of this package; everything that enters it is escaped.
+
+    Templates of this folder go by their name, others by that of their room too: "cohort/page.html".
+    """
+    here = Path(__file__).parent
     environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent),
+        loader=FileSystemLoader([here, here.parent]),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,

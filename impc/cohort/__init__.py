@@ -1,0 +1,1 @@
+"""Many subjects, many replicates, on one machine or a cluster (dask.distributed)."""

@@ -1,0 +1,172 @@
+"""`impc simulate reliability-study`: a seated-balance test over visits and conditions."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from impc.arrays import Array
+    from impc.plant import Plant
+
+__all__ = ["reliability_study"]
+
+_PLANT, _TORQUE = "plants:seated_balance_for", "plants:ternary_torque"
+_RATE = 100.0
+# 242 steps of 0.12 s: one whole period of the register, so that its lines are lines.
+_DWELL, _DURATION = 0.12, 242 * 0.12
+# Price of angles and rates, size of the sway that the subject makes itself (N m), noise of the two
+# angles (degrees): open eyes, closed eyes, vibration of the trunk's muscles.
+_CONDITIONS = {
+    "EO": (1.0, 0.5, (0.10, 0.15)),
+    "EC": (0.6, 0.8, (0.12, 0.20)),
+    "VIB": (0.75, 1.0, (0.15, 0.30)),
+}
+# Deviations of logarithms: of prices and of sway between subjects, and of sway at a visit, in a
+# trial; each visit lowers the sway by the learning.
+_PRICE, _SWAY, _VISIT, _TRIAL, _LEARNING = 0.35, 0.30, 0.08, 0.10, -0.03
+
+
+@click.command("reliability-study")
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    default=Path("results", "reliability-data"),
+    show_default=True,
+    help="Folder for the recordings, study.toml and truth.json.",
+)
+@click.option("--subjects", type=click.IntRange(2, 999), default=30, show_default=True)
+@click.option("--visits", type=click.IntRange(2, 9), default=3, show_default=True)
+@click.option("--trials", type=click.IntRange(2, 9), default=3, show_default=True)
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+def reliability_study(out: Path, **given: Any) -> None:
+    """Thirty subjects, three visits, three conditions and three trials on the seat.
+
+    Subjects differ in what angles and rates cost them and in how much they sway, visits and trials
+    in the sway. Closed eyes and vibration change prices, sway and noise. 29.04 s a trial, one
+    period of the ternary torque, 100 samples a second.
+    """
+    import numpy as np  # noqa: PLC0415
+
+    from impc.plant_source import import_function, make_plant, plant_source  # noqa: PLC0415
+    from impc.report.write import require_writable, write_files  # noqa: PLC0415
+
+    require_writable(out)
+    rng = np.random.default_rng(given["seed"])
+    plant = make_plant(plant_source(_PLANT, {}), ("perturbation",))
+    torque = np.asarray(
+        import_function(_TORQUE)(dwell=_DWELL, duration=_DURATION, rate=_RATE), dtype=np.float64
+    )
+    width = max(2, len(str(given["subjects"])))
+    truth: dict[str, Any] = {}
+    with click.progressbar(range(given["subjects"]), label="subjects") as numbers:
+        for number in numbers:
+            name = f"{number + 1:0{width}d}"
+            price, sway = np.exp(np.array([_PRICE, _SWAY]) * rng.standard_normal(2))
+            truth[name] = {"price": float(price), "sway": float(sway)}
+            for visit in range(given["visits"]):
+                files: dict[str, bytes] = {}
+                for condition in _CONDITIONS:
+                    level = sway * np.exp(_VISIT * rng.standard_normal() + _LEARNING * visit)
+                    cell = _cell(plant, torque, condition, float(price), level, given, rng)
+                    stem = f"sub-{name}_ses-{visit + 1}_task-{condition}"
+                    files |= {
+                        f"{stem}_run-{run + 1}_motion.csv": content
+                        for run, content in enumerate(cell)
+                    }
+                write_files(out / f"sub-{name}" / f"ses-{visit + 1}", files)
+    settings = {
+        "price": _PRICE, "sway": _SWAY, "visit": _VISIT, "trial": _TRIAL, "learning": _LEARNING,
+        "conditions": _CONDITIONS, **given,
+    }  # fmt: skip
+    text = json.dumps({"settings": settings, "subjects": truth}, indent=1) + "\n"
+    write_files(out, {"study.toml": _STUDY.encode(), "truth.json": text.encode()})
+    click.echo(f"{given['subjects']} subjects, {given['visits']} visits: {out / 'study.toml'}")
+
+
+def _cell(
+    plant: Plant,
+    torque: Array,
+    condition: str,
+    price: float,
+    sway: float,
+    given: dict[str, Any],
+    rng: np.random.Generator,
+) -> list[bytes]:
+    """All trials of a subject's visit in one condition, as files."""
+    import numpy as np  # noqa: PLC0415
+
+    from impc.files.formats import encode_table  # noqa: PLC0415
+    from impc.files.table import make_table  # noqa: PLC0415
+    from impc.lqr import solve_lqr  # noqa: PLC0415
+    from impc.weights import stage_weights  # noqa: PLC0415
+
+    factor, own, noise = _CONDITIONS[condition]
+    v = np.array([0.70, 0.65, 0.22, 0.20])
+    v /= np.linalg.norm(v)
+    Q = 1e-2 * np.eye(plant.n)
+    Q[:4, :4] = factor * price * (6e5 * np.outer(v, v) + np.diag([2e4, 2e4, 500, 500]))
+    K = solve_lqr(plant, stage_weights(Q, 1)).K
+    files = []
+    for _ in range(given["trials"]):
+        size = own * sway * float(np.exp(_TRIAL * rng.standard_normal()))
+        outputs = np.degrees(_simulated(plant, K, torque, size, rng))
+        outputs += np.array(noise) * rng.standard_normal(outputs.shape)
+        columns = {
+            "time": np.arange(len(torque)) / _RATE,
+            "seat_angle": outputs[:, 0],
+            "trunk_angle": outputs[:, 1],
+            "perturbation": torque,
+        }
+        units = {"time": "s", "seat_angle": "deg", "trunk_angle": "deg", "perturbation": "Nm"}
+        table = make_table("trial", columns, units=units, rate=_RATE)
+        files.append(encode_table(".csv", table))
+    return files
+
+
+def _simulated(
+    plant: Plant, K: Array, torque: Array, sway: float, rng: np.random.Generator
+) -> Array:
+    """Outputs of x+ = (A - BK) x + E d + B w, after one period that is not recorded."""
+    import numpy as np  # noqa: PLC0415
+    import scipy.signal  # noqa: PLC0415
+
+    driven = np.concatenate([torque, torque])
+    # Sway: noise of a time constant of half a second, as the command's.
+    white = rng.standard_normal((len(driven), plant.m))
+    root = np.exp(-1 / (0.5 * _RATE))
+    own = sway * scipy.signal.lfilter([np.sqrt(1 - root**2)], [1.0, -root], white, axis=0)
+    F, drive = plant.A - plant.B @ K, driven[:, None] @ plant.E.T + own @ plant.B.T
+    x, states = np.zeros(plant.n), np.empty((len(driven), plant.n))
+    for k in range(len(driven)):
+        states[k] = x
+        x = F @ x + drive[k]
+    return np.asarray(states[len(torque) :] @ plant.C.T)
+
+
+_STUDY = """\
+# A simulated reliability study: `impc reliability study.toml --out DIR`.
+[study]
+plant = "seated-balance"
+bids = "."                       # folders and files that are named sub-, ses-, task-, run-
+
+[recording]
+time = "time"
+
+[signals.theta1]
+column = "seat_angle"
+unit = "deg"
+
+[signals.theta2]
+column = "trunk_angle"
+unit = "deg"
+
+[signals.perturbation]
+column = "perturbation"
+unit = "N*m"
+"""

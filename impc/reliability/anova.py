@@ -1,0 +1,166 @@
+"""Repeated-measures analysis of variance over visits, and what follows it.
+
+One-way, uncorrected and with Greenhouse and Geisser's epsilon; paired t between visits, uncorrected
+and with Holm's correction; the trend over visits, the learning effect.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+import scipy.stats
+from statsmodels.stats.anova import AnovaRM
+from statsmodels.stats.multitest import multipletests
+
+from impc.arrays import Array
+from impc.errors import DataError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+__all__ = ["Anova", "PairedTest", "Trend", "learning_trend", "paired_tests", "visit_anova"]
+
+
+@dataclass(frozen=True)
+class Anova:
+    """F test of a difference between visits.
+
+    Attributes
+    ----------
+    F : float
+    freedom : tuple of float
+        Of numerator and denominator, uncorrected.
+    p : float
+        Uncorrected.
+    epsilon : float
+        Greenhouse and Geisser's, between 1 / (k - 1) and 1.
+    p_corrected : float
+        With both degrees of freedom times epsilon.
+    subjects, left_out : int
+        With all visits, and without.
+    """
+
+    F: float
+    freedom: tuple[float, float]
+    p: float
+    epsilon: float
+    p_corrected: float
+    subjects: int
+    left_out: int
+
+
+@dataclass(frozen=True)
+class PairedTest:
+    """Paired t between two visits: difference second minus first, p without and with Holm."""
+
+    first: str
+    second: str
+    difference: float
+    p: float
+    p_holm: float
+
+
+@dataclass(frozen=True)
+class Trend:
+    """Slope over visits: mean of the subjects' least-squares slopes, its interval and p."""
+
+    slope: float
+    low: float
+    high: float
+    p: float
+
+
+def visit_anova(scores: Array) -> Anova:
+    """Test of visits; scores (subjects, visits), NaN where missing.
+
+    Raises
+    ------
+    DataError
+        When fewer than two subjects or visits are complete, or nothing varies.
+    """
+    kept, left_out = _complete(scores)
+    n, k = kept.shape
+    long = pd.DataFrame(
+        {
+            "subject": np.repeat(np.arange(n), k),
+            "visit": np.tile(np.arange(k), n),
+            "score": kept.ravel(),
+        }
+    )
+    if np.ptp(kept - kept.mean(axis=1, keepdims=True)) == 0:
+        raise DataError("scores", "are the same at every visit", "there is nothing to test")
+    table = AnovaRM(long, "score", "subject", within=["visit"]).fit().anova_table
+    F = float(table["F Value"].iloc[0])
+    epsilon = _greenhouse_geisser(kept)
+    freedom = (float(k - 1), float((n - 1) * (k - 1)))
+    corrected = float(scipy.stats.f.sf(F, epsilon * freedom[0], epsilon * freedom[1]))
+    return Anova(F, freedom, float(table["Pr > F"].iloc[0]), epsilon, corrected, n, left_out)
+
+
+def paired_tests(scores: Array, visits: Sequence[str]) -> tuple[PairedTest, ...]:
+    """Every pair of visits; subjects who lack one of the two are left out of that pair.
+
+    Raises
+    ------
+    DataError
+        When a pair has fewer than two subjects.
+    """
+    rows = []
+    for i, j in itertools.combinations(range(len(visits)), 2):
+        both = scores[np.all(np.isfinite(scores[:, [i, j]]), axis=1)]
+        if len(both) < 2:
+            raise DataError(
+                f"visits {visits[i]} and {visits[j]}", f"share {len(both)} subjects", "two at least"
+            )
+        test: Any = scipy.stats.ttest_rel(both[:, j], both[:, i])
+        p = float(test.pvalue)
+        rows.append((visits[i], visits[j], float(np.mean(both[:, j] - both[:, i])), p))
+    usable = [row[3] for row in rows if np.isfinite(row[3])]
+    corrected = iter(multipletests(usable, method="holm")[1] if usable else [])
+    return tuple(
+        PairedTest(*row, float(next(corrected)) if np.isfinite(row[3]) else float("nan"))
+        for row in rows
+    )
+
+
+def learning_trend(scores: Array, level: float = 0.95) -> Trend:
+    """Whether scores rise or fall from visit to visit; scores (subjects, visits).
+
+    Raises
+    ------
+    DataError
+        As `visit_anova`.
+    """
+    kept, _ = _complete(scores)
+    visit = np.arange(kept.shape[1]) - (kept.shape[1] - 1) / 2
+    slopes = kept @ visit / float(visit @ visit)
+    test: Any = scipy.stats.ttest_1samp(slopes, 0.0)
+    interval = test.confidence_interval(level)
+    return Trend(
+        float(slopes.mean()), float(interval.low), float(interval.high), float(test.pvalue)
+    )
+
+
+def _greenhouse_geisser(scores: Array) -> float:
+    """tr(S)^2 / ((k - 1) tr(S^2)), S the covariance of visits, doubly centred."""
+    k = scores.shape[1]
+    centring = np.eye(k) - 1 / k
+    S = centring @ np.cov(scores, rowvar=False) @ centring
+    below = (k - 1) * float(np.sum(S**2))
+    return float(np.clip(np.trace(S) ** 2 / below, 1 / (k - 1), 1.0)) if below > 0 else 1.0
+
+
+def _complete(scores: Array) -> tuple[Array, int]:
+    table = np.asarray(scores, dtype=np.float64)
+    if table.ndim != 2 or table.shape[1] < 2:
+        raise DataError("scores", "are of one visit", "a test between visits needs two or more")
+    kept = table[np.all(np.isfinite(table), axis=1)]
+    if len(kept) < 2:
+        raise DataError(
+            "scores", f"are complete for {len(kept)} subject", "a test needs two or more"
+        )
+    return kept, len(table) - len(kept)

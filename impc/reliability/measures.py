@@ -1,0 +1,116 @@
+"""Measures of one trial: root-mean-square about upright, and mean bandpass signal energy (2.1).
+
+    RMS  = sqrt( mean y^2 )                        about 0, upright: the mean is not removed
+    E_mb = df sum_{i = l..h} Phi(f_i)              (2.1), Phi one-sided power spectral density
+
+The passband l..h is the largest contiguous range in which the input's power is above 3 % of its
+peak. A ternary sequence has no power at even harmonics of its period, so that no range of raw
+frequencies is contiguous: it is looked for among the frequencies that the input excites. An input
+that was cut inside a period, or is not periodic, excites all of them, unevenly: its power is then
+averaged over seven neighbours first.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.ndimage
+import scipy.signal
+
+from impc.arrays import Array, IntArray
+from impc.errors import DataError
+
+__all__ = ["Passband", "band_energy", "passband", "rms"]
+
+_SHARE = 0.03
+# Power below this share of the peak is none: rounding, and what a window leaks.
+_NOTHING = 1e-6
+# A period's odd harmonics are half of all frequencies.
+_MOST_LINES = 0.6
+_NEIGHBOURS = 7
+
+
+@dataclass(frozen=True)
+class Passband:
+    """Range of frequencies.
+
+    Attributes
+    ----------
+    low, high : float
+        Hz, both inside.
+    excited : IntArray
+        Indices of the excited frequencies inside, on the grid of the input's periodogram.
+    """
+
+    low: float
+    high: float
+    excited: IntArray
+
+
+def rms(outputs: Array) -> Array:
+    """Root-mean-square about upright of each output (p,), in its unit; outputs (samples, p)."""
+    return np.asarray(np.sqrt(np.mean(np.asarray(outputs) ** 2, axis=0)))
+
+
+def passband(signal: Array, rate: float, share: float = _SHARE) -> Passband:
+    """Largest contiguous range of excited frequencies with power above a share of the peak.
+
+    Parameters
+    ----------
+    signal : Array
+        Input of one trial (samples,): a whole number of periods.
+    rate : float
+        Samples per second.
+    share : float
+        Of the peak.
+
+    Raises
+    ------
+    DataError
+        When the input is constant, so that nothing is excited.
+    """
+    frequency, power = scipy.signal.periodogram(signal, rate, detrend=False)
+    power[0] = 0.0
+    peak = float(power.max(initial=0.0))
+    if peak <= 1e-24 * max(float(np.mean(np.asarray(signal) ** 2)), 1e-300) or peak == 0:
+        raise DataError("input", "is constant: its passband is empty", "check its column")
+    excited = np.flatnonzero(power > _NOTHING * peak)
+    if len(excited) > _MOST_LINES * len(power):  # no line spectrum
+        power = scipy.ndimage.uniform_filter1d(power, _NEIGHBOURS)
+        peak = float(power.max())
+    above = power[excited] > share * peak
+    runs = np.split(np.arange(len(excited)), np.flatnonzero(np.diff(above.astype(int))) + 1)
+    inside = [run for run in runs if above[run[0]]]
+    best = max(inside, key=lambda run: int(excited[run[-1]] - excited[run[0]]))
+    found = excited[best]
+    return Passband(float(frequency[found[0]]), float(frequency[found[-1]]), found)
+
+
+def band_energy(outputs: Array, rate: float, low: float, high: float) -> Array:
+    """Mean bandpass signal energy (2.1) of each output (p,), in its unit squared.
+
+    Parameters
+    ----------
+    outputs : Array
+        (samples, p).
+    rate : float
+        Samples per second.
+    low, high : float
+        Passband, Hz, both inside.
+
+    Raises
+    ------
+    DataError
+        When no frequency of the trial lies in the band.
+    """
+    frequency, power = scipy.signal.periodogram(outputs, rate, detrend=False, axis=0)
+    step = float(frequency[1] - frequency[0])
+    rounding = 1e-6 * step
+    inside = (frequency >= low - rounding) & (frequency <= high + rounding)
+    if not np.any(inside):
+        raise DataError(
+            "passband", f"{low:g} to {high:g} Hz holds no frequency of the trial",
+            "give longer trials",
+        )  # fmt: skip
+    return np.asarray(step * np.sum(power[inside], axis=0))

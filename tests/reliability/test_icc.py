@@ -1,0 +1,119 @@
+"""Intraclass correlations against published tables, pingouin, and simulation."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from impc.errors import DataError, InputError
+from impc.reliability.icc import (
+    FORMS,
+    Form,
+    icc,
+    mean_squares,
+    minimal_detectable_change,
+    standard_error_of_measurement,
+)
+
+#: Shrout and Fleiss, Psychological Bulletin 86 (1979) 420, table 2: six targets, four judges.
+SHROUT_FLEISS = np.array(
+    [[9, 2, 5, 8], [6, 1, 3, 2], [8, 4, 6, 8], [7, 1, 2, 6], [10, 5, 6, 9], [6, 2, 4, 7]], float
+)
+
+
+def test_mean_squares_of_shrout_and_fleiss() -> None:
+    """Their table 3."""
+    found = mean_squares(SHROUT_FLEISS)
+    assert found.subjects == pytest.approx(11.24, abs=5e-3)
+    assert found.within == pytest.approx(6.26, abs=5e-3)
+    assert found.occasions == pytest.approx(32.49, abs=5e-3)
+    assert found.error == pytest.approx(1.02, abs=5e-3)
+
+
+@pytest.mark.parametrize(
+    ("form", "value"),
+    [("1", 0.17), ("A,1", 0.29), ("C,1", 0.71), ("k", 0.44), ("A,k", 0.62), ("C,k", 0.91)],
+)
+def test_estimates_of_shrout_and_fleiss(form: Form, value: float) -> None:
+    """Their table 4."""
+    assert icc(SHROUT_FLEISS, form).value == pytest.approx(value, abs=5e-3)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_intervals_cover(form: Form) -> None:
+    """1000 tables of 15 subjects on 3 occasions with known variances; seed 3."""
+    rng = np.random.default_rng(3)
+    subject, occasion, error = 1.0, 0.0, 0.7
+    k = 3
+    single = subject**2 / (subject**2 + error**2)
+    truth = single if form.endswith("1") else k * single / (1 + (k - 1) * single)
+    inside = 0
+    for _ in range(1000):
+        scores = (
+            subject * rng.standard_normal((15, 1))
+            + occasion * rng.standard_normal((1, k))
+            + error * rng.standard_normal((15, k))
+        )
+        found = icc(scores, form)
+        inside += found.low <= truth <= found.high
+    assert 0.93 <= inside / 1000 <= 0.97
+
+
+def test_negative_estimates_are_reported() -> None:
+    scores = np.array([[1.0, 3.0], [3.0, 1.0], [2.0, 2.1]])
+    assert icc(scores, "C,1").value < 0
+    assert icc(scores, "A,1").value < 0
+    assert np.isnan(icc(scores, "A,k").value), "its denominator is negative"
+    mild = np.array(
+        [
+            [0.3, 0.8, 0.3],
+            [-1.3, 0.9, 0.4],
+            [-0.5, 0.6, 0.4],
+            [0.3, 0.0, 0.5],
+            [-0.7, -0.2, -0.5],
+            [0.6, 0.0, -0.3],
+        ]
+    )
+    assert icc(mild, "A,k").value < 0
+
+
+def test_missing_cells_leave_subjects_out() -> None:
+    scores = np.vstack([SHROUT_FLEISS, [5.0, np.nan, 3.0, 4.0]])
+    found = icc(scores, "A,1")
+    assert found.left_out == 1
+    assert found.value == icc(SHROUT_FLEISS, "A,1").value
+
+
+def test_perfect_agreement_and_no_variance() -> None:
+    same = np.repeat(np.arange(5.0)[:, None], 3, axis=1)
+    for form in FORMS:
+        found = icc(same, form)
+        assert (found.value, found.low, found.high) == (1.0, 1.0, 1.0)
+    assert np.isnan(icc(np.ones((4, 3)), "A,1").value)
+
+
+def test_consistency_ignores_a_shift_of_occasions_and_agreement_does_not() -> None:
+    shifted = SHROUT_FLEISS + np.array([0, 5, 10, 15])
+    assert icc(shifted, "C,1").value == pytest.approx(icc(SHROUT_FLEISS, "C,1").value)
+    assert icc(shifted, "A,1").value < icc(SHROUT_FLEISS, "A,1").value
+
+
+def test_measurement_error() -> None:
+    """SEM = SD sqrt(1 - ICC), and 1.96 sqrt(2) of it."""
+    sem = standard_error_of_measurement(SHROUT_FLEISS, 0.75)
+    assert sem == pytest.approx(np.std(SHROUT_FLEISS, ddof=1) / 2)
+    assert minimal_detectable_change(sem) == pytest.approx(1.959964 * np.sqrt(2) * sem)
+
+
+@pytest.mark.parametrize(
+    ("scores", "match"),
+    [(np.ones((5, 1)), "1 occasion"), (np.ones((1, 3)), "1 subject"), (np.ones(3), "dimensions")],
+)
+def test_too_little_is_a_sentence(scores: np.ndarray, match: str) -> None:
+    with pytest.raises(DataError, match=match):
+        icc(scores)
+
+
+def test_unknown_forms_are_refused() -> None:
+    with pytest.raises(InputError, match="ICC form"):
+        icc(SHROUT_FLEISS, "2,1")  # type: ignore[arg-type]
