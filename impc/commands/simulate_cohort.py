@@ -11,7 +11,7 @@ import click
 if TYPE_CHECKING:
     import numpy as np
 
-__all__ = ["cohort"]
+__all__ = ["cohort", "random_person"]
 
 _PLANT, _STEP = "plants:seated_balance_for", "plants:seated_balance_step_for"
 _TORQUE = "plants:ternary_torque"
@@ -66,7 +66,7 @@ def cohort(out: Path, **given: Any) -> None:
         for number in numbers:
             name = f"{number + 1:0{max(width, 2)}d}"
             group = "first" if number < (given["subjects"] + 1) // 2 else "second"
-            person = _person(rng)
+            person = random_person(rng)
             row = (group, person["mass"], person["height"], person["sex"])
             rows.append("\t".join([f"sub-{name}", *map(str, row)]))
             factor = given["difference"] if group == "second" else 1.0
@@ -86,7 +86,8 @@ def cohort(out: Path, **given: Any) -> None:
     click.echo(f"{given['subjects']} subjects, {given['visits']} visits: {out / 'study.toml'}")
 
 
-def _person(rng: np.random.Generator) -> dict[str, Any]:
+def random_person(rng: np.random.Generator) -> dict[str, Any]:
+    """Body mass (kg), height (m) and sex of an adult."""
     sex = "male" if rng.random() < 0.5 else "female"
     height = rng.normal(1.76 if sex == "male" else 1.63, 0.06)
     mass = rng.normal(23.0, 2.0) * height**2

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from impc.commands.simulate_cohort import random_person
+
 if TYPE_CHECKING:
     import numpy as np
 
@@ -23,13 +25,15 @@ _DWELL, _DURATION = 0.12, 242 * 0.12
 # Price of angles and rates, size of the sway that the subject makes itself (N m), noise of the two
 # angles (degrees): open eyes, closed eyes, vibration of the trunk's muscles.
 _CONDITIONS = {
-    "EO": (1.0, 0.5, (0.10, 0.15)),
-    "EC": (0.6, 0.8, (0.12, 0.20)),
-    "VIB": (0.75, 1.0, (0.15, 0.30)),
+    "EO": (1.0, 4.0, (0.10, 0.30)),
+    "EC": (0.6, 6.0, (0.12, 0.40)),
+    "VIB": (0.75, 7.0, (0.15, 0.60)),
 }
-# Deviations of logarithms: of prices and of sway between subjects, and of sway at a visit, in a
+# Deviations of logarithms: of prices and of sway between subjects, of both at a visit, of sway in a
 # trial; each visit lowers the sway by the learning.
-_PRICE, _SWAY, _VISIT, _TRIAL, _LEARNING = 0.35, 0.30, 0.08, 0.10, -0.03
+_PRICE, _SWAY, _VISIT, _TRIAL, _LEARNING = 0.8, 0.4, 0.25, 0.10, -0.03
+# Lean of seat and trunk at a visit, degrees: RMS is about upright and counts it.
+_LEAN = (0.1, 0.8)
 
 
 @click.command("reliability-study")
@@ -47,9 +51,9 @@ _PRICE, _SWAY, _VISIT, _TRIAL, _LEARNING = 0.35, 0.30, 0.08, 0.10, -0.03
 def reliability_study(out: Path, **given: Any) -> None:
     """Thirty subjects, three visits, three conditions and three trials on the seat.
 
-    Subjects differ in what angles and rates cost them and in how much they sway, visits and trials
-    in the sway. Closed eyes and vibration change prices, sway and noise. 29.04 s a trial, one
-    period of the ternary torque, 100 samples a second.
+    Subjects differ in body; subjects and visits in what angles and rates cost and in how much the
+    body sways; visits in how the body leans; trials in the sway. Closed eyes and vibration change
+    prices, sway and noise. 29.04 s a trial, one period of the ternary torque, 100 samples a second.
     """
     import numpy as np  # noqa: PLC0415
 
@@ -58,7 +62,6 @@ def reliability_study(out: Path, **given: Any) -> None:
 
     require_writable(out)
     rng = np.random.default_rng(given["seed"])
-    plant = make_plant(plant_source(_PLANT, {}), ("perturbation",))
     torque = np.asarray(
         import_function(_TORQUE)(dwell=_DWELL, duration=_DURATION, rate=_RATE), dtype=np.float64
     )
@@ -67,13 +70,16 @@ def reliability_study(out: Path, **given: Any) -> None:
     with click.progressbar(range(given["subjects"]), label="subjects") as numbers:
         for number in numbers:
             name = f"{number + 1:0{width}d}"
+            plant = make_plant(plant_source(_PLANT, random_person(rng)), ("perturbation",))
             price, sway = np.exp(np.array([_PRICE, _SWAY]) * rng.standard_normal(2))
             truth[name] = {"price": float(price), "sway": float(sway)}
             for visit in range(given["visits"]):
                 files: dict[str, bytes] = {}
+                lean = np.array(_LEAN) * rng.standard_normal(2)
                 for condition in _CONDITIONS:
-                    level = sway * np.exp(_VISIT * rng.standard_normal() + _LEARNING * visit)
-                    cell = _cell(plant, torque, condition, float(price), level, given, rng)
+                    here, level = np.exp(_VISIT * rng.standard_normal(2)) * (price, sway)
+                    level *= float(np.exp(_LEARNING * visit))
+                    cell = _cell(plant, torque, condition, (float(here), level), lean, given, rng)
                     stem = f"sub-{name}_ses-{visit + 1}_task-{condition}"
                     files |= {
                         f"{stem}_run-{run + 1}_motion.csv": content
@@ -82,6 +88,7 @@ def reliability_study(out: Path, **given: Any) -> None:
                 write_files(out / f"sub-{name}" / f"ses-{visit + 1}", files)
     settings = {
         "price": _PRICE, "sway": _SWAY, "visit": _VISIT, "trial": _TRIAL, "learning": _LEARNING,
+        "lean": _LEAN,
         "conditions": _CONDITIONS, **given,
     }  # fmt: skip
     text = json.dumps({"settings": settings, "subjects": truth}, indent=1) + "\n"
@@ -93,8 +100,8 @@ def _cell(
     plant: Plant,
     torque: Array,
     condition: str,
-    price: float,
-    sway: float,
+    size: tuple[float, float],
+    lean: Array,
     given: dict[str, Any],
     rng: np.random.Generator,
 ) -> list[bytes]:
@@ -106,7 +113,7 @@ def _cell(
     from impc.lqr import solve_lqr  # noqa: PLC0415
     from impc.weights import stage_weights  # noqa: PLC0415
 
-    factor, own, noise = _CONDITIONS[condition]
+    (price, sway), (factor, own, noise) = size, _CONDITIONS[condition]
     v = np.array([0.70, 0.65, 0.22, 0.20])
     v /= np.linalg.norm(v)
     Q = 1e-2 * np.eye(plant.n)
@@ -114,8 +121,8 @@ def _cell(
     K = solve_lqr(plant, stage_weights(Q, 1)).K
     files = []
     for _ in range(given["trials"]):
-        size = own * sway * float(np.exp(_TRIAL * rng.standard_normal()))
-        outputs = np.degrees(_simulated(plant, K, torque, size, rng))
+        here = own * sway * float(np.exp(_TRIAL * rng.standard_normal()))
+        outputs = lean + np.degrees(_simulated(plant, K, torque, here, rng))
         outputs += np.array(noise) * rng.standard_normal(outputs.shape)
         columns = {
             "time": np.arange(len(torque)) / _RATE,

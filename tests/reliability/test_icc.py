@@ -117,3 +117,42 @@ def test_too_little_is_a_sentence(scores: np.ndarray, match: str) -> None:
 def test_unknown_forms_are_refused() -> None:
     with pytest.raises(InputError, match="ICC form"):
         icc(SHROUT_FLEISS, "2,1")  # type: ignore[arg-type]
+
+
+#: What pingouin 0.7.0 prints (GPL: not a dependency) for the tables of `pingouin_table`.
+PINGOUIN = {
+    (30, 3, 1): {
+        "1": (0.654972, 0.47, 0.80),
+        "A,1": (0.665827, 0.42, 0.82),
+        "C,1": (0.735216, 0.58, 0.85),
+        "k": (0.850634, 0.73, 0.92),
+        "A,k": (0.856680, 0.69, 0.93),
+        "C,k": (0.892819, 0.80, 0.95),
+    },
+    (12, 4, 2): {
+        "1": (0.600780, 0.33, 0.84),
+        "A,1": (0.604051, 0.34, 0.84),
+        "C,1": (0.624524, 0.35, 0.85),
+        "k": (0.857540, 0.66, 0.95),
+        "A,k": (0.859201, 0.67, 0.95),
+        "C,k": (0.869335, 0.68, 0.96),
+    },
+}
+
+
+def pingouin_table(n: int, k: int, seed: int) -> np.ndarray:
+    """Subjects of deviation 1, error of 0.6, a shift of 0.3 from one occasion to the next."""
+    own = np.random.default_rng(seed).standard_normal((n, 1))
+    error = 0.6 * np.random.default_rng(seed + 100).standard_normal((n, k))
+    return np.round(own + error + 0.3 * np.arange(k), 3)
+
+
+@pytest.mark.parametrize("size", PINGOUIN, ids=str)
+@pytest.mark.parametrize("form", FORMS)
+def test_pingouin_prints_the_same(size: tuple[int, int, int], form: Form) -> None:
+    """To its printed digits: six of the estimate, two of the ends."""
+    value, low, high = PINGOUIN[size][form]
+    found = icc(pingouin_table(*size), form)
+    assert found.value == pytest.approx(value, abs=5e-7)
+    assert found.low == pytest.approx(low, abs=5.001e-3)
+    assert found.high == pytest.approx(high, abs=5.001e-3)
