@@ -21,7 +21,9 @@ _COMMANDS = {
     "example": "impc.commands.example",
     "fit": "impc.commands.fit",
     "inspect": "impc.commands.inspect",
+    "key-parameters": "impc.commands.key_parameters",
     "reliability": "impc.commands.reliability",
+    "select": "impc.commands.select",
     "simulate": "impc.commands.simulate",
 }
 

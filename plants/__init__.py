@@ -6,6 +6,16 @@ This package knows nothing of `impc`; either can be used without the other.
 from plants.actuation import LinearSystem, delayed_muscle, pade_delay
 from plants.anthropometry import SeatLayout, from_anthropometry
 from plants.cursor import cursor_plant
+from plants.head_neck import (
+    HEAD_NECK_FIXED,
+    HEAD_NECK_PARAMETERS,
+    TABLE_4_3,
+    HeadNeckParameter,
+    head_neck_matrices,
+    head_neck_model,
+    head_neck_plant,
+    step_reference,
+)
 from plants.integration import runge_kutta_step
 from plants.named_examples import (
     bbm_example,
@@ -29,6 +39,10 @@ from plants.seated_subject import (
 from plants.ternary import maximal_recurrence, ternary_sequence, ternary_torque
 
 __all__ = [
+    "HEAD_NECK_FIXED",
+    "HEAD_NECK_PARAMETERS",
+    "TABLE_4_3",
+    "HeadNeckParameter",
     "LinearSystem",
     "SeatLayout",
     "SeatedBalanceLimits",
@@ -40,6 +54,9 @@ __all__ = [
     "cursor_plant",
     "delayed_muscle",
     "from_anthropometry",
+    "head_neck_matrices",
+    "head_neck_model",
+    "head_neck_plant",
     "mass_matrix",
     "maximal_recurrence",
     "nonlinear_dynamics",
@@ -49,6 +66,7 @@ __all__ = [
     "seated_balance_plant",
     "seated_balance_step_for",
     "seated_parameters_for",
+    "step_reference",
     "ternary_sequence",
     "ternary_torque",
     "unstable_integrator_example",

@@ -44,15 +44,16 @@ class StudyTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes
     ----------
-    plant : str
-        As the option of `impc fit`.
+    plant, model : str
+        As the option of `impc fit`; a model for `impc select`.
     recordings, table, bids : str or None
         Where the recordings are: one of the three.
     participants : str or None
         Table of the subjects.
     """
 
-    plant: str
+    plant: str = ""
+    model: str = ""
     recordings: str | None = None
     table: str | None = None
     bids: str | None = None
@@ -95,7 +96,7 @@ class Study:
 
     Attributes
     ----------
-    plant : str
+    plant, model : str
     configuration : Configuration
         Signals and settings of every fit.
     units : tuple of Unit
@@ -105,6 +106,7 @@ class Study:
     plant: str
     configuration: Configuration
     units: tuple[Unit, ...]
+    model: str = ""
 
 
 def read_study(path: Path) -> Study:
@@ -116,7 +118,7 @@ def read_study(path: Path) -> Study:
         When the file or a table cannot be used, no recording is found, a recording has no
         participant, or two units would have the same name.
     """
-    configuration = read_configuration(path, "study")
+    configuration = read_configuration(path, "study", "model", "select")
     try:
         table = msgspec.convert(configuration.study, StudyTable)
     except msgspec.ValidationError as error:
@@ -134,7 +136,7 @@ def read_study(path: Path) -> Study:
         files = tuple(file for _, file in trials)
         units.append(Unit(*key, files, group, dict(configuration.plant) | arguments))
     _require_distinct(path, units)
-    return Study(table.plant, configuration, tuple(units))
+    return Study(table.plant, configuration, tuple(units), table.model)
 
 
 def _found(path: Path, table: StudyTable) -> list[tuple[dict[str, str], Path]]:

@@ -10,6 +10,7 @@ import click
 
 from impc.commands.output import print_files
 from impc.commands.simulate_cohort import cohort
+from impc.commands.simulate_head_tracking import head_tracking
 from impc.commands.simulate_reliability import reliability_study
 
 if TYPE_CHECKING:
@@ -259,3 +260,4 @@ u_max = {given["torque_limit"]}                  # N m
 
 command.add_command(cohort)
 command.add_command(reliability_study)
+command.add_command(head_tracking)

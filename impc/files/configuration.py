@@ -36,6 +36,7 @@ UNKNOWN_UNIT = "?"
 _LARGEST = 1_000_000
 _LABELS = ("subject", "visit", "condition", "trial")
 _TABLES = ("recording", "signals", "plant", "fit")
+_STUDY = ("study", "model", "select")
 
 
 class RecordingTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -109,8 +110,8 @@ class Configuration(msgspec.Struct, frozen=True):
         Arguments of the plant's function; not interpreted here.
     fit : dict
         Settings of the fit; not interpreted here.
-    study : dict
-        The [study] table of a study; not interpreted here.
+    study, model, select : dict
+        Tables of a study; not interpreted here.
     """
 
     recording: RecordingTable
@@ -118,6 +119,8 @@ class Configuration(msgspec.Struct, frozen=True):
     plant: dict[str, Any] = {}
     fit: dict[str, Any] = {}
     study: dict[str, Any] = {}
+    model: dict[str, Any] = {}
+    select: dict[str, Any] = {}
 
 
 def read_configuration(path: Path, *more: str) -> Configuration:
@@ -133,7 +136,7 @@ def read_configuration(path: Path, *more: str) -> Configuration:
     content = _parsed(source, path)
     known = (*_TABLES, *more)
     _require_known(source, "", content, known)
-    tables = {name: content.get(name, {}) for name in (*_TABLES, "study")}
+    tables = {name: content.get(name, {}) for name in (*_TABLES, *_STUDY)}
     for name, table in tables.items():
         if not isinstance(table, dict):
             raise InputError(f"{source}: {name}", "is not a table", f"write [{name}]")
@@ -151,7 +154,7 @@ def read_configuration(path: Path, *more: str) -> Configuration:
         raise InputError(
             f"{source}: signals", "names no signal", "write a table [signals.NAME] for each"
         )
-    return Configuration(recording, signals, tables["plant"], tables["fit"], tables["study"])
+    return Configuration(recording, signals, *(tables[name] for name in ("plant", "fit", *_STUDY)))
 
 
 _Struct = TypeVar("_Struct", bound=msgspec.Struct)

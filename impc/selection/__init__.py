@@ -1,0 +1,1 @@
+"""Selection of sensitive and key parameters of a simulation model (chapters 4 and 5)."""

@@ -1,0 +1,109 @@
+"""Model-based bootstrap of a subset of parameters: percentile intervals.
+
+fit -> residuals, centred -> drawn again, one by one or in blocks -> added to the fit's outputs ->
+fitted again from the fit -> percentiles. Residuals of people are coloured: drawn one by one they
+give intervals that are too narrow, in blocks they do not (`impc.bootstrap.block_length`).
+Replicate k draws from the k-th child of the seed.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.arrays import Array, frozen
+from impc.bootstrap import block_residuals
+from impc.selection.estimation import estimate, residuals
+from impc.selection.model import Trial
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from impc.selection.estimation import Estimate
+    from impc.selection.model import ParametricModel
+
+__all__ = ["BootstrapIntervals", "bootstrap_subset", "draw_blocks", "draw_single"]
+
+_THREADS = 2
+
+
+@dataclass(frozen=True)
+class BootstrapIntervals:
+    """Percentiles of the replicates.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Free parameters.
+    value, low, high : Array
+        In their units.
+    level : float
+    drawn : Array
+        (replicates, free).
+    """
+
+    names: tuple[str, ...]
+    value: Array
+    low: Array
+    high: Array
+    level: float
+    drawn: Array
+
+    @property
+    def width(self) -> Array:
+        """Of the intervals."""
+        return np.asarray(self.high - self.low)
+
+
+def draw_single(parts: list[Array], rng: np.random.Generator) -> list[Array]:
+    """Rows of all trials' residuals, one by one."""
+    pooled = np.concatenate([item - np.mean(item, axis=0) for item in parts])
+    return [pooled[rng.integers(len(pooled), size=len(item))] for item in parts]
+
+
+def draw_blocks(parts: list[Array], rng: np.random.Generator) -> list[Array]:
+    """Moving blocks of the residuals."""
+    return block_residuals(parts, rng)
+
+
+def bootstrap_subset(
+    model: ParametricModel,
+    trials: Sequence[Trial],
+    fit: Estimate,
+    replicates: int,
+    seed: int,
+    draw: Callable[[list[Array], np.random.Generator], list[Array]] = draw_single,
+    *,
+    level: float = 0.95,
+    progress: Callable[[], None] = lambda: None,
+) -> BootstrapIntervals:
+    """Intervals of the free parameters of a fit."""
+    theta = np.array(fit.theta)
+    left = residuals(model, theta, trials)
+    clean = [np.asarray(model.simulate(theta, item.input)) for item in trials]
+
+    def one(index: int) -> Array:
+        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index,)))
+        again = [
+            Trial(item.input, outputs + noise)
+            for item, outputs, noise in zip(trials, clean, draw(left, rng), strict=True)
+        ]
+        found = np.array(estimate(model, again, fit.free, theta).theta)[list(fit.free)]
+        progress()
+        return found
+
+    # The compiled recursion lets other threads run.
+    with ThreadPoolExecutor(_THREADS) as pool:
+        drawn = np.array(list(pool.map(one, range(replicates))))
+    low, high = np.quantile(drawn, [0.5 - level / 2, 0.5 + level / 2], axis=0)
+    return BootstrapIntervals(
+        tuple(model.names[index] for index in fit.free),
+        frozen(theta[list(fit.free)]),
+        frozen(low),
+        frozen(high),
+        level,
+        frozen(drawn),
+    )

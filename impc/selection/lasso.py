@@ -1,0 +1,215 @@
+"""LASSO selection (C.5): parameters that leave their typical values when that costs.
+
+    min over t in [-1, 1]^k   (1/N) sum e^2 + lambda ||t - t_typ||_1
+
+`proximal_lasso` solves it as it is: Gauss-Newton steps whose quadratic programs keep the absolute
+values and the bounds, so that parameters land exactly on their typical values. `table_c1` is the
+dissertation's: Nelder and Mead with bounds by t = sin(u), a threshold of 0.005, and lambda moved
+until n parameters are beyond it. Both end with the relaxed refit: the chosen ones by plain least
+squares. The scale of the first term is lost; here it is the mean square in the outputs' unit
+squared.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy.optimize
+
+from impc.arrays import Array, frozen
+from impc.selection.estimation import estimate
+from impc.selection.model import normalised, physical, sensitivity
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from impc.selection.estimation import Estimate
+    from impc.selection.model import ParametricModel, Trial
+
+__all__ = ["Lasso", "lasso_of_size", "proximal_lasso", "table_c1"]
+
+_THRESHOLD, _FIRST = 0.005, 0.13
+_SWEEPS, _ROUNDS, _HALVINGS = 2000, 60, 30
+
+
+@dataclass(frozen=True)
+class Lasso:
+    """A selection.
+
+    Attributes
+    ----------
+    weight : float
+        lambda.
+    t : Array
+        Normalised parameters (k,).
+    selected : tuple of int
+        Those away from their typical values.
+    refit : Estimate or None
+        Of the selected ones; None when none is.
+    objective : float
+    solves : int
+        Problems (C.5) that were solved.
+    """
+
+    weight: float
+    t: Array
+    selected: tuple[int, ...]
+    refit: Estimate | None
+    objective: float
+    solves: int
+
+
+def proximal_lasso(
+    model: ParametricModel, trials: Sequence[Trial], weight: float, start: Array | None = None
+) -> tuple[Array, float]:
+    """Solve (C.5): normalised parameters and the objective."""
+    typical = normalised(model, np.asarray(model.typical))
+    t = typical.copy() if start is None else np.clip(start, -1, 1)
+
+    def value(at: Array) -> float:
+        return _mean_square(model, trials, at) + weight * float(np.sum(np.abs(at - typical)))
+
+    current, damping = value(t), 1e-6
+    for _ in range(_ROUNDS):
+        H, g = _quadratic(model, trials, t)
+        step = _box_lasso(H + damping * np.eye(len(t)), g, t, typical, weight) - t
+        share, accepted = 1.0, False
+        for _ in range(_HALVINGS):
+            moved = value(t + share * step)
+            if moved < current:
+                accepted = True
+                break
+            share /= 2
+        if not accepted:
+            break
+        gained = current - moved
+        t, current = t + share * step, moved
+        # Parameters that a shortened step left next to their typical value belong on it.
+        if share < 1:
+            damping = max(10 * damping, 1e-6)
+        if gained < 1e-10 * max(current, 1e-300):
+            break
+    return np.asarray(t), current
+
+
+def lasso_of_size(model: ParametricModel, trials: Sequence[Trial], count: int) -> Lasso:
+    """The largest selection of at most `count` parameters along lambda, by bisection."""
+    low, high, solves = 1e-8, 1e3, 0
+    best: tuple[float, Array, float] | None = None
+    for _ in range(40):
+        middle = float(np.sqrt(low * high))
+        t, objective = proximal_lasso(model, trials, middle)
+        solves += 1
+        chosen = _selected(model, t)
+        if len(chosen) <= count:
+            high = middle
+            if best is None or len(chosen) >= len(_selected(model, best[1])):
+                best = (middle, t, objective)
+            if len(chosen) == count:
+                break
+        else:
+            low = middle
+        if high / low < 1.01:
+            break
+    if best is None:
+        best = (high, *proximal_lasso(model, trials, high))
+    return _finished(model, trials, *best, solves)
+
+
+def table_c1(
+    model: ParametricModel, trials: Sequence[Trial], count: int, *, solves: int = 12
+) -> Lasso:
+    """Table C.1: Nelder and Mead, a threshold of 0.005, lambda moved until `count` are beyond it.
+
+    The rule that moves lambda is lost: it is multiplied by 2 when too many parameters moved,
+    divided by 2 when too few, the factor's logarithm halved when the direction changes.
+    """
+    typical = normalised(model, np.asarray(model.typical))
+    weight, factor, before = _FIRST, 2.0, 0
+    for number in range(1, solves + 1):
+
+        def value(u: Array, weight: float = weight) -> float:
+            t = np.sin(u)
+            return _mean_square(model, trials, t) + weight * float(np.sum(np.abs(t - typical)))
+
+        found = scipy.optimize.minimize(
+            value, np.arcsin(np.clip(typical, -1, 1)), method="Nelder-Mead",
+            options={"maxfev": 200 * len(typical)},
+        )  # fmt: skip
+        t = np.sin(found.x)
+        moved = int(np.count_nonzero(np.abs(t - typical) > _THRESHOLD))
+        if moved == count or number == solves:
+            break
+        direction = 1 if moved > count else -1
+        if before and direction != before:
+            factor = float(np.sqrt(factor))
+        weight, before = weight * factor**direction, direction
+    return _finished(model, trials, weight, np.asarray(t), float(found.fun), number, _THRESHOLD)
+
+
+def _finished(
+    model: ParametricModel,
+    trials: Sequence[Trial],
+    weight: float,
+    t: Array,
+    objective: float,
+    solves: int,
+    threshold: float = 0.0,
+) -> Lasso:
+    chosen = _selected(model, t, threshold)
+    start = np.array(model.typical)
+    start[list(chosen)] = physical(model, t)[list(chosen)]
+    refit = estimate(model, trials, chosen, start) if chosen else None
+    return Lasso(weight, frozen(t), chosen, refit, objective, solves)
+
+
+def _selected(model: ParametricModel, t: Array, threshold: float = 0.0) -> tuple[int, ...]:
+    typical = normalised(model, np.asarray(model.typical))
+    return tuple(int(item) for item in np.flatnonzero(np.abs(t - typical) > max(threshold, 1e-12)))
+
+
+def _mean_square(model: ParametricModel, trials: Sequence[Trial], t: Array) -> float:
+    theta, total, count = physical(model, t), 0.0, 0
+    for trial in trials:
+        error = model.simulate(theta, trial.input) - trial.outputs
+        total, count = total + float(np.sum(error**2)), count + error.size
+    return total / count if np.isfinite(total) else np.inf
+
+
+def _quadratic(model: ParametricModel, trials: Sequence[Trial], t: Array) -> tuple[Array, Array]:
+    """H and g of the mean square about t: g'd + d'Hd/2."""
+    size = model.size
+    H, g, count = np.zeros((size, size)), np.zeros(size), 0
+    for trial in trials:
+        outputs, derivative = sensitivity(model, physical(model, t), trial.input)
+        J = derivative.reshape(-1, size)
+        H += J.T @ J
+        g += J.T @ (outputs - trial.outputs).ravel()
+        count += len(J)
+    return 2 * H / count, 2 * g / count
+
+
+def _box_lasso(H: Array, g: Array, t: Array, typical: Array, weight: float) -> Array:
+    """argmin over x in [-1, 1]^k of g'(x - t) + (x - t)'H(x - t)/2 + weight |x - typical|_1.
+
+    Cyclic coordinate descent: each coordinate's minimum is a soft threshold, cut at the bounds.
+    """
+    x = t.copy()
+    gradient = g.copy()
+    for _ in range(_SWEEPS):
+        largest = 0.0
+        for i in range(len(x)):
+            curvature = H[i, i]
+            wanted = x[i] - gradient[i] / curvature - typical[i]
+            shrunk = np.sign(wanted) * max(abs(wanted) - weight / curvature, 0.0)
+            moved = min(max(typical[i] + shrunk, -1.0), 1.0)
+            change = moved - x[i]
+            if change != 0:
+                gradient += H[:, i] * change
+                x[i] = moved
+                largest = max(largest, abs(change))
+        if largest < 1e-12:
+            break
+    return np.asarray(x)

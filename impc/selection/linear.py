@@ -1,0 +1,177 @@
+"""Linear models x' = A(theta) x + B(theta) r, y = C(theta) x, with exact sensitivities.
+
+The input is held between samples, so that
+
+    x+ = Ad x + Bd r,      [Ad Bd; 0 I] = exp( [A B; 0 0] dt )
+
+is exact, however fast a pole is. Derivatives of the exponential are Fréchet derivatives along those
+of A and B, which CasADi gives; with X_i = dx / dtheta_i
+
+    X_i+ = Ad X_i + (dAd/dtheta_i) x + (dBd/dtheta_i) r.
+
+`kronecker_sensitivity` is the same recursion as the dissertation writes it, (A.3): one row of
+blocks, and Kronecker products. It serves as a check.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import casadi as ca
+import numba
+import numpy as np
+import scipy.linalg
+
+from impc.arrays import Array
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+__all__ = ["Discrete", "discretised", "kronecker_sensitivity", "linear_functions"]
+
+
+class Discrete(NamedTuple):
+    """Sampled matrices and their derivatives, the parameter's axis first: (k, ...)."""
+
+    A: Array
+    B: Array
+    C: Array
+    dA: Array
+    dB: Array
+    dC: Array
+
+
+def discretised(matrices: ca.Function, theta: Array, dt: float) -> Discrete:
+    """Sample a model of CasADi, theta -> A, B, C, at one point."""
+    A, B, C = (item.full() for item in matrices(theta))
+    symbol = ca.SX.sym("theta", len(theta))
+    parts = matrices(symbol)
+    derivative = ca.Function(
+        "derivative", [symbol], [ca.jacobian(ca.vec(part), symbol) for part in parts]
+    )
+    return _sampled((A, B, C), [item.full() for item in derivative(theta)], dt)
+
+
+def linear_functions(
+    matrices: ca.Function, dt: float
+) -> tuple[Callable[[Array, Array], Array], Callable[[Array, Array], tuple[Array, Array]]]:
+    """Simulation and Jacobian of a `ParametricModel` from rest.
+
+    Parameters
+    ----------
+    matrices : casadi.Function
+        theta (k) -> A (n, n), B (n, d), C (p, n), continuous.
+    dt : float
+        Sample time, s.
+    """
+    symbol = ca.SX.sym("theta", matrices.size1_in(0))
+    parts = matrices(symbol)
+    derivative = ca.Function(
+        "derivative", [symbol], [ca.jacobian(ca.vec(part), symbol) for part in parts]
+    )
+
+    def simulate(theta: Array, given: Array) -> Array:
+        A, B, C = (item.full() for item in matrices(theta))
+        n = len(A)
+        exponential = np.asarray(scipy.linalg.expm(_joined(A, B) * dt))
+        x = _states(
+            np.ascontiguousarray(exponential[:n, :n]),
+            np.ascontiguousarray(exponential[:n, n:]),
+            np.ascontiguousarray(given),
+        )
+        return np.asarray(x @ C.T)
+
+    def jacobian(theta: Array, given: Array) -> tuple[Array, Array]:
+        continuous = [item.full() for item in matrices(theta)]
+        found = _sampled(continuous, [item.full() for item in derivative(theta)], dt)
+        x, X = _with_derivatives(found.A, found.B, found.dA, found.dB, np.ascontiguousarray(given))
+        outputs = x @ found.C.T
+        on_state = np.einsum("pn,skn->spk", found.C, X)
+        on_output = np.einsum("kpn,sn->spk", found.dC, x)
+        return np.asarray(outputs), np.asarray(on_state + on_output)
+
+    return simulate, jacobian
+
+
+def kronecker_sensitivity(found: Discrete, given: Array) -> Array:
+    """(A.3) with Kronecker products: derivative of the outputs (samples, p, k); slow."""
+    k, n, d = len(found.dA), found.A.shape[0], found.B.shape[1]
+    dA, dB, dC = (np.hstack(list(item)) for item in (found.dA, found.dB, found.dC))
+    x, X = np.zeros((n, 1)), np.zeros((n, k))
+    eye = np.eye(k)
+    rows = np.empty((len(given), found.C.shape[0], k))
+    for sample, r in enumerate(np.asarray(given).reshape(len(given), d, 1)):
+        rows[sample] = dC @ np.kron(eye, x) + found.C @ X
+        X = dA @ np.kron(eye, x) + found.A @ X + dB @ np.kron(eye, r)
+        x = found.A @ x + found.B @ r
+    return rows
+
+
+def _sampled(parts: Any, derivatives: list[Array], dt: float) -> Discrete:
+    A, B, C = parts
+    n, d = B.shape
+    k = derivatives[0].shape[1]
+    joined = _joined(A, B) * dt
+    dA, dB = np.empty((k, n, n)), np.empty((k, n, d))
+    exponential = np.asarray(scipy.linalg.expm(joined))
+    for index in range(k):
+        along = np.zeros_like(joined)
+        along[:n, :n] = derivatives[0][:, index].reshape(n, n, order="F") * dt
+        along[:n, n:] = derivatives[1][:, index].reshape(n, d, order="F") * dt
+        change = np.asarray(scipy.linalg.expm_frechet(joined, along, compute_expm=False))
+        dA[index], dB[index] = change[:n, :n], change[:n, n:]
+    dC = derivatives[2].T.reshape(k, n, C.shape[0]).transpose(0, 2, 1)
+    return Discrete(
+        np.ascontiguousarray(exponential[:n, :n]),
+        np.ascontiguousarray(exponential[:n, n:]),
+        np.asarray(C),
+        dA,
+        dB,
+        np.ascontiguousarray(dC),
+    )
+
+
+def _joined(A: Array, B: Array) -> Array:
+    n, d = B.shape
+    joined = np.zeros((n + d, n + d))
+    joined[:n, :n], joined[:n, n:] = A, B
+    return joined
+
+
+@numba.njit(cache=True, nogil=True)
+def _states(A: Any, B: Any, given: Any) -> Any:
+    samples, n, d = len(given), A.shape[0], B.shape[1]
+    x = np.zeros((samples, n))
+    for k in range(samples - 1):
+        for i in range(n):
+            total = 0.0
+            for j in range(n):
+                total += A[i, j] * x[k, j]
+            for j in range(d):
+                total += B[i, j] * given[k, j]
+            x[k + 1, i] = total
+    return x
+
+
+@numba.njit(cache=True, nogil=True)
+def _with_derivatives(A: Any, B: Any, dA: Any, dB: Any, given: Any) -> Any:
+    samples, n, d, count = len(given), A.shape[0], B.shape[1], len(dA)
+    x = np.zeros((samples, n))
+    X = np.zeros((samples, count, n))
+    for k in range(samples - 1):
+        for i in range(n):
+            total = 0.0
+            for j in range(n):
+                total += A[i, j] * x[k, j]
+            for j in range(d):
+                total += B[i, j] * given[k, j]
+            x[k + 1, i] = total
+        for p in range(count):
+            for i in range(n):
+                total = 0.0
+                for j in range(n):
+                    total += A[i, j] * X[k, p, j] + dA[p, i, j] * x[k, j]
+                for j in range(d):
+                    total += dB[p, i, j] * given[k, j]
+                X[k + 1, p, i] = total
+    return x, X

@@ -1,0 +1,158 @@
+"""The largest subsets of parameters that are estimated well enough together (C.4).
+
+    maximise |s|  subject to  rcond(F_s) > eps,  max diag F_s^-1 <= v,  |s| >= n_min
+
+F_s is the part of the information of the chosen parameters, the others being known. Taking one
+more parameter never lowers the variance of the others, so that every subset of a feasible set is
+feasible: sets are grown one parameter at a time, and only from feasible ones. With twelve
+parameters that is exhaustive search (4083 subsets of two and more) without the hopeless ones; with
+many it is a branch and bound with the same answer.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.errors import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from impc.arrays import Array
+
+__all__ = ["Selection", "exhaustive", "largest_subsets", "subset_variances", "sweep"]
+
+_EPS = float(np.finfo(np.float64).eps)
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Feasible subsets of the largest size for one bound.
+
+    Attributes
+    ----------
+    bound : float
+        v.
+    subsets : tuple of tuple of int
+        Best first: least largest variance. Empty when none of n_min or more is feasible.
+    variances : tuple of float
+        Largest variance of each.
+    """
+
+    bound: float
+    subsets: tuple[tuple[int, ...], ...]
+    variances: tuple[float, ...]
+
+    @property
+    def size(self) -> int:
+        """Number of parameters in each subset; 0 when there is none."""
+        return len(self.subsets[0]) if self.subsets else 0
+
+
+def subset_variances(informations: Sequence[Array], subsets: Sequence[Sequence[int]]) -> Array:
+    """Largest diagonal entry of F_s^-1 for subsets of one size, worst over several informations.
+
+    Infinite where F_s is singular to working precision. (5.5) with several subjects and visits.
+    """
+    chosen = np.asarray(subsets, dtype=int)
+    worst = np.zeros(len(chosen))
+    for F in informations:
+        parts = np.asarray(F)[chosen[:, :, None], chosen[:, None, :]]
+        # Scaled to a unit diagonal, so that rcond is that of correlations.
+        size = np.sqrt(np.einsum("sii->si", parts))
+        size = np.where(size > 0, size, 1.0)
+        scaled = parts / size[:, :, None] / size[:, None, :]
+        values, vectors = np.linalg.eigh(scaled)
+        usable = values[:, 0] > _EPS * values[:, -1]
+        inverse = np.einsum(
+            "sij,sj,sij->si", vectors, 1 / np.where(values > 0, values, np.inf), vectors
+        )
+        largest = np.max(inverse / size**2, axis=1)
+        worst = np.maximum(worst, np.where(usable, largest, np.inf))
+    return worst
+
+
+def largest_subsets(informations: Sequence[Array], bound: float, least: int = 2) -> Selection:
+    """Largest feasible subsets.
+
+    Parameters
+    ----------
+    informations : sequence of Array
+        F (k, k) of each subject and visit: the variance must hold for all.
+    bound : float
+        v, largest variance in normalised units.
+    least : int
+        n_min.
+
+    Raises
+    ------
+    InputError
+        When there is no information or the bound is not positive.
+    """
+    if not informations or not bound > 0:
+        raise InputError("selection", "needs an information and a positive bound", "give both")
+    count = len(informations[0])
+    level = [(index,) for index in range(count)]
+    kept = _feasible(informations, level, bound)
+    best = kept
+    while kept:
+        best = kept
+        known = {subset for subset, _ in kept}
+        grown = [
+            (*subset, index)
+            for subset, _ in kept
+            for index in range(subset[-1] + 1, count)
+            if all(
+                (*subset[:place], *subset[place + 1 :], index) in known
+                for place in range(len(subset))
+            )
+        ]
+        kept = _feasible(informations, grown, bound) if grown else []
+    if not best or len(best[0][0]) < least:
+        return Selection(bound, (), ())
+    ordered = sorted(best, key=lambda item: item[1])
+    return Selection(bound, tuple(item[0] for item in ordered), tuple(item[1] for item in ordered))
+
+
+def exhaustive(informations: Sequence[Array], bound: float, least: int = 2) -> Selection:
+    """The same by trying every subset: for checks, and up to twenty parameters.
+
+    Raises
+    ------
+    InputError
+        With more than twenty.
+    """
+    count = len(informations[0])
+    if count > 20:
+        raise InputError("parameters", f"are {count}", "use `largest_subsets`")
+    for size in range(count, least - 1, -1):
+        subsets = list(itertools.combinations(range(count), size))
+        found = _feasible(informations, subsets, bound)
+        if found:
+            ordered = sorted(found, key=lambda item: item[1])
+            return Selection(
+                bound, tuple(item[0] for item in ordered), tuple(item[1] for item in ordered)
+            )
+    return Selection(bound, (), ())
+
+
+def sweep(
+    informations: Sequence[Array], bounds: Sequence[float], least: int = 2
+) -> tuple[Selection, ...]:
+    """Selections over several bounds: .05, .15, ... .95 in the dissertation."""
+    return tuple(largest_subsets(informations, bound, least) for bound in bounds)
+
+
+def _feasible(
+    informations: Sequence[Array], subsets: Sequence[tuple[int, ...]], bound: float
+) -> list[tuple[tuple[int, ...], float]]:
+    variances = subset_variances(informations, subsets)
+    return [
+        (subset, float(value))
+        for subset, value in zip(subsets, variances, strict=True)
+        if value <= bound
+    ]

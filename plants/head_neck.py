@@ -1,0 +1,260 @@
+"""Head tracking in yaw and pitch: visual, vestibular, proprioceptive and intrinsic pathways.
+
+r is the angle to follow, y that of the head; e = r - y. With the trunk at rest
+
+    visual           T_vis = Kvis exp(-tau s) e
+    vestibular       T_vcr = Kvcr s^2 (tau1A s + 1)(tauCNS1 s + 1) / ((tauC s + 1)(tauCNS2 s + 1)) y
+    proprioceptive   T_ccr = Kccr (tauMS1 s + 1)(tauMS2 s + 1) y
+    torque           T = (T_vis - T_vcr - T_ccr) / (tau_c s + 1)
+    head             (J s^2 + B s + K - m g l) y = T        m g l in pitch only
+
+(Peng, Hain, Peterson 1996; Chen et al. 2002; the dissertation's chapters 4 and 5.) The vestibular
+and proprioceptive blocks are improper one by one, so the loop is built as one fraction:
+
+    y = N / D u,   u = Kvis exp(-tau s) (r - y),   N = (tauC s + 1)(tauCNS2 s + 1)
+    D = (tau_c s + 1)(J s^2 + B s + K - m g l) N + Kvcr s^2 (tau1A s + 1)(tauCNS1 s + 1)
+        + Kccr (tauMS1 s + 1)(tauMS2 s + 1) N
+
+of degree 5, with a Padé approximant of the delay. Time is measured in units of 1/3 s inside, so
+that the coefficients of the companion form differ by 1e4 and not by 1e9; its fast pole (about
+16 000 1/s) is left to an exact discretisation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import casadi as ca
+import control
+import numpy as np
+from numpy.typing import NDArray
+
+from plants._checks import finite_number, whole_number
+from plants.actuation import pade_delay
+
+__all__ = [
+    "HEAD_NECK_FIXED",
+    "HEAD_NECK_PARAMETERS",
+    "TABLE_4_3",
+    "Axis",
+    "HeadNeckParameter",
+    "head_neck_matrices",
+    "head_neck_model",
+    "head_neck_plant",
+    "step_reference",
+]
+
+Axis = Literal["yaw", "pitch"]
+_SCALE = 3.0  # rad/s
+
+
+@dataclass(frozen=True)
+class HeadNeckParameter:
+    """A candidate parameter: its unit, bounds, pathway and where they come from."""
+
+    name: str
+    meaning: str
+    unit: str
+    low: float
+    high: float
+    pathway: str
+    source: str
+
+
+_BOUNDS = "names: dissertation, table 4.2; bounds: likely, consistent with its interval widths"
+#: The twelve candidates of chapters 4 and 5, in their order.
+HEAD_NECK_PARAMETERS = tuple(
+    HeadNeckParameter(*row, _BOUNDS)
+    for row in (
+        ("Kvis", "visual gain", "N m/rad", 50.0, 1000.0, "visual"),
+        ("Kvcr", "vestibular gain", "N m s^2/rad", 500.0, 10000.0, "vestibular"),
+        ("Kccr", "proprioceptive gain", "N m/rad", 1.0, 300.0, "proprioceptive"),
+        ("tau", "visual delay", "s", 0.1, 0.4, "visual"),
+        ("tau1A", "lead of irregular vestibular afferents", "s", 0.01, 0.4, "vestibular"),
+        ("tauCNS1", "lead of the central nervous system", "s", 0.05, 1.0, "vestibular"),
+        ("tauC", "lag of irregular vestibular afferents", "s", 0.1, 5.0, "vestibular"),
+        ("tauCNS2", "lag of the central nervous system", "s", 5.0, 60.0, "vestibular"),
+        ("tauMS1", "first lead of the muscle spindle", "s", 0.01, 1.0, "proprioceptive"),
+        ("tauMS2", "second lead of the muscle spindle", "s", 0.01, 1.0, "proprioceptive"),
+        ("B", "intrinsic damping", "N m s/rad", 0.1, 5.0, "intrinsic"),
+        ("K", "intrinsic stiffness", "N m/rad", 0.1, 5.0, "intrinsic"),
+    )
+)
+#: Fixed: inertia of the head (yaw; pitch adds m l^2), torque converter, mass and lever in pitch.
+HEAD_NECK_FIXED = {
+    "J": (0.0148, "kg m^2", "Peng et al. 1996"),
+    "tau_c": (0.1, "s", "Peng et al. 1996"),
+    "m": (4.5, "kg", "chosen: lost"),
+    "l": (0.15, "m", "chosen: lost"),
+}
+#: Table 4.3 of the dissertation, means over ten subjects; None is fixed at the nominal mean.
+TABLE_4_3: dict[str, tuple[float | None, ...]] = {
+    "nominal": (428, 4860, 87.9, 0.263, 0.099, 0.675, 1.733, 27.2, 0.433, 0.439, 1.690, 2.170),
+    "fim": (279, None, 16.2, 0.242, 0.069, 0.918, None, None, None, None, None, None),
+    "lasso": (401, 8055, 36.4, 0.226, None, None, 2.200, None, None, None, None, None),
+}
+
+
+def head_neck_matrices(axis: Axis = "yaw", delay_order: int = 5) -> ca.Function:
+    """Return theta (12) -> A (5 + order, same), B (same, 1), C (1, same) of the closed loop.
+
+    Parameters
+    ----------
+    axis : {"yaw", "pitch"}
+    delay_order : int
+        Of the Padé approximant.
+
+    Raises
+    ------
+    ValueError
+        When the axis is unknown or the order out of range.
+    """
+    if axis not in ("yaw", "pitch"):
+        raise ValueError(f"axis: expected yaw or pitch, got {axis!r:.60}")
+    order = whole_number("delay_order", delay_order, "5 is usual", least=1, most=10)
+    theta = ca.SX.sym("theta", len(HEAD_NECK_PARAMETERS))
+    kvis, tau = theta[0], theta[3]
+    numerator, denominator = _inner(theta, axis)
+    lead = denominator[-1]
+    a = [coefficient / lead for coefficient in denominator[:-1]]
+    n = len(a)
+    inner = ca.SX.zeros(n, n)
+    for row in range(n - 1):
+        inner[row, row + 1] = 1
+    for column in range(n):
+        inner[n - 1, column] = -a[column]
+    seen = ca.SX.zeros(1, n)
+    for column, coefficient in enumerate(numerator):
+        seen[0, column] = coefficient / lead
+    enters = ca.SX.zeros(n, 1)
+    enters[n - 1] = 1
+    delay = pade_delay(1.0, order)  # of one second; its states run 1 / (tau scale) times as fast
+    rate = 1 / (tau * _SCALE)
+    D = np.asarray(delay.A)
+    E, F = np.reshape(delay.B, (order, 1)), np.reshape(delay.C, (1, order))
+    through = float(np.ravel(delay.D)[0])
+    # Delayed signal: F z + through w, z' = rate (D z + E w), w = Kvis (r - y).
+    A = ca.vertcat(
+        ca.horzcat(inner - enters * through * kvis @ seen, enters @ ca.SX(F)),
+        ca.horzcat(-rate * kvis * ca.SX(E) @ seen, rate * ca.SX(D)),
+    )
+    B = ca.vertcat(enters * through * kvis, rate * kvis * ca.SX(E))
+    C = ca.horzcat(seen, ca.SX.zeros(1, order))
+    return ca.Function(
+        "head_neck", [theta], [_SCALE * A, _SCALE * B, C], ["theta"], ["A", "B", "C"]
+    )
+
+
+def head_neck_plant(values: NDArray[np.float64], axis: Axis = "yaw", delay_order: int = 5) -> Any:
+    """Return the closed loop from reference to head angle as a continuous control.StateSpace.
+
+    Raises
+    ------
+    ValueError
+        When there are not twelve finite values, or as `head_neck_matrices`.
+    """
+    given = np.asarray(values, dtype=np.float64)
+    if given.shape != (len(HEAD_NECK_PARAMETERS),):
+        raise ValueError(f"values: expected 12 numbers, got an array of shape {given.shape}")
+    for item, value in zip(HEAD_NECK_PARAMETERS, given, strict=True):
+        finite_number(item.name, float(value), f"give it in {item.unit}")
+    A, B, C = (item.full() for item in head_neck_matrices(axis, delay_order)(given))
+    names: dict[str, Any] = {"inputs": ["reference"], "outputs": ["head"]}
+    return control.ss(A, B, C, 0, **names)
+
+
+def step_reference(
+    duration: float = 30.0,
+    rate: float = 60.0,
+    amplitude: float = 4.0,
+    shortest: float = 0.3,
+    longest: float = 0.9,
+    seed: int = 0,
+) -> NDArray[np.float64]:
+    """Pseudorandom steps of random duration and size: the reference of chapters 4 and 5.
+
+    Parameters
+    ----------
+    duration : float
+        s.
+    rate : float
+        Samples per s.
+    amplitude : float
+        Largest magnitude, in the unit wanted. The dissertation's is lost.
+    shortest, longest : float
+        Of a step, s: 0.3 and 0.9 in chapter 5.
+    seed : int
+
+    Returns
+    -------
+    ndarray, shape (round(duration * rate),)
+    """
+    rng = np.random.default_rng(seed)
+    samples = round(duration * rate)
+    values = np.empty(samples)
+    first = 0
+    while first < samples:
+        last = first + max(1, round(rng.uniform(shortest, longest) * rate))
+        values[first:last] = rng.uniform(-amplitude, amplitude)
+        first = last
+    return values
+
+
+def _inner(theta: Any, axis: Axis) -> tuple[list[Any], list[Any]]:
+    """Coefficients of N and D, lowest first, of p = s / scale."""
+    kvcr, kccr, t1a, tcns1, tc, tcns2, tms1, tms2, damping, stiffness = (
+        theta[index] for index in (1, 2, 4, 5, 6, 7, 8, 9, 10, 11)
+    )
+    J, converter, m, lever = (HEAD_NECK_FIXED[name][0] for name in ("J", "tau_c", "m", "l"))
+    gravity = m * 9.81 * lever if axis == "pitch" else 0.0
+    inertia = J + m * lever**2 if axis == "pitch" else J
+    N = _product([1, tc], [1, tcns2])
+    head = _product([1, converter], [stiffness - gravity, damping, inertia])
+    canal = _product([0, 0, kvcr], _product([1, t1a], [1, tcns1]))
+    spindle = _product([kccr, kccr * tms1], [1, tms2])
+    D = _sum(_product(head, N), canal, _product(spindle, N))
+    return (
+        [item * _SCALE**power for power, item in enumerate(N)],
+        [item * _SCALE**power for power, item in enumerate(D)],
+    )
+
+
+def _product(one: list[Any], other: list[Any]) -> list[Any]:
+    found: list[Any] = [0] * (len(one) + len(other) - 1)
+    for i, a in enumerate(one):
+        for j, b in enumerate(other):
+            found[i + j] = found[i + j] + a * b
+    return found
+
+
+def _sum(*polynomials: list[Any]) -> list[Any]:
+    found: list[Any] = [0] * max(map(len, polynomials))
+    for polynomial in polynomials:
+        for power, item in enumerate(polynomial):
+            found[power] = found[power] + item
+    return found
+
+
+def head_neck_model(axis: Axis = "yaw", delay_order: int = 5) -> dict[str, Any]:
+    """Describe the model for a selection of parameters: names, bounds, pathways, matrices.
+
+    Typical values are the nominal column of table 4.3.
+
+    Raises
+    ------
+    ValueError
+        As `head_neck_matrices`.
+    """
+    return {
+        "names": [item.name for item in HEAD_NECK_PARAMETERS],
+        "low": [item.low for item in HEAD_NECK_PARAMETERS],
+        "high": [item.high for item in HEAD_NECK_PARAMETERS],
+        "typical": [float(value) for value in TABLE_4_3["nominal"] if value is not None],
+        "pathways": [item.pathway for item in HEAD_NECK_PARAMETERS],
+        "units": [item.unit for item in HEAD_NECK_PARAMETERS],
+        "inputs": ["reference"],
+        "outputs": ["head"],
+        "rate": 60.0,
+        "matrices": head_neck_matrices(axis, delay_order),
+    }
