@@ -49,7 +49,7 @@ def test_sensitivities_against_differences() -> None:
             ends.append(MODEL.simulate(physical(MODEL, moved), given))
         difference = (ends[0] - ends[1]) / 2e-4
         scale = np.max(np.abs(exact[..., index])) + 1e-6 * np.max(np.abs(exact))
-        assert np.max(np.abs(difference - exact[..., index])) <= 1e-5 * scale
+        assert np.max(np.abs(difference - exact[..., index])) <= 1e-6 * scale
 
 
 def test_sensitivities_against_the_kronecker_recursion() -> None:
