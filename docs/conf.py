@@ -1,8 +1,15 @@
-"""The documentation site: pages in Markdown, the API from docstrings."""
+"""The documentation site: pages in Markdown, tutorials that run, the API from docstrings."""
 
 from __future__ import annotations
 
 import importlib.metadata
+import sys
+from pathlib import Path
+
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE))
+
+from terminal import Pictures, figures_page  # noqa: E402
 
 project = "impc"
 author = "the impc authors"
@@ -13,11 +20,13 @@ extensions = [
     "sphinx.ext.autosummary",
     "sphinx.ext.napoleon",
     "sphinx.ext.viewcode",
+    "sphinx_gallery.gen_gallery",
 ]
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
-exclude_patterns = ["_build", "benchmarks/*.json"]
+exclude_patterns = ["_build", "_results", "tutorials", "benchmarks/*.json"]
 html_theme = "furo"
 html_title = "impc"
+html_show_sphinx = False
 myst_heading_anchors = 3
 autosummary_generate = True
 autodoc_default_options = {
@@ -31,9 +40,23 @@ autodoc_member_order = "bysource"
 napoleon_numpy_docstring = True
 napoleon_use_rtype = False
 napoleon_use_ivar = True
-nitpicky = False
 # Names of attributes in docstrings that two modules share are words here, not links.
 suppress_warnings = ["ref.python"]
+
+sphinx_gallery_conf = {
+    "examples_dirs": str(HERE / "tutorials"),
+    "gallery_dirs": str(HERE / "_tutorials"),
+    "filename_pattern": r"tutorial_\d",
+    "within_subsection_order": "FileNameSortKey",
+    "image_scrapers": (Pictures(),),
+    "abort_on_example_error": True,
+    "download_all_examples": False,
+    "show_memory": False,
+    "min_reported_time": 1e9,
+    "write_computation_times": False,
+    "show_signature": False,
+    "remove_config_comments": True,
+}
 
 
 def _plain_text(app, what, name, obj, options, lines):  # type: ignore[no-untyped-def]
@@ -53,6 +76,13 @@ def _plain_text(app, what, name, obj, options, lines):  # type: ignore[no-untype
     lines[:] = kept
 
 
+def _write_figures(app):  # type: ignore[no-untyped-def]
+    """After the tutorials have run: the page of every figure."""
+    (HERE / "_figures.md").write_text(figures_page(), encoding="utf-8")
+
+
 def setup(app):  # type: ignore[no-untyped-def]
-    """Connect the hook."""
+    """Connect the hooks."""
     app.connect("autodoc-process-docstring", _plain_text)
+    # sphinx-gallery runs the tutorials at priority 500 of the same event.
+    app.connect("builder-inited", _write_figures, priority=900)

@@ -1,6 +1,6 @@
 """The surviving claims of chapters 4 and 5 beside what this package finds on simulated cohorts.
 
-    python -m experiments.selection_claims --replicates 200
+    python -m experiments.selection_claims --replicates 200 --nelder-mead
 
 Ten subjects as `impc simulate head-tracking` makes them (chapter 4), and ten about the FIM column
 of table 4.3 for the widths of its intervals. The dissertation's numbers are of its own subjects.
@@ -9,7 +9,9 @@ of table 4.3 for the widths of its intervals. The dissertation's numbers are of 
 from __future__ import annotations
 
 import argparse
+import time
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,15 +19,22 @@ import plants
 from impc.selection.bootstrap import bootstrap_subset
 from impc.selection.estimation import estimate, free_indices
 from impc.selection.fisher import fisher_information
+from impc.selection.lasso import lasso_of_size, table_c1
 from impc.selection.model import Trial
 from impc.selection.source import model_source
-from impc.selection.subsets import largest_subsets
+from impc.selection.subsets import largest_subsets, sweep
 
-__all__ = ["Width", "bootstrap_widths"]
+if TYPE_CHECKING:
+    from impc.arrays import Array
+    from impc.selection.model import ParametricModel
+
+__all__ = ["Width", "bootstrap_widths", "mean_subject", "reduced_widths"]
 
 _FREE = ("Kvis", "Kccr", "tau", "tau1A", "tauCNS1")
 # Table 4.3, FIM column: SD of the estimates over subjects; mean and SD of the interval widths.
 _SPREAD = np.array([27.0, 11.9, 0.024, 0.013, 0.077])
+_LASSO = ("Kvis", "Kvcr", "Kccr", "tau", "tauC")
+_COMMON = ("Kvis", "Kccr", "tau")
 _QUOTED = ((62.0, 19.0), (18.2, 6.0), (0.020, 0.010), (0.030, 0.015), (0.138, 0.069))
 _VAF = (0.8265, 0.0757)
 
@@ -79,10 +88,66 @@ def bootstrap_widths(shortest: float, longest: float, replicates: int) -> tuple[
     )
 
 
+def mean_subject() -> tuple[ParametricModel, Array, list[Trial]]:
+    """The FIM column of table 4.3, three trials, noise that leaves a VAF of 82.65 %."""
+    model = model_source("plants:head_neck_model", {}).model
+    nominal = np.array(model.typical)
+    column = zip(plants.TABLE_4_3["fim"], nominal, strict=True)
+    theta = np.array([base if value is None else value for value, base in column], dtype=float)
+    rng, trials = np.random.default_rng(0), []
+    for number in range(3):
+        reference = plants.step_reference(seed=number)[:, None]
+        head = model.simulate(theta, reference)
+        noise = np.sqrt((1 / _VAF[0] - 1) * np.mean(head**2))
+        trials.append(Trial(reference, head + noise * rng.standard_normal(head.shape)))
+    return model, theta, trials
+
+
+def reduced_widths(replicates: int) -> dict[str, Array]:
+    """Widths of the intervals of Kvis, Kccr and tau when 12, FIM-5 and LASSO-5 are free.
+
+    Others stay at the subject's own values, so that all three fits could find the truth.
+    """
+    model, theta, trials = mean_subject()
+    shown = free_indices(model, _COMMON)
+    found = {}
+    for label, names in (("all twelve", model.names), ("FIM", _FREE), ("LASSO", _LASSO)):
+        free = free_indices(model, names)
+        fit = estimate(model, trials, free, theta)
+        widths = bootstrap_subset(model, trials, fit, replicates, 0).width
+        found[label] = widths[[free.index(index) for index in shown]]
+    return found
+
+
+def _print_reduction(replicates: int) -> None:
+    widths = reduced_widths(replicates)
+    print(f"\nintervals of {', '.join(_COMMON)}, relative to those with all twelve free")
+    print("  dissertation   FIM 11, 15, 59 %    LASSO 43, 56, 96 %")
+    for label in ("FIM", "LASSO"):
+        shares = 100 * widths[label] / widths["all twelve"]
+        print(f"  here, {label:6}  {', '.join(f'{item:.0f}' for item in shares)} %")
+
+
+def _print_times(nelder_mead: bool) -> None:
+    model, theta, trials = mean_subject()
+    started = time.perf_counter()
+    sweep([fisher_information(model, theta, trials).F], [0.05 + 0.1 * k for k in range(10)])
+    fim = time.perf_counter() - started
+    print(f"\nseconds of information and sweep: {fim:.3f}; over that, for one subject")
+    searches = {"proximal": lasso_of_size} | ({"Table C.1": table_c1} if nelder_mead else {})
+    for label, search in searches.items():
+        started = time.perf_counter()
+        found = search(model, trials, 5)
+        seconds = time.perf_counter() - started
+        names = ", ".join(model.names[index] for index in found.selected)
+        print(f"  LASSO, {label}: {seconds:.1f} s, {seconds / fim:.0f} times; {names}")
+
+
 def main() -> None:
-    """Print the widths for several step durations, and the subsets at the nominal column."""
+    """Print widths for several step durations, their reduction, times, and the subsets."""
     parser = argparse.ArgumentParser(description="Claims of chapters 4 and 5.")
     parser.add_argument("--replicates", type=int, default=60)
+    parser.add_argument("--nelder-mead", action="store_true", help="Table C.1 too: minutes")
     given = parser.parse_args()
     for shortest, longest in ((0.3, 0.9), (0.2, 0.6), (0.5, 1.5)):
         print(f"\nwidths of 95 % intervals, ten subjects, steps of {shortest} to {longest} s")
@@ -92,6 +157,8 @@ def main() -> None:
                 f"  {item.name:8} {item.mean:8.3g} ± {item.spread:7.2g}   dissertation "
                 f"{item.quoted:g} ± {item.deviation:g}   {'inside' if inside else 'outside'}"
             )
+    _print_reduction(given.replicates)
+    _print_times(given.nelder_mead)
     model = model_source("plants:head_neck_model", {}).model
     theta = np.array(model.typical)
     trials = []

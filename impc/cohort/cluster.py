@@ -60,7 +60,9 @@ def connected(scheduler: str | None, workers: int | None) -> Iterator[Client]:
                 n_workers=workers or os.cpu_count() or 1,
                 threads_per_worker=1,
                 host="127.0.0.1",
-                dashboard_address=None,
+                # The scheduler has an HTTP server in any case: one that shows nothing, for this
+                # machine only, and not on 8787, which may be taken.
+                scheduler_kwargs={"dashboard": False, "dashboard_address": "127.0.0.1:0"},
                 silence_logs=50,
             ) as cluster,
             distributed.Client(cluster) as client,

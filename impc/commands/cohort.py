@@ -10,6 +10,8 @@ from pathlib import Path
 import click
 from tqdm import tqdm
 
+from impc.commands.scheduler import scheduler_options
+
 __all__ = ["command"]
 
 _SOME_FAILED = 1
@@ -24,10 +26,7 @@ _SOME_FAILED = 1
     show_default=True,
     help="Folder for results, tables and report; the same folder again goes on.",
 )
-@click.option("--scheduler", help="Address of a running Dask scheduler, such as tcp://host:8786.")
-@click.option(
-    "--workers", type=click.IntRange(min=1), help="Workers on this machine; one a core by default."
-)
+@scheduler_options
 @click.pass_context
 def command(
     context: click.Context, study_file: Path, out: Path, scheduler: str | None, workers: int | None

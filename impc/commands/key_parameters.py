@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import click
-from tqdm import tqdm
 
 from impc.commands.output import print_files
-from impc.commands.select import read_model_study
+from impc.commands.scheduler import scheduler_options
+from impc.commands.select import kept_results, read_model_study, study_runner
 
 __all__ = ["command"]
 
@@ -32,31 +31,38 @@ __all__ = ["command"]
 )
 @click.option("--vaf", type=float, default=69.0, show_default=True, help="Least mean VAF, %.")
 @click.option("--icc", type=float, default=0.75, show_default=True, help="Least ICC(A,k).")
-def command(study_file: Path, out: Path, bound: float, vaf: float, icc: float) -> None:
+@scheduler_options
+def command(
+    study_file: Path,
+    out: Path,
+    bound: float,
+    vaf: float,
+    icc: float,
+    scheduler: str | None,
+    workers: int | None,
+) -> None:
     """Key parameters of a study of several subjects and visits.
 
-    The study file is that of `impc select`.
+    The study file is that of `impc select`. It may be stopped at any time: the same command goes on
+    from there.
     """
-    import numpy as np  # noqa: PLC0415
-
     from impc.report.write import require_writable, write_files  # noqa: PLC0415
-    from impc.selection.estimation import multi_start  # noqa: PLC0415
     from impc.selection.key_parameters import key_parameters  # noqa: PLC0415
-    from impc.selection.report import key_files  # noqa: PLC0415
+    from impc.selection.key_report import key_files  # noqa: PLC0415
+    from impc.selection.settings import select_settings  # noqa: PLC0415
 
     require_writable(out)
-    _, source, recorded = read_model_study(study_file)
-    model = source.model
-    nominal = {}
-    with tqdm(total=len(recorded), unit="fit", file=sys.stderr, disable=None, leave=False) as bar:
-        for key, trials in recorded.items():
-            nominal[key] = np.array(multi_start(model, trials, range(model.size), 2, 0)[0].theta)
-            bar.update()
-    found = key_parameters(
-        model, recorded, nominal, bound=bound, least_vaf=vaf, least_reliability=icc
-    )
+    study, source, recorded = read_model_study(study_file)
+    settings = select_settings(study.configuration.select)
+    with study_runner(source, out, scheduler, workers, 2 * len(recorded)) as run:
+        found = key_parameters(
+            source.model, recorded, settings, run,
+            bound=bound, least_vaf=vaf, least_reliability=icc,
+        )  # fmt: skip
     line = f"impc key-parameters {study_file.name} --bound {bound:g} --vaf {vaf:g} --icc {icc:g}"
-    written = write_files(out, key_files(model, found, line))
-    chosen = ", ".join(model.names[index] for index in found.chosen) or "none passes all filters"
+    written = write_files(out, key_files(source.model, found, line))
+    kept_results(out).forget()
+    names = source.model.names
+    chosen = ", ".join(names[index] for index in found.chosen) or "none passes all filters"
     click.echo(f"key parameters: {chosen}")
     print_files(out, written)

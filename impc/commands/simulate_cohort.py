@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from tqdm import tqdm
 
 if TYPE_CHECKING:
     import numpy as np
@@ -62,8 +64,9 @@ def cohort(out: Path, **given: Any) -> None:
     rows = ["participant_id\tgroup\tmass\theight\tsex"]
     truth: dict[str, Any] = {}
     width = len(str(given["subjects"]))
-    with click.progressbar(range(given["subjects"]), label="subjects") as numbers:
-        for number in numbers:
+    numbers = range(given["subjects"])
+    with tqdm(numbers, unit="subject", file=sys.stderr, disable=None, leave=False) as bar:
+        for number in bar:
             name = f"{number + 1:0{max(width, 2)}d}"
             group = "first" if number < (given["subjects"] + 1) // 2 else "second"
             person = random_person(rng)

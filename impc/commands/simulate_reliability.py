@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from tqdm import tqdm
 
 from impc.commands.simulate_cohort import random_person
 
@@ -67,8 +69,9 @@ def reliability_study(out: Path, **given: Any) -> None:
     )
     width = max(2, len(str(given["subjects"])))
     truth: dict[str, Any] = {}
-    with click.progressbar(range(given["subjects"]), label="subjects") as numbers:
-        for number in numbers:
+    numbers = range(given["subjects"])
+    with tqdm(numbers, unit="subject", file=sys.stderr, disable=None, leave=False) as bar:
+        for number in bar:
             name = f"{number + 1:0{width}d}"
             plant = make_plant(plant_source(_PLANT, random_person(rng)), ("perturbation",))
             price, sway = np.exp(np.array([_PRICE, _SWAY]) * rng.standard_normal(2))

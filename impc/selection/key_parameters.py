@@ -17,18 +17,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.reliability.icc import icc
-from impc.selection.estimation import estimate
-from impc.selection.fisher import fisher_information
-from impc.selection.subsets import largest_subsets
+from impc.selection.estimation import Estimate, estimate
+from impc.selection.subject import Nominal, fit_nominal
+from impc.selection.subsets import largest_subsets, sweep
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
 
-    from impc.arrays import Array
     from impc.selection.model import ParametricModel, Trial
+    from impc.selection.running import Runner
+    from impc.selection.settings import SelectSettings
     from impc.selection.subsets import Selection
 
-__all__ = ["Candidate", "KeyParameters", "key_parameters"]
+__all__ = ["Candidate", "KeyParameters", "Refits", "key_parameters", "refit_subsets"]
 
 
 @dataclass(frozen=True)
@@ -66,6 +67,8 @@ class KeyParameters:
     ----------
     selection : Selection
         Subsets of the first filter.
+    sweep : tuple of Selection
+        The first filter at other bounds.
     candidates : tuple of Candidate
         All of them, best first: kept before not, then diversity, then reliability.
     chosen : tuple of int
@@ -73,20 +76,36 @@ class KeyParameters:
     """
 
     selection: Selection
+    sweep: tuple[Selection, ...]
     candidates: tuple[Candidate, ...]
     chosen: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Refits:
+    """Fits of several subsets to one subject and visit."""
+
+    fits: tuple[Estimate, ...]
+
+
+def refit_subsets(
+    model: ParametricModel, trials: Sequence[Trial], subsets: tuple[tuple[int, ...], ...]
+) -> Refits:
+    """Fit each subset alone, the other parameters at their typical values."""
+    typical = np.array(model.typical)
+    return Refits(tuple(estimate(model, trials, subset, typical) for subset in subsets))
 
 
 def key_parameters(
     model: ParametricModel,
     recorded: Mapping[tuple[str, str], Sequence[Trial]],
-    nominal: Mapping[tuple[str, str], Array],
+    settings: SelectSettings,
+    run: Runner,
     *,
     bound: float = 0.35,
     least_vaf: float = 69.0,
     least_reliability: float = 0.75,
     most: int = 20,
-    progress: Callable[[str], None] = lambda _: None,
 ) -> KeyParameters:
     """Choose key parameters of a study of several subjects and visits.
 
@@ -96,51 +115,46 @@ def key_parameters(
         Its typical values are where fixed parameters stay.
     recorded : mapping
         (subject, visit) -> trials.
-    nominal : mapping
-        (subject, visit) -> all parameters (k,) at which the information is taken.
+    settings : SelectSettings
+        Of the nominal fits, at which the information is taken.
+    run : Runner
+        Does the work of each subject and visit.
     bound, least_vaf, least_reliability
         v, VAF in %, rho: chapter 5 has .35, 69 % and .75.
     most : int
         How many subsets of the first filter go on, those of least variance.
-    progress : callable
-        Told each subset's names when it is done.
     """
-    informations = [
-        np.asarray(fisher_information(model, np.asarray(nominal[key]), trials).F)
-        for key, trials in recorded.items()
-    ]
-    selection = largest_subsets(informations, bound)
+    trials = {" visit ".join(filter(None, key)): tuple(item) for key, item in recorded.items()}
+    nominal = run(fit_nominal, Nominal, {name: (trials[name], settings) for name in trials})
+    informations = [np.asarray(item.information.F) for item in nominal.values()]
+    selection = largest_subsets(informations, bound, settings.least)
+    subsets = selection.subsets[:most]
+    refits = run(refit_subsets, Refits, {name: (trials[name], subsets) for name in trials})
     candidates = []
-    pairs = list(zip(selection.subsets, selection.variances, strict=True))[:most]
-    for subset, variance in pairs:
-        vaf, reliability = _refitted(model, recorded, subset)
+    for place, subset in enumerate(subsets):
+        fits = {key: item.fits[place] for key, item in zip(recorded, refits.values(), strict=True)}
+        vaf = float(np.mean([np.mean(item.vaf) for item in fits.values()]))
+        reliability = _reliability(fits, subset)
         diversity = len({model.pathways[index] for index in subset})
         kept = vaf > least_vaf and reliability >= least_reliability
+        variance = selection.variances[place]
         candidates.append(Candidate(subset, variance, vaf, reliability, diversity, kept))
-        progress(", ".join(model.names[index] for index in subset))
     candidates.sort(
         key=lambda item: (not item.kept, -item.diversity, -np.nan_to_num(item.reliability))
     )
     chosen = candidates[0].subset if candidates and candidates[0].kept else ()
-    return KeyParameters(selection, tuple(candidates), chosen)
+    swept = sweep(informations, settings.bounds, settings.least)
+    return KeyParameters(selection, swept, tuple(candidates), chosen)
 
 
-def _refitted(
-    model: ParametricModel,
-    recorded: Mapping[tuple[str, str], Sequence[Trial]],
-    subset: tuple[int, ...],
-) -> tuple[float, float]:
-    """Mean VAF, and the least ICC between visits of the subset's estimates."""
-    subjects = list(dict.fromkeys(key[0] for key in recorded))
-    visits = list(dict.fromkeys(key[1] for key in recorded))
+def _reliability(fits: Mapping[tuple[str, str], Estimate], subset: tuple[int, ...]) -> float:
+    """Least ICC(A,k) between visits of the subset's estimates; NaN without several of both."""
+    subjects = list(dict.fromkeys(key[0] for key in fits))
+    visits = list(dict.fromkeys(key[1] for key in fits))
+    if len(visits) < 2 or len(subjects) < 2:
+        return float("nan")
     values = np.full((len(subset), len(subjects), len(visits)), np.nan)
-    shares = []
-    for (subject, visit), trials in recorded.items():
-        found = estimate(model, trials, subset, np.array(model.typical))
-        shares.append(float(np.mean(found.vaf)))
+    for (subject, visit), found in fits.items():
         place = subjects.index(subject), visits.index(visit)
         values[:, place[0], place[1]] = np.array(found.theta)[list(subset)]
-    if len(visits) < 2 or len(subjects) < 2:
-        return float(np.mean(shares)), float("nan")
-    correlations = [icc(table, "A,k").value for table in values]
-    return float(np.mean(shares)), float(np.min(correlations))
+    return float(np.min([icc(table, "A,k").value for table in values]))

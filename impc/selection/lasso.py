@@ -19,13 +19,12 @@ import numpy as np
 import scipy.optimize
 
 from impc.arrays import Array, frozen
-from impc.selection.estimation import estimate
+from impc.selection.estimation import Estimate, estimate
 from impc.selection.model import normalised, physical, sensitivity
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from impc.selection.estimation import Estimate
     from impc.selection.model import ParametricModel, Trial
 
 __all__ = ["Lasso", "lasso_of_size", "proximal_lasso", "table_c1"]

@@ -41,6 +41,7 @@ class ModelSource:
     """A model, and how its signals are called in a recording."""
 
     name: str
+    arguments: Mapping[str, Any]
     model: ParametricModel
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
@@ -78,7 +79,9 @@ def model_source(name: str, arguments: Mapping[str, Any]) -> ModelSource:
         units=told.get("units"),
         jacobian=jacobian,
     )
-    return ModelSource(name, model, tuple(told["inputs"]), tuple(told["outputs"]), rate)
+    return ModelSource(
+        name, dict(arguments), model, tuple(told["inputs"]), tuple(told["outputs"]), rate
+    )
 
 
 def read_trials(study: Study, source: ModelSource) -> dict[tuple[str, str], tuple[Trial, ...]]:

@@ -16,6 +16,8 @@ from impc.selection.fisher import fisher_information
 from impc.selection.key_parameters import key_parameters
 from impc.selection.lasso import proximal_lasso, table_c1
 from impc.selection.model import ParametricModel, Trial, normalised, parametric_model
+from impc.selection.running import in_turn
+from impc.selection.settings import SelectSettings
 from tests.selection.dosing import blood_model
 from tests.selection.heads import head_model
 
@@ -95,15 +97,17 @@ def test_key_parameters_of_a_line() -> None:
     model = parametric_model(
         ["a", "b", "c"], [-5] * 3, [5] * 3, [0, 0, 0], base.simulate, pathways=["x", "x", "y"]
     )
-    recorded, nominal = {}, {}
+    recorded = {}
     for subject in range(6):
         own = np.array([rng.normal(0, 1), 0.0, rng.normal(0, 1)])
         for visit in ("1", "2"):
             u = rng.standard_normal((60, 3))
             theta = own + np.array([0, rng.normal(0, 0.3), 0])
             y = (u @ theta)[:, None] + 0.2 * rng.standard_normal((60, 1))
-            recorded[str(subject), visit], nominal[str(subject), visit] = [Trial(u, y)], theta
-    found = key_parameters(model, recorded, nominal, bound=0.5, least_vaf=10.0)
+            recorded[str(subject), visit] = [Trial(u, y)]
+    found = key_parameters(
+        model, recorded, SelectSettings(), in_turn(model), bound=0.5, least_vaf=10.0
+    )
     assert found.selection.size == 3
     assert found.chosen == ()
     pairs = {item.subset: item for item in found.candidates}

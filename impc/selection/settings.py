@@ -1,0 +1,71 @@
+"""The [select] table of a study file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from impc.errors import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+__all__ = ["SelectSettings", "select_settings"]
+
+
+@dataclass(frozen=True)
+class SelectSettings:
+    """Settings of `impc select`.
+
+    Attributes
+    ----------
+    bound : float
+        v, largest variance in normalised units, of the subset that is refitted.
+    bounds : list of float
+        Of the sweep.
+    least : int
+        n_min.
+    size : int
+        Parameters that the LASSO is to leave.
+    starts : int
+        Of the nominal fit.
+    replicates : int
+        Of the bootstrap.
+    draw : "single" or "block"
+    nelder_mead : bool
+        Whether Table C.1 is run too: slow.
+    seed : int
+    """
+
+    bound: float = 0.05
+    bounds: list[float] = field(default_factory=lambda: [0.05 + 0.1 * k for k in range(10)])
+    least: int = 2
+    size: int = 5
+    starts: int = 3
+    replicates: int = 200
+    draw: str = "block"
+    nelder_mead: bool = False
+    seed: int = 0
+
+
+def select_settings(table: Mapping[str, Any]) -> SelectSettings:
+    """Read the [select] table.
+
+    Raises
+    ------
+    InputError
+        When a key is unknown or a value of the wrong kind.
+    """
+    unknown = [key for key in table if key not in SelectSettings.__dataclass_fields__]
+    if unknown:
+        known = ", ".join(SelectSettings.__dataclass_fields__)
+        raise InputError(f"[select] {unknown[0]}", "is not a setting", f"known: {known}")
+    try:
+        found = msgspec.convert(dict(table), SelectSettings, strict=True)
+    except msgspec.ValidationError as error:
+        raise InputError("[select]", str(error), "see docs/selection.md") from None
+    if found.draw not in ("single", "block"):
+        raise InputError("[select] draw", f"got {found.draw!r}", "give single or block")
+    return found
