@@ -5,7 +5,7 @@
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
-.PHONY: help env demo test check slow bench lock clean
+.PHONY: help env demo test check docs reproduce wheel slow bench lock clean
 
 PYTHON ?= python3
 # Not to be set from outside: the environment is made with `venv --clear`.
@@ -40,6 +40,9 @@ help:
 	@echo 'make test    set up .venv, then check and pytest (without the slow tests)'
 	@echo 'make check   ruff check, ruff format --check, mypy --strict'
 	@echo 'make slow    the slow tests'
+	@echo 'make docs    build the site in docs/_build/html; warnings are errors, tutorials run (minutes)'
+	@echo 'make reproduce  write docs/reproduction: the dissertation, line by line (half an hour)'
+	@echo 'make wheel   build a wheel, install it in an empty environment, run impc example there'
 	@echo 'make bench   the benchmarks:                     python -m experiments.benchmarks'
 	@echo 'make lock    compile both lock files again (needs uv); UPGRADE=--upgrade takes newer versions'
 	@echo 'make clean   remove caches and build products; .venv and results stay'
@@ -51,11 +54,28 @@ demo: env
 
 test: check
 	$(PY) -m pytest -m "not slow"
+	$(MAKE) --no-print-directory docs
 
 check: env
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
 	$(PY) -m mypy --strict impc plants experiments tests
+
+docs: env
+	OPENBLAS_NUM_THREADS=1 $(PY) -m sphinx -W --keep-going -E -b html -q docs docs/_build/html
+	@echo 'docs/_build/html/index.html'
+
+reproduce: env
+	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.reproduction
+
+# The wheel, not the checkout: in an environment that has nothing else, from a folder that is not this one.
+wheel: env
+	rm -rf build dist
+	$(PY) -m build --no-isolation --wheel --outdir dist
+	rm -rf dist/venv && $(PY) -m venv dist/venv
+	dist/venv/bin/python -m pip --disable-pip-version-check -qq install dist/impc-*.whl
+	cd dist && venv/bin/impc example --case A --out example
+	cd dist && venv/bin/python -c "import impc, plants; assert '/venv/' in impc.__file__, impc.__file__"
 
 slow: env
 	$(PY) -m pytest -m slow
@@ -117,5 +137,5 @@ lock:
 	  --python-version 3.11 --no-deps --generate-hashes - -o requirements-polytope.lock
 
 clean:
-	rm -rf build dist docs/_build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf build dist docs/_build docs/_results docs/_tutorials docs/_api docs/_figures.md *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find . -name $(VENV) -prune -o -type d -name __pycache__ -prune -exec rm -rf {} +

@@ -107,6 +107,6 @@ def _prices(axes: Axes, results: Sequence[ConditionResult]) -> None:
     axes.set_yscale("log")
     axes.set_ylim(1, 1e9)
     axes.set_xlabel("blur (px)")
-    axes.set_ylabel("gain, price")
+    axes.set_ylabel("gain, price (-)")
     axes.set_title("(D)", loc="left")
     axes.legend(loc="upper right")

@@ -56,7 +56,15 @@ class TrialAgreement:
 def vaf(recorded: Array, simulated: Array) -> Array:
     """Variance accounted for (3.24): (1 - sum (y - y_sim)^2 / sum y^2) 100 %, one for each column.
 
-    NaN where the recorded output is zero throughout.
+    Parameters
+    ----------
+    recorded, simulated : Array
+        y and y_sim (samples, p), in one unit.
+
+    Returns
+    -------
+    Array
+        % (p,); NaN where the recorded output is zero throughout.
     """
     left = np.sum((recorded - simulated) ** 2, axis=0)
     total = np.sum(recorded**2, axis=0)
@@ -65,7 +73,18 @@ def vaf(recorded: Array, simulated: Array) -> Array:
 
 
 def centred_vaf(recorded: Array, simulated: Array) -> Array:
-    """As `vaf`, with the means removed from what was recorded and from what is left, %."""
+    """As `vaf`, with the means removed from what was recorded and from what is left.
+
+    Parameters
+    ----------
+    recorded, simulated : Array
+        Outputs (samples, p), in one unit.
+
+    Returns
+    -------
+    Array
+        % (p,); NaN where the recorded output is constant.
+    """
     left = np.var(recorded - simulated, axis=0)
     total = np.var(recorded, axis=0)
     share = np.divide(left, total, out=np.full_like(left, np.nan), where=total > 0)
@@ -73,7 +92,20 @@ def centred_vaf(recorded: Array, simulated: Array) -> Array:
 
 
 def whiteness(residual: Array, lags: int) -> Array:
-    """p-values of Ljung and Box's test for each column; NaN where nothing is left to test."""
+    """p-values of Ljung and Box's test that each column is white (Ljung and Box 1978).
+
+    Parameters
+    ----------
+    residual : Array
+        (samples, p).
+    lags : int
+        How many of the first autocorrelations are tested together.
+
+    Returns
+    -------
+    Array
+        (p,); NaN where nothing is left to test.
+    """
     values = []
     for column in residual.T:
         if np.ptp(column) == 0:
@@ -106,6 +138,14 @@ def agreement(
 
 
 def saturated_share(u: Array, u_min: Array, u_max: Array) -> float:
-    """Share of samples at which any input stands on a bound, to 1e-6 of it."""
+    """Share of samples at which any input stands on a bound, to 1e-6 of it.
+
+    Parameters
+    ----------
+    u : Array
+        Inputs (samples, m).
+    u_min, u_max : Array
+        Their bounds (m,); infinite where there is none.
+    """
     near = (u >= u_max * (1 - 1e-6)) | (u <= u_min * (1 - 1e-6))  # the origin is strictly inside
     return float(np.mean(np.any(near, axis=1)))

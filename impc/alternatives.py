@@ -45,6 +45,7 @@ class Alternative:
     name : str
         "as fitted", "no limit" or "horizon N".
     horizon : int
+        In samples.
     misfit : float
         2-norm of the residual; infinite when no controller was found.
     aic : float
@@ -79,6 +80,7 @@ def fit_alternatives(
     fitted : FittedController
         Its fit, from whose weights the others start.
     horizons : sequence of int
+        In samples; that of the problem is passed over.
     settle : float
         Seconds at the start of a left-out trial that do not count.
     progress : callable

@@ -21,15 +21,29 @@ __all__ = [
     "symmetric_matrix",
 ]
 
+#: An array of float64, of the shape that each docstring gives.
 Array = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
+#: An array of int64.
 IntArray = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
+#: An array of truth values.
 BoolArray = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
 #: An array as compiled code takes it, of any element type.
 Buffer = np.ndarray[Any, np.dtype[Any]]
 
 
 def frozen(values: ArrayLike) -> Array:
-    """Return a read-only float64 copy, so that a frozen dataclass is frozen to the last entry."""
+    """Return a read-only float64 copy, so that a frozen dataclass is frozen to the last entry.
+
+    Parameters
+    ----------
+    values : array_like
+        Numbers, of any shape.
+
+    Returns
+    -------
+    Array
+        Of the same shape.
+    """
     array = np.array(values, dtype=np.float64)
     array.flags.writeable = False
     return array
@@ -43,9 +57,14 @@ def finite_array(name: str, values: ArrayLike, shape: tuple[int | None, ...]) ->
     name : str
         Name of the argument, for the message.
     values : array_like
-        What the caller gave.
+        What the caller gave, of any shape.
     shape : tuple
         Expected shape; ``None`` where any length will do.
+
+    Returns
+    -------
+    Array
+        Of that shape.
 
     Raises
     ------
@@ -74,6 +93,20 @@ def finite_array(name: str, values: ArrayLike, shape: tuple[int | None, ...]) ->
 
 def symmetric_matrix(name: str, values: ArrayLike, size: int | None = None) -> Array:
     """Convert to a square symmetric float64 matrix; asymmetry above 1e-9 relative is an error.
+
+    Parameters
+    ----------
+    name : str
+        Name of the argument, for the message.
+    values : array_like
+        (size, size), or a number for (1, 1).
+    size : int, optional
+        Expected number of rows; any by default.
+
+    Returns
+    -------
+    Array
+        (size, size).
 
     Raises
     ------

@@ -72,6 +72,14 @@ def bootstrap(
 ) -> tuple[Replicate, ...]:
     """Fit `count` replicates one after the other; `progress` is told each one's number.
 
+    Parameters
+    ----------
+    seed : int
+        All numbers drawn follow from it.
+    resample : callable
+        (residuals, generator) -> residuals drawn again, lists with an array (samples, p) for each
+        trial: `block_residuals` or `model_residuals`.
+
     Raises
     ------
     InputError
@@ -94,7 +102,22 @@ def replicate(
     seed: int,
     resample: Callable[[list[Array], np.random.Generator], list[Array]],
 ) -> Replicate:
-    """One replicate, by its number."""
+    """One replicate, by its number.
+
+    Parameters
+    ----------
+    index : int
+        The child of the seed that it draws from, from 0.
+    seed : int
+        That of the whole bootstrap.
+    resample : callable
+        As in `bootstrap`: lists with an array (samples, p) for every trial.
+
+    Raises
+    ------
+    WeightsError, SolverError
+        When it cannot be fitted.
+    """
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index,)))
     clean, residuals = _split(fitted)
     drawn = resample(residuals, rng)
@@ -109,7 +132,15 @@ def replicate(
 def bootstrap_intervals(
     fitted: FittedController, replicates: Sequence[Replicate], method: str, level: float
 ) -> tuple[Interval, ...]:
-    """Percentile intervals of the entries of K and of the parameters."""
+    """Percentile intervals of the entries of K and of the parameters.
+
+    Parameters
+    ----------
+    method : str
+        Name of the bootstrap, kept in each interval.
+    level : float
+        Share of the replicates inside, between 0 and 1.
+    """
     names = list(entry_names(fitted.problem.plant))
     values = [*np.ravel(fitted.solution.K), *_parameters(fitted.problem)]
     if fitted.problem.family is not None:
@@ -123,7 +154,20 @@ def bootstrap_intervals(
 
 
 def block_residuals(residuals: list[Array], rng: np.random.Generator) -> list[Array]:
-    """Draw residuals (samples, p) of every trial in moving blocks."""
+    """Draw residuals of every trial in moving blocks.
+
+    Parameters
+    ----------
+    residuals : list of Array
+        (samples, p) of each trial.
+    rng : numpy.random.Generator
+        What is drawn from.
+
+    Returns
+    -------
+    list of Array
+        As many, (samples, p) each.
+    """
     centred = [part - np.mean(part, axis=0) for part in residuals]
     length = block_length(residuals)
     drawn = []
@@ -138,7 +182,7 @@ def block_residuals(residuals: list[Array], rng: np.random.Generator) -> list[Ar
 
 
 def block_length(residuals: list[Array]) -> int:
-    """Samples of a block, by the rule of the module's text."""
+    """Samples of a block for `residuals` (samples, p), by the rule of the module's text."""
     above = sum(np.sum(part[1:] * part[:-1], axis=0) for part in residuals)
     below = sum(np.sum(part**2, axis=0) for part in residuals)
     root = np.clip(np.divide(above, below, out=np.zeros_like(below), where=below > 0), -0.99, 0.99)
@@ -148,7 +192,20 @@ def block_length(residuals: list[Array]) -> int:
 
 
 def model_residuals(residuals: list[Array], rng: np.random.Generator) -> list[Array]:
-    """Draw residuals (samples, p) of every trial from autoregressions fitted to all of them."""
+    """Draw residuals of every trial from autoregressions fitted to all of them.
+
+    Parameters
+    ----------
+    residuals : list of Array
+        (samples, p) of each trial.
+    rng : numpy.random.Generator
+        What is drawn from.
+
+    Returns
+    -------
+    list of Array
+        As many, (samples, p) each.
+    """
     centred = [part - np.mean(part, axis=0) for part in residuals]
     outputs = centred[0].shape[1]
     models = [_autoregression([part[:, output] for part in centred]) for output in range(outputs)]

@@ -1,5 +1,7 @@
 """Box bounds on states and inputs, and their rows  E x + F u <= b.
 
+The bounds of (3.1), as docs/theory.md, section 3, takes them.
+
 Only finite bounds make a row. The order of the rows is fixed: input upper, input lower, state
 upper, state lower, each in the order of the signals, so that a row can be named in a message.
 """
@@ -76,8 +78,8 @@ def box_bounds(
     plant : Plant
         Gives the sizes and the names.
     x_min, x_max, u_min, u_max : array_like, optional
-        A number for all signals, or one for each. The origin is the equilibrium that is
-        regulated to, so it must lie strictly inside.
+        A number for all signals, or one for each, (n,) and (m,), in their units. The origin is
+        the equilibrium that is regulated to, so it must lie strictly inside.
 
     Raises
     ------

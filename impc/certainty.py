@@ -2,7 +2,7 @@
 
 Always: intervals of the gain and the parameters from their covariance, and the set of weights with
 the fitted gain. When the settings ask for them: bootstrap, profile likelihoods, the input limit as
-an unknown, other horizons.
+an unknown, other horizons (docs/fitting.md, docs/what-may-be-concluded.md).
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """A plant under the constrained controller, simulated and differentiated in one pass.
 
 At most samples v = 0 keeps every bound and the controller is the gain; only elsewhere a
-least-distance problem is solved. There, with the active rows a (multipliers lam) and one direction
-of change, written d,
+least-distance problem is solved (docs/theory.md, section 4). There, with the active rows a
+(multipliers lam) and one direction of change, written d,
 
     Gram_aa dlam = -N_a q + dM_a v - db_a + dT_a x + T_a dx,     q = dM'lam + dS v
     dv = -S^-1 q - N_a' dlam
@@ -50,7 +50,13 @@ __all__ = [
 
 
 class Status(IntEnum):
-    """What happened at a sample."""
+    """What happened at a sample.
+
+    FREE: the gain keeps every bound. ACTIVE: a bound is active. SOFTENED: a soft bound was
+    exceeded. INFEASIBLE: no input sequence keeps the bounds. UNSOLVED: the active-set method
+    found no answer. DIVERGED: the state left every reasonable range. NOT_REACHED: the simulation
+    ended before.
+    """
 
     FREE = 0
     ACTIVE = 1
@@ -79,7 +85,15 @@ _SENTENCES = {
 
 @dataclass(frozen=True)
 class Scenario:
-    """What drives a simulation: the initial state (n,) and the disturbance (steps, d)."""
+    """What drives a simulation, in the units of the plant.
+
+    Attributes
+    ----------
+    x0 : Array
+        Initial state (n,).
+    disturbance : Array
+        One row for each sample (steps, d).
+    """
 
     x0: Array
     disturbance: Array
@@ -127,7 +141,15 @@ class Simulation:
 
 @dataclass(frozen=True)
 class Sensitivity:
-    """Derivatives of a `Simulation` along p directions: x (steps + 1, n, p), u (steps, m, p)."""
+    """Derivatives of a `Simulation` along p directions.
+
+    Attributes
+    ----------
+    x : Array
+        Of the states (steps + 1, n, p).
+    u : Array
+        Of the inputs (steps, m, p).
+    """
 
     x: Array
     u: Array
@@ -135,7 +157,21 @@ class Sensitivity:
 
 @dataclass(frozen=True)
 class PreparedLoop:
-    """A controller with its rows and derivatives built; made by `prepare_loop`."""
+    """A controller with its rows and derivatives built; made by `prepare_loop`.
+
+    Attributes
+    ----------
+    controller : Controller
+    along : Directions
+        The p directions of the derivatives.
+    rows : Rows
+    row_directions : RowDirections
+        Derivatives of the rows.
+    matrices : LoopMatrices
+        Plant, gain and inverse metric.
+    matrix_directions : LoopMatrices
+        Derivatives of plant, gain and metric.
+    """
 
     controller: Controller
     along: Directions

@@ -1,4 +1,7 @@
-"""All methods on the recordings of a subject, in sample and on trials left out."""
+"""All methods on the recordings of a subject, in sample and on trials left out.
+
+docs/comparing.md says what each method is and where it breaks.
+"""
 
 from __future__ import annotations
 
@@ -31,6 +34,7 @@ class MethodComparison:
     Attributes
     ----------
     name : str
+        One of `METHODS`.
     fit : MethodFit
         On all trials.
     held_out : Array
@@ -44,12 +48,12 @@ class MethodComparison:
 
 
 def stages(trials: int) -> int:
-    """Number of estimates that `compare_recordings` makes."""
+    """Number of estimates that `compare_recordings` makes for so many `trials`."""
     return len(METHODS) * (1 + (trials if trials > 1 else 0))
 
 
 def bounds_of_method(problem: InverseProblem, name: str) -> InverseProblem:
-    """The problem with the bounds that the method's controller knows: inverse MPC alone has any."""
+    """The problem with the bounds that the method `name` knows: inverse MPC alone has any."""
     return problem if name.startswith("inverse_mpc") else without_bounds(problem)
 
 

@@ -3,7 +3,7 @@
 One file, because numba's cache on disk looks at the file of a function and not at those that it
 calls: with the two apart, a changed solver went on running as it was compiled before.
 
-The least-distance problem, by a dual active-set method:
+The least-distance problem (docs/theory.md, section 4), by a dual active-set method:
 
     minimise  v'S v / 2 + sum_r limit_r s_r     subject to  M v <= d + s,  s >= 0
 
@@ -34,6 +34,7 @@ from impc.prediction import RowDirections, Rows
 
 __all__ = ["CONVERGED", "INCONSISTENT", "UNSOLVED", "LoopMatrices", "run", "solve_dual"]
 
+#: What `solve_dual` says first: an answer, rows that exclude each other, none within its steps.
 CONVERGED, INCONSISTENT, UNSOLVED = 0, 1, 2
 
 # A row is dependent on the active ones when less than this share of its length is new. The part is
@@ -274,7 +275,17 @@ _FREE, _ACTIVE, _SOFTENED, _INFEASIBLE, _UNSOLVED, _DIVERGED = 0, 1, 2, 3, 4, 5
 
 
 class LoopMatrices(NamedTuple):
-    """Plant, gain and inverse metric; or derivatives (those of S itself) along p directions."""
+    """Plant, gain and inverse metric; or derivatives (those of S itself) along p directions.
+
+    Attributes
+    ----------
+    A, B, E : Buffer
+        (n, n), (n, m) and (n, d); derivatives have a last axis more, (n, n, p) and so on.
+    K : Buffer
+        (m, n), derivatives (m, n, p).
+    S : Buffer
+        S^-1 (m, m); derivatives are those of S, (m, m, p).
+    """
 
     A: Buffer
     B: Buffer
@@ -297,7 +308,29 @@ def run(
     du: Buffer,
     status: Buffer,
 ) -> tuple[int, int]:
-    """Fill x, u, dx, du and status; return the count of weak samples and the inconsistent row."""
+    """Simulate from x[0] and dx[0], with derivatives along p directions (p may be 0).
+
+    Parameters
+    ----------
+    dloop, drows : LoopMatrices, RowDirections
+        Derivatives of the loop and of its rows.
+    disturbance : Buffer
+        (steps, d).
+    divergence : float
+        Entry of a state, in its unit, at which the simulation ends.
+    x, u : Buffer
+        Written: states (steps + 1, n) after the first, inputs (steps, m).
+    dx, du : Buffer
+        Written: their derivatives (steps + 1, n, p) after the first, (steps, m, p).
+    status : Buffer
+        Written up to the sample that ends it: the value of `closed_loop.Status`, (steps,).
+
+    Returns
+    -------
+    weak, row : int
+        Number of samples at which the active set is about to change; the row that proved the last
+        problem inconsistent, or -1.
+    """
     count = len(rows.b)
     lam, slack = np.zeros(count), np.empty(count)
     room = min(count, rows.W.shape[1]) + 1

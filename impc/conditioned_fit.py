@@ -50,7 +50,19 @@ _LEAST_RADIUS = 1e-10
 
 @dataclass(frozen=True)
 class Residual:
-    """A residual (r,) with its derivatives with respect to K (r, m, n) and S (r, m, m)."""
+    """A residual with its derivatives with respect to K and S.
+
+    Attributes
+    ----------
+    values : Array
+        (r,).
+    dK : Array
+        (r, m, n).
+    dS : Array
+        (r, m, m).
+    usable : bool
+        Whether it could be computed; otherwise the step that led there is shortened.
+    """
 
     values: Array
     dK: Array
@@ -94,6 +106,7 @@ class ConditionedFit:
     condition : float
         kappa(blkdiag(Q, R)).
     objective : float
+        What was minimised, at these weights.
     iterations, evaluations : int
         Steps solved, and residuals computed.
     stationarity : float
@@ -129,6 +142,8 @@ def conditioned_fit(
     objective : Objective
     start : Weights
         Positive definite.
+    max_iterations : int
+        Steps that are solved at most.
     tolerance : float
         Decrease, relative to the objective, below which a step is not worth taking.
 

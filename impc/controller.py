@@ -4,8 +4,8 @@ With P from the Riccati equation, the cost of (3.1) along any input sequence is
 
     x_0'P x_0 + sum_k v_k' S v_k,      v_k = u_k + K x_k,   S = R + B'PB
 
-(docs/theory.md has the proof), so a controller is its gain K, its metric S up to scale, its
-bounds, its horizon and its terminal set. The weights are one way to name K and S.
+(docs/theory.md, section 2, has the proof), so a controller is its gain K, its metric S up to
+scale, its bounds, its horizon and its terminal set. The weights are one way to name K and S.
 """
 
 from __future__ import annotations
@@ -137,8 +137,8 @@ def gain_controller(
         S (m, m), positive definite; the identity by default, which is no choice for one input.
     near : TerminalSet, optional
         Set of a gain nearby: the same answer in less time, see `maximal_invariant_set`.
-
-    Other parameters and errors as in `mpc_controller`.
+    bounds, horizon, terminal_set, softening
+        As in `mpc_controller`.
 
     Raises
     ------

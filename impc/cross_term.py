@@ -3,6 +3,7 @@
     minimise ||S||_F  over the costs  x'Qx + 2 x'Su + u'Ru  with that gain and R >= I
 
 Every stabilising gain has such a cost: |u + Kx|^2 is one. Without R >= I the least would be zero.
+It starts the gradient branch of Table 3.1 (Priess et al. 2015, see `inverse_lqr`).
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ class CrossTerm:
 
 
 def inverse_lqr_cross_term(plant: Plant, gain: ArrayLike) -> CrossTerm:
-    """Least cross term with which a quadratic cost has exactly the gain.
+    """Least cross term with which a quadratic cost has exactly the `gain` (m, n).
 
     minimise ||S||_F subject to R >= I, [Q S; S' R] >= 0, where P and R are free and, with
     F = A - BK,

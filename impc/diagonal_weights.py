@@ -4,7 +4,7 @@ A regulator always stabilises, and n prices of states, with R = I, describe enou
 to come near any gain. So the search for the prices rarely leaves what can be simulated,
 and from its end the search for the gain itself has a short way. On the noisy seat at three torque
 limits it finds the right basin from here where it misses it from Bryson's rule
-(experiments/benchmarks/search.py).
+(docs/fitting.md; experiments/benchmarks/search.py).
 
 The unknowns are the logarithms of q_i, Q = diag(q_i (u / x_i)^2), where x_i and u are the sizes
 that states and command have under the best of `bryson_weights`; a normal prior of a factor e^3
@@ -55,6 +55,8 @@ def bryson_weights(problem: InverseProblem) -> list[Weights]:
 
 def diagonal_weights(problem: InverseProblem, *, max_evaluations: int = 15) -> Weights:
     """Fit the prices of the states, at given initial states, plant and R = I.
+
+    `max_evaluations` bounds the number of simulations of all trials.
 
     Raises
     ------

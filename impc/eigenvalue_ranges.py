@@ -7,7 +7,8 @@ programs and proved:
 
 The others are not convex. They are searched: from the ends along the centre's eigenvectors, the
 derivative v_i v_i' of an eigenvalue leads to the extreme member in that direction, as long as that
-gains. A member with that eigenvalue exists; one that goes farther may.
+gains. A member with that eigenvalue exists; one that goes farther may. Source:
+docs/equivalent-weights.md, section 2.
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ class EigenvalueRange:
     Attributes
     ----------
     low, high : float
+        At the scale of the set, trace R = m.
     low_proved, high_proved : bool
         Whether no member goes beyond; otherwise one may.
     """
@@ -57,8 +59,9 @@ def eigenvalue_ranges(
     ----------
     found : WeightsSet
     members : sequence of Array
-        blkdiag(Q, R) of members known already, at the scale of the set (trace R = m): where the
-        searches begin. By default the ends along the eigenvectors of the centre's Q.
+        blkdiag(Q, R), (n + m, n + m), of members known already, at the scale of the set (trace
+        R = m): where the searches begin. By default the ends along the eigenvectors of the
+        centre's Q.
 
     Raises
     ------

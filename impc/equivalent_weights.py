@@ -3,7 +3,7 @@
 The fibre of a gain (`gain_fibre`) is a linear space; its positive definite members are the weights
 with that gain. Three of them have a name here: the one that shows best that any exist, the one of
 least condition number, and the analytic centre. The first and the last do not depend on the units
-of states and inputs, the second does.
+of states and inputs, the second does (docs/equivalent-weights.md, section 2).
 """
 
 from __future__ import annotations
@@ -287,7 +287,10 @@ def _distance(X: Array, Y: Array) -> float:
 
 
 def inverse_factor(fibre: GainFibre, weights: Weights) -> Array:
-    """L^-1 of blkdiag(Q, R) = LL', by way of the natural coordinates, where it is accurate."""
+    """L^-1 (n + m, n + m) of blkdiag(Q, R) = LL', by way of the natural coordinates.
+
+    It is accurate there. This L is a factor, not a triangular one.
+    """
     factor = np.linalg.cholesky(fibre.to_natural(weights))
     return np.linalg.inv(factor) @ scipy.linalg.block_diag(fibre.T, fibre.G).T
 

@@ -1,7 +1,7 @@
 """The residual of an inverse problem at a gain and a metric, with its exact derivatives.
 
-One pass over each recording gives both. The columns follow what the problem does not know: gain,
-metric for several inputs, initial states, physical parameters.
+One pass over each recording gives both (docs/theory.md, section 4). The columns follow what the
+problem does not know: gain, metric for several inputs, initial states, physical parameters.
 """
 
 from __future__ import annotations
@@ -72,10 +72,10 @@ class Evaluation:
 def evaluate(
     problem: InverseProblem, gain: Array, metric: Array, near: TerminalSet | None = None
 ) -> Evaluation:
-    """Residual and exact derivatives at a gain and a metric; `near` as in `controller_for`.
+    """Residual and exact derivatives at a `gain` (m, n) and a `metric` (m, m).
 
-    A gain that does not stabilise the plant, or a loop that diverges, gives a large finite
-    residual and its reason, so that a search can step back from it.
+    `near` as in `controller_for`. A gain that does not stabilise the plant, or a loop that
+    diverges, gives a large finite residual and its reason, so that a search can step back.
     """
     plant = problem.plant
     m, n = plant.m, plant.n
@@ -122,7 +122,8 @@ def evaluate(
 def misfit_or_reason(problem: InverseProblem, gain: Array, metric: Array) -> tuple[float, str]:
     """2-norm of the residual and an empty string, or infinity and why there is none.
 
-    A fifth of the time of `evaluate`, which also differentiates.
+    At a `gain` (m, n) and a `metric` (m, m). A fifth of the time of `evaluate`, which also
+    differentiates.
     """
     if not is_stable(problem.plant.A - problem.plant.B @ gain, discrete=True):
         return np.inf, "the gain does not stabilise the plant"
@@ -138,7 +139,23 @@ def misfit_or_reason(problem: InverseProblem, gain: Array, metric: Array) -> tup
 
 
 def residual_only(problem: InverseProblem, gain: Array, metric: Array) -> Array:
-    """Residual without derivatives, for differences and comparisons."""
+    """Residual without derivatives, for differences and comparisons.
+
+    Parameters
+    ----------
+    gain, metric : Array
+        K (m, n) and S (m, m).
+
+    Returns
+    -------
+    Array
+        Simulated minus recorded outputs over their scales (r,), trial by trial, sample by sample.
+
+    Raises
+    ------
+    InputError, SolverError
+        As `controller_for`.
+    """
     controller = controller_for(problem, gain, metric)
     runs = [simulate(controller, drive) for drive in scenarios(problem)]
     return np.concatenate(

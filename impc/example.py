@@ -49,9 +49,13 @@ __all__ = [
 
 _T = TypeVar("_T")
 
+#: Initial states by name.
 CASES: dict[str, tuple[float, float]] = {"A": (1.0, 3.0), "B": (2.0, 3.0), "C": (2.0, 1.0)}
+#: N of the controller, in samples.
 HORIZON = 3
+#: Samples of a recording.
 STEPS = 20
+#: Largest magnitude of the input.
 BOUND = 1.0
 
 
@@ -62,6 +66,7 @@ class MethodResult:
     Attributes
     ----------
     name : str
+        One of the seven, as in the first column of the table.
     weights : Weights or None
         Scaled to R[0, 0] = 1; None for a gain without weights.
     K : Array or None
@@ -71,12 +76,13 @@ class MethodResult:
     state_misfit : float or None
         2-norm over all states and steps.
     max_abs_u : float or None
+        Largest magnitude of an input.
     bound_kept : bool or None
         Whether every input is inside the bound, to 1e-9.
     residual : float or None
         (3.10), against the true weights.
     seconds : float
-        Of this method alone, given what it starts from.
+        Time of this method alone in s, given what it starts from.
     simulations : int
         Closed loops simulated, with derivatives, on the way; 0 for methods that need none.
     feasible : bool or None
@@ -103,10 +109,13 @@ class CaseResult:
     Attributes
     ----------
     name : str
+        One of `CASES`.
     x0 : Array
+        Initial state (n,).
     controller : Controller
         The true one, with its terminal set.
     truth : Simulation
+        The recording.
     branch : str
         Branch of Table 3.1 that was taken: ``"LMI"`` or ``"gradient"``.
     methods : tuple of MethodResult

@@ -59,7 +59,7 @@ class FitMemory:
     writing: Lock = field(default_factory=Lock)
 
     def controller(self, name: str, problem: InverseProblem) -> FittedController:
-        """The controller of a stage, remembered or fitted now and then written down.
+        """The controller of the stage `name`, remembered or fitted now and then written down.
 
         Raises
         ------
@@ -75,7 +75,7 @@ class FitMemory:
         return found
 
     def estimate(self, name: str, compute: Callable[[], Estimate]) -> Estimate:
-        """An estimate of `method_estimates`, remembered or computed now and then written down.
+        """The estimate of the stage `name`, remembered or computed now and then written down.
 
         Raises
         ------
@@ -89,7 +89,13 @@ class FitMemory:
         return found
 
     def replicate(self, name: str, compute: Callable[[], Replicate]) -> Replicate:
-        """A bootstrap replicate, in the same way."""
+        """The bootstrap replicate of the stage `name`, in the same way.
+
+        Raises
+        ------
+        OutputError
+            When the file cannot be written.
+        """
         if name in self.stages:
             kept = self.stages[name]
             return Replicate(frozen(kept["K"]), frozen(kept["parameters"]))

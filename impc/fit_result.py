@@ -1,4 +1,4 @@
-"""Everything that a fit of a subject found, as values."""
+"""Everything that a fit of a subject found (section 3.5), as values."""
 
 from __future__ import annotations
 
@@ -30,6 +30,7 @@ class FittedParameter:
     Attributes
     ----------
     name : str
+        An argument of the plant's function.
     nominal, value : float
         In its unit.
     deviation : float
@@ -71,6 +72,7 @@ class FitResult:
         Largest change of a scaled output when the terminal set is added (or taken away); NaN when
         the loop with it does not reach the end.
     seconds : float
+        Time of the whole fit, s.
     """
 
     settings: FitSettings

@@ -1,4 +1,4 @@
-"""Settings of a fit, as the [fit] table of a configuration gives them."""
+"""Settings of a fit, as the [fit] table of a configuration gives them (docs/fitting.md)."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
 Without bounds this is the first line of Table 3.1; with them it is the reduced form of inverse
 MPC: the recordings determine K, and for several inputs the metric S while bounds are active, and
-nothing else (docs/theory.md).
+nothing else (docs/theory.md, section 2).
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class GainFit:
         Whether A - BK is stable. Without a terminal set the search may end where it is not.
     singular_values : Array
         Of the residual's derivative with respect to K and S in natural coordinates, after initial
-        states and parameters have taken what they can; largest first.
+        states and parameters have taken what they can (g,); largest first.
     metric_determined : bool
         Whether the recordings determine S: every singular value of its part, after K has taken
         what it can, is above 1e-8 of the largest.
@@ -140,6 +140,16 @@ def refine_gain(
 ) -> GainFit:
     """One search of `fit_gain` from a gain and a metric, without looking for better starts.
 
+    Parameters
+    ----------
+    gain, metric : Array
+        K (m, n) and S (m, m).
+    max_evaluations : int
+        Simulations with derivatives, at most.
+    spread : float
+        Standard deviation of a normal prior about the start, in natural coordinates; none by
+        default.
+
     Raises
     ------
     SolverError
@@ -152,7 +162,7 @@ def refine_gain(
 
 
 def bryson_starts(problem: InverseProblem) -> list[tuple[Array, Array]]:
-    """Gains and metrics of the regulators of `bryson_weights`."""
+    """Gains (m, n) and metrics (m, m) of the regulators of `bryson_weights`."""
     solutions = [solve_lqr(problem.plant, weights) for weights in bryson_weights(problem)]
     return [(np.array(item.K), np.array(item.S)) for item in solutions]
 

@@ -6,8 +6,9 @@ T T' is the covariance of the states that the first gain gives when white noise 
 inputs, so that a step of length one moves the command by one unit of that noise, whatever the
 units of the states. On the seat, at four torque limits, a trust region in these coordinates reached
 the gain from 7 of 11 starts, in raw entries from 5, and in raw entries with columns scaled by the
-Jacobian from 4 (experiments/benchmarks/search.py). No optimal regulator has a K T of norm above
-(tr(B'PB)/R)^(1/2), because white noise costs it tr(B'PB) a sample, of which R u^2 is a part.
+Jacobian from 4 (docs/fitting.md; experiments/benchmarks/search.py). No optimal regulator has a
+K T of norm above (tr(B'PB)/R)^(1/2), because white noise costs it tr(B'PB) a sample, of which
+R u^2 is a part.
 
 Initial states are measured in those of the trials themselves (`start_unit`), and a parameter in
 thirds of itself.
@@ -42,7 +43,19 @@ _START_FLOOR = 1e-8
 
 @dataclass(frozen=True)
 class Point:
-    """Gain (m, n), metric (m, m), initial states (trials, n), parameters' logarithms (k,)."""
+    """What a point of a search stands for.
+
+    Attributes
+    ----------
+    K : Array
+        Gain (m, n).
+    S : Array
+        Metric (m, m).
+    starts : Array
+        Initial states (trials, n).
+    logarithms : Array
+        Of the parameters over their nominal values (k,).
+    """
 
     K: Array
     S: Array
@@ -56,6 +69,13 @@ class Compressed:
 
     A search uses their norms and inner products only, which are those of the full ones; a
     recording of thousands of samples becomes a few dozen rows.
+
+    Attributes
+    ----------
+    residual : Array
+        (r,).
+    jacobian : Array
+        With respect to the q coordinates (r, q).
     """
 
     residual: Array
@@ -66,6 +86,12 @@ class Coordinates:
     """The coordinates of one search, and the residual in them.
 
     Caches the last evaluation, because the residual and its derivative come from one pass.
+
+    Parameters
+    ----------
+    problem : InverseProblem
+    gain, metric : Array
+        K (m, n) and S (m, m) where the search begins.
     """
 
     def __init__(self, problem: InverseProblem, gain: Array, metric: Array) -> None:
@@ -89,7 +115,7 @@ class Coordinates:
         self.start = self._pack(gain)
 
     def unpack(self, z: Array) -> Point:
-        """The values at z."""
+        """The values at z (q,)."""
         flat, factor, starts, parameters = np.split(z, self.ends[:-1])
         given = np.array([trial.x0 for trial in self.problem.recordings])
         if len(starts):
@@ -103,7 +129,7 @@ class Coordinates:
         )
 
     def at(self, z: Array) -> Compressed:
-        """Residual and derivative at z."""
+        """Residual and derivative at z (q,)."""
         key = z.tobytes()
         if self.last is None or self.last[0] != key:
             here = self.unpack(z)
@@ -120,7 +146,14 @@ class Coordinates:
         return WithPrior(self, weight)
 
     def without_nuisance(self, z: Array) -> Array:
-        """Derivative with respect to gain and metric that initial states and parameters leave."""
+        """Derivative at z (q,) with respect to gain and metric that the rest leaves.
+
+        Returns
+        -------
+        Array
+            (r, g), g coordinates of gain and metric: orthogonal to the columns of initial states
+            and parameters.
+        """
         jacobian = self.at(z).jacobian
         kept, nuisance = jacobian[:, : self.ends[1]], jacobian[:, self.ends[1] :]
         if nuisance.shape[1] == 0:
@@ -187,20 +220,27 @@ class Coordinates:
 
 @dataclass(frozen=True)
 class WithPrior:
-    """Residual and derivative with the rows of a prior about the start."""
+    """Residual and derivative with the rows of a prior about the start.
+
+    Attributes
+    ----------
+    space : Coordinates
+    weight : float
+        What a step of one away from the start counts in the residual.
+    """
 
     space: Coordinates
     weight: float
 
     def residual(self, z: Array) -> Array:
-        """Rows of the recordings, then of the prior."""
+        """Rows of the recordings at z (q,), then of the prior: (r + q,), or (r,) without it."""
         data = self.space.at(z).residual
         if self.weight == 0:
             return data
         return np.concatenate([data, self.weight * (z - self.space.start)])
 
     def derivative(self, z: Array) -> Array:
-        """Derivative of `residual`."""
+        """Derivative of `residual` at z (q,): (r + q, q), or (r, q) without a prior."""
         data = self.space.at(z).jacobian
         if self.weight == 0:
             return data
@@ -208,7 +248,9 @@ class WithPrior:
 
 
 def start_unit(problem: InverseProblem, gain: Array) -> Array:
-    """Unit of initial states, (n, n): they are thought of as any other state of their trials.
+    """Unit of initial states, (n, n), at a `gain` (m, n).
+
+    They are thought of as any other state of their trials.
 
     A factor of the second moments that the states have when the gain's controller is driven as the
     recordings were. Where nothing drives it, white noise at the inputs of the size of the outputs.

@@ -1,7 +1,7 @@
 """How far a fitted gain is determined: standard deviations under noise of any colour.
 
-To first order a least-squares estimate under stationary noise e_t has the covariance (White's and
-Newey and West's "sandwich", here with a Jacobian that is known)
+To first order a least-squares estimate under stationary noise e_t has the covariance (White 1980,
+Newey and West 1987: the "sandwich", here with a Jacobian that is known; docs/fitting.md)
 
     H^-1 cov( sum_t J_t' e_t ) H^-1,     H = sum_t J_t' J_t,
 
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 __all__ = ["DETERMINED", "GainCovariance", "gain_covariance"]
 
-# A direction whose singular value is below this, of the largest, is not determined at all.
+#: A direction whose singular value is below this, of the largest, is not determined at all.
 DETERMINED = 1e-6
 
 
@@ -50,11 +50,11 @@ class GainCovariance:
         Natural coordinates (n, n).
     singular_values : Array
         Of the scaled residual's derivative with respect to K T, once initial states and parameters
-        have taken what they can; largest first (m n,).
+        have taken what they can; largest first (m * n,).
     directions : Array
-        Right singular vectors, one a row (m n, m n).
+        Right singular vectors, one a row (m * n, m * n).
     deviations : Array
-        Standard deviation along each direction (m n,); infinite below 1e-6 of the largest
+        Standard deviation along each direction (m * n,); infinite below 1e-6 of the largest
         singular value.
     entries : Array
         Standard deviation of each entry of K (m, n), in its unit; infinite when a direction
@@ -83,7 +83,8 @@ def gain_covariance(
     ----------
     fit : GainFit
     noise : callable
-        How the noise is estimated from residuals: `residual_noise`, or `white_noise` for the plain
+        How the noise is estimated from the residuals, (samples, p) for each trial, and the count
+        of numbers fitted: `residual_noise`, or `white_noise` for the plain
         Cramér-Rao bound.
     """
     problem = fit.problem

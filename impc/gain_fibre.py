@@ -7,7 +7,8 @@ its gain is then linear in (Q, R):
     continuous:  0 = F'P + PF + Q + K'RK,    B'P  = RK
 
 so the weights with the gain K are the positive definite members of a linear space. With P
-eliminated nothing has to be asked of it: Q, R > 0 give P > 0.
+eliminated nothing has to be asked of it: Q, R > 0 give P > 0 (docs/equivalent-weights.md,
+section 1).
 
 The fibre is computed in natural coordinates, which follow from the plant and the gain alone: in
 them white noise at the inputs gives the states a covariance of I, and the inputs are measured in
@@ -67,7 +68,7 @@ class GainFibre:
     T, G : Array
         Natural coordinates of states x = T z (n, n) and inputs u = G v (m, m).
     singular_values : Array
-        Of the gain condition in natural coordinates, largest first: those below 1e-10 of the
+        Of the gain condition in natural coordinates (s,), largest first: those below 1e-10 of the
         first count as zero.
     """
 
@@ -89,12 +90,12 @@ class GainFibre:
         return pair_blocks(self.T.T @ self.Q @ self.T, self.G.T @ self.R @ self.G)
 
     def to_natural(self, weights: Weights) -> Array:
-        """blkdiag(T'QT, G'RG) of any weights."""
+        """blkdiag(T'QT, G'RG) of any weights, (n + m, n + m)."""
         both = scipy.linalg.block_diag(self.T, self.G)
         return np.asarray(both.T @ weights.block @ both)
 
     def from_natural(self, X: Array) -> Weights:
-        """Weights in the units of the plant; inverse of `to_natural`."""
+        """Weights in the units of the plant of an X (n + m, n + m); inverse of `to_natural`."""
         back = np.linalg.inv(scipy.linalg.block_diag(self.T, self.G))
         return split_blocks(back.T @ X @ back, self.plant.n)
 
@@ -148,7 +149,13 @@ def gain_fibre(plant: Plant, gain: ArrayLike, metric: ArrayLike | None = None) -
 
 
 def natural_coordinates(plant: Plant, K: Array) -> tuple[Array, Array]:
-    """Natural coordinates x = T z, u = G v of a plant under a stabilising gain: (n, n), (m, m)."""
+    """Natural coordinates x = T z, u = G v of a plant under a stabilising gain K (m, n).
+
+    Returns
+    -------
+    T, G : Array
+        (n, n) and (m, m).
+    """
     F = plant.A - plant.B @ K
     input_factor = np.linalg.cholesky(floored_covariance(_input_metric(plant, K, F), _INPUT_FLOOR))
     G = np.asarray(np.linalg.inv(input_factor).T, dtype=np.float64)
@@ -162,7 +169,7 @@ def natural_coordinates(plant: Plant, K: Array) -> tuple[Array, Array]:
 
 
 def pair_blocks(Q: Array, R: Array) -> Array:
-    """blkdiag(Q, R) for stacks (k, n, n) and (k, m, m)."""
+    """blkdiag(Q, R) for stacks Q (k, n, n) and R (k, m, m): (k, n + m, n + m)."""
     n, m = Q.shape[-1], R.shape[-1]
     joined = np.zeros((len(Q), n + m, n + m))
     joined[:, :n, :n], joined[:, n:, n:] = Q, R
@@ -170,7 +177,7 @@ def pair_blocks(Q: Array, R: Array) -> Array:
 
 
 def split_blocks(X: Array, n: int) -> Weights:
-    """The pair whose blkdiag(Q, R) is X, symmetrised."""
+    """The pair whose blkdiag(Q, R) is X (n + m, n + m), symmetrised; Q is (n, n)."""
     symmetric = (X + X.T) / 2
     return Weights(frozen(symmetric[:n, :n]), frozen(symmetric[n:, n:]))
 
@@ -190,7 +197,7 @@ def _input_metric(plant: Plant, K: Array, F: Array) -> Array:
 def floored_covariance(covariance: Array, floor: float) -> Array:
     """Make a covariance (n, n) definite: unit variance where there is none, correlations floored.
 
-    The eigenvalues of the correlation are raised to the floor.
+    The eigenvalues of the correlation are raised to the floor. The answer is (n, n) too.
     """
     variance = np.diag(covariance)
     scale = np.where(variance > 0, np.sqrt(np.maximum(variance, 1e-300)), 1.0)

@@ -1,5 +1,7 @@
 """Geometry of sets {z : Z z <= 1}: supports by linear programming, needed rows.
 
+What `terminal_set` needs of it (Gilbert and Tan 1991).
+
 The support of a row d is max d z over the set, with d z itself capped at twice the bound so that
 the program is always bounded. Its dual,
 
@@ -101,6 +103,27 @@ def redundant_rows(
     """Whether each row of new (c, q) exceeds 1 by no more than the tolerance where Z z <= 1.
 
     A row that the ray along itself meets inside the set is clearly needed, without a program.
+
+    Parameters
+    ----------
+    new, Z : Array
+        Rows (c, q) to judge, rows (s, q) of the set.
+    tolerance : float
+        Relative to the bound of 1.
+    hints : IntArray or None
+        Bases (c, q) of an earlier call, see `supports`.
+
+    Returns
+    -------
+    redundant : BoolArray
+        (c,).
+    bases : IntArray
+        Hints (c, q) for the next call.
+
+    Raises
+    ------
+    SolverError
+        When HiGHS fails.
     """
     reach = np.max(Z @ new.T, axis=0, initial=0.0)  # t * new leaves the set at t = 1 / reach
     inside = np.sum(new**2, axis=1) > (1 + tolerance + _TOUCHING) * reach
@@ -119,12 +142,28 @@ def needed_rows(
     Of rows that follow from one another the earlier is kept. A row is also needed when a ray from
     the origin meets it clearly before all others, which saves its program.
 
+    Parameters
+    ----------
+    Z : Array
+        (s, q).
+    mirrored : bool
+        Whether the set is symmetric about the origin, and Z one half of its rows.
+    tolerance : float
+        How far a row may exceed 1 and still follow.
+    hints : IntArray, optional
+        Bases (s, q) of an earlier call, see `supports`.
+
     Returns
     -------
     kept : IntArray
-        Increasing indices.
+        Increasing indices (k,).
     bases : IntArray
         Hints (s, q) for the next call.
+
+    Raises
+    ------
+    SolverError
+        When HiGHS fails.
     """
     kept, bases = np.arange(len(Z)), np.full(Z.shape, -1)
     doubtful = kept[~_first_hit(Z, mirrored, 1 + tolerance + _TOUCHING)]
@@ -140,7 +179,7 @@ def needed_rows(
 
 
 def with_mirror(Z: Array, mirrored: bool) -> Array:
-    """Return the rows, and their negatives when mirrored."""
+    """Return the rows Z (s, q), and when mirrored their negatives behind them, (2 * s, q)."""
     return np.concatenate([Z, -Z]) if mirrored else Z
 
 

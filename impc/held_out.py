@@ -1,4 +1,4 @@
-"""A trial as the controller that was fitted to the others predicts it."""
+"""A trial as the controller that was fitted to the others predicts it, by VAF (3.24)."""
 
 from __future__ import annotations
 
@@ -72,7 +72,22 @@ def predict(
 def left_out_vaf(
     alone: InverseProblem, gain: Array, metric: Array, settle: float
 ) -> tuple[Array, Array]:
-    """VAF and centred VAF (p,) of the one trial of a problem under a gain found without it."""
+    """VAF of the one trial of a problem under a gain found without it.
+
+    Parameters
+    ----------
+    alone : InverseProblem
+        With that trial only.
+    gain, metric : Array
+        K (m, n) and S (m, m).
+    settle : float
+        Time at the start that does not count, s; an unknown initial state is fitted to it.
+
+    Returns
+    -------
+    vaf, centred : Array
+        `agreement.vaf` and `agreement.centred_vaf`, % (p,); NaN when the loop ends early.
+    """
     trial = alone.recordings[0]
     first = round(settle / alone.plant.dt)
     started = alone

@@ -35,7 +35,16 @@ _DETERMINED = 1e-8
 
 @dataclass(frozen=True)
 class OtherWeights:
-    """Weights other than the reported ones, and the misfit of the same recordings with them."""
+    """Weights other than the reported ones, and the misfit of the same recordings with them.
+
+    Attributes
+    ----------
+    weights : Weights
+    condition : float
+        kappa(blkdiag(Q, R)).
+    misfit : float
+        2-norm of the output residual.
+    """
 
     weights: Weights
     condition: float
@@ -49,7 +58,7 @@ class Identifiability:
     Attributes
     ----------
     singular_values : Array
-        Of the outputs' derivative with respect to relative changes of blkdiag(Q, R), largest
+        Of the outputs' derivative with respect to relative changes of blkdiag(Q, R) (s,), largest
         first. Relative: in the coordinates D of dX = L D L', X = L L'.
     free : int
         Directions of (Q, R), scale not counted.
@@ -58,6 +67,7 @@ class Identifiability:
     chosen : int
         How many the condition number chose: free - rank.
     tolerance : float
+        That share of the largest.
     others : tuple of OtherWeights
         Other weights that explain the recordings equally well.
     """

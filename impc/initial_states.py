@@ -1,4 +1,4 @@
-"""The states in which trials start, when the controller is known."""
+"""The states in which trials start, when the controller is known (docs/fitting.md)."""
 
 from __future__ import annotations
 
@@ -36,6 +36,8 @@ def with_fitted_starts(
 
     Parameters
     ----------
+    gain, metric : Array
+        K (m, n) and S (m, m) of that controller.
     samples : int, optional
         How many samples of each trial may be looked at; all by default.
     """

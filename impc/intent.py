@@ -130,7 +130,8 @@ def intent(plant: Plant, gain: Array, sizes: Array, fallback: Weights) -> Intent
 def dominant_sentence(reading: Reading, plant: Plant, sizes: Array) -> str:
     """(3.26) in words: the dominant cost, its share, and which states it weighs.
 
-    A state counts by v_i times its typical size, so that units do not decide.
+    A state counts by v_i times its typical size, so that units do not decide: `sizes` (n,) in the
+    units of the states.
     """
     v = reading.dominant
     terms = [

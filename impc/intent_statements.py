@@ -8,6 +8,8 @@ good explanations (`weights_set`). A statement about them is worth making if it 
     sense     Q_ij above or below zero: the two states are priced together or against each other
     direction the dominant eigenvector of D Q D; its widest angle to that of the least condition
               number is searched for, not proved: a member that far exists, farther ones may
+
+docs/equivalent-weights.md, section 5, and docs/what-may-be-concluded.md.
 """
 
 from __future__ import annotations
@@ -95,6 +97,10 @@ def sense_statements(
 
     Parameters
     ----------
+    sizes : Array
+        Typical excursions d_i (n,), in the units of the states.
+    states : tuple of str
+        Names of those compared, in pairs.
     ranges : mapping
         Of `entry_ranges`, for these states at least.
     """
@@ -112,6 +118,8 @@ def sense_statements(
 
 def widest_dominant_angle(found: WeightsSet, sizes: Array) -> tuple[float, Weights]:
     """Widest angle found between dominant directions of D Q D, in degrees, and who has it.
+
+    D = diag(sizes), the typical excursions (n,) in the units of the states.
 
     The direction of the member of least condition number against others: from it and from the
     members at the ends of the ranges of the largest prices, each improved by steps of Frank and

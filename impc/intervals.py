@@ -6,6 +6,7 @@
     profile       where the misfit has grown by chi-squared's quantile (`impc.profile_likelihood`)
 
 Parameters are searched in logarithms and are positive: theirs are value * exp(+- z deviation).
+docs/fitting.md says how often each covers the truth.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 
 __all__ = ["LEVEL", "Interval", "covariance_intervals", "entry_names", "white_covariance"]
 
+#: Of an interval, where none is asked for.
 LEVEL = 0.95
 
 
@@ -41,6 +43,7 @@ class Interval:
     method : str
         See the module's text.
     level : float
+        Between 0 and 1, 0.95 for 95 %.
     value : float or None
         The estimate; None when nothing determines it.
     low, high : float

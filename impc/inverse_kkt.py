@@ -86,7 +86,7 @@ def stationarity_weights(
     u_max : Array
         Bounds of the inputs (m,), infinite where there is none.
     gain : Array
-        As in `inverse_kkt`.
+        (m, n), as in `inverse_kkt`.
 
     Raises
     ------

@@ -125,6 +125,7 @@ def inverse_lqr_gradient(
         By default the cross-term weights without their cross term, or the identity when A - BK is
         not stable.
     max_evaluations : int
+        Of the gain, at most.
     floor : float
         Relative; 0 lets Q become singular to working precision.
 

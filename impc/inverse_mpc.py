@@ -54,7 +54,9 @@ __all__ = [
 ]
 
 # c of (3.5) to (3.7) is lost. Small enough that the exact fit wins in the 2-norm (docs/theory.md).
+#: Weight of the condition number in (3.6) and (3.16), against 1 for the misfit.
 CONDITION_WEIGHT = 1e-4
+#: The same in (3.7), against 1 for the distance of the gains.
 AUXILIARY_CONDITION_WEIGHT = 1e-3
 # Steps of the direct form inside the reduced one: it need not end, only change the valley.
 _DETOUR = 60
@@ -122,7 +124,15 @@ class Start:
 
 @dataclass(frozen=True)
 class Inference:
-    """Table 3.1 from end to end: where it started, and the fit of line 9."""
+    """Table 3.1 from end to end.
+
+    Attributes
+    ----------
+    start : Start
+        Lines 1 to 8.
+    fit : ConditionedFit
+        Line 9.
+    """
 
     start: Start
     fit: ConditionedFit
@@ -149,7 +159,7 @@ def infer_weights(
 
 
 def start_gains(start: Start, plant: Plant) -> list[tuple[Array, Array]]:
-    """The gains that Table 3.1 passed on its way, with their metrics, as starts for `fit_gain`."""
+    """The gains (m, n) that Table 3.1 passed, with metrics (m, m), as starts for `fit_gain`."""
     passed = [start.weights]
     if start.gradient is not None and start.gradient.weights is not None:
         passed.append(start.gradient.weights)
@@ -197,6 +207,7 @@ def inverse_mpc(
     squared : bool
         Whether the misfit is the square of its 2-norm; see `Objective`.
     max_iterations : int
+        Steps that are solved at most.
 
     Raises
     ------
@@ -223,7 +234,7 @@ def inverse_mpc_reduced(
     Parameters
     ----------
     starts : pairs of Array
-        Gains and metrics from which the search may start, see `fit_gain`.
+        Gains (m, n) and metrics (m, m) from which the search may start, see `fit_gain`.
     condition_weight : float
         Of the direct form.
 
@@ -289,6 +300,20 @@ def auxiliary_weights(
     """Auxiliary problem (3.7): weights whose regulator is near the gain, and well conditioned.
 
     minimise  ||K(Q, R) - gain||_2 + condition_weight kappa(blkdiag(Q, R))
+
+    Parameters
+    ----------
+    gain : Array
+        (m, n).
+    start : Weights or None
+        Where the search begins; the identity for None.
+    condition_weight : float
+        Against 1 for the distance.
+
+    Raises
+    ------
+    WeightsError
+        When the start has no stabilising Riccati solution.
     """
     size = gain.size
     dK = np.eye(size).reshape(size, *gain.shape)
@@ -309,7 +334,20 @@ def output_penalty_weights(
     *,
     condition_weight: float = CONDITION_WEIGHT,
 ) -> ConditionedFit:
-    """Inverse LQR on the outputs (3.16): as `inverse_mpc`, but the loop is the plain regulator."""
+    """Inverse LQR on the outputs (3.16): as `inverse_mpc`, but the loop is the plain regulator.
+
+    Parameters
+    ----------
+    start : Weights
+        Positive definite.
+    condition_weight : float
+        Against a fit weight of 1.
+
+    Raises
+    ------
+    WeightsError, SolverError
+        As `inverse_mpc`.
+    """
     return inverse_mpc(without_bounds(problem), start, condition_weight=condition_weight)
 
 

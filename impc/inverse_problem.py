@@ -5,7 +5,7 @@ divided by its scale, and its derivatives with respect to K and S are exact. The
 through K and S only, so every method of the package is one of two searches over this residual: for
 a gain, or for weights. What else is not known of a recording, the state in which each trial starts
 and physical parameters of the plant, is searched together with the gain; `moved` gives the problem
-at other values of these.
+at other values of these (docs/theory.md, section 6; docs/fitting.md).
 """
 
 from __future__ import annotations
@@ -52,6 +52,7 @@ class InverseProblem:
     plant : Plant
     bounds : Bounds
     horizon : int
+        N, in samples.
     recordings : tuple of Recording
     terminal_set : bool
         Whether the controller ends in its maximal invariant set.
@@ -100,6 +101,7 @@ def inverse_problem(
         That of the family's nominal values, when there is one.
     bounds : Bounds
     horizon : int
+        N, in samples.
     recordings : tuple of Recording
     terminal_set, softening, unknown_start, family
         See `InverseProblem`.
@@ -133,7 +135,15 @@ def inverse_problem(
 
 
 def moved(problem: InverseProblem, starts: Array, logarithms: Array) -> InverseProblem:
-    """Return the problem at other initial states (trials, n) and other parameters (k,)."""
+    """Return the problem at other initial states and other parameters.
+
+    Parameters
+    ----------
+    starts : Array
+        Initial states (trials, n).
+    logarithms : Array
+        Of the family's parameters over their nominal values (k,).
+    """
     recordings = tuple(
         replace(trial, x0=frozen(x0)) for trial, x0 in zip(problem.recordings, starts, strict=True)
     )
@@ -151,7 +161,7 @@ def without_bounds(problem: InverseProblem) -> InverseProblem:
 def controller_for(
     problem: InverseProblem, gain: Array, metric: Array, near: TerminalSet | None = None
 ) -> Controller:
-    """Return the controller of the problem with that gain and metric.
+    """Return the controller of the problem with that `gain` (m, n) and `metric` (m, m).
 
     `near` is the terminal set of a gain nearby: the same answer in less time.
 

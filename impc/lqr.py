@@ -125,7 +125,7 @@ def solve_lqr(plant: Plant, weights: Weights) -> LqrSolution:
 
 
 def is_stable(F: Array, *, discrete: bool) -> bool:
-    """Whether all eigenvalues of F decay."""
+    """Whether all eigenvalues of F (n, n) decay: |z| < 1 when `discrete`, else Re s < 0."""
     eigenvalues = np.linalg.eigvals(F)
     if discrete:
         return bool(np.max(np.abs(eigenvalues)) < 1)
@@ -133,11 +133,23 @@ def is_stable(F: Array, *, discrete: bool) -> bool:
 
 
 def lyapunov_series(F: Array, right: Array) -> Array:
-    """Solve X = F X F' + right for a stack of right sides (p, n, n) by Smith's doubling.
+    """Solve X = F X F' + right for a stack of right sides by Smith's doubling (Smith 1968).
 
     X = sum F^k right F'^k; each doubling squares F, so the number of products grows with the
     logarithm of the time constant and the whole stack shares the powers. The relative truncation
     error is below the unit round-off when the loop ends.
+
+    Parameters
+    ----------
+    F : Array
+        (n, n), stable.
+    right : Array
+        (p, n, n).
+
+    Returns
+    -------
+    Array
+        X of each right side (p, n, n).
 
     Raises
     ------

@@ -46,6 +46,7 @@ if TYPE_CHECKING:
 
 __all__ = ["METHODS", "Estimate", "decode_estimate", "encode_estimate", "estimate_all"]
 
+#: Names of the methods, in the order in which they are estimated.
 METHODS = (
     "feedback_gain",
     "inverse_lqr_lmi",
@@ -67,6 +68,7 @@ class Estimate:
     K, S : Array or None
         Gain (m, n) and metric (m, m); None when the method ended without them.
     weights : Weights or None
+        None when the method ended without them.
     starts : Array
         Initial states that were taken (trials, n).
     logarithms : Array
@@ -74,6 +76,7 @@ class Estimate:
     noise : float
         2-norm of the residual that counts as noise for the methods that follow.
     seconds : float
+        Time that it took, s.
     reason : str
         Why there is no gain, or no weights.
     """
@@ -244,7 +247,7 @@ def encode_estimate(estimate: Estimate) -> dict[str, Any]:
 
 
 def decode_estimate(kept: dict[str, Any]) -> Estimate:
-    """Inverse of `encode_estimate`."""
+    """Inverse of `encode_estimate`, of what it `kept`."""
     return Estimate(
         None if kept["K"] is None else frozen(kept["K"]),
         None if kept["S"] is None else frozen(kept["S"]),

@@ -1,4 +1,7 @@
-"""One method's gain on all recordings: how it simulates them, and whether it keeps the bounds."""
+"""One method's gain on all recordings: how it simulates them, and whether it keeps the bounds.
+
+The measures of docs/comparing.md: VAF (3.24), largest input, share of samples beyond a bound.
+"""
 
 from __future__ import annotations
 
@@ -27,6 +30,7 @@ class MethodFit:
     Attributes
     ----------
     name : str
+        Of the method.
     K : Array or None
         (m, n); None when the method ended without one.
     weights : Weights or None
@@ -43,6 +47,7 @@ class MethodFit:
     fell : tuple of float or None
         For each trial the time in s at which the loop left every reasonable range.
     seconds : float
+        Time that the method took, s.
     reason : str
         Why there is no gain; empty otherwise.
     """
@@ -80,6 +85,8 @@ def judge(
 
     Parameters
     ----------
+    name : str
+        Of the method.
     problem : InverseProblem
         At the initial states to simulate from; its bounds are those that the controller knows.
     bounds : Bounds
@@ -87,7 +94,12 @@ def judge(
     gain, metric : Array
         (m, n), (m, m).
     weights, seconds, reason
-        Kept in the result.
+        Kept in the result; the time in s.
+
+    Raises
+    ------
+    InputError, SolverError
+        As `controller_for`.
     """
     controller = controller_for(problem, gain, metric)
     runs = tuple(simulate(controller, drive) for drive in scenarios(problem))
@@ -111,7 +123,10 @@ def judge(
 
 
 def without_gain(name: str, problem: InverseProblem, seconds: float, reason: str) -> MethodFit:
-    """What is left to say of a method that ended without a gain."""
+    """What is left to say of the method `name` that ended without a gain.
+
+    Its `reason` and the time in s, `seconds`, are kept.
+    """
     p, m, count = len(problem.plant.outputs), problem.plant.m, len(problem.recordings)
     return MethodFit(
         name,

@@ -75,7 +75,7 @@ class MpcSolver:
     function : casadi.Function
         The solver, taking the state as parameter ``p``.
     soft : BoolArray
-        Which rows have a slack.
+        Which rows have a slack (r,).
     """
 
     controller: Controller

@@ -40,6 +40,7 @@ if TYPE_CHECKING:
 
 __all__ = ["CONDITION_SHARE", "in_plant_units", "inverse_mpc_natural"]
 
+#: What the condition number of the start counts, against a misfit as large as the noise.
 CONDITION_SHARE = 1e-3
 # A step that promises less than this, of the objective, is below what the noise decides.
 _TOLERANCE = 1e-5
@@ -65,6 +66,8 @@ def inverse_mpc_natural(
         2-norm of the residual that no weights are asked to explain; positive.
     condition_share : float
         What the condition number of the start counts, against a misfit of `noise`.
+    max_iterations : int
+        Steps that are solved at most.
 
     Returns
     -------
@@ -99,7 +102,13 @@ def inverse_mpc_natural(
 
 
 def in_plant_units(weights: Weights, T: Array, G: Array) -> Weights:
-    """Weights of z = T^-1 x and v = G^-1 u as weights of x and u, scaled to R[0, 0] = 1."""
+    """Weights of z = T^-1 x and v = G^-1 u as weights of x and u, scaled to R[0, 0] = 1.
+
+    Parameters
+    ----------
+    T, G : Array
+        (n, n) and (m, m).
+    """
     z, v = np.linalg.inv(T), np.linalg.inv(G)
     block = pair_blocks((z.T @ weights.Q @ z)[None], (v.T @ weights.R @ v)[None])[0]
     return normalised(split_blocks(block, len(T)))

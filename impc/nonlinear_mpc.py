@@ -1,6 +1,6 @@
 """The controller with the plant's full equations inside, to show when the linear one is adequate.
 
-    minimise    x_N' P x_N + sum_{k<N} (x_k' Q x_k + u_k' R u_k)
+    minimise    x_N' P x_N + sum_{k<N} (x_k' Q x_k + u_k' R u_k)              (3.1), with f
     subject to  x_{k+1} = f(x_k, u_k),   u_min <= u_k <= u_max
 
 by single shooting in CasADi, solved by IPOPT at every sample, each from the last answer moved on by
@@ -55,6 +55,7 @@ class NonlinearMpc:
     solver : Any
         CasADi's nlpsol: start x and parameters -> sequence.
     horizon, n, m : int
+        N in samples, number of states, number of inputs.
     u_min, u_max : Array
         (m,).
     scale : Array
@@ -143,9 +144,7 @@ def simulate_nonlinear(mpc: NonlinearMpc, given: Scenario) -> Simulation:
         x[k + 1] = np.asarray(mpc.step(x[k], inputs)).ravel()
         guess = np.concatenate([plan[mpc.m :], plan[-mpc.m :]])
         if not np.all(np.isfinite(x[k + 1])) or np.max(np.abs(x[k + 1])) > largest:
-            status[k + 1 :] = Status.NOT_REACHED
-            if k + 1 < steps:
-                status[k + 1] = Status.DIVERGED
+            status[k] = Status.DIVERGED
             break
     reached = int(np.count_nonzero(status <= Status.SOFTENED))
     x[reached + 1 :] = x[reached]

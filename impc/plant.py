@@ -4,7 +4,7 @@
     dx/dt   = A x   + B u   + E d,      y   = C x            (continuous)
 
 u are the inputs that the controller commands, d the recorded disturbances. A plant without
-disturbances has an E with no columns.
+disturbances has an E with no columns. What the controller makes of it: docs/theory.md, section 1.
 """
 
 from __future__ import annotations

@@ -4,7 +4,8 @@ The parameters are positive (masses, lengths, stiffnesses, time constants) and a
 their logarithms about the nominal values. The plant's matrices are analytic functions of them, so
 the derivative is taken by Richardson's extrapolation of central differences of step h and h/2 in
 the logarithm: an error of order h^4 and of rounding/h. At h = 1e-3 both are 1e-12, and the two
-central differences tell how far the extrapolation can be trusted.
+central differences tell how far the extrapolation can be trusted. docs/fitting.md says how a
+parameter is freed.
 """
 
 from __future__ import annotations
@@ -49,7 +50,13 @@ class PlantFamily:
 
 
 class PlantDifferential(NamedTuple):
-    """Derivatives of A, B, E and C with respect to the logarithms; the parameters' axis is last."""
+    """Derivatives of A, B, E and C with respect to the logarithms; the parameters' axis is last.
+
+    Attributes
+    ----------
+    A, B, E, C : Array
+        (n, n, k), (n, m, k), (n, d, k) and (p, n, k).
+    """
 
     A: Array
     B: Array
@@ -61,6 +68,15 @@ def plant_family(
     make: Callable[[Array], Plant], names: Sequence[str], nominal: Sequence[float]
 ) -> PlantFamily:
     """Check and freeze a family.
+
+    Parameters
+    ----------
+    make : callable
+        Values of the parameters (k,), in their units -> plant.
+    names : sequence of str
+        Of the parameters.
+    nominal : sequence of float
+        Their values when nothing is known, in their units; positive.
 
     Raises
     ------
@@ -74,12 +90,14 @@ def plant_family(
 
 
 def plant_at(family: PlantFamily, logarithms: Array) -> Plant:
-    """The plant at nominal * exp(logarithms)."""
+    """The plant at nominal * exp(logarithms), logarithms (k,)."""
     return family.make(family.nominal * np.exp(logarithms))
 
 
 def plant_differential(family: PlantFamily, logarithms: Array) -> PlantDifferential:
     """Derivatives of the plant's matrices with respect to the logarithms of its parameters.
+
+    At `logarithms` (k,) of the parameters over their nominal values.
 
     Raises
     ------

@@ -131,6 +131,13 @@ def plant_family_of(
 ) -> PlantFamily | None:
     """The plants that differ in the free arguments; None when none is free.
 
+    Parameters
+    ----------
+    recorded : sequence of str
+        Names of recorded signals, as in `make_plant`.
+    free : sequence of str
+        Names of the arguments that are fitted.
+
     Raises
     ------
     InputError

@@ -1,4 +1,4 @@
-"""A terminal set as a polygon, for pictures, and as a `pytope.Polytope`."""
+"""A terminal set (docs/theory.md, section 3) as a polygon, and as a `pytope.Polytope`."""
 
 from __future__ import annotations
 

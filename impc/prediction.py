@@ -7,7 +7,7 @@ H = E - F K and the closed loop Phi = A - BK, the row says
 
 Stages k < N are the bounds along the horizon. A row (c, j) of the maximal invariant set is the
 same row at the stage k = N + j, where no v is left: the terminal set needs no code of its own,
-and follows K through the same derivative. In short  T x + M v <= b.
+and follows K through the same derivative. In short  T x + M v <= b  (docs/theory.md, section 3).
 """
 
 from __future__ import annotations
@@ -67,11 +67,20 @@ class RowDirections(NamedTuple):
     """Derivatives of `Rows` along p directions, which are the last axis of every array.
 
     The axis is last so that the innermost loops of the compiled code run over contiguous memory.
+
+    Attributes
+    ----------
+    T : Array
+        (r, n, p).
+    M : Array
+        (r, N m, p).
+    b : Array
+        (r, p).
     """
 
-    T: Array  # (r, n, p)
-    M: Array  # (r, N m, p)
-    b: Array  # (r, p)
+    T: Array
+    M: Array
+    b: Array
 
 
 @dataclass(frozen=True)
@@ -107,7 +116,15 @@ class Directions:
 
 
 def directions(controller: Controller, count: int, **given: Array) -> Directions:
-    """Return `count` directions with the given parts; those not given are zero."""
+    """Return `count` directions with the given parts; those not given are zero.
+
+    Parameters
+    ----------
+    count : int
+        Number of directions p.
+    **given : Array
+        Fields of `Directions` by name, in any layout that reshapes to theirs: K to (m, n, p).
+    """
     plant = controller.plant
     rows = bound_rows(controller.bounds, plant)
     shapes = {

@@ -9,6 +9,7 @@ f >= 1 the factor by which the colour of the residuals widens the variance of th
 is chi-squared with one degree of freedom at the true value, and {v : D(v) <= q} is an interval that
 need not be symmetric and is not fooled by curvature. It ends nowhere if the misfit stays: then the
 recordings do not determine the number. The input limit has a module of its own, `unknown_limit`.
+docs/fitting.md says how often the interval covers the truth.
 
 All of these numbers are affine in the coordinates z of the search (`Coordinates`), c + a'z,
 parameters in their logarithm; the search with a'z held goes on in the null space of a'.
@@ -56,7 +57,7 @@ class Profile:
     interval : Interval
         Method "profile".
     values, distances : Array
-        Values tried, ascending, and D at each, for a picture.
+        Values tried (t,), ascending, in the number's unit, and D at each (t,), for a picture.
     """
 
     interval: Interval
@@ -72,6 +73,7 @@ def profile_likelihood(fitted: FittedController, name: str, level: float = LEVEL
     fitted : FittedController
         Its free gain is where the profile begins: weights do not enter.
     name : str
+        K.<control>.<state>, or that of the parameter.
     level : float
         Of the interval, between 0 and 1.
 

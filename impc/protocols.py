@@ -88,6 +88,7 @@ def critical_stiffness(
     start, coarse_step, fine_step, margin : float
         Nm/rad; the fine searches begin `margin` above the coarse result.
     coarse_searches, fine_searches : int
+        How often each is done; of the coarse ones the least counts, of the fine ones the mean.
 
     Raises
     ------

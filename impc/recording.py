@@ -20,7 +20,13 @@ __all__ = ["Label", "Recording", "recording"]
 
 @dataclass(frozen=True)
 class Label:
-    """Whose trial it is; empty where the recording does not say."""
+    """Whose trial it is; empty where the recording does not say.
+
+    Attributes
+    ----------
+    subject, visit, condition, trial : str
+        Names, as the files or the study give them.
+    """
 
     subject: str = ""
     visit: str = ""
@@ -85,6 +91,7 @@ def recording(
         outputs starts at rest.
     label : Label, optional
     findings : tuple of str
+        What the checks of the file found, for the report.
 
     Raises
     ------

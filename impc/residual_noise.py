@@ -74,7 +74,15 @@ def residual_noise(trials: list[Array], lost: int = 0) -> ResidualNoise:
 
 
 def white_noise(trials: list[Array], lost: int = 0) -> ResidualNoise:
-    """As `residual_noise` if the residuals were white: outputs may be correlated, samples not."""
+    """As `residual_noise` if the residuals were white: outputs may be correlated, samples not.
+
+    Parameters
+    ----------
+    trials : list of Array
+        Residuals (samples, p) of each trial.
+    lost : int
+        Count of numbers that were fitted to them.
+    """
     total = sum(len(part) for part in trials)
     size = total * trials[0].shape[1]
     gamma = _lagged(trials, 0) / total * size / max(size - lost, 1)

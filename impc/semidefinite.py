@@ -1,4 +1,6 @@
-"""Linear programs over matrix inequalities, handed to Clarabel as they are.
+"""Linear programs over matrix inequalities (Boyd and Vandenberghe 2004, section 4.6).
+
+They are handed to Clarabel as they are.
 
     minimise  c'y  subject to  every  b_i - A_i y  in its cone
 
@@ -29,7 +31,17 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Cone:
-    """right - rows @ y lies in a cone of Clarabel's: rows (r, k), right (r,)."""
+    """right - rows @ y lies in a cone of Clarabel's.
+
+    Attributes
+    ----------
+    rows : Array
+        (r, k).
+    right : Array
+        (r,).
+    kind : Any
+        Clarabel's object for the cone.
+    """
 
     rows: Array
     right: Array
@@ -57,7 +69,7 @@ class SemidefiniteSolution:
 
 
 def matrix_inequality(constant: Array, basis: Array) -> Cone:
-    """constant + sum y_i basis_i >= 0, for symmetric matrices (d, d) and (k, d, d)."""
+    """constant + sum y_i basis_i >= 0, for symmetric `constant` (d, d) and `basis` (k, d, d)."""
     kind = clarabel.PSDTriangleConeT(len(constant))
     return Cone(-_triangle(basis).T, _triangle(constant[None])[0], kind)
 
@@ -65,7 +77,19 @@ def matrix_inequality(constant: Array, basis: Array) -> Cone:
 def norm_bound(
     vectors: Array, bound: Array, *, offset: Array | None = None, constant: float = 0.0
 ) -> Cone:
-    """||offset + sum y_i vectors_i|| <= constant + bound @ y, for vectors (k, r), offset (r,)."""
+    """||offset + sum y_i vectors_i|| <= constant + bound @ y.
+
+    Parameters
+    ----------
+    vectors : Array
+        (k, r), one a row.
+    bound : Array
+        (k,).
+    offset : Array, optional
+        (r,); zero by default.
+    constant : float
+        Zero by default.
+    """
     rows = -np.vstack([bound, vectors.T])
     right = np.concatenate([[constant], np.zeros(len(rows) - 1) if offset is None else offset])
     return Cone(rows, right, clarabel.SecondOrderConeT(len(rows)))
@@ -78,10 +102,19 @@ def solve_semidefinite(
     squares: Array | None = None,
     tolerance: float = 1e-11,
 ) -> SemidefiniteSolution:
-    """Minimise objective @ y + squares @ y^2 over the cones; no squares by default.
+    """Minimise objective @ y + squares @ y^2 over the cones.
 
-    The tolerance is Clarabel's, on gap and feasibility. Its own default of 1e-8 would be the error
-    of the weights.
+    Parameters
+    ----------
+    objective : Array
+        (k,).
+    cones : list of Cone
+        All of them hold.
+    squares : Array, optional
+        (k,), not negative; zero by default.
+    tolerance : float
+        Clarabel's, on gap and feasibility. Its own default of 1e-8 would be the error of the
+        weights.
 
     Raises
     ------

@@ -4,6 +4,7 @@ The controller sees the true state at its own rate and holds its command until t
 plant runs at the rate of the recording. Motor noise is added to the held command, white from one
 sample of the controller to the next; sensor noise to the recorded outputs, white from one recorded
 sample to the next. What is recorded is what a laboratory would have: clock, outputs, disturbance.
+The controller is that of (3.1); docs/fitting.md has what a fit makes of such subjects.
 """
 
 from __future__ import annotations
@@ -89,6 +90,7 @@ def simulate_subject(
     largest : float
         An output beyond this, in its unit, is a fall.
     seed : int or SeedSequence
+        All numbers drawn follow from it.
 
     Raises
     ------

@@ -5,7 +5,7 @@
 The disturbance d is known, the command is a random walk. V is the squared size of the outputs, and
 W such that a step of each input moves the outputs by their size within the first n samples. The
 ratio q is that of greatest likelihood, r follows from it; then fixed-interval smoothing
-(statsmodels). This is what a laboratory calls inverse dynamics.
+(statsmodels; Durbin and Koopman 2012, chapter 4). A laboratory calls it inverse dynamics.
 """
 
 from __future__ import annotations
@@ -35,7 +35,15 @@ _DIFFUSE = 1e6
 
 @dataclass(frozen=True)
 class Smoothed:
-    """One trial: states (samples, n) and commands (samples, m)."""
+    """One trial, in the units of the plant.
+
+    Attributes
+    ----------
+    x : Array
+        States (samples, n).
+    u : Array
+        Commands (samples, m).
+    """
 
     x: Array
     u: Array

@@ -1,4 +1,4 @@
-"""The semidefinite program of one prox-linear step.
+"""The semidefinite program of one prox-linear step (docs/conditioned-fit.md).
 
 In the coordinates d of dX = L D L', D = sum d_i basis_i, with an epigraph f of the norm,
 
@@ -46,6 +46,7 @@ class StepProgram:
     rest : float
         Norm of the part of the residual that no step changes.
     fit_weight, condition_weight : float
+        w_fit and w_cond.
     squared : bool
         Whether the fit counts by its square.
     """
@@ -78,7 +79,7 @@ def block_basis(n: int, m: int) -> Array:
 
 
 def solve_step(program: StepProgram, radius: float) -> tuple[Array, float]:
-    """Solve for the step d (k,) and the objective that it predicts.
+    """Solve for the step d (k,), at most `radius` long, and the objective that it predicts.
 
     Raises
     ------

@@ -75,7 +75,8 @@ class TerminalSet:
     rows : BoundRows
         The bounds of one stage, E x + F_u u <= b.
     bases : mapping of int to IntArray
-        How the linear programs ended, for ``near=``: by step, and those of the last pruning at 0.
+        How the linear programs ended, for ``near=``: bases (c, q) by step, and at 0 those of the
+        last pruning.
     """
 
     H: Array

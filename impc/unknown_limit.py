@@ -8,7 +8,7 @@ colour of the residuals widens the deviation of L (f = 1 for white ones),
 
 is chi-squared with one degree of freedom at the true limit. Where D(inf) is below its quantile the
 recordings do not tell whether there is a limit at all; they still tell that it is not below the
-least L that D allows.
+least L that D allows (docs/fitting.md).
 """
 
 from __future__ import annotations
@@ -58,13 +58,15 @@ class LimitEstimate:
     low, high : float
         Interval of the given level; `high` is infinite when no limit is determined.
     level : float
+        Between 0 and 1, 0.95 for 95 %.
     against_none : float
         D(inf): how much worse no limit explains the recordings; compare with the quantile.
     quantile : float
+        Of chi-squared at that level.
     reason : str
         In words.
     limits, distances : Array
-        Limits that were tried and D at each, for a picture.
+        Limits that were tried (t,), in the input's unit, and D at each (t,), for a picture.
     """
 
     value: float | None
@@ -79,7 +81,15 @@ class LimitEstimate:
 
 
 def with_limit(problem: InverseProblem, limit: float, control: int = 0) -> InverseProblem:
-    """The problem with |u_control| <= limit, or without that bound for an infinite limit."""
+    """The problem with |u_control| <= limit, or without that bound for an infinite limit.
+
+    Parameters
+    ----------
+    limit : float
+        Positive, in the input's unit.
+    control : int
+        Index of the input.
+    """
     bounds = problem.bounds
     u_min, u_max = np.array(bounds.u_min), np.array(bounds.u_max)
     u_min[control], u_max[control] = -limit, limit

@@ -46,7 +46,7 @@ class Weights:
 
     @property
     def block(self) -> Array:
-        """The block-diagonal matrix blkdiag(Q, R), of size n + m."""
+        """The block-diagonal matrix blkdiag(Q, R), (n + m, n + m)."""
         return np.asarray(scipy.linalg.block_diag(self.Q, self.R))
 
 
@@ -100,10 +100,10 @@ def residual(estimate: Weights, truth: Weights) -> float:
 
 
 def cholesky_parameters(weights: Weights) -> Array:
-    """Lower-triangular entries of the Cholesky factors of Q and R, row by row.
+    """Lower-triangular entries (k,) of the Cholesky factors of Q and R, row by row.
 
-    R is scaled to R[0, 0] = 1 first and its first entry, then always 1, is left out, so that the
-    parameters count n(n+1)/2 + m(m+1)/2 - 1: scale is not one of them. Equation (3.6).
+    R is scaled to R[0, 0] = 1 first and its first entry, then always 1, is left out, so that
+    k = n(n+1)/2 + m(m+1)/2 - 1: scale is not one of them. Equation (3.6).
 
     Raises
     ------
@@ -121,7 +121,15 @@ def cholesky_parameters(weights: Weights) -> Array:
 
 
 def weights_from_parameters(parameters: Array, n: int, m: int) -> Weights:
-    """Inverse of `cholesky_parameters`: Q = LL', R = GG' with G[0, 0] = 1."""
+    """Inverse of `cholesky_parameters`: Q = LL' (n, n), R = GG' (m, m) with G[0, 0] = 1.
+
+    Parameters
+    ----------
+    parameters : Array
+        (k,), as `cholesky_parameters` gives them.
+    n, m : int
+        Sizes of Q and R.
+    """
     q_factor, r_factor = np.zeros((n, n)), np.zeros((m, m))
     count = n * (n + 1) // 2
     q_factor[np.tril_indices(n)] = parameters[:count]

@@ -6,7 +6,7 @@ is convex: kappa(X) <= limit says that some t has  t I <= X <= limit t I.  A lin
 weights (an entry, a difference of two prices) therefore has a range over the set that two
 semidefinite programs find, and a statement such as "the price of x_1 is above that of x_2" holds
 for every member, or for none, or for some. Nothing that the recordings say of the weights can be
-finer than this set.
+finer than this set (docs/equivalent-weights.md, section 2).
 
 The programs are written as seen from a member X0 = LL' of the set, so that their entries are of
 order one although the condition numbers of plant units may be 1e8 (`least_condition_weights`).
@@ -78,7 +78,17 @@ class WeightsSet:
 
 
 class End(NamedTuple):
-    """The member at which a program ends, its value, and what no member goes beyond."""
+    """The member at which a program ends, its value, and what no member goes beyond.
+
+    Attributes
+    ----------
+    value : float
+        Of the function at the member.
+    bound : float
+        From the dual program.
+    weights : Weights
+        The member, at trace R = m.
+    """
 
     value: float
     bound: float

@@ -1,7 +1,7 @@
 """What the recordings leave open of the weights of one gain, in a form that a page can print.
 
 Every number is over all weights with the gain whose condition number, in the units of the plant, is
-at most a multiple of the least (`weights_set`).
+at most a multiple of the least (`weights_set`; docs/equivalent-weights.md, section 5).
 """
 
 from __future__ import annotations
@@ -40,6 +40,7 @@ class EntryRange:
     Attributes
     ----------
     first, second : str
+        Names of the states i and j.
     low, high : float
         At trace R = m.
     """
@@ -130,7 +131,15 @@ def summarise_weights(
 def weights_summary_or_reason(
     plant: Plant, gain: Array, sizes: Array
 ) -> tuple[WeightsSummary | None, str]:
-    """The summary, or None and why there is none."""
+    """The summary, or None and why there is none.
+
+    Parameters
+    ----------
+    gain : Array
+        K (m, n).
+    sizes : Array
+        Typical excursions of the states (n,), in their units.
+    """
     try:
         return summarise_weights(plant, gain, sizes), ""
     except (WeightsError, SolverError) as error:

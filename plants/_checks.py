@@ -9,6 +9,7 @@ import numpy as np
 
 __all__ = ["Array", "finite_number", "whole_number"]
 
+#: An array of float64.
 Array = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
 
 
@@ -53,6 +54,8 @@ def finite_number(
 
 def whole_number(name: str, value: object, remedy: str, *, least: int, most: int) -> int:
     """Return the value as an int when it is a whole number in [least, most].
+
+    The message of the error begins with `name` and ends with `remedy`.
 
     Raises
     ------

@@ -4,7 +4,8 @@
 
 The Padé approximant is realised as the lossless ladder that the continued fraction of the
 hyperbolic tangent gives, not by its polynomials: for order 5 and a delay of 80 ms their
-coefficients span ten decades, and the companion form inherits that.
+coefficients span ten decades, and the companion form inherits that. Delay and muscle are those of
+the seat's model, Table 3.2.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ __all__ = ["MAX_DELAY_ORDER", "LinearSystem", "delayed_muscle", "pade_delay"]
 
 # At order 10 the approximation is exact to 1e-15 where delay times frequency is 1.6; beyond 20,
 # states would only cost time.
+#: Largest order of a Padé approximant.
 MAX_DELAY_ORDER = 20
 
 

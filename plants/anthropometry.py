@@ -35,7 +35,7 @@ class Segment(NamedTuple):
     Attributes
     ----------
     mass : float
-        Fraction of the body mass, of one side.
+        Fraction of the body mass (in kg for kg), of one side.
     length : float
         m, at the mean height of the sample.
     centre : float
@@ -55,7 +55,7 @@ class Segment(NamedTuple):
     along: float
 
 
-# Mean height of the sample in m, and its segments.
+#: By sex: mean height of the sample in m, and its segments by name.
 DE_LEVA: dict[str, tuple[float, dict[str, Segment]]] = {
     "male": (
         1.741,

@@ -11,7 +11,8 @@ States: error (px), velocity of the cursor (px/s), the states of the delay
 Output: error (px). Any unit of length may stand for the pixel.
 
 Its parameters were not measured by anybody: delay and lag are fitted, the defaults are where a fit
-starts. A bound on the command is a bound on the acceleration before delay and lag.
+starts. A bound on the command is a bound on the acceleration before delay and lag. The recordings
+that it was made for are described in docs/cursor-tracking.md.
 """
 
 from __future__ import annotations

@@ -45,13 +45,28 @@ __all__ = [
     "step_reference",
 ]
 
+#: An axis of the head, for annotations.
 Axis = Literal["yaw", "pitch"]
 _SCALE = 3.0  # rad/s
 
 
 @dataclass(frozen=True)
 class HeadNeckParameter:
-    """A candidate parameter: its unit, bounds, pathway and where they come from."""
+    """A candidate parameter: its unit, bounds, pathway and where they come from.
+
+    Attributes
+    ----------
+    name, meaning : str
+        As in table 4.2, and in words.
+    unit : str
+        Of its values.
+    low, high : float
+        Bounds, in that unit.
+    pathway : str
+        The pathway of the loop that it belongs to.
+    source : str
+        Of name and bounds.
+    """
 
     name: str
     meaning: str
@@ -102,6 +117,7 @@ def head_neck_matrices(axis: Axis = "yaw", delay_order: int = 5) -> ca.Function:
     Parameters
     ----------
     axis : {"yaw", "pitch"}
+        Gravity acts in pitch.
     delay_order : int
         Of the Padé approximant.
 
@@ -149,6 +165,13 @@ def head_neck_matrices(axis: Axis = "yaw", delay_order: int = 5) -> ca.Function:
 def head_neck_plant(values: NDArray[np.float64], axis: Axis = "yaw", delay_order: int = 5) -> Any:
     """Return the closed loop from reference to head angle as a continuous control.StateSpace.
 
+    Parameters
+    ----------
+    values : array_like
+        The parameters (12,), in the order and units of `HEAD_NECK_PARAMETERS`.
+    axis, delay_order
+        As in `head_neck_matrices`.
+
     Raises
     ------
     ValueError
@@ -185,10 +208,12 @@ def step_reference(
     shortest, longest : float
         Of a step, s: 0.3 and 0.9 in chapter 5.
     seed : int
+        Another one gives other steps.
 
     Returns
     -------
-    ndarray, shape (round(duration * rate),)
+    ndarray
+        (samples,) with samples = round(duration * rate).
     """
     rng = np.random.default_rng(seed)
     samples = round(duration * rate)
@@ -239,7 +264,8 @@ def _sum(*polynomials: list[Any]) -> list[Any]:
 def head_neck_model(axis: Axis = "yaw", delay_order: int = 5) -> dict[str, Any]:
     """Describe the model for a selection of parameters: names, bounds, pathways, matrices.
 
-    Typical values are the nominal column of table 4.3.
+    Typical values are the nominal column of table 4.3; `axis` and `delay_order` are those of
+    `head_neck_matrices`.
 
     Raises
     ------

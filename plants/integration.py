@@ -1,4 +1,7 @@
-"""Fixed-step integration of a plant, as a CasADi function that can be mapped and differentiated."""
+"""Fixed-step integration of a plant, as a CasADi function that can be mapped and differentiated.
+
+Source: Hairer, Nørsett and Wanner 1993, section II.1.
+"""
 
 from __future__ import annotations
 

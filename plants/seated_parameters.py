@@ -1,4 +1,7 @@
-"""What the seated-balance plant is made of: its parameters and its limits, with their origins."""
+"""What the seated-balance plant is made of: its parameters and its limits, with their origins.
+
+They stand for those of Table 3.2, which are lost.
+"""
 
 from __future__ import annotations
 

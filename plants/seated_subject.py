@@ -1,4 +1,7 @@
-"""The seated-balance plant of a person, by the arguments that a configuration file gives."""
+"""The seated-balance plant of a person, by the arguments that a configuration file gives.
+
+Body: `plants.anthropometry`, after de Leva 1996. Plant: `plants.seated_balance`.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +21,7 @@ __all__ = ["seated_balance_for", "seated_balance_step_for", "seated_parameters_f
 def seated_parameters_for(
     mass: float = 79.7, height: float = 1.66, sex: Sex = "male", **parameters: float
 ) -> SeatedBalanceParameters:
-    """Parameters regressed on body mass (kg) and height (m), but for those given by name.
+    """Parameters regressed on body mass (kg), height (m) and sex, but for the `parameters` given.
 
     Raises
     ------
@@ -47,6 +50,7 @@ def seated_balance_for(
     mass, height : float
         kg, m.
     sex : {"male", "female"}
+        Whose segments are taken.
     sample_time : float
         s.
     delay_order : int
@@ -73,12 +77,20 @@ def seated_balance_step_for(
 ) -> ca.Function:
     """Return one sample of the nonlinear plant of a person, by Runge and Kutta's method.
 
-    The arguments are those of `seated_balance_for`, with a sample of 1 ms.
+    Parameters
+    ----------
+    mass, height, sex, sample_time, delay_order, **parameters
+        As in `seated_balance_for`; kg, m and s. The sample is 1 ms by default.
 
     Returns
     -------
     casadi.Function
         (state (5 + delay_order), input (2): command and perturbation in Nm) -> next state.
+
+    Raises
+    ------
+    ValueError
+        As `seated_parameters_for` and `nonlinear_dynamics`.
     """
     found = seated_parameters_for(mass, height, sex, **parameters)
     return runge_kutta_step(nonlinear_dynamics(found, delay_order), sample_time)

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 __all__ = ["MAX_STAGES", "maximal_recurrence", "ternary_sequence", "ternary_torque"]
 
 # At 24 stages the search takes half a second, and a period lasts 1100 years at a dwell of 0.125 s.
+#: Largest register that is searched for.
 MAX_STAGES = 24
 
 # Five stages in posture research: new = r3 - r4 - r5, started at [2 0 2 0 2].
@@ -145,7 +146,7 @@ def ternary_torque(
     Returns
     -------
     Array
-        Torque in Nm, shape (round(duration * rate),).
+        Torque in Nm (samples,), samples = round(duration * rate).
 
     Raises
     ------

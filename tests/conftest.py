@@ -2,18 +2,36 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import control
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from impc.bounds import box_bounds
 from impc.plant import as_plant
+from tests.labelled_axes import require_labels
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from impc.bounds import Bounds
     from impc.plant import Plant
+
+
+@pytest.fixture(autouse=True, scope="session")
+def figures_have_units() -> Iterator[None]:
+    """Whatever figure a test writes has labels with units on its axes."""
+    save = Figure.savefig
+
+    def checked(figure: Figure, *given: Any, **settings: Any) -> None:
+        require_labels(figure)
+        save(figure, *given, **settings)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Figure, "savefig", checked)
+        yield
 
 
 @pytest.fixture

@@ -42,6 +42,7 @@ class Comparison:
     question : str
         "group", "visit", "change" or "reliability".
     measure, condition : str
+        Of which, by name.
     first, second : str
         What is compared; empty for the reliability.
     estimate : float
@@ -74,7 +75,7 @@ class Comparison:
 
 
 def measures_of(units: pd.DataFrame) -> tuple[str, ...]:
-    """Columns that are compared: few, chosen before the data are seen.
+    """Columns of the table `units` that are compared: few, chosen before the data are seen.
 
     Gains on recorded outputs and their rates, prices of recorded outputs in the analytic centre,
     and VAF. Gains on states of a delay or a muscle, one by one, say little, and every measure makes

@@ -89,6 +89,7 @@ def run_study(
     store : Store
         Held open by this run.
     client : distributed.Client
+        Of the scheduler.
     progress : Progress, optional
 
     Returns

@@ -24,7 +24,7 @@ _LINE = re.compile(r"memory of worker (\d+) MB, of client (\d+) MB")
 
 
 def group_figure(units: pd.DataFrame, measures: Sequence[str]) -> Figure:
-    """Every unit's measures, by group; a bar at each group's mean."""
+    """The measures of every unit, by group, from the table `units`; a bar at a group's mean."""
     groups = sorted(set(units["group"])) or [""]
     rows = -(-len(measures) // _COLUMNS)
     figure = new_figure(DOUBLE_COLUMN, 2.0 * rows)
@@ -67,7 +67,7 @@ def memory_figure(log: Path) -> Figure | None:
     tasks = np.arange(1, len(worker) + 1)
     ax.plot(tasks, worker, linestyle="none", marker=".", color=BLUE, markersize=3, label="worker")
     ax.plot(tasks, client, color=VERMILLION, linestyle="--", label="client")
-    ax.set_xlabel("tasks done")
+    ax.set_xlabel("tasks done (-)")
     ax.set_ylabel("memory (MB)")
     ax.set_ylim(0, 1.2 * max(worker.max(), client.max()))
     ax.legend(loc="lower right", ncols=2)
@@ -75,7 +75,7 @@ def memory_figure(log: Path) -> Figure | None:
 
 
 def subject_figure(fit: dict[str, Any]) -> Figure:
-    """Recorded and simulated outputs of a unit's first trial."""
+    """Recorded and simulated outputs of a unit's first trial, from the content of its `fit`."""
     shown = fit["trajectory"]
     recorded, simulated = np.array(shown["recorded"]), np.array(shown["simulated"])
     figure = new_figure(DOUBLE_COLUMN, 1.3 * recorded.shape[1] + 0.5)

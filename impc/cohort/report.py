@@ -16,6 +16,8 @@ from impc.report.rendering import TextTable, embedded, number, plain, render_tem
 from impc.report.style import journal_style, render
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from impc.cohort.comparison import Comparison
     from impc.cohort.store import Store
     from impc.cohort.study import Study, Unit
@@ -31,7 +33,9 @@ _QUESTIONS = {
 
 
 def write_report(study: Study, store: Store, command: str) -> None:
-    """Write units.csv, replicates.csv, intervals.csv, comparisons.csv, result.json and the pages.
+    """Write units.csv, replicates.csv, intervals.csv, comparisons.csv, result.json, pages, figures.
+
+    The pages end with the `command` that made them.
 
     Raises
     ------
@@ -84,10 +88,10 @@ def _page(
     with journal_style():
         if len(tables["units"]):
             measures = _most_telling(compared, tables["units"])
-            pictures["groups"] = embedded(render(group_figure(tables["units"], measures))["png"])
+            pictures["groups"] = _kept(store, "groups", group_figure(tables["units"], measures))
         memory = memory_figure(store.folder / "cohort.log")
         if memory is not None:
-            pictures["memory"] = embedded(render(memory)["png"])
+            pictures["memory"] = _kept(store, "memory", memory)
     failures = _failures(study, store)
     count = int(study.configuration.fit.get("replicates", 0))
     return render_template(
@@ -105,6 +109,14 @@ def _page(
         pictures=pictures,
         command=command,
     )
+
+
+def _kept(store: Store, name: str, figure: Figure) -> str:
+    """Write the figure as PNG and PDF; return it for the page."""
+    files = render(figure)
+    for kind, content in files.items():
+        store.write(f"{name}.{kind}", content)
+    return embedded(files["png"])
 
 
 def _findings(compared: tuple[Comparison, ...]) -> list[str]:
@@ -185,7 +197,7 @@ def _subject_page(subject: str, units: list[Unit], store: Store) -> str:
             sections.append({"name": unit.name, "reason": reason})
             continue
         with journal_style():
-            picture = embedded(render(subject_figure(fit))["png"])
+            picture = _kept(store, f"subjects/{unit.name}", subject_figure(fit))
         sections.append(
             {
                 "name": unit.name,

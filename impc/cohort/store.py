@@ -36,29 +36,54 @@ class Store:
     Attributes
     ----------
     folder : Path
+        Where the files are.
     """
 
     folder: Path
 
     def fit(self, unit: str) -> dict[str, Any] | None:
-        """The fit of a unit, or None."""
+        """The fit of a unit, or None.
+
+        Raises
+        ------
+        InputError
+            When the file is not what this program wrote.
+        """
         return _read(self._path(unit, "fit"))
 
     def failure(self, unit: str) -> str | None:
-        """Why a unit has no fit, or None."""
+        """Why a unit has no fit, or None.
+
+        Raises
+        ------
+        InputError
+            When the file is not what this program wrote.
+        """
         found = _read(self._path(unit, "failed"))
         return None if found is None else str(found["reason"])
 
     def replicate(self, unit: str, index: int) -> dict[str, Any] | None:
-        """A replicate, or None."""
+        """The replicate `index` of a `unit`, or None.
+
+        Raises
+        ------
+        InputError
+            When the file is not what this program wrote.
+        """
         return _read(self._path(unit, f"replicate-{index:04d}"))
 
     def has_replicate(self, unit: str, index: int) -> bool:
-        """Whether that replicate is done."""
+        """Whether the replicate `index` of a `unit` is done."""
         return self._path(unit, f"replicate-{index:04d}").exists()
 
     def keep_fit(self, unit: str, content: Mapping[str, Any]) -> None:
-        """Write a fit down, or the reason why there is none."""
+        """Write the fit of a `unit` down, or the reason for none: `content`.
+
+        Raises
+        ------
+        OutputError
+            When that cannot be done.
+        """
         if "reason" in content:
             self._write(self._path(unit, "failed"), content)
             return
@@ -66,23 +91,42 @@ class Store:
         self._write(self._path(unit, "fit"), content)
 
     def keep_replicate(self, unit: str, index: int, content: Mapping[str, Any]) -> None:
-        """Write a replicate down."""
+        """Write the replicate `index` of a `unit` down: `content`.
+
+        Raises
+        ------
+        OutputError
+            When that cannot be done.
+        """
         self._write(self._path(unit, f"replicate-{index:04d}"), content)
 
     def keep_manifest(self, content: Mapping[str, Any]) -> None:
-        """Write the manifest down."""
+        """Write the manifest down: `content`.
+
+        Raises
+        ------
+        OutputError
+            When that cannot be done.
+        """
         self._write(self.folder / "manifest.json", content)
 
     def write(self, name: str, content: bytes) -> None:
-        """Write any file of the folder."""
+        """Write any file of the folder: its `name` and `content`.
+
+        Raises
+        ------
+        OutputError
+            When that cannot be done.
+        """
         _replace(self.folder / name, content)
 
     def require_same(self, unit: str, digest: str) -> None:
-        """Refuse a unit that was fitted to other recordings or with other settings.
+        """Refuse a unit whose fit is of other recordings or other settings than `digest` says.
 
         Raises
         ------
         InputError
+            When its fit has another digest, or cannot be read.
         """
         found = self.fit(unit)
         if found is not None and found["digest"] != digest:

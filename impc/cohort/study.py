@@ -97,6 +97,7 @@ class Study:
     Attributes
     ----------
     plant, model : str
+        Name, import path or file of the plant; import path of the model. Empty when not given.
     configuration : Configuration
         Signals and settings of every fit.
     units : tuple of Unit
@@ -110,7 +111,7 @@ class Study:
 
 
 def read_study(path: Path) -> Study:
-    """Read a study and find its recordings; none of them is opened.
+    """Read the study at `path` and find its recordings; none of them is opened.
 
     Raises
     ------

@@ -56,7 +56,9 @@ class FitTask:
     Attributes
     ----------
     files : tuple of str
+        Paths of the recordings.
     plant : str
+        Its import path or file.
     arguments : dict
         Of the plant.
     configuration : Configuration
@@ -88,7 +90,7 @@ def fit_unit(task: FitTask) -> dict[str, Any]:
 
 
 def replicate_unit(task: FitTask, fit: dict[str, Any], index: int) -> dict[str, Any]:
-    """One bootstrap replicate of a fitted unit, by its number."""
+    """One bootstrap replicate of a fitted unit, by its number `index`; `fit` is its content."""
     started = time.perf_counter()
     try:
         problem, settings = _problem(task)

@@ -14,7 +14,7 @@ __all__ = ["print_files"]
 
 
 def print_files(out: Path, written: Sequence[Path]) -> None:
-    """Name the files of a folder, one line for each name with its endings."""
+    """Name the files `written` to the folder `out`, one line for each name with its endings."""
     kinds: dict[str, list[str]] = {}
     for path in written:
         kinds.setdefault(path.stem, []).append(path.suffix)

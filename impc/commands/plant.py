@@ -22,6 +22,8 @@ KNOWN = {
 def find_plant(name: str, arguments: Mapping[str, Any]) -> PlantSource:
     """The plant of a short name, an import path ``module:function`` or a file.
 
+    `arguments` are those of its function.
+
     Raises
     ------
     InputError

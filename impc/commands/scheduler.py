@@ -16,7 +16,7 @@ F = TypeVar("F", bound="Callable[..., Any]")
 
 
 def scheduler_options(command: F) -> F:
-    """Add --scheduler and --workers."""
+    """Add --scheduler and --workers to a `command`."""
     address = click.option(
         "--scheduler", help="Address of a running Dask scheduler, such as tcp://host:8786."
     )

@@ -62,7 +62,7 @@ def command(study_file: Path, out: Path, scheduler: str | None, workers: int | N
 
 
 def kept_results(out: Path) -> Kept:
-    """Where results of single tasks wait until the whole is done."""
+    """Where results of single tasks wait in the folder `out` until the whole is done."""
     from impc.selection.running import Kept  # noqa: PLC0415
 
     return Kept(out / "in-progress")
@@ -72,7 +72,24 @@ def kept_results(out: Path) -> Kept:
 def study_runner(
     source: ModelSource, out: Path, scheduler: str | None, workers: int | None, tasks: int
 ) -> Iterator[Runner]:
-    """Workers with a progress bar; a message about what is kept when it is interrupted."""
+    """Workers with a progress bar; a message about what is kept when it is interrupted.
+
+    Parameters
+    ----------
+    out : Path
+        Folder in which results wait, see `kept_results`.
+    scheduler : str or None
+        Address of a running scheduler; None for workers on this machine.
+    workers : int or None
+        How many; None for as many as there are processors.
+    tasks : int
+        Of the progress bar.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        When it is interrupted, after the message.
+    """
     from impc.cohort.cluster import connected  # noqa: PLC0415
     from impc.selection.running import on_workers  # noqa: PLC0415
 
@@ -95,11 +112,11 @@ def study_runner(
 def read_model_study(
     path: Path,
 ) -> tuple[Study, ModelSource, dict[tuple[str, str], tuple[Trial, ...]]]:
-    """A study, its model and all recordings.
+    """The study at `path`, its model and all recordings.
 
     Raises
     ------
-    ImpcError
+    InputError, DataError
         When the file, the model or a recording cannot be used.
     """
     from impc.cohort.study import read_study  # noqa: PLC0415

@@ -30,9 +30,19 @@ _BETWEEN, _WITHIN = 0.2, 0.05
     show_default=True,
     help="Folder for the recordings, study.toml, participants.tsv and truth.json.",
 )
-@click.option("--subjects", type=click.IntRange(2, 9999), default=30, show_default=True)
-@click.option("--visits", type=click.IntRange(1, 9), default=1, show_default=True)
-@click.option("--trials", type=click.IntRange(1, 9), default=3, show_default=True)
+@click.option(
+    "--subjects",
+    type=click.IntRange(2, 9999),
+    default=30,
+    show_default=True,
+    help="In both groups together.",
+)
+@click.option(
+    "--visits", type=click.IntRange(1, 9), default=1, show_default=True, help="Of each subject."
+)
+@click.option(
+    "--trials", type=click.IntRange(1, 9), default=3, show_default=True, help="Of each visit."
+)
 @click.option(
     "--duration", type=click.FloatRange(5, 600), default=30.0, show_default=True, help="s"
 )
@@ -43,11 +53,23 @@ _BETWEEN, _WITHIN = 0.2, 0.05
     show_default=True,
     help="The second group's prices of angles and rates over the first's; 1 for none.",
 )
-@click.option("--torque-limit", type=click.FloatRange(min=1), default=6.0, show_default=True)
+@click.option(
+    "--torque-limit",
+    type=click.FloatRange(min=1),
+    default=6.0,
+    show_default=True,
+    help="Largest lumbar torque of a subject, Nm.",
+)
 @click.option(
     "--replicates", type=click.IntRange(min=0), default=20, show_default=True, help="In study.toml."
 )
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+@click.option(
+    "--seed",
+    type=click.IntRange(min=0),
+    default=0,
+    show_default=True,
+    help="All numbers drawn follow from it.",
+)
 def cohort(out: Path, **given: Any) -> None:
     """Subjects on the seat, half of them in each of two groups, in folders named as BIDS has it.
 
@@ -90,7 +112,7 @@ def cohort(out: Path, **given: Any) -> None:
 
 
 def random_person(rng: np.random.Generator) -> dict[str, Any]:
-    """Body mass (kg), height (m) and sex of an adult."""
+    """Body mass (kg), height (m) and sex of an adult, drawn from `rng`."""
     sex = "male" if rng.random() < 0.5 else "female"
     height = rng.normal(1.76 if sex == "male" else 1.63, 0.06)
     mass = rng.normal(23.0, 2.0) * height**2

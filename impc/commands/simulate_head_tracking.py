@@ -25,12 +25,36 @@ _SPREAD, _VISIT, _VAF = 0.25, 0.05, (82.3, 7.7)
     show_default=True,
     help="Folder for the recordings, study.toml and truth.json.",
 )
-@click.option("--axis", type=click.Choice(["yaw", "pitch"]), default="yaw", show_default=True)
-@click.option("--subjects", type=click.IntRange(1, 999), default=10, show_default=True)
-@click.option("--visits", type=click.IntRange(1, 9), default=1, show_default=True)
-@click.option("--trials", type=click.IntRange(1, 9), default=3, show_default=True)
-@click.option("--duration", type=click.FloatRange(5, 300), default=30.0, show_default=True)
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+@click.option(
+    "--axis",
+    type=click.Choice(["yaw", "pitch"]),
+    default="yaw",
+    show_default=True,
+    help="Of the head's rotation.",
+)
+@click.option(
+    "--subjects", type=click.IntRange(1, 999), default=10, show_default=True, help="How many."
+)
+@click.option(
+    "--visits", type=click.IntRange(1, 9), default=1, show_default=True, help="Of each subject."
+)
+@click.option(
+    "--trials", type=click.IntRange(1, 9), default=3, show_default=True, help="Of each visit."
+)
+@click.option(
+    "--duration",
+    type=click.FloatRange(5, 300),
+    default=30.0,
+    show_default=True,
+    help="Of a trial, s.",
+)
+@click.option(
+    "--seed",
+    type=click.IntRange(min=0),
+    default=0,
+    show_default=True,
+    help="All numbers drawn follow from it.",
+)
 def head_tracking(out: Path, **given: Any) -> None:
     """Ten subjects of chapter 4; --subjects 40 --visits 2 for chapter 5.
 

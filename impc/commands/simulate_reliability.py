@@ -46,10 +46,26 @@ _LEAN = (0.1, 0.8)
     show_default=True,
     help="Folder for the recordings, study.toml and truth.json.",
 )
-@click.option("--subjects", type=click.IntRange(2, 999), default=30, show_default=True)
-@click.option("--visits", type=click.IntRange(2, 9), default=3, show_default=True)
-@click.option("--trials", type=click.IntRange(2, 9), default=3, show_default=True)
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+@click.option(
+    "--subjects", type=click.IntRange(2, 999), default=30, show_default=True, help="How many."
+)
+@click.option(
+    "--visits", type=click.IntRange(2, 9), default=3, show_default=True, help="Of each subject."
+)
+@click.option(
+    "--trials",
+    type=click.IntRange(2, 9),
+    default=3,
+    show_default=True,
+    help="Of each visit and condition.",
+)
+@click.option(
+    "--seed",
+    type=click.IntRange(min=0),
+    default=0,
+    show_default=True,
+    help="All numbers drawn follow from it.",
+)
 def reliability_study(out: Path, **given: Any) -> None:
     """Thirty subjects, three visits, three conditions and three trials on the seat.
 

@@ -25,7 +25,15 @@ __all__ = ["Subject", "read_subject"]
 
 @dataclass(frozen=True)
 class Subject:
-    """The recordings of a subject as an inverse problem."""
+    """The recordings of a subject as an inverse problem.
+
+    Attributes
+    ----------
+    problem : InverseProblem
+    settings : FitSettings
+    source : PlantSource
+        Of the plant.
+    """
 
     problem: InverseProblem
     settings: FitSettings
@@ -34,6 +42,15 @@ class Subject:
 
 def read_subject(files: Sequence[Path], plant_name: str, config: Path) -> Subject:
     """Read recordings, one file a trial.
+
+    Parameters
+    ----------
+    files : sequence of Path
+        The recordings.
+    plant_name : str
+        Short name, import path or file of the plant.
+    config : Path
+        The configuration.
 
     Raises
     ------

@@ -23,7 +23,7 @@ _REMEDY = "install it: pip install 'impc[c3d]'"
 
 
 def read_c3d(path: Path) -> Table:
-    """Read the analog channels with their units and rate.
+    """Read the analog channels of the file at `path`, with their units and rate.
 
     Raises
     ------

@@ -67,12 +67,18 @@ class Channel:
         return f"{self.source}: {self.signal} (column {self.column!r})"
 
     def at(self, index: int) -> str:
-        """Where a sample is, for messages."""
+        """Where the sample `index` is, for messages."""
         return f"sample {index + 1} ({self.time[index]:.6g} s)"
 
 
 def unit_of_the_file(channel: Channel, told: Unit | None) -> str:
-    """The unit that the file tells must be the one that the configuration gives."""
+    """The unit that the file tells must be the one that the configuration gives.
+
+    Raises
+    ------
+    DataError
+        When it is another one.
+    """
     if told is None or (
         told.base == channel.unit.base and np.isclose(told.factor, channel.unit.factor)
     ):
@@ -92,6 +98,11 @@ def missing(channel: Channel, fill_gaps: float) -> str:
     channel : Channel
     fill_gaps : float
         s; the longest time between two finite samples that may be bridged.
+
+    Raises
+    ------
+    DataError
+        When a longer run is missing, or an end of the recording.
     """
     finite = np.isfinite(channel.values)
     lost = np.flatnonzero(~finite)
@@ -117,7 +128,13 @@ def missing(channel: Channel, fill_gaps: float) -> str:
 
 
 def constant(channel: Channel) -> str:
-    """A channel that never changes: an unplugged sensor, a perturbation that never acted."""
+    """A channel that never changes: an unplugged sensor, a perturbation that never acted.
+
+    Raises
+    ------
+    DataError
+        When it does not change.
+    """
     values = channel.values[np.isfinite(channel.values)]
     if np.ptp(values) <= 1e-12 * np.max(np.abs(values)):
         raise DataError(
@@ -129,7 +146,13 @@ def constant(channel: Channel) -> str:
 
 
 def clipped(channel: Channel) -> str:
-    """A response that rests on its extreme values: an amplifier or converter at its end."""
+    """A response that rests on its extreme values: an amplifier or converter at its end.
+
+    Raises
+    ------
+    DataError
+        When it rests there too often to be used.
+    """
     finite = channel.values[np.isfinite(channel.values)]
     span = np.ptp(finite)
     levels = np.unique(finite)
@@ -152,7 +175,13 @@ def clipped(channel: Channel) -> str:
 
 
 def beyond_the_stop(channel: Channel, limit: float) -> str:
-    """A value that the mechanical stop does not let happen; limit in the channel's unit."""
+    """A value that the mechanical stop does not let happen; limit in the channel's unit.
+
+    Raises
+    ------
+    DataError
+        When there is one.
+    """
     beyond = np.abs(channel.values) > limit * (1 + 1e-9)
     if not beyond.any():
         return ""
@@ -167,7 +196,13 @@ def beyond_the_stop(channel: Channel, limit: float) -> str:
 
 
 def degrees_for_radians(channel: Channel) -> str:
-    """An angle that is too large for a posture, or too small for a movement."""
+    """An angle that is too large for a posture, or too small for a movement.
+
+    Raises
+    ------
+    DataError
+        When it spans more than half a turn, or next to nothing in a unit below the radian.
+    """
     if not channel.unit.angle:
         return ""
     finite = channel.values[np.isfinite(channel.values)] * channel.unit.factor
@@ -196,7 +231,13 @@ def degrees_for_radians(channel: Channel) -> str:
 
 
 def too_few(source: str, samples: int, needed: int) -> str:
-    """Fewer samples at the analysis rate than a fit needs."""
+    """Fewer samples of a `source` at the analysis rate than the `needed` ones.
+
+    Raises
+    ------
+    DataError
+        When there are fewer.
+    """
     if samples < needed:
         raise DataError(
             source,

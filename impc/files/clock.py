@@ -86,6 +86,21 @@ def read_clock(table: Table, recording: RecordingTable) -> Clock:
 def column_of(table: Table, name: str, place: str) -> tuple[str, Array]:
     """A column by its name, with or without the unit that stands behind it in the heading.
 
+    Parameters
+    ----------
+    table : Table
+    name : str
+        Of the column.
+    place : str
+        Key of the configuration that gives it, for the message.
+
+    Returns
+    -------
+    name : str
+        As the file has it.
+    values : Array
+        (samples,).
+
     Raises
     ------
     DataError
@@ -124,7 +139,8 @@ def on_even_instants(clock: Clock, values: Array) -> Array:
     Returns
     -------
     Array
-        (steps[-1] + 1,). The values themselves where the clock is even and all are finite.
+        (instants,), of which there are steps[-1] + 1. The values themselves where the clock is
+        even and all are finite.
     """
     finite = np.isfinite(values)
     if clock.even and finite.all():

@@ -124,7 +124,7 @@ class Configuration(msgspec.Struct, frozen=True):
 
 
 def read_configuration(path: Path, *more: str) -> Configuration:
-    """Read a configuration; `more` names tables that it may have besides.
+    """Read the configuration at `path`; `more` names tables that it may have besides.
 
     Raises
     ------

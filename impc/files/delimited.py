@@ -48,7 +48,7 @@ class _Layout:
 
 
 def read_delimited(path: Path) -> Table:
-    """Read a .csv, .tsv or .txt file.
+    """Read the .csv, .tsv or .txt file at `path`.
 
     Raises
     ------
@@ -78,7 +78,7 @@ def read_delimited(path: Path) -> Table:
 
 
 def encode_delimited(table: Table, suffix: str) -> bytes:
-    """The bytes of a .csv (commas) or .tsv and .txt (tabs) file, every digit kept."""
+    """The bytes of a file with every digit kept; `suffix` .csv has commas, others have tabs."""
     delimiter = "," if suffix == ".csv" else "\t"
     text = io.StringIO()
     writer = csv.writer(text, delimiter=delimiter, lineterminator="\n")

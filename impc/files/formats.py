@@ -30,6 +30,7 @@ __all__ = [
     "write_table",
 ]
 
+#: Endings of the formats that are read.
 SUFFIXES = (".csv", ".tsv", ".txt", ".mat", ".tdms", ".c3d")
 #: Bytes of a file, and of its arrays in memory: an hour of 16 channels at 2 kHz.
 LARGEST = 1_000_000_000
@@ -84,7 +85,7 @@ def read_table(path: Path, largest: int = LARGEST) -> Table:
 
 
 def write_table(path: Path, table: Table) -> None:
-    """Write a table in the format of the ending, whole or not at all; .mat is written as v5.
+    """Write a table in the format of the `path`, whole or not at all; .mat is written as v5.
 
     Raises
     ------
@@ -108,7 +109,7 @@ def encode_table(ending: str, table: Table) -> bytes:
 
 
 def write_matlab73(path: Path, table: Table) -> None:
-    """Write a .mat file of version 7.3, whole or not at all.
+    """Write the .mat file of version 7.3 at `path`, whole or not at all.
 
     Raises
     ------

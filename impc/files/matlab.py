@@ -43,6 +43,7 @@ def read_matlab(path: Path, largest: int) -> Table:
     Parameters
     ----------
     path : Path
+        Of the file.
     largest : int
         The most bytes that its arrays may take once they are unpacked.
 
@@ -79,7 +80,7 @@ def read_matlab(path: Path, largest: int) -> Table:
 
 
 def array_columns(name: str, array: Any) -> dict[str, Array] | str:
-    """The columns of a real numeric array, or why it has none."""
+    """The columns (samples,) of a real numeric array called `name`, or why it has none."""
     if array.dtype.kind not in "fiub":
         return "is complex" if array.dtype.kind == "c" else "is not numeric"
     if array.size < 2:
@@ -105,6 +106,13 @@ def encode_matlab(table: Table) -> bytes:
 
 def nested_columns(source: str, columns: Mapping[str, Array]) -> dict[str, Any]:
     """Columns as MATLAB variables; `s.field` as the field of a struct.
+
+    Parameters
+    ----------
+    source : str
+        File, for the message.
+    columns : mapping of str to Array
+        (samples,) each.
 
     Raises
     ------

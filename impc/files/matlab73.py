@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = ["HDF5_SIGNATURE", "matlab73_bytes", "read_matlab73"]
 
+#: First bytes of an HDF5 file.
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _USER_BLOCK = 512
 _DEPTH = 8
@@ -46,6 +47,7 @@ def read_matlab73(path: Path, largest: int) -> Table:
     Parameters
     ----------
     path : Path
+        Of the file.
     largest : int
         The most bytes that its arrays may take once they are unpacked.
 

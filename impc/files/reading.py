@@ -45,6 +45,7 @@ def read_recordings(
     Parameters
     ----------
     paths : sequence of Path
+        One file a trial.
     configuration : Configuration
         Names a column for each output of the plant, and for the disturbances that were recorded;
         the others are zero.

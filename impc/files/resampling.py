@@ -34,17 +34,29 @@ _CHUNK = 2_000_000  # numbers in memory at a time: 16 MB
 
 
 def same_rate(samples: int, period: float, dt: float) -> bool:
-    """Whether two clocks stay together over a recording."""
+    """Whether two clocks stay together over a recording of so many `samples`.
+
+    Parameters
+    ----------
+    period, dt : float
+        Of the two clocks, s.
+    """
     return samples * abs(period - dt) <= _SAME * dt
 
 
 def resampled_samples(samples: int, period: float, dt: float) -> int:
-    """Number of instants k dt within a recording of that many samples."""
+    """Number of instants k dt within a recording of that many samples; `period` and dt in s."""
     return int(np.floor((samples - 1) * period / dt + 1e-6)) + 1
 
 
 def edge(period: float, dt: float) -> float:
-    """Seconds at either end in which the filter sees continued samples."""
+    """Seconds at either end in which the filter sees continued samples.
+
+    Parameters
+    ----------
+    period, dt : float
+        Of the recording and of the plant, s.
+    """
     return _half_width(period, dt)
 
 
@@ -61,7 +73,7 @@ def instants(values: Array, period: float, dt: float) -> Array:
     Returns
     -------
     Array
-        (resampled samples,). The values themselves when the rates are the same.
+        (resampled,). The values themselves when the rates are the same.
     """
     if same_rate(len(values), period, dt):
         return values
@@ -99,7 +111,7 @@ def held_means(values: Array, period: float, dt: float) -> Array:
     Returns
     -------
     Array
-        (resampled samples,). The values themselves when the rates are the same.
+        (resampled,). The values themselves when the rates are the same.
     """
     if same_rate(len(values), period, dt):
         return values

@@ -58,6 +58,19 @@ def make_table(
 ) -> Table:
     """Keep the columns of the length that most have; the others are named among the skipped.
 
+    Parameters
+    ----------
+    source : str
+        File, for messages.
+    columns : mapping of str to Array
+        (samples,) each, by name.
+    units : mapping of str to str, optional
+        As the file writes them, of the columns that have one.
+    rate : float, optional
+        Samples per second, where the file tells it.
+    skipped : mapping of str to str, optional
+        What was not read, and why.
+
     Raises
     ------
     DataError

@@ -33,6 +33,7 @@ def read_tdms(path: Path, largest: int) -> Table:
     Parameters
     ----------
     path : Path
+        Of the file.
     largest : int
         The most bytes that its arrays may take.
 

@@ -51,7 +51,7 @@ class Unit:
 
 @functools.cache
 def si_unit(written: str) -> Unit:
-    """What a unit is in SI base units: deg -> 0.01745 rad, "N*m" and "Nm" -> 1 N m.
+    """What a `written` unit is in SI base units: deg -> 0.01745 rad, "N*m" and "Nm" -> 1 N m.
 
     Raises
     ------
@@ -81,7 +81,7 @@ def si_unit(written: str) -> Unit:
 
 
 def is_unit(text: str) -> bool:
-    """Whether a piece of a column's heading is a unit."""
+    """Whether the `text` behind a column's name is a unit."""
     try:
         si_unit(text)
     except InputError:

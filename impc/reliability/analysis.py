@@ -51,6 +51,7 @@ class Trials:
     Attributes
     ----------
     outputs : tuple of str
+        Names, in the order of the recordings' columns.
     rate : float
         Samples per second.
     cells : mapping
@@ -62,7 +63,7 @@ class Trials:
     cells: Mapping[tuple[str, str, str], tuple[Recording, ...]]
 
     def labels(self, index: int) -> tuple[str, ...]:
-        """Subjects (0), visits (1) or conditions (2) in the order in which they come."""
+        """Subjects (`index` 0), visits (1) or conditions (2) in the order in which they come."""
         return tuple(dict.fromkeys(key[index] for key in self.cells))
 
 
@@ -73,6 +74,7 @@ class MeasureResult:
     Attributes
     ----------
     measure, output, condition : str
+        Of which, by name; the measure is one of `MEASURES`.
     scores : Array
         (subjects, visits), NaN where a cell is missing, in the output's unit (squared for energy).
     icc : Icc or None
@@ -110,6 +112,7 @@ class CmcResult:
     Attributes
     ----------
     output, condition : str
+        Of which, by name.
     within, between : Array
         (subjects,), NaN where there is none.
     undefined : int
@@ -130,6 +133,7 @@ class Reliability:
     Attributes
     ----------
     subjects, visits, conditions, outputs : tuple of str
+        Names, in the order of the study.
     band : Passband
         Of the input.
     measures : tuple of MeasureResult

@@ -1,7 +1,8 @@
 """Repeated-measures analysis of variance over visits, and what follows it.
 
-One-way, uncorrected and with Greenhouse and Geisser's epsilon; paired t between visits, uncorrected
-and with Holm's correction; the trend over visits, the learning effect.
+One-way, uncorrected and with the epsilon of Greenhouse and Geisser (1959); paired t between
+visits, uncorrected and with the correction of Holm (1979); the trend over visits, the learning
+effect.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ class Anova:
     Attributes
     ----------
     F : float
+        Mean square of visits over that of visits by subjects.
     freedom : tuple of float
         Of numerator and denominator, uncorrected.
     p : float
@@ -55,7 +57,17 @@ class Anova:
 
 @dataclass(frozen=True)
 class PairedTest:
-    """Paired t between two visits: difference second minus first, p without and with Holm."""
+    """Paired t between two visits.
+
+    Attributes
+    ----------
+    first, second : str
+        The visits.
+    difference : float
+        Mean of second minus first, in the score's unit.
+    p, p_holm : float
+        Without and with Holm's correction over all pairs.
+    """
 
     first: str
     second: str
@@ -66,7 +78,17 @@ class PairedTest:
 
 @dataclass(frozen=True)
 class Trend:
-    """Slope over visits: mean of the subjects' least-squares slopes, its interval and p."""
+    """Slope over visits.
+
+    Attributes
+    ----------
+    slope : float
+        Mean of the subjects' least-squares slopes, in the score's unit a visit.
+    low, high : float
+        Ends of its interval.
+    p : float
+        Of Student's t that the mean slope is zero.
+    """
 
     slope: float
     low: float
@@ -104,6 +126,13 @@ def visit_anova(scores: Array) -> Anova:
 def paired_tests(scores: Array, visits: Sequence[str]) -> tuple[PairedTest, ...]:
     """Every pair of visits; subjects who lack one of the two are left out of that pair.
 
+    Parameters
+    ----------
+    scores : Array
+        (subjects, visits), NaN where missing.
+    visits : sequence of str
+        Names of the columns.
+
     Raises
     ------
     DataError
@@ -129,6 +158,8 @@ def paired_tests(scores: Array, visits: Sequence[str]) -> tuple[PairedTest, ...]
 
 def learning_trend(scores: Array, level: float = 0.95) -> Trend:
     """Whether scores rise or fall from visit to visit; scores (subjects, visits).
+
+    `level` is that of the interval, between 0 and 1.
 
     Raises
     ------

@@ -26,7 +26,17 @@ _BANDS = ((0.40, "poor"), (0.60, "fair"), (0.75, "good"), (np.inf, "excellent"))
 
 @dataclass(frozen=True)
 class Finding:
-    """A statement of the dissertation, whether it was found here, and the numbers."""
+    """A statement of the dissertation, and what this study says of it.
+
+    Attributes
+    ----------
+    statement : str
+        Of the dissertation, chapter 2.
+    found : bool
+        Whether it holds here.
+    numbers : str
+        Those of this study.
+    """
 
     statement: str
     found: bool
@@ -34,7 +44,7 @@ class Finding:
 
 
 def band_of(value: float) -> str:
-    """Cicchetti's (1994) word for a reliability."""
+    """Cicchetti's (1994) word for a reliability of that `value`."""
     if np.isnan(value):
         return "not defined"
     return next(word for limit, word in _BANDS if value < limit)

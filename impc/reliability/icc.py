@@ -43,12 +43,22 @@ __all__ = [
     "standard_error_of_measurement",
 ]
 
+#: One of `FORMS`, for annotations.
 Form = Literal["1", "k", "C,1", "C,k", "A,1", "A,k"]
+#: Names of the forms, as above.
 FORMS: tuple[Form, ...] = ("1", "k", "C,1", "C,k", "A,1", "A,k")
 
 
 class MeanSquares(NamedTuple):
-    """Mean squares of the two-way layout, and its size."""
+    """Mean squares of the two-way layout, and its size.
+
+    Attributes
+    ----------
+    subjects, occasions, error, within : float
+        MSR, MSC, MSE and MSW, in the score's unit squared.
+    n, k : int
+        Number of subjects and of occasions.
+    """
 
     subjects: float
     occasions: float
@@ -72,6 +82,7 @@ class Icc:
     level : float
         Of the interval.
     subjects, occasions : int
+        How many there were of each.
     left_out : int
         Subjects that lacked a score on some occasion.
     """
@@ -132,7 +143,20 @@ def mean_squares(scores: Array) -> MeanSquares:
 
 
 def standard_error_of_measurement(scores: ArrayLike, correlation: float) -> float:
-    """SEM = SD sqrt(1 - ICC), SD that of all complete scores, in their unit; NaN for ICC > 1."""
+    """SEM = SD sqrt(1 - ICC), SD that of all complete scores, in their unit; NaN for ICC > 1.
+
+    Parameters
+    ----------
+    scores : array_like
+        (subjects, occasions), NaN where missing.
+    correlation : float
+        The ICC.
+
+    Raises
+    ------
+    DataError
+        When there are fewer than two complete subjects or two occasions.
+    """
     complete, _ = _complete(scores)
     return (
         float(np.std(complete, ddof=1) * np.sqrt(1 - correlation)) if correlation <= 1 else np.nan
@@ -140,7 +164,10 @@ def standard_error_of_measurement(scores: ArrayLike, correlation: float) -> floa
 
 
 def minimal_detectable_change(sem: float, level: float = 0.95) -> float:
-    """Change between two measurements that error alone exceeds in 1 - level: z sqrt(2) SEM."""
+    """Change between two measurements that error alone exceeds in 1 - level: z sqrt(2) SEM.
+
+    In the unit of the `sem`.
+    """
     return float(scipy.stats.norm.ppf(0.5 + level / 2) * np.sqrt(2) * sem)
 
 
@@ -200,6 +227,9 @@ def _interval(squares: MeanSquares, form: Form, value: float, level: float) -> t
 
 
 def _stepped_up(limit: float, k: int) -> float:
+    """Spearman and Brown; no single score's ICC is below -1/(k-1), where the mean's is -inf."""
+    if 1 + (k - 1) * limit <= 0:
+        return -np.inf
     return float(k * limit / (1 + (k - 1) * limit))
 
 
@@ -214,6 +244,8 @@ def _agreement_limits(squares: MeanSquares, rho: float, tail: float) -> tuple[fl
     freedom = (a * c + b * e) ** 2 / spread
     lower = scipy.stats.f.ppf(tail, n - 1, freedom)
     upper = scipy.stats.f.ppf(tail, freedom, n - 1)
+    if not np.isfinite(lower * upper):  # nearly no degree of freedom: nothing is excluded
+        return -np.inf, 1.0
     rest = k * c + (k * n - k - n) * e
     low = n * (r - lower * e) / (lower * rest + n * r)
     high = n * (upper * r - e) / (rest + n * upper * r)

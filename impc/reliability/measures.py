@@ -40,7 +40,7 @@ class Passband:
     low, high : float
         Hz, both inside.
     excited : IntArray
-        Indices of the excited frequencies inside, on the grid of the input's periodogram.
+        Indices (f,) of the excited frequencies inside, on the grid of the input's periodogram.
     """
 
     low: float

@@ -21,7 +21,7 @@ __all__ = ["reliability_files"]
 
 
 def reliability_files(trials: Trials, result: Reliability, command: str) -> dict[str, bytes]:
-    """Build all files; nothing is written."""
+    """Build all files; nothing is written. The page ends with the `command` that made it."""
     figures = reliability_figures(trials, result)
     tables = reliability_tables(result)
     pictures = {

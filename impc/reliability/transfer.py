@@ -1,6 +1,6 @@
 """Empirical transfer function estimates from the input to each output, with coherence.
 
-    G(f_k) = Y(f_k) / U(f_k)                                  one trial (ETFE, Ljung)
+    G(f_k) = Y(f_k) / U(f_k)                                  one trial (ETFE, Ljung 1999)
     G(f_k) = sum_j Y_j conj(U_j) / sum_j |U_j|^2              several trials, H1
     C(f_k) = |sum_j Y_j conj(U_j)|^2 / (sum_j |U_j|^2 sum_j |Y_j|^2)
 
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 __all__ = ["ComplexArray", "TransferFunction", "transfer_function"]
 
+#: An array of complex numbers.
 ComplexArray = np.ndarray[tuple[int, ...], np.dtype[np.complex128]]
 
 

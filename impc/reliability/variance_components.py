@@ -30,7 +30,15 @@ __all__ = ["VarianceComponent", "variance_components"]
 
 @dataclass(frozen=True)
 class VarianceComponent:
-    """One component: name, estimate and ends of the interval, in the score's unit squared."""
+    """One component.
+
+    Attributes
+    ----------
+    name : str
+        "subject", "visit" or "trial".
+    value, low, high : float
+        Estimate and ends of the interval, in the score's unit squared.
+    """
 
     name: str
     value: float

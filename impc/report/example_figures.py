@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 __all__ = ["FIGURES", "example_figures"]
 
-# Figure of the dissertation, the method it shows, and that method in words.
+#: Figure of the dissertation, the method it shows, and that method in words.
 FIGURES = (
     ("3.2", "feedback_gain", "feedback gain"),
     ("3.3", "inverse_mpc", "inverse MPC"),

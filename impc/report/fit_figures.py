@@ -56,7 +56,7 @@ def fit_figures(result: FitResult) -> dict[str, bytes]:
 
 
 def display_unit(name: str) -> tuple[float, str]:
-    """Factor and unit in which a signal is drawn.
+    """Factor and unit in which the signal `name` is drawn.
 
     Plants work in SI units and their signals carry none, so angles are told by their names: what
     begins with theta, angle, yaw, pitch or roll is shown in degrees, everything else as it is.
@@ -139,7 +139,7 @@ def _residuals(result: FitResult) -> Figure:
     plant = result.fitted.problem.plant
     count, p = len(result.given.recordings), len(plant.outputs)
     figure = new_figure(DOUBLE_COLUMN, 0.4 + 1.3 * p * 1.0)
-    axes = np.array(figure.subplots(p, 2, width_ratios=[3, 1], squeeze=False))
+    axes = np.array(figure.subplots(p, 2, width_ratios=[3, 1], squeeze=False, sharex="col"))
     for column, name in enumerate(plant.outputs):
         factor, unit = display_unit(name)
         series = [
@@ -159,6 +159,7 @@ def _residuals(result: FitResult) -> Figure:
             [-index * offset for index in range(count)],
             [trial_name(result, index)[-12:] for index in range(count)],
         )
+        axes[column, 0].set_ylabel("trial (-)")
         axes[column, 0].set_title(f"residual of {name}, {offset:.2g} {unit} apart", loc="left")
         _autocorrelation(axes[column, 1], series, plant.dt)
     axes[-1, 0].set_xlabel("time (s)")
@@ -183,7 +184,8 @@ def _autocorrelation(ax: Axes, series: list[Array], dt: float) -> None:
     band = 1.96 / np.sqrt(min(len(part) for part in series))
     ax.axhspan(-band, band, color=FORBIDDEN, linewidth=0)
     ax.set_ylim(-0.4, 1.0)
-    ax.set_title("autocorrelation; grey: white", loc="left")
+    ax.set_ylabel("autocorrelation (-)")
+    ax.set_title("grey: white noise", loc="left")
 
 
 def _intent(result: FitResult) -> Figure:
@@ -214,8 +216,8 @@ def _intent(result: FitResult) -> Figure:
             label=reading.rule,
         )
     left.set_yscale("log")
-    left.set_xlabel("eigenvalue of Q, largest first")
-    left.set_ylabel("price at R = 1")
+    left.set_xlabel("eigenvalue of Q, largest first (-)")
+    left.set_ylabel("price at R = 1 (SI)")
     right.set_xticks(np.arange(plant.n), plant.states, rotation=35, ha="right")
     right.set_ylabel("share in dominant cost (%)")
     right.legend(fontsize=5.5, loc="upper right")

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 __all__ = ["METHOD_LABELS", "direction_name", "findings", "method_note", "trial_name"]
 
+#: Methods in words, by their names.
 METHOD_LABELS = {
     "preliminary": "preliminary gains and parameters (3.19)",
     "feedback_gain": "feedback gain, no bounds (3.12)",
@@ -49,7 +50,7 @@ def findings(result: FitResult) -> tuple[str, ...]:
 
 
 def trial_name(result: FitResult, index: int) -> str:
-    """Label of a trial, its number where it has none."""
+    """Label of the trial `index`, its number where it has none."""
     return str(result.given.recordings[index].label) or f"trial {index + 1}"
 
 
@@ -70,7 +71,7 @@ def method_note(result: FitResult, method: MethodFit) -> str:
 def direction_name(
     direction: np.ndarray[tuple[int, ...], np.dtype[np.float64]], names: tuple[str, ...]
 ) -> str:
-    """A direction as a sum of named parts, the largest first."""
+    """A direction (n,) as a sum of parts called by their `names`, the largest first."""
     order = np.argsort(-np.abs(direction), kind="stable")
     parts = [
         f"{direction[index]:+.2f} {names[index]}"

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 __all__ = ["LOST", "FitProvenance", "Provenance", "example_provenance", "fit_provenance"]
 
+#: What the page of the example says of the dissertation's own plant.
 LOST = (
     "The dissertation's own plant (3.8), initial state and input bound are lost. "
     "This plant stands in for them: it shows everything that the dissertation says of its own, "
@@ -38,6 +39,7 @@ class Provenance:
         Import path of the plant.
     plant : Plant
     settings : mapping of str to number
+        Horizon, steps, input bound (in the input's unit) and weights of the condition number.
     versions : mapping of str to str
         Of Python and of the packages that compute.
     made : str
@@ -60,11 +62,13 @@ class FitProvenance:
     plant_name : str
         Import path or file.
     plant_arguments : mapping
+        What its function was called with.
     files : tuple of str
         Names of the recordings, without their folders.
     command : str
         Command line that made the result.
     versions : mapping of str to str
+        Of Python and of the packages that compute.
     made : str
         Date and time, UTC, ISO 8601.
     """
@@ -78,7 +82,10 @@ class FitProvenance:
 
 
 def example_provenance(plant_name: str, plant: Plant) -> Provenance:
-    """Gather the provenance of a run of the example, now and with what is installed here."""
+    """Gather the provenance of a run of the example, now and with what is installed here.
+
+    `plant_name` is the import path of the plant.
+    """
     settings: dict[str, float] = {
         "horizon": HORIZON,
         "steps": STEPS,
@@ -90,7 +97,7 @@ def example_provenance(plant_name: str, plant: Plant) -> Provenance:
 
 
 def fit_provenance(source: PlantSource, files: Sequence[Path], command: str) -> FitProvenance:
-    """Gather the provenance of a fit, now and with what is installed here."""
+    """Gather the provenance of a fit to `files` by a `command`, now and as installed here."""
     return FitProvenance(
         source.name,
         dict(source.arguments),

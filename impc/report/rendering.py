@@ -15,7 +15,17 @@ __all__ = ["TextTable", "embedded", "number", "plain", "render_template"]
 
 @dataclass(frozen=True)
 class TextTable:
-    """A table of texts: a caption, heads, and rows whose first cell is a head of its own."""
+    """A table of texts.
+
+    Attributes
+    ----------
+    caption : str
+        Above the table.
+    heads : tuple of str
+        One a column.
+    rows : tuple of tuple of str
+        Their first cell is a head of its own.
+    """
 
     caption: str
     heads: tuple[str, ...]
@@ -23,7 +33,7 @@ class TextTable:
 
 
 def render_template(name: str, **values: Any) -> str:
-    """Render a template of this package; everything that enters it is escaped.
+    """Render a template of this package; all `values` that enter it are escaped.
 
     Templates of this folder go by their name, others by that of their room too: "cohort/page.html".
     """
@@ -39,12 +49,12 @@ def render_template(name: str, **values: Any) -> str:
 
 
 def embedded(png: bytes) -> str:
-    """A picture as the address of an <img> that needs no other file."""
+    """The picture `png` as the address of an <img> that needs no other file."""
     return "data:image/png;base64," + base64.b64encode(png).decode("ascii")
 
 
 def number(value: float, digits: int = 3) -> str:
-    """A number for a table cell; words where there is none."""
+    """A `value` for a table cell, to so many significant `digits`; words where there is none."""
     if np.isnan(value):
         return "-"
     if np.isinf(value):
@@ -53,7 +63,7 @@ def number(value: float, digits: int = 3) -> str:
 
 
 def plain(value: Any) -> Any:
-    """Arrays and numpy numbers as lists and numbers, at every depth; what is no number as None.
+    """A `value` with its arrays and numpy numbers as lists and numbers, at every depth.
 
     JSON knows neither NaN nor infinity: both become null.
     """

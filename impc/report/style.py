@@ -35,14 +35,18 @@ __all__ = [
     "render",
 ]
 
-# Okabe and Ito (2008). Their lightness (46, 56, 60 of 100) is too near to tell them apart in grey,
-# hence the markers and line styles beside them.
+# Their lightness (46, 56, 60 of 100) is too near to tell them apart in grey, hence the markers
+# and line styles beside them.
+#: Colours of Okabe and Ito (2008).
 BLUE, VERMILLION, GREEN = "#0072B2", "#D55E00", "#009E73"
+#: Axes, text and recorded data.
 INK = "#222222"
+#: Areas: beyond a bound, or a band that noise explains.
 FORBIDDEN = "#E3E3E3"
+#: Inside of the terminal set.
 SET_FILL = "#DCE9F2"
 
-# Column widths in inches, as most journals of the field set them.
+#: Column widths in inches, as most journals of the field set them.
 SINGLE_COLUMN, DOUBLE_COLUMN = 3.5, 7.2
 # 700 pixels for one column: sharp on a telephone of 360 points at twice the density.
 _DPI = 200
@@ -73,13 +77,24 @@ _RC: dict[Any, Any] = {
 
 @dataclass(frozen=True)
 class Mark:
-    """How one signal is drawn."""
+    """How one signal is drawn, in the words of matplotlib.
+
+    Attributes
+    ----------
+    color : str
+        Such as "#0072B2".
+    marker : str
+        Empty for none.
+    line : str
+        Its style, such as "--".
+    """
 
     color: str
     marker: str
     line: str
 
 
+#: Of the first state and of the second.
 STATE_MARKS = (Mark(BLUE, "o", "-"), Mark(VERMILLION, "s", "--"))
 
 
@@ -91,7 +106,7 @@ def journal_style() -> Iterator[None]:
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """Return a figure that belongs to no window and to no global list."""
+    """Return a figure that belongs to no window and to no list; width and height in inches."""
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure

@@ -31,12 +31,21 @@ __all__ = [
 
 @dataclass(frozen=True)
 class MethodText:
-    """A method in words: a label for tables and one sentence for readers who do not know it."""
+    """A method in words.
+
+    Attributes
+    ----------
+    label : str
+        For tables.
+    sentence : str
+        For readers who do not know it.
+    """
 
     label: str
     sentence: str
 
 
+#: The true controller and the methods in words, by their names.
 METHODS: dict[str, MethodText] = {
     "truth": MethodText("true controller", "The MPC that made the recording."),
     "feedback_gain": MethodText(
@@ -70,6 +79,7 @@ METHODS: dict[str, MethodText] = {
     ),
 }
 
+#: Heads of the table.
 COLUMNS = (
     "method",
     "Q11 Q12 Q22 / R",
@@ -85,7 +95,21 @@ _NONE = "-"
 
 @dataclass(frozen=True)
 class Row:
-    """One line of the table, every cell as text; ``name`` is the key in result.json."""
+    """One line of the table, every cell as text.
+
+    Attributes
+    ----------
+    name : str
+        Of the method: the key in result.json.
+    weights, gain : str
+        Entries; a dash or "infeasible" where there are none.
+    misfit, largest, kept : str
+        2-norm of the state misfit, largest magnitude of the input, whether the bound is kept.
+    residual : str
+        (3.10).
+    seconds : str
+        Time of the method, s.
+    """
 
     name: str
     weights: str
@@ -159,7 +183,7 @@ def compact_weights(weights: Weights) -> str:
 
 
 def significant(value: float) -> str:
-    """Three significant digits; whole numbers that are exact to nine digits without a point."""
+    """Three digits of a `value`; whole numbers that are exact to nine digits without a point."""
     return str(round(value)) if 1 <= abs(value) < 1e6 and _whole(value) else f"{value:.3g}"
 
 

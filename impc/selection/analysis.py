@@ -53,7 +53,7 @@ class StudySelection:
     doubts : Doubts
         Of the first subject.
     seconds : mapping
-        "fim", "lasso" and, when it was asked for, "nelder_mead": mean over subjects.
+        "fim", "lasso" and, when it was asked for, "nelder_mead": time in s, mean over subjects.
     """
 
     nominal: Mapping[str, Nominal]

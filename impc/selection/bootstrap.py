@@ -3,7 +3,7 @@
 fit -> residuals, centred -> drawn again, one by one or in blocks -> added to the fit's outputs ->
 fitted again from the fit -> percentiles. Residuals of people are coloured: drawn one by one they
 give intervals that are too narrow, in blocks they do not (`impc.bootstrap.block_length`).
-Replicate k draws from the k-th child of the seed.
+Replicate k draws from the k-th child of the seed. Source: chapter 4; Künsch 1989 for the blocks.
 """
 
 from __future__ import annotations
@@ -39,8 +39,9 @@ class BootstrapIntervals:
     names : tuple of str
         Free parameters.
     value, low, high : Array
-        In their units.
+        (free,), in their units.
     level : float
+        Share of the replicates inside.
     drawn : Array
         (replicates, free).
     """
@@ -54,18 +55,44 @@ class BootstrapIntervals:
 
     @property
     def width(self) -> Array:
-        """Of the intervals."""
+        """Of the intervals (free,), in the parameters' units."""
         return np.asarray(self.high - self.low)
 
 
 def draw_single(parts: list[Array], rng: np.random.Generator) -> list[Array]:
-    """Rows of all trials' residuals, one by one."""
+    """Residuals drawn again row by row from those of all trials.
+
+    Parameters
+    ----------
+    parts : list of Array
+        Residuals (samples, p) of each trial.
+    rng : numpy.random.Generator
+        What is drawn from.
+
+    Returns
+    -------
+    list of Array
+        As many, (samples, p) each.
+    """
     pooled = np.concatenate([item - np.mean(item, axis=0) for item in parts])
     return [pooled[rng.integers(len(pooled), size=len(item))] for item in parts]
 
 
 def draw_blocks(parts: list[Array], rng: np.random.Generator) -> list[Array]:
-    """Moving blocks of the residuals."""
+    """Residuals drawn again in moving blocks, by `impc.bootstrap.block_residuals`.
+
+    Parameters
+    ----------
+    parts : list of Array
+        Residuals (samples, p) of each trial.
+    rng : numpy.random.Generator
+        What is drawn from.
+
+    Returns
+    -------
+    list of Array
+        As many, (samples, p) each.
+    """
     return block_residuals(parts, rng)
 
 
@@ -80,7 +107,29 @@ def bootstrap_subset(
     level: float = 0.95,
     progress: Callable[[], None] = lambda: None,
 ) -> BootstrapIntervals:
-    """Intervals of the free parameters of a fit."""
+    """Intervals of the free parameters of a fit.
+
+    Parameters
+    ----------
+    fit : Estimate
+        Where every replicate begins.
+    replicates : int
+        How many are fitted.
+    seed : int
+        All numbers drawn follow from it.
+    draw : callable
+        (residuals, generator) -> residuals drawn again, lists with an array (samples, p) for each
+        trial: `draw_single` or `draw_blocks`.
+    level : float
+        Of the intervals, between 0 and 1.
+    progress : callable
+        Called when a replicate is done.
+
+    Raises
+    ------
+    DataError
+        As `estimate`.
+    """
     theta = np.array(fit.theta)
     left = residuals(model, theta, trials)
     clean = [np.asarray(model.simulate(theta, item.input)) for item in trials]

@@ -42,6 +42,7 @@ class Estimate:
     vaf : Array
         (4.4) over all trials (p,), %.
     evaluations : int
+        Of the residual.
     at_bound : tuple of int
         Free parameters that end on a bound.
     """
@@ -55,7 +56,7 @@ class Estimate:
 
 
 def free_indices(model: ParametricModel, names: Sequence[str]) -> tuple[int, ...]:
-    """Indices of parameters by name.
+    """Indices of parameters by their `names`.
 
     Raises
     ------
@@ -83,8 +84,11 @@ def estimate(
     model : ParametricModel
     trials : sequence of Trial
     free : sequence of int
+        Indices of the parameters that are fitted.
     start : Array
-        All parameters (k,); the others keep these values.
+        All parameters (k,), in their units; the others keep these values.
+    max_evaluations : int
+        Of the residual, at most.
 
     Raises
     ------
@@ -151,8 +155,18 @@ def multi_start(
 ) -> tuple[Estimate, ...]:
     """Fits from the typical values and from points drawn about them, the best first.
 
-    `spread` is the deviation of the draws in normalised units. Points at which the model is not
-    finite are drawn again.
+    Points at which the model is not finite are drawn again.
+
+    Parameters
+    ----------
+    free : sequence of int
+        Indices of the parameters that are fitted.
+    starts : int
+        How many fits.
+    seed : int
+        All numbers drawn follow from it.
+    spread : float
+        Deviation of the draws, in normalised units.
     """
     rng = np.random.default_rng(seed)
     typical = normalised(model, np.asarray(model.typical))
@@ -172,12 +186,12 @@ def multi_start(
 
 
 def residuals(model: ParametricModel, theta: Array, trials: Sequence[Trial]) -> list[Array]:
-    """Outputs recorded minus simulated, (samples, p) for each trial."""
+    """Outputs recorded minus simulated at theta (k,): (samples, p) for each trial."""
     return [np.asarray(item.outputs - model.simulate(theta, item.input)) for item in trials]
 
 
 def pooled_vaf(model: ParametricModel, theta: Array, trials: Sequence[Trial]) -> Array:
-    """VAF (4.4) over all trials (p,), %."""
+    """VAF (4.4) over all trials, % (p,), at theta (k,) in its units."""
     recorded = np.concatenate([item.outputs for item in trials])
     simulated = np.concatenate([model.simulate(theta, item.input) for item in trials])
     return np.asarray(vaf(recorded, simulated))

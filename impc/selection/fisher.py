@@ -50,11 +50,12 @@ class Information:
     directions : Array
         Right singular vectors, one a row (k, k), in normalised units.
     relative : Array
-        The same for sensitivities with respect to the logarithms of the parameters: a direction
-        there is a scaling.
+        The same for sensitivities with respect to the logarithms of the parameters, singular
+        value and direction side by side (k, 1 + k). A direction there is a scaling.
     variance : float
         sigma^2 of the residual.
     rank : int
+        Of the relative sensitivities: singular values above 1e-6 of the largest.
     """
 
     F: Array
@@ -76,6 +77,7 @@ class NullDirection:
     shares : dict
         Parameter -> its part in the direction of relative changes, largest first.
     sentence : str
+        The same in words.
     """
 
     singular_value: float
@@ -121,7 +123,7 @@ def fisher_information(
 
 
 def common_scaling(model: ParametricModel, found: Information, names: Sequence[str]) -> float:
-    """How much scaling the named parameters together changes the outputs, over their noise.
+    """How much scaling the parameters `names` together changes the outputs, over their noise.
 
     The norm over all samples of the change per logarithm of the scale, in deviations of the noise:
     below 1 nobody sees a scaling by e.

@@ -16,13 +16,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from impc.arrays import Array, frozen
 from impc.reliability.icc import icc
 from impc.selection.estimation import Estimate, estimate
 from impc.selection.subject import Nominal, fit_nominal
 from impc.selection.subsets import largest_subsets, sweep
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     from impc.selection.model import ParametricModel, Trial
     from impc.selection.running import Runner
@@ -39,6 +40,7 @@ class Candidate:
     Attributes
     ----------
     subset : tuple of int
+        Indices of its parameters.
     variance : float
         Largest, over subjects and visits, in normalised units.
     vaf : float
@@ -73,17 +75,29 @@ class KeyParameters:
         All of them, best first: kept before not, then diversity, then reliability.
     chosen : tuple of int
         The first kept one; empty when none is kept.
+    nominal : Array
+        Estimates with all parameters free (parameters, subjects, visits), in physical units.
+    estimates : Array
+        Those of the chosen subset alone (chosen, subjects, visits), in physical units.
     """
 
     selection: Selection
     sweep: tuple[Selection, ...]
     candidates: tuple[Candidate, ...]
     chosen: tuple[int, ...]
+    nominal: Array
+    estimates: Array
 
 
 @dataclass(frozen=True)
 class Refits:
-    """Fits of several subsets to one subject and visit."""
+    """Fits of several subsets to one subject and visit.
+
+    Attributes
+    ----------
+    fits : tuple of Estimate
+        One a subset, in their order.
+    """
 
     fits: tuple[Estimate, ...]
 
@@ -91,7 +105,13 @@ class Refits:
 def refit_subsets(
     model: ParametricModel, trials: Sequence[Trial], subsets: tuple[tuple[int, ...], ...]
 ) -> Refits:
-    """Fit each subset alone, the other parameters at their typical values."""
+    """Fit each of the `subsets` alone, the other parameters at their typical values.
+
+    Raises
+    ------
+    DataError
+        As `estimate`.
+    """
     typical = np.array(model.typical)
     return Refits(tuple(estimate(model, trials, subset, typical) for subset in subsets))
 
@@ -132,9 +152,9 @@ def key_parameters(
     refits = run(refit_subsets, Refits, {name: (trials[name], subsets) for name in trials})
     candidates = []
     for place, subset in enumerate(subsets):
-        fits = {key: item.fits[place] for key, item in zip(recorded, refits.values(), strict=True)}
-        vaf = float(np.mean([np.mean(item.vaf) for item in fits.values()]))
-        reliability = _reliability(fits, subset)
+        fits = [item.fits[place] for item in refits.values()]
+        vaf = float(np.mean([np.mean(item.vaf) for item in fits]))
+        reliability = _reliability(_by_visit(recorded, fits, subset))
         diversity = len({model.pathways[index] for index in subset})
         kept = vaf > least_vaf and reliability >= least_reliability
         variance = selection.variances[place]
@@ -144,17 +164,35 @@ def key_parameters(
     )
     chosen = candidates[0].subset if candidates and candidates[0].kept else ()
     swept = sweep(informations, settings.bounds, settings.least)
-    return KeyParameters(selection, swept, tuple(candidates), chosen)
+    everything = tuple(range(model.size))
+    alone = [item.fits[subsets.index(chosen)] for item in refits.values()] if chosen else []
+    return KeyParameters(
+        selection,
+        swept,
+        tuple(candidates),
+        chosen,
+        _by_visit(recorded, [item.fit for item in nominal.values()], everything),
+        _by_visit(recorded, alone, chosen),
+    )
 
 
-def _reliability(fits: Mapping[tuple[str, str], Estimate], subset: tuple[int, ...]) -> float:
-    """Least ICC(A,k) between visits of the subset's estimates; NaN without several of both."""
-    subjects = list(dict.fromkeys(key[0] for key in fits))
-    visits = list(dict.fromkeys(key[1] for key in fits))
-    if len(visits) < 2 or len(subjects) < 2:
-        return float("nan")
+def _by_visit(
+    keys: Iterable[tuple[str, str]], fits: Sequence[Estimate], subset: tuple[int, ...]
+) -> Array:
+    """Estimates of a subset (len(subset), subjects, visits); NaN where a visit is missing."""
+    pairs = list(keys)
+    subjects = list(dict.fromkeys(subject for subject, _ in pairs))
+    visits = list(dict.fromkeys(visit for _, visit in pairs))
     values = np.full((len(subset), len(subjects), len(visits)), np.nan)
-    for (subject, visit), found in fits.items():
-        place = subjects.index(subject), visits.index(visit)
-        values[:, place[0], place[1]] = np.array(found.theta)[list(subset)]
+    if subset:
+        for (subject, visit), found in zip(pairs, fits, strict=True):
+            place = subjects.index(subject), visits.index(visit)
+            values[:, place[0], place[1]] = np.array(found.theta)[list(subset)]
+    return frozen(values)
+
+
+def _reliability(values: Array) -> float:
+    """(5.6): the least ICC(A,k) of a subset's parameters; NaN without several of both."""
+    if min(values.shape[1:]) < 2:
+        return float("nan")
     return float(np.min([icc(table, "A,k").value for table in values]))

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from impc.reliability.icc import icc
 from impc.report.rendering import TextTable, embedded, number, plain, render_template
 from impc.report.style import BLUE, DOUBLE_COLUMN, INK, journal_style, new_figure, render
 from impc.selection.report import names_of, table_csv
@@ -14,6 +15,7 @@ from impc.selection.report import names_of, table_csv
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from impc.arrays import Array
     from impc.selection.key_parameters import KeyParameters
     from impc.selection.model import ParametricModel
 
@@ -21,7 +23,7 @@ __all__ = ["key_files"]
 
 
 def key_files(model: ParametricModel, found: KeyParameters, command: str) -> dict[str, bytes]:
-    """Build all files of `impc key-parameters`; nothing is written."""
+    """Build all files of `impc key-parameters`; they name the `command`; nothing is written."""
     rows = tuple(
         (
             names_of(model, item.subset),
@@ -47,7 +49,7 @@ def key_files(model: ParametricModel, found: KeyParameters, command: str) -> dic
             f"{found.selection.bound:g}).",
             f"Chosen: {chosen}.",
         ],
-        tables=[table, _sweep_table(model, found)],
+        tables=[table, _estimate_table(model, found), _sweep_table(model, found)],
         picture_source=embedded(pictures["png"]),
         caption="Counterpart of figure 5.3: subsets in the space of reliability and goodness of "
         "fit; filled ones pass all filters.",
@@ -58,9 +60,23 @@ def key_files(model: ParametricModel, found: KeyParameters, command: str) -> dic
         "size": found.selection.size,
         "subsets": len(found.selection.subsets),
         "sweep": [
-            {"bound": item.bound, "size": item.size, "subsets": len(item.subsets)}
+            {
+                "bound": item.bound,
+                "size": item.size,
+                "subsets": [[model.names[index] for index in subset] for subset in item.subsets],
+            }
             for item in found.sweep
         ],
+        "icc": {
+            "nominal": dict(zip(model.names, map(_icc, found.nominal), strict=True)),
+            "chosen": dict(
+                zip(
+                    (model.names[index] for index in found.chosen),
+                    map(_icc, found.estimates),
+                    strict=True,
+                )
+            ),
+        },
         "candidates": [
             {
                 "names": [model.names[index] for index in item.subset],
@@ -80,6 +96,46 @@ def key_files(model: ParametricModel, found: KeyParameters, command: str) -> dic
         "candidates.csv": table_csv(table),
         **{f"solution-space.{kind}": picture for kind, picture in pictures.items()},
     }
+
+
+def _icc(values: Array) -> dict[str, float]:
+    """ICC(A,k) between visits with its 95 % interval; NaN without several subjects and visits."""
+    if min(values.shape) < 2:
+        return dict.fromkeys(("value", "low", "high"), np.nan)
+    told = icc(values, "A,k")
+    return {"value": told.value, "low": told.low, "high": told.high}
+
+
+def _estimate_table(model: ParametricModel, found: KeyParameters) -> TextTable:
+    """Counterpart of tables 5.3 and 5.4: mean ± SD over subjects, physical units."""
+    places = {index: place for place, index in enumerate(found.chosen)}
+    visits = [f"visit {number + 1}" for number in range(found.nominal.shape[2])]
+    rows = []
+    for index, name in enumerate(model.names):
+        own = found.estimates[places[index]] if index in places else None
+        rows.append(
+            (
+                name,
+                model.units[index],
+                _mean_sd(found.nominal[index]),
+                _with_interval(found.nominal[index]),
+                *(["fixed"] * len(visits) if own is None else map(_mean_sd, own.T)),
+                "" if own is None else _with_interval(own),
+            )
+        )
+    heads = ("parameter", "unit", "all free", "ICC, all free", *visits, "ICC")
+    title = "Estimates, mean ± SD over subjects; ICC(A,k) between visits with its 95 % interval."
+    return TextTable(title, heads, tuple(rows))
+
+
+def _mean_sd(values: Array) -> str:
+    spread = number(float(np.nanstd(values, ddof=1))) if values.size > 1 else "-"
+    return f"{number(float(np.nanmean(values)))} ± {spread}"
+
+
+def _with_interval(values: Array) -> str:
+    value, low, high = _icc(values).values()
+    return "-" if np.isnan(value) else f"{value:.2f} [{low:.2f}, {high:.2f}]"
 
 
 def _sweep_table(model: ParametricModel, found: KeyParameters) -> TextTable:
@@ -117,7 +173,7 @@ def _solution_figure(model: ParametricModel, found: KeyParameters) -> Figure:
             [], [], marker=markers[min(diversity, len(markers)) - 1], color=INK, linestyle="none",
             markerfacecolor="white", label=f"{diversity} pathways",
         )  # fmt: skip
-    ax.set_xlabel("reliability, least ICC(A,k)")
+    ax.set_xlabel("reliability, least ICC(A,k) (-)")
     ax.set_ylabel("mean VAF (%)")
     if found.candidates:
         ax.legend(loc="best")

@@ -48,6 +48,7 @@ class Lasso:
     refit : Estimate or None
         Of the selected ones; None when none is.
     objective : float
+        (C.5) at t.
     solves : int
         Problems (C.5) that were solved.
     """
@@ -63,7 +64,15 @@ class Lasso:
 def proximal_lasso(
     model: ParametricModel, trials: Sequence[Trial], weight: float, start: Array | None = None
 ) -> tuple[Array, float]:
-    """Solve (C.5): normalised parameters and the objective."""
+    """Solve (C.5): normalised parameters (k,) and the objective.
+
+    Parameters
+    ----------
+    weight : float
+        lambda.
+    start : Array, optional
+        Normalised parameters (k,); the typical values by default.
+    """
     typical = normalised(model, np.asarray(model.typical))
     t = typical.copy() if start is None else np.clip(start, -1, 1)
 
@@ -123,7 +132,8 @@ def table_c1(
     """Table C.1: Nelder and Mead, a threshold of 0.005, lambda moved until `count` are beyond it.
 
     The rule that moves lambda is lost: it is multiplied by 2 when too many parameters moved,
-    divided by 2 when too few, the factor's logarithm halved when the direction changes.
+    divided by 2 when too few, the factor's logarithm halved when the direction changes. At most
+    `solves` problems are solved.
     """
     typical = normalised(model, np.asarray(model.typical))
     weight, factor, before = _FIRST, 2.0, 0

@@ -31,7 +31,15 @@ __all__ = ["Discrete", "discretised", "kronecker_sensitivity", "linear_functions
 
 
 class Discrete(NamedTuple):
-    """Sampled matrices and their derivatives, the parameter's axis first: (k, ...)."""
+    """Sampled matrices and their derivatives, the parameter's axis first.
+
+    Attributes
+    ----------
+    A, B, C : Array
+        (n, n), (n, d) and (p, n).
+    dA, dB, dC : Array
+        (k, n, n), (k, n, d) and (k, p, n).
+    """
 
     A: Array
     B: Array
@@ -42,7 +50,17 @@ class Discrete(NamedTuple):
 
 
 def discretised(matrices: ca.Function, theta: Array, dt: float) -> Discrete:
-    """Sample a model of CasADi, theta -> A, B, C, at one point."""
+    """Sample a model at one point.
+
+    Parameters
+    ----------
+    matrices : casadi.Function
+        theta (k) -> A (n, n), B (n, d), C (p, n), continuous.
+    theta : Array
+        (k,).
+    dt : float
+        Sample time, s.
+    """
     A, B, C = (item.full() for item in matrices(theta))
     symbol = ca.SX.sym("theta", len(theta))
     parts = matrices(symbol)
@@ -94,7 +112,13 @@ def linear_functions(
 
 
 def kronecker_sensitivity(found: Discrete, given: Array) -> Array:
-    """(A.3) with Kronecker products: derivative of the outputs (samples, p, k); slow."""
+    """(A.3) with Kronecker products: derivative of the outputs (samples, p, k); slow.
+
+    Parameters
+    ----------
+    given : Array
+        Input (samples, d).
+    """
     k, n, d = len(found.dA), found.A.shape[0], found.B.shape[1]
     dA, dB, dC = (np.hstack(list(item)) for item in (found.dA, found.dB, found.dC))
     x, X = np.zeros((n, 1)), np.zeros((n, k))

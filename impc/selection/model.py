@@ -28,7 +28,15 @@ _STEP = 1e-4
 
 @dataclass(frozen=True)
 class Trial:
-    """One recording: input (samples, d) and outputs (samples, p)."""
+    """One recording, in the units of the model's signals.
+
+    Attributes
+    ----------
+    input : Array
+        (samples, d).
+    outputs : Array
+        (samples, p).
+    """
 
     input: Array
     outputs: Array
@@ -85,6 +93,20 @@ def parametric_model(
 ) -> ParametricModel:
     """Check and freeze a model.
 
+    Parameters
+    ----------
+    names : sequence of str
+        Of the k parameters.
+    low, high, typical : sequence of float
+        Bounds and typical values (k,), in their units.
+    simulate : callable
+        (theta (k,), input (samples, d)) -> outputs (samples, p).
+    pathways, units : sequence of str, optional
+        Of each parameter; empty by default.
+    jacobian : callable, optional
+        (theta, input) -> outputs and their derivative (samples, p, k) with respect to theta, in
+        its units.
+
     Raises
     ------
     InputError
@@ -110,17 +132,30 @@ def parametric_model(
 
 
 def normalised(model: ParametricModel, theta: Array) -> Array:
-    """(4.2): parameters in units of half their range about its middle."""
+    """(4.2): parameters theta (k,) in units of half their range about its middle, (k,)."""
     return np.asarray((theta - (model.high + model.low) / 2) / model.gain)
 
 
 def physical(model: ParametricModel, t: Array) -> Array:
-    """Inverse of `normalised`."""
+    """Inverse of `normalised`: t (k,) to parameters in their units, (k,)."""
     return np.asarray((model.high + model.low) / 2 + model.gain * t)
 
 
 def sensitivity(model: ParametricModel, theta: Array, given: Array) -> tuple[Array, Array]:
-    """Outputs (samples, p), and their derivative with respect to normalised parameters (…, k)."""
+    """Outputs of the model, and their derivative with respect to normalised parameters.
+
+    Parameters
+    ----------
+    theta : Array
+        (k,), in their units.
+    given : Array
+        Input (samples, d).
+
+    Returns
+    -------
+    outputs, derivative : Array
+        (samples, p) and (samples, p, k).
+    """
     if model.jacobian is not None:
         outputs, derivative = model.jacobian(theta, given)
         return outputs, np.asarray(derivative * model.gain)

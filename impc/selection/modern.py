@@ -57,7 +57,7 @@ class FixedBias:
     moved : float
         By how much, in normalised units.
     shift : Array
-        Of each free parameter.
+        Of each free parameter (free,), in normalised units.
     """
 
     name: str
@@ -73,7 +73,7 @@ def pivoted_order(found: Information) -> tuple[int, ...]:
 
 
 def subset_by_svd(found: Information, count: int) -> tuple[int, ...]:
-    """Subset of a size by SVD with pivoted QR."""
+    """Subset of `count` parameters by SVD with pivoted QR."""
     _, order = scipy.linalg.qr(np.asarray(found.directions)[:count], mode="r", pivoting=True)
     return tuple(sorted(int(index) for index in order[:count]))
 
@@ -89,7 +89,7 @@ def collinearity(found: Information, subset: Sequence[int]) -> float:
 
 
 def best_collinear(found: Information, count: int) -> tuple[tuple[int, ...], float]:
-    """The subset of a size with the least collinearity, and its index."""
+    """The subset of `count` parameters with the least collinearity, and its index."""
     subsets = itertools.combinations(range(len(found.F)), count)
     index, best = min((collinearity(found, subset), subset) for subset in subsets)
     return best, index
@@ -104,7 +104,15 @@ def with_doubled_ranges(model: ParametricModel) -> ParametricModel:
 def agreement(
     model: ParametricModel, trials: Sequence[Trial], theta: Array, bound: float
 ) -> dict[str, Selection | tuple[int, ...]]:
-    """Selections by every rule, and those of the information with other ranges and points."""
+    """Selections by every rule, and those of the information with other ranges and points.
+
+    Parameters
+    ----------
+    theta : Array
+        (k,), in their units.
+    bound : float
+        v, largest variance in normalised units.
+    """
     found = fisher_information(model, theta, trials)
     ours = largest_subsets([found.F], bound)
     size = max(ours.size, 2)
@@ -152,6 +160,15 @@ def profile_interval(
 
     The parameter is held, the other free ones are fitted again; residuals are taken as white. An
     end that is not met inside the parameter's range is infinite.
+
+    Parameters
+    ----------
+    fit : Estimate
+        Where the profile begins.
+    index : int
+        Of the parameter, one of `fit.free`.
+    level : float
+        Of the interval, between 0 and 1.
     """
     others = tuple(item for item in fit.free if item != index)
     samples = sum(item.outputs.size for item in trials)

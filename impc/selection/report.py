@@ -27,7 +27,7 @@ __all__ = ["names_of", "selection_files", "selection_table", "table_csv"]
 def selection_files(
     model: ParametricModel, found: StudySelection, command: str
 ) -> dict[str, bytes]:
-    """Build all files of `impc select`; nothing is written."""
+    """Build all files of `impc select`; they name the `command`; nothing is written."""
     tables = {
         "identifiability": _rank_table(model, found),
         "sweep": _sweep_table(model, found),

@@ -50,12 +50,18 @@ class Runner(Protocol):
 
 @dataclass(frozen=True)
 class Kept:
-    """Results of tasks in a folder, one file each."""
+    """Results of tasks in a folder, one file each.
+
+    Attributes
+    ----------
+    folder : Path
+        Made when the first result is kept.
+    """
 
     folder: Path
 
     def find(self, key: str, kind: type[T]) -> T | None:
-        """What was kept under a key; None when nothing was, or it is damaged."""
+        """What was kept under a key, of that `kind`; None when nothing was, or it is damaged."""
         try:
             content = (self.folder / key).read_bytes()
             return msgspec.msgpack.decode(content, type=kind, dec_hook=_array)
@@ -63,7 +69,7 @@ class Kept:
             return None
 
     def keep(self, key: str, value: object) -> None:
-        """Write a result down.
+        """Write the result `value` down under a `key`.
 
         Raises
         ------
@@ -109,6 +115,7 @@ def on_workers(
     Parameters
     ----------
     client : distributed.Client
+        Of the scheduler.
     source : ModelSource
         Its import path must be known to the workers too.
     kept : Kept

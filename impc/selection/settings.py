@@ -34,9 +34,11 @@ class SelectSettings:
     replicates : int
         Of the bootstrap.
     draw : "single" or "block"
+        How the bootstrap draws residuals.
     nelder_mead : bool
         Whether Table C.1 is run too: slow.
     seed : int
+        Of starts and replicates.
     """
 
     bound: float = 0.05

@@ -38,7 +38,20 @@ _NEEDED = ("names", "low", "high", "typical", "inputs", "outputs", "rate")
 
 @dataclass(frozen=True)
 class ModelSource:
-    """A model, and how its signals are called in a recording."""
+    """A model, and how its signals are called in a recording.
+
+    Attributes
+    ----------
+    name : str
+        Import path of the function.
+    arguments : mapping
+        What it was called with.
+    model : ParametricModel
+    inputs, outputs : tuple of str
+        Signals of a recording.
+    rate : float
+        Samples per second of the model.
+    """
 
     name: str
     arguments: Mapping[str, Any]
@@ -49,7 +62,7 @@ class ModelSource:
 
 
 def model_source(name: str, arguments: Mapping[str, Any]) -> ModelSource:
-    """Call the function of an import path ``module:function`` with arguments.
+    """Call the function of an import path `name`, ``module:function``, with arguments.
 
     Raises
     ------

@@ -1,4 +1,7 @@
-"""Work on one subject: what its recordings tell of all parameters, then of the chosen ones."""
+"""Work on one subject: what its recordings tell of all parameters, then of the chosen ones.
+
+The steps of chapter 4, as docs/selection.md lists them.
+"""
 
 from __future__ import annotations
 
@@ -52,7 +55,7 @@ class Nominal:
         Parameters that may be scaled together unseen.
     sweep : tuple of Selection
     seconds : float
-        Of information and sweep.
+        Time of information and sweep, s.
     """
 
     fit: Estimate
@@ -76,6 +79,7 @@ class Chosen:
     nelder_mead : Lasso or None
         Table C.1, when asked for.
     seconds_lasso, seconds_nelder_mead : float
+        Time of each, s.
     """
 
     refit: Estimate
@@ -95,6 +99,7 @@ class Doubts:
     agreement : dict
         Rule -> its best subset.
     collinearity : float
+        Brun's index of the chosen parameters.
     bias : tuple of FixedBias
     profile : tuple of (float, float)
         Ends of the profile likelihood's 95 % interval of each chosen parameter.

@@ -54,9 +54,10 @@ class Selection:
 
 
 def subset_variances(informations: Sequence[Array], subsets: Sequence[Sequence[int]]) -> Array:
-    """Largest diagonal entry of F_s^-1 for subsets of one size, worst over several informations.
+    """Largest diagonal entry of F_s^-1 for s subsets of one size, worst over all F: (s,).
 
-    Infinite where F_s is singular to working precision. (5.5) with several subjects and visits.
+    Infinite where F_s is singular to working precision. (5.5) with several subjects and visits:
+    `informations` (k, k) of each.
     """
     chosen = np.asarray(subsets, dtype=int)
     worst = np.zeros(len(chosen))
@@ -119,7 +120,16 @@ def largest_subsets(informations: Sequence[Array], bound: float, least: int = 2)
 
 
 def exhaustive(informations: Sequence[Array], bound: float, least: int = 2) -> Selection:
-    """The same by trying every subset: for checks, and up to twenty parameters.
+    """`largest_subsets` by trying every subset: for checks, and up to twenty parameters.
+
+    Parameters
+    ----------
+    informations : sequence of Array
+        F of each subject and visit (k, k).
+    bound : float
+        v, largest variance in normalised units.
+    least : int
+        n_min.
 
     Raises
     ------
@@ -143,7 +153,10 @@ def exhaustive(informations: Sequence[Array], bound: float, least: int = 2) -> S
 def sweep(
     informations: Sequence[Array], bounds: Sequence[float], least: int = 2
 ) -> tuple[Selection, ...]:
-    """Selections over several bounds: .05, .15, ... .95 in the dissertation."""
+    """Selections over several bounds: .05, .15, ... .95 in the dissertation.
+
+    `informations` (k, k) and `least` are those of `largest_subsets`.
+    """
     return tuple(largest_subsets(informations, bound, least) for bound in bounds)
 
 

@@ -98,6 +98,22 @@ def test_consistency_ignores_a_shift_of_occasions_and_agreement_does_not() -> No
     assert icc(shifted, "A,1").value < icc(SHROUT_FLEISS, "A,1").value
 
 
+@pytest.mark.parametrize("form", FORMS)
+def test_limits_lie_about_the_estimate_for_few_subjects(form: Form) -> None:
+    """With three subjects limits of (A,1) pass -1/(k-1), where those of (A,k) are -inf."""
+    lows = []
+    for seed in range(300):
+        rng = np.random.default_rng(seed)
+        scores = rng.standard_normal((3, 1)) + rng.standard_normal((3, 2))
+        found = icc(scores, form)
+        lows.append(found.low)
+        if not np.isnan(found.value):
+            assert found.low <= found.value + 1e-9, f"seed {seed}"
+            assert found.value <= found.high + 1e-9, f"seed {seed}"
+    if form == "A,k":
+        assert np.any(np.isneginf(lows))
+
+
 def test_measurement_error() -> None:
     """SEM = SD sqrt(1 - ICC), and 1.96 sqrt(2) of it."""
     sem = standard_error_of_measurement(SHROUT_FLEISS, 0.75)

@@ -1,0 +1,1 @@
+"""The reproduction table: every equation, table, figure and claim of the dissertation."""

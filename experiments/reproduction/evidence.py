@@ -1,0 +1,88 @@
+"""What the entries look at: the package's own commands, run once, and their `result.json`.
+
+A command whose result is there is not run again, so `make reproduce` may be interrupted; delete
+the folder to begin anew. The studies that feed `impc select`, `impc key-parameters` and
+`impc reliability` are simulated by the package (seed 0), because the dissertation's recordings are
+not public.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from experiments.selection_claims import bootstrap_widths, reduced_widths
+
+__all__ = ["Evidence", "gather"]
+
+TRIALS = ("trial_1.csv", "trial_2.csv", "trial_3.csv")
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """`result.json` of each command, as read; `claims` are of `experiments.selection_claims`."""
+
+    example: dict[str, Any]
+    fit: dict[str, Any]
+    reliability: dict[str, Any]
+    select: dict[str, Any]
+    yaw: dict[str, Any]
+    pitch: dict[str, Any]
+    claims: dict[str, Any]
+    folder: Path
+
+
+def gather(folder: Path) -> Evidence:
+    """Run what has no result yet in `folder`; about half an hour on two cores."""
+    subject = folder / "subject"
+    _once(subject / "truth.json", ["simulate", "seated-balance", "--formats", "csv"])
+    balance = folder / "balance"
+    _once(balance / "truth.json", ["simulate", "reliability-study"])
+    heads = {name: folder / f"heads-{name}" for name in ("ten", "yaw", "pitch")}
+    tracking = ["simulate", "head-tracking"]
+    forty = ["--subjects", "40", "--visits", "2"]
+    _once(heads["ten"] / "truth.json", tracking)
+    _once(heads["yaw"] / "truth.json", [*tracking, *forty])
+    _once(heads["pitch"] / "truth.json", [*tracking, *forty, "--axis", "pitch"])
+    recordings = [str(subject / name) for name in TRIALS]
+    config = str(subject / "subject.toml")
+    commands = {
+        "example": ["example"],
+        "fit": ["fit", *recordings, "--plant", "seated-balance", "--config", config],
+        "reliability": ["reliability", str(balance / "study.toml")],
+        "select": ["select", str(heads["ten"] / "study.toml")],
+        "yaw": ["key-parameters", str(heads["yaw"] / "study.toml")],
+        "pitch": ["key-parameters", str(heads["pitch"] / "study.toml")],
+    }
+    results = {
+        name: json.loads(_once(folder / name / "result.json", line).read_text("utf-8"))
+        for name, line in commands.items()
+    }
+    return Evidence(**results, claims=_claims(folder / "claims.json"), folder=folder)
+
+
+def _claims(path: Path) -> dict[str, Any]:
+    """Widths of bootstrap intervals, with 60 replicates; kept like the results of commands."""
+    if not path.exists():
+        print("bootstrap intervals of chapter 4: ten minutes", flush=True)
+        content = {
+            "widths": [asdict(item) for item in bootstrap_widths(0.2, 0.6, 60)],
+            "reduced": {name: list(item) for name, item in reduced_widths(60).items()},
+        }
+        staging = path.with_suffix(".part")
+        staging.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+        staging.replace(path)
+    return dict(json.loads(path.read_text("utf-8")))
+
+
+def _once(result: Path, line: list[str]) -> Path:
+    """Run `impc <line> --out <folder of the result>` unless the result is there."""
+    if not result.exists():
+        given = [*line, "--out", str(result.parent)]
+        print("impc", *given, flush=True)
+        subprocess.run([Path(sys.executable).with_name("impc"), *given], check=True)
+    return result

@@ -1,0 +1,39 @@
+"""A block of TOML through the package's own readers, whole or a part."""
+
+from __future__ import annotations
+
+import tomllib
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from impc.cohort.study import StudyTable
+from impc.files.configuration import read_configuration
+from impc.fit_settings import fit_settings
+from impc.selection.settings import select_settings
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+__all__ = ["require_valid"]
+
+# What a part lacks to be a configuration.
+_SIGNAL = '\n[signals.any]\ncolumn = "any"\nunit = "1"\n'
+
+
+def require_valid(text: str, folder: Path) -> None:
+    """Read a block as the commands do.
+
+    Raises
+    ------
+    ImpcError, msgspec.ValidationError
+        When a key is unknown, or a value of the wrong kind or out of range.
+    """
+    whole = "signals" in tomllib.loads(text)
+    path = folder / "block.toml"
+    path.write_text(text if whole else text + _SIGNAL, encoding="utf-8")
+    found = read_configuration(path, "study", "model", "select")
+    path.unlink()
+    fit_settings(found.fit)
+    select_settings(found.select)
+    msgspec.convert(found.study, StudyTable)

@@ -1,0 +1,105 @@
+"""A small shell: command lines of the pages, in a folder, without a new process for each.
+
+`impc` runs here, as its tests run it; `python FILE` too; anything else is a line for /bin/sh.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import io
+import os
+import runpy
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from click.testing import CliRunner
+
+from impc.cli import main
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+__all__ = ["run_line", "working_in"]
+
+# `impc simulate` gives the same files for the same options: once is enough.
+_SIMULATED: dict[tuple[str, ...], tuple[Path, str]] = {}
+
+
+@contextlib.contextmanager
+def working_in(folder: Path) -> Iterator[None]:
+    """Work in a folder; modules that were imported from it are forgotten afterwards."""
+    before, path = set(sys.modules), list(sys.path)
+    with contextlib.chdir(folder):
+        try:
+            yield
+        finally:
+            sys.path[:] = path
+            for name in set(sys.modules) - before:
+                file = getattr(sys.modules[name], "__file__", None)
+                if file and Path(file).resolve().is_relative_to(folder.resolve()):
+                    del sys.modules[name]
+            importlib.invalidate_caches()
+
+
+def run_line(line: str, kept: Path) -> str:
+    """Run one line in the current folder and return what it prints.
+
+    Parameters
+    ----------
+    line : str
+    kept : Path
+        Folder for what `impc simulate` made, for the lines that make the same.
+    """
+    program, *arguments = shlex.split(line)
+    importlib.invalidate_caches()
+    if program in ("impc", ".venv/bin/impc"):
+        given = [name for word in arguments for name in _expanded(word)]
+        return _simulate(given, kept) if given[:1] == ["simulate"] else _impc(given)
+    if program == "python" and not arguments[0].startswith("-"):
+        printed = io.StringIO()
+        sys.path.insert(0, "")
+        with contextlib.redirect_stdout(printed):
+            runpy.run_path(arguments[0], run_name="__main__")
+        return printed.getvalue()
+    if program == "edit":
+        _edit(*arguments)
+        return ""
+    done = subprocess.run(line, shell=True, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, f"{line}\n{done.stderr}"
+    return done.stdout
+
+
+def _expanded(word: str) -> list[str]:
+    return sorted(str(path) for path in Path().glob(word)) if "*" in word else [word]
+
+
+def _impc(arguments: list[str]) -> str:
+    done = CliRunner().invoke(main, arguments)
+    if done.exception is not None and not isinstance(done.exception, SystemExit):
+        raise done.exception
+    assert done.exit_code == 0, f"impc {shlex.join(arguments)}\n{done.stderr}"
+    return done.stdout
+
+
+def _simulate(arguments: list[str], kept: Path) -> str:
+    where = arguments.index("--out")
+    out = Path(arguments[where + 1])
+    key = (*arguments[:where], *arguments[where + 2 :])
+    if key not in _SIMULATED:
+        made = kept / f"simulated-{len(_SIMULATED)}"
+        _SIMULATED[key] = made, _impc([*key, "--out", str(made)])
+    made, printed = _SIMULATED[key]
+    shutil.copytree(made, out, dirs_exist_ok=True)
+    return printed.replace(str(made), os.fspath(out))
+
+
+def _edit(name: str, old: str, new: str) -> None:
+    path = Path(name)
+    text = path.read_text(encoding="utf-8")
+    assert old in text, f"{name} has no {old!r}"
+    path.write_text(text.replace(old, new), encoding="utf-8")

@@ -1,0 +1,163 @@
+"""What is run in another way than the pages say, and why. Nothing else is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+__all__ = ["NOT_RUN", "PREPARED", "SMALLER", "Smaller"]
+
+
+@dataclass(frozen=True)
+class Smaller:
+    """What is run instead of a line of a page.
+
+    Attributes
+    ----------
+    lines : tuple of str
+        Command lines; `edit FILE OLD NEW` does what an editor would do.
+    reason : str
+    """
+
+    lines: tuple[str, ...]
+    reason: str
+
+
+_ENVIRONMENT = "makes an environment; the tests run inside one"
+_WHOLE = "runs what these tests are a part of"
+_SITE = "builds the site: four minutes"
+_PUBLISH = "publishes, or needs a network"
+_CLUSTER = "needs machines of a cluster; tests/cohort starts a scheduler and workers of its own"
+
+#: (page, line) -> why it is not run.
+NOT_RUN = {
+    ("README.md", "make demo"): _ENVIRONMENT,
+    ("README.md", "make test"): _ENVIRONMENT,
+    ("README.md", ". .venv/bin/activate"): _ENVIRONMENT,
+    ("docs/start.md", "make demo"): _ENVIRONMENT,
+    ("docs/start.md", ". .venv/bin/activate"): _ENVIRONMENT,
+    ("docs/contributing.md", "make check"): _WHOLE,
+    ("docs/contributing.md", "make test"): _WHOLE,
+    ("docs/contributing.md", "make slow"): _WHOLE,
+    ("docs/contributing.md", "python -m pytest tests/documents -k start"): _WHOLE,
+    ("docs/contributing.md", "python -m pytest tests/test_lqr.py"): _WHOLE,
+    ("docs/contributing.md", "make docs"): _SITE,
+    (
+        "docs/contributing.md",
+        "python -m sphinx -W -D sphinx_gallery_conf.filename_pattern=nothing docs docs/_build/html",
+    ): _SITE,
+    ("docs/cohorts.md", "dask scheduler --port 8786"): _CLUSTER,
+    ("docs/cohorts.md", "dask worker tcp://HOST:8786 --nthreads 1 --nworkers 32"): _CLUSTER,
+    (
+        "docs/cohorts.md",
+        "impc cohort study.toml --out results --scheduler tcp://HOST:8786",
+    ): _CLUSTER,
+    (
+        "docs/cursor-tracking.md",
+        "python -m experiments.cursor_tracking --out results/cursor-tracking",
+    ): "needs recordings that are no part of the project; tests/test_cursor_tracking.py has them",
+    ("docs/release.md", "make wheel"): "builds in the checkout, and needs a network",
+    (
+        "docs/release.md",
+        "python -m zipfile --list dist/impc-0.1.0-py3-none-any.whl",
+    ): "needs the wheel",
+    ("docs/release.md", 'git tag -a v0.1.0 -m "impc 0.1.0"'): _PUBLISH,
+    ("docs/release.md", "git push origin v0.1.0"): _PUBLISH,
+}
+
+# A trial of 4 s instead of 30 s; a fit with six states instead of ten, over 4 samples instead of
+# 20, and not once more for every trial: a tenth of the time.
+_SUBJECT = "impc simulate seated-balance --out {0} --duration 4 --formats csv"
+_EASIER = (
+    "edit {0}/subject.toml [plant] '[plant]\ndelay_order = 1'",
+    "edit {0}/subject.toml 'horizon = 20' 'held_out = false\nhorizon = 4'",
+)
+_SEAT = tuple(line.format("results/subject") for line in (_SUBJECT, *_EASIER))
+_HERE = tuple(line.format(".") for line in (_SUBJECT, *_EASIER))
+_SHORT = "shorter trials, and a smaller fit of them"
+
+#: (page, line) -> what is run instead.
+SMALLER = {
+    ("README.md", "impc simulate seated-balance --out results/subject"): Smaller(_SEAT, _SHORT),
+    (
+        "README.md",
+        "impc fit lab_1.csv --plant seated-balance --config lab.toml --out results/lab",
+    ): Smaller(
+        (
+            "edit lab.toml [plant] '[plant]\ndelay_order = 1'",
+            "edit lab.toml 'horizon = 20' 'horizon = 4'",
+            "impc fit lab_1.csv --plant seated-balance --config lab.toml --out results/lab",
+        ),
+        _SHORT,
+    ),
+    ("docs/start.md", "impc simulate seated-balance --out results/subject"): Smaller(_SEAT, _SHORT),
+    (
+        "docs/recordings.md",
+        "impc fit trial_*.csv --plant seated-balance --config subject.toml",
+    ): Smaller(
+        (
+            "edit subject.toml [plant] '[plant]\ndelay_order = 1'",
+            "edit subject.toml [fit] '[fit]\nheld_out = false\nhorizon = 4'",
+            "impc fit trial_*.csv --plant seated-balance --config subject.toml",
+        ),
+        _SHORT,
+    ),
+    ("docs/cohorts.md", "impc simulate cohort --out results/cohort-data"): Smaller(
+        (
+            "impc simulate cohort --out results/cohort-data"
+            " --subjects 2 --trials 1 --duration 5 --replicates 0",
+        ),
+        "two short subjects without a bootstrap, for thirty with 20 replicates",
+    ),
+    ("docs/cohorts.md", "impc cohort results/cohort-data/study.toml --out results/cohort"): Smaller(
+        ("impc cohort results/cohort-data/study.toml --out results/cohort --workers 1",),
+        "one worker to start, whatever the cores",
+    ),
+    (
+        "docs/reliability.md",
+        "impc simulate reliability-study --out results/reliability-data",
+    ): Smaller(
+        ("impc simulate reliability-study --out results/reliability-data --subjects 2",),
+        "two subjects for thirty",
+    ),
+    ("docs/selection.md", "impc simulate head-tracking --out results/head-data"): Smaller(
+        (
+            "impc simulate head-tracking --out results/head-data"
+            " --subjects 1 --trials 1 --duration 6",
+            "edit results/head-data/study.toml 'replicates = 200' 'replicates = 20\nstarts = 1'",
+            "edit results/head-data/study.toml 'size = 5' 'size = 9'",
+        ),
+        "one short subject for ten, 20 replicates for 200, a LASSO that ends sooner",
+    ),
+    ("docs/selection.md", "impc select results/head-data/study.toml --out results/select"): Smaller(
+        ("impc select results/head-data/study.toml --out results/select --workers 1",),
+        "one worker to start, whatever the cores",
+    ),
+    (
+        "docs/selection.md",
+        "impc simulate head-tracking --subjects 40 --visits 2 --out results/head-data-2",
+    ): Smaller(
+        (
+            "impc simulate head-tracking --subjects 2 --visits 2 --trials 1 --duration 6"
+            " --out results/head-data-2",
+            "edit results/head-data-2/study.toml 'replicates = 200' 'replicates = 20\nstarts = 1'",
+        ),
+        "two short subjects for forty",
+    ),
+    (
+        "docs/selection.md",
+        "impc key-parameters results/head-data-2/study.toml --out results/key",
+    ): Smaller(
+        (
+            "impc key-parameters results/head-data-2/study.toml --out results/key"
+            " --bound 0.03 --workers 1",
+        ),
+        "fewer subsets to refit: 0.03 is below the default bound",
+    ),
+}
+
+#: page -> lines that make the files which the page supposes its reader to have.
+PREPARED = {
+    "docs/fitting.md": _HERE,
+    "docs/recordings.md": (*_HERE, "rm subject.toml"),
+    "docs/comparing.md": _HERE,
+}

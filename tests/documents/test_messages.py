@@ -1,0 +1,223 @@
+"""Each message that docs/troubleshooting.md quotes is provoked, and says what the page says."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import control
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from impc.bounds import box_bounds
+from impc.cli import main
+from impc.closed_loop import require_complete, scenario, simulate
+from impc.cohort import cluster
+from impc.cohort.store import open_store
+from impc.cohort.study import read_study
+from impc.controller import mpc_controller
+from impc.errors import ImpcError
+from impc.files.alignment import misaligned
+from impc.files.configuration import read_configuration
+from impc.files.reading import read_recordings
+from impc.fit_recordings import fit_problem
+from impc.fit_settings import FitSettings, fit_settings
+from impc.lqr import solve_lqr
+from impc.plant import Plant, as_plant
+from impc.plant_source import make_plant, plant_source
+from impc.recording import recording
+from impc.report.write import require_writable
+from impc.weights import stage_weights
+from tests.documents.blocks import PAGES
+from tests.files.damaged import DAMAGED, PLANT
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+PAGE = PAGES["docs/troubleshooting.md"].read_text(encoding="utf-8")
+MESSAGES = re.findall(r"\*\*`([^`]+)`\*\*", PAGE)
+STUDY = """
+[study]
+plant = "cursor"
+recordings = "{subject}.csv"
+[signals.error]
+column = "e"
+unit = "1"
+"""
+
+
+def damaged(name: str) -> Callable[[Path], None]:
+    """Read one of the damaged recordings of tests/files."""
+
+    def read(folder: Path) -> None:
+        path, text = DAMAGED[name].make(folder)
+        (folder / "c.toml").write_text(text)
+        configuration = read_configuration(folder / "c.toml")
+        source = plant_source(PLANT, configuration.plant)
+        plant = make_plant(source, tuple(configuration.signals))
+        read_recordings([path], configuration, plant)
+
+    return read
+
+
+def cart(growth: float = 1.1) -> Plant:
+    return as_plant(control.ss([[growth]], [[1]], [[1]], 0, 0.1))
+
+
+def command(*words: str) -> str:
+    done = CliRunner().invoke(main, words)
+    assert done.exit_code == 2
+    return done.stderr
+
+
+def short_trial(_: Path) -> None:
+    trial = recording(cart(), np.ones((20, 1)))
+    fit_problem(cart(), [trial], FitSettings(settle=10))
+
+
+def late_push(_: Path) -> str:
+    push = np.random.default_rng(2).standard_normal(3000)
+    lean = np.convolve(push, np.exp(-np.arange(100) / 30))[: len(push)]
+    return misaligned(push, np.roll(lean, -60), 0.01)
+
+
+def far_start(_: Path) -> None:
+    bounds = box_bounds(cart(), x_min=-1, x_max=1, u_min=-0.1, u_max=0.1)
+    weights = stage_weights(np.eye(1), 1)
+    controller = mpc_controller(cart(), weights, bounds, 3)
+    require_complete(controller, simulate(controller, scenario(cart(), x0=[5], steps=3)))
+
+
+def draft_over_a_file(folder: Path) -> str:
+    (folder / "a.csv").write_text("t,a\n0,1\n1,2\n")
+    return command("inspect", str(folder / "a.csv"), "--out", str(folder / "a.csv"))
+
+
+def file_for_a_folder(folder: Path) -> None:
+    (folder / "out").write_text("")
+    require_writable(folder / "out")
+
+
+def two_runs(folder: Path) -> None:
+    with open_store(folder), open_store(folder):
+        pass
+
+
+def another_study(folder: Path) -> None:
+    with open_store(folder) as store:
+        store.keep_fit("sub-1", {"digest": "one"})
+        store.require_same("sub-1", "other")
+
+
+def study_file(folder: Path, text: str) -> Path:
+    (folder / "study.toml").write_text(text)
+    return folder / "study.toml"
+
+
+def unknown_subject(folder: Path) -> None:
+    (folder / "s1.csv").write_text("")
+    (folder / "who.tsv").write_text("subject\tgroup\ns2\tb\n")
+    text = STUDY.replace("recordings", 'participants = "who.tsv"\nrecordings')
+    read_study(study_file(folder, text))
+
+
+def no_model(folder: Path) -> str:
+    (folder / "s1.csv").write_text("")
+    study = study_file(folder, STUDY)
+    return command("select", str(study), "--out", str(folder / "out"))
+
+
+def no_scheduler(_: Path) -> None:
+    with cluster.connected("tcp://127.0.0.1:9", None):
+        pass
+
+
+def everything_recorded(_: Path) -> None:
+    source = plant_source("plants:cursor_plant", {})
+    make_plant(source, source.make().input_labels)
+
+
+#: Message -> what provokes it: raises the error, or returns the text.
+PROVOKED: dict[str, Callable[[Path], object]] = {
+    "does not exist; check the path": damaged("missing file"),
+    "has the ending '...', and not .csv, .tsv, .txt, .mat, .tdms, .c3d": damaged("excel workbook"),
+    "ends in ... and is a zip archive or an Excel workbook": damaged("excel workbook called csv"),
+    "has no rows of numbers divided by": damaged("csv of a header alone"),
+    "line ... names ... columns, and the rows below have ... values": damaged(
+        "decimal commas between commas"
+    ),
+    "column '...' has text in ... of ... rows": damaged("text in a column"),
+    "the file ends in the middle of a row": damaged("truncated csv"),
+    "is a MATLAB table; save a struct of vectors": damaged("table object"),
+    "is damaged and cannot be read (...)": damaged("truncated mat"),
+    "is not TOML (...)": damaged("configuration that is no toml"),
+    "is not known; did you mean ...": damaged("misspelled key"),
+    "[fit] ...: is not a setting; known: ...": lambda _: fit_settings({"horzon": 20}),
+    "is still '?'; fill in the column's unit": damaged("unit not filled in"),
+    "unit '...' is not known": damaged("unknown unit"),
+    "is missing: the plant's outputs are ...": damaged("output without a column"),
+    "is no output or disturbance of the plant": damaged("signal that the plant lacks"),
+    "column '...': is not in the file; ...": damaged("absent column"),
+    "tells no clock and no rate": damaged("unknown rate"),
+    "is in '...' by the configuration and in '...' by the file": damaged(
+        "units swapped against the file"
+    ),
+    "more than half a turn": damaged("degrees called radians"),
+    "radians taken for degrees?": damaged("radians called degrees"),
+    "is beyond its stop of ...": damaged("angle beyond the stop"),
+    "samples are missing or not finite": damaged("missing samples"),
+    "has ... gaps, the first at ...": damaged("gap in the clock"),
+    "is repeated ... times": damaged("duplicated time stamps"),
+    "runs backward ... times": damaged("clock that runs backward"),
+    "is constant at ...": damaged("constant channel"),
+    "is clipped at ...": damaged("clipped channel"),
+    "samples at the plant's rate, ... are needed": damaged("too few samples"),
+    "serve to find where it starts": short_trial,
+    "comes before it: their correlation is ...": late_push,
+    "cannot be imported (...)": lambda _: plant_source("nowhere:stick", {}),
+    "refuses its arguments (...)": lambda _: make_plant(
+        plant_source("plants:cursor_plant", {"size": 3}), ()
+    ),
+    "is continuous, a discrete one is needed": lambda _: as_plant(
+        control.ss([[-1]], [[1]], [[1]], 0)
+    ).require_discrete(),
+    "plant.D: is not zero": lambda _: as_plant(control.ss([[0.5]], [[1]], [[1]], 1, 0.1)),
+    "is not stabilisable: no input reaches the mode ...": lambda _: as_plant(
+        control.ss([[2, 0], [0, 0.5]], [[0], [1]], np.eye(2), 0, 0.1)
+    ),
+    "all its inputs are recorded": everything_recorded,
+    "have no stabilising Riccati solution (...)": lambda _: solve_lqr(
+        cart(1.0), stage_weights(np.zeros((1, 1)), 1)
+    ),
+    "no input sequence keeps the bound ...": far_start,
+    "exclude the origin for ...": lambda _: box_bounds(cart(), u_min=1, u_max=2),
+    "exists already; give another name, or remove it": draft_over_a_file,
+    "... is a file; give another folder": file_for_a_folder,
+    "another run is writing to it": two_runs,
+    "was fitted to other recordings or with other settings": another_study,
+    "matches no file; check the path": lambda folder: read_study(study_file(folder, STUDY)),
+    "is not in ...; add a row": unknown_subject,
+    "study.model: is missing": no_model,
+    "scheduler ...: does not answer (...)": no_scheduler,
+}
+
+
+def test_every_message_of_the_page_is_provoked() -> None:
+    assert len(MESSAGES) == len(set(MESSAGES))
+    assert set(MESSAGES) == set(PROVOKED)
+
+
+@pytest.mark.parametrize("message", PROVOKED)
+def test_the_message_is_what_is_said(
+    message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cluster, "_PATIENCE", "1s")
+    try:
+        said = str(PROVOKED[message](tmp_path))
+    except ImpcError as error:
+        said = str(error)
+    pattern = ".*".join(re.escape(part) for part in message.split("..."))
+    assert re.search(pattern, said), said
+    assert "\n" not in said.strip()
