@@ -37,7 +37,7 @@ endif
 
 help:
 	@echo 'make demo    set up .venv and run the example:   impc example'
-	@echo 'make test    set up .venv, then check and pytest (without the slow tests)'
+	@echo 'make test    set up .venv, then check and pytest: all but the slow tests, the site too'
 	@echo 'make check   ruff check, ruff format --check, mypy --strict'
 	@echo 'make slow    the slow tests'
 	@echo 'make docs    build the site in docs/_build/html; warnings are errors, tutorials run (minutes)'
@@ -52,9 +52,9 @@ help:
 demo: env
 	$(VENV)/bin/impc example
 
+# A file of tests stays on one process, in the order of the folders: the longest are first.
 test: check
-	$(PY) -m pytest -m "not slow"
-	$(MAKE) --no-print-directory docs
+	OPENBLAS_NUM_THREADS=1 $(PY) -m pytest -m "not slow" -n logical --maxprocesses 8 --dist loadfile --no-loadscope-reorder
 
 check: env
 	$(PY) -m ruff check .

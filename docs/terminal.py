@@ -44,7 +44,8 @@ def terminal(line: str, *, status: int = 0, last: int | None = None) -> None:
     )
     if done.returncode != status:
         raise RuntimeError(f"{line}\nended with {done.returncode}:\n{done.stdout}{done.stderr}")
-    lines = (done.stdout + done.stderr).rstrip().splitlines()
+    said = (done.stdout + done.stderr).replace(f"{RESULTS}{os.sep}", "")
+    lines = said.rstrip().splitlines()
     shown = lines if last is None else lines[-last:]
     print("\n".join((["..."] if len(shown) < len(lines) else []) + shown))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from typing import TYPE_CHECKING, Any
 
 import control
@@ -32,6 +33,16 @@ def figures_have_units() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Figure, "savefig", checked)
         yield
+
+
+@pytest.fixture
+def blank_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Files of figures with no picture: drawing takes most of some commands' time."""
+
+    def blank(_figure: Figure, stream: io.BytesIO, **_: Any) -> None:
+        stream.write(b"blank")
+
+    monkeypatch.setattr(Figure, "savefig", blank)
 
 
 @pytest.fixture

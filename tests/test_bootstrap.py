@@ -51,10 +51,10 @@ def width(found: tuple[Interval, ...]) -> Array:
 
 
 def test_bootstrap_agrees_with_the_sandwich(fitted: FittedController) -> None:
-    """60 replicates, seed 4: widths within a third of the sandwich's, for both ways to draw."""
+    """30 replicates, seed 4: widths within a third of the sandwich's, for both ways to draw."""
     sandwich = width(covariance_intervals(fitted, gain_covariance(fitted.free), "sandwich"))
     for draw in (block_residuals, model_residuals):
-        found = bootstrap(fitted, 60, SEED, draw)
+        found = bootstrap(fitted, 30, SEED, draw)
         ratio = width(bootstrap_intervals(fitted, found, "bootstrap", 0.95)) / sandwich
         assert np.all(np.abs(np.log(ratio)) < np.log(1.5)), ratio
 

@@ -69,7 +69,7 @@ def test_an_absent_file_is_said(tmp_path: Path) -> None:
         read_conditions(tmp_path / "nothing.mat")
 
 
-@pytest.mark.parametrize("index", [0, 5])
+@pytest.mark.parametrize("index", [5])
 class TestRecordings:
     pytestmark = recorded
 

@@ -35,8 +35,8 @@ def test_on_a_linear_plant_it_is_the_linear_controller(x0: list[float]) -> None:
 
 
 def test_on_the_seat_they_part_as_the_square_of_the_angle() -> None:
-    """Twice the torque, four times the share of the angle, to a fifth; 2 s each."""
-    small, double = compare_at(1.0, 2.0), compare_at(2.0, 2.0)
+    """Twice the torque, four times the share of the angle, to a fifth; a second each."""
+    small, double = compare_at(1.0, 1.0), compare_at(2.0, 1.0)
     shares = [item.controllers / item.angle for item in (small, double)]
     assert shares[0] < 1e-3
     assert shares[1] / shares[0] == pytest.approx(4.0, rel=0.2)

@@ -8,7 +8,7 @@ three visits, three conditions, three trials of 29 s.
 
 from terminal import show, terminal
 
-terminal("impc simulate reliability-study --subjects 6 --out reliability-data")
+terminal("impc simulate reliability-study --subjects 4 --out reliability-data")
 terminal("impc reliability reliability-data/study.toml --out reliability")
 
 # %%

@@ -136,14 +136,11 @@ def _sampled(parts: Any, derivatives: list[Array], dt: float) -> Discrete:
     n, d = B.shape
     k = derivatives[0].shape[1]
     joined = _joined(A, B) * dt
-    dA, dB = np.empty((k, n, n)), np.empty((k, n, d))
-    exponential = np.asarray(scipy.linalg.expm(joined))
-    for index in range(k):
-        along = np.zeros_like(joined)
-        along[:n, :n] = derivatives[0][:, index].reshape(n, n, order="F") * dt
-        along[:n, n:] = derivatives[1][:, index].reshape(n, d, order="F") * dt
-        change = np.asarray(scipy.linalg.expm_frechet(joined, along, compute_expm=False))
-        dA[index], dB[index] = change[:n, :n], change[:n, n:]
+    along = np.zeros((k, n + d, n + d))
+    along[:, :n, :n] = derivatives[0].T.reshape(k, n, n).transpose(0, 2, 1) * dt
+    along[:, :n, n:] = derivatives[1].T.reshape(k, d, n).transpose(0, 2, 1) * dt
+    exponential, change = _exponentials(joined, along)
+    dA, dB = change[:, :n, :n].copy(), change[:, :n, n:].copy()
     dC = derivatives[2].T.reshape(k, n, C.shape[0]).transpose(0, 2, 1)
     return Discrete(
         np.ascontiguousarray(exponential[:n, :n]),
@@ -153,6 +150,22 @@ def _sampled(parts: Any, derivatives: list[Array], dt: float) -> Discrete:
         dB,
         np.ascontiguousarray(dC),
     )
+
+
+def _exponentials(M: Array, along: Array) -> tuple[Array, Array]:
+    """exp(M) and its Fréchet derivatives (k, N, N) along k directions, all in one call.
+
+    exp [[M, L], [0, M]] has the derivative along L in its corner (Higham 2008, (10.43)); L is
+    brought to the size of M, so that it does not decide how often the exponential is squared.
+    """
+    count, size = along.shape[:2]
+    length = np.linalg.norm(along, axis=(1, 2), keepdims=True) / max(np.linalg.norm(M), 1e-300)
+    length[length == 0] = 1.0
+    blocks = np.zeros((count, 2 * size, 2 * size))
+    blocks[:, :size, :size] = blocks[:, size:, size:] = M
+    blocks[:, :size, size:] = along / length
+    found = np.asarray(scipy.linalg.expm(blocks))
+    return found[0, :size, :size], found[:, :size, size:] * length
 
 
 def _joined(A: Array, B: Array) -> Array:

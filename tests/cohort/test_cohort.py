@@ -20,6 +20,7 @@ from tests.cohort.carts import write_study
 
 ROOT = Path(__file__).parents[2]
 SEED = 8
+REPLICATES = 20
 TABLES = ("units.csv", "replicates.csv", "intervals.csv")
 
 
@@ -36,7 +37,7 @@ def run(study: Path, out: Path, *more: str) -> subprocess.CompletedProcess[str]:
 
 @pytest.fixture(scope="module")
 def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_study(tmp_path_factory.mktemp("study"), 4, visits=2, replicates=40)
+    return write_study(tmp_path_factory.mktemp("study"), 2, visits=2, replicates=REPLICATES)
 
 
 @pytest.fixture(scope="module")
@@ -54,17 +55,17 @@ def same_tables(one: Path, other: Path) -> None:
 
 def test_the_tables_are_whole(undisturbed: Path) -> None:
     units = pd.read_csv(undisturbed / "units.csv", dtype={"subject": str})
-    assert len(units) == 8
+    assert len(units) == 4
     assert set(units["group"]) == {"a", "b"}
     replicates = pd.read_csv(undisturbed / "replicates.csv")
-    assert len(replicates) == 8 * 40
+    assert len(replicates) == 4 * REPLICATES
     assert not replicates.duplicated(["unit", "replicate"]).any()
     intervals = pd.read_csv(undisturbed / "intervals.csv")
     inside = (intervals["low"] < intervals["value"]) & (intervals["value"] < intervals["high"])
     assert inside.mean() > 0.9
     assert (undisturbed / "subjects" / "sub-01.html").exists()
     found = json.loads((undisturbed / "result.json").read_text())
-    assert found["fitted"] == 8
+    assert found["fitted"] == 4
 
 
 def workers_of(process: psutil.Process) -> list[psutil.Process]:
@@ -178,29 +179,35 @@ def test_two_runs_into_one_folder_are_refused(study: Path, tmp_path: Path) -> No
     assert len(done.stderr.strip().splitlines()) == 1
 
 
-def test_damaged_recordings_stop_nobody_else(tmp_path: Path) -> None:
-    """Three of thirty: 27 results, three reasons, status 1; mended, the rest follows."""
-    study = write_study(tmp_path, 30)
-    names = [tmp_path / f"sub-{number:02d}" / "cart_1.csv" for number in (4, 11, 29)]
+@pytest.mark.parametrize(
+    ("subjects", "damaged"),
+    [(5, (1, 3, 4)), pytest.param(30, (4, 11, 29), marks=pytest.mark.slow)],
+)
+def test_damaged_recordings_stop_nobody_else(
+    tmp_path: Path, subjects: int, damaged: tuple[int, ...]
+) -> None:
+    """Three of them: results of the others, three reasons, status 1; mended, the rest follows."""
+    study = write_study(tmp_path, subjects)
+    names = [tmp_path / f"sub-{number:02d}" / "cart_1.csv" for number in damaged]
     whole = {path: path.read_bytes() for path in names}
     names[0].write_bytes(b"")
     names[1].write_bytes(whole[names[1]][:2000] + b"abc,def,ghi\n")
     names[2].write_bytes(whole[names[2]].replace(b"position", b"elsewhere"))
     out = tmp_path / "out"
-    done = run(study, out, "--workers", "2")
+    done = run(study, out, "--workers", "1")
     assert done.returncode == 1, done.stderr
     found = json.loads((out / "result.json").read_text())
-    assert found["fitted"] == 27
-    assert set(found["failed"]) == {"sub-04_ses-1", "sub-11_ses-1", "sub-29_ses-1"}
-    assert len(pd.read_csv(out / "units.csv")) == 27
+    assert found["fitted"] == subjects - 3
+    assert set(found["failed"]) == {f"sub-{number:02d}_ses-1" for number in damaged}
+    assert len(pd.read_csv(out / "units.csv")) == subjects - 3
     reasons = [line for line in done.stderr.splitlines() if line.startswith("sub-")]
     assert len(reasons) == 3
-    assert "27 of 30 units fitted" in done.stdout
+    assert f"{subjects - 3} of {subjects} units fitted" in done.stdout
     for path, content in whole.items():
         path.write_bytes(content)
-    again = run(study, out, "--workers", "2")
+    again = run(study, out, "--workers", "1")
     assert again.returncode == 0, again.stderr
-    assert len(pd.read_csv(out / "units.csv")) == 30
+    assert len(pd.read_csv(out / "units.csv")) == subjects
 
 
 def test_other_settings_are_refused(study: Path, undisturbed: Path) -> None:

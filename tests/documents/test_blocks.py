@@ -13,7 +13,7 @@ import io
 import json
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pytest
 from matplotlib.figure import Figure
@@ -30,21 +30,16 @@ _SILENT = {"text", "bibtex", "matlab"}
 _NUMBER = re.compile(r"[-+]?\d+(\.\d*)?(e[-+]?\d+)?")
 
 
-def blank(_figure: Figure, stream: io.BytesIO, **_: Any) -> None:
-    """A picture in no time: figures are drawn in tests/test_report.py and beside it."""
-    stream.write(b"blank")
-
-
 @pytest.fixture(scope="session")
 def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("simulated")
 
 
+@pytest.mark.usefixtures("blank_figures")
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page)])
 def test_the_blocks_run(
     page: str, kept: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(Figure, "savefig", blank)
     monkeypatch.setattr(Figure, "draw_without_rendering", lambda _: None)
     names: dict[str, object] = {"__name__": "page"}
     with working_in(tmp_path):

@@ -92,6 +92,7 @@ def remove(folder: Path, pattern: str) -> None:
         path.unlink()
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_one_visit_is_a_sentence(study: Path, tmp_path: Path) -> None:
     folder = copy(study, tmp_path / "s")
     remove(folder, "*_ses-2_*")
@@ -100,6 +101,7 @@ def test_one_visit_is_a_sentence(study: Path, tmp_path: Path) -> None:
     assert "of 1 occasion" in (tmp_path / "o" / "icc-rms.csv").read_text()
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_one_subject_is_a_sentence(study: Path, tmp_path: Path) -> None:
     folder = copy(study, tmp_path / "s")
     for number in range(2, 6):
@@ -109,6 +111,7 @@ def test_one_subject_is_a_sentence(study: Path, tmp_path: Path) -> None:
     assert "complete for 1 subject" in (tmp_path / "o" / "icc-rms.csv").read_text()
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_unequal_cells_are_said(study: Path, tmp_path: Path) -> None:
     """One subject lacks a visit, another a trial: left out of the one, cut alike in the other."""
     folder = copy(study, tmp_path / "s")
@@ -121,6 +124,7 @@ def test_unequal_cells_are_said(study: Path, tmp_path: Path) -> None:
     assert "give two or more subjects, visits and trials" in table
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_a_condition_without_trials(study: Path, tmp_path: Path) -> None:
     """A condition that one visit lacks for everybody: no number, and why."""
     folder = copy(study, tmp_path / "s")

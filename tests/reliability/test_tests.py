@@ -39,7 +39,7 @@ def test_anova_is_that_of_a_two_way_model() -> None:
 def test_greenhouse_geisser() -> None:
     """Two visits: 1. Compound symmetry of many subjects: near 1. One wild visit: near 1/2."""
     assert visit_anova(scores(visits=2)).epsilon == pytest.approx(1.0)
-    assert visit_anova(scores(subjects=2000)).epsilon == pytest.approx(1.0, abs=0.01)
+    assert visit_anova(scores(subjects=500)).epsilon == pytest.approx(1.0, abs=0.01)
     wild = scores(subjects=200)
     wild[:, 2] += 100 * np.random.default_rng(SEED).standard_normal(200)
     found = visit_anova(wild)

@@ -127,11 +127,11 @@ def test_widths_of_table_4_3() -> None:
 
 def test_head_tracking_from_files_to_files(tmp_path: Path) -> None:
     made = run("simulate", "head-tracking", "--out", str(tmp_path), "--subjects", "1",
-               "--trials", "1", "--duration", "15")  # fmt: skip
+               "--trials", "1", "--duration", "8")  # fmt: skip
     assert made.exit_code == 0, made.stderr
     study = tmp_path / "study.toml"
     study.write_text(study.read_text().replace("replicates = 200", "replicates = 20\nstarts = 1"))
-    done = run("select", str(study), "--out", str(tmp_path / "out"))
+    done = run("select", str(study), "--out", str(tmp_path / "out"), "--workers", "1")
     assert done.exit_code == 0, done.stderr
     found = json.loads((tmp_path / "out" / "result.json").read_text())
     assert set(found["selected"]) == {"fim", "lasso", "nelder_mead"}
@@ -182,10 +182,10 @@ replicates = 40
 
 def test_a_model_from_another_field(tmp_path: Path) -> None:
     study = blood_study(tmp_path, 5, 2)
-    done = run("select", str(study), "--out", str(tmp_path / "select"))
+    done = run("select", str(study), "--out", str(tmp_path / "select"), "--workers", "1")
     assert done.exit_code == 0, done.stderr
     assert "information: ka, ke, V" in done.stdout
-    done = run("key-parameters", str(study), "--out", str(tmp_path / "key"))
+    done = run("key-parameters", str(study), "--out", str(tmp_path / "key"), "--workers", "1")
     assert done.exit_code == 0, done.stderr
     found = json.loads((tmp_path / "key" / "result.json").read_text())
     assert found["chosen"] == ["ka", "ke", "V"]
@@ -202,7 +202,7 @@ def test_faults_are_one_line(tmp_path: Path) -> None:
         ("replicates = 40", "draw = 'x'", "single or block"),
     ):
         study.write_text(text.replace(old, new))
-        done = run("select", str(study), "--out", str(tmp_path / "out"))
+        done = run("select", str(study), "--out", str(tmp_path / "out"), "--workers", "1")
         assert done.exit_code == 2, done.stdout
         assert match in done.stderr
         assert len(done.stderr.strip().splitlines()) == 1
