@@ -15,6 +15,7 @@ from terminal import RESULTS, Pictures, figures_page  # noqa: E402
 
 project = "impc"
 author = "the impc authors"
+project_copyright = "2026, the impc authors"
 release = importlib.metadata.version("impc")
 extensions = [
     "myst_parser",
@@ -28,6 +29,8 @@ source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
 exclude_patterns = ["_build", "_results", "tutorials", "benchmarks/*.json"]
 html_theme = "furo"
 html_title = "impc"
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
 html_show_sphinx = False
 myst_heading_anchors = 3
 autosummary_generate = False

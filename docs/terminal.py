@@ -113,10 +113,9 @@ def figures_page() -> str:
 
 
 def _command(page: str) -> str:
-    found = re.search(
-        r"impc (?:example|fit|compare|cohort|reliability|select|key-parameters)[^<]*", page
-    )
-    return found.group(0).strip() if found else ""
+    """As a report says how it was made, or empty."""
+    found = re.search(r"<code>(impc [^<]*)</code>", page)
+    return found.group(1).strip() if found else ""
 
 
 _HEAD = """\

@@ -7,7 +7,7 @@ and no bootstrap; ``impc simulate cohort`` without options makes thirty with twe
 each.
 """
 
-from terminal import change, terminal
+from terminal import change, show, terminal
 
 terminal(
     "impc simulate cohort --out cohort-data --subjects 4 --trials 1 --duration 10 --replicates 0"
@@ -38,3 +38,4 @@ terminal("impc cohort cohort-data/study.toml --out cohort")
 # Differences between the groups are tested with the Holm correction over all measures; with two
 # subjects a group nothing can be significant, and the page says so.
 terminal("cat cohort/comparisons.csv")
+show("cohort/groups.png")
