@@ -7,20 +7,16 @@ import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from experiments.reproduction import balance, example, seat
+from experiments.reproduction import balance, example, key, seat, sensitive
 from experiments.reproduction.appendices import appendix_entries
 from experiments.reproduction.balance import balance_entries
 from experiments.reproduction.entry import Chapter
 from experiments.reproduction.evidence import gather
 from experiments.reproduction.example import controller_entries, example_entries
-from experiments.reproduction.heads import (
-    STAND_IN_FORTY,
-    STAND_IN_TEN,
-    key_entries,
-    sensitive_entries,
-)
+from experiments.reproduction.key import key_entries
 from experiments.reproduction.page import figure_name, page
 from experiments.reproduction.seat import seat_entries
+from experiments.reproduction.sensitive import sensitive_entries
 
 if TYPE_CHECKING:
     from experiments.reproduction.evidence import Evidence
@@ -61,10 +57,10 @@ def _chapters(evidence: Evidence) -> list[Chapter]:
         ),
         Chapter(
             "Chapter 4: sensitive parameters",
-            STAND_IN_TEN,
+            sensitive.STAND_IN,
             tuple(sensitive_entries(evidence)),
         ),
-        Chapter("Chapter 5: key parameters", STAND_IN_FORTY, tuple(key_entries(evidence))),
+        Chapter("Chapter 5: key parameters", key.STAND_IN, tuple(key_entries(evidence))),
         Chapter(
             "Appendices",
             "On the mean subject of table 4.3, simulated.",

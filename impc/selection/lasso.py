@@ -96,9 +96,9 @@ def proximal_lasso(
             break
         gained = current - moved
         t, current = t + share * step, moved
-        # Parameters that a shortened step left next to their typical value belong on it.
         if share < 1:
-            damping = max(10 * damping, 1e-6)
+            # Shorter programs next time: only whole steps put parameters on their typical values.
+            damping *= 10
         if gained < 1e-10 * max(current, 1e-300):
             break
     return np.asarray(t), current

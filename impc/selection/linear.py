@@ -155,7 +155,7 @@ def _sampled(parts: Any, derivatives: list[Array], dt: float) -> Discrete:
 def _exponentials(M: Array, along: Array) -> tuple[Array, Array]:
     """exp(M) and its Fréchet derivatives (k, N, N) along k directions, all in one call.
 
-    exp [[M, L], [0, M]] has the derivative along L in its corner (Higham 2008, (10.43)); L is
+    exp [[M, L], [0, M]] has the derivative along L in its corner (Higham 2008, chapter 3); L is
     brought to the size of M, so that it does not decide how often the exponential is squared.
     """
     count, size = along.shape[:2]
