@@ -198,6 +198,6 @@ def pooled_vaf(model: ParametricModel, theta: Array, trials: Sequence[Trial]) ->
 
 
 def _part(model: ParametricModel, t: Array, trial: Trial, chosen: IntArray) -> tuple[Array, Array]:
-    outputs, derivative = sensitivity(model, physical(model, t), trial.input)
+    outputs, derivative = sensitivity(model, physical(model, t), trial.input, chosen)
     residual = (outputs - trial.outputs).ravel()
-    return residual, derivative[..., chosen].reshape(residual.size, len(chosen))
+    return residual, derivative.reshape(residual.size, len(chosen))

@@ -22,7 +22,7 @@ import numba
 import numpy as np
 import scipy.linalg
 
-from impc.arrays import Array
+from impc.arrays import Array, IntArray
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -72,7 +72,9 @@ def discretised(matrices: ca.Function, theta: Array, dt: float) -> Discrete:
 
 def linear_functions(
     matrices: ca.Function, dt: float
-) -> tuple[Callable[[Array, Array], Array], Callable[[Array, Array], tuple[Array, Array]]]:
+) -> tuple[
+    Callable[[Array, Array], Array], Callable[[Array, Array, IntArray], tuple[Array, Array]]
+]:
     """Simulation and Jacobian of a `ParametricModel` from rest.
 
     Parameters
@@ -99,9 +101,9 @@ def linear_functions(
         )
         return np.asarray(x @ C.T)
 
-    def jacobian(theta: Array, given: Array) -> tuple[Array, Array]:
+    def jacobian(theta: Array, given: Array, free: IntArray) -> tuple[Array, Array]:
         continuous = [item.full() for item in matrices(theta)]
-        found = _sampled(continuous, [item.full() for item in derivative(theta)], dt)
+        found = _sampled(continuous, [item.full()[:, free] for item in derivative(theta)], dt)
         x, X = _with_derivatives(found.A, found.B, found.dA, found.dB, np.ascontiguousarray(given))
         outputs = x @ found.C.T
         on_state = np.einsum("pn,skn->spk", found.C, X)

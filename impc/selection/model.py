@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.arrays import Array, frozen
+from impc.arrays import Array, IntArray, frozen
 from impc.errors import InputError
 
 if TYPE_CHECKING:
@@ -57,7 +57,8 @@ class ParametricModel:
     simulate : callable
         (theta (k,), input (samples, d)) -> outputs (samples, p).
     jacobian : callable or None
-        (theta, input) -> (outputs, their derivative (samples, p, k)).
+        (theta, input, free) -> (outputs, their derivative (samples, p, f) with respect to the f
+        parameters whose indices are `free`).
     """
 
     names: tuple[str, ...]
@@ -67,7 +68,7 @@ class ParametricModel:
     pathways: tuple[str, ...]
     units: tuple[str, ...]
     simulate: Callable[[Array, Array], Array]
-    jacobian: Callable[[Array, Array], tuple[Array, Array]] | None = None
+    jacobian: Callable[[Array, Array, IntArray], tuple[Array, Array]] | None = None
 
     @property
     def size(self) -> int:
@@ -89,7 +90,7 @@ def parametric_model(
     *,
     pathways: Sequence[str] | None = None,
     units: Sequence[str] | None = None,
-    jacobian: Callable[[Array, Array], tuple[Array, Array]] | None = None,
+    jacobian: Callable[[Array, Array, IntArray], tuple[Array, Array]] | None = None,
 ) -> ParametricModel:
     """Check and freeze a model.
 
@@ -104,8 +105,8 @@ def parametric_model(
     pathways, units : sequence of str, optional
         Of each parameter; empty by default.
     jacobian : callable, optional
-        (theta, input) -> outputs and their derivative (samples, p, k) with respect to theta, in
-        its units.
+        (theta, input, free) -> outputs and their derivative (samples, p, f) with respect to the f
+        parameters whose indices are `free`, in their units.
 
     Raises
     ------
@@ -141,7 +142,9 @@ def physical(model: ParametricModel, t: Array) -> Array:
     return np.asarray((model.high + model.low) / 2 + model.gain * t)
 
 
-def sensitivity(model: ParametricModel, theta: Array, given: Array) -> tuple[Array, Array]:
+def sensitivity(
+    model: ParametricModel, theta: Array, given: Array, free: IntArray | None = None
+) -> tuple[Array, Array]:
     """Outputs of the model, and their derivative with respect to normalised parameters.
 
     Parameters
@@ -150,19 +153,22 @@ def sensitivity(model: ParametricModel, theta: Array, given: Array) -> tuple[Arr
         (k,), in their units.
     given : Array
         Input (samples, d).
+    free : IntArray, optional
+        Indices (f,) of the parameters that are asked for; all by default.
 
     Returns
     -------
     outputs, derivative : Array
-        (samples, p) and (samples, p, k).
+        (samples, p) and (samples, p, f).
     """
+    along = np.arange(model.size) if free is None else free
     if model.jacobian is not None:
-        outputs, derivative = model.jacobian(theta, given)
-        return outputs, np.asarray(derivative * model.gain)
+        outputs, derivative = model.jacobian(theta, given, along)
+        return outputs, np.asarray(derivative * model.gain[along])
     outputs = np.asarray(model.simulate(theta, given))
     t = normalised(model, theta)
     columns = []
-    for index in range(model.size):
+    for index in along:
         ends = []
         for sign in (1.0, -1.0):
             moved = t.copy()
