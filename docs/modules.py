@@ -7,6 +7,7 @@ hundred and sixty modules took longer than all else. `api.md` shows the tables.
 from __future__ import annotations
 
 import importlib
+import inspect
 import pkgutil
 import shutil
 from collections import defaultdict
@@ -69,17 +70,17 @@ def _room(name: str) -> str:
 
 def _page(name: str) -> str:
     module = importlib.import_module(name)
-    things = [getattr(module, item) for item in getattr(module, "__all__", [])]
-    # Other objects have no docstring of their own: autosummary would show that of their type.
-    named = [item for item in things if hasattr(item, "__name__")]
-    public = [
-        item.__name__ if hasattr(module, item.__name__) else f"{item.__module__}.{item.__name__}"
-        for item in named
-    ]
+    public = [item for item in getattr(module, "__all__", []) if _told(getattr(module, item))]
     names = (
         f"\n   .. autosummary::\n      :nosignatures:\n\n{_indented(public, 6)}\n" if public else ""
     )
     return _PAGE.format(name=name, line="=" * len(name), names=names)
+
+
+def _told(thing: object) -> bool:
+    """Classes and functions: of anything else autosummary would show its type's docstring."""
+    plain = inspect.unwrap(thing) if callable(thing) else thing
+    return inspect.isclass(plain) or inspect.isroutine(plain)
 
 
 def _indented(names: list[str], by: int = 3) -> str:

@@ -29,9 +29,17 @@ if TYPE_CHECKING:
     from impc.selection.fisher import Information
     from impc.selection.model import ParametricModel
 
-__all__ = ["Width", "bootstrap_widths", "mean_subject", "nominal_information", "reduced_widths"]
+__all__ = [
+    "FIM_SUBSET",
+    "Width",
+    "bootstrap_widths",
+    "mean_subject",
+    "nominal_information",
+    "reduced_widths",
+]
 
-_FREE = ("Kvis", "Kccr", "tau", "tau1A", "tauCNS1")
+#: The five parameters that the dissertation's Fisher information selects.
+FIM_SUBSET = ("Kvis", "Kccr", "tau", "tau1A", "tauCNS1")
 # Table 4.3, FIM column: SD of the estimates over subjects; mean and SD of the interval widths.
 _SPREAD = np.array([27.0, 11.9, 0.024, 0.013, 0.077])
 _LASSO = ("Kvis", "Kvcr", "Kccr", "tau", "tauC")
@@ -54,15 +62,8 @@ class Width:
 def bootstrap_widths(shortest: float, longest: float, replicates: int) -> tuple[Width, ...]:
     """Mean widths over ten subjects about the FIM column; steps of a duration in s."""
     model = model_source("plants:head_neck_model", {}).model
-    nominal = np.array(model.typical)
-    centre = np.array(
-        [
-            base if value is None else value
-            for value, base in zip(plants.TABLE_4_3["fim"], nominal, strict=True)
-        ],
-        dtype=float,
-    )
-    free = list(free_indices(model, _FREE))
+    nominal, centre = np.array(model.typical), plants.table_4_3_column("fim")
+    free = list(free_indices(model, FIM_SUBSET))
     low, high = np.array(model.low)[free], np.array(model.high)[free]
     margin = 1e-3 * (high - low)
     widths = []
@@ -85,16 +86,14 @@ def bootstrap_widths(shortest: float, longest: float, replicates: int) -> tuple[
     mean, spread = np.mean(widths, axis=0), np.std(widths, axis=0, ddof=1)
     return tuple(
         Width(name, float(a), float(b), *quoted)
-        for name, a, b, quoted in zip(_FREE, mean, spread, _QUOTED, strict=True)
+        for name, a, b, quoted in zip(FIM_SUBSET, mean, spread, _QUOTED, strict=True)
     )
 
 
 def mean_subject() -> tuple[ParametricModel, Array, list[Trial]]:
     """The FIM column of table 4.3, three trials, noise that leaves a VAF of 82.65 %."""
     model = model_source("plants:head_neck_model", {}).model
-    nominal = np.array(model.typical)
-    column = zip(plants.TABLE_4_3["fim"], nominal, strict=True)
-    theta = np.array([base if value is None else value for value, base in column], dtype=float)
+    theta = plants.table_4_3_column("fim")
     rng, trials = np.random.default_rng(0), []
     for number in range(3):
         reference = plants.step_reference(seed=number)[:, None]
@@ -124,7 +123,7 @@ def reduced_widths(replicates: int) -> dict[str, Array]:
     model, theta, trials = mean_subject()
     shown = free_indices(model, _COMMON)
     found = {}
-    for label, names in (("all twelve", model.names), ("FIM", _FREE), ("LASSO", _LASSO)):
+    for label, names in (("all twelve", model.names), ("FIM", FIM_SUBSET), ("LASSO", _LASSO)):
         free = free_indices(model, names)
         fit = estimate(model, trials, free, theta)
         widths = bootstrap_subset(model, trials, fit, replicates, 0).width
@@ -179,8 +178,8 @@ def main() -> None:
         names = ", ".join(model.names[index] for index in selection.subsets[0])
         print(f"  v = {bound:.2f}: {len(selection.subsets)} subsets of {selection.size}; {names}")
         if bound == 0.05:
-            place = selection.subsets.index(free_indices(model, _FREE)) + 1
-            print(f"           the dissertation's {', '.join(_FREE)} is number {place}")
+            place = selection.subsets.index(free_indices(model, FIM_SUBSET)) + 1
+            print(f"           the dissertation's {', '.join(FIM_SUBSET)} is number {place}")
 
 
 if __name__ == "__main__":

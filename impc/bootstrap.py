@@ -13,6 +13,7 @@ Replicate k draws from the k-th child of the seed: the same numbers in any order
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -28,12 +29,14 @@ from impc.intervals import Interval, entry_names
 from impc.inverse_problem import controller_for, scenarios
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
 
     from impc.fitted_controller import FittedController
     from impc.inverse_problem import InverseProblem
 
 __all__ = [
+    "DRAWS",
+    "Draw",
     "Replicate",
     "block_length",
     "block_residuals",
@@ -42,6 +45,9 @@ __all__ = [
     "model_residuals",
     "replicate",
 ]
+
+#: Draws residuals again: (residuals (samples, p) of each trial, generator) -> as many.
+Draw = Callable[[list[Array], np.random.Generator], list[Array]]
 
 _HIGHEST_ORDER = 12
 _BEFORE = 500
@@ -67,7 +73,7 @@ def bootstrap(
     fitted: FittedController,
     count: int,
     seed: int,
-    resample: Callable[[list[Array], np.random.Generator], list[Array]],
+    resample: Draw,
     progress: Callable[[int], None] = lambda _: None,
 ) -> tuple[Replicate, ...]:
     """Fit `count` replicates one after the other; `progress` is told each one's number.
@@ -76,9 +82,8 @@ def bootstrap(
     ----------
     seed : int
         All numbers drawn follow from it.
-    resample : callable
-        (residuals, generator) -> residuals drawn again, lists with an array (samples, p) for each
-        trial: `block_residuals` or `model_residuals`.
+    resample : Draw
+        `block_residuals` or `model_residuals`.
 
     Raises
     ------
@@ -100,7 +105,7 @@ def replicate(
     fitted: FittedController,
     index: int,
     seed: int,
-    resample: Callable[[list[Array], np.random.Generator], list[Array]],
+    resample: Draw,
 ) -> Replicate:
     """One replicate, by its number.
 
@@ -110,8 +115,8 @@ def replicate(
         The child of the seed that it draws from, from 0.
     seed : int
         That of the whole bootstrap.
-    resample : callable
-        As in `bootstrap`: lists with an array (samples, p) for every trial.
+    resample : Draw
+        As in `bootstrap`.
 
     Raises
     ------
@@ -154,19 +159,9 @@ def bootstrap_intervals(
 
 
 def block_residuals(residuals: list[Array], rng: np.random.Generator) -> list[Array]:
-    """Draw residuals of every trial in moving blocks.
+    """A `Draw` in moving blocks: `residuals` (samples, p) of each trial to as many, (samples, p).
 
-    Parameters
-    ----------
-    residuals : list of Array
-        (samples, p) of each trial.
-    rng : numpy.random.Generator
-        What is drawn from.
-
-    Returns
-    -------
-    list of Array
-        As many, (samples, p) each.
+    `rng` is what is drawn from.
     """
     centred = [part - np.mean(part, axis=0) for part in residuals]
     length = block_length(residuals)
@@ -192,19 +187,9 @@ def block_length(residuals: list[Array]) -> int:
 
 
 def model_residuals(residuals: list[Array], rng: np.random.Generator) -> list[Array]:
-    """Draw residuals of every trial from autoregressions fitted to all of them.
+    """A `Draw` by autoregressions: `residuals` (samples, p) of each trial to as many, (samples, p).
 
-    Parameters
-    ----------
-    residuals : list of Array
-        (samples, p) of each trial.
-    rng : numpy.random.Generator
-        What is drawn from.
-
-    Returns
-    -------
-    list of Array
-        As many, (samples, p) each.
+    They are fitted to all trials; `rng` is what is drawn from.
     """
     centred = [part - np.mean(part, axis=0) for part in residuals]
     outputs = centred[0].shape[1]
@@ -227,6 +212,10 @@ def model_residuals(residuals: list[Array], rng: np.random.Generator) -> list[Ar
         ]
         drawn.append(np.column_stack(columns))
     return drawn
+
+
+#: By the word that `bootstrap` of [fit] gives.
+DRAWS: dict[str, Draw] = {"block": block_residuals, "model": model_residuals}
 
 
 def _autoregression(parts: list[Array]) -> Array:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.alternatives import fit_alternatives
-from impc.bootstrap import block_residuals, bootstrap_intervals, model_residuals, replicate
+from impc.bootstrap import DRAWS, bootstrap_intervals, replicate
 from impc.intervals import LEVEL, Interval, covariance_intervals, white_covariance
 from impc.profile_likelihood import profile_likelihood
 from impc.unknown_limit import input_limit
@@ -31,8 +31,6 @@ if TYPE_CHECKING:
     from impc.weights_summary import WeightsSummary
 
 __all__ = ["Certainty", "assess", "count_stages"]
-
-_DRAW = {"block": block_residuals, "model": model_residuals}
 
 
 @dataclass(frozen=True)
@@ -136,7 +134,7 @@ def _bootstrap(
 ) -> tuple[Interval, ...]:
     if not settings.replicates:
         return ()
-    draw = _DRAW[settings.bootstrap]
+    draw = DRAWS[settings.bootstrap]
     found = []
     for index in range(settings.replicates):
         name = f"replicate {index + 1}"

@@ -63,7 +63,8 @@ class _Program(click.Group):
             ctx.exit(_INTERRUPTED)
 
 
-@click.group(cls=_Program, invoke_without_command=True)
+# Every command below shows the defaults of its options.
+@click.group(cls=_Program, invoke_without_command=True, context_settings={"show_default": True})
 @click.version_option(package_name="impc", prog_name="impc")
 @click.pass_context
 def main(context: click.Context) -> None:

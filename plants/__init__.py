@@ -15,6 +15,7 @@ from plants.head_neck import (
     head_neck_model,
     head_neck_plant,
     step_reference,
+    table_4_3_column,
 )
 from plants.integration import runge_kutta_step
 from plants.named_examples import (
@@ -67,6 +68,7 @@ __all__ = [
     "seated_balance_step_for",
     "seated_parameters_for",
     "step_reference",
+    "table_4_3_column",
     "ternary_sequence",
     "ternary_torque",
     "unstable_integrator_example",

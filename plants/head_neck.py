@@ -43,6 +43,7 @@ __all__ = [
     "head_neck_model",
     "head_neck_plant",
     "step_reference",
+    "table_4_3_column",
 ]
 
 #: An axis of the head, for annotations.
@@ -109,6 +110,15 @@ TABLE_4_3: dict[str, tuple[float | None, ...]] = {
     "fim": (279, None, 16.2, 0.242, 0.069, 0.918, None, None, None, None, None, None),
     "lasso": (401, 8055, 36.4, 0.226, None, None, 2.200, None, None, None, None, None),
 }
+
+
+def table_4_3_column(name: str) -> NDArray[np.float64]:
+    """All twelve parameters (12,) of the column `name` of table 4.3, in their units.
+
+    Where the column is empty the parameter was fixed at the nominal mean.
+    """
+    filled = zip(TABLE_4_3[name], TABLE_4_3["nominal"], strict=True)
+    return np.array([base if value is None else value for value, base in filled], dtype=float)
 
 
 def head_neck_matrices(axis: Axis = "yaw", delay_order: int = 5) -> ca.Function:

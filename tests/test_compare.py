@@ -19,6 +19,7 @@ from impc.fit_memory import open_memory
 from impc.fit_recordings import fit_problem
 from impc.fit_settings import FitSettings
 from impc.method_estimates import METHODS, Estimate, decode_estimate, encode_estimate
+from tests.support import easier_seat
 
 SETTINGS = FitSettings(horizon=10, u_max=1.0)
 
@@ -131,8 +132,7 @@ def test_the_command(tmp_path: Path) -> None:
     assert made.exit_code == 0, made.stderr
     files = [str(tmp_path / f"trial_{number}.csv") for number in (1, 2)]
     config = tmp_path / "subject.toml"
-    easier = config.read_text().replace("[plant]", "[plant]\ndelay_order = 1")
-    config.write_text(easier.replace("horizon = 20", "horizon = 4"))
+    config.write_text(easier_seat(config.read_text()))
     out = tmp_path / "out"
     arguments = ["--plant", "seated-balance", "--config", str(config)]
     done = runner.invoke(main, ["compare", *files, *arguments, "--out", str(out)])

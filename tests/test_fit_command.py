@@ -20,6 +20,7 @@ from impc.fit_recordings import fit_problem, fit_recordings
 from impc.fit_settings import fit_settings
 from impc.plant_source import make_plant, plant_source
 from tests.files.damaged import DAMAGED, PLANT
+from tests.support import easier_seat
 
 OWN_PLANT = """
 import control
@@ -222,9 +223,7 @@ def test_an_interrupted_command_says_what_it_kept(
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    text = (subject / "subject.toml").read_text()
-    easier = text.replace("[plant]", "[plant]\ndelay_order = 1").replace("n = 20", "n = 4")
-    (tmp_path / "easier.toml").write_text(easier)
+    (tmp_path / "easier.toml").write_text(easier_seat((subject / "subject.toml").read_text()))
     arguments = ("fit", *[str(subject / f"trial_{n}.csv") for n in (1, 2)], "--plant",
                  "seated-balance", "--config", str(tmp_path / "easier.toml"), "--out",
                  str(tmp_path / "out"))  # fmt: skip

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import re
-from pathlib import Path
-
 import pytest
 
 from impc.example import run_case
 from impc.plant import Plant
 from impc.report.table import text_table
+from tests.documents.blocks import PAGES, blocks
 
-ROOT = Path(__file__).parent.parent
-README = (ROOT / "README.md").read_text(encoding="utf-8")
-BLOCKS = re.findall(r"^```(\w+)\n(.*?)^```$", README, flags=re.MULTILINE | re.DOTALL)
+README = PAGES["README.md"].read_text(encoding="utf-8")
 
 
 def close(shown: str, found: str) -> bool:
@@ -32,7 +28,8 @@ def test_the_first_lines_are_the_two_commands() -> None:
 
 
 def test_the_table_is_what_comes_out(example_plant: Plant) -> None:
-    shown = next(text for kind, text in BLOCKS if kind == "text" and "feedback_gain" in text)
+    texts = (block.text for block in blocks("README.md") if block.language == "text")
+    shown = next(text for text in texts if "feedback_gain" in text)
     found = text_table(run_case(example_plant, "A"))
     shown_rows, found_rows = shown.splitlines(), found.splitlines()
     assert len(shown_rows) == len(found_rows)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,6 +16,7 @@ from experiments.reproduction.key import key_entries
 from experiments.reproduction.page import figure_name, page
 from experiments.reproduction.seat import seat_entries
 from experiments.reproduction.sensitive import sensitive_entries
+from impc.report.write import write_files
 
 if TYPE_CHECKING:
     from experiments.reproduction.evidence import Evidence
@@ -31,12 +31,9 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=ROOT / "docs" / "reproduction")
     given = parser.parse_args()
     chapters = _chapters(gather(given.results))
-    given.out.mkdir(parents=True, exist_ok=True)
-    for chapter in chapters:
-        for entry in chapter.entries:
-            if entry.figure:
-                shutil.copyfile(given.results / entry.figure, given.out / figure_name(entry))
-    (given.out / "index.md").write_text(page(chapters), encoding="utf-8")
+    drawn = [entry for chapter in chapters for entry in chapter.entries if entry.figure]
+    figures = {figure_name(entry): (given.results / entry.figure).read_bytes() for entry in drawn}
+    write_files(given.out, figures | {"index.md": page(chapters).encode()})
     print(f"Written to {given.out}: index.md and its figures")
 
 

@@ -3,39 +3,48 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 import plants
 from experiments.reproduction.entry import Entry, Verdict, agrees
-from experiments.selection_claims import mean_subject
-from impc.selection.estimation import estimate
+from experiments.selection_claims import FIM_SUBSET, mean_subject
+from impc.selection.estimation import estimate, free_indices
 from impc.selection.fisher import fisher_information
 from impc.selection.lasso import lasso_of_size
 from impc.selection.linear import discretised, kronecker_sensitivity
-from impc.selection.model import normalised, sensitivity
+from impc.selection.model import Trial, normalised, sensitivity
 from impc.selection.subsets import exhaustive, largest_subsets
+
+if TYPE_CHECKING:
+    from impc.arrays import Array
+    from impc.selection.fisher import Information
+    from impc.selection.model import ParametricModel
 
 __all__ = ["appendix_entries"]
 
-_FREE = ("Kvis", "Kccr", "tau", "tau1A", "tauCNS1")
 _DRAWS = 200
 
 
 def appendix_entries() -> list[Entry]:
     """(A.1) to (A.6), (B.1), (C.1) to (C.5) and table C.1, on the mean subject of table 4.3."""
-    return [*_information(), *_lasso(), *_selection()]
+    subject = mean_subject()
+    information = fisher_information(*subject)
+    return [*_information(*subject, information), *_lasso(*subject), *_selection(information)]
 
 
-def _information() -> list[Entry]:
-    model, theta, trials = mean_subject()
+def _information(
+    model: ParametricModel, theta: Array, trials: list[Trial], information: Information
+) -> list[Entry]:
     outputs, exact = sensitivity(model, theta, trials[0].input)
     linear = discretised(plants.head_neck_matrices(), theta, 1 / 60)
     recursion = kronecker_sensitivity(linear, trials[0].input) * model.gain
     kronecker = float(np.max(np.abs(recursion - exact)) / np.max(np.abs(exact)))
-    difference = _central_difference_gap()
-    spread = _spread_over_bound()
-    information = fisher_information(model, theta, trials)
+    _, differences = sensitivity(replace(model, jacobian=None), theta, trials[0].input)
+    difference = float(np.max(np.abs(differences - exact)) / np.max(np.abs(exact)))
+    spread = _spread_over_bound(model, theta, trials, information)
     diagonal = np.diag(information.F)
     return [
         Entry(
@@ -78,8 +87,7 @@ def _information() -> list[Entry]:
     ]
 
 
-def _lasso() -> list[Entry]:
-    model, _, trials = mean_subject()
+def _lasso(model: ParametricModel, _: Array, trials: list[Trial]) -> list[Entry]:
     found = lasso_of_size(model, trials, 5)
     fixed = [index for index in range(model.size) if index not in found.selected]
     typical = normalised(model, np.array(model.typical))
@@ -106,9 +114,8 @@ def _lasso() -> list[Entry]:
     ]
 
 
-def _selection() -> list[Entry]:
-    model, theta, trials = mean_subject()
-    F = fisher_information(model, theta, trials).F
+def _selection(information: Information) -> list[Entry]:
+    F = information.F
     started = time.perf_counter()
     all_of_them = exhaustive([F], 0.05)
     seconds = time.perf_counter() - started
@@ -136,31 +143,17 @@ def _selection() -> list[Entry]:
     ]
 
 
-def _central_difference_gap() -> float:
-    """Largest difference over the largest entry of each column; steps of 1e-4 of the range."""
-    model, theta, trials = mean_subject()
-    _, exact = sensitivity(model, theta, trials[0].input)
-    gaps = []
-    for index in range(model.size):
-        step = np.zeros(model.size)
-        step[index] = 1e-4 * model.gain[index]
-        ahead, back = (model.simulate(theta + sign * step, trials[0].input) for sign in (1.0, -1.0))
-        column = exact[:, :, index]
-        gaps.append(np.max(np.abs((ahead - back) / 2e-4 - column)) / np.max(np.abs(exact)))
-    return float(max(gaps))
-
-
-def _spread_over_bound() -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-    model, theta, trials = mean_subject()
-    free = [model.names.index(name) for name in _FREE]
-    information = fisher_information(model, theta, trials)
+def _spread_over_bound(
+    model: ParametricModel, theta: Array, trials: list[Trial], information: Information
+) -> Array:
+    free = list(free_indices(model, FIM_SUBSET))
     bound = np.sqrt(np.diag(np.linalg.inv(information.F[np.ix_(free, free)])))
     rng = np.random.default_rng(0)
     clean = [model.simulate(theta, item.input) for item in trials]
     found = []
     for _ in range(_DRAWS):
         noisy = [
-            type(item)(item.input, y + np.sqrt(information.variance) * rng.standard_normal(y.shape))
+            Trial(item.input, y + np.sqrt(information.variance) * rng.standard_normal(y.shape))
             for item, y in zip(trials, clean, strict=True)
         ]
         fit = estimate(model, noisy, free, theta)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from experiments.reproduction.entry import Entry, Verdict, agrees, kind
+from experiments.reproduction.entry import Entry, Verdict, agrees, drawing, kind
 from impc.reliability.icc import icc
 from impc.reliability.measures import band_energy
 from plants.ternary import ternary_sequence
@@ -94,8 +94,8 @@ def _figures(result: dict[str, Any]) -> list[Entry]:
     opposite = bool(np.all(sequence[:half] == -sequence[half:]))
     band = result["passband"]
     return [
-        _apparatus("Figure 2.1", "Seat and subject, upright and tilted."),
-        _apparatus("Figure 2.2", "Physical model and block diagram."),
+        drawing("Figure 2.1", "Seat and subject, upright and tilted."),
+        drawing("Figure 2.2", "Physical model and block diagram."),
         Entry(
             "Figure 2.3",
             "Ternary torque of 5 N m and both angles of a trial.",
@@ -200,17 +200,6 @@ def _p_values(result: dict[str, Any], item: str, measure: str, quoted: str) -> E
         Verdict.LOST,
         "The means are lost; p values belong to the thirty subjects. The simulated ones do not"
         " change between visits on average.",
-    )
-
-
-def _apparatus(item: str, says: str) -> Entry:
-    return Entry(
-        item,
-        says,
-        ("plants.seated_balance",),
-        "The model is in the module, with its equations.",
-        Verdict.IN_KIND,
-        "A drawing of the apparatus or the model, not a result.",
     )
 
 

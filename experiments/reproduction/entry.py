@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
-__all__ = ["Chapter", "Entry", "Verdict", "agrees", "kind"]
+__all__ = ["Chapter", "Entry", "Verdict", "agrees", "drawing", "kind"]
 
 
 class Verdict(Enum):
@@ -64,3 +64,15 @@ def agrees(holds: bool) -> Verdict:
 def kind(holds: bool) -> Verdict:
     """Of a statement about the dissertation's own data, looked for in data of ours."""
     return Verdict.IN_KIND if holds else Verdict.NOT
+
+
+def drawing(item: str, says: str) -> Entry:
+    """A figure of the seat or of its model: there is nothing in it to reproduce."""
+    return Entry(
+        item,
+        says,
+        ("plants.seated_balance",),
+        "The model is in the module, with its equations.",
+        Verdict.IN_KIND,
+        "A drawing of the apparatus or the model, not a result.",
+    )

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.selection_claims import bootstrap_widths, reduced_widths
+from impc.report.write import write_files
 
 __all__ = ["Evidence", "gather"]
 
@@ -73,9 +74,7 @@ def _claims(path: Path) -> dict[str, Any]:
             "widths": [asdict(item) for item in bootstrap_widths(0.2, 0.6, 60)],
             "reduced": {name: list(item) for name, item in reduced_widths(60).items()},
         }
-        staging = path.with_suffix(".part")
-        staging.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-        staging.replace(path)
+        write_files(path.parent, {path.name: (json.dumps(content, indent=1) + "\n").encode()})
     return dict(json.loads(path.read_text("utf-8")))
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import control
 import numpy as np
 
-from experiments.reproduction.entry import Entry, Verdict, agrees, kind
+from experiments.reproduction.entry import Entry, Verdict, agrees, drawing, kind
 from impc.agreement import vaf
 from impc.inverse_lqr import inverse_lqr_lmi
 from impc.plant import as_plant
@@ -72,8 +72,8 @@ def _model() -> list[Entry]:
             Verdict.LOST,
             "All values of the table are lost; each of ours carries its origin in the source.",
         ),
-        _drawing("Figure 3.5", "Seat, subject, and their two-link model."),
-        _drawing("Figure 3.6", "Block diagram of the loop: delay, muscle, body."),
+        drawing("Figure 3.5", "Seat, subject, and their two-link model."),
+        drawing("Figure 3.6", "Block diagram of the loop: delay, muscle, body."),
     ]
 
 
@@ -217,17 +217,6 @@ def _intent(fit: dict[str, Any], truth: dict[str, Any]) -> list[Entry]:
             _SUBJECT,
         ),
     ]
-
-
-def _drawing(item: str, says: str) -> Entry:
-    return Entry(
-        item,
-        says,
-        ("plants.seated_balance",),
-        "The model is in the module, with its equations.",
-        Verdict.IN_KIND,
-        "A drawing of the apparatus or the model, not a result.",
-    )
 
 
 def _linearisation_gap(p: SeatedBalanceParameters) -> float:

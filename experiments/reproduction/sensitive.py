@@ -8,13 +8,15 @@ import numpy as np
 
 import plants
 from experiments.reproduction.entry import Entry, Verdict, agrees, kind
-from experiments.selection_claims import mean_subject, nominal_information
-from impc.selection.estimation import estimate, pooled_vaf
+from experiments.selection_claims import FIM_SUBSET, mean_subject, nominal_information
+from impc.selection.estimation import estimate, free_indices, pooled_vaf
 from impc.selection.model import normalised, physical
 from impc.selection.subsets import exhaustive, largest_subsets
 
 if TYPE_CHECKING:
     from experiments.reproduction.evidence import Evidence
+    from impc.selection.fisher import Information
+    from impc.selection.model import ParametricModel
 
 __all__ = ["STAND_IN", "sensitive_entries"]
 
@@ -24,20 +26,22 @@ STAND_IN = (
     " independently in each parameter, which real subjects are not."
 )
 _TEN = "On simulated subjects."
-_FIM = ("Kvis", "Kccr", "tau", "tau1A", "tauCNS1")
 
 
 def sensitive_entries(evidence: Evidence) -> list[Entry]:
     """(4.1) to (4.5), tables 4.1 to 4.3, figures 4.1 to 4.5 and the claims of chapter 4."""
-    select, claims = evidence.select, evidence.claims
-    return [*_equations(), *_tables(select, claims), *_claims(select)]
+    select, nominal = evidence.select, nominal_information()
+    return [
+        *_equations(),
+        *_tables(select, evidence.claims, *nominal),
+        *_claims(select, *nominal),
+    ]
 
 
 def _equations() -> list[Entry]:
     model, theta, trials = mean_subject()
     there = float(np.max(np.abs(physical(model, normalised(model, theta)) / theta - 1)))
-    free = [model.names.index(name) for name in _FIM]
-    fit = estimate(model, trials, free, theta)
+    fit = estimate(model, trials, free_indices(model, FIM_SUBSET), theta)
     closed = float(pooled_vaf(model, theta, trials)[0])
     names = ", ".join(model.names)
     return [
@@ -74,10 +78,10 @@ def _equations() -> list[Entry]:
     ]
 
 
-def _tables(select: dict[str, Any], claims: dict[str, Any]) -> list[Entry]:
-    model, information = nominal_information()
-    nominal = _means(select["vaf"]["nominal"])
-    fim, lasso = _means(select["vaf"]["fim"]), _means(select["vaf"]["lasso"])
+def _tables(
+    select: dict[str, Any], claims: dict[str, Any], model: ParametricModel, information: Information
+) -> list[Entry]:
+    nominal, fim, lasso = _mean_vafs(select)
     widths = claims["widths"]
     inside = sum(abs(item["mean"] - item["quoted"]) <= item["deviation"] for item in widths)
     first = ", ".join(
@@ -169,14 +173,14 @@ def _reduction(claims: dict[str, Any]) -> Entry:
     )
 
 
-def _claims(select: dict[str, Any]) -> list[Entry]:
-    model, information = nominal_information()
+def _claims(
+    select: dict[str, Any], model: ParametricModel, information: Information
+) -> list[Entry]:
     selection = exhaustive([information.F], 0.05)
-    chosen = tuple(sorted(model.names.index(name) for name in _FIM))
-    place = [tuple(sorted(item)) for item in selection.subsets].index(chosen) + 1
+    place = selection.subsets.index(free_indices(model, FIM_SUBSET)) + 1
     ratio = select["seconds"]["lasso"] / select["seconds"]["fim"]
     fim, lasso, common = select["selected"]["fim"], select["selected"]["lasso"], select["common"]
-    first = next(iter(select["intervals"].values()))
+    vafs, first = _mean_vafs(select), next(iter(select["intervals"].values()))
     return [
         Entry(
             "Claim, 4.3",
@@ -199,10 +203,9 @@ def _claims(select: dict[str, Any]) -> list[Entry]:
             "Claim, 4.3",
             "Estimating twelve gains nothing: VAF 82.26 (12), 82.65 (FIM), 81.87 % (LASSO).",
             ("impc.selection.estimation:pooled_vaf",),
-            f"{_means(select['vaf']['nominal']):.2f}, {_means(select['vaf']['fim']):.2f},"
-            f" {_means(select['vaf']['lasso']):.2f} %. (Five parameters cannot explain more than"
-            " twelve that include them: the dissertation's nominal fits had stopped early.)",
-            kind(_means(select["vaf"]["nominal"]) - _means(select["vaf"]["fim"]) < 1),
+            f"{vafs[0]:.2f}, {vafs[1]:.2f}, {vafs[2]:.2f} %. (Five parameters cannot explain more"
+            " than twelve that include them: the dissertation's nominal fits had stopped early.)",
+            kind(vafs[0] - vafs[1] < 1),
             _TEN,
         ),
         Entry(
@@ -251,13 +254,16 @@ def _claims(select: dict[str, Any]) -> list[Entry]:
 
 def _margins() -> str:
     told = []
-    for name, column in plants.TABLE_4_3.items():
-        base = plants.TABLE_4_3["nominal"]
-        values = [b if v is None else v for v, b in zip(column, base, strict=True)]
-        poles = np.linalg.eigvals(plants.head_neck_plant(np.array(values, dtype=float)).A)
+    for name in plants.TABLE_4_3:
+        poles = np.linalg.eigvals(plants.head_neck_plant(plants.table_4_3_column(name)).A)
         told.append(f"{name} {max(poles.real):.3f}")
     return f"Largest real part of a pole, 1/s: {', '.join(told)}."
 
 
-def _means(groups: dict[str, list[float]]) -> float:
-    return float(np.mean([np.mean(values) for values in groups.values()]))
+def _mean_vafs(select: dict[str, Any]) -> tuple[float, float, float]:
+    """With all free, FIM and LASSO; means over outputs, then over subjects, %."""
+    nominal, fim, lasso = (
+        float(np.mean([np.mean(values) for values in select["vaf"][which].values()]))
+        for which in ("nominal", "fim", "lasso")
+    )
+    return nominal, fim, lasso

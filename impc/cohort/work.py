@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import psutil
 
-from impc.bootstrap import block_residuals, model_residuals, replicate
+from impc.bootstrap import DRAWS, replicate
 from impc.closed_loop import simulate
 from impc.commands.plant import find_plant
 from impc.errors import ImpcError
@@ -44,7 +44,6 @@ if TYPE_CHECKING:
 
 __all__ = ["FitTask", "fit_unit", "replicate_unit"]
 
-_DRAW = {"block": block_residuals, "model": model_residuals}
 # Points of a trajectory that are kept for pictures.
 _SHOWN = 600
 
@@ -95,7 +94,7 @@ def replicate_unit(task: FitTask, fit: dict[str, Any], index: int) -> dict[str, 
     try:
         problem, settings = _problem(task)
         fitted = _restored(problem, fit)
-        found = replicate(fitted, index, settings.seed, _DRAW[settings.bootstrap])
+        found = replicate(fitted, index, settings.seed, DRAWS[settings.bootstrap])
     except ImpcError as error:
         return {"reason": str(error), "digest": task.digest}
     content = {

@@ -10,7 +10,7 @@ from pathlib import Path
 import click
 from tqdm import tqdm
 
-from impc.commands.scheduler import scheduler_options
+from impc.commands.options import out_option, scheduler_options
 
 __all__ = ["command"]
 
@@ -19,13 +19,7 @@ _SOME_FAILED = 1
 
 @click.command("cohort")
 @click.argument("study_file", metavar="STUDY", type=click.Path(path_type=Path))
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path),
-    default=Path("results", "cohort"),
-    show_default=True,
-    help="Folder for results, tables and report; the same folder again goes on.",
-)
+@out_option("cohort", "results, tables and report; the same folder again goes on")
 @scheduler_options
 @click.pass_context
 def command(

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 from tqdm import tqdm
 
+from impc.commands.options import out_option
 from impc.commands.output import print_files
 from impc.commands.plant import KNOWN
 
@@ -34,13 +35,7 @@ __all__ = ["command"]
     type=click.Path(path_type=Path),
     help="What the columns mean, and settings, as for `impc fit`.",
 )
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path),
-    default=Path("results", "compare"),
-    show_default=True,
-    help="Folder for report.html, result.json, comparison.csv and the figure.",
-)
+@out_option("compare", "report.html, result.json, comparison.csv and the figure")
 def command(files: tuple[Path, ...], plant_name: str, config: Path, out: Path) -> None:
     """Compare feedback gain, inverse LQR, inverse KKT and inverse MPC, one file a trial.
 

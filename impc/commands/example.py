@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 from tqdm import tqdm
 
+from impc.commands.options import out_option
 from impc.commands.output import print_files
 from impc.commands.plant import load_plant
 
@@ -29,16 +30,9 @@ _EXAMPLE_PLANT = "plants:yalmip_example"
     "--case",
     type=click.Choice(["A", "B", "C", "all"]),
     default="all",
-    show_default=True,
     help="Initial state: A (1, 3), B (2, 3), C (2, 1).",
 )
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path),
-    default=Path("results", "example"),
-    show_default=True,
-    help="Folder for report.html, result.json and the figures.",
-)
+@out_option("example", "report.html, result.json and the figures")
 def command(case: str, out: Path) -> None:
     """Run the simulation example of section 3.4 of the dissertation.
 

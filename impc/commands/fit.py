@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 from tqdm import tqdm
 
+from impc.commands.options import out_option
 from impc.commands.output import print_files
 from impc.commands.plant import KNOWN
 
@@ -32,13 +33,7 @@ __all__ = ["command"]
     type=click.Path(path_type=Path),
     help="What the columns mean, and settings; `impc inspect FILE` writes one.",
 )
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path),
-    default=Path("results", "fit"),
-    show_default=True,
-    help="Folder for report.html, result.json and the figures.",
-)
+@out_option("fit", "report.html, result.json and the figures")
 def command(files: tuple[Path, ...], plant_name: str, config: Path, out: Path) -> None:
     """Fit the controller behind the trials of one subject, one file a trial.
 

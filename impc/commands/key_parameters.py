@@ -6,8 +6,8 @@ from pathlib import Path
 
 import click
 
+from impc.commands.options import out_option, scheduler_options
 from impc.commands.output import print_files
-from impc.commands.scheduler import scheduler_options
 from impc.commands.select import kept_results, read_model_study, study_runner
 
 __all__ = ["command"]
@@ -15,22 +15,15 @@ __all__ = ["command"]
 
 @click.command("key-parameters")
 @click.argument("study_file", metavar="STUDY", type=click.Path(path_type=Path))
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path),
-    default=Path("results", "key-parameters"),
-    show_default=True,
-    help="Folder for report.html, result.json, table and figure.",
-)
+@out_option("key-parameters", "report.html, result.json, table and figure")
 @click.option(
     "--bound",
     type=click.FloatRange(min=0, min_open=True),
     default=0.35,
-    show_default=True,
     help="Largest variance, in halves of the ranges, squared.",
 )
-@click.option("--vaf", type=float, default=69.0, show_default=True, help="Least mean VAF, %.")
-@click.option("--icc", type=float, default=0.75, show_default=True, help="Least ICC(A,k).")
+@click.option("--vaf", type=float, default=69.0, help="Least mean VAF, %.")
+@click.option("--icc", type=float, default=0.75, help="Least ICC(A,k).")
 @scheduler_options
 def command(
     study_file: Path,

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 from tqdm import tqdm
 
+from impc.commands.options import out_option
 from impc.commands.output import print_files
 from impc.commands.plant import find_plant
 
@@ -21,18 +22,11 @@ __all__ = ["command"]
 
 @click.command("reliability")
 @click.argument("study_file", metavar="STUDY", type=click.Path(path_type=Path))
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path),
-    default=Path("results", "reliability"),
-    show_default=True,
-    help="Folder for report.html, result.json, tables and figures.",
-)
+@out_option("reliability", "report.html, result.json, tables and figures")
 @click.option(
     "--last",
     type=click.IntRange(min=1),
     default=3,
-    show_default=True,
     help="How many of a visit's trials count, the last ones.",
 )
 def command(study_file: Path, out: Path, last: int) -> None:

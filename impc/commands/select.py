@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import click
 from tqdm import tqdm
 
+from impc.commands.options import out_option, scheduler_options
 from impc.commands.output import print_files
-from impc.commands.scheduler import scheduler_options
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -26,13 +26,7 @@ __all__ = ["command", "kept_results", "read_model_study", "study_runner"]
 
 @click.command("select")
 @click.argument("study_file", metavar="STUDY", type=click.Path(path_type=Path))
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path),
-    default=Path("results", "select"),
-    show_default=True,
-    help="Folder for report.html, result.json, tables and figure.",
-)
+@out_option("select", "report.html, result.json, tables and figure")
 @scheduler_options
 def command(study_file: Path, out: Path, scheduler: str | None, workers: int | None) -> None:
     """Sensitive parameters of a simulation model (chapter 4), subject by subject and in common.

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from impc.commands.options import out_option, seed_option
 from impc.commands.output import print_files
 from impc.commands.simulate_cohort import cohort
 from impc.commands.simulate_head_tracking import head_tracking
@@ -37,57 +38,45 @@ def command() -> None:
 
 
 @command.command("seated-balance")
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path),
-    default=Path("results", "subject"),
-    show_default=True,
-    help="Folder for the recordings, subject.toml and truth.json.",
-)
+@out_option("subject", "the recordings, subject.toml and truth.json")
 @click.option(
     "--torque-limit",
     type=click.FloatRange(min=0, min_open=True),
     default=6.0,
-    show_default=True,
     help="Largest torque of the subject, Nm.",
 )
-@click.option("--trials", type=click.IntRange(1, 99), default=3, show_default=True)
+@click.option("--trials", type=click.IntRange(1, 99), default=3)
 @click.option(
     "--duration",
     type=click.FloatRange(min=2, max=600),
     default=30.0,
-    show_default=True,
     help="Of a trial, s.",
 )
 @click.option(
     "--amplitude",
     type=click.FloatRange(min=0, min_open=True),
     default=5.0,
-    show_default=True,
     help="Of the ternary torque on the seat, Nm.",
 )
 @click.option(
     "--motor-noise",
     type=click.FloatRange(min=0),
     default=0.3,
-    show_default=True,
     help="Standard deviation of the noise on the torque, Nm.",
 )
 @click.option(
     "--sensor-noise",
     type=click.FloatRange(min=0),
     default=0.1,
-    show_default=True,
     help="Standard deviation of the noise on the angles, degrees.",
 )
-@click.option("--mass", type=float, default=79.7, show_default=True, help="kg")
-@click.option("--height", type=float, default=1.66, show_default=True, help="m")
-@click.option("--sex", type=click.Choice(["male", "female"]), default="male", show_default=True)
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+@click.option("--mass", type=float, default=79.7, help="kg")
+@click.option("--height", type=float, default=1.66, help="m")
+@click.option("--sex", type=click.Choice(["male", "female"]), default="male")
+@seed_option
 @click.option(
     "--formats",
     default="csv,tsv,mat,mat73,tdms,c3d",
-    show_default=True,
     help="Which file formats, with commas between.",
 )
 def seated_balance(out: Path, formats: str, **given: Any) -> None:

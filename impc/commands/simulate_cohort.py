@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 import click
 from tqdm import tqdm
 
+from impc.commands.options import out_option, seed_option
+
 if TYPE_CHECKING:
     import numpy as np
 
@@ -23,53 +25,30 @@ _BETWEEN, _WITHIN = 0.2, 0.05
 
 
 @click.command("cohort")
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path),
-    default=Path("results", "cohort-data"),
-    show_default=True,
-    help="Folder for the recordings, study.toml, participants.tsv and truth.json.",
-)
+@out_option("cohort-data", "the recordings, study.toml, participants.tsv and truth.json")
 @click.option(
     "--subjects",
     type=click.IntRange(2, 9999),
     default=30,
-    show_default=True,
     help="In both groups together.",
 )
-@click.option(
-    "--visits", type=click.IntRange(1, 9), default=1, show_default=True, help="Of each subject."
-)
-@click.option(
-    "--trials", type=click.IntRange(1, 9), default=3, show_default=True, help="Of each visit."
-)
-@click.option(
-    "--duration", type=click.FloatRange(5, 600), default=30.0, show_default=True, help="s"
-)
+@click.option("--visits", type=click.IntRange(1, 9), default=1, help="Of each subject.")
+@click.option("--trials", type=click.IntRange(1, 9), default=3, help="Of each visit.")
+@click.option("--duration", type=click.FloatRange(5, 600), default=30.0, help="s")
 @click.option(
     "--difference",
     type=click.FloatRange(min=0.05, max=20),
     default=0.4,
-    show_default=True,
     help="The second group's prices of angles and rates over the first's; 1 for none.",
 )
 @click.option(
     "--torque-limit",
     type=click.FloatRange(min=1),
     default=6.0,
-    show_default=True,
     help="Largest lumbar torque of a subject, Nm.",
 )
-@click.option(
-    "--replicates", type=click.IntRange(min=0), default=20, show_default=True, help="In study.toml."
-)
-@click.option(
-    "--seed",
-    type=click.IntRange(min=0),
-    default=0,
-    show_default=True,
-    help="All numbers drawn follow from it.",
-)
+@click.option("--replicates", type=click.IntRange(min=0), default=20, help="In study.toml.")
+@seed_option
 def cohort(out: Path, **given: Any) -> None:
     """Subjects on the seat, half of them in each of two groups, in folders named as BIDS has it.
 

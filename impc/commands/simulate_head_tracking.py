@@ -8,6 +8,8 @@ from typing import Any
 
 import click
 
+from impc.commands.options import out_option, seed_option
+
 __all__ = ["head_tracking"]
 
 _MODEL, _STEPS = "plants:head_neck_model", "plants:step_reference"
@@ -18,43 +20,23 @@ _SPREAD, _VISIT, _VAF = 0.25, 0.05, (82.3, 7.7)
 
 
 @click.command("head-tracking")
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path),
-    default=Path("results", "head-data"),
-    show_default=True,
-    help="Folder for the recordings, study.toml and truth.json.",
-)
+@out_option("head-data", "the recordings, study.toml and truth.json")
 @click.option(
     "--axis",
     type=click.Choice(["yaw", "pitch"]),
     default="yaw",
-    show_default=True,
     help="Of the head's rotation.",
 )
-@click.option(
-    "--subjects", type=click.IntRange(1, 999), default=10, show_default=True, help="How many."
-)
-@click.option(
-    "--visits", type=click.IntRange(1, 9), default=1, show_default=True, help="Of each subject."
-)
-@click.option(
-    "--trials", type=click.IntRange(1, 9), default=3, show_default=True, help="Of each visit."
-)
+@click.option("--subjects", type=click.IntRange(1, 999), default=10, help="How many.")
+@click.option("--visits", type=click.IntRange(1, 9), default=1, help="Of each subject.")
+@click.option("--trials", type=click.IntRange(1, 9), default=3, help="Of each visit.")
 @click.option(
     "--duration",
     type=click.FloatRange(5, 300),
     default=30.0,
-    show_default=True,
     help="Of a trial, s.",
 )
-@click.option(
-    "--seed",
-    type=click.IntRange(min=0),
-    default=0,
-    show_default=True,
-    help="All numbers drawn follow from it.",
-)
+@seed_option
 def head_tracking(out: Path, **given: Any) -> None:
     """Ten subjects of chapter 4; --subjects 40 --visits 2 for chapter 5.
 

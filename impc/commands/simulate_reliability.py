@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from tqdm import tqdm
 
+from impc.commands.options import out_option, seed_option
 from impc.commands.simulate_cohort import random_person
 
 if TYPE_CHECKING:
@@ -39,33 +40,16 @@ _LEAN = (0.1, 0.8)
 
 
 @click.command("reliability-study")
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path),
-    default=Path("results", "reliability-data"),
-    show_default=True,
-    help="Folder for the recordings, study.toml and truth.json.",
-)
-@click.option(
-    "--subjects", type=click.IntRange(2, 999), default=30, show_default=True, help="How many."
-)
-@click.option(
-    "--visits", type=click.IntRange(2, 9), default=3, show_default=True, help="Of each subject."
-)
+@out_option("reliability-data", "the recordings, study.toml and truth.json")
+@click.option("--subjects", type=click.IntRange(2, 999), default=30, help="How many.")
+@click.option("--visits", type=click.IntRange(2, 9), default=3, help="Of each subject.")
 @click.option(
     "--trials",
     type=click.IntRange(2, 9),
     default=3,
-    show_default=True,
     help="Of each visit and condition.",
 )
-@click.option(
-    "--seed",
-    type=click.IntRange(min=0),
-    default=0,
-    show_default=True,
-    help="All numbers drawn follow from it.",
-)
+@seed_option
 def reliability_study(out: Path, **given: Any) -> None:
     """Thirty subjects, three visits, three conditions and three trials on the seat.
 

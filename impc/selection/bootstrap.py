@@ -15,17 +15,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.arrays import Array, frozen
-from impc.bootstrap import block_residuals
 from impc.selection.estimation import estimate, residuals
 from impc.selection.model import Trial
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    from impc.bootstrap import Draw
     from impc.selection.estimation import Estimate
     from impc.selection.model import ParametricModel
 
-__all__ = ["BootstrapIntervals", "bootstrap_subset", "draw_blocks", "draw_single"]
+__all__ = ["BootstrapIntervals", "bootstrap_subset", "draw_single"]
 
 _THREADS = 2
 
@@ -60,40 +60,12 @@ class BootstrapIntervals:
 
 
 def draw_single(parts: list[Array], rng: np.random.Generator) -> list[Array]:
-    """Residuals drawn again row by row from those of all trials.
+    """A `Draw` row by row: residuals `parts` (samples, p) of each trial to as many, (samples, p).
 
-    Parameters
-    ----------
-    parts : list of Array
-        Residuals (samples, p) of each trial.
-    rng : numpy.random.Generator
-        What is drawn from.
-
-    Returns
-    -------
-    list of Array
-        As many, (samples, p) each.
+    Rows come from all trials; `rng` is what is drawn from.
     """
     pooled = np.concatenate([item - np.mean(item, axis=0) for item in parts])
     return [pooled[rng.integers(len(pooled), size=len(item))] for item in parts]
-
-
-def draw_blocks(parts: list[Array], rng: np.random.Generator) -> list[Array]:
-    """Residuals drawn again in moving blocks, by `impc.bootstrap.block_residuals`.
-
-    Parameters
-    ----------
-    parts : list of Array
-        Residuals (samples, p) of each trial.
-    rng : numpy.random.Generator
-        What is drawn from.
-
-    Returns
-    -------
-    list of Array
-        As many, (samples, p) each.
-    """
-    return block_residuals(parts, rng)
 
 
 def bootstrap_subset(
@@ -102,7 +74,7 @@ def bootstrap_subset(
     fit: Estimate,
     replicates: int,
     seed: int,
-    draw: Callable[[list[Array], np.random.Generator], list[Array]] = draw_single,
+    draw: Draw = draw_single,
     *,
     level: float = 0.95,
     progress: Callable[[], None] = lambda: None,
@@ -117,9 +89,8 @@ def bootstrap_subset(
         How many are fitted.
     seed : int
         All numbers drawn follow from it.
-    draw : callable
-        (residuals, generator) -> residuals drawn again, lists with an array (samples, p) for each
-        trial: `draw_single` or `draw_blocks`.
+    draw : Draw
+        `draw_single` or `impc.bootstrap.block_residuals`.
     level : float
         Of the intervals, between 0 and 1.
     progress : callable

@@ -25,12 +25,20 @@ from impc.selection.subsets import largest_subsets, sweep
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
+    from impc.reliability.icc import Icc
     from impc.selection.model import ParametricModel, Trial
     from impc.selection.running import Runner
     from impc.selection.settings import SelectSettings
     from impc.selection.subsets import Selection
 
-__all__ = ["Candidate", "KeyParameters", "Refits", "key_parameters", "refit_subsets"]
+__all__ = [
+    "Candidate",
+    "KeyParameters",
+    "Refits",
+    "between_visits",
+    "key_parameters",
+    "refit_subsets",
+]
 
 
 @dataclass(frozen=True)
@@ -193,6 +201,10 @@ def _by_visit(
 
 def _reliability(values: Array) -> float:
     """(5.6): the least ICC(A,k) of a subset's parameters; NaN without several of both."""
-    if min(values.shape[1:]) < 2:
-        return float("nan")
-    return float(np.min([icc(table, "A,k").value for table in values]))
+    told = [between_visits(table) for table in values]
+    return float(np.min([item.value if item else np.nan for item in told]))
+
+
+def between_visits(values: Array) -> Icc | None:
+    """ICC(A,k) of a parameter's `values` (subjects, visits); None without several of both."""
+    return icc(values, "A,k") if min(values.shape) >= 2 else None

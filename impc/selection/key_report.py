@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.reliability.icc import icc
 from impc.report.rendering import TextTable, embedded, number, plain, render_template
 from impc.report.style import BLUE, DOUBLE_COLUMN, INK, journal_style, new_figure, render
+from impc.selection.key_parameters import between_visits
 from impc.selection.report import names_of, table_csv
 
 if TYPE_CHECKING:
@@ -99,11 +99,9 @@ def key_files(model: ParametricModel, found: KeyParameters, command: str) -> dic
 
 
 def _icc(values: Array) -> dict[str, float]:
-    """ICC(A,k) between visits with its 95 % interval; NaN without several subjects and visits."""
-    if min(values.shape) < 2:
-        return dict.fromkeys(("value", "low", "high"), np.nan)
-    told = icc(values, "A,k")
-    return {"value": told.value, "low": told.low, "high": told.high}
+    """With its 95 % interval; NaN where there is none."""
+    told = between_visits(values)
+    return {key: getattr(told, key, np.nan) for key in ("value", "low", "high")}
 
 
 def _estimate_table(model: ParametricModel, found: KeyParameters) -> TextTable:

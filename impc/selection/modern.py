@@ -20,7 +20,7 @@ import scipy.optimize
 import scipy.stats
 
 from impc.arrays import Array, frozen
-from impc.selection.estimation import estimate
+from impc.selection.estimation import estimate, residuals
 from impc.selection.fisher import fisher_information
 from impc.selection.model import normalised, physical
 from impc.selection.subsets import largest_subsets
@@ -198,6 +198,4 @@ def profile_interval(
 
 
 def _misfit(model: ParametricModel, trials: Sequence[Trial], theta: Array) -> float:
-    return sum(
-        float(np.sum((model.simulate(theta, item.input) - item.outputs) ** 2)) for item in trials
-    )
+    return sum(float(np.sum(part**2)) for part in residuals(model, theta, trials))

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from impc.bootstrap import block_residuals
 from impc.selection.bootstrap import (
     BootstrapIntervals,
     bootstrap_subset,
-    draw_blocks,
     draw_single,
 )
 from impc.selection.estimation import Estimate, estimate, multi_start
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Chosen", "Doubts", "Nominal", "fit_chosen", "fit_nominal", "raise_doubts"]
 
-_DRAW = {"single": draw_single, "block": draw_blocks}
+_DRAW = {"single": draw_single, "block": block_residuals}
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
+from impc.bootstrap import block_residuals
 from impc.cli import main
-from impc.selection.bootstrap import bootstrap_subset, draw_blocks, draw_single
+from impc.selection.bootstrap import bootstrap_subset, draw_single
 from impc.selection.estimation import estimate, free_indices
 from impc.selection.fisher import fisher_information
 from impc.selection.key_parameters import key_parameters
@@ -64,7 +65,7 @@ def test_blocks_widen_intervals_of_coloured_residuals() -> None:
     trial = Trial(drive, (drive @ [2.0, 0.0, -1.0])[:, None] + 0.5 * slow)
     fit = estimate(model, [trial], (0, 1, 2), np.zeros(3))
     single = bootstrap_subset(model, [trial], fit, 200, SEED, draw_single).width
-    blocks = bootstrap_subset(model, [trial], fit, 200, SEED, draw_blocks).width
+    blocks = bootstrap_subset(model, [trial], fit, 200, SEED, block_residuals).width
     assert np.all(blocks > 1.5 * single)
 
 

@@ -1,7 +1,8 @@
-"""Options of commands whose work goes to workers."""
+"""Options that several commands have alike."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 import click
@@ -10,9 +11,24 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from typing import Any
 
-__all__ = ["scheduler_options"]
+__all__ = ["out_option", "scheduler_options", "seed_option"]
 
 F = TypeVar("F", bound="Callable[..., Any]")
+
+#: --seed of everything that is simulated.
+seed_option = click.option(
+    "--seed", type=click.IntRange(min=0), default=0, help="All numbers drawn follow from it."
+)
+
+
+def out_option(folder: str, holds: str) -> Callable[[F], F]:
+    """--out: a `folder` inside results/ by default; its help says what it `holds`."""
+    return click.option(
+        "--out",
+        type=click.Path(path_type=Path),
+        default=Path("results", folder),
+        help=f"Folder for {holds}.",
+    )
 
 
 def scheduler_options(command: F) -> F:
