@@ -1,0 +1,295 @@
+"""The controller's program stage by stage, where nothing but the inputs is bounded.
+
+The rows in v = u + Kx lose their digits when no plan comes near the gain: v then grows as the plant
+runs away, and u = v - Kx cancels. Here the inputs themselves are the unknowns, those at a bound are
+*exactly* there, and the others follow from a Riccati recursion over the stages:
+
+    V_k(x) = min over the free inputs of  v_k'S v_k / 2 + V_{k+1}(A x + B u),    V_N = 0,
+
+with V_k(x) = x'P_k x / 2 + q_k'x + const. With u = c - Lx, L zero for an input at its bound, D = K - L
+and F = A - BL,
+
+    P_k = D'S D + F'P_{k+1} F,      q_k = D'S c + F'(P_{k+1} B c + q_{k+1}):
+
+sums without a difference in them, so that what the plant does not amplify is not amplified by
+rounding either. Which inputs stand at a bound is found by a primal active-set method (Nocedal and
+Wright, Numerical Optimization, section 16.5): every plan on the way keeps the bounds.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numba import njit
+
+from impc.arrays import Array, Buffer
+
+if TYPE_CHECKING:
+    from impc.compiled import LoopMatrices
+
+__all__ = ["Plan", "differentiate_plan", "solve_saturated"]
+
+# Rounding of a sum, relative to its largest term: the recursion over 60 stages of 8 states has a
+# tenth of it.
+_ROUNDING = 1e-13
+# What the first input may be uncertain by, relative to its bound.
+_TOLERANCE = 1e-10
+
+
+class Plan(NamedTuple):
+    """Inputs over the horizon with what their derivative needs.
+
+    Attributes
+    ----------
+    u, x : Array
+        Inputs (N, m) and states (N + 1, n).
+    at : Array of int
+        -1 and 1 for an input at its lower and upper bound, 0 for a free one, (N, m).
+    L, P, q : Array
+        Of the recursion: (N, m, n), (N + 1, n, n), (N + 1, n).
+    H : Array
+        Second derivative by the inputs of each stage, S + B'P_{k+1} B, (N, m, m).
+    told : bool
+        Whether the first input is told from rounding; the rest is of no use otherwise.
+    """
+
+    u: Array
+    x: Array
+    at: Array
+    L: Array
+    P: Array
+    q: Array
+    H: Array
+    told: bool
+
+
+def solve_saturated(
+    loop: LoopMatrices, S: Array, low: Array, high: Array, N: int, x: Array, last: Plan | None = None
+) -> Plan:
+    """Return the best plan from a state under bounds on the inputs alone.
+
+    Parameters
+    ----------
+    S : Array
+        The metric (m, m); that of `loop` is its inverse.
+    low, high : Array
+        Bounds (m,), infinite where there is none.
+    N : int
+        Horizon, in samples.
+    x : Array
+        State (n,).
+    last : Plan, optional
+        That of the sample before: a start that saves most of the steps.
+    """
+    u, at = np.zeros((N, len(S))), np.zeros((N, len(S)), dtype=np.int8)
+    if last is None:
+        _saturate(loop.A, loop.B, loop.K, low, high, x, u, at)
+    else:
+        u[:-1], at[:-1] = last.u[1:], last.at[1:]
+    return Plan(*_solve(loop.A, loop.B, loop.K, S, low, high, x, u, at))
+
+
+@njit(cache=True, nogil=True)
+def _solve(
+    A: Buffer, B: Buffer, K: Buffer, S: Buffer, low: Buffer, high: Buffer, x0: Buffer, u: Buffer,
+    at: Buffer,
+) -> tuple[Buffer, Buffer, Buffer, Buffer, Buffer, Buffer, Buffer, bool]:  # fmt: skip
+    N, m, n = len(u), K.shape[0], K.shape[1]
+    x = np.zeros((N + 1, n))
+    L, P, q = np.zeros((N, m, n)), np.zeros((N + 1, n, n)), np.zeros((N + 1, n))
+    H, gradient, noise = np.zeros((N, m, m)), np.zeros((N, m)), np.zeros((N, m))
+    wanted = np.zeros((N, m))
+    for _ in range(20 * N * m + 100):
+        _backward(A, B, K, S, u, at, L, P, q, H, wanted)
+        if not np.all(np.isfinite(P[0])):
+            break
+        _forward(A, B, K, S, x0, at, L, P, q, H, u, wanted, x, gradient, noise)
+        step, k, j = _blocked(u, wanted, noise, low, high)
+        if step < 1.0:
+            u += step * (wanted - u)
+            at[k, j] = 1 if wanted[k, j] > u[k, j] else -1
+            u[k, j] = high[j] if at[k, j] > 0 else low[j]
+            continue
+        u[:] = wanted
+        k, j = _released(at, gradient, noise)
+        if k < 0:
+            return u, x, at, L, P, q, H, _told(low, high, u[0], at[0], gradient[0], noise[0])
+        at[k, j] = 0
+    return u, x, at, L, P, q, H, False
+
+
+@njit(cache=True)
+def _saturate(
+    A: Buffer, B: Buffer, K: Buffer, low: Buffer, high: Buffer, x0: Buffer, u: Buffer, at: Buffer
+) -> None:
+    """Begin with the gain, cut at the bounds."""
+    x = x0.copy()
+    for k in range(len(u)):
+        u[k] = -(K @ x)
+        for j in range(u.shape[1]):
+            if u[k, j] > high[j]:
+                u[k, j], at[k, j] = high[j], 1
+            elif u[k, j] < low[j]:
+                u[k, j], at[k, j] = low[j], -1
+        x = A @ x + B @ u[k]
+
+
+@njit(cache=True)
+def _backward(
+    A: Buffer, B: Buffer, K: Buffer, S: Buffer, u: Buffer, at: Buffer,
+    L: Buffer, P: Buffer, q: Buffer, H: Buffer, c: Buffer,
+) -> None:  # fmt: skip
+    """Write the recursion for the inputs at their bounds; c is the constant part of the inputs."""
+    N, m = u.shape
+    for k in range(N - 1, -1, -1):
+        PB = P[k + 1] @ B
+        H[k] = S + B.T @ PB
+        G = S @ K + PB.T @ A
+        constant = B.T @ q[k + 1]
+        if not np.all(np.isfinite(H[k])):
+            P[0] = np.inf
+            return
+        free = np.flatnonzero(at[k] == 0)
+        L[k] = 0.0
+        for j in range(m):
+            c[k, j] = u[k, j] if at[k, j] != 0 else 0.0
+        if len(free):
+            block, right = np.empty((len(free), len(free))), np.empty((len(free), K.shape[1] + 1))
+            push = H[k] @ c[k] + constant
+            for a in range(len(free)):
+                for b in range(len(free)):
+                    block[a, b] = H[k, free[a], free[b]]
+                right[a, :-1] = G[free[a]]
+                right[a, -1] = push[free[a]]
+            solved = np.linalg.solve(block, right)
+            for a in range(len(free)):
+                L[k, free[a]] = solved[a, :-1]
+                c[k, free[a]] = -solved[a, -1]
+        D, F = K - L[k], A - B @ L[k]
+        SD = S @ D
+        q[k] = SD.T @ c[k] + F.T @ (PB @ c[k] + q[k + 1])
+        full = D.T @ SD + F.T @ (P[k + 1] @ F)
+        P[k] = (full + full.T) / 2
+
+
+@njit(cache=True)
+def _forward(
+    A: Buffer, B: Buffer, K: Buffer, S: Buffer, x0: Buffer, at: Buffer, L: Buffer, P: Buffer,
+    q: Buffer, H: Buffer, u: Buffer, c: Buffer, x: Buffer, gradient: Buffer, noise: Buffer,
+) -> None:  # fmt: skip
+    """Turn c into the inputs, and write the change of each input that its gradient asks for.
+
+    `noise` is what rounding makes of that change.
+    """
+    N, m = u.shape
+    x[0] = x0
+    for k in range(N):
+        for j in range(m):
+            if at[k, j] == 0:
+                c[k, j] -= np.dot(L[k, j], x[k])
+        x[k + 1] = A @ x[k] + B @ c[k]
+        v = c[k] + K @ x[k]
+        costate = P[k + 1] @ x[k + 1] + q[k + 1]
+        pull = S @ v + B.T @ costate
+        large = np.abs(S) @ (np.abs(c[k]) + np.abs(K) @ np.abs(x[k])) + np.abs(B).T @ (
+            np.abs(P[k + 1]) @ np.abs(x[k + 1]) + np.abs(q[k + 1])
+        )
+        for j in range(m):
+            gradient[k, j] = -pull[j] / H[k, j, j]
+            noise[k, j] = _ROUNDING * large[j] / H[k, j, j]
+
+
+@njit(cache=True)
+def _blocked(
+    u: Buffer, wanted: Buffer, noise: Buffer, low: Buffer, high: Buffer
+) -> tuple[float, int, int]:
+    """Share of the step to the wanted plan that keeps the bounds, and the input that blocks it."""
+    best, row, column = 1.0, -1, -1
+    for k in range(u.shape[0]):
+        for j in range(u.shape[1]):
+            for side in (low[j], high[j]):
+                beyond = wanted[k, j] - side if side > 0 else side - wanted[k, j]
+                if beyond <= 0.0:
+                    continue
+                step = (side - u[k, j]) / (wanted[k, j] - u[k, j])
+                if step < best:
+                    best, row, column = max(step, 0.0), k, j
+    return best, row, column
+
+
+@njit(cache=True)
+def _released(at: Buffer, gradient: Buffer, noise: Buffer) -> tuple[int, int]:
+    """The input at a bound that gains most by leaving it, or -1."""
+    best, row, column = 0.0, -1, -1
+    for k in range(at.shape[0]):
+        for j in range(at.shape[1]):
+            gain = -at[k, j] * gradient[k, j]
+            if at[k, j] != 0 and gain > noise[k, j] and gain > best:
+                best, row, column = gain, k, j
+    return row, column
+
+
+@njit(cache=True)
+def _told(
+    low: Buffer, high: Buffer, u: Buffer, at: Buffer, gradient: Buffer, noise: Buffer
+) -> bool:
+    """Whether rounding leaves every first input where it is."""
+    for j in range(len(u)):
+        unit = min(-low[j], high[j])
+        if not np.isfinite(unit):
+            unit = abs(u[j])
+        held = at[j] != 0 and at[j] * gradient[j] > noise[j]
+        if not (held or noise[j] <= _TOLERANCE * unit):
+            return False
+    return True
+
+
+def differentiate_plan(
+    plan: Plan, loop: LoopMatrices, dloop: LoopMatrices, S: Array, dbound: Array, dx: Array
+) -> Array:
+    """Return the derivative of the first input along p directions, the bounds that hold kept.
+
+    The stationarity of the free inputs and the recursion of the states are differentiated; what
+    that gives is the same program with other constants, and has the same L and P.
+
+    Parameters
+    ----------
+    dloop : LoopMatrices
+        Directions of plant, gain and metric.
+    dbound : Array
+        Of the bound that each input of the plan holds, (N, m, p); not read at free inputs.
+    dx : Array
+        Of the state (n, p).
+
+    Returns
+    -------
+    Array
+        (m, p).
+    """
+    A, B, K = loop.A, loop.B, loop.K
+    s = np.zeros(dx.shape)
+    for k in range(len(plan.u) - 1, -1, -1):
+        x, u, L, P = plan.x[k], plan.u[k], plan.L[k], plan.P[k + 1]
+        v, costate = u + K @ x, P @ plan.x[k + 1] + plan.q[k + 1]
+        moved = _times(dloop.A, x) + _times(dloop.B, u)
+        pull = S @ _times(dloop.K, x) + _times(dloop.S, v)
+        turned = _times(np.swapaxes(dloop.B, 0, 1), costate)
+        e = np.where(plan.at[k, :, None] != 0, dbound[k], 0.0)
+        free = plan.at[k] == 0
+        wrong = pull + turned + B.T @ (P @ moved + s) + plan.H[k] @ e
+        e[free] = -np.linalg.solve(plan.H[k][np.ix_(free, free)], wrong[free])
+        s = (
+            (K - L).T @ (S @ e + pull)
+            + (A - B @ L).T @ (P @ (B @ e + moved) + s)
+            + _times(np.swapaxes(dloop.K, 0, 1), S @ v)
+            + _times(np.swapaxes(dloop.A, 0, 1), costate)
+            - L.T @ turned
+        )
+    first: Array = e - plan.L[0] @ dx
+    return first
+
+
+def _times(direction: Array, vector: Array) -> Array:
+    """Each of p matrices, the last axis, times a vector."""
+    return np.tensordot(direction, vector, ((1,), (0,)))
