@@ -46,6 +46,8 @@ _DEPENDENT = 1e-9
 _CHECKED = 1e-9
 # Rounding of a row at the answer, relative to the sum of the magnitudes of its terms.
 _ROW_ROUNDING = 1e-14
+# Rounding of v, relative to the same.
+_SUM_ROUNDING = 1e-15
 # Rounding of a slack, relative to the largest term in it. It matters where soft rows are given up:
 # their multipliers are the penalty, a million and more.
 _ROUNDING = 1e-14
@@ -339,6 +341,7 @@ def run(
         np.empty((room, room)),
         np.empty((room, width)),
         np.zeros(width),
+        np.empty(width),
         np.zeros(du.shape[1:]),
     )
     plant_moves = bool(np.any(dloop.A) or np.any(dloop.B) or np.any(dloop.E))
@@ -370,6 +373,7 @@ class _Workspace(NamedTuple):
     factor: Buffer
     basis: Buffer
     v: Buffer
+    rounding: Buffer
     dv0: Buffer
 
 
@@ -412,7 +416,7 @@ def _answer(
             return _INFEASIBLE, False, active
         if code == UNSOLVED:
             return _UNSOLVED, False, -1
-        _recover(rows, lam, v)
+        _recover(rows, lam, work, active)
         soft, near, told = _check(loop.K, rows, lam, work, active, x, unit)
         if not told:
             return _UNSOLVED, False, -1
@@ -440,13 +444,25 @@ def _hold(x: Buffer, dx: Buffer, t: int) -> None:
 
 
 @njit(cache=True)
-def _recover(rows: Rows, lam: Buffer, v: Buffer) -> None:
-    """v = -N' lam."""
+def _recover(rows: Rows, lam: Buffer, work: _Workspace, active: int) -> None:
+    """v = -N' lam, corrected so that the tight rows are tight; what rounding made of v."""
+    slack, free, v, rounding = work.slack, work.free, work.v, work.rounding
     v[:] = 0.0
+    rounding[:] = 0.0
     for r in range(len(lam)):
         if lam[r] != 0.0:
             for i in range(len(v)):
-                v[i] -= lam[r] * rows.N[r, i]
+                part = lam[r] * rows.N[r, i]
+                v[i] -= part
+                rounding[i] += _SUM_ROUNDING * abs(part)
+    # The price of a soft row is a million and more: what is left of v has lost as many digits.
+    column = np.empty(active)
+    for a in range(active):
+        column[a] = slack[free[a]] - _dot(rows.M[free[a]], v)
+    substitute(work.factor, active, column)
+    for a in range(active):
+        for i in range(len(v)):
+            v[i] += column[a] * rows.N[free[a], i]
 
 
 @njit(cache=True)
@@ -487,14 +503,20 @@ def _check(
             return soft, near, False
         # A multiplier moves v by lam N: weak when that is nothing beside the row's bound.
         near |= abs(left) < _WEAK * bound and pulled < _WEAK * bound
-    column = np.empty(active)
+    column, moved = np.empty(active), np.empty(len(v))
     for i in range(m):
         for a in range(active):
             column[a] = rows.N[free[a], i]
         substitute(factor, active, column)
         error, size = 0.0, 0.0
+        moved[:] = 0.0
+        moved[i] = 1.0
         for a in range(active):
             error += abs(column[a]) * wrong[free[a]]
+            for k in range(len(v)):
+                moved[k] -= column[a] * rows.M[free[a], k]
+        for k in range(len(v)):
+            error += abs(moved[k]) * work.rounding[k]
         for j in range(len(x)):
             size += abs(K[i, j] * x[j])
         if not error <= _CHECKED * min(unit[i], abs(v[i]) + size):
