@@ -30,11 +30,10 @@ if TYPE_CHECKING:
 
 __all__ = ["Plan", "differentiate_plan", "solve_saturated"]
 
-# Rounding of a sum, relative to its largest term: the recursion over 60 stages of 8 states has a
-# tenth of it.
-_ROUNDING = 1e-13
+# Rounding of a gradient, relative to the sum of the magnitudes of its terms.
+_ROUNDING = 1e-14
 # What the first input may be uncertain by, relative to its bound.
-_TOLERANCE = 1e-10
+_TOLERANCE = 1e-8
 
 
 class Plan(NamedTuple):
@@ -114,7 +113,16 @@ def _solve(
         u[:] = wanted
         k, j = _released(at, gradient, noise)
         if k < 0:
-            return u, x, at, L, P, q, H, _told(low, high, u[0], at[0], gradient[0], noise[0])
+            energy, curvature = _doubt(A, B, K, S, x0, u, at, H, gradient, noise)
+            open_loop = _open_curvature(A, B, K, S, N)
+            told = True
+            for j in range(m):
+                unit = min(-low[j], high[j])
+                unit = unit if np.isfinite(unit) else abs(u[0, j])
+                pull, round_off = at[0, j] * gradient[0, j] * H[0, j, j], noise[0, j] * H[0, j, j]
+                held = pull > round_off + np.sqrt(open_loop[j, j] * energy)
+                told &= held or np.sqrt(energy * curvature[j]) <= _TOLERANCE * unit
+            return u, x, at, L, P, q, H, told
         at[k, j] = 0
     return u, x, at, L, P, q, H, False
 
@@ -231,18 +239,45 @@ def _released(at: Buffer, gradient: Buffer, noise: Buffer) -> tuple[int, int]:
 
 
 @njit(cache=True)
-def _told(
-    low: Buffer, high: Buffer, u: Buffer, at: Buffer, gradient: Buffer, noise: Buffer
-) -> bool:
-    """Whether rounding leaves every first input where it is."""
-    for j in range(len(u)):
-        unit = min(-low[j], high[j])
-        if not np.isfinite(unit):
-            unit = abs(u[j])
-        held = at[j] != 0 and at[j] * gradient[j] > noise[j]
-        if not (held or noise[j] <= _TOLERANCE * unit):
-            return False
-    return True
+def _doubt(
+    A: Buffer, B: Buffer, K: Buffer, S: Buffer, x0: Buffer, u: Buffer, at: Buffer, H: Buffer,
+    gradient: Buffer, noise: Buffer,
+) -> tuple[float, Buffer]:  # fmt: skip
+    """Twice the cost by which the best plan may be better, and 1 / curvature of each first input.
+
+    Inputs whose multiplier rounding hides are freed without a bound: no choice of those that stay
+    at their bounds can be better than that (docs/theory.md, section 4).
+    """
+    N, m, n = len(u), K.shape[0], K.shape[1]
+    loose = at.copy()
+    for k in range(N):
+        for j in range(m):
+            if at[k, j] != 0 and not at[k, j] * gradient[k, j] > noise[k, j]:
+                loose[k, j] = 0
+    x, L = np.zeros((N + 1, n)), np.zeros((N, m, n))
+    P, q, free_H = np.zeros((N + 1, n, n)), np.zeros((N + 1, n)), np.zeros((N, m, m))
+    best, left, unknown = np.zeros((N, m)), np.zeros((N, m)), np.zeros((N, m))
+    _backward(A, B, K, S, u, loose, L, P, q, free_H, best)
+    _forward(A, B, K, S, x0, loose, L, P, q, free_H, u, best, x, left, unknown)
+    energy = 0.0
+    for k in range(N):
+        for j in range(m):
+            if at[k, j] == 0:
+                energy += H[k, j, j] * noise[k, j] ** 2
+            elif loose[k, j] == 0:
+                pull = (abs(gradient[k, j]) + noise[k, j]) * H[k, j, j]
+                energy += pull * abs(best[k, j] - u[k, j])
+    return energy, np.diag(np.linalg.inv(free_H[0]))
+
+
+@njit(cache=True)
+def _open_curvature(A: Buffer, B: Buffer, K: Buffer, S: Buffer, N: int) -> Buffer:
+    """Second derivative of the cost by the first input alone, (m, m)."""
+    step = K.T @ S @ K
+    P = np.zeros(A.shape)
+    for _ in range(N - 1):
+        P = step + A.T @ P @ A
+    return S + B.T @ P @ B
 
 
 def differentiate_plan(
