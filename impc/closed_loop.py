@@ -56,9 +56,9 @@ class Status(IntEnum):
     """What happened at a sample.
 
     FREE: the gain keeps every bound. ACTIVE: a bound is active. SOFTENED: a soft bound was
-    exceeded. INFEASIBLE: no input sequence keeps the bounds. UNSOLVED: which input is
-    the answer, or whether there is one, could not be told in double precision. DIVERGED: the state left every reasonable range. NOT_REACHED: the simulation
-    ended before.
+    exceeded. INFEASIBLE: it is proved that no input sequence keeps the bounds. UNSOLVED: which
+    input is the answer, or whether there is one, could not be told in double precision. DIVERGED:
+    the state left every reasonable range. NOT_REACHED: the simulation ended before.
     """
 
     FREE = 0

