@@ -179,32 +179,18 @@ def _backward(
 @njit(cache=True)
 def _solve_part(H: Buffer, free: Buffer, right: Buffer) -> bool:
     """Solve with the free rows and columns of H in place; False when they hide each other."""
-    factor = H.copy()
+    left = H.copy()
     for a in free:
+        pivot = left[a, a]
+        if not pivot > _ROUNDING * H[a, a]:  # or not a number
+            return False
+        left[a] /= pivot
+        right[a] /= pivot
         for b in free:
-            if b > a:
-                break
-            for k in free:
-                if k >= b:
-                    break
-                factor[a, b] -= factor[a, k] * factor[b, k]
-            if b < a:
-                factor[a, b] /= factor[b, b]
-            elif factor[a, a] > _ROUNDING * H[a, a]:
-                factor[a, a] = np.sqrt(factor[a, a])
-            else:  # or not a number
-                return False
-    for a in free:
-        for k in free:
-            if k >= a:
-                break
-            right[a] -= factor[a, k] * right[k]
-        right[a] /= factor[a, a]
-    for a in free[::-1]:
-        for k in free:
-            if k > a:
-                right[a] -= factor[k, a] * right[k]
-        right[a] /= factor[a, a]
+            if b != a:
+                share = left[b, a]
+                left[b] -= share * left[a]
+                right[b] -= share * right[a]
     return True
 
 

@@ -90,6 +90,16 @@ def far_start(_: Path) -> None:
     require_complete(controller, simulate(controller, scenario(cart(), x0=[5], steps=3)))
 
 
+def runaway(growth: float, **settings: float) -> None:
+    """A start beyond what the input can stop."""
+    plant = cart(growth)
+    side = settings.pop("x_max", np.inf)
+    bounds = box_bounds(plant, u_min=-0.1, u_max=0.1, x_min=-side, x_max=side)
+    weights, softening = stage_weights(np.eye(1), 1), settings.get("softening")
+    controller = mpc_controller(plant, weights, bounds, 60, terminal_set=False, softening=softening)
+    require_complete(controller, simulate(controller, scenario(plant, x0=[5], steps=400)))
+
+
 def draft_over_a_file(folder: Path) -> str:
     (folder / "a.csv").write_text("t,a\n0,1\n1,2\n")
     return command("inspect", str(folder / "a.csv"), "--out", str(folder / "a.csv"))
@@ -192,6 +202,10 @@ PROVOKED: dict[str, Callable[[Path], object]] = {
         cart(1.0), stage_weights(np.zeros((1, 1)), 1)
     ),
     "no input sequence keeps the bound ...": far_start,
+    "the input could not be told in double precision": lambda _: runaway(
+        2.0, x_max=1.0, softening=50.0
+    ),
+    "the state left every reasonable range": lambda _: runaway(1.1),
     "exclude the origin for ...": lambda _: box_bounds(cart(), u_min=1, u_max=2),
     "exists already; give another name, or remove it": draft_over_a_file,
     "... is a file; give another folder": file_for_a_folder,
