@@ -63,7 +63,7 @@ def proves_infeasible(controller: Controller, rows: Rows, y: Array, x: Array) ->
         bound = _exact(rows.b[used]) @ weights[used]
         p = _exact(np.zeros(plant.n))
         if controller.terminal is not None:
-            p = _exact(controller.terminal.H.T) @ np.where(used, weights, Decimal(0))[ahead]
+            p = _exact(controller.terminal.H.T) @ (used * weights)[ahead]
         total, largest = -bound, abs(bound)
         for k in range(horizon - 1, -1, -1):
             pull = p @ B

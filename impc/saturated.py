@@ -165,9 +165,9 @@ def _backward(
             right[:, -1] = H[k] @ c[k] + constant
             if not _solve_part(H[k], free, right):
                 return False
-            for j in free:
-                L[k, j] = right[j, :-1]
-                c[k, j] = -right[j, -1]
+            for a in free:
+                L[k, a] = right[a, :-1]
+                c[k, a] = -right[a, -1]
         D, F = K - L[k], A - B @ L[k]
         SD = S @ D
         q[k] = SD.T @ c[k] + F.T @ (PB @ c[k] + q[k + 1])

@@ -15,7 +15,7 @@ import scipy.linalg
 
 Exact = Any  # an array of Decimal: numpy has no type for it
 getcontext().prec = 80  # numbers grow by 2^60, their squares by 1e36
-_ZERO = Decimal(0)
+_ZERO: Any = Decimal(0)
 _KEPT = Decimal("1e-12")  # a state on its bound was rounded there: share of the bound
 
 

@@ -183,4 +183,4 @@ def _is_infeasible(case: HardCase, x: np.ndarray) -> bool:
         bounds=[*(list(sides) * controller.horizon), (None, 1.0)],
         method="highs",
     )
-    return answer.status == 2 or -answer.fun <= 1e-7
+    return answer.status == 2 or float(answer.x[-1]) <= 1e-7
