@@ -334,27 +334,32 @@ def run(
     """
     count, width = rows.M.shape
     room = min(count, width) + 1
-    work = _Workspace(
-        np.empty(count),
-        _KEPT * rows.b,
-        np.empty(room, dtype=np.int64),
-        np.empty((room, room)),
-        np.empty((room, width)),
-        np.zeros(width),
-        np.empty(width),
-        np.zeros(du.shape[1:]),
-    )
+    slack, kept = np.empty(count), _KEPT * rows.b
+    v, dv0 = np.zeros(width), np.zeros(du.shape[1:])
+    free, factor = np.empty(room, dtype=np.int64), np.empty((room, room))
+    basis, rounding = np.empty((room, width)), np.empty(width)
+    work = _Workspace(slack, kept, free, factor, basis, v, rounding, dv0)
     plant_moves = bool(np.any(dloop.A) or np.any(dloop.B) or np.any(dloop.E))
     weakly_active = 0
     for t in range(first, len(u)):
         if status[t] > _SOFTENED:
-            status[t], near, row = _answer(
-                loop, dloop, rows, drows, unit, work, x[t], dx[t], u[t], du[t], lam
-            )
-            if status[t] > _SOFTENED:
-                _hold(x, dx, t)
-                return weakly_active, row
+            needs_qp, near = False, False
+            for r in range(count):
+                slack[r] = rows.b[r] - _dot(rows.T[r], x[t])
+                needs_qp |= not slack[r] >= -kept[r]
+                near |= abs(slack[r]) < _WEAK * rows.b[r]
+            v[: u.shape[1]] = 0.0
+            dv0[:] = 0.0
+            status[t] = _FREE
+            if needs_qp:
+                status[t], near, row = _solve(
+                    loop, dloop, rows, drows, unit, work, x[t], dx[t], lam
+                )
+                if status[t] > _SOFTENED:
+                    _hold(x, dx, t)
+                    return weakly_active, row
             weakly_active += near
+            _apply(loop, dloop, v, dv0, x[t], dx[t], u[t], du[t])
         _advance(loop, dloop, plant_moves, disturbance[t], x, dx, u[t], du[t], t)
         size = np.max(np.abs(x[t + 1]))
         if not size < divergence:
@@ -378,7 +383,7 @@ class _Workspace(NamedTuple):
 
 
 @njit(cache=True)
-def _answer(
+def _solve(
     loop: LoopMatrices,
     dloop: LoopMatrices,
     rows: Rows,
@@ -387,45 +392,24 @@ def _answer(
     work: _Workspace,
     x: Buffer,
     dx: Buffer,
-    u: Buffer,
-    du: Buffer,
     lam: Buffer,
 ) -> tuple[int, bool, int]:
-    """Write u and du of one sample; return its status, whether its rows are weak, and a row."""
-    slack, v, dv0 = work.slack, work.v, work.dv0
-    needs_qp, soft, near = False, False, False
-    for r in range(len(slack)):
-        slack[r] = rows.b[r] - _dot(rows.T[r], x)
-        needs_qp |= not slack[r] >= -work.kept[r]
-        near |= abs(slack[r]) < _WEAK * rows.b[r]
-    v[: len(u)] = 0.0
-    dv0[:] = 0.0
-    if needs_qp:
-        code, active = solve_dual(
-            rows.W,
-            rows.gram,
-            slack,
-            rows.limit,
-            work.kept,
-            lam,
-            work.free,
-            work.factor,
-            work.basis,
-        )
-        if code == INCONSISTENT:
-            return _INFEASIBLE, False, active
-        if code == UNSOLVED:
-            return _UNSOLVED, False, -1
-        _recover(rows, lam, work, active)
-        soft, near, told = _check(loop.K, rows, lam, work, active, x, unit)
-        if not told:
-            return _UNSOLVED, False, -1
-        if dx.shape[1]:
-            _differentiate(
-                loop, dloop, rows, drows, lam, work.free, work.factor, active, v, x, dx, dv0
-            )
-    _apply(loop, dloop, v, dv0, x, dx, u, du)
-    return (_SOFTENED if soft else (_ACTIVE if needs_qp else _FREE)), near, -1
+    """Write v and dv0 of one sample; return its status, whether its rows are weak, and a row."""
+    slack, free, factor = work.slack, work.free, work.factor
+    code, active = solve_dual(
+        rows.W, rows.gram, slack, rows.limit, work.kept, lam, free, factor, work.basis
+    )
+    if code == INCONSISTENT:
+        return _INFEASIBLE, False, active
+    if code == UNSOLVED:
+        return _UNSOLVED, False, -1
+    _recover(rows, lam, work, active)
+    soft, near, told = _check(loop.K, rows, lam, work, active, x, unit)
+    if not told:
+        return _UNSOLVED, False, -1
+    if dx.shape[1]:
+        _differentiate(loop, dloop, rows, drows, lam, free, factor, active, work.v, x, dx, work.dv0)
+    return (_SOFTENED if soft else _ACTIVE), near, -1
 
 
 @njit(cache=True, inline="always")

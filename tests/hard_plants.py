@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.optimize import linprog
@@ -176,7 +177,7 @@ def _is_infeasible(case: HardCase, x: np.ndarray) -> bool:
     scale = np.maximum(abs(G).max(axis=1), abs(room))
     count = len(scale)
     sides = zip(controller.bounds.u_min, controller.bounds.u_max, strict=True)
-    answer = linprog(
+    answer: Any = linprog(
         np.r_[np.zeros(width), -1.0],
         A_ub=np.column_stack([(G / scale[:, None]).astype(float), np.ones(count)]),
         b_ub=(room / scale).astype(float),
