@@ -403,8 +403,11 @@ def _solve(
         return _INFEASIBLE, False, active
     if code == UNSOLVED:
         return _UNSOLVED, False, -1
-    _recover(rows, lam, work, active)
+    _recover(rows, lam, work)
     soft, near, told = _check(loop.K, rows, lam, work, active, x, unit)
+    if not told:
+        _tighten(rows, work, active)
+        soft, near, told = _check(loop.K, rows, lam, work, active, x, unit)
     if not told:
         return _UNSOLVED, False, -1
     if dx.shape[1]:
@@ -428,9 +431,9 @@ def _hold(x: Buffer, dx: Buffer, t: int) -> None:
 
 
 @njit(cache=True)
-def _recover(rows: Rows, lam: Buffer, work: _Workspace, active: int) -> None:
-    """v = -N' lam, corrected so that the tight rows are tight; what rounding made of v."""
-    slack, free, v, rounding = work.slack, work.free, work.v, work.rounding
+def _recover(rows: Rows, lam: Buffer, work: _Workspace) -> None:
+    """v = -N' lam, and what rounding made of it."""
+    v, rounding = work.v, work.rounding
     v[:] = 0.0
     rounding[:] = 0.0
     for r in range(len(lam)):
@@ -439,7 +442,15 @@ def _recover(rows: Rows, lam: Buffer, work: _Workspace, active: int) -> None:
                 part = lam[r] * rows.N[r, i]
                 v[i] -= part
                 rounding[i] += _SUM_ROUNDING * abs(part)
-    # The price of a soft row is a million and more: what is left of v has lost as many digits.
+
+
+@njit(cache=True)
+def _tighten(rows: Rows, work: _Workspace, active: int) -> None:
+    """Correct v so that the tight rows are tight.
+
+    The price of a soft row is a million and more: what is left of v has lost as many digits.
+    """
+    slack, free, v = work.slack, work.free, work.v
     column = np.empty(active)
     for a in range(active):
         column[a] = slack[free[a]] - _dot(rows.M[free[a]], v)
