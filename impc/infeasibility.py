@@ -8,7 +8,7 @@ when even the best inputs leave their sum above zero, which no plan that keeps t
 Along x_{k+1} = A x_k + B u_k the sum is p_0'x_0 + sum_k (B'p_{k+1})'u_k less the bounds, with
 p_k = A'p_{k+1} + E'y_k, so each input stands at the bound that its sign asks for. Where y comes
 from does not matter. The Farkas combination of the rows in v = u + Kx is a proof in exact numbers
-only; here the multipliers of its input rows are not used.
+only; here the multipliers of its input rows are not used (docs/theory.md, section 4).
 """
 
 from __future__ import annotations
