@@ -13,7 +13,7 @@ D = K - L and F = A - BL,
 
 sums without a difference in them, so that what the plant does not amplify is not amplified by
 rounding either. Which inputs stand at a bound is found by a primal active-set method (Nocedal and
-Wright, Numerical Optimization, section 16.5): every plan on the way keeps the bounds.
+Wright, Numerical Optimization, section 16.5): every plan on the way keeps the bounds. What is checked: docs/theory.md, section 4.
 """
 
 from __future__ import annotations
@@ -319,7 +319,8 @@ def differentiate_plan(
     """Return the derivative of the first input along p directions, the bounds that hold kept.
 
     The stationarity of the free inputs and the recursion of the states are differentiated; what
-    that gives is the same program with other constants, and has the same L and P.
+    that gives is the same program with other constants, and has the same L and P (docs/theory.md,
+    section 4).
 
     Parameters
     ----------
