@@ -326,6 +326,8 @@ def differentiate_plan(
     ----------
     dloop : LoopMatrices
         Directions of plant, gain and metric.
+    S : Array
+        The metric (m, m).
     dbound : Array
         Of the bound that each input of the plan holds, (N, m, p); not read at free inputs.
     dx : Array
