@@ -13,7 +13,8 @@ D = K - L and F = A - BL,
 
 sums without a difference in them, so that what the plant does not amplify is not amplified by
 rounding either. Which inputs stand at a bound is found by a primal active-set method (Nocedal and
-Wright, Numerical Optimization, section 16.5): every plan on the way keeps the bounds. What is checked: docs/theory.md, section 4.
+Wright, Numerical Optimization, section 16.5): every plan on the way keeps the bounds.
+What is checked: docs/theory.md, section 4.
 """
 
 from __future__ import annotations
