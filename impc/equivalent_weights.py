@@ -116,7 +116,9 @@ def weights_margin(fibre: GainFibre) -> WeightsMargin:
     return WeightsMargin(margin, exist=False, weights=None)
 
 
-def least_condition_weights(fibre: GainFibre) -> EquivalentWeights:
+def least_condition_weights(
+    fibre: GainFibre, member: Weights | None = None
+) -> EquivalentWeights:
     """Return the weights of least condition number that have the gain.
 
     minimise alpha subject to I <= X <= alpha I, X = blkdiag(Q, R) in the fibre.
@@ -126,6 +128,13 @@ def least_condition_weights(fibre: GainFibre) -> EquivalentWeights:
     such program reaches 2e-4 on the seat plant (a condition number of 2e7); from its own answer
     the next reaches 1e-11. As written above it returns twice the least condition number there.
 
+    Parameters
+    ----------
+    fibre : GainFibre
+    member : Weights, optional
+        Weights known to have the gain: where to begin when no program finds any. Weights at the
+        edge of what a program can tell from none (a margin below 1e-9) are found again like this.
+
     Raises
     ------
     WeightsError
@@ -134,7 +143,7 @@ def least_condition_weights(fibre: GainFibre) -> EquivalentWeights:
         When the dual bound stays more than 1e-4 below, or no member is definite to working
         precision in the units of the plant.
     """
-    best = _interior(fibre)
+    best = _interior(fibre, member)
     least, gap, status = condition_number(best), 1.0, ""
     for _ in range(4):
         before = least
@@ -222,8 +231,15 @@ def other_weights(
     return tuple(_member(fibre, fibre.from_natural(X), status, None) for X in chosen[1:])
 
 
-def _interior(fibre: GainFibre) -> Weights:
-    found = weights_margin(fibre)
+def _interior(fibre: GainFibre, member: Weights | None = None) -> Weights:
+    try:
+        found = weights_margin(fibre)
+    except SolverError:
+        if member is None:
+            raise
+        return member
+    if found.weights is None and member is not None:
+        return member
     if found.weights is None:
         raise WeightsError(
             "gain",

@@ -19,13 +19,14 @@ from impc.diagonal_weights import diagonal_weights
 from impc.equivalent_weights import least_condition_weights
 from impc.errors import SolverError, WeightsError
 from impc.evaluation import residual_only
-from impc.gain import GainFit, refine_gain
+from impc.gain import GainFit, fit_gain
 from impc.gain_fibre import gain_fibre, natural_coordinates
 from impc.initial_states import with_fitted_starts
 from impc.inverse_mpc import auxiliary_weights
 from impc.lqr import solve_lqr
 from impc.natural_fit import in_plant_units, inverse_mpc_natural
 from impc.plant import change_coordinates
+from impc.weights_behind import weights_behind
 
 if TYPE_CHECKING:
     from impc.conditioned_fit import ConditionedFit
@@ -89,13 +90,12 @@ def fit_controller(problem: InverseProblem, start: Weights | None = None) -> Fit
     """
     begin = diagonal_weights(problem) if start is None else start
     free = free_gain(problem, begin)
-    if free.explained:
-        try:
-            weights = least_condition_weights(gain_fibre(free.problem.plant, free.K)).weights
-        except WeightsError:
-            pass  # no weights have that gain: the direct form says which come near
-        else:
-            return _finish(free, free.problem, weights, exact=True, converged=True)
+    if free.explained:  # otherwise no weights can have it: the direct form says which come near
+        behind = weights_behind(free)
+        if behind.explained and behind.equivalent is not None:
+            return _finish(
+                behind.gain, free.problem, behind.equivalent.weights, exact=True, converged=True
+            )
     found = inverse_mpc_natural(free.problem, begin, noise_of(free))
     if found.misfit < free.misfit:  # the free gain stands in a local minimum
         free = free_gain(free.problem, found.weights)
@@ -130,7 +130,8 @@ def _again(free: GainFit, begin: Weights, found: ConditionedFit) -> ConditionedF
 def free_gain(problem: InverseProblem, begin: Weights) -> GainFit:
     """The best gain of any kind near that of some weights, with what else the problem lacks."""
     solution = solve_lqr(problem.plant, begin)
-    return refine_gain(problem, np.array(solution.K), np.array(solution.S), spread=_SPREAD)
+    start = np.array(solution.K), np.array(solution.S)
+    return fit_gain(problem, start, attempts=1, regulators=False, spread=_SPREAD)
 
 
 def noise_of(free: GainFit) -> float:

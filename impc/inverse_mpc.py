@@ -17,14 +17,14 @@ from impc.closed_loop import simulate
 from impc.conditioned_fit import ConditionedFit, Objective, Residual, conditioned_fit
 from impc.controller import mpc_controller
 from impc.diagonal_weights import bryson_weights
-from impc.equivalent_weights import gain_fibre, least_condition_weights
-from impc.errors import SolverError, WeightsError
 from impc.evaluation import evaluate
 from impc.gain import GainFit, fit_gain
 from impc.inverse_lqr import inverse_lqr_gradient, inverse_lqr_lmi
 from impc.inverse_problem import scenarios, without_bounds
 from impc.lqr import solve_lqr
 from impc.weights import Weights, condition_number, normalised, stage_weights
+from impc.weights_behind import weights_behind
+from impc.weights_search import search_weights
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from impc.lqr import LqrSolution
     from impc.plant import Plant
     from impc.terminal_set import TerminalSet
+    from impc.weights_behind import WeightsBehind
 
 __all__ = [
     "AUXILIARY_CONDITION_WEIGHT",
@@ -75,9 +76,12 @@ class ReducedFit:
     equivalent : EquivalentWeights or None
         Weights of least condition number with exactly that gain; None when there are none.
     direct : ConditionedFit or None
-        Weights of the direct form, when none have exactly that gain.
+        Weights of the direct form, when none have exactly that gain, or those that do fit worse.
+    explained : bool
+        Whether the constrained controller of these weights reproduces the recordings to 1e-9 of
+        them.
     reason : str
-        Why the direct form was needed; empty when it was not.
+        Why not; empty when it does.
     kept_hard : bool
         Whether the controller found reaches every sample with hard state bounds and terminal set,
         which the search had softened; see `verify_hard`.
@@ -86,6 +90,7 @@ class ReducedFit:
     gain: GainFit
     equivalent: EquivalentWeights | None
     direct: ConditionedFit | None
+    explained: bool
     reason: str
     kept_hard: bool
 
@@ -243,32 +248,28 @@ def inverse_mpc_reduced(
     SolverError
         When the recordings cannot be simulated from any start.
     """
-    first = fit_gain(problem, *starts, attempts=2)
-    equivalent, reason = _least_condition(problem.plant, first)
-    if equivalent is not None and first.explained:
-        return _with_gain(problem, first, equivalent)
+    first = weights_behind(fit_gain(problem, *starts, attempts=2))
+    if first.explained:
+        return _with_gain(problem, first)
     direct = inverse_mpc(
         problem,
         _most_promising(problem),
         condition_weight=condition_weight,
         max_iterations=_DETOUR,
     )
-    end = (np.array(direct.solution.K), np.array(direct.solution.S))
-    second = fit_gain(problem, end, attempts=1)
-    if equivalent is not None and first.misfit <= second.misfit:
-        return _with_gain(problem, first, equivalent)
-    again, _ = _least_condition(problem.plant, second)
-    if again is not None:
-        return _with_gain(problem, second, again)
-    if equivalent is not None:
-        return _with_gain(problem, first, equivalent)
+    end = search_weights(problem, direct.weights).solution
+    second = weights_behind(fit_gain(problem, (np.array(end.K), np.array(end.S)), attempts=1))
+    best = min(first, second, key=lambda item: item.misfit)
+    if best.misfit <= direct.misfit:
+        return _with_gain(problem, best)
     kept = all(run.complete for run in verify_hard(problem, direct.weights))
-    return ReducedFit(first, None, direct, reason, kept)
+    return ReducedFit(first.gain, None, direct, False, first.reason, kept)
 
 
-def _with_gain(problem: InverseProblem, fit: GainFit, equivalent: EquivalentWeights) -> ReducedFit:
-    kept = all(run.complete for run in verify_hard(problem, equivalent.weights))
-    return ReducedFit(fit, equivalent, None, "", kept)
+def _with_gain(problem: InverseProblem, found: WeightsBehind) -> ReducedFit:
+    assert found.equivalent is not None  # its misfit is finite
+    kept = all(run.complete for run in verify_hard(problem, found.equivalent.weights))
+    return ReducedFit(found.gain, found.equivalent, None, found.explained, found.reason, kept)
 
 
 def _most_promising(problem: InverseProblem) -> Weights:
@@ -279,15 +280,6 @@ def _most_promising(problem: InverseProblem) -> Weights:
         return float(np.linalg.norm(evaluate(problem, solution.K, solution.S).residual))
 
     return min(bryson_weights(problem), key=distance)
-
-
-def _least_condition(plant: Plant, fit: GainFit) -> tuple[EquivalentWeights | None, str]:
-    """The weights of least condition number with the fitted gain, or why there are none."""
-    try:
-        fibre = gain_fibre(plant, fit.K, fit.S if fit.metric_determined else None)
-        return least_condition_weights(fibre), ""
-    except (WeightsError, SolverError) as error:  # none, or none that could be certified
-        return None, str(error)
 
 
 def auxiliary_weights(

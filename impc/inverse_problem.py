@@ -38,6 +38,7 @@ __all__ = [
     "inverse_problem",
     "misfit",
     "moved",
+    "recorded_size",
     "scenarios",
     "without_bounds",
 ]
@@ -185,6 +186,12 @@ def controller_for(
 def scenarios(problem: InverseProblem) -> list[Scenario]:
     """What drives each recording."""
     return [Scenario(trial.x0, trial.disturbance[:-1]) for trial in problem.recordings]
+
+
+def recorded_size(problem: InverseProblem) -> float:
+    """2-norm of all recorded outputs, each divided by its scale."""
+    parts = [(trial.outputs / problem.output_scale).ravel() for trial in problem.recordings]
+    return float(np.linalg.norm(np.concatenate(parts)))
 
 
 def misfit(problem: InverseProblem, simulations: list[Simulation]) -> float:

@@ -195,8 +195,7 @@ def _functional(
     if name in entries:
         index = entries.index(name)
         control, state = divmod(index, space.n)
-        mine = slice(control * space.n, (control + 1) * space.n)
-        row[mine] = np.linalg.inv(space.T)[:, state]
+        row[: space.ends[0]] = np.kron(space.G[control], np.linalg.inv(space.T)[:, state])
         value = float(free.K[control, state])
         return row, lambda offset: value + offset
     family = free.problem.family

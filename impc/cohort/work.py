@@ -204,8 +204,9 @@ def _restored(problem: InverseProblem, fit: dict[str, Any]) -> FittedController:
     here = moved(problem, np.array(fit["starts"]), np.array(fit["logarithms"]))
     weights = stage_weights(fit["Q"], fit["R"])
     solution = solve_lqr(here.plant, weights)
+    metrics = solution.S[None]
     free = GainFit(
-        solution.K, solution.S, here, fit["misfit"], False, True, np.zeros(0), False, 0, ()
+        solution.K, solution.S, here, fit["misfit"], False, True, np.zeros(0), metrics, 0, ()
     )
     return FittedController(
         here, free, weights, solution, fit["misfit"], fit["exact"], fit["converged"]
