@@ -116,9 +116,7 @@ def weights_margin(fibre: GainFibre) -> WeightsMargin:
     return WeightsMargin(margin, exist=False, weights=None)
 
 
-def least_condition_weights(
-    fibre: GainFibre, member: Weights | None = None
-) -> EquivalentWeights:
+def least_condition_weights(fibre: GainFibre, member: Weights | None = None) -> EquivalentWeights:
     """Return the weights of least condition number that have the gain.
 
     minimise alpha subject to I <= X <= alpha I, X = blkdiag(Q, R) in the fibre.

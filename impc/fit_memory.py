@@ -168,6 +168,7 @@ def _encode(found: FittedController) -> dict[str, Any]:
         "misfit": found.misfit,
         "exact": found.exact,
         "converged": found.converged,
+        "metrics": found.metrics.tolist(),
         **_nuisance(found.problem),
         "free": {
             "K": free.K.tolist(),
@@ -214,6 +215,7 @@ def _restore(problem: InverseProblem, kept: dict[str, Any]) -> FittedController:
         kept["misfit"],
         kept["exact"],
         kept["converged"],
+        frozen(kept["metrics"]),
     )
 
 

@@ -140,11 +140,11 @@ def fit_recordings(
     progress.done("inverse MPC")
     covariance = _covariance(fitted)
     known = replace(fitted.problem, unknown_start=False, family=None, logarithms=frozen([]))
-    plant, K = known.plant, np.array(fitted.solution.K)
+    plant, K, metrics = known.plant, np.array(fitted.solution.K), np.array(fitted.metrics)
     sizes = _state_sizes(known, fitted)
     with _threads() as pool:
         others = _left_out(pool, problem, settings, progress)
-        whole_set = pool.submit(weights_summary_or_reason, plant, K, sizes)
+        whole_set = pool.submit(weights_summary_or_reason, plant, K, metrics, sizes)
         methods = compare_methods(fitted, progress.done, _preliminary(problem, settings))
         held_out = []
         for index, other in enumerate(others):
@@ -162,7 +162,7 @@ def fit_recordings(
         fitted,
         covariance,
         _parameters(fitted, covariance),
-        intent(plant, K, sizes, fitted.weights),
+        intent(plant, K, metrics, sizes, fitted.weights),
         identifiability(known, fitted.weights),
         certainty,
         tuple(

@@ -10,19 +10,21 @@ natural coordinates (`natural_fit`) takes the weights that fit best (docs/fittin
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from impc.arrays import Array, frozen
 from impc.diagonal_weights import diagonal_weights
 from impc.equivalent_weights import least_condition_weights
 from impc.errors import SolverError, WeightsError
 from impc.evaluation import residual_only
-from impc.gain import GainFit, fit_gain
+from impc.gain import EXPLAINED, GainFit, describe_gain, fit_gain
 from impc.gain_fibre import gain_fibre, natural_coordinates
 from impc.initial_states import with_fitted_starts
 from impc.inverse_mpc import auxiliary_weights
+from impc.inverse_problem import recorded_size
 from impc.lqr import solve_lqr
 from impc.natural_fit import in_plant_units, inverse_mpc_natural
 from impc.plant import change_coordinates
@@ -60,9 +62,12 @@ class FittedController:
     misfit : float
         2-norm of the residual with these weights.
     exact : bool
-        Whether the weights have exactly the free gain.
+        Whether the weights have the free gain, and reproduce the recordings to 1e-9 of them.
     converged : bool
         Whether the search for the weights ended.
+    metrics : Array
+        Basis of the metrics that the recordings do not tell from that of the weights (k, m, m), see
+        `GainFit`.
     """
 
     problem: InverseProblem
@@ -72,6 +77,12 @@ class FittedController:
     misfit: float
     exact: bool
     converged: bool
+    metrics: Array
+
+    @property
+    def explained(self) -> bool:
+        """Whether these weights, simulated, reproduce the recordings to 1e-9 of them."""
+        return self.misfit <= EXPLAINED * recorded_size(self.problem)
 
 
 def fit_controller(problem: InverseProblem, start: Weights | None = None) -> FittedController:
@@ -136,13 +147,16 @@ def free_gain(problem: InverseProblem, begin: Weights) -> GainFit:
 
 def noise_of(free: GainFit) -> float:
     """Misfit of the free gain, at least that of rounding."""
-    outputs = [trial.outputs / free.problem.output_scale for trial in free.problem.recordings]
-    return max(free.misfit, 1e-9 * float(np.linalg.norm(np.concatenate(outputs))))
+    return max(free.misfit, EXPLAINED * recorded_size(free.problem))
 
 
 def _finish(
     free: GainFit, problem: InverseProblem, weights: Weights, *, exact: bool, converged: bool
 ) -> FittedController:
     solution = solve_lqr(problem.plant, weights)
-    misfit = float(np.linalg.norm(residual_only(problem, solution.K, solution.S)))
-    return FittedController(problem, free, weights, solution, misfit, exact, converged)
+    K, S = np.array(solution.K), np.array(solution.S)
+    metrics = frozen(S[None])
+    if problem.plant.m > 1:
+        metrics = describe_gain(replace(free, problem=problem), K, S).metrics
+    misfit = float(np.linalg.norm(residual_only(problem, K, S)))
+    return FittedController(problem, free, weights, solution, misfit, exact, converged, metrics)

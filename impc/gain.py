@@ -158,9 +158,7 @@ def _by_single_steps(
     near, _ = _best_search(steps, [*starts, *regulators[::3]], _STEP_ATTEMPTS, budget, np.inf)
     if near is None:
         return None
-    found, _ = _best_search(
-        problem, [(np.array(near.K), np.array(near.S))], 1, budget, spread
-    )
+    found, _ = _best_search(problem, [(np.array(near.K), np.array(near.S))], 1, budget, spread)
     return found and replace(found, evaluations=found.evaluations + near.evaluations)
 
 

@@ -40,6 +40,7 @@ __all__ = [
     "moved",
     "recorded_size",
     "scenarios",
+    "typical_output",
     "without_bounds",
 ]
 
@@ -107,7 +108,8 @@ def inverse_problem(
     terminal_set, softening, unknown_start, family
         See `InverseProblem`.
     output_scale : array_like, optional
-        (p,), positive; 1 by default.
+        (p,), positive; by default the root-mean-square of each output over all recordings, so
+        that no answer depends on units. An output that is zero throughout counts as the largest.
 
     Raises
     ------
@@ -118,7 +120,8 @@ def inverse_problem(
     if not recordings:
         raise DataError("recordings", "there are none", "give at least one trial")
     p = len(plant.outputs)
-    scale = finite_array("output_scale", np.ones(p) if output_scale is None else output_scale, (p,))
+    given = _root_mean_square(recordings) if output_scale is None else output_scale
+    scale = finite_array("output_scale", given, (p,))
     if np.any(scale <= 0):
         raise InputError("output_scale", f"got {scale.tolist()}", "give positive numbers")
     return InverseProblem(
@@ -133,6 +136,14 @@ def inverse_problem(
         family,
         frozen(np.zeros(0 if family is None else len(family.names))),
     )
+
+
+def _root_mean_square(recordings: tuple[Recording, ...]) -> Array:
+    outputs = np.concatenate([trial.outputs for trial in recordings])
+    largest = np.max(np.abs(outputs), axis=0)
+    unit = np.where(largest > 0, largest, 1.0)  # squares of 1e200 are none
+    size = largest * np.sqrt(np.mean((outputs / unit) ** 2, axis=0))
+    return np.where(size > 0, size, np.max(size) or 1.0)
 
 
 def moved(problem: InverseProblem, starts: Array, logarithms: Array) -> InverseProblem:
@@ -192,6 +203,12 @@ def recorded_size(problem: InverseProblem) -> float:
     """2-norm of all recorded outputs, each divided by its scale."""
     parts = [(trial.outputs / problem.output_scale).ravel() for trial in problem.recordings]
     return float(np.linalg.norm(np.concatenate(parts)))
+
+
+def typical_output(problem: InverseProblem) -> float:
+    """Root-mean-square of all recorded outputs over their scales: 1 at the default scales."""
+    count = sum(trial.outputs.size for trial in problem.recordings)
+    return recorded_size(problem) / float(np.sqrt(count)) or 1.0
 
 
 def misfit(problem: InverseProblem, simulations: list[Simulation]) -> float:

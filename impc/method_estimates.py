@@ -36,6 +36,7 @@ from impc.lqr import is_stable, solve_lqr
 from impc.natural_fit import in_plant_units, inverse_mpc_natural
 from impc.plant import change_coordinates
 from impc.weights import stage_weights
+from impc.weights_behind import weights_behind
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -169,12 +170,9 @@ def _weights(find: Callable[[], Weights], reduced: Estimate, plant: Plant) -> Es
 
 
 def _reduced(begin: _Begin, problem: InverseProblem) -> Estimate:
-    free = free_gain(problem, begin.weights)
-    weights, reason = None, ""
-    try:
-        weights = least_condition_weights(gain_fibre(free.problem.plant, free.K)).weights
-    except WeightsError as error:
-        reason = str(error)
+    behind = weights_behind(free_gain(problem, begin.weights))
+    free, reason = behind.gain, behind.reason
+    weights = None if behind.equivalent is None else behind.equivalent.weights
     starts = frozen([trial.x0 for trial in free.problem.recordings])
     return Estimate(
         free.K, free.S, weights, starts, free.problem.logarithms, noise_of(free), 0.0, reason

@@ -60,8 +60,8 @@ def inverse_mpc_natural(
     ----------
     problem : InverseProblem
     start : Weights
-        Positive definite. Their gain is kept and the weights of least condition number with it, in
-        natural coordinates, are where the search begins.
+        Positive definite. Their gain and metric are kept, and the weights of least condition number
+        with both, in natural coordinates, are where the search begins.
     noise : float
         2-norm of the residual that no weights are asked to explain; positive.
     condition_share : float
@@ -82,10 +82,14 @@ def inverse_mpc_natural(
         When the start has no stabilising solution, or the recordings cannot be simulated with it.
     """
     plant = problem.plant
-    gain = solve_lqr(plant, start).K
-    T, G = natural_coordinates(plant, gain)
+    solution = solve_lqr(plant, start)
+    T, G = natural_coordinates(plant, solution.K)
     natural = change_coordinates(plant, T, G)
-    begin = least_condition_weights(gain_fibre(natural, np.linalg.solve(G, gain @ T))).weights
+    fibre = gain_fibre(natural, np.linalg.solve(G, solution.K @ T), G.T @ solution.S @ G)
+    member = split_blocks(
+        pair_blocks((T.T @ start.Q @ T)[None], (G.T @ start.R @ G)[None])[0], plant.n
+    )
+    begin = least_condition_weights(fibre, member).weights
     share = condition_share / condition_number(begin)
     objective = Objective(_residual(problem, T, G, noise), 1.0, share, squared=True)
     found = conditioned_fit(

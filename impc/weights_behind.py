@@ -4,8 +4,8 @@
                                                                          ->  simulated and compared
 
 With one input the weights of the program reproduce the recordings as the gain does. With several
-the fitted pair (K, S) is that of weights only up to the fit's own error, and a program that is given
-such a pair has no members or far ones. So weights that miss the recordings are refined
+the fitted pair (K, S) is that of weights only up to the fit's own error, and a program that is
+given such a pair has no members or far ones. So weights that miss the recordings are refined
 (`search_weights`), and the program is run again from the pair that they make, which has members to
 the last digit.
 """
@@ -27,7 +27,6 @@ from impc.lqr import solve_lqr
 from impc.weights_search import search_weights
 
 if TYPE_CHECKING:
-    from impc.arrays import Array
     from impc.equivalent_weights import EquivalentWeights
     from impc.gain import GainFit
     from impc.inverse_problem import InverseProblem

@@ -7,8 +7,8 @@ little of S by much. Here (Q, R) themselves move, as
     X = blkdiag(Q, R) = L L'   ->   L exp(D) L',
 
 so that they stay positive definite, and each step is the least-squares one among the D of a
-trust region (Levenberg and Marquardt). Its length does not depend on the units of states and inputs, and what
-the recordings do not tell of the weights stays as it was.
+trust region (Levenberg and Marquardt). Its length does not depend on the units of
+states and inputs, and what the recordings do not tell of the weights stays as it was.
 """
 
 from __future__ import annotations

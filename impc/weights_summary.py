@@ -82,7 +82,7 @@ class WeightsSummary:
 
 
 def summarise_weights(
-    plant: Plant, gain: Array, sizes: Array, ratio: float = RATIO
+    plant: Plant, gain: Array, metrics: Array, sizes: Array, ratio: float = RATIO
 ) -> WeightsSummary:
     """Run the programs over the set of weights of a gain.
 
@@ -91,6 +91,8 @@ def summarise_weights(
     plant : Plant
     gain : Array
         K (m, n).
+    metrics : Array
+        Basis of the metrics that the recordings do not tell apart (k, m, m), see `GainFit`.
     sizes : Array
         Typical size of each state (n,), positive, in its unit.
     ratio : float
@@ -101,7 +103,7 @@ def summarise_weights(
     WeightsError, SolverError
         When no weights have the gain, or a program fails.
     """
-    found = weights_set(gain_fibre(plant, gain), ratio)
+    found = weights_set(gain_fibre(plant, gain, metrics), ratio)
     named = _shown(plant, found.least.weights, sizes)
     names = tuple(plant.states[index] for index in named)
     ranges = entry_ranges(found, named)
@@ -129,7 +131,7 @@ def summarise_weights(
 
 
 def weights_summary_or_reason(
-    plant: Plant, gain: Array, sizes: Array
+    plant: Plant, gain: Array, metrics: Array, sizes: Array
 ) -> tuple[WeightsSummary | None, str]:
     """The summary, or None and why there is none.
 
@@ -137,11 +139,13 @@ def weights_summary_or_reason(
     ----------
     gain : Array
         K (m, n).
+    metrics : Array
+        (k, m, m), as above.
     sizes : Array
         Typical excursions of the states (n,), in their units.
     """
     try:
-        return summarise_weights(plant, gain, sizes), ""
+        return summarise_weights(plant, gain, metrics, sizes), ""
     except (WeightsError, SolverError) as error:
         return None, str(error)
 

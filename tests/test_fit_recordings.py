@@ -121,7 +121,9 @@ def test_intent_of_known_weights() -> None:
     """The double integrator with Q = I: the least condition number is 1, whatever v is."""
     plant = as_plant(control.ss([[1, 1], [0, 1]], [[0.5], [1]], np.eye(2), 0, True))
     weights = stage_weights(np.diag([4.0, 1.0]), 1)
-    found = intent(plant, np.array(solve_lqr(plant, weights).K), np.ones(2), weights)
+    found = intent(
+        plant, np.array(solve_lqr(plant, weights).K), np.ones((1, 1, 1)), np.ones(2), weights
+    )
     np.testing.assert_allclose(found.reported.eigenvalues, [1, 4], rtol=1e-5)
     np.testing.assert_allclose(found.reported.dominant, [1, 0], atol=1e-4)
     sentence = dominant_sentence(found.reported, plant, np.array([1.0, 3.0]))

@@ -132,7 +132,7 @@ def _described(
     sizes = np.sqrt(np.mean(np.concatenate([run.x for run in fit.runs]) ** 2, axis=0))
     moving = sizes[sizes > 0]
     sizes = np.maximum(sizes, np.min(moving) if len(moving) else 1.0)
-    readings = intent(plant, K, sizes, fitted.weights)
+    readings = intent(plant, K, np.array(fitted.metrics), sizes, fitted.weights)
     parameters = {}
     if fitted.problem.family is not None:
         family = fitted.problem.family
@@ -209,7 +209,7 @@ def _restored(problem: InverseProblem, fit: dict[str, Any]) -> FittedController:
         solution.K, solution.S, here, fit["misfit"], False, True, np.zeros(0), metrics, 0, ()
     )
     return FittedController(
-        here, free, weights, solution, fit["misfit"], fit["exact"], fit["converged"]
+        here, free, weights, solution, fit["misfit"], fit["exact"], fit["converged"], metrics
     )
 
 
