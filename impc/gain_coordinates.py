@@ -194,8 +194,11 @@ class Coordinates:
             parts.append(found.dS.reshape(-1, self.m**2) @ self._metric_chain(z))
         width = int(self.ends[-1])
         rows, row = [], 0
-        for index, trial in enumerate(self.problem.recordings):
-            mine = slice(row, row + trial.outputs.size)
+        sizes = [trial.outputs.size for trial in self.problem.recordings]
+        if not self.problem.unknown_start:  # no column belongs to one trial: all are one block
+            sizes = [sum(sizes)]
+        for index, size in enumerate(sizes):
+            mine = slice(row, row + size)
             row = mine.stop
             blocks = [part[mine] for part in parts]
             blocks += [found.dx0[mine] @ self.start_unit] if found.dx0.shape[1] else []

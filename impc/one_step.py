@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 __all__ = ["follows_plant", "one_step"]
 
 # Samples looked at, evenly spread: a search takes their number times 0.1 ms an evaluation.
-_MOST = 400
+_MOST = 150
 # Of the states: noise that a laboratory would call none is above, rounding in files is below.
 _FOLLOWS = 1e-6
 
