@@ -25,6 +25,7 @@ from impc.errors import SolverError, WeightsError
 from impc.evaluation import Evaluation, evaluate, misfit_or_reason, unusable
 from impc.inverse_problem import controller_for, scenarios
 from impc.lqr import LqrSolution, gain_gradients, solve_lqr
+from impc.one_step import one_step
 from impc.weights import Weights, stage_weights
 
 if TYPE_CHECKING:
@@ -56,6 +57,9 @@ def bryson_weights(problem: InverseProblem) -> list[Weights]:
 def diagonal_weights(problem: InverseProblem, *, max_evaluations: int = 15) -> Weights:
     """Fit the prices of the states, at given initial states, plant and R = I.
 
+    Where no regulator of `bryson_weights` can be simulated to the end, sample by sample
+    (`one_step`).
+
     `max_evaluations` bounds the number of simulations of all trials.
 
     Raises
@@ -64,7 +68,12 @@ def diagonal_weights(problem: InverseProblem, *, max_evaluations: int = 15) -> W
         When none of `bryson_weights` can be simulated, or nothing moves in the simulation.
     """
     known = replace(problem, unknown_start=False, family=None, logarithms=frozen([]))
-    search = _Prices(known, *_best(known))
+    try:
+        best = _best(known)
+    except SolverError:  # every one diverges, which takes more than a step
+        known = one_step(known)
+        best = _best(known)
+    search = _Prices(known, *best)
     start = search.start
     noise = float(np.linalg.norm(search.at(start).residual)) / np.sqrt(search.samples)
     weight = noise / _SPREAD

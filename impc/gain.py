@@ -19,15 +19,19 @@ from impc.diagonal_weights import bryson_weights
 from impc.errors import DataError, SolverError, WeightsError
 from impc.evaluation import misfit_or_reason
 from impc.gain_coordinates import Coordinates
+from impc.gain_fibre import natural_coordinates
 from impc.inverse_kkt import inverse_kkt
 from impc.inverse_problem import moved, recorded_size
 from impc.lqr import is_stable, solve_lqr
-from impc.one_step import follows_plant, one_step
+from impc.one_step import follows_plant, one_step, regressed_gain
+from impc.weights import stage_weights
+from impc.weights_search import search_weights
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from impc.inverse_problem import InverseProblem
+    from impc.weights import Weights
 
 __all__ = ["EXPLAINED", "GainFit", "bryson_starts", "describe_gain", "fit_gain", "refine_gain"]
 
@@ -38,6 +42,8 @@ _TOLD = 1e-8
 _ROUNDS = 8
 # Searches step by step: of 20 random problems that needed them the fourth helped one.
 _STEP_ATTEMPTS = 4
+# Evaluations of a search for weights step by step: its valleys took up to 200.
+_LONGEST = 300
 # A round of a noisy search ends when the misfit falls by less than 1e-6 of itself; the rounds end
 # when one lowers it by less than 1e-3: the noise is then known to that.
 _NOISY_TOLERANCE, _SETTLED = 1e-6, 1e-3
@@ -149,17 +155,54 @@ def _by_single_steps(
 ) -> GainFit | None:
     """A search from the gain that fits each step of the recordings by itself (`one_step`)."""
     steps = one_step(problem)
-    regulators = bryson_starts(problem)
+    regulators = bryson_weights(problem)[::3]
+    pairs = [_pair(problem, weights) for weights in regulators]
     try:
-        solution = solve_lqr(problem.plant, inverse_kkt(problem, regulators[0][0]))
-        starts = [*starts, (np.array(solution.K), np.array(solution.S))]
+        regulators.append(inverse_kkt(problem, pairs[0][0]))
+        pairs.append(_pair(problem, regulators[-1]))
     except (WeightsError, SolverError, DataError):  # one start less
         pass
-    near, _ = _best_search(steps, [*starts, *regulators[::3]], _STEP_ATTEMPTS, budget, np.inf)
+    given = [*starts, *pairs]
+    gain = regressed_gain(problem)
+    if gain is not None:
+        given += [(gain, S) for _, S in given]
+    near, _ = _best_search(steps, given, _STEP_ATTEMPTS, 2 * budget, np.inf)
     if near is None:
         return None
-    found, _ = _best_search(problem, [(np.array(near.K), np.array(near.S))], 1, budget, spread)
-    return found and replace(found, evaluations=found.evaluations + near.evaluations)
+    end, spent = (np.array(near.K), np.array(near.S)), near.evaluations
+    if not near.explained:
+        found, more = _weights_by_steps(steps, [_round(problem, pairs[1][0]), *regulators[::-1]])
+        spent += more
+        end = found if found is not None else end
+    fit, _ = _best_search(problem, [end], 1, 2 * budget, spread)
+    return fit and replace(fit, evaluations=fit.evaluations + spent)
+
+
+def _round(problem: InverseProblem, gain: Array) -> Weights:
+    """The weights that are I in the natural coordinates of a gain (m, n)."""
+    T, G = (np.linalg.inv(item) for item in natural_coordinates(problem.plant, gain))
+    return stage_weights(T.T @ T, G.T @ G)
+
+
+def _pair(problem: InverseProblem, weights: Weights) -> tuple[Array, Array]:
+    solution = solve_lqr(problem.plant, weights)
+    return np.array(solution.K), np.array(solution.S)
+
+
+def _weights_by_steps(
+    steps: InverseProblem, starts: list[Weights]
+) -> tuple[tuple[Array, Array] | None, int]:
+    """Gain and metric of weights that explain each step, if a search finds any; evaluations."""
+    spent, enough = 0, EXPLAINED * recorded_size(steps)
+    for weights in starts:
+        try:
+            found = search_weights(steps, weights, max_evaluations=_LONGEST)
+        except (WeightsError, SolverError):  # one start less
+            continue
+        spent += found.evaluations
+        if found.misfit <= enough:
+            return (np.array(found.solution.K), np.array(found.solution.S)), spent
+    return None, spent
 
 
 def _best_search(
@@ -225,8 +268,7 @@ def describe_gain(fit: GainFit, gain: Array, metric: Array) -> GainFit:
 
 def bryson_starts(problem: InverseProblem) -> list[tuple[Array, Array]]:
     """Gains (m, n) and metrics (m, m) of the regulators of `bryson_weights`."""
-    solutions = [solve_lqr(problem.plant, weights) for weights in bryson_weights(problem)]
-    return [(np.array(item.K), np.array(item.S)) for item in solutions]
+    return [_pair(problem, weights) for weights in bryson_weights(problem)]
 
 
 def _rank(
