@@ -15,7 +15,7 @@ import scipy.linalg
 import scipy.optimize
 
 from impc.arrays import Array, frozen
-from impc.diagonal_weights import bryson_weights
+from impc.diagonal_weights import bryson_regulators
 from impc.errors import DataError, SolverError, WeightsError
 from impc.evaluation import misfit_or_reason
 from impc.gain_coordinates import Coordinates
@@ -155,7 +155,7 @@ def _by_single_steps(
 ) -> GainFit | None:
     """A search from the gain that fits each step of the recordings by itself (`one_step`)."""
     steps = one_step(problem)
-    regulators = bryson_weights(problem)[::3]
+    regulators = [weights for weights, _ in bryson_regulators(problem)[::3]]
     pairs = [_pair(problem, weights) for weights in regulators]
     try:
         regulators.append(inverse_kkt(problem, pairs[0][0]))
@@ -268,7 +268,7 @@ def describe_gain(fit: GainFit, gain: Array, metric: Array) -> GainFit:
 
 def bryson_starts(problem: InverseProblem) -> list[tuple[Array, Array]]:
     """Gains (m, n) and metrics (m, m) of the regulators of `bryson_weights`."""
-    return [_pair(problem, weights) for weights in bryson_weights(problem)]
+    return [(np.array(item.K), np.array(item.S)) for _, item in bryson_regulators(problem)]
 
 
 def _rank(

@@ -16,7 +16,7 @@ from impc.arrays import Array
 from impc.closed_loop import simulate
 from impc.conditioned_fit import ConditionedFit, Objective, Residual, conditioned_fit
 from impc.controller import mpc_controller
-from impc.diagonal_weights import bryson_weights
+from impc.diagonal_weights import bryson_regulators
 from impc.evaluation import evaluate
 from impc.gain import EXPLAINED, GainFit, fit_gain
 from impc.inverse_lqr import inverse_lqr_gradient, inverse_lqr_lmi
@@ -329,11 +329,10 @@ def _with_gain(problem: InverseProblem, found: WeightsBehind) -> ReducedFit:
 def _most_promising(problem: InverseProblem) -> Weights:
     """Of `bryson_weights` those with the least misfit, whether or not every sample is reached."""
 
-    def distance(weights: Weights) -> float:
-        solution = solve_lqr(problem.plant, weights)
+    def distance(solution: LqrSolution) -> float:
         return float(np.linalg.norm(evaluate(problem, solution.K, solution.S).residual))
 
-    return min(bryson_weights(problem), key=distance)
+    return min(bryson_regulators(problem), key=lambda item: distance(item[1]))[0]
 
 
 def auxiliary_weights(
