@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,7 +15,7 @@ from impc.equivalent_weights import least_condition_weights, other_weights
 from impc.errors import ImpcError
 from impc.fitted_controller import fit_controller
 from impc.gain import fit_gain
-from impc.gain_fibre import gain_fibre
+from impc.gain_fibre import gain_fibre, natural_coordinates
 from impc.inverse_mpc import infer_weights, inverse_mpc_reduced
 from impc.inverse_problem import InverseProblem, inverse_problem
 from impc.lqr import solve_lqr
@@ -193,3 +194,20 @@ def test_weights_at_the_edge_of_those_that_a_program_finds() -> None:
     fibre = gain_fibre(plant, solution.K, solution.S)
     found = least_condition_weights(fibre, thin)
     assert found.gain_error < 1e-8
+
+
+def test_a_noisy_fit_stays_where_it_ended() -> None:
+    """Weak directions: begun at its own answer the gain moved by 2 % of the command's unit."""
+    _, clean = random_problem(1, 2)
+    (trial,) = clean.recordings
+    scale = np.asarray(clean.output_scale)
+    noise = 0.15 * scale * np.random.default_rng(1).standard_normal(trial.outputs.shape)
+    noisy = recording(clean.plant, trial.outputs + noise, trial.disturbance, trial.x0)
+    problem = replace(clean, recordings=(noisy,))
+    found = fit_controller(problem)
+    again = fit_controller(problem, found.weights)
+    T, G = natural_coordinates(clean.plant, np.array(found.solution.K))
+    moved = np.linalg.solve(G, (again.solution.K - found.solution.K) @ T)
+    assert found.converged
+    assert not found.explained
+    assert np.linalg.norm(moved) < 2e-3
