@@ -131,7 +131,7 @@ def test_metric_is_kept_along_what_is_told_of_it(m: int, seed: int) -> None:
     """Some of S is not told: weights that share what is told behave alike, others do not."""
     controller, problem = random_problem(seed, m)
     plant = problem.plant
-    fit = fit_gain(problem, (np.array(controller.K), np.array(controller.metric)), attempts=1)
+    fit = fit_gain(problem, (np.array(controller.K), np.array(controller.S)), attempts=1)
     assert fit.explained
     assert not fit.metric_determined
     assert 1 < len(fit.metrics) < m * (m + 1) // 2
@@ -157,7 +157,7 @@ def test_fibre_of_a_metric_in_a_span() -> None:
     """Every member's R + B'PB is in the span, and the span of all metrics asks nothing."""
     controller, problem = random_problem(2, 3)
     plant = problem.plant
-    metric = np.array(controller.metric)
+    metric = np.array(controller.S)
     other = np.diag([1.0, 0.0, 0.0])
     fibre = gain_fibre(plant, controller.K, np.array([metric, other]))
     span = np.array([metric.ravel(), other.ravel()]).T
@@ -171,7 +171,7 @@ def test_fibre_of_a_metric_in_a_span() -> None:
 
 
 def test_search_for_weights_ends_at_weights_that_explain() -> None:
-    controller, problem = random_problem(3, 2)
+    controller, problem = random_problem(1, 2)
     weights = least_condition_weights(gain_fibre(problem.plant, controller.K)).weights
     assert missed(problem, weights) > 1e-3
     found = search_weights(problem, weights)
@@ -197,8 +197,8 @@ def test_weights_at_the_edge_of_those_that_a_program_finds() -> None:
 
 
 def test_a_noisy_fit_stays_where_it_ended() -> None:
-    """Weak directions: begun at its own answer the gain moved by 2 % of the command's unit."""
-    _, clean = random_problem(1, 2)
+    """Begun at its own answer the gain moved by a fifth of its error along weak directions."""
+    controller, clean = random_problem(1, 2)
     (trial,) = clean.recordings
     scale = np.asarray(clean.output_scale)
     noise = 0.15 * scale * np.random.default_rng(1).standard_normal(trial.outputs.shape)
@@ -206,8 +206,11 @@ def test_a_noisy_fit_stays_where_it_ended() -> None:
     problem = replace(clean, recordings=(noisy,))
     found = fit_controller(problem)
     again = fit_controller(problem, found.weights)
-    T, G = natural_coordinates(clean.plant, np.array(found.solution.K))
-    moved = np.linalg.solve(G, (again.solution.K - found.solution.K) @ T)
+    T, G = natural_coordinates(clean.plant, np.array(controller.K))
+    moved, error = (
+        float(np.linalg.norm(np.linalg.solve(G, difference @ T)))
+        for difference in (again.solution.K - found.solution.K, found.free.K - controller.K)
+    )
     assert found.converged
     assert not found.explained
-    assert np.linalg.norm(moved) < 2e-3
+    assert moved < 0.1 * error
