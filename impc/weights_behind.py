@@ -1,5 +1,7 @@
 """Weights behind a fitted gain, judged by what they do: the second half of the reduced form.
 
+See docs/theory.md, section 6, and docs/fitting.md for several inputs.
+
     all weights with the gain and, along what is told of it, the metric  ->  least condition number
                                                                          ->  simulated and compared
 
