@@ -224,12 +224,10 @@ def _lyapunov(plant: Plant, F: Array, stack: Array) -> Array:
 
 def _add_metric(conditions: Array, S: Array, G: Array, metric: ArrayLike) -> Array:
     """Rows that keep S (k, m, m), natural, in the span of the given metrics."""
-    given = [symmetric_matrix("metric", item, len(G)) for item in _stack(metric)]
+    stack = np.asarray(metric, dtype=np.float64)
+    stack = stack[None] if stack.ndim == 2 else stack
+    given = [symmetric_matrix("metric", item, len(G)) for item in stack]
     spanned = np.array([(G.T @ item @ G).ravel() for item in given]).T
     basis, _ = np.linalg.qr(spanned / np.linalg.norm(spanned, axis=0))
     flat = S.reshape(len(S), -1)
     return np.hstack([conditions, flat - flat @ basis @ basis.T])
-
-
-def _stack(metric: ArrayLike) -> ArrayLike:
-    return np.asarray(metric)[None] if np.ndim(metric) == 2 else metric  # type: ignore[return-value]

@@ -118,4 +118,7 @@ def _recorded_states(problem: InverseProblem) -> list[Array] | None:
     C = problem.plant.C
     if C.shape[0] != C.shape[1] or np.linalg.matrix_rank(C) < len(C):
         return None
-    return [np.linalg.solve(C, trial.outputs.T).T for trial in problem.recordings]
+    return [
+        np.asarray(np.linalg.solve(C, trial.outputs.T).T, dtype=np.float64)
+        for trial in problem.recordings
+    ]
