@@ -139,9 +139,7 @@ def fit_condition(condition: Condition) -> ConditionResult:
     ]
     outside = [left_out_vaf(condition, index) for index in range(count)]
     solution = fitted.solution
-    covariance = gain_covariance(
-        replace(fitted.free, K=solution.K, S=solution.S, problem=fitted.problem)
-    )
+    covariance = gain_covariance(fitted.problem, np.array(solution.K), np.array(solution.S))
     plant = fitted.problem.plant
     found = weights_set(gain_fibre(plant, solution.K), _RATIO)
     of_error = np.zeros((plant.n + 1, plant.n + 1))

@@ -25,7 +25,7 @@ from impc.errors import DataError, SolverError
 from impc.fit_result import FitResult, FittedParameter
 from impc.fit_settings import FitSettings, fit_bounds
 from impc.fitted_controller import FittedController, fit_controller
-from impc.gain_covariance import gain_covariance
+from impc.gain_estimate import gain_estimate
 from impc.held_out import predict
 from impc.identifiability import identifiability
 from impc.intent import intent
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from impc.bootstrap import Replicate
-    from impc.gain_covariance import GainCovariance
+    from impc.gain_estimate import GainEstimate
     from impc.plant import Plant
     from impc.plant_family import PlantFamily
     from impc.recording import Recording
@@ -138,7 +138,7 @@ def fit_recordings(
     started = time.perf_counter()
     fitted = progress.controller("fit", problem)
     progress.done("inverse MPC")
-    covariance = _covariance(fitted)
+    estimate = gain_estimate(fitted)
     known = replace(fitted.problem, unknown_start=False, family=None, logarithms=frozen([]))
     plant, K = known.plant, np.array(fitted.solution.K)
     sizes = _state_sizes(known, fitted)
@@ -154,14 +154,14 @@ def fit_recordings(
         progress.done("set of weights")
     runs, bounds = methods[-1].runs, problem.bounds
     certainty = assess(
-        problem, fitted, covariance, weights_found, settings, progress.done, progress.replicate
+        problem, fitted, estimate, weights_found, settings, progress.done, progress.replicate
     )
     return FitResult(
         settings,
         problem,
         fitted,
-        covariance,
-        _parameters(fitted, covariance),
+        estimate,
+        _parameters(estimate),
         intent(plant, K, sizes, fitted.weights),
         identifiability(known, fitted.weights),
         certainty,
@@ -225,26 +225,18 @@ def _without(index: int) -> str:
     return f"without trial {index + 1}"
 
 
-def _covariance(fitted: FittedController) -> GainCovariance:
-    """At the gain of the weights, which is the one that is reported."""
-    solution = fitted.solution
-    reported = replace(
-        fitted.free, K=frozen(solution.K), S=frozen(solution.S), problem=fitted.problem
-    )
-    return gain_covariance(reported)
-
-
-def _parameters(
-    fitted: FittedController, covariance: GainCovariance
-) -> tuple[FittedParameter, ...]:
-    family = fitted.problem.family
+def _parameters(estimate: GainEstimate) -> tuple[FittedParameter, ...]:
+    family = estimate.problem.family
     if family is None:
         return ()
-    values = family.nominal * np.exp(fitted.problem.logarithms)
     return tuple(
         FittedParameter(name, float(nominal), float(value), float(value * deviation))
         for name, nominal, value, deviation in zip(
-            family.names, family.nominal, values, covariance.parameters, strict=True
+            family.names,
+            family.nominal,
+            estimate.parameters,
+            estimate.covariance.parameters,
+            strict=True,
         )
     )
 

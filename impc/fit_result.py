@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from impc.certainty import Certainty
     from impc.fit_settings import FitSettings
     from impc.fitted_controller import FittedController
-    from impc.gain_covariance import GainCovariance
+    from impc.gain_estimate import GainEstimate
     from impc.held_out import HeldOut
     from impc.identifiability import Identifiability
     from impc.intent import Intent
@@ -53,9 +53,9 @@ class FitResult:
     given : InverseProblem
         The problem as it was posed: nominal plant, trials at rest.
     fitted : FittedController
-        Weights and gain; `fitted.problem` holds the initial states and the plant found.
-    covariance : GainCovariance
-        How far the gain is determined.
+        Weights and their gain; `fitted.problem` holds the initial states and the plant found.
+    estimate : GainEstimate
+        The gain that the recordings tell, and how far: what is printed with intervals.
     parameters : tuple of FittedParameter
     intent : Intent
     identifiability : Identifiability
@@ -78,7 +78,7 @@ class FitResult:
     settings: FitSettings
     given: InverseProblem
     fitted: FittedController
-    covariance: GainCovariance
+    estimate: GainEstimate
     parameters: tuple[FittedParameter, ...]
     intent: Intent
     identifiability: Identifiability

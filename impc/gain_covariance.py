@@ -9,8 +9,9 @@ J_t being the derivative of the outputs at sample t with respect to everything t
 the middle as `residual_noise` estimates it from the residuals. With white noise it is the
 Cramér-Rao bound.
 
-The prior of a search (`fit_gain`) is left out: the result says what the recordings determine, and
-in a direction that they hardly do it is wide.
+Beside the gain everything else that was fitted is unknown: initial states, physical parameters
+and, for several inputs, the metric S. The prior of a search (`fit_gain`) is left out: the result
+says what the recordings determine, and in a direction that they hardly do it is wide.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.arrays import Array, frozen
+from impc.arrays import Array, BoolArray, frozen
 from impc.evaluation import evaluate
 from impc.gain_fibre import natural_coordinates
 from impc.residual_noise import ResidualNoise, residual_noise, spread_of_sum
@@ -28,13 +29,19 @@ from impc.residual_noise import ResidualNoise, residual_noise, spread_of_sum
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from impc.gain import GainFit
+    from impc.evaluation import Evaluation
     from impc.inverse_problem import InverseProblem
 
-__all__ = ["DETERMINED", "GainCovariance", "gain_covariance"]
+__all__ = ["DETERMINED", "FOREIGN", "TOLD", "GainCovariance", "gain_covariance"]
 
 #: A direction whose singular value is below this, of the largest, is not determined at all.
 DETERMINED = 1e-6
+#: A direction with a larger deviation, of the natural size of a gain, is not told: there the prior
+#: of a search and the curvature of the problem count beside the recordings.
+TOLD = 0.2
+#: An entry is told by itself when what is not told could move it by less than this share of its
+#: deviation, were it wrong by the natural size of a gain: the interval then covers 94.3 % for 95 %.
+FOREIGN = 0.25
 
 
 @dataclass(frozen=True)
@@ -59,6 +66,9 @@ class GainCovariance:
     entries : Array
         Standard deviation of each entry of K (m, n), in its unit; infinite when a direction
         without a value takes part in it.
+    foreign : Array
+        What the directions that are not told could move each entry by, were they wrong by the
+        natural size of a gain, over its deviation by those that are (m, n).
     parameters : Array
         Standard deviation of the logarithm of each physical parameter (k,).
     noise : ResidualNoise
@@ -70,30 +80,46 @@ class GainCovariance:
     directions: Array
     deviations: Array
     entries: Array
+    foreign: Array
     parameters: Array
     noise: ResidualNoise
 
+    @property
+    def told(self) -> BoolArray:
+        """Which directions the recordings tell (m * n,)."""
+        return np.asarray(self.deviations < TOLD)
+
+    @property
+    def told_entries(self) -> BoolArray:
+        """Which entries of K they tell by themselves, not only together with others (m, n)."""
+        return np.asarray(self.foreign < FOREIGN)
+
 
 def gain_covariance(
-    fit: GainFit, noise: Callable[[list[Array], int], ResidualNoise] = residual_noise
+    problem: InverseProblem,
+    gain: Array,
+    metric: Array,
+    noise: Callable[[list[Array], int], ResidualNoise] = residual_noise,
 ) -> GainCovariance:
-    """Covariance of a fitted gain, and of the parameters fitted with it.
+    """Covariance of a gain fitted by least squares, and of the parameters fitted with it.
 
     Parameters
     ----------
-    fit : GainFit
+    problem : InverseProblem
+        At the initial states and the parameters that were found.
+    gain, metric : Array
+        K (m, n) and S (m, m) that were found.
     noise : callable
         How the noise is estimated from the residuals, (samples, p) for each trial, and the count
         of numbers fitted: `residual_noise`, or `white_noise` for the plain
         Cramér-Rao bound.
     """
-    problem = fit.problem
     m, n = problem.plant.m, problem.plant.n
-    T, _ = natural_coordinates(problem.plant, fit.K)
-    found = evaluate(problem, fit.K, fit.S)
+    T, _ = natural_coordinates(problem.plant, gain)
+    found = evaluate(problem, gain, metric)
     on_gain = found.dK.reshape(-1, m * n) @ np.kron(np.eye(m), np.linalg.inv(T).T)
-    nuisance = _nuisance(problem, found.dx0, found.dparameters)
-    # What initial states and parameters can explain is taken out of the gain's columns; the gain's
+    nuisance = _nuisance(problem, found)
+    # What the rest can explain is taken out of the gain's columns; the gain's
     # block of the inverse of H is that of what is left.
     left = _orthogonal(nuisance)
     seen = on_gain - left @ (left.T @ on_gain)
@@ -107,20 +133,34 @@ def gain_covariance(
     deviations = np.full(m * n, np.inf)
     deviations[usable] = np.sqrt(np.maximum(np.diag(spread), 0.0))
     back = np.kron(np.eye(m), np.linalg.inv(T).T) @ directions.T
-    variances = np.einsum("ij,jk,ik->i", back[:, usable], spread, back[:, usable])
-    entries = np.sqrt(np.maximum(variances, 0.0))
-    # An entry that shares as much as rounding does with a direction that has no value has none.
-    share = np.linalg.norm(back[:, ~usable], axis=1) / np.linalg.norm(back, axis=1)
-    entries[share > 1e-6] = np.inf
+    entries, foreign = _entries(back, deviations, spread)
     return GainCovariance(
         frozen(T),
         frozen(values),
         frozen(directions),
         frozen(deviations),
         frozen(entries.reshape(m, n)),
+        frozen(foreign.reshape(m, n)),
         frozen(_parameter_deviations(problem, on_gain, nuisance, colour)),
         colour,
     )
+
+
+def _entries(back: Array, deviations: Array, spread: Array) -> tuple[Array, Array]:
+    """Deviations of the entries, and the share in each of what is not told.
+
+    `back` turns steps along the directions into entries, one direction a column.
+    """
+    usable, told = np.isfinite(deviations), deviations < TOLD
+    own = spread[np.ix_(told[usable], told[usable])]
+    by_itself = np.sqrt(np.maximum(np.diag(back[:, told] @ own @ back[:, told].T), 0.0))
+    untold = np.linalg.norm(back[:, ~told], axis=1)
+    foreign = np.divide(untold, by_itself, out=np.full(len(back), np.inf), where=by_itself > 0)
+    whole = np.sqrt(np.maximum(np.diag(back[:, usable] @ spread @ back[:, usable].T), 0.0))
+    # An entry that shares as much as rounding does with a direction that has no value has none.
+    lost = np.linalg.norm(back[:, ~usable], axis=1) / np.linalg.norm(back, axis=1)
+    whole[lost > 1e-6] = np.inf
+    return np.where(foreign < FOREIGN, by_itself, whole), foreign
 
 
 def _by_trial(problem: InverseProblem, rows: Array) -> list[Array]:
@@ -133,16 +173,17 @@ def _by_trial(problem: InverseProblem, rows: Array) -> list[Array]:
     return parts
 
 
-def _nuisance(problem: InverseProblem, dx0: Array, dparameters: Array) -> Array:
-    """Columns of initial states, trial by trial, then of parameters."""
-    columns, row = [], 0
+def _nuisance(problem: InverseProblem, found: Evaluation) -> Array:
+    """Columns of the metric and of initial states, trial by trial, then of parameters."""
+    metric = found.dS.reshape(len(found.residual), -1)
+    columns, row = [metric] if problem.plant.m > 1 else [], 0
     for trial in problem.recordings:
         mine = slice(row, row + trial.outputs.size)
         row = mine.stop
-        block = np.zeros_like(dx0)
-        block[mine] = dx0[mine]
+        block = np.zeros_like(found.dx0)
+        block[mine] = found.dx0[mine]
         columns.append(block)
-    return np.hstack([*columns, dparameters])
+    return np.hstack([*columns, found.dparameters])
 
 
 def _orthogonal(columns: Array) -> Array:

@@ -179,7 +179,7 @@ class _Run:
         if work.index == _FIT:
             return self.client.submit(fit_unit, task, pure=False, retries=0)
         fit = self.store.fit(work.unit)
-        keep = ("starts", "logarithms", "Q", "R", "misfit", "exact", "converged")
+        keep = ("starts", "logarithms", "K", "S", "Q", "R")
         needed = {key: fit[key] for key in keep} if fit is not None else {}
         return self.client.submit(replicate_unit, task, needed, work.index, pure=False, retries=0)
 

@@ -239,15 +239,20 @@ def _gain_table(fit: dict[str, Any]) -> TextTable:
                 (
                     f"{control} from {state}",
                     number(fit["K"][i][j], 4),
-                    number(_nan(fit["K_deviation"][i][j]), 2),
+                    number(_nan(fit["K_deviation"][i][j]), 2)
+                    if fit["K_told"][i][j]
+                    else "not told",
+                    number(fit["K_of_weights"][i][j], 4),
                     number(reported["Q"][j][j]) if i == 0 else "",
                 )
             )
     caption = (
-        "Gain with standard deviations, and prices of the weights of least condition number: a "
-        "choice among all weights with this gain."
+        "Gain with standard deviations (`not told`: the recordings tell this entry only together "
+        "with others), beside the gain of the reported weights; and prices of the weights of least "
+        "condition number: a choice among all weights with the latter gain."
     )
-    return TextTable(caption, ("entry", "gain", "deviation", "price of the state"), tuple(rows))
+    heads = ("entry", "gain", "deviation", "gain of the weights", "price of the state")
+    return TextTable(caption, heads, tuple(rows))
 
 
 def _nan(value: float | None) -> float:

@@ -72,7 +72,8 @@ def _unit_row(fit: dict[str, Any]) -> dict[str, Any]:
     row |= {f"vaf.{name}": value for name, value in fit["vaf"].items()}
     row |= {f"held_out_vaf.{name}": value for name, value in fit["held_out_vaf"].items()}
     row["saturated"] = fit["saturated"]
-    row |= _gain(fit, "K", fit["K"]) | _gain(fit, "K_deviation", fit["K_deviation"])
+    for name in ("K", "K_deviation", "K_told", "K_of_weights"):
+        row |= _gain(fit, name, fit[name])
     reported = next(iter(fit["readings"].values()))
     row |= _states(fit, "dominant", reported["dominant"])
     row |= _states(fit, "price", np.diag(reported["Q"]))

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from impc.alternatives import verdict
+from impc.intervals import entry_names
 from impc.report.rendering import TextTable, number
 
 if TYPE_CHECKING:
     from impc.certainty import Certainty
+    from impc.fit_result import FitResult
     from impc.intent_statements import Statement
+    from impc.intervals import Interval
     from impc.weights_summary import WeightsSummary
 
 __all__ = [
@@ -29,10 +34,13 @@ _METHODS = {
     "model": "model bootstrap",
     "profile": "profile likelihood",
 }
+_NO_ENDS = "not determined"
 
 
-def intervals_table(certainty: Certainty) -> TextTable:
-    """Intervals of every number, a column for each method."""
+def intervals_table(result: FitResult) -> TextTable:
+    """Intervals of every number, a column for each method, beside the gain of the weights."""
+    certainty, plant = result.certainty, result.fitted.problem.plant
+    of_weights = dict(zip(entry_names(plant), np.ravel(result.fitted.solution.K), strict=True))
     methods = [key for key in _METHODS if any(item.method == key for item in certainty.intervals)]
     found = {(item.name, item.method): item for item in certainty.intervals}
     names = list(dict.fromkeys(item.name for item in certainty.intervals))
@@ -43,15 +51,21 @@ def intervals_table(certainty: Certainty) -> TextTable:
         cells = []
         for method in methods:
             item = found.get((name, method))
-            cells.append("-" if item is None else _range(item.low, item.high))
-        rows.append((name, "not determined" if value is None else number(value, 4), *cells))
+            cells.append("-" if item is None else _told(item))
+        shown = "not determined" if value is None else number(value, 4)
+        theirs = number(float(of_weights[name]), 4) if name in of_weights else "-"
+        rows.append((name, shown, *cells, theirs))
     level = certainty.intervals[0].level
     caption = (
-        f"Intervals of {100 * level:.0f} %. Where residuals are coloured, as those of people are, "
-        "the second column is too narrow. Entries of the gain share directions that hardly show in "
-        "the recordings; the table of directions tells which combinations are well determined."
+        f"What the recordings tell, with intervals of {100 * level:.0f} %. Where residuals are "
+        "coloured, as those of people are, the second column is too narrow. An entry that is not "
+        "told takes part in directions that hardly show in the recordings: within the range in "
+        "brackets it cannot be told from others, and the table of directions says which "
+        "combinations are. The last column is the gain of the reported weights. A rule chose "
+        "them, so it has no interval of its own: outside the estimate's, these weights do not "
+        "quite behave as the recordings do."
     )
-    heads = ("number", "value", *(_METHODS[method] for method in methods))
+    heads = ("number", "value", *(_METHODS[method] for method in methods), "gain of the weights")
     return TextTable(caption, heads, tuple(rows))
 
 
@@ -149,9 +163,14 @@ def _verdict(item: Statement) -> str:
     return "true for all" if item.holds else "false for all"
 
 
+def _told(item: Interval) -> str:
+    ends = _range(item.low, item.high)
+    return ends if item.told or ends == _NO_ENDS else f"not told ({ends})"
+
+
 def _range(low: float, high: float) -> str:
     if low == -float("inf") and high == float("inf"):
-        return "not determined"
+        return _NO_ENDS
     left = "no end" if low == -float("inf") else number(low, 4)
     right = "no end" if high == float("inf") else number(high, 4)
     return f"{left} to {right}"

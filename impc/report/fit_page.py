@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.gain_covariance import DETERMINED
+from impc.gain_covariance import TOLD
 from impc.report.certainty_tables import (
     alternatives_table,
     eigenvalues_table,
@@ -56,7 +56,7 @@ def fit_page(result: FitResult, figures: Mapping[str, bytes], provenance: FitPro
         readings=_readings(result),
         weights_set=_weights_set(result),
         weights_reason=result.certainty.weights_reason,
-        gain=intervals_table(result.certainty),
+        gain=intervals_table(result),
         limits=limit_sentences(result.certainty),
         alternatives=alternatives_table(result.certainty),
         directions=_directions(result),
@@ -155,7 +155,7 @@ def _weights_set(result: FitResult) -> tuple[tuple[str, ...], tuple[TextTable, .
 
 
 def _directions(result: FitResult) -> TextTable:
-    plant, covariance = result.fitted.problem.plant, result.covariance
+    plant, covariance = result.fitted.problem.plant, result.estimate.covariance
     names = tuple(
         state if plant.m == 1 else f"{state} to {control}"
         for control in plant.controls
@@ -167,22 +167,28 @@ def _directions(result: FitResult) -> TextTable:
     for index, value in enumerate(covariance.singular_values):
         moved = (back @ covariance.directions[index]) * sizes
         relative = value / covariance.singular_values[0]
+        deviation = float(covariance.deviations[index])
         rows.append(
             (
                 str(index + 1),
                 direction_name(moved / np.linalg.norm(moved), names),
                 f"{relative:.1e}",
-                number(float(covariance.deviations[index]), 2)
-                if relative > DETERMINED
-                else "not determined",
+                _deviation(deviation),
             )
         )
     caption = (
         "Directions of the gain, best determined first, as commands at typical states; the "
-        "deviation is relative to the natural size of a gain, so that 1 means all but unknown."
+        "deviation is relative to the natural size of a gain, so that 1 means all but unknown; "
+        f"above {TOLD:g} the recordings do not tell, and the estimate stays near the weights'."
     )
     heads = ("", "direction", "singular value / largest", "standard deviation")
     return TextTable(caption, heads, tuple(rows))
+
+
+def _deviation(value: float) -> str:
+    if np.isinf(value):
+        return "not determined"
+    return number(value, 2) if value < TOLD else f"not told ({number(value, 2)})"
 
 
 def _parameters(result: FitResult) -> TextTable | None:

@@ -2,8 +2,10 @@
 
     vaf.<output>, held_out_vaf.<output>      %, all trials; the mean of the trials left out
     states, controls, outputs, disturbances  names, in the order of every array below
-    K, S, Q, R, P, horizon, bounds           the controller; weights at R[0][0] = 1
-    covariance                               standard deviations of K, directions and how sure
+    K, S, Q, R, P, horizon, bounds           the controller of the weights, at R[0][0] = 1
+    estimate                                 the gain that the recordings tell, without weights: K,
+                                             deviations, directions, and which of them are told
+    intervals.<number>                       of that gain and of the parameters
     intent                                   eigenvalues (ascending), dominant, sentence, readings
     identifiability                          rank, free, chosen, singular_values
     parameters.<name>                        nominal, value, deviation
@@ -28,6 +30,7 @@ from impc.report.rendering import plain
 
 if TYPE_CHECKING:
     from impc.fit_result import FitResult
+    from impc.gain_estimate import GainEstimate
     from impc.report.provenance import FitProvenance
 
 __all__ = ["fit_json"]
@@ -67,16 +70,10 @@ def _controller(result: FitResult) -> dict[str, Any]:
 
 
 def _found(result: FitResult) -> dict[str, Any]:
-    covariance, found, intent = result.covariance, result.identifiability, result.intent
+    found, intent = result.identifiability, result.intent
     plant = result.fitted.problem.plant
     return {
-        "covariance": {
-            "K": covariance.entries,
-            "singular_values": covariance.singular_values,
-            "directions": covariance.directions,
-            "deviations": covariance.deviations,
-            "natural_coordinates": covariance.T,
-        },
+        "estimate": _estimate(result.estimate),
         "intent": {
             "eigenvalues": intent.reported.eigenvalues,
             "vectors": intent.reported.vectors,
@@ -121,6 +118,22 @@ def _found(result: FitResult) -> dict[str, Any]:
             }
             for item in result.methods
         },
+    }
+
+
+def _estimate(estimate: GainEstimate) -> dict[str, Any]:
+    covariance = estimate.covariance
+    return {
+        "K": estimate.K,
+        "S": estimate.S,
+        "misfit": estimate.misfit,
+        "deviations": covariance.entries,
+        "told": covariance.told_entries,
+        "singular_values": covariance.singular_values,
+        "directions": covariance.directions,
+        "direction_deviations": covariance.deviations,
+        "told_directions": covariance.told,
+        "natural_coordinates": covariance.T,
     }
 
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.gain_covariance import DETERMINED
+from impc.gain_covariance import DETERMINED, TOLD
 from impc.intent import dominant_sentence
 from impc.report.rendering import number
 
@@ -133,12 +133,14 @@ def _how_sure(result: FitResult) -> str:
 
 
 def _determined(result: FitResult) -> str:
-    found, covariance = result.identifiability, result.covariance
+    found, covariance = result.identifiability, result.estimate.covariance
     values = covariance.singular_values
     count = int(np.count_nonzero(values > DETERMINED * values[0]))
-    told = int(np.count_nonzero(np.array(covariance.deviations) < 1))
+    told = int(np.count_nonzero(covariance.told))
+    entries = int(np.count_nonzero(covariance.told_entries))
     return (
         f"Of the {len(values)} directions of the gain the recordings determine {count} above "
-        f"rounding and {told} to better than their natural size; of the {found.free} directions "
+        f"rounding and {told} to better than {TOLD:g} of their natural size; {entries} of its "
+        f"entries they tell by themselves. Of the {found.free} directions "
         f"of the weights {found.rank}, the other {found.chosen} are a choice."
     )
