@@ -78,7 +78,7 @@ def simulated_subject(seed: int, limit: float, ceiling: float = 0.9) -> Subject:
     )
     samples = sum(trial.outputs.size for trial in trials)
     error = estimate.K - truth
-    along = covariance.directions @ np.ravel(error @ covariance.T)
+    along = covariance.along(error)
     return Subject(
         100 * (fitted.misfit**2 - noise) / samples,
         np.ravel(error / covariance.entries),

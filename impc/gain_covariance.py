@@ -48,16 +48,17 @@ FOREIGN = 0.25
 class GainCovariance:
     """What the recordings say of the gain at a fit.
 
-    Directions are of the gain in natural coordinates, K T with x = T z, row by row (`gain_fibre`):
-    a step of 1 moves the command by one unit of the white input noise that T stands for.
+    Directions are of the gain in natural coordinates, G^-1 K T with x = T z and u = G v, row by row
+    (`gain_fibre`): a step of 1 moves the command by one unit of the white input noise that T stands
+    for. No optimal gain is far beyond 1 on this scale.
 
     Attributes
     ----------
-    T : Array
-        Natural coordinates (n, n).
+    T, G : Array
+        Natural coordinates of states (n, n) and inputs (m, m).
     singular_values : Array
-        Of the scaled residual's derivative with respect to K T, once initial states and parameters
-        have taken what they can; largest first (m * n,).
+        Of the scaled residual's derivative with respect to G^-1 K T, once everything else has taken
+        what it can; largest first (m * n,).
     directions : Array
         Right singular vectors, one a row (m * n, m * n).
     deviations : Array
@@ -76,6 +77,7 @@ class GainCovariance:
     """
 
     T: Array
+    G: Array
     singular_values: Array
     directions: Array
     deviations: Array
@@ -83,6 +85,10 @@ class GainCovariance:
     foreign: Array
     parameters: Array
     noise: ResidualNoise
+
+    def along(self, step: Array) -> Array:
+        """A step of the gain (m, n) as steps along the directions (m * n,)."""
+        return np.asarray(self.directions @ np.ravel(np.linalg.solve(self.G, step @ self.T)))
 
     @property
     def told(self) -> BoolArray:
@@ -115,9 +121,10 @@ def gain_covariance(
         Cramér-Rao bound.
     """
     m, n = problem.plant.m, problem.plant.n
-    T, _ = natural_coordinates(problem.plant, gain)
+    T, G = natural_coordinates(problem.plant, gain)
     found = evaluate(problem, gain, metric)
-    on_gain = found.dK.reshape(-1, m * n) @ np.kron(np.eye(m), np.linalg.inv(T).T)
+    in_units = np.kron(G, np.linalg.inv(T).T)
+    on_gain = found.dK.reshape(-1, m * n) @ in_units
     nuisance = _nuisance(problem, found)
     # What the rest can explain is taken out of the gain's columns; the gain's
     # block of the inverse of H is that of what is left.
@@ -132,10 +139,10 @@ def gain_covariance(
     spread = spread_of_sum(colour, _by_trial(problem, along))
     deviations = np.full(m * n, np.inf)
     deviations[usable] = np.sqrt(np.maximum(np.diag(spread), 0.0))
-    back = np.kron(np.eye(m), np.linalg.inv(T).T) @ directions.T
-    entries, foreign = _entries(back, deviations, spread)
+    entries, foreign = _entries(in_units @ directions.T, deviations, spread)
     return GainCovariance(
         frozen(T),
+        frozen(G),
         frozen(values),
         frozen(directions),
         frozen(deviations),

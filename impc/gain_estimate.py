@@ -120,9 +120,10 @@ def _round(here: GainEstimate) -> GainEstimate:
     an interval, and some of it nothing determines.
     """
     space = Coordinates(here.problem, np.array(here.K), np.array(here.S))
-    told = np.array(here.covariance.directions[here.covariance.told])
+    told = here.covariance.directions[here.covariance.told]
     rest = int(space.ends[-1] - space.ends[0])
-    along = scipy.linalg.block_diag(told.T.reshape(-1, len(told)), np.eye(rest))
+    in_search = np.kron(np.array(here.covariance.G), np.eye(space.n))  # whose gain is K T
+    along = scipy.linalg.block_diag(in_search @ told.T, np.eye(rest))
     samples = sum(trial.outputs.size for trial in here.problem.recordings)
     noise = float(np.linalg.norm(space.at(space.start).residual)) / np.sqrt(samples)
     prior = np.hstack([np.zeros((rest, len(told))), noise * np.eye(rest)])

@@ -54,7 +54,7 @@ def test_without_noise_all_that_is_determined_comes_out(
     covariance = gain_estimate(fitted).covariance
     determined = covariance.singular_values > 1e-6 * covariance.singular_values[0]
     truth = np.array(work.controller.K)
-    error = covariance.directions @ np.ravel((fitted.solution.K - truth) @ covariance.T)
+    error = covariance.along(fitted.solution.K - truth)
     size = np.linalg.norm(truth @ covariance.T)
     assert np.count_nonzero(determined) >= 9
     assert np.max(np.abs(error[determined])) <= 1e-5 * size

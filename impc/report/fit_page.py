@@ -161,7 +161,7 @@ def _directions(result: FitResult) -> TextTable:
         for control in plant.controls
         for state in plant.states
     )
-    back = np.kron(np.eye(plant.m), np.linalg.inv(covariance.T).T)
+    back = np.kron(np.array(covariance.G), np.linalg.inv(covariance.T).T)
     sizes = np.tile(np.array(result.intent.sizes), plant.m)
     rows = []
     for index, value in enumerate(covariance.singular_values):

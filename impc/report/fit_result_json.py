@@ -134,6 +134,7 @@ def _estimate(estimate: GainEstimate) -> dict[str, Any]:
         "direction_deviations": covariance.deviations,
         "told_directions": covariance.told,
         "natural_coordinates": covariance.T,
+        "natural_inputs": covariance.G,
     }
 
 
