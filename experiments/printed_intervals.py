@@ -7,6 +7,7 @@ recording is fitted as `impc fit` does, and the intervals of the entries of K th
 tell, and of its told directions, are compared with the truth.
 
     python -m experiments.printed_intervals --recordings 200
+    python -m experiments.printed_intervals --recordings 200 --random
 """
 
 from __future__ import annotations
@@ -36,10 +37,23 @@ from impc.weights import stage_weights
 
 if TYPE_CHECKING:
     from impc.arrays import Array
+    from impc.fitted_controller import FittedController
 
-__all__ = ["Scores", "carts", "noisy_recording", "regulator", "score", "shares"]
+__all__ = [
+    "Scores",
+    "carts",
+    "fit",
+    "noisy_recording",
+    "random_recording",
+    "regulator",
+    "score",
+    "score_carts",
+    "score_random",
+    "shares",
+    "with_noise",
+]
 
-_HORIZON, _SAMPLES, _HOLD = 8, 800, 10
+_HORIZON, _SAMPLES, _HOLD, _BEFORE = 8, 800, 10, 500
 _TWO_SIDED = 1.959964
 
 
@@ -96,30 +110,83 @@ def regulator(plant: Plant) -> Controller:
 
 
 def noisy_recording(controller: Controller, seed: int, vaf: float, root: float) -> Recording:
-    """One recording with noise of that root that leaves a VAF of `vaf` %."""
-    plant = controller.plant
-    rng, count = np.random.default_rng(seed), plant.E.shape[1]
+    """One recording of 80 s with noise of that root that leaves a VAF of `vaf` %."""
+    rng = np.random.default_rng(seed)
+    count = controller.plant.E.shape[1]
     push = np.repeat(rng.choice([-0.8, 0.0, 0.8], (_SAMPLES // _HOLD, count)), _HOLD, axis=0)
+    return with_noise(controller, push, rng, vaf, root)
+
+
+def with_noise(
+    controller: Controller, push: Array, rng: np.random.Generator, vaf: float, root: float
+) -> Recording:
+    """The controller's outputs under a disturbance, with noise."""
+    plant, samples = controller.plant, len(push)
     run = simulate(controller, scenario(plant, np.zeros(plant.n), disturbance=push))
-    clean = (require_complete(controller, run).x @ plant.C.T)[:_SAMPLES]
-    white = rng.standard_normal((_SAMPLES + 500, clean.shape[1]))
-    noise = scipy.signal.lfilter([np.sqrt(1 - root**2)], [1.0, -root], white, axis=0)[500:]
+    clean = (require_complete(controller, run).x @ plant.C.T)[:samples]
+    white = rng.standard_normal((samples + _BEFORE, clean.shape[1]))
+    noise = scipy.signal.lfilter([np.sqrt(1 - root**2)], [1.0, -root], white, axis=0)[_BEFORE:]
     size = np.sqrt((100 - vaf) / vaf * np.mean(clean**2, axis=0))
     return recording(plant, clean + size * noise, push)
 
 
-def score(seed: int, inputs: int, vaf: float, root: float) -> Scores:
-    """Fit one recording of `inputs` carts and compare what is printed with the truth."""
-    controller = regulator(carts(inputs))
-    trial = noisy_recording(controller, seed, vaf, root)
-    settings = FitSettings(horizon=_HORIZON, u_max=1.0)
-    estimate = gain_estimate(fit_controller(fit_problem(controller.plant, [trial], settings)))
+def random_recording(seed: int, inputs: int, vaf: float) -> tuple[Controller, Recording]:
+    """A random plant of up to five states and random weights; 400 samples, white noise.
+
+    Each limit is what the command without one exceeds for a twentieth of the time.
+    """
+    rng = np.random.default_rng([seed, inputs])
+    n = int(rng.integers(max(2, inputs), 6))
+    outputs, pushes = int(rng.integers(1, n + 1)), int(rng.integers(1, inputs + 1))
+    A = rng.standard_normal((n, n))
+    A *= rng.uniform(0.7, 1.05) / np.max(np.abs(np.linalg.eigvals(A)))
+    B, E = rng.standard_normal((n, inputs)), rng.standard_normal((n, pushes))
+    C = rng.standard_normal((outputs, n))
+    system = control.ss(A, np.hstack([B, E]), C, 0, 0.1)
+    plant = as_plant(system, system.input_labels[:inputs])
+    L = rng.standard_normal((n, n))
+    Q = L @ L.T + 0.1 * np.eye(n)
+    L = rng.standard_normal((inputs, inputs))
+    R = (L @ L.T + 0.3 * np.eye(inputs)) * 10 ** rng.uniform(-1, 1)
+    push = np.repeat(rng.choice([-1.0, 0.0, 1.0], (80, pushes)), 5, axis=0)
+    drive = scenario(plant, np.zeros(n), disturbance=push)
+
+    def controller(limit: Array) -> Controller:
+        bounds = box_bounds(plant, u_min=-limit, u_max=limit)
+        return mpc_controller(plant, stage_weights(Q, R), bounds, 6, terminal_set=False)
+
+    unlimited = np.abs(simulate(controller(np.full(inputs, 1e6)), drive).u)
+    truth = controller(np.quantile(unlimited, 0.95, axis=0))
+    noise = np.random.default_rng([seed, inputs, round(vaf), 0])
+    return truth, with_noise(truth, push, noise, vaf, 0.0)
+
+
+def fit(controller: Controller, trial: Recording) -> FittedController:
+    """Fit a recording as `impc fit` does, under the true limit."""
+    settings = FitSettings(horizon=controller.horizon, u_max=list(controller.bounds.u_max))
+    return fit_controller(fit_problem(controller.plant, [trial], settings))
+
+
+def score(controller: Controller, trial: Recording) -> Scores:
+    """Fit a recording and compare what is printed with the truth."""
+    estimate = gain_estimate(fit(controller, trial))
     found, error = estimate.covariance, estimate.K - controller.K
     return Scores(
         np.where(np.ravel(found.told_entries), np.ravel(error / found.entries), np.nan),
         np.where(found.told, found.along(error) / found.deviations, np.nan),
         np.ravel(error / controller.K),
     )
+
+
+def score_carts(seed: int, inputs: int, vaf: float, root: float) -> Scores:
+    """`score` of one recording of `inputs` carts."""
+    controller = regulator(carts(inputs))
+    return score(controller, noisy_recording(controller, seed, vaf, root))
+
+
+def score_random(seed: int, inputs: int, vaf: float) -> Scores:
+    """`score` of one random plant."""
+    return score(*random_recording(seed, inputs, vaf))
 
 
 def shares(scores: Array) -> Array:
@@ -129,19 +196,27 @@ def shares(scores: Array) -> Array:
 
 
 def _cell(pool: ProcessPoolExecutor, count: int, inputs: int, vaf: float, root: float) -> None:
-    one = functools.partial(score, inputs=inputs, vaf=vaf, root=root)
-    label = f"{inputs} inputs, VAF {vaf:g} %, root {root:g}"
-    found = list(tqdm(pool.map(one, range(count), chunksize=4), label, count, disable=None))
+    one = functools.partial(score_carts, inputs=inputs, vaf=vaf, root=root)
+    found = list(tqdm(pool.map(one, range(count), chunksize=4), total=count, disable=None))
     entries = np.array([item.entries for item in found])
     directions = np.array([item.directions for item in found])
-    bias = np.median([item.bias for item in found], axis=0)
+    bias = 100 * np.median([item.bias[0] for item in found])
     told = 100 * np.mean(np.isfinite(directions))
-    largest = 100 * float(np.max(np.abs(bias[: inputs + 1 : inputs + 1])))
     print(
         f"| {inputs} | {vaf:g} | {root:g} | {_range(shares(entries))} | "
-        f"{_range(shares(directions))} | {told:.0f} | {largest:.1f} |",
+        f"{_range(shares(directions))} | {told:.0f} | {bias:+.1f} |",
         flush=True,
     )
+
+
+def _random(pool: ProcessPoolExecutor, count: int, inputs: int, vaf: float) -> None:
+    one = functools.partial(score_random, inputs=inputs, vaf=vaf)
+    found = list(tqdm(pool.map(one, range(count), chunksize=4), total=count, disable=None))
+    entries = np.concatenate([item.entries for item in found])[:, None]
+    directions = np.concatenate([item.directions for item in found])[:, None]
+    told = 100 * np.mean(np.isfinite(directions))
+    cells = [f"{100 * shares(scores)[0]:.1f}" for scores in (entries, directions)]
+    print(f"| {inputs}, random | {vaf:g} | 0 | {' | '.join(cells)} | {told:.0f} | |", flush=True)
 
 
 def _range(values: Array) -> str:
@@ -155,11 +230,16 @@ def main() -> None:
     parser.add_argument("--recordings", type=int, default=200)
     parser.add_argument("--inputs", type=int, nargs="+", default=[1, 2, 3])
     parser.add_argument("--vaf", type=float, nargs="+", default=[90.0, 70.0])
+    parser.add_argument("--random", action="store_true", help="a random plant each, white noise")
     parser.add_argument("--roots", type=float, nargs="+", default=[0.0, 0.8])
     given = parser.parse_args()
     print("| inputs | VAF % | root | entries of K, % | directions, % | told, % | bias of K11, % |")
     print("|---|---|---|---|---|---|---|")
     with ProcessPoolExecutor(2) as pool:
+        if given.random:
+            for inputs, vaf in itertools.product(given.inputs, given.vaf):
+                _random(pool, given.recordings, inputs, vaf)
+            return
         for inputs, vaf, root in itertools.product(given.inputs, given.vaf, given.roots):
             _cell(pool, given.recordings, inputs, vaf, root)
 

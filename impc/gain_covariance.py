@@ -101,6 +101,9 @@ class GainCovariance:
         return np.asarray(self.foreign < FOREIGN)
 
 
+_ROUNDING = 1e-10
+
+
 def gain_covariance(
     problem: InverseProblem,
     gain: Array,
@@ -181,9 +184,10 @@ def _by_trial(problem: InverseProblem, rows: Array) -> list[Array]:
 
 
 def _nuisance(problem: InverseProblem, found: Evaluation) -> Array:
-    """Columns of the metric and of initial states, trial by trial, then of parameters."""
-    metric = found.dS.reshape(len(found.residual), -1)
-    columns, row = [metric] if problem.plant.m > 1 else [], 0
+    """Columns of what S is told, of initial states, trial by trial, then of parameters."""
+    metric, sizes, _ = np.linalg.svd(found.dS.reshape(len(found.residual), -1), full_matrices=False)
+    # Rounding leaves 1e-15 where S is not told: its scale, and inputs that are never at a bound.
+    columns, row = [metric[:, sizes > _ROUNDING * np.max(sizes)]], 0
     for trial in problem.recordings:
         mine = slice(row, row + trial.outputs.size)
         row = mine.stop
@@ -200,7 +204,7 @@ def _orthogonal(columns: Array) -> Array:
     if scaled.shape[1] == 0:
         return np.zeros((len(columns), 0))
     left, values, _ = np.linalg.svd(scaled, full_matrices=False)
-    return np.asarray(left[:, values > 1e-10 * values[0]])
+    return np.asarray(left[:, values > _ROUNDING * values[0]])
 
 
 def _parameter_deviations(
