@@ -5,7 +5,7 @@
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
-.PHONY: help env demo test check docs reproduce wheel slow bench lock clean
+.PHONY: help env demo test check docs reproduce wheel slow coverage bench lock clean
 
 PYTHON ?= python3
 # Not to be set from outside: the environment is made with `venv --clear`.
@@ -40,6 +40,7 @@ help:
 	@echo 'make test    set up .venv, then check and pytest: all but the slow tests, the site too'
 	@echo 'make check   ruff check, ruff format --check, mypy --strict'
 	@echo 'make slow    the slow tests'
+	@echo 'make coverage  how often printed intervals hold the truth: the table of docs/fitting.md'
 	@echo 'make docs    build the site in docs/_build/html; warnings are errors, tutorials run (minutes)'
 	@echo 'make reproduce  write docs/reproduction: the dissertation, line by line (half an hour)'
 	@echo 'make wheel   build a wheel, install it in an empty environment, run impc example there'
@@ -79,6 +80,9 @@ wheel: env
 
 slow: env
 	$(PY) -m pytest -m slow
+
+coverage: env
+	$(PY) -m experiments.printed_intervals --recordings 200
 
 bench: env
 	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(PY) -m experiments.benchmarks

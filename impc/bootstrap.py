@@ -114,7 +114,7 @@ def replicate(
 def bootstrap_intervals(
     estimate: GainEstimate, replicates: Sequence[Replicate], method: str, level: float
 ) -> tuple[Interval, ...]:
-    """Percentile intervals of the entries of K and of the parameters.
+    """Percentile intervals of the entries of K and of the parameters; no ends where not told.
 
     Parameters
     ----------
@@ -124,18 +124,17 @@ def bootstrap_intervals(
         Share of the replicates inside, between 0 and 1.
     """
     names = list(entry_names(estimate.problem.plant))
-    values = [*np.ravel(estimate.K), *estimate.parameters]
-    told = [
-        *np.ravel(estimate.covariance.told_entries).tolist(),
-        *(True for _ in estimate.parameters),
-    ]
     if estimate.problem.family is not None:
         names += estimate.problem.family.names
+    values = np.append(np.ravel(estimate.K), estimate.parameters)
     drawn = np.array([np.append(np.ravel(item.K), item.parameters) for item in replicates])
-    ends = np.quantile(drawn, [0.5 - level / 2, 0.5 + level / 2], axis=0)
+    low, high = np.quantile(drawn, [0.5 - level / 2, 0.5 + level / 2], axis=0)
+    told = np.append(np.ravel(estimate.covariance.told_entries), np.isfinite(estimate.parameters))
+    # Replicates stay where the search began along what is not told: their spread says nothing.
+    low, high = np.where(told, low, -np.inf), np.where(told, high, np.inf)
     return tuple(
-        Interval(name, method, level, float(value), float(low), float(high), known)
-        for name, value, low, high, known in zip(names, values, *ends, told, strict=True)
+        Interval(name, method, level, float(value), float(one), float(other), bool(known))
+        for name, value, one, other, known in zip(names, values, low, high, told, strict=True)
     )
 
 

@@ -46,9 +46,9 @@ class Interval:
     low, high : float
         Infinite where the recordings set no end.
     told : bool
-        Whether the recordings tell this number by itself. Where they do not, the interval is that
-        of a plain least-squares estimate, and the value is nearer than it says to where the search
-        began: it holds the truth more often than its level.
+        Whether the recordings tell this number by itself. Where they do not, a covariance's
+        interval is that of a plain least-squares estimate, while the value is kept near where the
+        search began: it holds the truth more often than its level. A bootstrap's has no ends.
     """
 
     name: str

@@ -2,7 +2,8 @@
 
     units.csv       a row a unit: labels, VAF, gain, its deviations, dominant direction, parameters
     replicates.csv  a row a replicate: labels, number, gain, parameters
-    intervals.csv   a row an entry of the gain or a parameter: percentiles of the replicates
+    intervals.csv   a row an entry of the gain or a parameter: percentiles of the replicates, empty
+                    where the recordings do not tell the entry by itself
 
 Rows are in the order of the study and columns in that of the plant: the same results give the same
 bytes, whatever ran them. Times and memory are in the log, not here.
@@ -99,9 +100,12 @@ def _states(fit: dict[str, Any], name: str, values: Any) -> dict[str, float]:
 
 def _intervals(unit: Unit, fit: dict[str, Any], drawn: pd.DataFrame) -> list[dict[str, Any]]:
     estimate = _gain(fit, "K", fit["K"]) | fit["parameters"]
+    told = _gain(fit, "K", fit["K_told"])
     rows = []
     for name in drawn.columns:
-        low, high = np.quantile(drawn[name], [0.5 - _LEVEL / 2, 0.5 + _LEVEL / 2])
+        # Replicates stay where the search began along what is not told: their spread says nothing.
+        ends = [0.5 - _LEVEL / 2, 0.5 + _LEVEL / 2]
+        low, high = np.quantile(drawn[name], ends) if told.get(name, True) else (np.nan, np.nan)
         rows.append(
             _labels(unit)
             | {
