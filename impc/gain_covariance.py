@@ -42,6 +42,9 @@ TOLD = 0.2
 #: An entry is told by itself when what is not told could move it by less than this share of its
 #: deviation, were it wrong by the natural size of a gain: the interval then covers 94.3 % for 95 %.
 FOREIGN = 0.25
+# Of an entry's natural size: a smaller share in a direction is rounding's.
+_SHARE = 1e-6
+_ROUNDING = 1e-10
 
 
 @dataclass(frozen=True)
@@ -99,9 +102,6 @@ class GainCovariance:
     def told_entries(self) -> BoolArray:
         """Which entries of K they tell by themselves, not only together with others (m, n)."""
         return np.asarray(self.foreign < FOREIGN)
-
-
-_ROUNDING = 1e-10
 
 
 def gain_covariance(
@@ -164,12 +164,12 @@ def _entries(back: Array, deviations: Array, spread: Array) -> tuple[Array, Arra
     usable, told = np.isfinite(deviations), deviations < TOLD
     own = spread[np.ix_(told[usable], told[usable])]
     by_itself = np.sqrt(np.maximum(np.diag(back[:, told] @ own @ back[:, told].T), 0.0))
+    size = np.linalg.norm(back, axis=1)
     untold = np.linalg.norm(back[:, ~told], axis=1)
+    untold[untold <= _SHARE * size] = 0.0
     foreign = np.divide(untold, by_itself, out=np.full(len(back), np.inf), where=by_itself > 0)
     whole = np.sqrt(np.maximum(np.diag(back[:, usable] @ spread @ back[:, usable].T), 0.0))
-    # An entry that shares as much as rounding does with a direction that has no value has none.
-    lost = np.linalg.norm(back[:, ~usable], axis=1) / np.linalg.norm(back, axis=1)
-    whole[lost > 1e-6] = np.inf
+    whole[np.linalg.norm(back[:, ~usable], axis=1) > _SHARE * size] = np.inf
     return np.where(foreign < FOREIGN, by_itself, whole), foreign
 
 

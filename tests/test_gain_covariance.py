@@ -56,7 +56,8 @@ def test_deviations_of_two_inputs_count_the_metric_as_unknown() -> None:
 
     def deviations(columns: Array) -> Array:
         size = np.linalg.norm(columns, axis=0)
-        return (np.linalg.norm(np.linalg.pinv(columns / size, 1e-6), axis=1) / size)[: K.size]
+        rows = np.linalg.norm(np.linalg.pinv(columns / size, 1e-6), axis=1)
+        return np.asarray((rows / size)[: K.size])
 
     np.testing.assert_allclose(np.ravel(found.entries), deviations(J), rtol=1e-4)
     known = deviations(np.delete(J, [K.size, K.size + 1], axis=1))
