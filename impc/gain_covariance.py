@@ -12,6 +12,9 @@ Cramér-Rao bound.
 Beside the gain everything else that was fitted is unknown: initial states, physical parameters
 and, for several inputs, the metric S. The prior of a search (`fit_gain`) is left out: the result
 says what the recordings determine, and in a direction that they hardly do it is wide.
+
+To first order a direction that is not told has no part in those that are; to second order it has,
+and it may be wrong by as much as a gain can be. `curvature` adds that (docs/fitting.md).
 """
 
 from __future__ import annotations
@@ -22,7 +25,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.arrays import Array, BoolArray, frozen
-from impc.evaluation import evaluate
+from impc.evaluation import evaluate, misfit_or_reason, residual_only
 from impc.gain_fibre import natural_coordinates
 from impc.residual_noise import ResidualNoise, residual_noise, spread_of_sum
 
@@ -45,6 +48,7 @@ FOREIGN = 0.25
 # Of an entry's natural size: a smaller share in a direction is rounding's.
 _SHARE = 1e-6
 _ROUNDING = 1e-10
+_STEPS = (1.0, 0.5, 0.25, 0.125)
 
 
 @dataclass(frozen=True)
@@ -109,6 +113,8 @@ def gain_covariance(
     gain: Array,
     metric: Array,
     noise: Callable[[list[Array], int], ResidualNoise] = residual_noise,
+    *,
+    curvature: bool = False,
 ) -> GainCovariance:
     """Covariance of a gain fitted by least squares, and of the parameters fitted with it.
 
@@ -122,6 +128,9 @@ def gain_covariance(
         How the noise is estimated from the residuals, (samples, p) for each trial, and the count
         of numbers fitted: `residual_noise`, or `white_noise` for the plain
         Cramér-Rao bound.
+    curvature : bool
+        Whether the deviations of told directions count what those that are not told do to them to
+        second order, were these wrong by their deviation, or by the natural size of a gain.
     """
     m, n = problem.plant.m, problem.plant.n
     T, G = natural_coordinates(problem.plant, gain)
@@ -142,6 +151,13 @@ def gain_covariance(
     spread = spread_of_sum(colour, _by_trial(problem, along))
     deviations = np.full(m * n, np.inf)
     deviations[usable] = np.sqrt(np.maximum(np.diag(spread), 0.0))
+    if curvature:
+        told = np.flatnonzero(deviations < TOLD)
+        reach = np.minimum(deviations, 1.0)[:, None] * directions
+        steps = (reach[deviations >= TOLD] @ in_units.T).reshape(-1, m, n)
+        shifts = _shifts(problem, gain, metric, steps) @ along[:, told]
+        spread[np.ix_(told, told)] += shifts.T @ shifts / 2
+        deviations[usable] = np.sqrt(np.maximum(np.diag(spread), 0.0))
     entries, foreign = _entries(in_units @ directions.T, deviations, spread)
     return GainCovariance(
         frozen(T),
@@ -154,6 +170,22 @@ def gain_covariance(
         frozen(_parameter_deviations(problem, on_gain, nuisance, colour)),
         colour,
     )
+
+
+def _shifts(problem: InverseProblem, gain: Array, metric: Array, steps: Array) -> Array:
+    """What steps of the gain (k, m, n), forth and back, do to the residual: (2 k, r).
+
+    A step that cannot be simulated is halved, and what it does scaled by the square: the first
+    order of a step that is not told has no part in those that are.
+    """
+    here, shifts = residual_only(problem, gain, metric), []
+    for step in (sign * step for step in steps for sign in (1.0, -1.0)):
+        for share in _STEPS:
+            there = gain + share * step
+            if not misfit_or_reason(problem, there, metric)[1]:
+                shifts.append((residual_only(problem, there, metric) - here) / share**2)
+                break
+    return np.array(shifts).reshape(-1, len(here))
 
 
 def _entries(back: Array, deviations: Array, spread: Array) -> tuple[Array, Array]:

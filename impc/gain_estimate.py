@@ -56,7 +56,7 @@ class GainEstimate:
     misfit : float
         2-norm of the residual.
     covariance : GainCovariance
-        For noise of the colour that the residuals show.
+        For noise of the colour that the residuals show, with curvature.
     white : GainCovariance
         As if the residuals were white.
     """
@@ -90,39 +90,45 @@ def gain_estimate(fitted: FittedController) -> GainEstimate:
     SolverError
         When the residual at that gain is not finite.
     """
-    here = _estimate(fitted.problem, fitted.solution.K, fitted.solution.S, fitted.misfit)
-    if fitted.exact:
-        return here
-    for _ in range(_ROUNDS):
+    K, S = np.array(fitted.solution.K), np.array(fitted.solution.S)
+    here = _Found(fitted.problem, K, S, fitted.misfit, gain_covariance(fitted.problem, K, S))
+    for _ in range(0 if fitted.exact else _ROUNDS):
         before, here = here, _round(here)
-        same = np.count_nonzero(here.covariance.told) == np.count_nonzero(before.covariance.told)
+        same = np.count_nonzero(here.linear.told) == np.count_nonzero(before.linear.told)
         if same and here.misfit > (1 - _SETTLED) * before.misfit:
             break
-    return here
-
-
-def _estimate(problem: InverseProblem, gain: Array, metric: Array, misfit: float) -> GainEstimate:
-    K, S = np.array(gain), np.array(metric)
+    at = here.problem, here.K, here.S
     return GainEstimate(
-        problem,
-        frozen(K),
-        frozen(S),
-        misfit,
-        gain_covariance(problem, K, S),
-        gain_covariance(problem, K, S, white_noise),
+        here.problem,
+        frozen(here.K),
+        frozen(here.S),
+        here.misfit,
+        gain_covariance(*at, curvature=True),
+        gain_covariance(*at, white_noise, curvature=True),
     )
 
 
-def _round(here: GainEstimate) -> GainEstimate:
+@dataclass(frozen=True)
+class _Found:
+    """A gain of the search, with its covariance to first order."""
+
+    problem: InverseProblem
+    K: Array
+    S: Array
+    misfit: float
+    linear: GainCovariance
+
+
+def _round(here: _Found) -> _Found:
     """Least squares over the told directions and everything beside the gain.
 
     What is beside the gain has the normal prior of any search (`fit_gain`): it is not printed with
     an interval, and some of it nothing determines.
     """
-    space = Coordinates(here.problem, np.array(here.K), np.array(here.S))
-    told = here.covariance.directions[here.covariance.told]
+    space = Coordinates(here.problem, here.K, here.S)
+    told = here.linear.directions[here.linear.told]
     rest = int(space.ends[-1] - space.ends[0])
-    in_search = np.kron(np.array(here.covariance.G), np.eye(space.n))  # whose gain is K T
+    in_search = np.kron(np.array(here.linear.G), np.eye(space.n))  # whose gain is K T
     along = scipy.linalg.block_diag(in_search @ told.T, np.eye(rest))
     samples = sum(trial.outputs.size for trial in here.problem.recordings)
     noise = float(np.linalg.norm(space.at(space.start).residual)) / np.sqrt(samples)
@@ -147,4 +153,5 @@ def _round(here: GainEstimate) -> GainEstimate:
     there = space.unpack(z)
     problem = moved(here.problem, there.starts, there.logarithms)
     misfit = float(np.linalg.norm(space.at(z).residual))
-    return _estimate(problem, there.K, there.S, misfit)
+    covariance = gain_covariance(problem, there.K, there.S)
+    return _Found(problem, there.K, there.S, misfit, covariance)

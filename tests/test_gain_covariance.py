@@ -78,6 +78,9 @@ def test_a_direction_that_is_told_is_told_where_others_are_not(seed: int) -> Non
     off = np.abs(found.along(estimate.K - truth) / found.deviations)
     assert np.max(off[found.told]) < 3.5
     assert not np.all(found.told)
+    linear = gain_covariance(estimate.problem, np.array(estimate.K), np.array(estimate.S))
+    assert np.all(found.deviations >= linear.deviations * (1 - 1e-9))
+    assert np.any(found.deviations[found.told] > 1.02 * linear.deviations[found.told])
     # What is not told stays where the weights are.
     step = found.along(estimate.K - fitted.solution.K)
     assert np.max(np.abs(step[~found.told])) < 0.2
