@@ -1,11 +1,19 @@
-"""A plant from where a user keeps it: an import path with arguments, or a saved state space."""
+"""A plant from where a user keeps it: an import path with arguments, or a saved state space.
+
+A module that comes with the package, or with what is installed, is never looked for in the working
+folder: a file there called plants.py or numpy.py replaces nothing. Only a module of another name is
+looked for there, last, as long as it is being imported. What a user's function does wrong, whatever
+it raises, is one line that names it.
+"""
 
 from __future__ import annotations
 
-import importlib
+import importlib.util
 import inspect
 import json
+import os
 import sys
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,16 +22,23 @@ import control
 import numpy as np
 import scipy.io
 
-from impc.errors import ImpcError, InputError, PlantError
+from impc.errors import ImpcError, InputError, PlantError, one_line
 from impc.plant import Plant, as_plant
 from impc.plant_family import PlantFamily, plant_family
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from impc.arrays import Array
 
-__all__ = ["PlantSource", "import_function", "make_plant", "plant_family_of", "plant_source"]
+__all__ = [
+    "PlantSource",
+    "import_function",
+    "make_plant",
+    "plant_family_of",
+    "plant_source",
+    "users_code",
+]
 
 _MATRICES = ("A", "B", "C")
 _NAMES = ("states", "inputs", "outputs")
@@ -69,28 +84,71 @@ def plant_source(name: str, arguments: Mapping[str, Any]) -> PlantSource:
 
 
 def import_function(path: str) -> Callable[..., Any]:
-    """The function of an import path ``module:function``; the current folder is looked in too.
+    """The function of an import path ``module:function``; see the module's text for where.
 
     Raises
     ------
     InputError
-        When there is no such module or function.
+        When there is no such module or function, or the module cannot be imported.
     """
     module, colon, function = path.partition(":")
     if not (module and colon and function):
         raise InputError(
             f"plant {path}", "is neither a known name, a file, nor module:function", "see docs"
         )
-    sys.path.insert(0, "")  # a user's own module stands beside the recordings
+    first = module.partition(".")[0]
+    installed = first in sys.modules or importlib.util.find_spec(first) is not None
     try:
-        found: Callable[..., Any] = getattr(importlib.import_module(module), function)
+        with (
+            users_code(f"plant {path}", ImportError, AttributeError),
+            nullcontext() if installed else _beside_the_recordings(),
+        ):
+            found = getattr(importlib.import_module(module), function)
     except (ImportError, AttributeError) as error:
+        hidden = installed and Path(f"{first}.py").exists()
+        remedy = "rename yours: an installed module has its name" if hidden else "check its names"
         raise InputError(
-            f"plant {path}", f"cannot be imported ({error})", "check module and function"
+            f"plant {path}", f"cannot be imported ({one_line(error)})", remedy
         ) from None
+    made: Callable[..., Any] = found
+    return made
+
+
+@contextmanager
+def users_code(name: str, *passing: type[Exception]) -> Iterator[None]:
+    """Run code of a user's, of that `name`: whatever it raises is one line that says so.
+
+    Errors of the package, those of the kinds in `passing` and an interruption from the keyboard
+    stay what they are.
+
+    Raises
+    ------
+    InputError
+        For anything else, a call of `sys.exit` among it.
+    """
+    try:
+        yield
+    except (ImpcError, *passing):
+        raise
+    except BaseException as error:
+        if type(error) is KeyboardInterrupt:
+            raise
+        said = one_line(error)
+        problem = f"ends in {type(error).__name__}{f' ({said})' if said else ''}"
+        raise InputError(name, problem, "correct the function, or what it is given") from None
+
+
+@contextmanager
+def _beside_the_recordings() -> Iterator[None]:
+    """The working folder on the import path, behind all that is installed."""
+    folder = os.getcwd()
+    sys.path.append(folder)
+    try:
+        yield
     finally:
-        sys.path.remove("")
-    return found
+        sys.path.reverse()  # the last one, should it have been there before
+        sys.path.remove(folder)
+        sys.path.reverse()
 
 
 def make_plant(source: PlantSource, recorded: Sequence[str], **changed: float) -> Plant:
@@ -109,21 +167,21 @@ def make_plant(source: PlantSource, recorded: Sequence[str], **changed: float) -
         When the arguments do not fit the function, or what it returns is no usable plant.
     """
     arguments = {**source.arguments, **changed}
+    name = f"plant {source.name}"
     try:
-        system = source.make(**arguments)
+        with users_code(name, TypeError, ValueError):
+            system = source.make(**arguments)
+            inputs = tuple(getattr(system, "input_labels", ()))
+            controls = [item for item in inputs if item not in recorded]
+            if inputs and not controls:
+                raise PlantError(name, "all its inputs are recorded", "one must be the command")
+            return as_plant(system, controls or None)
     except ImpcError:
         raise
     except (TypeError, ValueError) as error:
         raise InputError(
-            f"plant {source.name}", f"refuses its arguments ({error})", "correct the [plant] table"
+            name, f"refuses its arguments ({one_line(error)})", "correct the [plant] table"
         ) from None
-    names = tuple(getattr(system, "input_labels", ()))
-    controls = [name for name in names if name not in recorded]
-    if names and not controls:
-        raise PlantError(
-            f"plant {source.name}", "all its inputs are recorded", "one must be the command"
-        )
-    return as_plant(system, controls or None)
 
 
 def plant_family_of(
