@@ -10,9 +10,10 @@ from typing import Any
 
 # `python -m impc.cli` puts the working folder first: a numpy.py among recordings is not numpy. The
 # folder of a checkout is left, for the plants in it.
-if __name__ == "__main__" and not sys.flags.safe_path:
-    if not os.path.exists(os.path.join(sys.path[0], "impc", "cli.py")):
-        del sys.path[0]
+if __name__ == "__main__" and not (
+    sys.flags.safe_path or os.path.exists(os.path.join(sys.path[0], "impc", "cli.py"))
+):
+    del sys.path[0]
 
 import click
 
@@ -55,11 +56,12 @@ class _Program(click.Group):
         # Matrices of ten rows: a second thread of linear algebra costs more than it does. Before
         # numpy is imported, and only in this program; a value of the user's own stands.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-        called_by_python = bool(args or kwargs)
-        with nullcontext() if called_by_python else own_process():
-            status = ended(
-                lambda: click.Group.main(self, *args, **kwargs | {"standalone_mode": False})
-            )
+
+        def work() -> Any:
+            return click.Group.main(self, *args, **kwargs | {"standalone_mode": False})
+
+        with nullcontext() if args or kwargs else own_process():
+            status = ended(work)
         sys.exit(status)
 
     def invoke(self, ctx: click.Context) -> Any:

@@ -17,11 +17,13 @@ __all__ = [
     "PlantError",
     "SolverError",
     "WeightsError",
+    "brief",
     "one_line",
 ]
 
 # A line that is longer than this hides its remedy; names and values are cut in the middle.
 _LONGEST = 600
+_MANY_BITS = 128  # 39 digits
 _ESCAPED_BYTE = range(0xDC80, 0xDD00)
 
 
@@ -95,6 +97,13 @@ def one_line(text: object, longest: int = _LONGEST) -> str:
         return line
     half = (longest - 5) // 2
     return f"{line[:half]} ... {line[-half:]}"
+
+
+def brief(value: object) -> str:
+    """A `value` that somebody gave, for a message: at most sixty characters of it."""
+    if isinstance(value, int) and value.bit_length() > _MANY_BITS:
+        return f"an integer of about {value.bit_length() * 0.30103:.0f} digits"
+    return one_line(value, 60)
 
 
 def _text(value: object) -> str:

@@ -41,25 +41,20 @@ def ended(run: Callable[[], Any]) -> int:
     try:
         with _quiet(heard):
             return int(run() or ExitStatus.DONE)
-    except ImpcError as error:
-        return _say(f"error: {error}", ExitStatus.BAD_INPUT)
-    except click.Abort:
-        return _say("interrupted", ExitStatus.INTERRUPTED)
-    except click.ClickException as error:
-        return _say(f"error: {error.format_message()}", ExitStatus.BAD_INPUT)
-    except InterruptionError as interruption:
-        kept = f"; {interruption}" if interruption.args else ""
-        return _say(f"interrupted{kept}", ExitStatus.INTERRUPTED)
+    except SystemExit:  # of click's shell completion
+        raise
     except BrokenPipeError:
         return ExitStatus.UNREAD
-    except OSError as error:
-        if error.errno not in _NO_ROOM:
-            return _defect(error, heard)
-        where = error.filename or "output"
-        return _say(f"error: {where}: {error.strerror}; make room", ExitStatus.BAD_INPUT)
-    except SystemExit:  # of click's shell completion, and of the interpreter
-        raise
+    except (InterruptionError, click.Abort) as error:
+        kept = f"; {error}" if error.args else ""
+        return _say(f"interrupted{kept}", ExitStatus.INTERRUPTED)
+    except (ImpcError, click.ClickException) as error:
+        told = error.format_message() if isinstance(error, click.ClickException) else error
+        return _say(f"error: {told}", ExitStatus.BAD_INPUT)
     except BaseException as error:  # the net itself
+        if isinstance(error, OSError) and error.errno in _NO_ROOM:
+            where = error.filename or "output"
+            return _say(f"error: {where}: {error.strerror}; make room", ExitStatus.BAD_INPUT)
         return _defect(error, heard)
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 from tqdm import tqdm
 
-from impc.commands.options import out_option
+from impc.commands.options import out_option, yes_option
 from impc.commands.output import print_files
 from impc.commands.plant import KNOWN
 
@@ -34,13 +34,16 @@ __all__ = ["command"]
     help="What the columns mean, and settings; `impc inspect FILE` writes one.",
 )
 @out_option("fit", "report.html, result.json and the figures")
-def command(files: tuple[Path, ...], plant_name: str, config: Path, out: Path) -> None:
+@yes_option
+def command(files: tuple[Path, ...], plant_name: str, config: Path, out: Path, yes: bool) -> None:
     """Fit the controller behind the trials of one subject, one file a trial.
 
     What is done when you interrupt it is kept in the folder: the same command goes on from there.
     """
     # Imported here: the libraries take seconds to load, and --help needs none.
+    from impc.commands.consent import require_consent  # noqa: PLC0415
     from impc.commands.subject import read_subject  # noqa: PLC0415
+    from impc.effort import fit_effort  # noqa: PLC0415
     from impc.fit_memory import open_memory  # noqa: PLC0415
     from impc.fit_recordings import (  # noqa: PLC0415
         FitProgress,
@@ -54,6 +57,7 @@ def command(files: tuple[Path, ...], plant_name: str, config: Path, out: Path) -
     require_writable(out)
     subject = read_subject(files, plant_name, config)
     problem, settings = subject.problem, subject.settings
+    require_consent(fit_effort(problem, settings), yes)
     memory = open_memory(out, problem, settings)
     with tqdm(
         total=stages(problem, settings),

@@ -11,13 +11,18 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from typing import Any
 
-__all__ = ["out_option", "scheduler_options", "seed_option"]
+__all__ = ["out_option", "scheduler_options", "seed_option", "yes_option"]
 
 F = TypeVar("F", bound="Callable[..., Any]")
 
 #: --seed of everything that is simulated.
 seed_option = click.option(
     "--seed", type=click.IntRange(min=0), default=0, help="All numbers drawn follow from it."
+)
+
+#: --yes of what may take hours, see `impc.commands.consent`.
+yes_option = click.option(
+    "--yes", is_flag=True, help="Do not ask before what takes hours or much memory."
 )
 
 

@@ -27,11 +27,27 @@ def find_plant(name: str, arguments: Mapping[str, Any]) -> PlantSource:
     Raises
     ------
     InputError
-        As `plant_source`.
+        As `plant_source`; when an argument is a date or an integer beyond 64 bits.
     """
+    from impc.errors import InputError  # noqa: PLC0415
     from impc.plant_source import plant_source  # noqa: PLC0415
 
+    for key, value in arguments.items():
+        if not _kept(value):
+            kind = type(value).__name__
+            raise InputError(f"[plant] {key}", f"is a {kind} that no result can keep", "see docs")
     return plant_source(KNOWN.get(name, name), arguments)
+
+
+def _kept(value: object) -> bool:
+    """Whether result.json can hold it: no date, no integer beyond 64 bits, at no depth."""
+    if isinstance(value, dict):
+        return all(map(_kept, value.values()))
+    if isinstance(value, list):
+        return all(map(_kept, value))
+    if isinstance(value, int):
+        return value.bit_length() < 64
+    return isinstance(value, (float, str))
 
 
 def load_plant(path: str) -> Plant:
