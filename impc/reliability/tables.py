@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,7 +13,7 @@ from impc.report.rendering import TextTable, number
 if TYPE_CHECKING:
     from impc.reliability.analysis import MeasureResult, Reliability
 
-__all__ = ["csv_bytes", "reliability_tables"]
+__all__ = ["reliability_tables"]
 
 _NUMBERS = {"rms": "2.2", "energy": "2.3"}
 _VISIT_TABLES = {"rms": "2.5", "energy": "2.6"}
@@ -32,15 +30,6 @@ def reliability_tables(result: Reliability) -> dict[str, TextTable]:
     tables["pairs"] = _pair_table(result)
     tables["dissertation"] = _quoted_table()
     return tables
-
-
-def csv_bytes(table: TextTable) -> bytes:
-    """A table as CSV."""
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(table.heads)
-    writer.writerows(table.rows)
-    return stream.getvalue().encode()
 
 
 def _of(result: Reliability, measure: str) -> list[MeasureResult]:
