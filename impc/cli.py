@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 import os
 import sys
-from contextlib import nullcontext
 from typing import Any
 
 # `python -m impc.cli` puts the working folder first: a numpy.py among recordings is not numpy. The
@@ -18,6 +17,8 @@ if __name__ == "__main__" and not (
 import click
 
 from impc.commands.ending import ended, interruptions, own_process
+from impc.exit_status import ExitStatus
+from impc.jit import keep_caches
 
 __all__ = ["main"]
 
@@ -60,8 +61,13 @@ class _Program(click.Group):
         def work() -> Any:
             return click.Group.main(self, *args, **kwargs | {"standalone_mode": False})
 
-        with nullcontext() if args or kwargs else own_process():
+        if args or kwargs:  # called from Python
+            sys.exit(ended(work))
+        with own_process():
+            note = keep_caches()
             status = ended(work)
+            if note and status == ExitStatus.DONE and "numba" in sys.modules:
+                click.echo(f"impc: note: {note}", err=True)
         sys.exit(status)
 
     def invoke(self, ctx: click.Context) -> Any:

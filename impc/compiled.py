@@ -27,9 +27,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from impc.arrays import Buffer
+from impc.jit import njit
 from impc.prediction import RowDirections, Rows
 
 __all__ = ["CONVERGED", "INCONSISTENT", "UNSOLVED", "LoopMatrices", "run", "solve_dual"]

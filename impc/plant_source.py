@@ -13,6 +13,7 @@ import inspect
 import json
 import os
 import sys
+import warnings
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -169,8 +170,10 @@ def make_plant(source: PlantSource, recorded: Sequence[str], **changed: float) -
     arguments = {**source.arguments, **changed}
     name = f"plant {source.name}"
     try:
-        with users_code(name, TypeError, ValueError):
-            system = source.make(**arguments)
+        with users_code(name, TypeError, ValueError, np.exceptions.ComplexWarning):
+            with warnings.catch_warnings():
+                warnings.simplefilter("error", np.exceptions.ComplexWarning)
+                system = source.make(**arguments)
             inputs = tuple(getattr(system, "input_labels", ()))
             controls = [item for item in inputs if item not in recorded]
             if inputs and not controls:
@@ -178,6 +181,8 @@ def make_plant(source: PlantSource, recorded: Sequence[str], **changed: float) -
             return as_plant(system, controls or None)
     except ImpcError:
         raise
+    except np.exceptions.ComplexWarning:  # control.ss would drop the imaginary parts
+        raise PlantError(name, "has complex matrices", "give it real ones") from None
     except (TypeError, ValueError) as error:
         raise InputError(
             name, f"refuses its arguments ({one_line(error)})", "correct the [plant] table"

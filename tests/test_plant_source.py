@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,13 @@ import scipy.io
 
 import plants
 from impc.errors import ImpcError, InputError, PlantError
-from impc.plant_source import make_plant, plant_family_of, plant_source
+from impc.plant_source import (
+    PlantSource,
+    import_function,
+    make_plant,
+    plant_family_of,
+    plant_source,
+)
 
 A, B, C = [[1.0, 0.1], [0.0, 1.0]], [[0.005, 0.0], [0.1, 0.1]], [[1.0, 0.0]]
 
@@ -35,6 +42,69 @@ def test_a_module_beside_the_recordings(tmp_path: Path, monkeypatch: pytest.Monk
     assert family is not None
     assert family.nominal.tolist() == [2.0]
     assert family.make(np.array([4.0])).B[0, 0] == 0.25
+
+
+def test_the_working_folder_is_last_and_not_left_on_the_path(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A user's module finds its neighbours, and nothing installed is replaced by one of them."""
+    (tmp_path / "mine_of_two.py").write_text(
+        "import neighbour_of_mine, statsmodels\nmake = neighbour_of_mine.make\n"
+    )
+    (tmp_path / "neighbour_of_mine.py").write_text(
+        "import sys, control\nwhere = sys.path[-1]\ndef make(): return control.ss(1, 1, 1, 0, 0.1)\n"
+    )
+    for name in ("plants", "statsmodels"):
+        (tmp_path / f"{name}.py").write_text("raise SystemExit\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delitem(sys.modules, "statsmodels", raising=False)
+    path = list(sys.path)
+    found = import_function("mine_of_two:make")
+    assert sys.modules[found.__module__].where == str(tmp_path)
+    assert sys.path == path
+    assert import_function("plants:cursor_plant").__module__ == "plants.cursor"
+    with pytest.raises(InputError, match="rename yours: an installed module has its name"):
+        import_function("plants:mine")
+
+
+class OwnInterrupt(KeyboardInterrupt):
+    """Not from the keyboard."""
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        SystemExit(0), MemoryError(), RecursionError("too deep"), OwnInterrupt("a\nb"),
+        GeneratorExit(), StopIteration(), ZeroDivisionError("division by zero"),
+        UserWarning("look"), OverflowError("too large"), AttributeError("none"),
+    ],
+    ids=lambda error: type(error).__name__,
+)  # fmt: skip
+def test_whatever_a_plant_raises_is_one_line_that_names_it(error: BaseException) -> None:
+    def make() -> object:
+        raise error
+
+    with pytest.raises(InputError, match=rf"^plant mine:make: ends in {type(error).__name__}") as e:
+        make_plant(PlantSource("mine:make", make, {}), ())
+    assert str(e.value).isprintable()
+
+
+def test_the_keyboard_interrupts_a_plant() -> None:
+    def make() -> object:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        make_plant(PlantSource("mine:make", make, {}), ())
+
+
+def test_a_module_that_ends_the_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "ending_plant.py").write_text("import sys\nsys.exit(0)\n")
+    (tmp_path / "broken_plant.py").write_text("def cart(:\n")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match="plant ending_plant:x: ends in SystemExit"):
+        plant_source("ending_plant:x", {})
+    with pytest.raises(InputError, match="plant broken_plant:x: ends in SyntaxError"):
+        plant_source("broken_plant:x", {})
 
 
 @pytest.mark.parametrize("suffix", ["mat", "npz", "json"])

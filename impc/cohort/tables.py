@@ -15,8 +15,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from impc.report.csv_text import csv_bytes
-
 if TYPE_CHECKING:
     from impc.cohort.store import Store
     from impc.cohort.study import Study, Unit
@@ -55,7 +53,8 @@ def cohort_tables(study: Study, store: Store) -> dict[str, pd.DataFrame]:
 
 def table_bytes(table: pd.DataFrame) -> bytes:
     """A table as CSV, numbers to the last digit."""
-    return csv_bytes(list(table.columns), table.itertuples(index=False, name=None))
+    text: str = table.to_csv(index=False, lineterminator="\n")
+    return text.encode()
 
 
 def _labels(unit: Unit) -> dict[str, Any]:

@@ -22,7 +22,14 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from types import FrameType, TracebackType
 
-__all__ = ["InterruptionError", "StrayExitError", "ended", "interruptions", "own_process"]
+__all__ = [
+    "InterruptionError",
+    "StrayError",
+    "UnreadError",
+    "ended",
+    "interruptions",
+    "own_process",
+]
 
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
 
@@ -31,8 +38,12 @@ class InterruptionError(Exception):
     """The keyboard's interruption of a command, as an exception that click leaves alone."""
 
 
-class StrayExitError(Exception):
-    """Something called `sys.exit` inside a command, which would end it as if it were done."""
+class UnreadError(Exception):
+    """Nobody reads the output any more."""
+
+
+class StrayError(Exception):
+    """A call of `sys.exit` or a broken pipe inside a command, which click would take for an end."""
 
 
 def ended(run: Callable[[], Any]) -> int:
@@ -43,7 +54,7 @@ def ended(run: Callable[[], Any]) -> int:
             return int(run() or ExitStatus.DONE)
     except SystemExit:  # of click's shell completion
         raise
-    except BrokenPipeError:
+    except UnreadError:
         return ExitStatus.UNREAD
     except (InterruptionError, click.Abort) as error:
         kept = f"; {error}" if error.args else ""
@@ -60,13 +71,23 @@ def ended(run: Callable[[], Any]) -> int:
 
 @contextlib.contextmanager
 def interruptions() -> Iterator[None]:
-    """Turn an interruption from the keyboard, and a stray `sys.exit`, into what `ended` tells."""
+    """Turn what click would end the program for into what `ended` tells."""
     try:
         yield
     except KeyboardInterrupt as interruption:
         raise InterruptionError(*interruption.args) from None
     except SystemExit as error:
-        raise StrayExitError(f"sys.exit({error.code!r}) was called") from error
+        raise StrayError(f"sys.exit({error.code!r}) was called") from error
+    except BrokenPipeError as error:
+        raise (UnreadError() if _printing(error) else StrayError("a pipe broke")) from error
+
+
+def _printing(error: BaseException) -> bool:
+    """Whether it is the program's output that broke, and not a pipe to another process."""
+    last = error.__traceback__
+    while last is not None and last.tb_next is not None:
+        last = last.tb_next
+    return last is not None and str(last.tb_frame.f_globals.get("__name__")).startswith("click")
 
 
 @contextlib.contextmanager
@@ -167,11 +188,21 @@ def _logged(error: BaseException, heard: list[str]) -> str:
 
 @contextlib.contextmanager
 def _quiet(heard: list[str]) -> Iterator[None]:
-    """Keep warnings of libraries for the log; those that are errors are raised as before."""
+    """Keep what libraries warn of for the log; warnings that are errors are raised as before."""
+    import logging  # noqa: PLC0415  # where click needs it not
 
     def keep(message: Warning | str, category: type[Warning], *place: Any) -> None:
         heard.append(f"{category.__name__}: {message} ({place[0]}, line {place[1]})")
 
-    with warnings.catch_warnings():
-        warnings.showwarning = keep  # type: ignore[assignment]
-        yield
+    class Keep(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            heard.append(f"{record.name}: {record.getMessage()}")
+
+    handler = Keep(logging.WARNING)
+    logging.getLogger().addHandler(handler)
+    try:
+        with warnings.catch_warnings():
+            warnings.showwarning = keep  # type: ignore[assignment]
+            yield
+    finally:
+        logging.getLogger().removeHandler(handler)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
+import sys
+import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import control
 import numpy as np
@@ -17,16 +20,20 @@ from impc.closed_loop import require_complete, scenario, simulate
 from impc.cohort import cluster
 from impc.cohort.store import open_store
 from impc.cohort.study import read_study
+from impc.commands.consent import require_consent
+from impc.commands.plant import find_plant
 from impc.controller import mpc_controller
+from impc.effort import Effort
 from impc.errors import ImpcError
 from impc.files.alignment import misaligned
 from impc.files.configuration import read_configuration
 from impc.files.reading import read_recordings
 from impc.fit_recordings import fit_problem
 from impc.fit_settings import FitSettings, fit_settings
+from impc.jit import keep_caches
 from impc.lqr import solve_lqr
 from impc.plant import Plant, as_plant
-from impc.plant_source import make_plant, plant_source
+from impc.plant_source import PlantSource, make_plant, plant_source
 from impc.recording import recording
 from impc.report.write import require_writable
 from impc.weights import stage_weights
@@ -139,6 +146,31 @@ def everything_recorded(_: Path) -> None:
     make_plant(source, source.make().input_labels)
 
 
+def settings(table: dict[str, Any]) -> Callable[[Path], object]:
+    return lambda _: fit_settings(table)
+
+
+def module_of_an_installed_name(folder: Path) -> None:
+    (folder / "control.py").write_text("def stick(): pass")
+    with contextlib.chdir(folder):
+        plant_source("control:stick", {})
+
+
+def caches_without_a_home(folder: Path) -> str:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tempfile, "tempdir", str(folder))
+        for name in ("XDG_CACHE_HOME", "XDG_CONFIG_HOME"):
+            patch.setenv(name, "/proc/none")
+        for name in ("NUMBA_CACHE_DIR", "MPLCONFIGDIR"):
+            patch.setenv(name, "")  # so that it is put back afterwards
+            patch.delenv(name)
+        return f"impc: note: {keep_caches()}"
+
+
+def large_request(seconds: float, gigabytes: float) -> Callable[[Path], object]:
+    return lambda _: require_consent(Effort(seconds, gigabytes), given=False)
+
+
 #: Message -> what provokes it: raises the error, or returns the text.
 PROVOKED: dict[str, Callable[[Path], object]] = {
     "does not exist; check the path": damaged("missing file"),
@@ -180,6 +212,16 @@ PROVOKED: dict[str, Callable[[Path], object]] = {
     "refuses its arguments (...)": lambda _: make_plant(
         plant_source("plants:cursor_plant", {"size": 3}), ()
     ),
+    "rename yours: an installed module has its name": module_of_an_installed_name,
+    "ends in ... (...); correct the function, or what it is given": lambda _: make_plant(
+        PlantSource("mine:stick", lambda: sys.exit(0), {}), ()
+    ),
+    "[fit] ...: got ...; give at least ..., at most ...": settings({"horizon": 2**63}),
+    "names ... twice; name each once": settings({"free": ["mass", "mass"]}),
+    "is a ... that no result can keep": lambda _: find_plant("cursor", {"sample_time": 2**64}),
+    "would need ... GB of memory, more than this machine has": large_request(0, 1e9),
+    "this request: would take about ... hours; ...; or say --yes": large_request(1e9, 0),
+    "impc: note: caches are kept in ...": caches_without_a_home,
     "is continuous, a discrete one is needed": lambda _: as_plant(
         control.ss([[-1]], [[1]], [[1]], 0)
     ).require_discrete(),
