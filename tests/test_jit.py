@@ -79,14 +79,13 @@ def test_the_library_compiles_in_memory_without_a_place_for_caches(tmp_path: Pat
     shutil.copytree(ROOT / "impc", tmp_path / "impc", ignore=shutil.ignore_patterns("__pycache__"))
     (tmp_path / "impc" / "__pycache__").write_text("a file, where numba would make a folder")
     code = (
-        "from impc.jit import njit\n"
         "import impc.compiled\n"
-        "twice = njit(cache=True)(impc.compiled.substitute.py_func)\n"
         "print(type(impc.compiled.substitute._cache).__name__, impc.compiled.__file__)\n"
     )
+    homeless = {"PYTHONPATH": str(tmp_path), "HOME": NOWHERE, "XDG_CACHE_HOME": NOWHERE}
+    words = [sys.executable, "-P", "-c", code]
     done = subprocess.run(
-        [sys.executable, "-P", "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False,
-        env=os.environ | {"PYTHONPATH": str(tmp_path), "HOME": NOWHERE, "XDG_CACHE_HOME": NOWHERE},
-    )  # fmt: skip
+        words, env=os.environ | homeless, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
     assert done.stdout.split() == ["NullCache", str(tmp_path / "impc" / "compiled.py")]

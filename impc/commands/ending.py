@@ -102,7 +102,8 @@ def own_process() -> Iterator[None]:
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):  # a name that the terminal's encoding lacks is no fault
             stream.reconfigure(errors="backslashreplace")
-    sys.unraisablehook = threading.excepthook = lambda _: None
+    sys.unraisablehook = lambda _: None
+    threading.excepthook = lambda _: None
     with contextlib.suppress(ValueError):  # not the main thread
         signal.signal(signal.SIGINT, _Interrupts())
     yield
