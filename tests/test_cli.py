@@ -86,6 +86,15 @@ def test_result_json_is_the_run(case_b: tuple[Result, Path], example_plant: Plan
         (("example", "--wrong"), "--wrong"),
         (("exam",), "exam"),
         (("--wrong",), "--wrong"),
+        (("simulate", "seated-balance", "--motor-noise", "nan"), "--motor-noise"),
+        (("simulate", "seated-balance", "--amplitude", "1e308"), "--amplitude"),
+        (("simulate", "seated-balance", "--mass", "-inf"), "--mass"),
+        (("simulate", "seated-balance", "--seed", "9" * 400), "--seed"),
+        (("simulate", "cohort", "--duration", "nan"), "--duration"),
+        (("simulate", "cohort", "--replicates", str(2**63)), "--replicates"),
+        (("key-parameters", "study.toml", "--bound", "nan"), "--bound"),
+        (("select", "study.toml", "--workers", "1000000000"), "--workers"),
+        (("fit", "a\nb.csv", "--plant", "cursor", "--config", "\udcff.toml"), r"\xff.toml"),
     ],
 )
 def test_bad_arguments_get_one_line(arguments: tuple[str, ...], names: str) -> None:

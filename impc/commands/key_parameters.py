@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+from impc.commands.numbers import Number
 from impc.commands.options import out_option, scheduler_options
 from impc.commands.output import print_files
 from impc.commands.select import kept_results, read_model_study, study_runner
@@ -18,12 +19,12 @@ __all__ = ["command"]
 @out_option("key-parameters", "report.html, result.json, table and figure")
 @click.option(
     "--bound",
-    type=click.FloatRange(min=0, min_open=True),
+    type=Number(min=0, max=1e6, min_open=True),
     default=0.35,
     help="Largest variance, in halves of the ranges, squared.",
 )
-@click.option("--vaf", type=float, default=69.0, help="Least mean VAF, %.")
-@click.option("--icc", type=float, default=0.75, help="Least ICC(A,k).")
+@click.option("--vaf", type=Number(), default=69.0, help="Least mean VAF, %.")
+@click.option("--icc", type=Number(), default=0.75, help="Least ICC(A,k).")
 @scheduler_options
 def command(
     study_file: Path,

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, TypeVar
 
 import click
 
+from impc.commands.numbers import LARGEST_SEED
+
 if TYPE_CHECKING:
     from collections.abc import Callable
     from typing import Any
@@ -17,7 +19,10 @@ F = TypeVar("F", bound="Callable[..., Any]")
 
 #: --seed of everything that is simulated.
 seed_option = click.option(
-    "--seed", type=click.IntRange(min=0), default=0, help="All numbers drawn follow from it."
+    "--seed",
+    type=click.IntRange(0, LARGEST_SEED),
+    default=0,
+    help="All numbers drawn follow from it.",
 )
 
 #: --yes of what may take hours, see `impc.commands.consent`.
@@ -43,7 +48,7 @@ def scheduler_options(command: F) -> F:
     )
     local = click.option(
         "--workers",
-        type=click.IntRange(min=1),
+        type=click.IntRange(1, 1024),
         help="Workers on this machine; one a core by default.",
     )
     return address(local(command))
