@@ -37,7 +37,7 @@ class Effort:
     Attributes
     ----------
     seconds : float
-        On one core of an ordinary machine.
+        s, on one core of an ordinary machine.
     gigabytes : float
         Of the arrays that are alive at a time.
     """

@@ -127,9 +127,10 @@ def users_code(name: str, *passing: type[Exception]) -> Iterator[None]:
     InputError
         For anything else, a call of `sys.exit` among it.
     """
+    foreseen: tuple[type[Exception], ...] = (ImpcError, *passing)
     try:
         yield
-    except (ImpcError, *passing):
+    except foreseen:
         raise
     except BaseException as error:
         if type(error) is KeyboardInterrupt:

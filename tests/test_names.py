@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from typing import Any
 
 import numpy as np
 from matplotlib.text import Text
@@ -36,8 +37,9 @@ def test_no_name_is_mathematics_on_a_figure() -> None:
         right.set_yticks([0, 1])
         right.set_yticklabels(HOSTILE[:2])
         assert {"png", "pdf"} == set(render(figure))
-        drawn = [text.get_text() for text in figure.findobj(Text)]
-        set_as = [text._preprocess_math(text.get_text()) for text in figure.findobj(Text)]
+        texts: list[Any] = figure.findobj(Text)
+        drawn = [text.get_text() for text in texts]
+        set_as = [text._preprocess_math(text.get_text()) for text in texts]
     shown = [said for said, mathematics in set_as if not mathematics]
     numbers = [text for text, (_, how) in zip(drawn, set_as, strict=True) if how]
     assert numbers

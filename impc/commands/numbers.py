@@ -22,13 +22,7 @@ class Number(click.FloatRange):
     name = "number"
 
     def convert(self, value: Any, param: Parameter | None, ctx: Context | None) -> float:
-        """Read the `value` of an option.
-
-        Raises
-        ------
-        click.BadParameter
-            When it is no number, not finite, or out of range.
-        """
+        """The number that `value` says; click gives `param` and `ctx` for its message."""
         found = float(super().convert(value, param, ctx))
         if not math.isfinite(found):
             self.fail(f"{value} is no number to compute with.", param, ctx)

@@ -30,7 +30,7 @@ _ANY_LENGTH = 10**9
 
 
 def csv_bytes(heads: Sequence[Any], rows: Iterable[Sequence[Any]]) -> bytes:
-    """A table as CSV in UTF-8: commas, one line a row; None and NaN are empty cells."""
+    """The table of these `heads` and `rows` as CSV in UTF-8; None and NaN are empty cells."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow([_cell(head) for head in heads])

@@ -151,7 +151,7 @@ def _set_literally(figure: Figure) -> None:
             formatter = axis.get_major_formatter()
             if isinstance(formatter, (FuncFormatter, FixedFormatter)):  # names at the ticks
                 axis.set_major_formatter(FuncFormatter(_literal_tick(formatter)))
-    found: set[Text] = set(figure.findobj(Text))  # type: ignore[arg-type]  # a class is welcome
+    found: set[Text] = set(figure.findobj(Text))
     for text in found - numbers:
         text.set_parse_math(False)
         text.set_text("\n".join(one_line(line) for line in text.get_text().split("\n")))
