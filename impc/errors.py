@@ -1,8 +1,8 @@
 """What can go wrong, as one tree of exceptions that say what to do.
 
 Every message is one line: the subject (an argument, a file, a sample), what was found there,
-and the remedy; signs that would break the line are escaped. The three parts are kept apart so that the command line, a report and a worker
-process can show them without parsing text.
+and the remedy; signs that would break the line are escaped. The three parts are kept apart so that
+the command line, a report and a worker process can show them without parsing text.
 """
 
 from __future__ import annotations
