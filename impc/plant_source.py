@@ -92,12 +92,12 @@ def import_function(path: str) -> Callable[..., Any]:
     InputError
         When there is no such module or function, or the module cannot be imported.
     """
-    module, colon, function = path.partition(":")
-    if not (module and colon and function):
+    module, _, function = path.partition(":")
+    first = module.partition(".")[0]
+    if not (first and function):
         raise InputError(
             f"plant {path}", "is neither a known name, a file, nor module:function", "see docs"
         )
-    first = module.partition(".")[0]
     installed = first in sys.modules or importlib.util.find_spec(first) is not None
     try:
         with (

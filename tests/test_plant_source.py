@@ -19,6 +19,7 @@ from impc.plant_source import (
     plant_family_of,
     plant_source,
 )
+from impc.selection.source import model_source
 
 A, B, C = [[1.0, 0.1], [0.0, 1.0]], [[0.005, 0.0], [0.1, 0.1]], [[1.0, 0.0]]
 
@@ -107,6 +108,13 @@ def test_a_module_that_ends_the_program(tmp_path: Path, monkeypatch: pytest.Monk
         plant_source("broken_plant:x", {})
 
 
+def test_a_model_that_ends_the_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "ending_model.py").write_text("def model(): raise SystemExit(0)\n")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match="model ending_model:model: ends in SystemExit"):
+        model_source("ending_model:model", {})
+
+
 @pytest.mark.parametrize("suffix", ["mat", "npz", "json"])
 def test_a_saved_state_space(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"plant.{suffix}"
@@ -141,6 +149,7 @@ def test_a_free_parameter_of_the_seat() -> None:
     ("name", "arguments", "says"),
     [
         ("seat", {}, "neither a known name, a file, nor module:function"),
+        (".here:f", {}, "neither a known name, a file, nor module:function"),
         ("plants:no_such", {}, "cannot be imported"),
         ("no_such_module:f", {}, "cannot be imported"),
         ("plants:seated_balance_plant", {"weight": 3}, "refuses its arguments"),
