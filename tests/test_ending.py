@@ -164,18 +164,21 @@ def test_modules_beside_recordings_replace_nothing(tmp_path: Path) -> None:
 
 
 INTERRUPTED = """
-import os, signal
-def once():
+import atexit, os, signal
+def interrupt():
     os.kill(os.getpid(), signal.SIGINT)
 def twice():
     try:
-        os.kill(os.getpid(), signal.SIGINT)
+        interrupt()
     except KeyboardInterrupt:
-        os.kill(os.getpid(), signal.SIGINT)
+        interrupt()
+def late():
+    atexit.register(interrupt)  # while Python waits for what is still at work
+    interrupt()
 """
 
 
-@pytest.mark.parametrize("function", ["once", "twice"])
+@pytest.mark.parametrize("function", ["twice", "late"])
 def test_interruptions_from_the_keyboard(tmp_path: Path, function: str) -> None:
     (tmp_path / "mine.py").write_text(INTERRUPTED)
     (tmp_path / "a.csv").write_text(RECORDING)
