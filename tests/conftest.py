@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import control
 import numpy as np
 import pytest
+from hypothesis import settings
 from matplotlib.figure import Figure
 
 from impc.bounds import box_bounds
@@ -19,6 +20,15 @@ if TYPE_CHECKING:
 
     from impc.bounds import Bounds
     from impc.plant import Plant
+
+
+# The same examples on every machine and no clock. `make search` draws new ones, from a seed that it
+# prints (--hypothesis-profile=search --hypothesis-seed=...).
+settings.register_profile("fixed", derandomize=True, deadline=None, database=None, print_blob=True)
+settings.register_profile(
+    "search", derandomize=False, deadline=None, database=None, print_blob=True, max_examples=1000
+)
+settings.load_profile("fixed")
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -21,6 +21,27 @@ def nelder_mead(objective: Callable[[Any], float], start: np.ndarray, budget: in
     return float(minimize(objective, start, method="Nelder-Mead", options=options).fun)
 
 
+def extrapolated_slope(function: Callable[[float], Any], first: float = 1e-2) -> np.ndarray:
+    """Derivative of an array of a number at 0, by central differences at halved steps (Ridders).
+
+    One step alone must weigh truncation against rounding, which grow where the other falls: at
+    1e-5 a gain of 256 with a P of condition 1e5 is off by 2e-4. Neville's table takes both away
+    and tells its own error, by which the estimate is chosen.
+    """
+    table: list[np.ndarray] = []
+    best, least = np.zeros(0), np.inf
+    for power in range(8):
+        step = first / 2**power
+        row = [np.asarray((function(step) - function(-step)) / (2 * step))]
+        for order, earlier in enumerate(table, 1):
+            row.append(row[-1] + (row[-1] - earlier) / (4.0**order - 1))
+            error = max(np.max(np.abs(row[-1] - row[-2])), np.max(np.abs(row[-1] - earlier)))
+            if error < least:
+                best, least = row[-1], float(error)
+        table = row
+    return best
+
+
 def random_plant(rng: np.random.Generator, n: int, m: int, radius: float, d: int = 0) -> Plant:
     """A random discrete plant with the given spectral radius and d disturbances."""
     A = rng.normal(size=(n, n))
