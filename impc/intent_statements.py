@@ -82,7 +82,7 @@ def order_statements(
             direction[i, i], direction[j, j] = sizes[i] ** 2, -(sizes[j] ** 2)
             says = f"a typical {one} costs more than a typical {other}"
             ends = linear_range(found, direction)
-            span = (ends.low, ends.high)
+            span = (ends.low_bound, ends.high_bound)  # no member goes beyond
             statements.append(_statement(found, span, one, other, says, sizes[i]))
     return tuple(statements)
 
@@ -111,7 +111,7 @@ def sense_statements(
             i, j = names.index(one), names.index(other)
             ends, scale = ranges[max(i, j), min(i, j)], sizes[i] * sizes[j]
             says = f"{one} and {other} of the same sign cost more than of opposite signs"
-            span = (scale * ends.low, scale * ends.high)
+            span = (scale * ends.low_bound, scale * ends.high_bound)
             statements.append(_statement(found, span, one, other, says, sizes[i]))
     return tuple(statements)
 

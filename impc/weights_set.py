@@ -321,7 +321,7 @@ def _member(found: WeightsSet, y: Array) -> Array:
 
 
 def _cones(found: WeightsSet, more: int = 0) -> list[Cone]:
-    """t l I <= X <= limit t l I in the variables (y, t), l so that the first, as seen, is t at most.
+    """t l I <= X <= limit t l I in the variables (y, t), with l I at most I as seen.
 
     `more` variables follow that do not occur here.
     """

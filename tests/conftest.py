@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from impc.bounds import box_bounds
 from impc.plant import as_plant
 from tests.labelled_axes import require_labels
+from tests.support import SEARCH
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -22,13 +23,11 @@ if TYPE_CHECKING:
     from impc.plant import Plant
 
 
-# The same examples on every machine and no clock. `make search` draws new ones, from a seed that it
-# prints (--hypothesis-profile=search --hypothesis-seed=...).
-settings.register_profile("fixed", derandomize=True, deadline=None, database=None, print_blob=True)
+# The same examples on every machine and no clock; `make search` draws new ones.
 settings.register_profile(
-    "search", derandomize=False, deadline=None, database=None, print_blob=True, max_examples=1000
+    "impc", derandomize=SEARCH == 1, deadline=None, database=None, print_blob=True
 )
-settings.load_profile("fixed")
+settings.load_profile("impc")
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
+import os
 from typing import TYPE_CHECKING, Any
 
 import control
 import numpy as np
 import scipy.optimize
+from hypothesis import settings
 
 from impc.plant import Plant, as_plant
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+
+#: How many times the examples of `make test` are drawn: 1, or what `make search` asks for.
+SEARCH = int(os.environ.get("IMPC_SEARCH", "1"))
+
+
+def draws(count: int) -> settings:
+    """So many examples of hypothesis, always the same; times SEARCH new ones in `make search`."""
+    return settings(max_examples=count * SEARCH)
 
 
 def nelder_mead(objective: Callable[[Any], float], start: np.ndarray, budget: int) -> float:

@@ -6,7 +6,7 @@ import control
 import numpy as np
 import pytest
 import scipy.linalg
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from impc.arrays import Array
@@ -19,7 +19,7 @@ from impc.inverse_lqr import (
 from impc.lqr import solve_lqr
 from impc.plant import Plant, as_plant
 from impc.weights import condition_number, stage_weights
-from tests.support import extrapolated_slope
+from tests.support import draws, extrapolated_slope
 
 EXAMPLE = as_plant(control.ss([[2, -1], [1, 0.2]], [[1], [0]], np.eye(2), 0, 1.0))
 NO_WEIGHTS_GAIN = np.array([[1.21183, -0.71277]])
@@ -150,7 +150,7 @@ def test_gradient_agrees_with_differences(seed: int, n: int, m: int, dt: float) 
     require_gradient(seed, n, m, dt)
 
 
-@settings(max_examples=6)
+@draws(6)
 @given(
     seed=st.integers(0, 2**32 - 1),
     n=st.integers(1, 4),

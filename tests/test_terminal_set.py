@@ -11,7 +11,7 @@ import control
 import numpy as np
 import pytest
 import scipy.linalg
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
@@ -29,6 +29,7 @@ from impc.terminal_set import (
 )
 from impc.weights import stage_weights
 from plants.seated_balance import seated_balance_plant
+from tests.support import draws
 
 if TYPE_CHECKING:
     from impc.arrays import Array
@@ -208,7 +209,7 @@ def cases(draw: st.DrawFn) -> Case:
     return plant, regulator(plant), bounds
 
 
-few = settings(max_examples=25, deadline=None, derandomize=True, print_blob=True)
+few = draws(25)
 
 
 @few
