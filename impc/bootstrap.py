@@ -21,7 +21,7 @@ import numpy as np
 import scipy.signal
 from statsmodels.regression.linear_model import burg
 
-from impc.arrays import Array, frozen
+from impc.arrays import Array, Frozen, frozen
 from impc.closed_loop import simulate
 from impc.errors import InputError
 from impc.fitted_controller import fit_controller
@@ -54,7 +54,7 @@ _BEFORE = 500
 
 
 @dataclass(frozen=True)
-class Replicate:
+class Replicate(Frozen):
     """Estimates of one replicate.
 
     Attributes

@@ -17,17 +17,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from impc.arrays import Array, finite_array, frozen
+from impc.arrays import Array, Frozen, as_numbers, finite_array, frozen
 from impc.bounds import bound_rows
 from impc.compiled import LoopMatrices, run
+from impc.door import Value, checked
 from impc.errors import DataError, InfeasibleError, SolverError
 from impc.prediction import RowDirections, build_rows, differentiate_rows, directions
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import ArrayLike
 
     from impc.controller import Controller
@@ -84,7 +87,7 @@ _SENTENCES = {
 
 
 @dataclass(frozen=True)
-class Scenario:
+class Scenario(Value):
     """What drives a simulation, in the units of the plant.
 
     Attributes
@@ -94,6 +97,11 @@ class Scenario:
     disturbance : Array
         One row for each sample (steps, d).
     """
+
+    rules: ClassVar[Mapping[str, Any]] = {
+        "x0": "n",
+        "disturbance": "* d",
+    }
 
     x0: Array
     disturbance: Array
@@ -105,7 +113,7 @@ class Scenario:
 
 
 @dataclass(frozen=True)
-class Simulation:
+class Simulation(Frozen):
     """A closed loop from its first state to its last.
 
     Attributes
@@ -140,7 +148,7 @@ class Simulation:
 
 
 @dataclass(frozen=True)
-class Sensitivity:
+class Sensitivity(Frozen):
     """Derivatives of a `Simulation` along p directions.
 
     Attributes
@@ -181,6 +189,7 @@ class PreparedLoop:
     matrix_directions: LoopMatrices
 
 
+@checked(x0="n", steps=(1, 10_000_000))
 def scenario(
     plant: Plant, x0: ArrayLike, steps: int | None = None, disturbance: ArrayLike | None = None
 ) -> Scenario:
@@ -203,16 +212,17 @@ def scenario(
     start = finite_array("x0", x0, (plant.n,))
     count = plant.E.shape[1]
     if disturbance is None:
-        if steps is None or steps < 1:
-            raise DataError("steps", f"got {steps!r} without a disturbance", "give at least 1")
+        if steps is None:
+            raise DataError("steps", "not given, nor a disturbance", "give at least 1")
         return Scenario(frozen(start), frozen(np.zeros((steps, count))))
-    columns = np.asarray(disturbance)
+    columns = as_numbers("disturbance", disturbance)
     given = finite_array(
         "disturbance", columns[:, None] if columns.ndim == 1 else columns, (steps, count)
     )
     return Scenario(frozen(start), frozen(given))
 
 
+@checked
 def simulate(controller: Controller, given: Scenario) -> Simulation:
     """Simulate the plant of the controller; never raises for what happens on the way.
 
@@ -225,6 +235,7 @@ def simulate(controller: Controller, given: Scenario) -> Simulation:
     return simulation
 
 
+@checked
 def simulate_and_differentiate(
     controller: Controller, given: Scenario, along: Directions
 ) -> tuple[Simulation, Sensitivity]:
@@ -272,6 +283,7 @@ def run_loop(prepared: PreparedLoop, given: Scenario) -> tuple[Simulation, Sensi
     return Simulation(x, u, status, weakly_active, failed_row), Sensitivity(dx, du)
 
 
+@checked
 def require_complete(controller: Controller, simulation: Simulation) -> Simulation:
     """Return the simulation when every sample was reached.
 

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 
-from impc.arrays import Array
+from impc.arrays import Array, Frozen
+from impc.door import checked
 from impc.errors import SolverError, WeightsError
 from impc.gain_fibre import GainFibre, gain_fibre, pair_blocks, split_blocks
 from impc.lqr import solve_lqr
@@ -59,7 +60,7 @@ class WeightsMargin:
 
 
 @dataclass(frozen=True)
-class EquivalentWeights:
+class EquivalentWeights(Frozen):
     """Weights that have the gain of a fibre.
 
     Attributes
@@ -87,6 +88,7 @@ class EquivalentWeights:
     gap: float | None
 
 
+@checked
 def weights_margin(fibre: GainFibre) -> WeightsMargin:
     """Say whether any weights have the gain: max t such that X >= t I, mean eigenvalue of X is 1.
 
@@ -116,6 +118,7 @@ def weights_margin(fibre: GainFibre) -> WeightsMargin:
     return WeightsMargin(margin, exist=False, weights=None)
 
 
+@checked
 def least_condition_weights(fibre: GainFibre) -> EquivalentWeights:
     """Return the weights of least condition number that have the gain.
 
@@ -153,6 +156,7 @@ def least_condition_weights(fibre: GainFibre) -> EquivalentWeights:
     return _member(fibre, best, f"least condition number, Clarabel: {status}", gap)
 
 
+@checked
 def analytic_centre(fibre: GainFibre) -> EquivalentWeights:
     """Return the member of largest det Q det R among those with trace(N^-1 R) = m.
 
@@ -190,6 +194,7 @@ def analytic_centre(fibre: GainFibre) -> EquivalentWeights:
     )
 
 
+@checked(count=0, condition_ratio=1)
 def other_weights(
     fibre: GainFibre, count: int = 2, *, condition_ratio: float = 10.0
 ) -> tuple[EquivalentWeights, ...]:

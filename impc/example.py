@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from impc.arrays import Array, frozen
+from impc.arrays import Array, Frozen, frozen
 from impc.bounds import box_bounds
 from impc.closed_loop import Scenario, Simulation, require_complete, scenario, simulate
 from impc.controller import Controller, gain_controller, mpc_controller
@@ -60,7 +60,7 @@ BOUND = 1.0
 
 
 @dataclass(frozen=True)
-class MethodResult:
+class MethodResult(Frozen):
     """What one method makes of the recording.
 
     Attributes
@@ -103,7 +103,7 @@ class MethodResult:
 
 
 @dataclass(frozen=True)
-class CaseResult:
+class CaseResult(Frozen):
     """One initial state: the truth, the methods in the order of the table, and what was determined.
 
     Attributes

@@ -21,6 +21,7 @@ from impc.arrays import Array, frozen
 from impc.certainty import assess, count_stages
 from impc.closed_loop import simulate
 from impc.comparison import compare_methods
+from impc.door import checked
 from impc.errors import DataError, SolverError
 from impc.fit_result import FitResult, FittedParameter
 from impc.fit_settings import FitSettings, fit_bounds
@@ -77,6 +78,7 @@ def stages(problem: InverseProblem, settings: FitSettings) -> int:
     return 1 + methods + left_out + count_stages(problem, settings)
 
 
+@checked
 def fit_problem(
     plant: Plant,
     recordings: Sequence[Recording],

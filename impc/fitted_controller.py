@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.diagonal_weights import diagonal_weights
+from impc.door import checked
 from impc.equivalent_weights import least_condition_weights
 from impc.errors import SolverError, WeightsError
 from impc.evaluation import residual_only
@@ -73,6 +74,7 @@ class FittedController:
     converged: bool
 
 
+@checked
 def fit_controller(problem: InverseProblem, start: Weights | None = None) -> FittedController:
     """Fit the weights of the constrained controller behind recordings.
 

@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy.optimize
 
-from impc.arrays import Array, frozen
+from impc.arrays import Array, Frozen, frozen
 from impc.diagonal_weights import bryson_weights
+from impc.door import checked
 from impc.errors import SolverError
 from impc.evaluation import misfit_or_reason
 from impc.gain_coordinates import Coordinates
@@ -34,7 +35,7 @@ _NOISY_TOLERANCE, _SETTLED = 1e-6, 1e-3
 
 
 @dataclass(frozen=True)
-class GainFit:
+class GainFit(Frozen):
     """A gain fitted to recordings.
 
     Attributes
@@ -76,6 +77,7 @@ class GainFit:
     refused: tuple[str, ...]
 
 
+@checked(attempts=1, max_evaluations=1, spread=0)
 def fit_gain(
     problem: InverseProblem,
     *starts: tuple[Array, Array],

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.arrays import Array, frozen
+from impc.arrays import Array, Frozen, frozen
 from impc.evaluation import evaluate
 from impc.gain_fibre import natural_coordinates
 from impc.residual_noise import ResidualNoise, residual_noise, spread_of_sum
@@ -38,7 +38,7 @@ DETERMINED = 1e-6
 
 
 @dataclass(frozen=True)
-class GainCovariance:
+class GainCovariance(Frozen):
     """What the recordings say of the gain at a fit.
 
     Directions are of the gain in natural coordinates, K T with x = T z, row by row (`gain_fibre`):

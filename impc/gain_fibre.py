@@ -25,8 +25,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy.linalg
 
-from impc.arrays import Array, finite_array, frozen, symmetric_matrix
-from impc.errors import WeightsError
+from impc.arrays import Array, Frozen, finite_array, frozen, symmetric_matrix
+from impc.door import checked
+from impc.errors import InputError, WeightsError
 from impc.lqr import is_stable, lyapunov_series
 from impc.step_program import block_basis
 from impc.weights import Weights
@@ -54,7 +55,7 @@ _STATE_FLOOR, _INPUT_FLOOR = 1e-8, 1e-3
 
 
 @dataclass(frozen=True)
-class GainFibre:
+class GainFibre(Frozen):
     """The linear space of the pairs (Q, R) for which the gain is stationary.
 
     Attributes
@@ -100,6 +101,7 @@ class GainFibre:
         return split_blocks(back.T @ X @ back, self.plant.n)
 
 
+@checked(gain="m n", metric="m m")
 def gain_fibre(plant: Plant, gain: ArrayLike, metric: ArrayLike | None = None) -> GainFibre:
     """Compute the space of the weights that have a given gain.
 
@@ -217,7 +219,11 @@ def _lyapunov(plant: Plant, F: Array, stack: Array) -> Array:
 
 def _add_metric(conditions: Array, S: Array, G: Array, metric: ArrayLike) -> Array:
     """Rows S - s metric = 0, with one more unknown s."""
-    given = G.T @ symmetric_matrix("metric", metric, len(G)) @ G
+    square = symmetric_matrix("metric", metric, len(G))
+    size = float(np.max(np.abs(square)))
+    if size == 0:
+        raise InputError("metric", "is zero", "give R + B'PB, up to scale")
+    given = G.T @ (square / size) @ G
     rows = np.hstack([conditions, S.reshape(len(S), -1)])
     scale = np.concatenate([np.zeros(conditions.shape[1]), -given.ravel() / np.linalg.norm(given)])
     return np.vstack([rows, scale])

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.arrays import Array, frozen
+from impc.arrays import Array, Frozen, frozen
 from impc.equivalent_weights import (
     analytic_centre,
     least_condition_weights,
@@ -38,7 +38,7 @@ _NAMED = 0.05
 
 
 @dataclass(frozen=True)
-class Reading:
+class Reading(Frozen):
     """The intent as one choice of weights shows it.
 
     Attributes
@@ -71,7 +71,7 @@ class Reading:
 
 
 @dataclass(frozen=True)
-class Intent:
+class Intent(Frozen):
     """Readings of the intent behind one gain; the first is the dissertation's.
 
     Attributes

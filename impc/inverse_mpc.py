@@ -17,6 +17,7 @@ from impc.closed_loop import simulate
 from impc.conditioned_fit import ConditionedFit, Objective, Residual, conditioned_fit
 from impc.controller import mpc_controller
 from impc.diagonal_weights import bryson_weights
+from impc.door import checked
 from impc.equivalent_weights import gain_fibre, least_condition_weights
 from impc.errors import SolverError, WeightsError
 from impc.evaluation import evaluate
@@ -138,6 +139,7 @@ class Inference:
     fit: ConditionedFit
 
 
+@checked(condition_weight=0)
 def infer_weights(
     problem: InverseProblem, *, condition_weight: float = CONDITION_WEIGHT
 ) -> Inference:
@@ -168,6 +170,7 @@ def start_gains(start: Start, plant: Plant) -> list[tuple[Array, Array]]:
     return [(np.array(start.gain.K), pairs[0][1]), *pairs]
 
 
+@checked
 def starting_point(problem: InverseProblem) -> Start:
     """Lines 1 to 8 of Table 3.1: a feedback gain, and the weights of a regulator like it.
 
@@ -186,6 +189,7 @@ def starting_point(problem: InverseProblem) -> Start:
     return Start(gain, lmi, gradient, auxiliary, auxiliary.weights)
 
 
+@checked(condition_weight=0, max_iterations=1)
 def inverse_mpc(
     problem: InverseProblem,
     start: Weights,
@@ -220,6 +224,7 @@ def inverse_mpc(
     )
 
 
+@checked(condition_weight=0)
 def inverse_mpc_reduced(
     problem: InverseProblem,
     *starts: tuple[Array, Array],
@@ -290,6 +295,7 @@ def _least_condition(plant: Plant, fit: GainFit) -> tuple[EquivalentWeights | No
         return None, str(error)
 
 
+@checked(gain="m n", condition_weight=0)
 def auxiliary_weights(
     plant: Plant,
     gain: Array,
@@ -328,6 +334,7 @@ def auxiliary_weights(
     )
 
 
+@checked(condition_weight=0)
 def output_penalty_weights(
     problem: InverseProblem,
     start: Weights,
@@ -351,6 +358,7 @@ def output_penalty_weights(
     return inverse_mpc(without_bounds(problem), start, condition_weight=condition_weight)
 
 
+@checked
 def verify_hard(problem: InverseProblem, weights: Weights) -> list[Simulation]:
     """Simulate every recording with hard state bounds and terminal set.
 

@@ -11,18 +11,21 @@ at other values of these (docs/theory.md, section 6; docs/fitting.md).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from impc.arrays import Array, finite_array, frozen
 from impc.bounds import box_bounds
 from impc.closed_loop import Scenario
-from impc.controller import Controller, gain_controller
+from impc.controller import LONGEST_HORIZON, Controller, gain_controller
+from impc.door import Value, checked
 from impc.errors import DataError, InputError
 from impc.plant_family import plant_at
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import ArrayLike
 
     from impc.bounds import Bounds
@@ -44,7 +47,7 @@ __all__ = [
 
 
 @dataclass(frozen=True)
-class InverseProblem:
+class InverseProblem(Value):
     """Find the controller that made the recordings.
 
     Attributes
@@ -69,6 +72,12 @@ class InverseProblem:
         Logarithms of the family's parameters over their nominal values at which `plant` is (k,).
     """
 
+    rules: ClassVar[Mapping[str, Any]] = {
+        "horizon": (1, LONGEST_HORIZON),
+        "output_scale": "p",
+        "logarithms": "*",
+    }
+
     plant: Plant
     bounds: Bounds
     horizon: int
@@ -81,6 +90,7 @@ class InverseProblem:
     logarithms: Array
 
 
+@checked(horizon=(1, LONGEST_HORIZON), output_scale="p")
 def inverse_problem(
     plant: Plant,
     bounds: Bounds,
@@ -153,6 +163,7 @@ def moved(problem: InverseProblem, starts: Array, logarithms: Array) -> InverseP
     return replace(problem, plant=plant, recordings=recordings, logarithms=frozen(logarithms))
 
 
+@checked
 def without_bounds(problem: InverseProblem) -> InverseProblem:
     """Return the same problem for a plain feedback gain: no bounds, no terminal set."""
     return replace(problem, bounds=box_bounds(problem.plant), terminal_set=False)

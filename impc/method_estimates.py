@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from impc.arrays import Array, frozen
+from impc.arrays import Array, Frozen, frozen
 from impc.diagonal_weights import diagonal_weights
 from impc.equivalent_weights import least_condition_weights
 from impc.errors import ImpcError, SolverError, WeightsError
@@ -60,7 +60,7 @@ METHODS = (
 
 
 @dataclass(frozen=True)
-class Estimate:
+class Estimate(Frozen):
     """What one method makes of one set of recordings.
 
     Attributes

@@ -14,6 +14,7 @@ import control
 import numpy as np
 import scipy.io
 
+from impc.door import checked
 from impc.errors import ImpcError, InputError, PlantError
 from impc.plant import Plant, as_plant
 from impc.plant_family import PlantFamily, plant_family
@@ -49,6 +50,7 @@ class PlantSource:
     arguments: Mapping[str, Any]
 
 
+@checked
 def plant_source(name: str, arguments: Mapping[str, Any]) -> PlantSource:
     """Find a plant by import path, or by the name of a .mat, .npz or .json file.
 
@@ -68,6 +70,7 @@ def plant_source(name: str, arguments: Mapping[str, Any]) -> PlantSource:
     return PlantSource(name, import_function(name), arguments)
 
 
+@checked
 def import_function(path: str) -> Callable[..., Any]:
     """The function of an import path ``module:function``; the current folder is looked in too.
 
@@ -93,6 +96,7 @@ def import_function(path: str) -> Callable[..., Any]:
     return found
 
 
+@checked
 def make_plant(source: PlantSource, recorded: Sequence[str], **changed: float) -> Plant:
     """Make the plant; inputs that are recorded are disturbances, the others are controls.
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy.optimize
 
-from impc.arrays import Array, BoolArray, frozen
+from impc.arrays import Array, BoolArray, Frozen, frozen
 from impc.diagonal_weights import bryson_weights
 from impc.errors import InputError, SolverError
 from impc.evaluation import evaluate, misfit_or_reason
@@ -35,7 +35,7 @@ _PARAMETER_UNIT = 1 / 3
 
 
 @dataclass(frozen=True)
-class PreliminaryGain:
+class PreliminaryGain(Frozen):
     """Result of `preliminary_gain`.
 
     Attributes

@@ -25,7 +25,7 @@ import scipy.linalg
 import scipy.optimize
 import scipy.stats
 
-from impc.arrays import Array, frozen
+from impc.arrays import Array, Frozen, frozen
 from impc.errors import InputError
 from impc.gain_coordinates import PARAMETER_UNIT, Coordinates
 from impc.gain_covariance import gain_covariance
@@ -49,7 +49,7 @@ _ROUNDS = 6
 
 
 @dataclass(frozen=True)
-class Profile:
+class Profile(Frozen):
     """Profile of one number.
 
     Attributes

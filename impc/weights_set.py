@@ -23,7 +23,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import scipy.linalg
 
-from impc.arrays import Array
+from impc.arrays import Array, Frozen
+from impc.door import checked
 from impc.equivalent_weights import analytic_centre, inverse_factor, least_condition_weights
 from impc.errors import InputError, SolverError, WeightsError
 from impc.gain_fibre import pair_blocks, split_blocks
@@ -55,7 +56,7 @@ _GAP, _HALVINGS = 1e-8, 50
 
 
 @dataclass(frozen=True)
-class WeightsSet:
+class WeightsSet(Frozen):
     """The set of the module's text, ready for programs over it.
 
     Attributes
@@ -122,6 +123,7 @@ class Range:
     high_weights: Weights
 
 
+@checked
 def weights_set(fibre: GainFibre, ratio: float = 10.0) -> WeightsSet:
     """Prepare the set of weights with condition number up to `ratio` times the least.
 
@@ -175,6 +177,7 @@ def _largest_trace(fibre: GainFibre, inverse: Array, raw: Array) -> float:
     return alpha * m * float(np.linalg.norm(fibre.G, 2)) ** 2 / (1 - error)
 
 
+@checked(direction="n+m n+m")
 def linear_range(found: WeightsSet, direction: Array) -> Range:
     """Range of trace(direction blkdiag(Q, R)) over the set, direction symmetric (n + m, n + m).
 
@@ -187,6 +190,7 @@ def linear_range(found: WeightsSet, direction: Array) -> Range:
     return Range(low.value, high.value, low.bound, high.bound, low.weights, high.weights)
 
 
+@checked(direction="n+m n+m")
 def linear_maximum(found: WeightsSet, direction: Array) -> End:
     """Largest trace(direction blkdiag(Q, R)) over the set, direction symmetric (n + m, n + m).
 
@@ -199,6 +203,7 @@ def linear_maximum(found: WeightsSet, direction: Array) -> End:
     return End(-end.value, -end.bound, end.weights)
 
 
+@checked
 def entry_ranges(
     found: WeightsSet, states: Sequence[int] | None = None
 ) -> dict[tuple[int, int], Range]:
@@ -214,6 +219,7 @@ def entry_ranges(
     return ranges
 
 
+@checked(scaling="n")
 def trace_range(found: WeightsSet, scaling: Array) -> Range:
     """Range of trace(D Q D), D = diag(scaling) (n,): the low end is the member of least trace."""
     size = np.zeros(len(found.first))
@@ -221,6 +227,7 @@ def trace_range(found: WeightsSet, scaling: Array) -> Range:
     return linear_range(found, np.diag(size))
 
 
+@checked(scaling="n")
 def nearest_diagonal(found: WeightsSet, scaling: Array) -> End:
     """Member whose D Q D, D = diag(scaling) (n,), has the least off-diagonal part (Frobenius).
 
@@ -257,6 +264,7 @@ def nearest_diagonal(found: WeightsSet, scaling: Array) -> End:
     return End(value, unit * solved.bound, split_blocks(X, n))
 
 
+@checked
 def extreme_eigenvalue(found: WeightsSet, *, largest: bool) -> End:
     """Least largest eigenvalue of Q over the set, or its largest least one.
 

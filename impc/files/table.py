@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.arrays import frozen
+from impc.arrays import Frozen, frozen
 from impc.errors import DataError
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ __all__ = ["Table", "make_table"]
 
 
 @dataclass(frozen=True)
-class Table:
+class Table(Frozen):
     """The numeric columns of one file.
 
     Attributes

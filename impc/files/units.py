@@ -7,6 +7,7 @@ import re
 from dataclasses import dataclass
 from typing import Any
 
+from impc.door import checked
 from impc.errors import InputError
 
 __all__ = ["Unit", "is_unit", "si_unit"]
@@ -49,6 +50,7 @@ class Unit:
         return self.base == "radian"
 
 
+@checked
 @functools.cache
 def si_unit(written: str) -> Unit:
     """What a `written` unit is in SI base units: deg -> 0.01745 rad, "N*m" and "Nm" -> 1 N m.
