@@ -5,7 +5,7 @@
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
-.PHONY: help env demo test check docs reproduce wheel slow bench lock clean
+.PHONY: help env demo test check docs reproduce wheel slow search numerics bench lock clean
 
 PYTHON ?= python3
 # Not to be set from outside: the environment is made with `venv --clear`.
@@ -40,6 +40,8 @@ help:
 	@echo 'make test    set up .venv, then check and pytest: all but the slow tests, the site too'
 	@echo 'make check   ruff check, ruff format --check, mypy --strict'
 	@echo 'make slow    the slow tests'
+	@echo 'make search   new examples for the tests by hypothesis, from a seed that is printed'
+	@echo 'make numerics the numerical tests on other processors and dependencies (an hour; needs uv)'
 	@echo 'make docs    build the site in docs/_build/html; warnings are errors, tutorials run (minutes)'
 	@echo 'make reproduce  write docs/reproduction: the dissertation, line by line (half an hour)'
 	@echo 'make wheel   build a wheel, install it in an empty environment, run impc example there'
@@ -79,6 +81,23 @@ wheel: env
 
 slow: env
 	$(PY) -m pytest -m slow
+
+# Twenty times the examples of `make test`, other ones each time; SEED=... repeats a search.
+SEED ?= $(shell date +%s)
+search: env
+	@echo 'make search SEED=$(SEED)'
+	IMPC_SEARCH=20 OPENBLAS_NUM_THREADS=1 $(PY) -m pytest -m "not slow" --hypothesis-seed=$(SEED) $(SEARCHED)
+SEARCHED := tests/test_inverse_lqr.py tests/test_equivalent_weights.py tests/test_terminal_set.py
+
+# The floors of pyproject.toml on the oldest Python, the newest there are on the newest.
+numerics: .venv-oldest/.stamp .venv-newest/.stamp
+	.venv-newest/bin/python -m tests.numerics .venv-oldest/bin/python .venv-newest/bin/python
+
+.venv-oldest/.stamp .venv-newest/.stamp: pyproject.toml
+	@$(UV) --version >/dev/null 2>&1 || { echo 'make numerics needs uv: pip install uv' >&2; exit 1; }
+	$(UV) venv -q --clear --python $(if $(findstring oldest,$@),3.11,3.13) $(@D)
+	$(UV) pip install -q --python $(@D) $(if $(findstring oldest,$@),--resolution lowest-direct) -r pyproject.toml --extra dev
+	@touch $@
 
 bench: env
 	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(PY) -m experiments.benchmarks

@@ -94,7 +94,8 @@ def as_numbers(name: str, values: ArrayLike) -> Array:
     if isinstance(values, np.ma.MaskedArray):
         if values.dtype.kind not in "biuf":
             raise _not_numbers(name, f"an array of {values.dtype}")
-        return np.asarray(values.astype(np.float64).filled(np.nan))
+        masked: Any = values.astype(np.float64)
+        return np.asarray(masked.filled(np.nan), dtype=np.float64)
     try:
         raw = np.asarray(values)
         if raw.dtype.kind == "O":  # None would become NaN, and text a number

@@ -24,7 +24,7 @@ import math
 import numbers
 import re
 import sys
-from typing import TYPE_CHECKING, Any, ClassVar, ParamSpec, TypeVar, overload
+from typing import TYPE_CHECKING, Any, ClassVar, ParamSpec, TypeVar, cast, overload
 
 import numpy as np
 
@@ -32,7 +32,7 @@ from impc.arrays import Frozen, as_numbers, require_finite, with_shape
 from impc.errors import DataError, InputError, brief
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Hashable, Mapping
 
     Kind = Callable[[str, Any], Any]
     Rule = str | float | tuple[float, float]
@@ -120,7 +120,7 @@ class Value(Frozen):
 
     def __post_init__(self) -> None:
         sizes: dict[str, int] = {}
-        for name, kind in _field_kinds(type(self)):
+        for name, kind in _field_kinds(cast("Hashable", type(self))):
             value = getattr(self, name)
             found = kind(name, value)
             _require_sizes(name, found, sizes)
@@ -168,8 +168,8 @@ def _ruled(name: str, value: Any, rule: Rule, sizes: dict[str, int]) -> Any:
             raise InputError(name, f"got {_described(value)}", f"give {wanted}")
         return value
     symbols = rule.lstrip("~").split()
-    wanted = tuple(_size(symbol, sizes) for symbol in symbols)
-    value = with_shape(name, value, wanted)
+    expected = tuple(_size(symbol, sizes) for symbol in symbols)
+    value = with_shape(name, value, expected)
     if not rule.startswith("~"):
         require_finite(name, value)
     for symbol, size in zip(symbols, value.shape, strict=True):
@@ -193,8 +193,8 @@ def _sealed(value: Any) -> Any:
 
 
 @functools.cache
-def _field_kinds(owner: type) -> tuple[tuple[str, Kind], ...]:
-    fields = dataclasses.fields(owner)  # type: ignore[arg-type]  # a dataclass
+def _field_kinds(owner: Any) -> tuple[tuple[str, Kind], ...]:
+    fields = dataclasses.fields(owner)
     return tuple((field.name, _kind(str(field.type))) for field in fields)
 
 

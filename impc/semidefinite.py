@@ -196,7 +196,7 @@ def _sandwiched(part: Array, cone: Cone) -> Array:
     if not _is_matrix(cone):
         return np.zeros_like(cone.rows)
     Z = _matrices(part[None])[0]
-    return _triangle(Z @ _matrices(cone.rows.T) @ Z).T
+    return np.asarray(_triangle(Z @ _matrices(cone.rows.T) @ Z).T)
 
 
 def _is_matrix(cone: Cone) -> bool:

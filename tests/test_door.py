@@ -162,6 +162,7 @@ def test_a_value_made_by_hand_is_checked_and_not_the_callers() -> None:
     Q[0, 0] = 5.0
     assert made.Q[0, 0] == 1.0
     assert made.R.dtype == np.float64
+    wrong: Any
     for wrong in ("text", np.eye(3)[:2], np.full((2, 2), np.nan)):
         with pytest.raises(InputError, match="Q: "):
             replace(made, Q=wrong)

@@ -38,6 +38,8 @@ NOT_RUN = {
     ("docs/contributing.md", "make check"): _WHOLE,
     ("docs/contributing.md", "make test"): _WHOLE,
     ("docs/contributing.md", "make slow"): _WHOLE,
+    ("docs/contributing.md", "make search"): _WHOLE,
+    ("docs/contributing.md", "make numerics"): _WHOLE,
     ("docs/contributing.md", "python -m pytest tests/documents -k start"): _WHOLE,
     ("docs/contributing.md", "python -m pytest tests/test_lqr.py"): _WHOLE,
     ("docs/contributing.md", "make docs"): _SITE,
