@@ -98,8 +98,10 @@ def as_numbers(name: str, values: ArrayLike) -> Array:
         return np.asarray(masked.filled(np.nan), dtype=np.float64)
     try:
         raw = np.asarray(values)
-        if raw.dtype.kind == "O":  # None would become NaN, and text a number
-            raw = np.asarray(_entries(raw), dtype=np.float64).reshape(raw.shape)
+        if raw.dtype.kind == "O" and all(_is_real(entry) for entry in raw.flat):
+            # Whole numbers beyond int64, fractions, pandas' NA; None would become NaN.
+            real = [np.nan if repr(entry) == "<NA>" else float(entry) for entry in raw.flat]
+            raw = np.array(real, dtype=np.float64).reshape(raw.shape)
     except (TypeError, ValueError, OverflowError, AttributeError):
         raise _not_numbers(name, type(values).__name__) from None
     if raw.dtype.kind not in "biuf":
@@ -108,15 +110,8 @@ def as_numbers(name: str, values: ArrayLike) -> Array:
         return np.asarray(raw, dtype=np.float64)
 
 
-def _entries(raw: Any) -> list[float]:
-    """The entries of an array of objects: whole numbers beyond int64, fractions, pandas' NA."""
-    return [np.nan if repr(entry) == "<NA>" else _real(entry) for entry in raw.ravel()]
-
-
-def _real(entry: object) -> float:
-    if not isinstance(entry, numbers.Real):
-        raise TypeError(type(entry).__name__)
-    return float(entry)
+def _is_real(entry: object) -> bool:
+    return isinstance(entry, numbers.Real) or repr(entry) == "<NA>"
 
 
 def _not_numbers(name: str, got: str) -> DataError:
@@ -153,7 +148,21 @@ def finite_array(name: str, values: ArrayLike, shape: tuple[int | None, ...]) ->
 
 
 def with_shape(name: str, array: Array, shape: tuple[int | None, ...]) -> Array:
-    """Return the array when it has the shape, None where any length will do.
+    """Return the array when it has the shape.
+
+    Parameters
+    ----------
+    name : str
+        Name of the argument, for the message.
+    array : Array
+        Of any shape.
+    shape : tuple
+        Expected shape; ``None`` where any length will do.
+
+    Returns
+    -------
+    Array
+        Of that shape.
 
     Raises
     ------
@@ -170,6 +179,13 @@ def with_shape(name: str, array: Array, shape: tuple[int | None, ...]) -> Array:
 
 def require_finite(name: str, array: Array) -> None:
     """Require that every entry is finite.
+
+    Parameters
+    ----------
+    name : str
+        Name of the argument, for the message.
+    array : Array
+        Of any shape.
 
     Raises
     ------

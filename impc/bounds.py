@@ -39,7 +39,7 @@ class Bounds(Value):
         Input bounds (m,), in the units of the inputs.
     """
 
-    rules: ClassVar[Mapping[str, Any]] = {
+    _rules: ClassVar[Mapping[str, Any]] = {
         "x_min": "~n",
         "x_max": "~n",
         "u_min": "~m",

@@ -98,7 +98,7 @@ class Scenario(Value):
         One row for each sample (steps, d).
     """
 
-    rules: ClassVar[Mapping[str, Any]] = {
+    _rules: ClassVar[Mapping[str, Any]] = {
         "x0": "n",
         "disturbance": "* d",
     }

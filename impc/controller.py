@@ -61,7 +61,7 @@ class Controller(Value):
         answer is that of the hard problem whenever there is one. Input bounds are always hard.
     """
 
-    rules: ClassVar[Mapping[str, Any]] = {
+    _rules: ClassVar[Mapping[str, Any]] = {
         "K": "m n",
         "S": "m m",
         "horizon": (1, LONGEST_HORIZON),

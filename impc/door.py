@@ -108,15 +108,10 @@ class Value(Frozen):
     """Base of frozen dataclasses: fields are checked by the same table, arrays made read-only.
 
     So whenever one is made, by its constructor or by `dataclasses.replace`; copies and what comes
-    out of a pickle were checked, and stay read-only too.
-
-    Attributes
-    ----------
-    rules : mapping
-        Rules of the fields.
+    out of a pickle were checked, and stay read-only too. `_rules` are the rules of the fields.
     """
 
-    rules: ClassVar[Mapping[str, Rule]] = {}
+    _rules: ClassVar[Mapping[str, Rule]] = {}
 
     def __post_init__(self) -> None:
         sizes: dict[str, int] = {}
@@ -124,7 +119,7 @@ class Value(Frozen):
             value = getattr(self, name)
             found = kind(name, value)
             _require_sizes(name, found, sizes)
-            rule = self.rules.get(name)
+            rule = self._rules.get(name)
             if rule is not None and found is not None:
                 found = _ruled(name, found, rule, sizes)
             found = _sealed(found)
@@ -152,7 +147,7 @@ def _sizes_of(value: Any) -> dict[str, int]:
         if isinstance(inner, Frozen):
             sizes |= _sizes_of(inner)
     if isinstance(value, Value):
-        for name, rule in value.rules.items():
+        for name, rule in value._rules.items():
             shape = getattr(value, name)
             if isinstance(rule, str) and isinstance(shape, np.ndarray):
                 pairs = zip(rule.lstrip("~").split(), shape.shape, strict=False)

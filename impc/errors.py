@@ -1,8 +1,8 @@
 """What can go wrong, as one tree of exceptions that say what to do.
 
 Every message is one line: the subject (an argument, a file, a sample), what was found there,
-and the remedy. The three parts are kept apart so that the command line, a report and a worker
-process can show them without parsing text.
+and the remedy; signs that would break the line are escaped. The three parts are kept apart so that
+the command line, a report and a worker process can show them without parsing text.
 """
 
 from __future__ import annotations
@@ -38,8 +38,6 @@ class ImpcError(Exception):
         What was expected and what was given instead.
     remedy : str
         What to do about it.
-
-    Each part may hold names from anywhere; `str` makes one line of the whole (`one_line`).
     """
 
     def __init__(self, subject: str, problem: str, remedy: str) -> None:

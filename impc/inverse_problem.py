@@ -72,7 +72,7 @@ class InverseProblem(Value):
         Logarithms of the family's parameters over their nominal values at which `plant` is (k,).
     """
 
-    rules: ClassVar[Mapping[str, Any]] = {
+    _rules: ClassVar[Mapping[str, Any]] = {
         "horizon": (1, LONGEST_HORIZON),
         "output_scale": "p",
         "logarithms": "*",

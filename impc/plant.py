@@ -39,7 +39,7 @@ class Plant(Value):
         Names of the signals, in the order of the arrays.
     """
 
-    rules: ClassVar[Mapping[str, Any]] = {
+    _rules: ClassVar[Mapping[str, Any]] = {
         "A": "n n",
         "B": "n m",
         "E": "n d",

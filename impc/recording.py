@@ -58,7 +58,7 @@ class Recording(Value):
         What the checks of its file found and let pass, one sentence each.
     """
 
-    rules: ClassVar[Mapping[str, Any]] = {
+    _rules: ClassVar[Mapping[str, Any]] = {
         "outputs": "* p",
         "disturbance": "* d",
         "x0": "n",

@@ -188,7 +188,7 @@ def _projected(part: Array, cone: Cone) -> Array:
         head = max(float(part[0]), 0.0)
         return np.append(head, part[1:] * min(1.0, head / max(length, 1e-300)))
     values, vectors = np.linalg.eigh(_matrices(part[None])[0])
-    return _triangle(((vectors * np.maximum(values, 0.0)) @ vectors.T)[None])[0]
+    return np.asarray(_triangle(((vectors * np.maximum(values, 0.0)) @ vectors.T)[None])[0])
 
 
 def _sandwiched(part: Array, cone: Cone) -> Array:

@@ -44,7 +44,7 @@ class Weights(Value):
         Input weight (m, m), symmetric, positive definite.
     """
 
-    rules: ClassVar[Mapping[str, Any]] = {
+    _rules: ClassVar[Mapping[str, Any]] = {
         "Q": "n n",
         "R": "m m",
     }

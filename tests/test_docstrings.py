@@ -53,7 +53,7 @@ ROOT = Path(__file__).parent.parent
 
 # Modules and packages without an equation to cite, by what they are about instead.
 PLUMBING = {
-    "checks and exceptions": ("impc.arrays", "impc.errors", "plants._checks"),
+    "checks and exceptions": ("impc.arrays", "impc.door", "impc.errors", "plants._checks"),
     "the command line": ("impc.cli", "impc.commands"),
     "files and what is in them": ("impc.files", "impc.fit_memory", "impc.recording"),
     "import paths": ("impc.plant_source", "impc.selection.source"),
