@@ -140,7 +140,7 @@ def _side(name: str, values: ArrayLike | None, size: int, default: float) -> Arr
         side = np.array(np.broadcast_to(np.asarray(values, dtype=float), (size,)))
     except ValueError:
         raise BoundsError(
-            name, f"has shape {np.shape(values)}", f"give a number or {size} of them"
+            name, f"got shape {np.shape(values)}", f"give a number or {size} of them"
         ) from None
     if np.any(np.isnan(side)):
         raise BoundsError(name, f"has NaN: {side.tolist()}", "use inf where there is no bound")

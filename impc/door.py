@@ -159,7 +159,10 @@ def _ruled(name: str, value: Any, rule: Rule, sizes: dict[str, int]) -> Any:
     if not isinstance(rule, str):
         least, most = rule if isinstance(rule, tuple) else (rule, math.inf)
         if not least <= value <= most:
-            wanted = f"at least {least:g}" + (f" and at most {most:g}" if most < math.inf else "")
+            what = "a whole number of " if isinstance(value, int) else ""
+            wanted = f"{what}at least {least:g}" + (
+                f" and at most {most:g}" if most < math.inf else ""
+            )
             raise InputError(name, f"got {_described(value)}", f"give {wanted}")
         return value
     symbols = rule.lstrip("~").split()

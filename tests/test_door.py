@@ -76,7 +76,7 @@ def test_an_error_names_its_argument() -> None:
         (lambda: mpc_controller(None, pair, box, 4), "plant: expected a Plant, got None; make it"),  # type: ignore[arg-type]
         (lambda: mpc_controller(PLANT, box, box, 4), "weights: expected a Weights, got Bounds"),  # type: ignore[arg-type]
         (lambda: mpc_controller(PLANT, pair, box, 4.0), "horizon: got 4.0; give a whole number"),  # type: ignore[arg-type]
-        (lambda: mpc_controller(PLANT, pair, box, 5001), "horizon: got 5001; give at least 1 and"),
+        (lambda: mpc_controller(PLANT, pair, box, 5001), "horizon: got 5001; give a whole number"),
         (lambda: mpc_controller(PLANT, pair, box, 2**63), "horizon: is beyond 2147483647"),
         (lambda: mpc_controller(PLANT, stage_weights(np.eye(3), 1), box, 4),
          "weights: has 3 states, what stands before it 2; give values of one plant"),
