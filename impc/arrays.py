@@ -198,7 +198,7 @@ def require_finite(name: str, array: Array) -> None:
     first = tuple(int(index) for index in bad[0])
     raise DataError(
         name,
-        f"{len(bad)} of {array.size} entries are NaN, masked or infinite, the first at {first}",
+        f"{len(bad)} of {array.size} entries are NaN or infinite, the first at {first}",
         "remove or repair those samples before fitting",
     )
 

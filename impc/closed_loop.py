@@ -213,7 +213,7 @@ def scenario(
     count = plant.E.shape[1]
     if disturbance is None:
         if steps is None:
-            raise DataError("steps", "not given, nor a disturbance", "give at least 1")
+            raise DataError("steps", "got None without a disturbance", "give at least 1")
         return Scenario(frozen(start), frozen(np.zeros((steps, count))))
     columns = as_numbers("disturbance", disturbance)
     given = finite_array(
