@@ -56,7 +56,9 @@ def _json(result: Reliability, command: str) -> bytes:
         name = f"{item.measure}.{item.output}"
         if item.icc is not None:
             told = {key: getattr(item.icc, key) for key in ("value", "low", "high", "form")}
-            told |= {"sem": item.sem, "mdc": item.mdc, "subjects": item.icc.subjects}
+            told |= {"subjects": item.icc.subjects, "interval": "generalised"}
+            if item.error is not None:
+                told |= {key: getattr(item.error, key) for key in ("sem", "mdc", "freedom")}
             found["icc"].setdefault(name, {})[item.condition] = told
         if item.anova is not None:
             test = asdict(item.anova)

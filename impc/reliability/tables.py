@@ -56,8 +56,8 @@ def _icc_table(result: Reliability, measure: str) -> TextTable:
     rows = []
     for item in _of(result, measure):
         factor, unit = _units(item)
-        found = item.icc
-        if found is None:
+        found, error = item.icc, item.error
+        if found is None or error is None:
             rows.append((item.condition, item.output, "-", "-", "-", "-", "; ".join(item.notes)))
             continue
         rows.append(
@@ -66,15 +66,16 @@ def _icc_table(result: Reliability, measure: str) -> TextTable:
                 item.output,
                 f"{found.value:.2f} ({found.low:.2f}, {found.high:.2f})",
                 band_of(found.value),
-                f"{factor * item.sem:.3g} {unit}",
-                f"{factor * item.mdc:.3g} {unit}",
+                f"{factor * error.sem:.3g} {unit}",
+                f"{factor * error.mdc:.3g} {unit}",
                 "; ".join((f"{found.subjects} subjects", *item.notes)),
             )
         )
     caption = (
         f"Counterpart of table {_NUMBERS[measure]}: between-visit reliability of "
-        f"{MEASURES[measure]}, ICC(A,k) with 95 % interval, standard error of measurement and "
-        "minimal detectable change (95 %)."
+        f"{MEASURES[measure]}, ICC(A,k) of the mean over visits with its generalised 95 % "
+        "interval, which allows for few visits that differ; standard error of measurement and "
+        "minimal detectable change (95 %) of the score of a single visit."
     )
     heads = ("condition", "output", "ICC(A,k)", "band", "SEM", "MDC", "notes")
     return TextTable(caption, heads, tuple(rows))
