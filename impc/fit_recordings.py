@@ -29,8 +29,10 @@ from impc.gain_covariance import gain_covariance
 from impc.held_out import predict
 from impc.identifiability import identifiability
 from impc.intent import intent
+from impc.intent_draws import drawn_gains
 from impc.inverse_problem import InverseProblem, controller_for, inverse_problem, scenarios
 from impc.preliminary import PreliminaryGain, preliminary_gain
+from impc.residual_diagnostics import residual_diagnostics
 from impc.weights_summary import weights_summary_or_reason
 
 if TYPE_CHECKING:
@@ -144,7 +146,8 @@ def fit_recordings(
     sizes = _state_sizes(known, fitted)
     with _threads() as pool:
         others = _left_out(pool, problem, settings, progress)
-        whole_set = pool.submit(weights_summary_or_reason, plant, K, sizes)
+        draws = drawn_gains(plant, fitted.weights, covariance) if settings.intent_draws else ()
+        whole_set = pool.submit(weights_summary_or_reason, plant, K, sizes, draws)
         methods = compare_methods(fitted, progress.done, _preliminary(problem, settings))
         held_out = []
         for index, other in enumerate(others):
@@ -171,6 +174,7 @@ def fit_recordings(
         ),
         tuple(held_out),
         methods,
+        residual_diagnostics(fitted.problem, K, np.array(fitted.solution.S)),
         _terminal_set_difference(known, fitted),
         time.perf_counter() - started,
     )

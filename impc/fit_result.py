@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from impc.lqr import solve_lqr
+from impc.residual_diagnostics import residual_warnings
 
 if TYPE_CHECKING:
     from impc.agreement import TrialAgreement
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from impc.intent import Intent
     from impc.inverse_problem import InverseProblem
     from impc.method_fit import MethodFit
+    from impc.residual_diagnostics import ResidualDiagnostics
 
 __all__ = ["FitResult", "FittedParameter"]
 
@@ -68,6 +70,8 @@ class FitResult:
         One a trial; empty for a single trial or when not asked for.
     methods : tuple of MethodFit
         Those of `impc.comparison` in their order; the last is inverse MPC.
+    diagnostics : ResidualDiagnostics
+        What the residuals say against the fit.
     terminal_set_difference : float
         Largest change of a scaled output when the terminal set is added (or taken away); NaN when
         the loop with it does not reach the end.
@@ -86,6 +90,7 @@ class FitResult:
     trials: tuple[TrialAgreement, ...]
     held_out: tuple[HeldOut, ...]
     methods: tuple[MethodFit, ...]
+    diagnostics: ResidualDiagnostics
     terminal_set_difference: float
     seconds: float
 
@@ -100,6 +105,13 @@ class FitResult:
         found = self.certainty.weights
         over_set = 0.0 if found is None else found.widest_angle
         return max(self.intent.widest_angle, over_set)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What has to be read before any number."""
+        saturated = sum(item.saturated for item in self.trials) / len(self.trials)
+        outputs = self.fitted.problem.plant.outputs
+        return residual_warnings(self.diagnostics, outputs, saturated)
 
     @property
     def inverse_mpc(self) -> MethodFit:

@@ -68,6 +68,9 @@ class FitSettings:
     profiles : list of str
         Entries of the gain, K.<control>.<state>, and free parameters whose profile likelihood is
         wanted.
+    intent_draws : bool
+        Whether statements on the intent are tried on gains that the recordings allow beside the
+        fitted one (`impc.intent_draws`); without that none is made.
     unknown_limit : bool
         Whether the limit of each input is estimated too.
     horizons : list of int
@@ -87,6 +90,7 @@ class FitSettings:
     bootstrap: Literal["block", "model"] = "block"
     seed: int = 0
     profiles: list[str] = field(default_factory=list)
+    intent_draws: bool = True
     unknown_limit: bool = False
     horizons: list[int] = field(default_factory=list)
 

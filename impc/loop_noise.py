@@ -133,7 +133,9 @@ def loop_noise(plant: Plant, gain: Array, residuals: list[Array]) -> LoopNoise |
 
 def _spectrum(residuals: list[Array]) -> _Spectrum | None:
     shortest = min(map(len, residuals))
-    size = np.sqrt(np.mean(np.concatenate([part - part.mean(axis=0) for part in residuals]) ** 2, axis=0))
+    size = np.sqrt(
+        np.mean(np.concatenate([part - part.mean(axis=0) for part in residuals]) ** 2, axis=0)
+    )
     if shortest < 64 or not np.all(size > 0) or not np.all(np.isfinite(size)):
         return None
     edges = [1.5]

@@ -63,7 +63,7 @@ def cart_trials(count: int, noise: float, samples: int = 300) -> list[Recording]
 @pytest.fixture(scope="module")
 def noisy() -> FitResult:
     trials = noisy_recordings(6.0, SEED, 0.9)
-    settings = FitSettings(u_max=6.0, feedback_states=FEEDBACK)
+    settings = FitSettings(u_max=6.0, feedback_states=FEEDBACK, intent_draws=False)
     return fit_recordings(fit_problem(seat().problem.plant, trials, settings), settings)
 
 

@@ -86,6 +86,8 @@ def _print(result: FitResult) -> None:
     """The table of methods and the intent, as the page has them."""
     from impc.intent import dominant_sentence  # noqa: PLC0415
 
+    for line in result.warnings:
+        click.echo(line)
     plant = result.fitted.problem.plant
     heads = "".join(f"{f'VAF {name}':>16}" for name in plant.outputs)
     click.echo(f"{'method':<20}{heads}{'largest input':>16}  ")

@@ -140,9 +140,7 @@ class MeasurementError:
     level: float
 
 
-def icc(
-    scores: ArrayLike, form: Form = "A,k", level: float = 0.95, method: Method = "F"
-) -> Icc:
+def icc(scores: ArrayLike, form: Form = "A,k", level: float = 0.95, method: Method = "F") -> Icc:
     """Intraclass correlation of scores.
 
     Parameters

@@ -18,6 +18,7 @@ __all__ = [
     "entries_table",
     "intervals_table",
     "limit_sentences",
+    "prices_table",
     "set_sentences",
     "statements_table",
 ]
@@ -64,25 +65,62 @@ def set_sentences(summary: WeightsSummary) -> tuple[str, ...]:
         f"its members with a condition number up to {summary.limit:.2g}, ten times the least.",
         f"The dominant direction {kept} over the set: it turns by up to "
         f"{summary.widest_angle:.0f} degrees (found by search; more may be possible).",
+        *_over_drawn(summary),
         "The condition number depends on the units of the states, and so does the member that it "
         "chooses. The analytic centre does not.",
     )
 
 
+def _over_drawn(summary: WeightsSummary) -> tuple[str, ...]:
+    if not summary.drawn:
+        return ()
+    return (
+        f"The gain is an estimate too: over {summary.drawn} others that the recordings allow the "
+        f"dominant direction of the weights of least condition number turns by up to "
+        f"{summary.angle_of_gain:.0f} degrees (95 %).",
+    )
+
+
 def statements_table(summary: WeightsSummary) -> TextTable:
     """Statements that hold for every member, and those that members disagree on."""
-    order = {True: 0, False: 0, None: 1}
     rows = tuple(
-        (item.says, _verdict(item), f"{item.low:.3g} to {item.high:.3g}")
-        for item in sorted(summary.statements, key=lambda item: order[item.holds])
+        (item.says, _verdict(item), _over_gains(item), f"{item.low:.3g} to {item.high:.3g}")
+        for item in sorted(summary.statements, key=lambda item: (not item.made, item.holds is None))
+    )
+    tried = (
+        f"The gain is an estimate: each statement was tried on {summary.drawn} other gains that the "
+        "recordings allow. One that holds for all weights, of all gains but one at most, may be "
+        "made of the subject, at 95 %."
+        if summary.drawn
+        else "The gain is an estimate, and other gains were not tried ([fit] intent_draws): none "
+        "may be made of the subject."
     )
     caption = (
         "Statements on the states that are recorded or cost most, at the size that they have in "
-        "the recordings. "
-        "One that holds for all weights may be said of the subject. The range is that of the "
-        "difference, or of the mixed price, over the price of the state named first."
+        f"the recordings. {tried} The range is that of the difference, or of the mixed price, over "
+        "the price of the state named first, at the fitted gain."
     )
-    return TextTable(caption, ("statement", "over all weights", "range"), rows)
+    heads = ("statement", "at 95 %", "other gains that agree", "range at the fitted gain")
+    return TextTable(caption, heads, rows)
+
+
+def prices_table(summary: WeightsSummary) -> TextTable | None:
+    """Prices of the named states, for the fitted gain and for all that the recordings allow."""
+    if not summary.prices:
+        return None
+    rows = tuple(
+        (
+            item.state,
+            f"{number(item.low)} to {number(item.high)}",
+            f"{number(item.low_drawn)} to {number(item.high_drawn)}",
+        )
+        for item in summary.prices
+    )
+    caption = (
+        "What a typical excursion costs, d^2 Q at trace R = m, over all weights: with the fitted "
+        f"gain, and with it or any of {summary.drawn} others that the recordings allow (95 %)."
+    )
+    return TextTable(caption, ("state", "fitted gain", "95 % interval"), rows)
 
 
 def entries_table(summary: WeightsSummary) -> TextTable:
@@ -144,9 +182,15 @@ def alternatives_table(certainty: Certainty) -> TextTable | None:
 
 
 def _verdict(item: Statement) -> str:
-    if item.holds is None:
-        return "undecided"
+    if not item.made:
+        return "not made"
     return "true for all" if item.holds else "false for all"
+
+
+def _over_gains(item: Statement) -> str:
+    if item.holds is None:
+        return "weights of the fitted gain disagree"
+    return "not tried" if item.confidence is None else f"{100 * item.confidence:.0f} %"
 
 
 def _range(low: float, high: float) -> str:

@@ -14,6 +14,7 @@ from impc.report.certainty_tables import (
     entries_table,
     intervals_table,
     limit_sentences,
+    prices_table,
     set_sentences,
     statements_table,
 )
@@ -150,8 +151,9 @@ def _weights_set(result: FitResult) -> tuple[tuple[str, ...], tuple[TextTable, .
     summary = result.certainty.weights
     if summary is None:
         return (), ()
-    tables = (statements_table(summary), entries_table(summary), eigenvalues_table(summary))
-    return set_sentences(summary), tables
+    prices = prices_table(summary)
+    tables = [statements_table(summary), *([] if prices is None else [prices])]
+    return set_sentences(summary), (*tables, entries_table(summary), eigenvalues_table(summary))
 
 
 def _directions(result: FitResult) -> TextTable:

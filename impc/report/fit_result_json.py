@@ -4,6 +4,7 @@
     states, controls, outputs, disturbances  names, in the order of every array below
     K, S, Q, R, P, horizon, bounds           the controller; weights at R[0][0] = 1
     covariance                               standard deviations of K, directions and how sure
+    warnings, residuals                      sentences; the tests behind them
     intent                                   eigenvalues (ascending), dominant, sentence, readings
     identifiability                          rank, free, chosen, singular_values
     parameters.<name>                        nominal, value, deviation
@@ -76,6 +77,14 @@ def _found(result: FitResult) -> dict[str, Any]:
             "directions": covariance.directions,
             "deviations": covariance.deviations,
             "natural_coordinates": covariance.T,
+        },
+        "warnings": result.warnings,
+        "residuals": {
+            name: None if test is None else {**asdict(test), "found": test.found}
+            for name, test in (
+                ("loop_noise", result.diagnostics.loop),
+                ("structure", result.diagnostics.structure),
+            )
         },
         "intent": {
             "eigenvalues": intent.reported.eigenvalues,

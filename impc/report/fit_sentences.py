@@ -38,6 +38,7 @@ _NAMED = 0.15
 def findings(result: FitResult) -> tuple[str, ...]:
     """The first lines of the page."""
     return (
+        *result.warnings,
         *_agreement(result),
         *_saturation(result),
         *_against_inverse_lqr(result),
@@ -125,10 +126,17 @@ def _against_inverse_lqr(result: FitResult) -> list[str]:
 
 
 def _how_sure(result: FitResult) -> str:
+    summary = result.certainty.weights
+    drawn = (
+        ""
+        if summary is None or not summary.drawn
+        else f" Other gains that the recordings allow turn it by up to "
+        f"{summary.angle_of_gain:.0f} degrees at 95 %."
+    )
     return (
         f"Other weights with exactly the same behaviour turn that direction by up to "
         f"{result.widest_angle:.0f} degrees: so far it was chosen by a rule and not by the "
-        f"subject (section 4)."
+        f"subject (section 4).{drawn}"
     )
 
 
