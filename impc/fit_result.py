@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 
 __all__ = ["FitResult", "FittedParameter"]
 
+# Standard deviation of the logarithm of a parameter that the recordings tell.
+_TOLD = 0.5
+
 
 @dataclass(frozen=True)
 class FittedParameter:
@@ -43,6 +46,14 @@ class FittedParameter:
     nominal: float
     value: float
     deviation: float
+
+    @property
+    def determined(self) -> bool:
+        """Whether the recordings tell it: to a factor of e at 95 %, its logarithm to 0.5.
+
+        What they do not tell stays near its nominal value, where the search began.
+        """
+        return self.deviation < _TOLD * self.value
 
 
 @dataclass(frozen=True)

@@ -3,17 +3,17 @@
 A fit takes what it does not explain as noise in the recorder. Noise that moves the body instead
 (motor noise, noise in what is sensed) is answered by the controller, and what is recorded of it has
 the response of the closed loop in it. Where such noise drives the command into its limit the fit is
-biased and its intervals do not hold (docs/fitting.md). Two models of the spectrum of the residuals,
+biased and its intervals do not hold (docs/fitting.md). Two models of the spectrum of residuals,
 
-    output noise    S_0(w) = H(w) V H(w)*                H diagonal: an autoregression of order two
-                                                         for each output, V (p, p)
+    output noise    S_0(w) = H(w) V H(w)* + D            H diagonal: an autoregression of order
+                                                         four for each output; V (p, p); D white
     and in the loop S_1(w) = S_0(w) + G(w) W(w) G(w)*    G = C (z - A + B K)^-1 B, the fitted loop;
                                                          W diagonal, first-order of one root
 
 are compared by Whittle's likelihood. Twice the gain of the second is near chi-squared of m + 1
 degrees of freedom when the first is true; the share of an output's variance that the second lays to
-the loop says how much there is of it. With one output an autoregression of order two can all but
-imitate a loop of two states: a share is then told with less power.
+the loop says how much there is of it. With one output an autoregression can all but imitate a loop
+of few states, and the test has little power.
 """
 
 from __future__ import annotations
@@ -43,7 +43,8 @@ _LEVEL, _LEAST_SHARE = 0.99, 0.2
 _WIDTH, _INSIDE = 0.05, 4
 # Hann's window makes neighbours depend: as many independent ordinates as T / 1.94 (35 / 18).
 _HANN = 35 / 18
-_FLOOR = 1e-9
+# Of the mean level: a spectrum below it, as of rounding, is not looked into.
+_FLOOR = 1e-3
 
 
 @dataclass(frozen=True)
@@ -115,17 +116,24 @@ def loop_noise(plant: Plant, gain: Array, residuals: list[Array]) -> LoopNoise |
             lambda t: _misfit(
                 _outputs(t, spectrum, p) + _loops(t[-m - 1 :], shapes, spectrum), spectrum
             ),
-            np.concatenate([_lowered(first.x, p, share), np.full(m, np.log(share)), [root]]),
+            np.concatenate([outputs, np.full(m, np.log(share)), [root]]),
         )
-        for share, root in ((0.05, 0.0), (0.9, 0.0), (0.9, 1.5))
+        for outputs, share, root in (
+            (_lowered(first.x, p, 0.05), 0.05, 0.0),
+            (_lowered(first.x, p, 0.9), 0.9, 1.5),
+            (_plain(p), 1.0, 0.0),
+        )
     ]
     best = min(both, key=lambda item: float(item.fun))
+    # The first model once more, from the second's outputs: its optimum must not be a worse one.
+    again = _minimise(lambda t: _misfit(_outputs(t, spectrum, p), spectrum), best.x[: _size(p)])
+    least = min(float(first.fun), float(again.fun))
     inside = _loops(best.x[-m - 1 :], shapes, spectrum)
     outside = _outputs(best.x, spectrum, p)
     total = [np.einsum("b,bii->i", spectrum.counts, part).real for part in (inside, outside)]
     return LoopNoise(
         frozen(total[0] / (total[0] + total[1])),
-        max(0.0, 2 * float(first.fun - best.fun)),
+        max(0.0, 2 * (least - float(best.fun))),
         float(scipy.stats.chi2.ppf(_LEVEL, m + 1)),
         float(np.tanh(best.x[-1])),
     )
@@ -205,13 +213,27 @@ def _misfit(S: np.ndarray, spectrum: _Spectrum) -> float:
 
 
 def _start(spectrum: _Spectrum, p: int) -> Array:
-    """Autoregressions of order one with the first autocorrelation of each output."""
+    """Autoregressions of each output by Levinson's recursion, a little white noise beside them."""
+    lags = np.arange(_ORDER + 1)[:, None]
     own = np.einsum("bii->bi", spectrum.power).real * spectrum.counts[:, None]
-    first = np.clip(np.cos(spectrum.angles) @ own / own.sum(axis=0), -0.995, 0.995)
-    reflections = np.zeros((p, _ORDER))
-    reflections[:, 0] = -np.arctanh(first)
-    triangle = np.diag(np.log(1 - first**2) / 2)[np.tril_indices(p)]
-    return np.concatenate([np.ravel(reflections), triangle, np.full(p, np.log(0.05))])
+    covariances = np.cos(lags * spectrum.angles) @ own / own.sum(axis=0)
+    reflections, left = np.zeros((p, _ORDER)), np.ones(p)
+    for output in range(p):
+        model = np.ones(1)
+        for order in range(_ORDER):
+            ahead = float(model @ covariances[order + 1 : 0 : -1, output][: len(model)])
+            reflections[output, order] = np.clip(-ahead / left[output], -0.995, 0.995)
+            model = np.append(model, 0.0) + reflections[output, order] * np.append(model, 0.0)[::-1]
+            left[output] *= 1 - reflections[output, order] ** 2
+    triangle = np.diag(np.log(left) / 2)[np.tril_indices(p)]
+    white = np.full(p, np.log(1e-2))
+    return np.concatenate([np.ravel(np.arctanh(reflections)), triangle, white])
+
+
+def _plain(p: int) -> Array:
+    """White noise of a hundredth of the outputs."""
+    triangle = np.diag(np.full(p, np.log(0.1)))[np.tril_indices(p)]
+    return np.concatenate([np.zeros(_ORDER * p), triangle, np.full(p, np.log(1e-2))])
 
 
 def _lowered(theta: Array, p: int, share: float) -> Array:
@@ -224,4 +246,6 @@ def _lowered(theta: Array, p: int, share: float) -> Array:
 
 
 def _minimise(misfit: Callable[[Array], float], start: Array) -> scipy.optimize.OptimizeResult:
-    return scipy.optimize.minimize(misfit, start, method="L-BFGS-B")
+    # A likelihood of some 1e4 to 1e-2: the threshold is 9. All but flat directions end it else.
+    options = {"ftol": 1e-6, "maxiter": 100}
+    return scipy.optimize.minimize(misfit, start, method="L-BFGS-B", options=options)

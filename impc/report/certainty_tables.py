@@ -88,8 +88,8 @@ def statements_table(summary: WeightsSummary) -> TextTable:
         for item in sorted(summary.statements, key=lambda item: (not item.made, item.holds is None))
     )
     tried = (
-        f"The gain is an estimate: each statement was tried on {summary.drawn} other gains that the "
-        "recordings allow. One that holds for all weights, of all gains but one at most, may be "
+        f"The gain is an estimate: each statement was tried on {summary.drawn} other gains that "
+        "the recordings allow. One that holds for all weights of all gains but one at most may be "
         "made of the subject, at 95 %."
         if summary.drawn
         else "The gain is an estimate, and other gains were not tried ([fit] intent_draws): none "

@@ -191,10 +191,18 @@ def _parameters(result: FitResult) -> TextTable | None:
     if not result.parameters:
         return None
     rows = tuple(
-        (item.name, number(item.nominal, 4), number(item.value, 4), number(item.deviation, 2))
+        (
+            item.name,
+            number(item.nominal, 4),
+            number(item.value, 4) if item.determined else "not determined",
+            number(item.deviation, 2),
+        )
         for item in result.parameters
     )
-    caption = "Physical parameters fitted with the gain (3.19), in SI units."
+    caption = (
+        "Physical parameters fitted with the gain (3.19), in SI units. One that is not determined, "
+        "to a factor of e at 95 %, stays near its nominal value whatever the truth."
+    )
     return TextTable(caption, ("parameter", "nominal", "fitted", "standard deviation"), rows)
 
 

@@ -7,7 +7,7 @@
     warnings, residuals                      sentences; the tests behind them
     intent                                   eigenvalues (ascending), dominant, sentence, readings
     identifiability                          rank, free, chosen, singular_values
-    parameters.<name>                        nominal, value, deviation
+    parameters.<name>                        nominal, value, deviation, determined
     trials                                   label, vaf, whiteness, x0, held_out_vaf, findings
     methods.<name>                           K, Q, R, vaf, trial_vaf, largest_input, keeps_bounds,
                                              fell (s, one a trial)
@@ -113,7 +113,9 @@ def _found(result: FitResult) -> dict[str, Any]:
             "singular_values": found.singular_values,
         },
         **_certainty(result),
-        "parameters": {item.name: asdict(item) for item in result.parameters},
+        "parameters": {
+            item.name: {**asdict(item), "determined": item.determined} for item in result.parameters
+        },
         "trials": [_trial(result, index) for index in range(len(result.trials))],
         "methods": {
             item.name: {
