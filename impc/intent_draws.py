@@ -100,15 +100,18 @@ def drawn_gains(
     factor = np.linalg.cholesky(weights.block)
     centre, T = solve_lqr(plant, weights), np.array(covariance.T)
     deviations = np.maximum(np.array(covariance.deviations), _SHARPEST)
-    told = np.array(covariance.directions) / deviations[:, None]
+    directions = np.array(covariance.directions)
+    told = directions / deviations[:, None]
     basis = _symmetric_blocks(n, m)
     moved = factor @ basis @ factor.T
     slopes = gain_gradients(centre)
     dK = np.einsum("abij,kij->kab", slopes.Q, moved[:, :n, :n])
     dK += np.einsum("abij,kij->kab", slopes.R, moved[:, n:, n:])
-    derivative = told @ (dK @ T).reshape(len(basis), -1).T
+    derivative = directions @ (dK @ T).reshape(len(basis), -1).T
     # Along what leaves the gain as it is nothing need move: the set of weights has all of it.
-    _, values, rows = np.linalg.svd(derivative, full_matrices=False)
+    _, _, moving = np.linalg.svd(derivative, full_matrices=False)
+    basis = np.tensordot(moving, basis, 1)
+    _, values, rows = np.linalg.svd(derivative @ moving.T / deviations[:, None])
     spread = 1 / np.sqrt(values**2 + 1 / _DECADE**2)
     basis = np.tensordot(rows, basis, 1)
 

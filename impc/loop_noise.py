@@ -19,7 +19,7 @@ of few states, and the test has little power.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.optimize
@@ -173,7 +173,7 @@ def _loop_shapes(plant: Plant, gain: Array, spectrum: _Spectrum) -> np.ndarray:
     z = np.exp(1j * angles)[..., None, None]
     G = plant.C @ np.linalg.solve(z * np.eye(len(closed)) - closed, plant.B + 0j)
     G = G / spectrum.size[:, None]
-    return np.einsum("bkpj,bkqj->bjpq", G, G.conj()) / _INSIDE
+    return np.asarray(np.einsum("bkpj,bkqj->bjpq", G, G.conj()) / _INSIDE)
 
 
 def _outputs(theta: Array, spectrum: _Spectrum, p: int) -> np.ndarray:
@@ -245,7 +245,7 @@ def _lowered(theta: Array, p: int, share: float) -> Array:
     return result
 
 
-def _minimise(misfit: Callable[[Array], float], start: Array) -> scipy.optimize.OptimizeResult:
+def _minimise(misfit: Callable[[Array], float], start: Array) -> Any:
     # A likelihood of some 1e4 to 1e-2: the threshold is 9. All but flat directions end it else.
-    options = {"ftol": 1e-6, "maxiter": 100}
+    options: Any = {"ftol": 1e-6, "maxiter": 100}
     return scipy.optimize.minimize(misfit, start, method="L-BFGS-B", options=options)
