@@ -65,6 +65,7 @@ class PriceRange:
     Attributes
     ----------
     state : str
+        Its name.
     low, high : float
         Over all weights with the fitted gain, in the cost's unit.
     low_drawn, high_drawn : float
@@ -128,7 +129,8 @@ def drawn_gains(
         off = told @ np.ravel((K - centre.K) @ T)
         return float(a @ a - off @ off - (a * spread) @ (a * spread) / _DECADE**2) / 2
 
-    a, drawn = np.zeros(len(spread)), []
+    a: Array = np.zeros(len(spread))
+    drawn = []
     for _ in range(count):
         for _ in range(_STEPS):
             a = _slice(a, excess, rng)

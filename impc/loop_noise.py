@@ -128,15 +128,23 @@ def loop_noise(plant: Plant, gain: Array, residuals: list[Array]) -> LoopNoise |
     # The first model once more, from the second's outputs: its optimum must not be a worse one.
     again = _minimise(lambda t: _misfit(_outputs(t, spectrum, p), spectrum), best.x[: _size(p)])
     least = min(float(first.fun), float(again.fun))
-    inside = _loops(best.x[-m - 1 :], shapes, spectrum)
-    outside = _outputs(best.x, spectrum, p)
-    total = [np.einsum("b,bii->i", spectrum.counts, part).real for part in (inside, outside)]
-    return LoopNoise(
-        frozen(total[0] / (total[0] + total[1])),
-        max(0.0, 2 * (least - float(best.fun))),
-        float(scipy.stats.chi2.ppf(_LEVEL, m + 1)),
-        float(np.tanh(best.x[-1])),
+    statistic = max(0.0, 2 * (least - float(best.fun)))
+    # Autoregressions can take over much of a loop's answer: of readings that gain at least half as
+    # much as the best, the one that lays most to the loop.
+    good = [item for item in both if 2 * (least - float(item.fun)) >= statistic / 2]
+    shares, root = max(
+        ((_shares(item.x, shapes, spectrum, p), _root(item.x)) for item in good or [best]),
+        key=lambda pair: float(np.max(pair[0])),
     )
+    threshold = float(scipy.stats.chi2.ppf(_LEVEL, m + 1))
+    return LoopNoise(frozen(shares), statistic, threshold, root)
+
+
+def _shares(theta: Array, shapes: np.ndarray, spectrum: _Spectrum, p: int) -> Array:
+    """Of each output's variance, what the loop has."""
+    parts = (_loops(theta[_size(p) :], shapes, spectrum), _outputs(theta, spectrum, p))
+    inside, outside = (np.einsum("b,bii->i", spectrum.counts, part).real for part in parts)
+    return np.asarray(inside / (inside + outside))
 
 
 def _spectrum(residuals: list[Array]) -> _Spectrum | None:
@@ -182,7 +190,7 @@ def _outputs(theta: Array, spectrum: _Spectrum, p: int) -> np.ndarray:
     H = np.empty((len(backwards), p), dtype=np.complex128)
     for output in range(p):
         model = np.ones(1)
-        for reflection in np.tanh(theta[_ORDER * output : _ORDER * (output + 1)]):
+        for reflection in np.tanh(np.clip(theta[_ORDER * output : _ORDER * (output + 1)], -5, 5)):
             model = np.append(model, 0.0) + reflection * np.append(model, 0.0)[::-1]
         H[:, output] = 1 / np.polynomial.polynomial.polyval(backwards, model)
     factor = np.zeros((p, p))
@@ -190,7 +198,7 @@ def _outputs(theta: Array, spectrum: _Spectrum, p: int) -> np.ndarray:
     factor[np.diag_indices(p)] = np.exp(np.clip(np.diag(factor), -10, 10))
     root = H[:, :, None] * factor
     white = np.exp(np.clip(theta[_size(p) - p : _size(p)], -25, 10))
-    return np.asarray(root @ np.swapaxes(root.conj(), 1, 2)) + np.diag(white)
+    return np.asarray(root @ np.swapaxes(root.conj(), 1, 2) + np.diag(white))
 
 
 def _size(p: int) -> int:
@@ -200,14 +208,22 @@ def _size(p: int) -> int:
 
 def _loops(theta: Array, shapes: np.ndarray, spectrum: _Spectrum) -> np.ndarray:
     """G W G*: logarithms of the variances at the inputs, and their root."""
-    root = np.tanh(theta[-1])
+    root = _root(theta)
     colour = (1 - root**2) / np.abs(1 - root * np.exp(-1j * spectrum.angles)) ** 2
-    return np.einsum("j,bjpq,b->bpq", np.exp(np.clip(theta[:-1], -25, 10)), shapes, colour)
+    sizes = np.exp(np.clip(theta[:-1], -25, 10))
+    return np.asarray(np.einsum("j,bjpq,b->bpq", sizes, shapes, colour))
+
+
+def _root(theta: Array) -> float:
+    """Of the noise at the inputs: .995 at most, a drift is not told from a trend."""
+    return float(np.tanh(np.clip(theta[-1], -3, 3)))
 
 
 def _misfit(S: np.ndarray, spectrum: _Spectrum) -> float:
     """Minus Whittle's log-likelihood."""
-    S = S + _FLOOR * np.eye(S.shape[1])
+    # Relative to its size too: one input alone gives a spectrum of rank one.
+    least = _FLOOR + 1e-9 * np.einsum("bii->b", S).real
+    S = S + least[:, None, None] * np.eye(S.shape[1])
     told = np.linalg.slogdet(S)[1] + np.einsum("bii->b", np.linalg.solve(S, spectrum.power)).real
     return float(spectrum.counts @ told)
 

@@ -2,7 +2,7 @@
 
 Intervals hold for stationary noise in the recorder. Two things break that without lowering the VAF:
 noise that enters the loop and is answered (`loop_noise`), and a body that is not the model's
-(`residual_structure`). Either becomes a warning that comes first on the page.
+(`residual_structure`). Either becomes a warning that comes first on the page (docs/fitting.md).
 """
 
 from __future__ import annotations

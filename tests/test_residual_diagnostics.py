@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -55,7 +56,7 @@ def through_the_loop(rng: np.random.Generator) -> list[Array]:
     return found
 
 
-NOISES = {
+NOISES: dict[str, Callable[[np.random.Generator], list[Array]]] = {
     "white": lambda rng: coloured(rng, []),
     "first order": lambda rng: coloured(rng, [-0.9]),
     "correlated": lambda rng: coloured(rng, [-0.9], np.array([[1.0, 0.0], [-0.9, 0.44]])),
