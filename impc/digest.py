@@ -12,12 +12,10 @@ import ast
 import dataclasses
 import functools
 import hashlib
-import importlib.machinery
 import importlib.metadata
 import numbers
 import platform
 import sys
-import sysconfig
 from collections.abc import Mapping, Sequence, Set
 from datetime import date, datetime
 from datetime import time as time_of_day
@@ -28,6 +26,7 @@ import msgspec
 import numpy as np
 
 from impc.errors import DataError
+from impc.user_code import OURS, is_installed, module_file
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -37,7 +36,6 @@ __all__ = ["content_digest", "digest", "source_digest", "versions"]
 
 # What computes: another version of any of them may give other digits.
 _PACKAGES = ("casadi", "clarabel", "control", "cvxpy", "numba", "numpy", "scipy")
-_OURS = ("impc", "plants")
 _PLANT_FILES = (".mat", ".npz", ".json")
 # Digest of a module's source, taken once a process: Python does not read a module again either.
 _SOURCES: dict[ModuleType, str] = {}
@@ -127,7 +125,7 @@ def versions() -> dict[str, str]:
     for name in _PACKAGES:
         found[name] = importlib.metadata.version(name)
     here = Path(__file__).resolve().parent
-    sources = sorted(path for name in _OURS for path in (here.parent / name).rglob("*.py"))
+    sources = sorted(path for name in OURS for path in (here.parent / name).rglob("*.py"))
     found["impc"] = digest(
         [(path.relative_to(here.parent).as_posix(), path.read_bytes()) for path in sources]
     )
@@ -173,20 +171,20 @@ def _names_a_file(value: object) -> bool:
 def _source(module: ModuleType) -> str:
     if module not in _SOURCES:
         found: dict[str, bytes] = {}
-        _gather(module.__name__, _file_of(module.__name__, None), found)
+        _gather(module.__name__, module_file(module.__name__, None), found)
         _SOURCES[module] = digest(found)
     return _SOURCES[module]
 
 
 def _gather(name: str, file: Path | None, found: dict[str, bytes]) -> None:
     """Add the source of a module of the user's, and of those of the user's that it imports."""
-    if name in found or name.partition(".")[0] in _OURS or file is None or _installed(file):
+    if name in found or name.partition(".")[0] in OURS or file is None or is_installed(file):
         return
     found[name] = file.read_bytes()
     if file.suffix == ".py":
         package = name if file.name == "__init__.py" else name.rpartition(".")[0]
         for other in sorted(_imports(found[name], package)):
-            _gather(other, _file_of(other, file.parent), found)
+            _gather(other, module_file(other, file.parent), found)
 
 
 def _imports(source: bytes, package: str) -> set[str]:
@@ -201,26 +199,3 @@ def _imports(source: bytes, package: str) -> set[str]:
             names.update({base, *(f"{base}.{item.name}" for item in node.names)})
     # A package's own __init__ runs too when a module in it is imported.
     return {".".join(name.split(".")[: k + 1]) for name in names for k in range(name.count(".") + 1)}
-
-
-def _file_of(name: str, beside: Path | None) -> Path | None:
-    """Where a module comes from; None for what is built in, and for names of no module."""
-    if name in sys.modules:
-        file = getattr(sys.modules[name], "__file__", None)
-        return Path(file) if file else None
-    if "." in name:  # imported when it is used; its parent tells where it would come from
-        parent = sys.modules.get(name.rpartition(".")[0])
-        places = list(getattr(parent, "__path__", []))
-    else:
-        places = [*([str(beside)] if beside else []), *sys.path]
-    spec = importlib.machinery.PathFinder.find_spec(name, places)
-    return Path(spec.origin) if spec and spec.has_location and spec.origin else None
-
-
-def _installed(file: Path) -> bool:
-    """Whether a module's file belongs to Python or was installed."""
-    path = file.resolve()
-    if {"site-packages", "dist-packages"} & set(path.parts):
-        return True
-    libraries = (Path(sysconfig.get_path(key)).resolve() for key in ("stdlib", "platstdlib"))
-    return any(path.is_relative_to(library) for library in libraries)

@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
+from impc.report.cells import guarded_cell
+
 if TYPE_CHECKING:
     from impc.cohort.store import Store
     from impc.cohort.study import Study, Unit
@@ -52,8 +54,14 @@ def cohort_tables(study: Study, store: Store) -> dict[str, pd.DataFrame]:
 
 
 def table_bytes(table: pd.DataFrame) -> bytes:
-    """A table as CSV, numbers to the last digit."""
-    text: str = table.to_csv(index=False, lineterminator="\n")
+    """A table as CSV, numbers to the last digit, no cell a formula."""
+    guarded = table.rename(columns=guarded_cell)
+    for name in guarded.columns:
+        if not pd.api.types.is_numeric_dtype(guarded[name]):
+            guarded[name] = [
+                guarded_cell(cell) if isinstance(cell, str) else cell for cell in guarded[name]
+            ]
+    text: str = guarded.to_csv(index=False, lineterminator="\n")
     return text.encode()
 
 

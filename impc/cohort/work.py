@@ -19,8 +19,9 @@ import psutil
 
 from impc.bootstrap import DRAWS, replicate
 from impc.closed_loop import simulate
+from impc.cohort.digest import unit_digest
 from impc.commands.plant import find_plant
-from impc.errors import ImpcError
+from impc.errors import DataError, ImpcError
 from impc.files.reading import read_recordings
 from impc.fit_recordings import fit_problem
 from impc.fit_settings import fit_settings
@@ -80,8 +81,7 @@ def fit_unit(task: FitTask) -> dict[str, Any]:
         fitted = fit_controller(problem)
         content = _described(problem, fitted, settings)
     except ImpcError as error:
-        return {"reason": str(error), "digest": task.digest}
-    content["digest"] = task.digest
+        return {"reason": str(error)}
     content["seconds"] = time.perf_counter() - started
     content["memory_mb"] = _memory()
     found: dict[str, Any] = plain(content)
@@ -96,9 +96,8 @@ def replicate_unit(task: FitTask, fit: dict[str, Any], index: int) -> dict[str, 
         fitted = _restored(problem, fit)
         found = replicate(fitted, index, settings.seed, DRAWS[settings.bootstrap])
     except ImpcError as error:
-        return {"reason": str(error), "digest": task.digest}
+        return {"reason": str(error)}
     content = {
-        "digest": task.digest,
         "K": found.K,
         "parameters": found.parameters,
         "seconds": time.perf_counter() - started,
@@ -112,6 +111,12 @@ def replicate_unit(task: FitTask, fit: dict[str, Any], index: int) -> dict[str, 
 def _problem(task: FitTask) -> tuple[InverseProblem, FitSettings]:
     settings = fit_settings(task.configuration.fit)
     source = find_plant(task.plant, task.arguments)
+    # A worker on another machine, or one that has run for days, may have other files and code.
+    if unit_digest(task.files, source.name, task.arguments, task.configuration) != task.digest:
+        raise DataError(
+            "worker", "has other recordings, another plant or other versions than this command",
+            "give all machines the same, and start the workers again",
+        )  # fmt: skip
     recorded = tuple(task.configuration.signals)
     plant = make_plant(source, recorded)
     family = plant_family_of(source, recorded, settings.free)

@@ -11,7 +11,7 @@ import click
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-__all__ = ["out_option", "scheduler_options", "seed_option"]
+__all__ = ["code_options", "out_option", "scheduler_options", "seed_option"]
 
 F = TypeVar("F", bound="Callable[..., Any]")
 
@@ -83,3 +83,23 @@ def scheduler_options(command: F) -> F:
     for option in reversed(options):
         found = option(found)
     return found
+
+
+def code_options(kind: str) -> Callable[[F], F]:
+    """--plant and --allow-plant, or --model and --allow-model: consent to run what a file names.
+
+    Parameters
+    ----------
+    kind : str
+        "plant" or "model".
+    """
+    name = click.option(
+        f"--{kind}", f"{kind}_name", help=f"The {kind}, in place of the one that the study names."
+    )
+    allow = click.option(
+        f"--allow-{kind}",
+        "allowed",
+        is_flag=True,
+        help=f"Run the code that the study names as its {kind}.",
+    )
+    return lambda command: name(allow(command))

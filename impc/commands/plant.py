@@ -6,11 +6,13 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+    from pathlib import Path
 
+    from impc.cohort.study import Study
     from impc.plant import Plant
     from impc.plant_source import PlantSource
 
-__all__ = ["KNOWN", "find_plant", "load_plant"]
+__all__ = ["KNOWN", "find_plant", "load_plant", "named_plant"]
 
 #: Short names of plants, by their import paths: the library itself knows no plant.
 KNOWN = {
@@ -45,3 +47,31 @@ def load_plant(path: str) -> Plant:
     from impc.plant_source import make_plant, plant_source  # noqa: PLC0415
 
     return make_plant(plant_source(path, {}), ())
+
+
+def named_plant(study_file: Path, study: Study, given: str | None, allowed: bool) -> PlantSource:
+    """The plant of a study, when the command line consents to it.
+
+    Parameters
+    ----------
+    study_file : Path
+    study : Study
+        As it was read from the file.
+    given : str or None
+        Plant that the command line names.
+    allowed : bool
+        Whether the command line allows the plant that the file names.
+
+    Raises
+    ------
+    InputError
+        When it needs consent and has none, is no code of the user's, or cannot be found.
+    """
+    from impc.user_code import consented_name, require_users_function  # noqa: PLC0415
+
+    where = f"{study_file}: study.plant"
+    name = consented_name(where, study.plant, given, allowed, "plant", tuple(KNOWN))
+    source = find_plant(name, study.configuration.plant)
+    if ":" in source.name:
+        require_users_function(where, source.make)
+    return source

@@ -230,8 +230,8 @@ def write_files(folder: Path, files: Mapping[str, bytes]) -> tuple[Path, ...]:
                 if run is not None and folder.is_relative_to(run.folder):
                     place = folder.relative_to(run.folder)
                     listed = {(place / name).as_posix(): files[name] for name in files}
-                    run.begin(listed)
                     undo.callback(run.undo, listed)
+                    run.begin(listed)
                 for name in files:
                     (folder / name).parent.mkdir(parents=True, exist_ok=True)
                     _move(new / name, folder / name, old / name, undo)

@@ -25,7 +25,10 @@ TABLES = ("units.csv", "replicates.csv", "intervals.csv")
 
 
 def command(study: Path, out: Path, *more: str) -> list[str]:
-    return [sys.executable, "-m", "impc.cli", "cohort", str(study), "--out", str(out), *more]
+    return [
+        sys.executable, "-m", "impc.cli", "cohort", str(study), "--out", str(out),
+        "--plant", "tests.cohort.carts:cart_plant", *more,
+    ]  # fmt: skip
 
 
 def run(study: Path, out: Path, *more: str) -> subprocess.CompletedProcess[str]:
@@ -172,7 +175,7 @@ def test_no_scheduler_is_one_line(study: Path, tmp_path: Path) -> None:
 
 
 def test_two_runs_into_one_folder_are_refused(study: Path, tmp_path: Path) -> None:
-    with open_store(tmp_path):
+    with open_store(tmp_path, {}):
         done = run(study, tmp_path, "--workers", "1")
     assert done.returncode == 2
     assert "another run is writing to it" in done.stderr
