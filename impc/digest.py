@@ -66,7 +66,9 @@ def _pieces(value: Any) -> Iterator[bytes]:
     kind = type(value).__name__.encode()
     if value is None or isinstance(value, (bool, str, PurePath, numbers.Number, date, datetime)):
         number = value.item() if isinstance(value, np.generic) else value
-        yield type(number).__name__.encode() + b" " + repr(number).encode("utf-8", "backslashreplace")
+        yield (
+            type(number).__name__.encode() + b" " + repr(number).encode("utf-8", "backslashreplace")
+        )
     elif isinstance(value, time_of_day):
         yield kind + repr(value).encode()
     elif isinstance(value, bytes):
@@ -195,7 +197,11 @@ def _imports(source: bytes, package: str) -> set[str]:
             names.update(item.name for item in node.names)
         elif isinstance(node, ast.ImportFrom):
             above = package.split(".")[: len(package.split(".")) - node.level + 1]
-            base = ".".join([*(above if node.level else []), *([node.module] if node.module else [])])
+            base = ".".join(
+                [*(above if node.level else []), *([node.module] if node.module else [])]
+            )
             names.update({base, *(f"{base}.{item.name}" for item in node.names)})
     # A package's own __init__ runs too when a module in it is imported.
-    return {".".join(name.split(".")[: k + 1]) for name in names for k in range(name.count(".") + 1)}
+    return {
+        ".".join(name.split(".")[: k + 1]) for name in names for k in range(name.count(".") + 1)
+    }

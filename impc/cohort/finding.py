@@ -68,7 +68,9 @@ def _expression(where: str, pattern: str) -> str:
         )  # fmt: skip
     rest = re.sub(r"\{\w+\}", "", pattern)
     if re.search(r"[{}\x00-\x1f]", rest) or "**" in pattern:
-        raise InputError(where, f"cannot be {pattern[:80]!a}", "write a path with names in {braces}")
+        raise InputError(
+            where, f"cannot be {pattern[:80]!a}", "write a path with names in {braces}"
+        )
     expression, seen = "", set()
     for part in re.split(r"(\{\w+\})", Path(pattern).as_posix()):
         name = part[1:-1]

@@ -42,7 +42,9 @@ def checked_name(where: str, what: str, text: str) -> str:
             "use letters, digits, spaces and . + - _",
         )  # fmt: skip
     if name and not name[0].isalnum():
-        raise InputError(f"{where}: {what} {name!a}", "begins oddly", "begin with a letter or digit")
+        raise InputError(
+            f"{where}: {what} {name!a}", "begins oddly", "begin with a letter or digit"
+        )
     if len(name) > _LONGEST:
         raise InputError(
             f"{where}: {what} {name[:_LONGEST]!a}...", f"has {len(name)} characters",

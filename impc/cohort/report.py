@@ -194,9 +194,7 @@ def _unit_table(units: pd.DataFrame) -> TextTable | None:
     return TextTable("Every unit. units.csv has all numbers.", heads, rows)
 
 
-def _subject_page(
-    subject: str, units: list[Unit], store: Store, failures: Failures
-) -> str:
+def _subject_page(subject: str, units: list[Unit], store: Store, failures: Failures) -> str:
     sections: list[dict[str, Any]] = []
     for unit in units:
         fit = store.fit(unit.name)

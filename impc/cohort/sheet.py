@@ -69,7 +69,9 @@ def read_sheet(path: Path) -> Sheet:
     heads = tuple(cell.strip() for cell in lines[0])
     for name in heads:
         if not name or heads.count(name) > 1:
-            problem = f"has {heads.count(name)} columns {name!a}" if name else "has an unnamed column"
+            problem = (
+                f"has {heads.count(name)} columns {name!a}" if name else "has an unnamed column"
+            )
             raise InputError(where, problem, "give each column a name of its own")
     for number, line in enumerate(lines[1:], start=2):
         if len(line) != len(heads):

@@ -200,9 +200,7 @@ def _people(path: Path) -> dict[str, tuple[str, dict[str, float | str]]]:
             )
         if subject in found:
             raise InputError(sheet.where, f"has two rows of subject {subject}", "keep one")
-        person = {
-            name: value for name in others if (value := values[name][number]) is not None
-        }
+        person = {name: value for name in others if (value := values[name][number]) is not None}
         found[subject] = checked_name(sheet.where, "group", row.get("group", "")), person
     return found
 

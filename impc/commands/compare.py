@@ -53,7 +53,7 @@ def command(files: tuple[Path, ...], plant_name: str, config: Path, out: Path) -
     require_writable(out)
     subject = read_subject(files, plant_name, config)
     problem, settings = subject.problem, subject.settings
-    memory = open_memory(out, problem, settings, "compare")
+    memory = open_memory(out, problem, settings, "compare", subject.inputs.digest)
     with tqdm(
         total=stages(len(problem.recordings)),
         unit="estimate",
@@ -74,7 +74,7 @@ def command(files: tuple[Path, ...], plant_name: str, config: Path, out: Path) -
             raise KeyboardInterrupt(memory.kept()) from None
     names = " ".join(path.name for path in files)
     line = f"impc compare {names} --plant {plant_name} --config {config.name}"
-    provenance = fit_provenance(subject.source, files, line)
+    provenance = fit_provenance(subject.source, subject.inputs, files, line)
     written = write_files(out, compare_files(problem, compared, provenance))
     memory.forget()
     click.echo(text_table(problem, compared))

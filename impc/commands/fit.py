@@ -54,7 +54,7 @@ def command(files: tuple[Path, ...], plant_name: str, config: Path, out: Path) -
     require_writable(out)
     subject = read_subject(files, plant_name, config)
     problem, settings = subject.problem, subject.settings
-    memory = open_memory(out, problem, settings)
+    memory = open_memory(out, problem, settings, "fit", subject.inputs.digest)
     with tqdm(
         total=stages(problem, settings),
         unit="stage",
@@ -75,7 +75,7 @@ def command(files: tuple[Path, ...], plant_name: str, config: Path, out: Path) -
             raise KeyboardInterrupt(memory.kept()) from None
     names = " ".join(path.name for path in files)
     line = f"impc fit {names} --plant {plant_name} --config {config.name}"
-    provenance = fit_provenance(subject.source, files, line)
+    provenance = fit_provenance(subject.source, subject.inputs, files, line)
     written = write_files(out, fit_files(result, provenance))
     memory.forget()
     _print(result)

@@ -232,5 +232,6 @@ def _json(
         "command": provenance.command,
         "versions": dict(provenance.versions),
         "made": provenance.made,
+        "sha256": provenance.inputs.plain(),
     }
     return (json.dumps(plain(content), indent=1, allow_nan=False) + "\n").encode()

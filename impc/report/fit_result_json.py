@@ -174,5 +174,6 @@ def _made(result: FitResult, provenance: FitProvenance) -> dict[str, Any]:
         "command": provenance.command,
         "versions": dict(provenance.versions),
         "made": provenance.made,
+        "sha256": provenance.inputs.plain(),
         "seconds": result.seconds,
     }
