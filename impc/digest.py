@@ -58,7 +58,8 @@ def digest(*parts: object) -> str:
     text = hashlib.sha256()
     for piece in _pieces(parts):
         # With its length, so that ("ab", "c") is not ("a", "bc").
-        text.update(f"{len(piece)}:".encode() + piece)
+        text.update(f"{len(piece)}:".encode())
+        text.update(piece)
     return text.hexdigest()
 
 
@@ -196,12 +197,21 @@ def _imports(source: bytes, package: str) -> set[str]:
         if isinstance(node, ast.Import):
             names.update(item.name for item in node.names)
         elif isinstance(node, ast.ImportFrom):
-            above = package.split(".")[: len(package.split(".")) - node.level + 1]
-            base = ".".join(
-                [*(above if node.level else []), *([node.module] if node.module else [])]
-            )
+            base = _base(node, package)
             names.update({base, *(f"{base}.{item.name}" for item in node.names)})
     # A package's own __init__ runs too when a module in it is imported.
-    return {
-        ".".join(name.split(".")[: k + 1]) for name in names for k in range(name.count(".") + 1)
-    }
+    return {part for name in names for part in _with_parents(name)}
+
+
+def _base(node: ast.ImportFrom, package: str) -> str:
+    """What `from ... import` imports from, its leading dots resolved."""
+    if not node.level:
+        return node.module or ""
+    parts = package.split(".")
+    above = parts[: len(parts) - node.level + 1]
+    return ".".join([*above, *([node.module] if node.module else [])])
+
+
+def _with_parents(name: str) -> list[str]:
+    parts = name.split(".")
+    return [".".join(parts[: count + 1]) for count in range(len(parts))]

@@ -127,7 +127,7 @@ def test_the_page_says_what_the_numbers_say(fitted: tuple[Result, Path]) -> None
     assert "Nothing found." in page
     for name in ("residuals.pdf", "intent.png", "methods.pdf", "trajectories-trial-3.pdf"):
         assert (fitted[1] / name).stat().st_size > 5_000
-    assert not (fitted[1] / "fit-in-progress.json").exists()
+    assert not (fitted[1] / "fit-in-progress").exists()
 
 
 def test_the_command_prints_the_table(fitted: tuple[Result, Path]) -> None:
@@ -233,8 +233,8 @@ def test_an_interrupted_command_says_what_it_kept(
     assert stopped.exit_code == 130
     assert "fit" in stopped.stderr
     assert "the same command goes on from there" in stopped.stderr
-    assert [path.name for path in (tmp_path / "out").iterdir()] == ["fit-in-progress.json"]
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {".impc", "fit-in-progress"}
     done = run(*arguments)
     assert done.exit_code == 0, done.stderr
     assert (tmp_path / "out" / "report.html").exists()
-    assert not (tmp_path / "out" / "fit-in-progress.json").exists()
+    assert not (tmp_path / "out" / "fit-in-progress").exists()

@@ -210,8 +210,9 @@ def test_a_memory_of_another_fit_is_not_used(
     assert open_memory(tmp_path, problem, replace(settings, settle=2.0)).stages == {}
     other = replace(problem, recordings=problem.recordings[:2])
     assert open_memory(tmp_path, other, settings).stages == {}
-    path = tmp_path / "fit-in-progress.json"
-    for text in ("", "{", "[]", json.dumps({"digest": 3})):
+    path = tmp_path / "fit-in-progress" / "fit.json"
+    whole = path.read_text()
+    for text in ("", "{", "[]", json.dumps({"digest": 3}), whole.replace("1", "2", 1)):
         path.write_text(text)
         assert open_memory(tmp_path, problem, settings).stages == {}
 

@@ -90,7 +90,7 @@ def _page(
     failures: Failures,
     command: str,
 ) -> str:
-    pictures = {}
+    pictures = {"groups": "", "memory": ""}
     with journal_style():
         if len(tables["units"]):
             measures = _most_telling(compared, tables["units"])

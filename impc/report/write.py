@@ -160,7 +160,7 @@ def _listed(folder: Path, command: str) -> frozenset[str]:
 
 
 def _name(line: str) -> str | None:
-    """A name of the list; None for a line that a killed run did not finish, and for no safe name."""
+    """A name of the list; None for a line that a killed run left half, and for no safe name."""
     try:
         name, _ = json.loads(line)
     except (ValueError, TypeError, RecursionError):

@@ -86,8 +86,8 @@ def _require_in_range(found: SelectSettings) -> None:
     ):
         if not least <= value <= most:
             raise InputError(f"[select] {name}", f"got {value}", f"give {least} to {most}")
-    for value in (found.bound, *found.bounds):
-        if not 0 < value < math.inf:
-            raise InputError("[select] bound, bounds", f"got {value:g}", "give numbers above 0")
+    for bound in (found.bound, *found.bounds):
+        if not 0 < bound < math.inf:
+            raise InputError("[select] bound, bounds", f"got {bound:g}", "give numbers above 0")
     if not found.bounds:
         raise InputError("[select] bounds", "is empty", "give one or more, or leave it out")

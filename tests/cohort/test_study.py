@@ -66,7 +66,7 @@ def test_a_table_and_participants(tmp_path: Path) -> None:
     found = read_study(study(tmp_path, 'table = "t.tsv"\nparticipants = "p.tsv"'))
     (unit,) = found.units
     assert unit.group == "old"
-    assert unit.arguments == {"mass": 70.0, "sex": "male"}
+    assert unit.person == {"mass": 70.0, "sex": "male"}
 
 
 @pytest.mark.parametrize(

@@ -101,14 +101,15 @@ def file_for_a_folder(folder: Path) -> None:
 
 
 def two_runs(folder: Path) -> None:
-    with open_store(folder), open_store(folder):
+    with open_store(folder, {}), open_store(folder, {}):
         pass
 
 
 def another_study(folder: Path) -> None:
-    with open_store(folder) as store:
-        store.keep_fit("sub-1", {"digest": "one"})
-        store.require_same("sub-1", "other")
+    with open_store(folder, {"sub-1": "one"}) as store:
+        store.keep_fit("sub-1", {"K": [[1.0]]})
+    with open_store(folder, {"sub-1": "other"}) as store:
+        store.fit("sub-1")
 
 
 def study_file(folder: Path, text: str) -> Path:
@@ -130,7 +131,7 @@ def no_model(folder: Path) -> str:
 
 
 def no_scheduler(_: Path) -> None:
-    with cluster.connected("tcp://127.0.0.1:9", None):
+    with cluster.connected(cluster.Cluster("tcp://127.0.0.1:9")):
         pass
 
 
