@@ -20,6 +20,7 @@ from impc.errors import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from importlib.machinery import ModuleSpec
 
 __all__ = ["OURS", "consented_name", "is_installed", "module_file", "require_users_function"]
 
@@ -120,18 +121,27 @@ def module_file(name: str, beside: Path | None) -> Path | None:
         file = getattr(sys.modules[name], "__file__", None)
         return Path(file) if file else None
     try:
-        if "." in name:  # its parent, where that is imported, tells where it would come from
-            parent = sys.modules.get(name.rpartition(".")[0])
-            spec = importlib.machinery.PathFinder.find_spec(name, getattr(parent, "__path__", []))
-        else:
-            spec = importlib.util.find_spec(name)
-            if spec is None and beside is not None:
-                spec = importlib.machinery.PathFinder.find_spec(name, [str(beside)])
+        spec = _spec(name, beside)
     except (ImportError, ValueError):
         return None
-    if spec is None or spec.origin in (None, "built-in", "frozen"):
+    if spec is None or not spec.has_location or spec.origin is None:
         return None
-    return Path(str(spec.origin))
+    return Path(spec.origin)
+
+
+def _spec(name: str, beside: Path | None) -> ModuleSpec | None:
+    """By the packages it is in, none of which is imported."""
+    top, *below = name.split(".")
+    spec = importlib.util.find_spec(top)
+    if spec is None and beside is not None:
+        spec = importlib.machinery.PathFinder.find_spec(top, [str(beside)])
+    for part in below:
+        if spec is None or spec.submodule_search_locations is None:
+            return None
+        top = f"{top}.{part}"
+        places = list(spec.submodule_search_locations)
+        spec = importlib.machinery.PathFinder.find_spec(top, places)
+    return spec
 
 
 def is_installed(file: Path) -> bool:
