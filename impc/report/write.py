@@ -101,7 +101,7 @@ def owned(folder: Path, command: str) -> Iterator[None]:
     require_writable(folder)
     with ExitStack() as undo:
         try:
-            for path in (folder, *folder.parents):
+            for path in reversed((folder, *folder.parents)):  # undone from the inside out
                 if not path.exists():
                     undo.callback(_remove_if_empty, path)
             folder.mkdir(parents=True, exist_ok=True)
