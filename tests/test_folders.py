@@ -39,14 +39,16 @@ def test_a_run_replaces_the_one_before_whole(tmp_path: Path) -> None:
 def test_another_command_and_files_of_ones_own_are_refused(tmp_path: Path) -> None:
     with owned(tmp_path / "a", "fit"):
         write_files(tmp_path / "a", PAGE)
-    with pytest.raises(OutputError, match="holds results of impc fit"), owned(
-        tmp_path / "a", "compare"
+    with (
+        pytest.raises(OutputError, match="holds results of impc fit"),
+        owned(tmp_path / "a", "compare"),
     ):
         pytest.fail("entered")
     (tmp_path / "b").mkdir()
     (tmp_path / "b" / "report.html").write_text("mine")
-    with pytest.raises(OutputError, match=r"holds report.html of another version"), owned(
-        tmp_path / "b", "fit"
+    with (
+        pytest.raises(OutputError, match=r"holds report.html of another version"),
+        owned(tmp_path / "b", "fit"),
     ):
         pytest.fail("entered")
     (tmp_path / "c").mkdir()
@@ -67,7 +69,13 @@ def test_nothing_is_left_of_a_run_that_wrote_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["", "fit\n[", 'fit\n["../../evil", ""]\n["/tmp/evil", ""]\n[3, ""]\n{}\n', "fit\n" + "[" * 9999]
+    "text",
+    [
+        "",
+        "fit\n[",
+        'fit\n["../../evil", ""]\n["/tmp/evil", ""]\n[3, ""]\n{}\n',
+        "fit\n" + "[" * 9999,
+    ],
 )
 def test_a_damaged_list_removes_nothing_else(text: str, tmp_path: Path) -> None:
     folder = tmp_path / "a" / "b"

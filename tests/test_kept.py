@@ -14,7 +14,11 @@ from impc.kept import Kept
 
 def test_what_is_kept_reads_the_same(tmp_path: Path) -> None:
     kept = Kept(tmp_path / "kept")
-    content = {"x": np.random.default_rng(0).standard_normal(50).tolist(), "n": None, "t": "µ\ud800"}
+    content = {
+        "x": np.random.default_rng(0).standard_normal(50).tolist(),
+        "n": None,
+        "t": "µ\ud800",
+    }
     assert kept.find("a/b", "d") is None
     kept.keep("a/b", "d", content)
     assert kept.find("a/b", "d") == content
@@ -38,7 +42,12 @@ def test_a_seal_of_the_right_form_and_wrong_value(tmp_path: Path) -> None:
     kept.keep("a", "d", {"gain": -24.95})
     found = json.loads(kept.path("a").read_text())
     assert list(found) == ["sha256", "content", "digest", "name"]
-    for key, value in (("digest", "e"), ("name", "b"), ("content", {"gain": -34.04}), ("sha256", 3)):
+    for key, value in (
+        ("digest", "e"),
+        ("name", "b"),
+        ("content", {"gain": -34.04}),
+        ("sha256", 3),
+    ):
         kept.path("a").write_text(json.dumps(found | {key: value}))
         with pytest.raises(InputError, match="is damaged"):
             kept.find("a", "d")

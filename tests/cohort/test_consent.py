@@ -66,7 +66,12 @@ def test_what_a_module_of_yours_imported_is_not_yours(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("command", "what"),
-    [("cohort", "plant"), ("reliability", "plant"), ("select", "model"), ("key-parameters", "model")],
+    [
+        ("cohort", "plant"),
+        ("reliability", "plant"),
+        ("select", "model"),
+        ("key-parameters", "model"),
+    ],
 )
 def test_no_command_runs_it(
     command: str, what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

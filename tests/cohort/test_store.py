@@ -42,7 +42,9 @@ def test_tables_hold_what_was_kept(tmp_path: Path) -> None:
     found = cohort_tables(STUDY, filled(tmp_path))
     assert len(found["units"]) == 2
     assert len(found["replicates"]) == 2 * REPLICATES
-    assert found["units"]["K.force.position"].tolist() == [fit_of(seed)["K"][0][0] for seed in (0, 1)]
+    assert found["units"]["K.force.position"].tolist() == [
+        fit_of(seed)["K"][0][0] for seed in (0, 1)
+    ]
     assert work_left(STUDY, Store(tmp_path, DIGESTS)) == (8, 8)
 
 
@@ -164,6 +166,8 @@ def test_no_unit_fitted_is_a_report_of_reasons(
 
 
 def test_formulas_are_no_cells() -> None:
-    table = pd.DataFrame({"unit": ["=HYPERLINK(1)", "@SUM(1)", "-2", "sub-1"], "=K": [-1.5, 2, 3, 4]})
+    table = pd.DataFrame(
+        {"unit": ["=HYPERLINK(1)", "@SUM(1)", "-2", "sub-1"], "=K": [-1.5, 2, 3, 4]}
+    )
     text = table_bytes(table).decode()
     assert text == "unit,'=K\n'=HYPERLINK(1),-1.5\n'@SUM(1),2.0\n-2,3.0\nsub-1,4.0\n"

@@ -136,9 +136,7 @@ HOSTILE = [
 
 
 @pytest.mark.parametrize(("text", "rows", "match"), HOSTILE)
-def test_hostile_studies_are_one_sentence(
-    tmp_path: Path, text: str, rows: str, match: str
-) -> None:
+def test_hostile_studies_are_one_sentence(tmp_path: Path, text: str, rows: str, match: str) -> None:
     touch(tmp_path, "1.csv")
     (tmp_path / "t.csv").write_bytes(rows.encode())
     with pytest.raises(InputError, match=match) as caught:
@@ -188,7 +186,9 @@ def test_accents_composed_and_not_are_one_name(tmp_path: Path) -> None:
 
 def test_an_absolute_pattern_and_brackets_in_it(tmp_path: Path) -> None:
     touch(tmp_path, "d[1]/s1.csv", "d1/s2.csv")
-    found = read_study(study(tmp_path, f'recordings = "{tmp_path.as_posix()}/d[1]/s{{subject}}.csv"'))
+    found = read_study(
+        study(tmp_path, f'recordings = "{tmp_path.as_posix()}/d[1]/s{{subject}}.csv"')
+    )
     assert [unit.subject for unit in found.units] == ["1"]
 
 

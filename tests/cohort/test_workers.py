@@ -53,7 +53,9 @@ def test_tasks_deaths_and_faults(tmp_path: Path) -> None:
             one for process in family for one in process.net_connections() if one.status == "LISTEN"
         ]
         assert listening == []
-    assert not [one for one in psutil.Process().children() if "spawn_main" in " ".join(one.cmdline())]
+    assert not [
+        one for one in psutil.Process().children() if "spawn_main" in " ".join(one.cmdline())
+    ]
 
 
 def test_a_module_of_the_current_folder_does_not_stand_in_for_pythons(tmp_path: Path) -> None:

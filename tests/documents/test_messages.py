@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import re
+import time
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import control
+import distributed
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -15,6 +17,8 @@ from impc.bounds import box_bounds
 from impc.cli import main
 from impc.closed_loop import require_complete, scenario, simulate
 from impc.cohort import cluster
+from impc.cohort.names import checked_name
+from impc.cohort.sheet import Sheet, column_values, read_sheet
 from impc.cohort.store import open_store
 from impc.cohort.study import read_study
 from impc.controller import mpc_controller
@@ -24,11 +28,12 @@ from impc.files.configuration import read_configuration
 from impc.files.reading import read_recordings
 from impc.fit_recordings import fit_problem
 from impc.fit_settings import FitSettings, fit_settings
+from impc.kept import Kept
 from impc.lqr import solve_lqr
 from impc.plant import Plant, as_plant
 from impc.plant_source import make_plant, plant_source
 from impc.recording import recording
-from impc.report.write import require_writable
+from impc.report.write import owned, require_writable, write_files
 from impc.weights import stage_weights
 from tests.documents.blocks import PAGES
 from tests.files.damaged import DAMAGED, PLANT
@@ -130,9 +135,62 @@ def no_model(folder: Path) -> str:
     return command("select", str(study), "--out", str(folder / "out"))
 
 
-def no_scheduler(_: Path) -> None:
-    with cluster.connected(cluster.Cluster("tcp://127.0.0.1:9")):
+def another_command(folder: Path) -> None:
+    with owned(folder / "out", "fit"):
+        write_files(folder / "out", {"report.html": b""})
+    with owned(folder / "out", "compare"):
         pass
+
+
+def results_without_a_list(folder: Path) -> None:
+    (folder / "report.html").write_text("")
+    with owned(folder, "fit"):
+        pass
+
+
+def file_of_ones_own(folder: Path) -> None:
+    (folder / "gain.png").write_text("")
+    with owned(folder, "fit"):
+        write_files(folder, {"gain.png": b""})
+
+
+def damaged_result(folder: Path) -> None:
+    (folder / "fit.json").write_text("{}")
+    Kept(folder).find("fit", "")
+
+
+def no_room(folder: Path) -> None:
+    (folder / "units").write_text("")  # a file where a folder should go
+    Kept(folder / "units").keep("fit", "", {})
+
+
+def own_plant(folder: Path) -> Path:
+    (folder / "s1.csv").write_text("")
+    return study_file(folder, STUDY.replace('"cursor"', '"mine:plant"'))
+
+
+def sheet_of(folder: Path, text: str) -> Sheet:
+    (folder / "t.csv").write_text(text)
+    return read_sheet(folder / "t.csv")
+
+
+def connect(address: str) -> None:
+    with cluster.connected(cluster.Cluster(address)):
+        pass
+
+
+def no_scheduler(_: Path) -> None:
+    connect("tcp://127.0.0.1:9")
+
+
+def lost_scheduler(_: Path) -> None:
+    make: Any = distributed.LocalCluster
+    with make(
+        n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None, silence_logs=60
+    ) as found, cluster.connected(cluster.Cluster(found.scheduler_address)) as workers:  # fmt: skip
+        workers.submit("long", time.sleep, 0.5)
+        found.close()
+        list(workers.results())
 
 
 def everything_recorded(_: Path) -> None:
@@ -197,7 +255,29 @@ PROVOKED: dict[str, Callable[[Path], object]] = {
     "exists already; give another name, or remove it": draft_over_a_file,
     "... is a file; give another folder": file_for_a_folder,
     "another run is writing to it": two_runs,
-    "was fitted to other recordings or with other settings": another_study,
+    "was fitted to other recordings or with other settings, plant or versions": another_study,
+    "holds results of impc ...; give another folder": another_command,
+    "holds ... of another version or of your own": results_without_a_list,
+    "is not of an earlier run of this command": file_of_ones_own,
+    "is damaged, or not what this program wrote": damaged_result,
+    "cannot be written (...); make room and start again": no_room,
+    "names code that would be run, ...": lambda folder: command(
+        "cohort", str(own_plant(folder)), "--out", str(folder / "out")
+    ),
+    "is no function of a module of yours": lambda folder: command(
+        "cohort", str(own_plant(folder)), "--plant", "os:system", "--out", str(folder / "out")
+    ),
+    "has ... in it; use letters, digits, spaces and . + - _": lambda _: checked_name(
+        "t.csv", "subject", "a/b"
+    ),
+    "row ... has ... cells, the head ...": lambda folder: sheet_of(
+        folder, "subject,mass\n1,70,5\n"
+    ),
+    "which may be thousands; write it with a decimal point": lambda folder: column_values(
+        sheet_of(folder, "subject;mass\n1;1,234\n"), "mass"
+    ),
+    "was lost while tasks were out": lost_scheduler,
+    "needs --tls-..., ...; give the three files": lambda _: connect("tls://127.0.0.1:9"),
     "matches no file; check the path": lambda folder: read_study(study_file(folder, STUDY)),
     "is not in ...; add a row": unknown_subject,
     "study.model: is missing": no_model,

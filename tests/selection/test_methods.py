@@ -189,7 +189,9 @@ def test_a_model_from_another_field(tmp_path: Path) -> None:
     done = run("select", str(study), *MINE, "--out", str(tmp_path / "select"), "--workers", "1")
     assert done.exit_code == 0, done.stderr
     assert "information: ka, ke, V" in done.stdout
-    done = run("key-parameters", str(study), *MINE, "--out", str(tmp_path / "key"), "--workers", "1")
+    done = run(
+        "key-parameters", str(study), *MINE, "--out", str(tmp_path / "key"), "--workers", "1"
+    )
     assert done.exit_code == 0, done.stderr
     found = json.loads((tmp_path / "key" / "result.json").read_text())
     assert found["chosen"] == ["ka", "ke", "V"]
