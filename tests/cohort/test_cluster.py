@@ -112,11 +112,9 @@ def test_a_scheduler_that_is_lost(
     scheduler: Any, files: tuple[Path, Path, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(cluster, "_PATIENCE", "1s")
-    with (
-        pytest.raises(OutputError, match="was lost") as caught,
-        connected(Cluster(scheduler.scheduler_address, None, *files)) as workers,
-    ):
+    with connected(Cluster(scheduler.scheduler_address, None, *files)) as workers:
         workers.submit("long", time.sleep, 0.5)
         scheduler.close()
-        list(workers.results())
+        with pytest.raises(OutputError, match="was lost") as caught:
+            list(workers.results())
     assert "\n" not in str(caught.value)

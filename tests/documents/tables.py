@@ -48,7 +48,8 @@ NOT_RUN = {
     ): _SITE,
     (
         "docs/cohorts.md",
-        "openssl req -x509 -newkey rsa:2048 -nodes -days 365 -subj /CN=impc-ca -keyout ca-key.pem -out ca.pem",
+        "openssl req -x509 -newkey rsa:2048 -nodes -days 365 -subj /CN=impc-ca"
+        " -keyout ca-key.pem -out ca.pem",
     ): _CERTIFICATES,
     (
         "docs/cohorts.md",
@@ -56,7 +57,8 @@ NOT_RUN = {
     ): _CERTIFICATES,
     (
         "docs/cohorts.md",
-        "openssl x509 -req -in request.pem -CA ca.pem -CAkey ca-key.pem -CAcreateserial -days 365 -out cert.pem",
+        "openssl x509 -req -in request.pem -CA ca.pem -CAkey ca-key.pem -CAcreateserial"
+        " -days 365 -out cert.pem",
     ): _CERTIFICATES,
     ("docs/cohorts.md", "chmod 600 key.pem ca-key.pem"): _CERTIFICATES,
     **{
