@@ -102,7 +102,7 @@ def _fields(value: Any) -> dict[str, Any]:
 
 
 def content_digest(path: Path) -> str:
-    """SHA-256 of a whole file, hexadecimal; 0.4 to 2 GB a second.
+    """SHA-256 of the whole file at `path`, hexadecimal; 0.4 to 2 GB a second.
 
     Raises
     ------

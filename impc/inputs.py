@@ -54,13 +54,14 @@ class Inputs:
 
 
 def gather_inputs(files: Sequence[Path], configuration: Path, source: PlantSource) -> Inputs:
-    """Digests of recordings, `configuration` and plant as they are now.
+    """Digests of recordings, configuration and plant as they are now.
 
     Parameters
     ----------
     files : sequence of Path
         The recordings.
     configuration : Path
+        Its file.
     source : PlantSource
         Of the plant.
 

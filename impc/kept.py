@@ -52,13 +52,15 @@ class Kept:
             When the file is damaged, or of another run.
         """
         path = self.path(name)
-        try:
-            text = path.read_text(encoding="utf-8")
-        except FileNotFoundError:
+        if not path.exists():
             return None
-        except (OSError, ValueError):
-            raise _damaged(path) from None
-        found = _unsealed(path, text)
+        found = _unsealed(path)
+        if found is None:
+            raise InputError(
+                f"file {path}",
+                "is damaged, or not what this program wrote",
+                "remove it and start again",
+            )
         if (found["name"], found["digest"]) != (name, digest):
             raise InputError(
                 f"file {path}",
@@ -68,7 +70,15 @@ class Kept:
         return found["content"]
 
     def recall(self, name: str, digest: str) -> Any:
-        """As `find`, but None for what is damaged or of another run: it is done again."""
+        """As `find`, but None for what is damaged or of another run: it is done again.
+
+        Parameters
+        ----------
+        name : str
+            Which result.
+        digest : str
+            Of what it is to be made of.
+        """
         try:
             return self.find(name, digest)
         except InputError:
@@ -77,13 +87,10 @@ class Kept:
     def recall_all(self, digest: str) -> dict[str, Any]:
         """All that runs with that `digest` kept, name -> content, oldest first."""
         found = {}
-        files = [path for path in self.folder.glob("*.json") if path.is_file()]
+        files = [path for path in self.folder.rglob("*.json") if path.is_file()]
         for path in sorted(files, key=lambda path: (path.stat().st_mtime_ns, path.name)):
-            try:
-                one = _unsealed(path, path.read_text(encoding="utf-8"))
-            except (OSError, ValueError):  # InputError is a ValueError: done again
-                continue
-            if one["digest"] == digest and self.path(one["name"]) == path:
+            one = _unsealed(path)
+            if one is not None and one["digest"] == digest and self.path(one["name"]) == path:
                 found[one["name"]] = one["content"]
         return found
 
@@ -134,21 +141,14 @@ def _seal(body: dict[str, Any]) -> str:
     return hashlib.sha256(_text(body).encode()).hexdigest()
 
 
-def _unsealed(path: Path, text: str) -> dict[str, Any]:
-    """What a sealed file holds; its numbers are written so that they read the same again."""
+def _unsealed(path: Path) -> dict[str, Any] | None:
+    """What a sealed file holds; None when its seal is broken."""
     try:
-        found: Any = json.loads(text)
-    except (ValueError, RecursionError):
-        raise _damaged(path) from None
-    if not isinstance(found, dict) or set(found) != {"sha256", "name", "digest", "content"}:
-        raise _damaged(path)
-    seal = found.pop("sha256")
-    if seal != _seal(found):
-        raise _damaged(path)
-    return found
-
-
-def _damaged(path: Path) -> InputError:
-    return InputError(
-        f"file {path}", "is damaged, or not what this program wrote", "remove it and start again"
-    )
+        found: Any = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(found, dict) or set(found) != {"sha256", "name", "digest", "content"}:
+            return None
+        seal = found.pop("sha256")
+        # Numbers are written so that they read the same again: so does the text of the rest.
+        return found if seal == _seal(found) else None
+    except (OSError, ValueError, RecursionError):
+        return None

@@ -22,6 +22,7 @@ def test_what_is_kept_reads_the_same(tmp_path: Path) -> None:
     assert kept.find("a/b", "d") is None
     kept.keep("a/b", "d", content)
     assert kept.find("a/b", "d") == content
+    assert kept.recall_all("d") == {"a/b": content}
     assert kept.recall("a/b", "other") is None
     with pytest.raises(InputError, match="other recordings"):
         kept.find("a/b", "other")

@@ -6,13 +6,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from impc.digest import content_digest, digest, source_digest, versions
+from impc.errors import DataError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from impc.files.configuration import Configuration
 
-__all__ = ["unit_digest"]
+__all__ = ["require_same_inputs", "unit_digest"]
 
 # They say how many replicates there are, not what any of them is.
 _COUNTS = ("replicates",)
@@ -49,3 +50,26 @@ def unit_digest(
         {key: value for key, value in configuration.fit.items() if key not in _COUNTS},
         versions(),
     )
+
+
+def require_same_inputs(here: str, wanted: str) -> None:
+    """Refuse to work where the files, the plant or the versions are not those of the client.
+
+    Parameters
+    ----------
+    here : str
+        `unit_digest` as the worker finds it.
+    wanted : str
+        As the client found it.
+
+    Raises
+    ------
+    DataError
+        When they differ.
+    """
+    if here != wanted:
+        raise DataError(
+            "worker",
+            "has other recordings, another plant or other versions than this command",
+            "give all machines the same, and start the workers again",
+        )

@@ -104,7 +104,7 @@ def find_by_entities(folder: Path) -> list[Found]:
 
 
 def find_by_table(path: Path) -> list[Found]:
-    """Files and labels from a table with the columns file and subject, and maybe more.
+    """Files and labels from the table at `path`, with the columns file and subject, maybe more.
 
     Raises
     ------

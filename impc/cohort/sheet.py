@@ -48,7 +48,7 @@ class Sheet:
 
 
 def read_sheet(path: Path) -> Sheet:
-    """Read a table.
+    """Read the table at `path`.
 
     Raises
     ------

@@ -19,9 +19,9 @@ import psutil
 
 from impc.bootstrap import DRAWS, replicate
 from impc.closed_loop import simulate
-from impc.cohort.digest import unit_digest
+from impc.cohort.digest import require_same_inputs, unit_digest
 from impc.commands.plant import find_plant
-from impc.errors import DataError, ImpcError
+from impc.errors import ImpcError
 from impc.files.reading import read_recordings
 from impc.fit_recordings import fit_problem
 from impc.fit_settings import fit_settings
@@ -112,11 +112,8 @@ def _problem(task: FitTask) -> tuple[InverseProblem, FitSettings]:
     settings = fit_settings(task.configuration.fit)
     source = find_plant(task.plant, task.arguments)
     # A worker on another machine, or one that has run for days, may have other files and code.
-    if unit_digest(task.files, source.name, task.arguments, task.configuration) != task.digest:
-        raise DataError(
-            "worker", "has other recordings, another plant or other versions than this command",
-            "give all machines the same, and start the workers again",
-        )  # fmt: skip
+    here = unit_digest(task.files, source.name, task.arguments, task.configuration)
+    require_same_inputs(here, task.digest)
     recorded = tuple(task.configuration.signals)
     plant = make_plant(source, recorded)
     family = plant_family_of(source, recorded, settings.free)

@@ -106,7 +106,17 @@ class LocalWorkers:
         return len(self._workers)
 
     def submit(self, key: Hashable, work: Callable[..., Any], *given: Any) -> None:
-        """As `Workers.submit`."""
+        """As `Workers.submit`: work(*given) under a `key`.
+
+        Parameters
+        ----------
+        key : hashable
+            Its name.
+        work : callable
+            Of an importable module.
+        *given : object
+            Its arguments.
+        """
         self._waiting.append(_Task(key, work, given))
         self._give_out()
 

@@ -55,6 +55,7 @@ def named_plant(study_file: Path, study: Study, given: str | None, allowed: bool
     Parameters
     ----------
     study_file : Path
+        For messages.
     study : Study
         As it was read from the file.
     given : str or None

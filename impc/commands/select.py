@@ -111,6 +111,7 @@ def read_model_study(
     Parameters
     ----------
     path : Path
+        The study file.
     given : str or None
         Model that the command line names.
     allowed : bool

@@ -14,7 +14,7 @@ __all__ = ["flush_folder", "write_whole"]
 
 
 def write_whole(path: Path, content: bytes) -> None:
-    """Write beside the place, flush to the disk, rename: there is the whole file or the one before.
+    """Write `content` beside `path`, flush to the disk, rename: the whole file, or the one before.
 
     Its folder is made when it is missing.
 

@@ -203,6 +203,7 @@ def write_files(folder: Path, files: Mapping[str, bytes]) -> tuple[Path, ...]:
     Parameters
     ----------
     folder : Path
+        Where they go.
     files : mapping of str to bytes
         A slash in a name makes a folder.
 
