@@ -126,7 +126,10 @@ def versions() -> dict[str, str]:
     """Of Python, of the packages that compute, and the digest of this package's own source."""
     found = {"python": platform.python_version()}
     for name in _PACKAGES:
-        found[name] = importlib.metadata.version(name)
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            found[name] = "not installed"
     here = Path(__file__).resolve().parent
     sources = sorted(path for name in OURS for path in (here.parent / name).rglob("*.py"))
     found["impc"] = digest(

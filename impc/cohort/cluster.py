@@ -68,10 +68,9 @@ def _client(cluster: Cluster, address: str) -> Iterator[Client]:
     import dask  # noqa: PLC0415
     import distributed  # noqa: PLC0415
 
-    # What it has to say, `_client` and `_SchedulerWorkers` say in one line.
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)
     security = _security(cluster, address)
-    with dask.config.set({"distributed.comm.timeouts.connect": _PATIENCE}):
+    patience = {"distributed.comm.timeouts.connect": _PATIENCE}
+    with dask.config.set(patience), _silent("distributed"):
         try:
             client = distributed.Client(address, timeout=_PATIENCE, security=security)
         except (OSError, ValueError, TypeError, TimeoutError) as error:
@@ -82,6 +81,20 @@ def _client(cluster: Cluster, address: str) -> Iterator[Client]:
             ) from None
         with client:
             yield client
+
+
+@contextmanager
+def _silent(package: str) -> Iterator[None]:
+    """What it would log (112 lines for a lost scheduler), errors say here in one line."""
+    names = [name for name in logging.root.manager.loggerDict if name.startswith(package)]
+    levels = {name: logging.getLogger(name).level for name in names}
+    for name in names:
+        logging.getLogger(name).setLevel(logging.CRITICAL + 1)
+    try:
+        yield
+    finally:
+        for name, level in levels.items():
+            logging.getLogger(name).setLevel(level)
 
 
 def _security(cluster: Cluster, address: str) -> Any:

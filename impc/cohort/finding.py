@@ -53,7 +53,7 @@ def find_by_pattern(where: str, folder: Path, pattern: str) -> list[Found]:
     for file in sorted(folder.glob(wild)):
         match = matching.fullmatch(file.relative_to(folder).as_posix())
         if match:
-            found.append((_labels(str(file), match.groupdict()), file))
+            found.append((_labels(_printable(file), match.groupdict()), file))
     return found
 
 
@@ -99,7 +99,7 @@ def find_by_entities(folder: Path) -> list[Found]:
         entities = dict(re.findall(r"(?:^|_)([a-z]+)-([^_.]+)", file.name))
         labels = {key: entities.get(short, "") for key, short in _ENTITIES.items()}
         if labels["subject"]:
-            found.append((_labels(str(file), labels), file))
+            found.append((_labels(_printable(file), labels), file))
     return found
 
 
@@ -133,3 +133,9 @@ def _require_once(where: str, files: Sequence[Path]) -> None:
 
 def _labels(where: str, given: dict[str, str]) -> dict[str, str]:
     return {key: checked_name(where, key, given.get(key) or "") for key in KEYS}
+
+
+def _printable(file: Path) -> str:
+    """A path for a message: its name may have bytes that are no text, and control characters."""
+    text = str(file).encode("utf-8", "backslashreplace").decode()
+    return text if text.isprintable() else ascii(text)[1:-1]

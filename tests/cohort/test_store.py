@@ -15,7 +15,7 @@ from impc.cohort.engine import Failures, run_study, work_left
 from impc.cohort.report import write_report
 from impc.cohort.store import Store, open_store
 from impc.cohort.tables import cohort_tables, table_bytes
-from impc.errors import ImpcError, InputError
+from impc.errors import ImpcError, InputError, OutputError
 from tests.cohort.made_up import Here, fit_of, made_up_study, replicate_of, tasks_of
 
 REPLICATES = 3
@@ -164,6 +164,13 @@ def test_no_unit_fitted_is_a_report_of_reasons(
     assert failures.lines == [f"{name}: no regulator can be simulated" for name in NAMES]
     assert "0 of 2 units" in (tmp_path / "report.html").read_text()
     assert json.loads((tmp_path / "result.json").read_text())["fitted"] == 0
+
+
+def test_no_room_for_the_log_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "cohort.log").mkdir()
+    with pytest.raises(OutputError, match="cohort.log: cannot be written") as caught:
+        Store(tmp_path, DIGESTS).log("run")
+    assert "\n" not in str(caught.value)
 
 
 def test_formulas_are_no_cells() -> None:

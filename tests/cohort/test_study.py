@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
@@ -175,6 +176,14 @@ def test_participants(tmp_path: Path, text: str, expected: str | dict[str, float
             read_study(path)
     else:
         assert read_study(path).units[0].person == expected
+
+
+@pytest.mark.parametrize("name", [b"s1\xff.csv", b"s1\n2.csv", b"s1\x1b[2J.csv"])
+def test_file_names_that_are_no_text(tmp_path: Path, name: bytes) -> None:
+    (tmp_path / os.fsdecode(name)).write_text("x")
+    with pytest.raises(InputError, match="in it") as caught:
+        read_study(study(tmp_path, 'recordings = "s{subject}.csv"'))
+    assert str(caught.value).isprintable()
 
 
 def test_accents_composed_and_not_are_one_name(tmp_path: Path) -> None:
