@@ -17,6 +17,7 @@ from impc.report.certainty_tables import (
     set_sentences,
     statements_table,
 )
+from impc.report.fit_figures import shown_trials
 from impc.report.fit_sentences import (
     METHOD_LABELS,
     direction_name,
@@ -46,8 +47,9 @@ def fit_page(result: FitResult, figures: Mapping[str, bytes], provenance: FitPro
         findings=findings(result),
         trajectories=[
             (trial_name(result, index), embedded(figures[f"trajectories-trial-{index + 1}.png"]))
-            for index in range(count)
+            for index in shown_trials(result)
         ],
+        trials=count,
         pictures={
             name: embedded(figures[f"{name}.png"]) for name in ("residuals", "intent", "methods")
         },

@@ -168,7 +168,7 @@ def test_no_unit_fitted_is_a_report_of_reasons(
 
 def test_no_room_for_the_log_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "cohort.log").mkdir()
-    with pytest.raises(OutputError, match="cohort.log: cannot be written") as caught:
+    with pytest.raises(OutputError, match=r"cohort\.log: cannot be written") as caught:
         Store(tmp_path, DIGESTS).log("run")
     assert "\n" not in str(caught.value)
 
