@@ -71,6 +71,8 @@ def consented_name(
 
 def _require_users_module(where: str, module: str) -> None:
     """Before anything is imported."""
+    if not all(part.isidentifier() for part in module.split(".")):
+        raise InputError(where, f"{module[:80]!a} is no module's name", "write module:function")
     top = module.partition(".")[0]
     if top in sys.stdlib_module_names or top in sys.builtin_module_names or top == "impc":
         raise _not_yours(where, module)

@@ -56,6 +56,13 @@ def test_code_of_others_is_refused_with_consent(name: str) -> None:
             consent(name, given, allowed)
 
 
+@pytest.mark.parametrize("name", ["..x:y", ":y", "a b:c", "a/../b:c", "a\nb:c"])
+def test_what_is_no_name_of_a_module(name: str) -> None:
+    with pytest.raises(InputError, match="is no module's name") as caught:
+        consent(name, allowed=True)
+    assert "\n" not in str(caught.value)
+
+
 def test_what_a_module_of_yours_imported_is_not_yours(tmp_path: Path) -> None:
     for function in (subprocess.run, print, Path, "text"):
         with pytest.raises(InputError, match="no function of a module of yours"):
