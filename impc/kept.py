@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import re
 import shutil
 from dataclasses import dataclass
@@ -52,9 +53,12 @@ class Kept:
             When the file is damaged, or of another run.
         """
         path = self.path(name)
-        if not path.exists():
+        try:
+            found = _unsealed(path.read_bytes())
+        except FileNotFoundError:
             return None
-        found = _unsealed(path)
+        except OSError:
+            found = None
         if found is None:
             raise InputError(
                 f"file {path}",
@@ -87,9 +91,9 @@ class Kept:
     def recall_all(self, digest: str) -> dict[str, Any]:
         """All that runs with that `digest` kept, name -> content, oldest first."""
         found = {}
-        files = [path for path in self.folder.rglob("*.json") if path.is_file()]
+        files = [path for path in self.folder.rglob("*.json") if os.access(path, os.R_OK)]
         for path in sorted(files, key=lambda path: (path.stat().st_mtime_ns, path.name)):
-            one = _unsealed(path)
+            one = _unsealed(path.read_bytes())
             if one is not None and one["digest"] == digest and self.path(one["name"]) == path:
                 found[one["name"]] = one["content"]
         return found
@@ -114,6 +118,21 @@ class Kept:
         body = {"content": content, "digest": digest, "name": name}
         sealed = f'{{"sha256": "{_seal(body)}", {_text(body)[1:]}\n'
         write_whole(self.path(name), sealed.encode())
+
+    def discard(self, name: str) -> None:
+        """Remove the result of that `name`, if there is one.
+
+        Raises
+        ------
+        OutputError
+            When that cannot be done.
+        """
+        try:
+            self.path(name).unlink(missing_ok=True)
+        except OSError as error:
+            raise OutputError(
+                f"file {self.path(name)}", f"cannot be removed ({error.strerror})", "remove it"
+            ) from None
 
     def forget(self) -> None:
         """Remove the folder: the final results have been written.
@@ -141,14 +160,14 @@ def _seal(body: dict[str, Any]) -> str:
     return hashlib.sha256(_text(body).encode()).hexdigest()
 
 
-def _unsealed(path: Path) -> dict[str, Any] | None:
+def _unsealed(text: bytes) -> dict[str, Any] | None:
     """What a sealed file holds; None when its seal is broken."""
     try:
-        found: Any = json.loads(path.read_text(encoding="utf-8"))
+        found: Any = json.loads(text)
         if not isinstance(found, dict) or set(found) != {"sha256", "name", "digest", "content"}:
             return None
         seal = found.pop("sha256")
         # Numbers are written so that they read the same again: so does the text of the rest.
         return found if seal == _seal(found) else None
-    except (OSError, ValueError, RecursionError):
+    except (ValueError, RecursionError):
         return None

@@ -137,7 +137,7 @@ class Store:
         return found
 
     def _keep(self, unit: str, name: str, failure: str, content: Mapping[str, Any]) -> None:
-        self._kept.path(f"{unit}/{failure}").unlink(missing_ok=True)
+        self._kept.discard(f"{unit}/{failure}")
         self._kept.keep(f"{unit}/{name}", self.digests[unit], content)
 
 

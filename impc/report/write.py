@@ -114,8 +114,11 @@ def owned(folder: Path, command: str) -> Iterator[None]:
             yield
         finally:
             _RUN.reset(token)
-        if run.written:
-            run.finish()
+        try:
+            if run.written:
+                run.finish()
+        except OSError as error:
+            raise _unwritable(folder, error) from None
 
 
 def _begun(folder: Path, command: str, undo: ExitStack) -> _Run:
