@@ -29,11 +29,13 @@ def test_a_run_replaces_the_one_before_whole(tmp_path: Path) -> None:
     with owned(folder, "fit"):
         write_files(folder, PAGE | {"old.png": b"", "deep/er/old.csv": b""})
     (folder / "notes.txt").write_text("mine")
+    (folder / ".impc-k3" / "new").mkdir(parents=True)  # what a killed run leaves
     with owned(folder, "fit"):
         write_files(folder, {"new.png": b""})
         write_files(folder / "sub", {"x.csv": b""})
     assert names(folder) == {"notes.txt", "new.png", "sub/x.csv", ".impc"}
     assert not (folder / "deep").exists()
+    assert not (folder / ".impc-k3").exists()
 
 
 def test_another_command_and_files_of_ones_own_are_refused(tmp_path: Path) -> None:

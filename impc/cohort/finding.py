@@ -94,7 +94,8 @@ def find_by_entities(folder: Path) -> list[Found]:
     """
     found = []
     for file in sorted(folder.rglob("sub-*")):
-        if file.suffix.lower() not in _ENDINGS or not file.is_file():
+        hidden = any(part.startswith(".") for part in file.relative_to(folder).parts)
+        if hidden or file.suffix.lower() not in _ENDINGS or not file.is_file():
             continue
         entities = dict(re.findall(r"(?:^|_)([a-z]+)-([^_.]+)", file.name))
         labels = {key: entities.get(short, "") for key, short in _ENTITIES.items()}

@@ -223,15 +223,19 @@ def write_files(folder: Path, files: Mapping[str, bytes]) -> tuple[Path, ...]:
     """
     require_writable(folder)
     run = _RUN.get()
+    if run is not None and not folder.is_relative_to(run.folder):
+        run = None
+    # In the folder that is owned: the next run finds there what a killed one left.
+    beside = folder if run is None else run.folder
     try:
-        with _made(folder), tempfile.TemporaryDirectory(prefix=".impc-", dir=folder) as staging:
+        with _made(folder), tempfile.TemporaryDirectory(prefix=".impc-", dir=beside) as staging:
             new, old = Path(staging, "new"), Path(staging, "old")
             for name, content in files.items():
                 (new / name).parent.mkdir(parents=True, exist_ok=True)
                 (old / name).parent.mkdir(parents=True, exist_ok=True)
                 _write_flushed(new / name, content)
             with ExitStack() as undo:
-                if run is not None and folder.is_relative_to(run.folder):
+                if run is not None:
                     place = folder.relative_to(run.folder)
                     listed = {(place / name).as_posix(): files[name] for name in files}
                     undo.callback(run.undo, listed)

@@ -54,6 +54,7 @@ def test_bids_names(tmp_path: Path) -> None:
         "sub-01/ses-1/sub-01_ses-1_task-EO_run-2_motion.csv",
         "sub-01/ses-1/sub-01_ses-1_task-EO_run-2_motion.json",
         "sub-01/ses-2/sub-01_ses-2_task-EO_run-1_motion.csv",
+        "sub-01/ses-2/.impc-k3/new/sub-01_ses-2_task-EO_run-2_motion.csv",
     )
     found = read_study(study(tmp_path, 'bids = "."'))
     assert [(unit.name, len(unit.files)) for unit in found.units] == [
