@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from impc.errors import DataError
-from impc.files.matlab import array_columns, nested_columns
+from impc.files.matlab import AS_STRUCT, array_columns, nested_columns
 from impc.files.table import make_table
 
 if TYPE_CHECKING:
@@ -28,7 +28,6 @@ _DEPTH = 8
 _NUMERIC = {"double", "single", "logical"} | {
     f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)
 }
-_AS_STRUCT = 'save a struct of vectors: s = table2struct(T, "ToScalar", true)'
 
 
 @dataclass
@@ -107,7 +106,7 @@ def _collect(found: _Found, prefix: str, group: Any, depth: int) -> None:
         kind = _class_of(item)
         if isinstance(item, h5py.Group):
             if "MATLAB_object_decode" in item.attrs or kind not in ("struct", ""):
-                found.skipped[full] = f"is a MATLAB {kind}; {_AS_STRUCT}, or writetable"
+                found.skipped[full] = f"is a MATLAB {kind}; {AS_STRUCT}, or writetable"
             elif depth >= _DEPTH:
                 raise DataError(found.source, f"{full} is nested too deep", "save plain vectors")
             else:
@@ -121,8 +120,8 @@ def _add(found: _Found, name: str, dataset: Any, kind: str) -> None:
     if dataset.external or dataset.is_virtual:
         raise DataError(found.source, f"{name} lies in another file", "save the signals themselves")
     if "MATLAB_object_decode" in dataset.attrs or kind not in (*_NUMERIC, ""):
-        reasons = {"char": "is text", "cell": f"is a cell array; {_AS_STRUCT}, or cell2mat"}
-        found.skipped[name] = reasons.get(kind, f"is a MATLAB {kind}; {_AS_STRUCT}, or writetable")
+        reasons = {"char": "is text", "cell": f"is a cell array; {AS_STRUCT}, or cell2mat"}
+        found.skipped[name] = reasons.get(kind, f"is a MATLAB {kind}; {AS_STRUCT}, or writetable")
         return
     if dataset.attrs.get("MATLAB_empty", 0):
         found.skipped[name] = "is empty"
