@@ -54,8 +54,10 @@ def read_tdms(path: Path, largest: int) -> Table:
                 source, "ends in the middle of its data", "copy it again, or close it in LabVIEW"
             )
         channels = [channel for group in file.groups() for channel in group.channels()]
-        if 8 * sum(len(channel) for channel in channels) > largest:
-            raise DataError(source, "is too large", "export only the channels that are needed")
+        claimed = sum(len(channel) for channel in channels)
+        if 8 * claimed > largest:
+            problem = f"is too large: it says that it has {claimed} values"
+            raise DataError(source, problem, "export only the channels that are needed")
         return _table(source, channels)
 
 
@@ -94,14 +96,14 @@ def _table(source: str, channels: list[Any]) -> Table:
     for channel in channels:
         twice = names[channel.name] > 1
         name = f"{channel.group_name}/{channel.name}" if twice else channel.name
+        if channel.dtype.kind not in "fiubM":
+            skipped[name] = "is complex" if channel.dtype.kind == "c" else "is text"
+            continue
         data = channel[:]
         unit = str(channel.properties.get("unit_string", ""))
         if data.dtype.kind == "M" and len(data):
             data = (data - data[0]) / np.timedelta64(1, "s")
             unit = "s"
-        if data.dtype.kind not in "fiub":
-            skipped[name] = "is complex" if data.dtype.kind == "c" else "is text"
-            continue
         columns[name] = np.asarray(data, dtype=np.float64)
         units[name] = unit
         step = float(channel.properties.get("wf_increment", 0) or 0)

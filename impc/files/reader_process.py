@@ -1,0 +1,141 @@
+"""The process that reads files by libraries which a damaged file may end, or make take all memory.
+
+It is started by `impc.files.apart` and serves one request after another: a line of JSON comes in,
+eight bytes of length, JSON and columns of float64 go out. It ends when its input ends, when a
+request takes too long, and after a request that needed too much memory.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import faulthandler
+import json
+import math
+import os
+import re
+import signal
+import sys
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from impc.errors import DataError, ImpcError
+from impc.files.door import damaged
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from typing import BinaryIO
+
+    from impc.arrays import Array
+
+__all__ = ["READERS", "main"]
+
+#: Module, function and library of each format that is read here.
+READERS = {
+    "matlab73": ("impc.files.matlab73", "read_matlab73", "h5py"),
+    "tdms": ("impc.files.tdms", "read_tdms", "nptdms"),
+    "c3d": ("impc.files.c3d_analog", "read_c3d", "c3d"),
+}
+# Address space that a process may keep beyond what it began with: more has leaked.
+_LEAK = 100_000_000
+
+
+def main() -> None:
+    """Serve until the input ends."""
+    with contextlib.suppress(ValueError):  # not the main thread, in tests
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # whoever asks is interrupted, and ends this
+    # What libraries print must not stand among the answers.
+    answers = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)
+    began = 0
+    for line in sys.stdin.buffer:
+        request = json.loads(line)
+        _prepare(request)
+        began = began or _address_space()
+        _limit(request)
+        reply, columns = _answer(request)
+        faulthandler.cancel_dump_traceback_later()
+        _send(answers, reply, columns)
+        if "memory" in reply or _address_space() > began + _LEAK:
+            return
+
+
+def _prepare(request: dict[str, Any]) -> None:
+    """Import what the request needs, so that its limits are for the file alone."""
+    for module in READERS.get(request["do"], ())[::2]:
+        with contextlib.suppress(ImportError):  # the reader says so
+            import_module(module)
+
+
+def _limit(request: dict[str, Any]) -> None:
+    """No more than so much memory and so many seconds, whatever a library does.
+
+    Seconds are of computing, so that a busy machine changes no verdict; a file that makes its
+    library wait is ended by the clock after ten times as long.
+    """
+    seconds = int(request["seconds"])
+    faulthandler.dump_traceback_later(10 * seconds, exit=True)
+    try:
+        import resource  # noqa: PLC0415  # not on Windows
+    except ImportError:
+        return
+    used = sum(resource.getrusage(resource.RUSAGE_SELF)[:2])
+    limits = {"RLIMIT_CORE": 0, "RLIMIT_CPU": math.ceil(used) + seconds}
+    if _address_space():
+        limits["RLIMIT_AS"] = _address_space() + int(request["room"])
+    for name, most in limits.items():
+        kind = getattr(resource, name)
+        hard = resource.getrlimit(kind)[1]
+        resource.setrlimit(kind, (most if hard < 0 else min(most, hard), hard))
+
+
+def _address_space() -> int:
+    """Bytes of address space; 0 where the system does not tell, as it then bounds none."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
+    except (OSError, ValueError):
+        return 0
+    return pages * os.sysconf("SC_PAGE_SIZE")
+
+
+def _answer(request: dict[str, Any]) -> tuple[dict[str, Any], Iterable[Array]]:
+    try:
+        if request["do"] == "match":
+            found = re.fullmatch(request["pattern"], request["text"])
+            return {"groups": None if found is None else found.groupdict()}, ()
+        return _table(request)
+    except MemoryError:
+        return {"memory": True}, ()
+    except ImpcError as error:
+        subject = error.subject.replace(request["path"], request["source"], 1)
+        return {"error": [subject, error.problem, error.remedy]}, ()
+
+
+def _table(request: dict[str, Any]) -> tuple[dict[str, Any], Iterable[Array]]:
+    module, function, _ = READERS[request["do"]]
+    try:
+        table = getattr(import_module(module), function)(Path(request["path"]), request["largest"])
+    except (ImpcError, MemoryError):
+        raise
+    # The libraries meet damaged files with any exception: struct.error, KeyError, AssertionError.
+    except Exception as error:
+        raise damaged(request["path"], error) from None
+    if table.rate is not None and not (math.isfinite(table.rate) and table.rate > 0):
+        problem = f"says {table.rate:g} samples per second"
+        raise DataError(request["path"], problem, "export it again with its rate")
+    told = {
+        "names": list(table.columns),
+        "samples": table.samples,
+        "units": dict(table.units),
+        "rate": table.rate,
+        "skipped": dict(table.skipped),
+    }
+    return {"table": told}, table.columns.values()
+
+
+def _send(answers: BinaryIO, reply: dict[str, Any], columns: Iterable[Array]) -> None:
+    text = json.dumps(reply).encode("ascii")
+    answers.write(len(text).to_bytes(8, "little") + text)
+    for values in columns:
+        answers.write(values.data)
+    answers.flush()
