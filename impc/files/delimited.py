@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 import io
 import re
+from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -32,7 +33,11 @@ __all__ = ["encode_delimited", "read_delimited", "split_heading"]
 _DELIMITERS = {".csv": ",;\t", ".tsv": "\t", ".txt": "\t;, "}
 _NAMES = {",": "commas", ";": "semicolons", "\t": "tabs", " ": "blanks", "|": "bars", ":": "colons"}
 _MISSING = ["", "NaN", "nan", "NAN", "NA", "N/A", "null"]
-_NUMBER = re.compile(r"[+-]?(\d+[.,]?\d*|[.,]\d+)(e[+-]?\d+)?|[+-]?inf(inity)?|nan", re.IGNORECASE)
+# Digits are taken once (++): a field of 50 000 of them and a letter is no matter of a minute.
+_NUMBER = re.compile(
+    r"[+-]?(\d++[.,]?\d*+|[.,]\d++)(e[+-]?\d++)?|[+-]?inf(inity)?|nan", re.IGNORECASE
+)
+_LONGEST = 50_000  # characters of a line: 2000 columns of 24
 _HEAD = 100  # lines in which the first row of numbers must stand
 _HEADING = re.compile(r"(.*\S)\s*[(\[]([^()\[\]]*)[)\]]")
 
@@ -117,6 +122,10 @@ def _lines(source: str, content: bytes) -> list[tuple[int, str]]:
     lines = [(number, line) for number, line in enumerate(split, 1) if line.strip()]
     if not lines:
         raise DataError(source, "is empty", "export it again")
+    long = next(((number, len(line)) for number, line in lines if len(line) > _LONGEST), None)
+    if long is not None:
+        problem = f"line {long[0]} has {long[1]} characters, and {_LONGEST} is the most"
+        raise DataError(source, problem, "export it again, one sample a row")
     return lines
 
 
@@ -213,10 +222,10 @@ def _headings(
         )
     split = [split_heading(item) for item in last]
     names = [name for name, _ in split]
-    repeated = next((name for name in names if name and names.count(name) > 1), None)
+    repeated = _repeated(names)
     if repeated is not None:
         names = list(last)  # angle (deg) beside angle (rad)
-        repeated = next((name for name in names if name and names.count(name) > 1), None)
+        repeated = _repeated(names)
     if repeated is not None:
         raise DataError(source, f"names two columns {repeated!r}", "give each its own name")
     units = {
@@ -225,6 +234,12 @@ def _headings(
         if name and (below or own)
     }
     return names, units
+
+
+def _repeated(names: Sequence[str]) -> str | None:
+    """The first name that comes again; columns without a name do not count."""
+    times = Counter(names)
+    return next((name for name in names if name and times[name] > 1), None)
 
 
 def _are_units(row: Sequence[str]) -> bool:

@@ -26,7 +26,7 @@ __all__ = ["HDF5_SIGNATURE", "matlab73_bytes", "read_matlab73"]
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _USER_BLOCK = 512
 _DEPTH = 8
-_MOST = 10_000  # objects in a file
+_MOST = 10_000  # names in a file
 _MOST_TOLD = 256  # bytes of an attribute of MATLAB's: it has one word
 _NUMERIC = {"double", "single", "logical"} | {
     f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)
@@ -39,6 +39,7 @@ class _Found:
 
     source: str
     left: int  # bytes that may still be read
+    names: int = 0
     seen: set[tuple[int, int]] = field(default_factory=set)  # places of objects in the file
     columns: dict[str, Array] = field(default_factory=dict)
     skipped: dict[str, str] = field(default_factory=dict)
@@ -104,6 +105,9 @@ def _collect(found: _Found, prefix: str, group: Any, depth: int) -> None:
         if not prefix and name in ("#refs#", "#subsystem#"):
             continue
         full = f"{prefix}{name}"
+        found.names += 1
+        if found.names > _MOST:
+            raise DataError(found.source, f"holds more than {_MOST} names", "save fewer of them")
         if not isinstance(group.get(name, getlink=True), h5py.HardLink):
             raise DataError(found.source, f"{full} points elsewhere", "save the signals themselves")
         item = group[name]
@@ -171,8 +175,6 @@ def _seen(found: _Found, item: Any) -> bool:
     if key in found.seen:
         return True
     found.seen.add(key)
-    if len(found.seen) > _MOST:
-        raise DataError(found.source, f"holds more than {_MOST} variables", "save fewer of them")
     return False
 
 
