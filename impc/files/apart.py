@@ -128,8 +128,8 @@ def match_apart(subject: str, pattern: str, text: str) -> dict[str, str | None] 
     try:
         groups: dict[str, str | None] | None = _asked(subject, request)[0]["groups"]
     except DataError as error:
-        problem = f"is matched with {text[:80]!r} for too long ({error.problem})"
-        raise InputError(subject, problem, "write no repetition within a repetition") from None
+        problem = f"cannot be matched with {text[:80]!r} in {_SECONDS} s"
+        raise InputError(subject, problem, "write no repetition within a repetition") from error
     return groups
 
 
