@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import importlib
 import inspect
-import json
 import sys
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import control
 import numpy as np
-import scipy.io
 
 from impc.errors import ImpcError, InputError, PlantError
 from impc.plant import Plant, as_plant
 from impc.plant_family import PlantFamily, plant_family
+from impc.saved_plant import SAVED, read_matrices, state_space
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -24,10 +23,6 @@ if TYPE_CHECKING:
     from impc.arrays import Array
 
 __all__ = ["PlantSource", "import_function", "make_plant", "plant_family_of", "plant_source"]
-
-_MATRICES = ("A", "B", "C")
-_NAMES = ("states", "inputs", "outputs")
-_FILES = (".mat", ".npz", ".json")
 
 
 @dataclass(frozen=True)
@@ -60,10 +55,10 @@ def plant_source(name: str, arguments: Mapping[str, Any]) -> PlantSource:
     InputError
         When there is no such module, function or file, or a matrix is missing.
     """
-    if Path(name).suffix in _FILES:
-        matrices = _read(Path(name))
+    if Path(name).suffix in SAVED:
+        matrices = read_matrices(Path(name))
         return PlantSource(
-            name, lambda **given: _state_space(name, {**matrices, **given}), arguments
+            name, lambda **given: state_space(name, {**matrices, **given}), arguments
         )
     return PlantSource(name, import_function(name), arguments)
 
@@ -110,9 +105,15 @@ def make_plant(source: PlantSource, recorded: Sequence[str], **changed: float) -
     """
     arguments = {**source.arguments, **changed}
     try:
-        system = source.make(**arguments)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", np.exceptions.ComplexWarning)
+            system = source.make(**arguments)
     except ImpcError:
         raise
+    except np.exceptions.ComplexWarning:  # control.ss would drop the imaginary parts
+        raise PlantError(
+            f"plant {source.name}", "has complex matrices", "give it real ones"
+        ) from None
     except (TypeError, ValueError) as error:
         raise InputError(
             f"plant {source.name}", f"refuses its arguments ({error})", "correct the [plant] table"
@@ -165,52 +166,3 @@ def _nominal(source: PlantSource, name: str) -> float:
             f"[fit] free {name}", "has no nominal value", f"give {name} in the [plant] table"
         )
     return float(value)
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        if path.suffix == ".json":
-            found = json.loads(path.read_text(encoding="utf-8"))
-        elif path.suffix == ".npz":
-            with np.load(path, allow_pickle=False) as archive:
-                found = {name: archive[name] for name in archive.files}
-        else:
-            found = {
-                name: value
-                for name, value in scipy.io.loadmat(path).items()
-                if not name.startswith("__")
-            }
-    except (OSError, ValueError, NotImplementedError) as error:
-        raise InputError(
-            f"plant {path}", f"cannot be read ({error})", "save A, B, C and dt in it, MATLAB: -v7"
-        ) from None
-    if not isinstance(found, dict):
-        raise InputError(f"plant {path}", "holds no names", "save A, B, C and dt in it")
-    missing = [name for name in (*_MATRICES, "dt") if name not in found]
-    if missing:
-        raise InputError(
-            f"plant {path}", f"lacks {', '.join(missing)}", "save A, B, C and dt in it"
-        )
-    return found
-
-
-def _state_space(name: str, given: Mapping[str, Any]) -> Any:
-    unknown = [key for key in given if key not in (*_MATRICES, "D", "dt", *_NAMES)]
-    if unknown:
-        raise InputError(f"plant {name}", f"does not know {unknown[0]}", f"names: {list(_NAMES)}")
-    try:
-        matrices = {key: np.atleast_2d(np.asarray(given[key], dtype=float)) for key in _MATRICES}
-        dt = float(np.asarray(given["dt"]).item())
-    except (TypeError, ValueError) as error:
-        raise InputError(
-            f"plant {name}", f"is not made of numbers ({error})", "save matrices"
-        ) from None
-    D = np.zeros((len(matrices["C"]), matrices["B"].shape[1]))
-    labels = {key: _labels(given[key]) for key in _NAMES if key in given}
-    return control.ss(*matrices.values(), given.get("D", D), dt, **labels)
-
-
-def _labels(values: Any) -> list[str]:
-    return [
-        str(np.asarray(item).item()).strip() for item in np.ravel(np.asarray(values, dtype=object))
-    ]

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
+import control
 import numpy as np
 import pytest
 import scipy.io
@@ -12,6 +14,7 @@ import scipy.io
 import plants
 from impc.errors import ImpcError, InputError, PlantError
 from impc.plant_source import make_plant, plant_family_of, plant_source
+from tests.files.samples import mat5_array, mat5_element, mat5_file
 
 A, B, C = [[1.0, 0.1], [0.0, 1.0]], [[0.005, 0.0], [0.1, 0.1]], [[1.0, 0.0]]
 
@@ -74,8 +77,8 @@ def test_a_free_parameter_of_the_seat() -> None:
         ("plants:no_such", {}, "cannot be imported"),
         ("no_such_module:f", {}, "cannot be imported"),
         ("plants:seated_balance_plant", {"weight": 3}, "refuses its arguments"),
-        ("nowhere.mat", {}, "cannot be read"),
-        ("nowhere.json", {}, "cannot be read"),
+        ("nowhere.mat", {}, "does not exist"),
+        ("nowhere.json", {}, "does not exist"),
     ],
 )
 def test_what_cannot_be_used_is_said_in_one_line(
@@ -92,7 +95,7 @@ def test_files_that_hold_no_plant(tmp_path: Path) -> None:
         ('{"A": [[1]], "B": [[1]], "C": [[1]]}', "lacks dt"),
         ("[1, 2]", "holds no names"),
         ("{", "cannot be read"),
-        ('{"A": [["x"]], "B": [[1]], "C": [[1]], "dt": 1}', "not made of numbers"),
+        ('{"A": [["x"]], "B": [[1]], "C": [[1]], "dt": 1}', "not made of numbers in rows"),
         ('{"A": [[1]], "B": [[1, 2]], "C": [[1, 2]], "dt": 1}', "plant"),
     ):
         path.write_text(text)
@@ -120,3 +123,82 @@ def test_what_a_function_returns_must_be_a_state_space() -> None:
     source = plant_source("builtins:dict", {})
     with pytest.raises(PlantError, match=r"expected a control\.StateSpace"):
         make_plant(source, ())
+
+
+@pytest.mark.parametrize("suffix", ["mat", "npz"])
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"A": np.array(A) + 1j}, "complex"),
+        ({"D": np.array([[1j, 0]])}, "complex"),
+        ({"dt": 0.1 + 1j}, "complex"),
+        ({"dt": np.inf}, "dt that is not one number"),
+        ({"dt": [0.1, 0.2]}, "dt that is not one number"),
+        ({"C": np.array([["1", "0"]])}, "not made of numbers in rows"),
+        ({"A": np.array([A, A])}, "not made of numbers in rows"),
+    ],
+)
+def test_matrices_that_are_no_plant(
+    tmp_path: Path, suffix: str, change: dict[str, object], says: str
+) -> None:
+    path = tmp_path / f"plant.{suffix}"
+    matrices: dict[str, object] = {"A": A, "B": B, "C": C, "dt": 0.1, **change}
+    if suffix == "mat":
+        scipy.io.savemat(path, matrices)
+    else:
+        np.savez(path, **matrices)  # type: ignore[arg-type]  # its stub knows arrays only
+    with pytest.raises(InputError, match=says) as caught:
+        make_plant(plant_source(str(path), {}), ())
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("names", "says"),
+    [
+        ({"states": ["x", "v", "a"]}, "names 3 states and has 2"),
+        ({"states": ["x"]}, "names 1 states and has 2"),
+        ({"inputs": ["force"]}, "names 1 inputs and has 2"),
+        ({"outputs": ["x", "y"]}, "names 2 outputs and has 1"),
+        ({"states": ["x", "x"]}, "names two states 'x'"),
+        ({"states": {"x": 1}}, "that are not names"),
+        ({"states": [["x"], []]}, "names 1 states"),
+        ({"states": ["x", None]}, "that are not names"),
+    ],
+)
+def test_names_that_are_not_those_of_the_plant(
+    tmp_path: Path, names: dict[str, object], says: str
+) -> None:
+    path = tmp_path / "plant.json"
+    path.write_text(json.dumps({"A": A, "B": B, "C": C, "dt": 0.1, **names}))
+    with pytest.raises(InputError, match=says):
+        make_plant(plant_source(str(path), {}), ())
+
+
+def test_files_of_plants_that_are_hostile(tmp_path: Path) -> None:
+    def refused(name: str, content: bytes, says: str) -> None:
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(InputError, match=says) as caught:
+            plant_source(str(tmp_path / name), {})
+        assert "\n" not in str(caught.value)
+
+    refused("deep.json", b"[" * 100_000, "nested too deep")
+    refused("digits.json", b'{"A": ' + b"1" * 5000 + b"}", "cannot be read")
+    refused("bytes.json", b"\xff", "cannot be read")
+    refused("none.json", b"", "is empty")
+    refused("cut.npz", b"PK\x03\x04" + bytes(200), "cannot be read")
+    numbers = mat5_element(200, bytes(72))  # a type that ends scipy's process
+    refused("crash.mat", mat5_file(mat5_array(6, (3, 3), "A", numbers)), "of type 200")
+    np.savez_compressed(tmp_path / "bomb.npz", A=np.zeros(10_000_000))
+    refused("bomb.npz", (tmp_path / "bomb.npz").read_bytes(), "too large once it is unpacked")
+    os.mkfifo(tmp_path / "pipe.json")
+    with pytest.raises(InputError, match="is no ordinary file"):
+        plant_source(str(tmp_path / "pipe.json"), {})
+
+
+def test_a_function_whose_plant_is_complex() -> None:
+    def make() -> object:
+        return control.ss(np.array([[0.5 + 1j]]), 1, 1, 0, 0.1)
+
+    source = plant_source("plants:seated_balance_plant", {})
+    with pytest.raises(PlantError, match="has complex matrices"):
+        make_plant(type(source)("mine", make, {}), ())

@@ -54,12 +54,12 @@ def require_no_thousands(
                 del left[index]  # decimals, without a doubt
         if not left:
             return
-    for index in left:
+    for index, name in left.items():
         if index in whole and index in first:
             line, item = first[index]
             raise DataError(
                 source,
-                f"column {left[index]!r} has whole numbers and {item!r} in line {line}, which may "
+                f"column {name!r} has whole numbers and {item!r} in line {line}, which may "
                 "be a thousand",
                 "export it without thousands separators, or with as many decimals in every row",
             )

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from impc.errors import InputError
+from impc.files.door import shown
 
 __all__ = ["Unit", "is_unit", "si_unit"]
 
@@ -110,5 +111,7 @@ def _registry() -> Any:
 
 def _unknown(written: str) -> InputError:
     return InputError(
-        f"unit {written!r}", "is not known", 'write it as in "deg", "rad/s", "N*m", "mV", "1"'
+        f"unit {shown(written, 40)!r}",
+        "is not known",
+        'write it as in "deg", "rad/s", "N*m", "mV", "1"',
     )
