@@ -11,6 +11,7 @@ import difflib
 import math
 import re
 import tomllib
+import warnings
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import msgspec
@@ -149,7 +150,7 @@ def read_configuration(path: Path, *more: str) -> Configuration:
     _check_recording(source, recording)
     signals = {}
     for name, table in tables["signals"].items():
-        signals[name] = _convert(source, f"signals.{name}", table, SignalTable)
+        signals[name] = _convert(source, f"signals.{shown(name)}", table, SignalTable)
         _check_signal(source, f"signals.{shown(name)}", signals[name])
     if not signals:
         raise InputError(
@@ -231,7 +232,9 @@ def _check_recording(source: str, table: RecordingTable) -> None:
 
 def _check_pattern(refuse: Any, table: RecordingTable, pattern: str) -> None:
     try:
-        groups = re.compile(pattern).groupindex
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # "possible nested set"
+            groups = re.compile(pattern).groupindex
     except (re.error, OverflowError, RecursionError) as error:
         raise refuse(
             "pattern", f"is no regular expression ({shown(str(error))})", "correct it"

@@ -58,7 +58,9 @@ def require_ordinary(path: Path, largest: int, error: type[ImpcError] = DataErro
         raise error(
             source,
             f"has {_size(found.st_size)}, and {_size(largest)} is the most that is read",
-            "export only the signals and seconds that are needed",
+            "export only the signals and seconds that are needed"
+            if error is DataError
+            else "give a smaller one",
         )
     return found.st_size
 
