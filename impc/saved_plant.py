@@ -29,6 +29,8 @@ _NEEDED = ("A", "B", "C", "dt")
 _REMEDY = "save A, B, C and dt in it, MATLAB: -v7"
 # Bytes of a file and of what it unpacks to: a plant of a thousand states has 8 MB.
 _LARGEST = 50_000_000
+# An entry whose fourth power is still a number: balancing and Riccati's equation take it.
+_MOST = 1e70
 
 
 def read_matrices(path: Path) -> dict[str, Any]:
@@ -124,6 +126,9 @@ def _matrix(subject: str, name: str, value: Any) -> Any:
     if array.dtype.kind not in "fiu" or array.ndim != 2:
         problem = f"has {name} that is not made of numbers in rows"
         raise InputError(subject, problem, "save matrices")
+    if array.size and np.abs(array.astype(np.float64)).max() > _MOST:
+        problem = f"has entries beyond {_MOST:g} in {name}"
+        raise InputError(subject, problem, "give the plant in other units")
     return array.astype(np.float64)
 
 

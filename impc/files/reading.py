@@ -169,7 +169,8 @@ def _label(source: str, entry: RecordingTable) -> Label:
 
 def _channel(table: Table, clock: Clock, name: str, entry: SignalTable) -> checks.Channel:
     column, values = column_of(table, entry.column, f"signals.{name}.column")
-    with np.errstate(over="ignore"):  # beyond the largest number: not finite, and told below
+    # Beyond the largest number, or a NaN that signals: not finite, and told below.
+    with np.errstate(over="ignore", invalid="ignore"):
         used = entry.sign * (values[clock.rows] - entry.offset)
     return checks.Channel(table.source, name, column, si_unit(entry.unit), clock.time, used)
 

@@ -48,15 +48,15 @@ def read_tdms(path: Path, largest: int) -> Table:
         raise DataError(str(path), "needs the package nptdms", _REMEDY) from None
     source = str(path)
     # Opened here, because nptdms leaves a file open when its head is damaged.
-    with _silent(), path.open("rb") as handle, TdmsFile.open(handle) as file:
+    with _silent(), _Bounded(io.FileIO(path)) as handle, TdmsFile.open(handle) as file:
         if file.file_status.incomplete_final_segment:
             raise DataError(
                 source, "ends in the middle of its data", "copy it again, or close it in LabVIEW"
             )
         channels = [channel for group in file.groups() for channel in group.channels()]
         claimed = sum(len(channel) for channel in channels)
-        if 8 * claimed > largest:
-            problem = f"is too large: it says that it has {claimed} values"
+        if 8 * claimed > largest or claimed > path.stat().st_size:
+            problem = f"is too large or damaged: it says that it has {claimed} values"
             raise DataError(source, problem, "export only the channels that are needed")
         return _table(source, channels)
 
@@ -85,6 +85,19 @@ def encode_tdms(table: Table) -> bytes:
     with TdmsWriter(content) as writer:
         writer.write_segment(channels)
     return content.getvalue()
+
+
+class _Bounded(io.BufferedReader):
+    """A file that is asked for no more than it has: Python takes the memory before it looks."""
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """As of any file; `size` in bytes."""
+        if size is None or size < 0:
+            return super().read()
+        here = self.tell()
+        end = self.seek(0, io.SEEK_END)
+        self.seek(here)
+        return super().read(min(size, max(0, end - here)))
 
 
 def _table(source: str, channels: list[Any]) -> Table:

@@ -63,5 +63,5 @@ def mutated_text(rng: random.Random, text: str, pieces: tuple[str, ...]) -> byte
         elif kind == 3 and len(lines) > 1:
             del lines[at]
         else:
-            return mutated_bytes(rng, "\n".join(lines).encode())
+            return mutated_bytes(rng, "\n".join(lines).encode("utf-8", "surrogatepass"))
     return "\n".join(lines).encode("utf-8", "surrogatepass")
