@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import stat
 from typing import TYPE_CHECKING
 
@@ -75,7 +74,7 @@ def damaged(source: str, fault: Exception) -> DataError:
     fault : Exception
         Of any kind: struct.error, KeyError, AssertionError.
     """
-    reason = shown(str(fault), 120) or type(fault).__name__
+    reason = shown(" ".join(str(fault).split()), 120) or type(fault).__name__
     return DataError(source, f"is damaged and cannot be read ({reason})", "copy or export it again")
 
 
@@ -89,8 +88,7 @@ def shown(text: str, most: int = 80) -> str:
     most : int
         Characters after which it is cut.
     """
-    plain = "".join(mark if mark.isprintable() else " " for mark in text[: 10 * most])
-    line = re.sub(r" +", " ", plain).strip()
+    line = "".join(mark if mark.isprintable() else " " for mark in text[: 10 * most]).strip()
     return line if len(line) <= most else f"{line[: most - 3]}..."
 
 

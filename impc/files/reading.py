@@ -66,7 +66,7 @@ def read_recordings(
         When a file cannot be read or a check fails. Nothing is returned then.
     """
     plant.require_discrete()
-    _require_names(configuration, plant)
+    _require_names(configuration, plant)  # before files are read, which may take long
     _require_distinct(paths)
     if not paths:
         raise InputError("recordings", "no file is given", "name at least one")
@@ -85,9 +85,12 @@ def recording_of(table: Table, configuration: Configuration, plant: Plant) -> Re
 
     Raises
     ------
+    InputError
+        When the configuration does not name the plant's signals.
     DataError
         When a check fails.
     """
+    _require_names(configuration, plant)
     entry = configuration.recording
     label = _label(table.source, entry)
     clock = read_clock(table, entry)
