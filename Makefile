@@ -5,7 +5,7 @@
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
-.PHONY: help env demo test check docs reproduce wheel slow bench lock clean
+.PHONY: help env demo test check docs reproduce wheel slow bench fuzz lock clean
 
 PYTHON ?= python3
 # Not to be set from outside: the environment is made with `venv --clear`.
@@ -44,6 +44,7 @@ help:
 	@echo 'make reproduce  write docs/reproduction: the dissertation, line by line (half an hour)'
 	@echo 'make wheel   build a wheel, install it in an empty environment, run impc example there'
 	@echo 'make bench   the benchmarks:                     python -m experiments.benchmarks'
+	@echo 'make fuzz    160 000 mutated files, configurations and plants; FUZZ="--seed 1 --cases 1000"'
 	@echo 'make lock    compile both lock files again (needs uv); UPGRADE=--upgrade takes newer versions'
 	@echo 'make clean   remove caches and build products; .venv and results stay'
 	@echo 'PYTHON=python3.12 chooses the Python; the one used otherwise is the first of'
@@ -82,6 +83,10 @@ slow: env
 
 bench: env
 	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(PY) -m experiments.benchmarks
+
+# Prints its seed; a case that does not end in one line is kept in results/fuzz.
+fuzz: env
+	OPENBLAS_NUM_THREADS=1 $(PY) -m tests.fuzz $(FUZZ)
 
 env: $(PROJECT) $(POLYTOPE)
 

@@ -116,7 +116,7 @@ def _from_mat(path: Path) -> dict[str, Any]:
 def _matrix(subject: str, name: str, value: Any) -> Any:
     """Two dimensions of real numbers."""
     if isinstance(value, Other):
-        raise InputError(subject, f"has a matrix {name} that is {value.kind}", "save real numbers")
+        raise InputError(subject, f"has a {value.kind} matrix {name}", "save real numbers")
     try:
         array = np.atleast_2d(np.asarray(value))
     except ValueError:  # rows of unequal length

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -9,6 +10,7 @@ from typing import TYPE_CHECKING
 import control
 import numpy as np
 import pytest
+import scipy.io
 from click.testing import CliRunner
 
 from impc.bounds import box_bounds
@@ -19,9 +21,12 @@ from impc.cohort.store import open_store
 from impc.cohort.study import read_study
 from impc.controller import mpc_controller
 from impc.errors import ImpcError
+from impc.files import apart
 from impc.files.alignment import misaligned
 from impc.files.configuration import read_configuration
-from impc.files.reading import read_recordings
+from impc.files.formats import read_table
+from impc.files.reading import read_recordings, recording_of
+from impc.files.table import Table, make_table
 from impc.fit_recordings import fit_problem
 from impc.fit_settings import FitSettings, fit_settings
 from impc.lqr import solve_lqr
@@ -32,6 +37,7 @@ from impc.report.write import require_writable
 from impc.weights import stage_weights
 from tests.documents.blocks import PAGES
 from tests.files.damaged import DAMAGED, PLANT
+from tests.files.samples import hdf5_mat, pushed_seat, settings
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -139,6 +145,63 @@ def everything_recorded(_: Path) -> None:
     make_plant(source, source.make().input_labels)
 
 
+def thousands(folder: Path) -> None:
+    (folder / "t.csv").write_text("t;x\n0;999\n1;1.000\n")
+    read_table(folder / "t.csv")
+
+
+def a_pipe(folder: Path) -> None:
+    os.mkfifo(folder / "t.csv")
+    read_table(folder / "t.csv")
+
+
+def reader_that(ends: str) -> Callable[[Path], None]:
+    """Read by a process that ends so."""
+
+    def read(folder: Path) -> None:
+        hdf5_mat(folder / "t.mat", {"x": np.arange(9.0)})
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(apart, "_current", [])
+            patch.setattr(apart, "_START", f"import os, signal; {ends}")
+            read_table(folder / "t.mat")
+
+    return read
+
+
+def endless_pattern(_: Path) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(apart, "_SECONDS", 1)
+        apart.match_apart("recording.pattern", "(a+)+x", "a" * 60)
+
+
+def clock_in_microseconds(folder: Path) -> None:
+    columns = pushed_seat()
+    table = make_table("t.csv", {**columns, "time": 1e6 * columns["time"]})
+    read_seat(folder, table)
+
+
+def value_of_a_fault(folder: Path) -> None:
+    columns = pushed_seat()
+    read_seat(folder, make_table("t.csv", {**columns, "seat": 1e300 * columns["seat"]}))
+
+
+def read_seat(folder: Path, table: Table) -> None:
+    (folder / "c.toml").write_text(settings())
+    plant = make_plant(plant_source(PLANT, {}), ("perturbation",))
+    recording_of(table, read_configuration(folder / "c.toml"), plant)
+
+
+def saved_plant(**changed: object) -> Callable[[Path], None]:
+    """Make a plant from a file in which something is wrong."""
+
+    def read(folder: Path) -> None:
+        matrices: dict[str, object] = {"A": [[0.5]], "B": [[1.0]], "C": [[1.0]], "dt": 0.1}
+        scipy.io.savemat(folder / "plant.mat", matrices | changed)
+        make_plant(plant_source(str(folder / "plant.mat"), {}), ())
+
+    return read
+
+
 #: Message -> what provokes it: raises the error, or returns the text.
 PROVOKED: dict[str, Callable[[Path], object]] = {
     "does not exist; check the path": damaged("missing file"),
@@ -151,6 +214,16 @@ PROVOKED: dict[str, Callable[[Path], object]] = {
     "column '...' has text in ... of ... rows": damaged("text in a column"),
     "the file ends in the middle of a row": damaged("truncated csv"),
     "is a MATLAB table; save a struct of vectors": damaged("table object"),
+    "which may be a thousand": thousands,
+    "is no ordinary file": a_pipe,
+    "takes more than ... GB to read": reader_that("os.kill(os.getpid(), signal.SIGKILL)"),
+    "takes longer than ... s to read": reader_that("os.kill(os.getpid(), signal.SIGXCPU)"),
+    "ends the process that reads it (...)": reader_that("os.abort()"),
+    "cannot be matched with '...' in ... s": endless_pattern,
+    "has a sample every ... s, and the plant one every ... s": clock_in_microseconds,
+    "which is no measurement": value_of_a_fault,
+    "has a complex matrix ...": saved_plant(A=np.array([[0.5 + 1j]])),
+    "names ... states and has ...": saved_plant(states=np.array(["x", "v"], dtype=object)),
     "is damaged and cannot be read (...)": damaged("truncated mat"),
     "is not TOML (...)": damaged("configuration that is no toml"),
     "is not known; did you mean ...": damaged("misspelled key"),

@@ -29,7 +29,7 @@ def main() -> int:
     """Run; 1 when a case failed."""
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
     parser.add_argument("--seed", type=int, default=int.from_bytes(os.urandom(4), "little"))
-    parser.add_argument("--cases", type=int, default=100_000, help="of all targets together")
+    parser.add_argument("--cases", type=int, default=160_000, help="of all targets together")
     parser.add_argument("--only", choices=TARGETS, action="append", help="may be given again")
     given = parser.parse_args()
     names = given.only or list(TARGETS)
