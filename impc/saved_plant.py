@@ -36,6 +36,16 @@ _MOST = 1e70
 def read_matrices(path: Path) -> dict[str, Any]:
     """What a file holds, by name; A, B, C and dt are among it. No pickles are opened.
 
+    Parameters
+    ----------
+    path : Path
+        Of a .mat file up to version 7, .npz or .json.
+
+    Returns
+    -------
+    dict of str to object
+        As the file has them, not checked.
+
     Raises
     ------
     InputError

@@ -56,7 +56,7 @@ PLUMBING = {
     "checks and exceptions": ("impc.arrays", "impc.errors", "plants._checks"),
     "the command line": ("impc.cli", "impc.commands"),
     "files and what is in them": ("impc.files", "impc.fit_memory", "impc.recording"),
-    "import paths": ("impc.plant_source", "impc.selection.source"),
+    "import paths": ("impc.plant_source", "impc.saved_plant", "impc.selection.source"),
     "queues and settings of a study": ("impc.selection.running", "impc.selection.settings"),
     "a study from its folder to its pages": ("impc.cohort",),
     "pages and figures": ("impc.report", "impc.reliability.figures", "impc.reliability.report"),

@@ -88,7 +88,9 @@ def read_apart(kind: str, path: Path, largest: int) -> Table:
         "room": _ROOM + _ROOM_A_BYTE * size,
         "seconds": _SECONDS + _SECONDS_A_MEGABYTE * size // 1_000_000,
     }
-    reply, columns = _asked(source, request)
+    reply, columns = _asked(request)
+    if "refused" in reply:
+        raise DataError(*reply["refused"])
     told = reply["table"]
     return Table(
         source,
@@ -125,11 +127,11 @@ def match_apart(subject: str, pattern: str, text: str) -> dict[str, str | None] 
         "path": "",
         "source": "",
     }
-    try:
-        groups: dict[str, str | None] | None = _asked(subject, request)[0]["groups"]
-    except DataError as error:
+    reply, _ = _asked(request)
+    if "refused" in reply:
         problem = f"cannot be matched with {text[:80]!r} in {_SECONDS} s"
-        raise InputError(subject, problem, "write no repetition within a repetition") from error
+        raise InputError(subject, problem, "write no repetition within a repetition")
+    groups: dict[str, str | None] | None = reply["groups"]
     return groups
 
 
@@ -187,51 +189,49 @@ _lock = threading.Lock()
 _current: list[_Process] = []
 
 
-def _asked(source: str, request: dict[str, Any]) -> tuple[dict[str, Any], list[Array]]:
+def _asked(request: dict[str, Any]) -> tuple[dict[str, Any], list[Array]]:
     """The answer of the process that is there, or of a new one."""
     with _lock:
         while True:
-            process = _running(source)
+            try:
+                process = _running()
+            except OSError as error:
+                reason = error.strerror or type(error).__name__
+                problem = f"the process that reads it cannot be started ({reason})"
+                return _refusal(request, problem, f"check that {sys.executable} can run"), []
             served = process.served
             try:
                 reply, columns = process.ask(request)
             except (EOFError, OSError):
-                status = _replaced(process)
-                if served:
-                    continue
-                raise DataError(source, *_why(status, request)) from None
+                reply = _refusal(request, *_why(_replaced(process), request))
             except BaseException:  # interrupted: its answer would be taken for the next one's
                 _replaced(process)
                 raise
-            if "memory" in reply:
+            else:
+                if "memory" not in reply:
+                    return reply, columns
                 _replaced(process)
-                if served:
-                    continue
-                raise DataError(source, *_too_large(request))
-            if "error" in reply:
-                raise DataError(*reply["error"])
-            return reply, columns
+                reply = _refusal(request, *_too_large(request))
+            if not served:
+                return reply, []
 
 
-def _running(source: str) -> _Process:
+def _refusal(request: dict[str, Any], problem: str, remedy: str) -> dict[str, Any]:
+    return {"refused": [request["source"], problem, remedy]}
+
+
+def _running() -> _Process:
+    """The process that is there, or a new one; OSError where none can be started."""
     if _current and _current[0].owner != os.getpid():
         _current.clear()
     if not _current:
-        root = str(Path(impc.__path__[0]).parent)
-        try:
-            popen = subprocess.Popen(
-                [sys.executable, "-P", "-c", _START, root],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.DEVNULL,
-                env={**os.environ, **_ENVIRONMENT},
-            )
-        except OSError as error:
-            reason = error.strerror or type(error).__name__
-            problem = f"the process that reads it cannot be started ({reason})"
-            raise DataError(
-                source, problem, f"check {sys.executable or 'sys.executable'}"
-            ) from None
+        popen = subprocess.Popen(
+            [sys.executable, "-P", "-c", _START, str(Path(impc.__path__[0]).parent)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            env={**os.environ, **_ENVIRONMENT},
+        )
         _current.append(_Process(popen))
     return _current[0]
 

@@ -44,21 +44,39 @@ class TooLargeError(Exception):
 
 @dataclass(frozen=True)
 class Text:
-    """An array of characters: its rows, without blanks behind them."""
+    """An array of characters.
+
+    Attributes
+    ----------
+    rows : tuple of str
+        Without blanks behind them.
+    """
 
     rows: tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class Cells:
-    """A cell array: its values, column by column."""
+    """A cell array.
+
+    Attributes
+    ----------
+    values : tuple of object
+        Column by column, each as in `read_variables`.
+    """
 
     values: tuple[Any, ...]
 
 
 @dataclass(frozen=True)
 class Other:
-    """What is neither numbers, text, cells nor a struct: `kind` ends the sentence "it is"."""
+    """What is neither real numbers, text, cells nor a struct of one element.
+
+    Attributes
+    ----------
+    kind : str
+        What it is, as the end of a sentence that begins with "is".
+    """
 
     kind: str
 
@@ -154,7 +172,7 @@ def read_variables(path: Path, largest: int) -> dict[str, Any]:
         When its arrays take more than `largest` bytes.
     """
     content = memoryview(path.read_bytes())
-    order = ">" if content[126:128] == b"MI" else "<"
+    order = ">" if bytes(content[126:128]) == b"MI" else "<"
     limits = _Limits(largest)
     found: dict[str, Any] = {}
     for matrix in _matrices(content[128:], order, limits):

@@ -59,6 +59,8 @@ def read_matlab73(path: Path, largest: int) -> Table:
     ------
     DataError
         When it holds no numeric vector or matrix, or refers to another file.
+    ValueError
+        When it is damaged.
     """
     import h5py  # noqa: PLC0415  # a fifth of a second, for who reads text only
 

@@ -55,7 +55,14 @@ def size(channel: Channel) -> str:
 
 
 def times_of_a_recording(subject: str, time: Array) -> None:
-    """The `time` in s of a clock, finite and rising.
+    """The times of a clock.
+
+    Parameters
+    ----------
+    subject : str
+        File and clock, for the message.
+    time : Array
+        (samples,), s, finite and rising.
 
     Raises
     ------
@@ -70,7 +77,14 @@ def times_of_a_recording(subject: str, time: Array) -> None:
 
 
 def period_of_a_recording(subject: str, period: float) -> None:
-    """The `period` of a clock, s.
+    """The period of a clock.
+
+    Parameters
+    ----------
+    subject : str
+        File and clock, for the message.
+    period : float
+        s.
 
     Raises
     ------
@@ -86,7 +100,14 @@ def period_of_a_recording(subject: str, period: float) -> None:
 
 
 def comparable_rates(subject: str, period: float, dt: float) -> None:
-    """A clock and the plant's; `period` and dt in s.
+    """A clock and the plant's.
+
+    Parameters
+    ----------
+    subject : str
+        File, for the message.
+    period, dt : float
+        Of the recording and of the plant, s.
 
     Raises
     ------
@@ -102,7 +123,16 @@ def comparable_rates(subject: str, period: float, dt: float) -> None:
 
 
 def few_gaps(subject: str, time: Array, period: float) -> None:
-    """The `time` in s of a clock whose `period` is usual, s.
+    """Gaps of a clock: how many instants it has beside its samples.
+
+    Parameters
+    ----------
+    subject : str
+        File and clock, for the message.
+    time : Array
+        (samples,), s, finite and rising.
+    period : float
+        What is usual between two samples, s.
 
     Raises
     ------

@@ -19,14 +19,15 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from impc.errors import DataError, ImpcError
-from impc.files.door import damaged
+from impc.errors import ImpcError
+from impc.files.door import damaged, shown
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
     from typing import BinaryIO
 
     from impc.arrays import Array
+    from impc.files.table import Table
 
 __all__ = ["READERS", "main"]
 
@@ -99,30 +100,24 @@ def _address_space() -> int:
 
 
 def _answer(request: dict[str, Any]) -> tuple[dict[str, Any], Iterable[Array]]:
+    """The reply and its columns; {"memory": True} for too much, {"refused": ...} for a reason."""
     try:
         if request["do"] == "match":
             found = re.fullmatch(request["pattern"], request["text"])
             return {"groups": None if found is None else found.groupdict()}, ()
-        return _table(request)
+        module, function, _ = READERS[request["do"]]
+        read = getattr(import_module(module), function)
+        table: Table = read(Path(request["path"]), request["largest"])
     except MemoryError:
         return {"memory": True}, ()
     except ImpcError as error:
-        subject = error.subject.replace(request["path"], request["source"], 1)
-        return {"error": [subject, error.problem, error.remedy]}, ()
-
-
-def _table(request: dict[str, Any]) -> tuple[dict[str, Any], Iterable[Array]]:
-    module, function, _ = READERS[request["do"]]
-    try:
-        table = getattr(import_module(module), function)(Path(request["path"]), request["largest"])
-    except (ImpcError, MemoryError):
-        raise
+        return _refused(request, error), ()
     # The libraries meet damaged files with any exception: struct.error, KeyError, AssertionError.
     except Exception as error:
-        raise damaged(request["path"], error) from None
+        return _refused(request, damaged(request["path"], error)), ()
     if table.rate is not None and not (math.isfinite(table.rate) and table.rate > 0):
         problem = f"says {table.rate:g} samples per second"
-        raise DataError(request["path"], problem, "export it again with its rate")
+        return {"refused": [request["source"], problem, "export it again with its rate"]}, ()
     told = {
         "names": list(table.columns),
         "samples": table.samples,
@@ -131,6 +126,12 @@ def _table(request: dict[str, Any]) -> tuple[dict[str, Any], Iterable[Array]]:
         "skipped": dict(table.skipped),
     }
     return {"table": told}, table.columns.values()
+
+
+def _refused(request: dict[str, Any], error: ImpcError) -> dict[str, Any]:
+    """The parts of an error, with the file's name as the user gave it."""
+    subject = error.subject.replace(request["path"], request["source"], 1)
+    return {"refused": [subject, shown(error.problem, 300), error.remedy]}
 
 
 def _send(answers: BinaryIO, reply: dict[str, Any], columns: Iterable[Array]) -> None:
