@@ -49,7 +49,7 @@ def _run(fuzzer: Fuzzer, name: str, cases: int, seed: int) -> int:
     failed, slowest, begin = 0, 0.0, time.process_time()
     for case in range(cases):
         path, read = TARGETS[name](fuzzer)
-        before = time.perf_counter()
+        before = time.process_time()
         try:
             reasons[_kind(fuzzer.reason(read))] += 1
         except Exception:  # anything: that is what is looked for
@@ -58,7 +58,7 @@ def _run(fuzzer: Fuzzer, name: str, cases: int, seed: int) -> int:
             kept = _KEPT / f"{seed}-{case}-{path.name}"
             shutil.copy(path, kept)
             print(f"FAILED {kept}: {traceback.format_exc(limit=-2)}", flush=True)
-        slowest = max(slowest, time.perf_counter() - before)
+        slowest = max(slowest, time.process_time() - before)
     here, readers = (
         resource.getrusage(who).ru_maxrss / 1e6
         for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
