@@ -81,6 +81,13 @@ def test_messages_name_the_file_as_it_was_given(
     assert read_table(Path("t.mat")).source == "t.mat"
 
 
+def test_a_name_in_a_reason_is_of_one_line(tmp_path: Path) -> None:
+    hdf5_mat(tmp_path / "t.mat", SEAT)
+    with h5py.File(tmp_path / "t.mat", "r+") as file:
+        file["a\n\x1b[2J"] = h5py.SoftLink("seat")
+    assert refusal(tmp_path / "t.mat") == "a  [2J points elsewhere"
+
+
 @pytest.mark.parametrize(
     ("end", "says"),
     [
