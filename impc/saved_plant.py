@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 import control
 import numpy as np
 
-from impc.errors import InputError
+from impc.errors import ImpcError, InputError
+from impc.files.apart import matrices_apart
 from impc.files.door import require_ordinary
-from impc.files.matlab5 import Cells, Other, Text, TooLargeError, read_variables
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -58,7 +58,9 @@ def read_matrices(path: Path) -> dict[str, Any]:
         found = read(path)
     except RecursionError:
         raise InputError(subject, "is nested too deep", _REMEDY) from None
-    except (MemoryError, TooLargeError):
+    except ImpcError:
+        raise
+    except MemoryError:
         raise InputError(subject, "is too large once it is unpacked", _REMEDY) from None
     except Exception as error:  # zipfile, zlib, numpy and json raise a dozen kinds
         reason = " ".join(str(error).split())[:120] or type(error).__name__
@@ -109,7 +111,7 @@ def _from_json(path: Path) -> Any:
 def _from_npz(path: Path) -> dict[str, Any]:
     with zipfile.ZipFile(path) as archive:
         if sum(member.file_size for member in archive.infolist()) > _LARGEST:
-            raise TooLargeError
+            raise MemoryError
     with np.load(path, allow_pickle=False) as arrays:
         return {name: arrays[name] for name in arrays.files}
 
@@ -120,13 +122,11 @@ def _from_mat(path: Path) -> dict[str, Any]:
     version = int.from_bytes(head[124:126], "big" if head[126:128] == b"MI" else "little") >> 8
     if not head.startswith(b"MATLAB ") or version != 1:
         raise ValueError("no MATLAB file of version 5 to 7")
-    return read_variables(path, _LARGEST)
+    return matrices_apart(path, _LARGEST)
 
 
 def _matrix(subject: str, name: str, value: Any) -> Any:
     """Two dimensions of real numbers."""
-    if isinstance(value, Other):
-        raise InputError(subject, f"has a {value.kind} matrix {name}", "save real numbers")
     try:
         array = np.atleast_2d(np.asarray(value))
     except ValueError:  # rows of unequal length
@@ -143,13 +143,9 @@ def _matrix(subject: str, name: str, value: Any) -> Any:
 
 
 def _labels(subject: str, name: str, value: Any) -> list[str]:
-    """Names from a list, an array, a cell array of text, or the rows of a text."""
+    """Names from a text, a list or an array of them."""
     if isinstance(value, str):
         value = [value]
-    if isinstance(value, Cells):
-        value = [item.rows for item in value.values if isinstance(item, Text)]
-    if isinstance(value, Text):
-        value = value.rows
     found = [item.item() if isinstance(item, np.ndarray) else item for item in _flat(value)]
     if not found or not all(isinstance(item, str | int) and str(item).strip() for item in found):
         raise InputError(subject, f"has {name} that are not names", "save a list of text")

@@ -1,10 +1,10 @@
 """Files read in a process of their own, with a limit on memory and time.
 
-HDF5 is compiled, and nptdms and c3d take what a header says: a damaged file can end their process,
-fill the memory, or never end. It is then a process of their own that ends, and the reason is one
-line. One such process serves a whole run; it starts with the first file, and is replaced when it
-ends. A process that served before and fails is no verdict on a file: that one is read again by a
-new one.
+HDF5 and scipy's reader of MATLAB 5 are compiled, and nptdms and c3d take what a header says: a
+damaged file can end their process, fill the memory, or never end. It is then a process of their own
+that ends, and the reason is one line. One such process serves a whole run; it starts with the first
+file, and is replaced when it ends. A process that served before and fails is no verdict on a file:
+that one is read again by a new one.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     from impc.arrays import Array
 
-__all__ = ["match_apart", "read_apart"]
+__all__ = ["match_apart", "matrices_apart", "read_apart"]
 
 # Seconds of computing that a file may take: measured, 1.5 s for 100 MB of HDF5 and 6 s for a C3D
 # of 10 MB (60 000 frames), which is the slowest.
@@ -79,16 +79,7 @@ def read_apart(kind: str, path: Path, largest: int) -> Table:
         too long, or ended the process.
     """
     source = str(path)
-    size = path.stat().st_size
-    request = {
-        "do": kind,
-        "path": str(path.absolute()),
-        "source": source,
-        "largest": largest,
-        "room": _ROOM + _ROOM_A_BYTE * size,
-        "seconds": _SECONDS + _SECONDS_A_MEGABYTE * size // 1_000_000,
-    }
-    reply, columns = _asked(request)
+    reply, columns = _asked(_request(kind, path, largest))
     if "refused" in reply:
         raise DataError(*reply["refused"])
     told = reply["table"]
@@ -99,6 +90,37 @@ def read_apart(kind: str, path: Path, largest: int) -> Table:
         told["rate"],
         told["skipped"],
     )
+
+
+def matrices_apart(path: Path, largest: int) -> dict[str, Any]:
+    """What a .mat file of version 5 to 7 holds of a saved plant, by name.
+
+    Parameters
+    ----------
+    path : Path
+        Of the file.
+    largest : int
+        The most bytes that its arrays may take.
+
+    Returns
+    -------
+    dict of str to object
+        Arrays of real numbers, (rows, columns) or more, and lists of text.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read, as in `read_apart`, or holds anything else.
+    """
+    reply, arrays = _asked(_request("matrices", path, largest))
+    if "refused" in reply:
+        raise InputError(f"plant {path}", *reply["refused"][1:])
+    shapes: dict[str, list[int]] = reply["shapes"]
+    matrices = {
+        name: array.reshape(shape)
+        for (name, shape), array in zip(shapes.items(), arrays, strict=True)
+    }
+    return {**matrices, **reply["texts"]}
 
 
 def match_apart(subject: str, pattern: str, text: str) -> dict[str, str | None] | None:
@@ -157,10 +179,7 @@ class _Process:
             self.popen.stdin.flush()
             length = int.from_bytes(self._bytes(8), "little")
             reply = json.loads(self._bytes(length))
-            columns = []
-            if "table" in reply:
-                shape = (len(reply["table"]["names"]), reply["table"]["samples"])
-                columns = [self._column(shape[1]) for _ in range(shape[0])]
+            columns = [self._column(length) for length in reply.get("lengths", ())]
         self.served = True
         return reply, columns
 
@@ -214,6 +233,18 @@ def _asked(request: dict[str, Any]) -> tuple[dict[str, Any], list[Array]]:
                 reply = _refusal(request, *_too_large(request))
             if not served:
                 return reply, []
+
+
+def _request(kind: str, path: Path, largest: int) -> dict[str, Any]:
+    size = path.stat().st_size
+    return {
+        "do": kind,
+        "path": str(path.absolute()),
+        "source": str(path),
+        "largest": largest,
+        "room": _ROOM + _ROOM_A_BYTE * size,
+        "seconds": _SECONDS + _SECONDS_A_MEGABYTE * size // 1_000_000,
+    }
 
 
 def _refusal(request: dict[str, Any], problem: str, remedy: str) -> dict[str, Any]:

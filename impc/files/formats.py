@@ -13,7 +13,7 @@ from impc.files.apart import read_apart
 from impc.files.c3d_analog import encode_c3d
 from impc.files.delimited import encode_delimited, read_delimited
 from impc.files.door import LARGEST, damaged, require_ordinary
-from impc.files.matlab import encode_matlab, read_matlab
+from impc.files.matlab import encode_matlab
 from impc.files.matlab73 import HDF5_SIGNATURE, matlab73_bytes
 from impc.files.tdms import encode_tdms
 
@@ -166,7 +166,7 @@ def _matlab_reader(source: str, head: bytes, found: str) -> Callable[[Path, int]
         return functools.partial(read_apart, "matlab73")
     _require(source, head.startswith(b"MATLAB "), ".mat", found)
     if version == 1 and not hdf5:
-        return read_matlab
+        return functools.partial(read_apart, "matlab")
     inside, said = ("7.3", "5") if hdf5 else ("5", "7.3")
     if hdf5 or version == 2:
         problem = f"says that it is version {said} and holds version {inside} or damaged data"

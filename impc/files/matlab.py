@@ -1,4 +1,7 @@
-"""MATLAB .mat files up to version 7 (called v5 after their header) as tables.
+"""MATLAB .mat files up to version 7 (called v5 after their header), by scipy.
+
+A flipped bit can end the process in scipy's reader. So all tags are looked at first
+(`impc.files.matlab_tags`), and files are read in a process of their own (`impc.files.apart`).
 
 Vectors are columns by their name, the columns of a matrix are `name_1`, `name_2` and so on, numeric
 fields of a struct are `s.field`. The longer side of a matrix is taken as time.
@@ -8,24 +11,33 @@ from __future__ import annotations
 
 import io
 import re
+import warnings
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from impc.errors import DataError, OutputError
-from impc.files.matlab5 import Cells, Other, Text, TooLargeError, read_variables
+from impc.files.matlab_tags import look_at_tags, too_large
 from impc.files.table import make_table
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterator, Mapping
     from pathlib import Path
 
     from impc.arrays import Array
     from impc.files.table import Table
 
-__all__ = ["AS_STRUCT", "array_columns", "encode_matlab", "nested_columns", "read_matlab"]
+__all__ = [
+    "AS_STRUCT",
+    "array_columns",
+    "encode_matlab",
+    "nested_columns",
+    "read_matlab",
+    "read_matrices",
+]
 
 _DEPTH = 8
+_LONGEST = 1_000_000  # characters of the names in a saved plant
 #: What a cell, table or object has to become; each sentence ends a reason.
 AS_STRUCT = 'save a struct of vectors: s = table2struct(T, "ToScalar", true)'
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,62}")
@@ -46,21 +58,60 @@ def read_matlab(path: Path, largest: int) -> Table:
     DataError
         When it holds no numeric vector or matrix: cells, tables and objects cannot be read.
     ValueError
-        When it is damaged.
+        When it is damaged, or unpacks to more than it says.
     """
-    try:
-        found = read_variables(path, largest)
-    except TooLargeError as error:
-        raise DataError(
-            str(path),
-            f"would take {error.args[0] / 1e9:.1f} GB once it is unpacked",
-            "save only the signals that are needed",
-        ) from None
     columns: dict[str, Array] = {}
     skipped: dict[str, str] = {}
-    for name, value in found.items():
+    for name, value in _variables(path, largest).items():
         _collect(name, value, columns, skipped, 0)
     return make_table(str(path), columns, None, None, skipped)
+
+
+def read_matrices(path: Path, largest: int) -> dict[str, Array | list[str | None]]:
+    """Read the matrices and names of a saved plant from a .mat file of version 5 to 7.
+
+    Parameters
+    ----------
+    path : Path
+        Of the file.
+    largest : int
+        The most bytes that its arrays may take once they are unpacked, as float64.
+
+    Returns
+    -------
+    dict of str to Array or list
+        Real numbers in MATLAB's sizes, (rows, columns) or more; of a text its rows, of a cell array
+        its texts, None for what is no text.
+
+    Raises
+    ------
+    DataError
+        When it holds something else, or too much.
+    ValueError
+        When it is damaged, or unpacks to more than it says.
+    """
+    found: dict[str, Array | list[str | None]] = {}
+    left = largest
+    for name, value in _variables(path, largest).items():
+        reason = _unreadable(value)
+        kind = getattr(getattr(value, "dtype", None), "kind", "")
+        if kind == "c":
+            raise DataError(str(path), f"has a complex matrix {name}", "save real numbers")
+        if reason and kind in "US":
+            found[name] = _rows(value)
+        elif reason and type(value) is np.ndarray and kind == "O":
+            cells = value.ravel(order="F")
+            found[name] = [
+                " ".join(map(str, _rows(cell))) if _is_text(cell) else None for cell in cells
+            ]
+        elif reason or kind not in "fiub":
+            raise DataError(str(path), f"{name} {reason or 'is a struct'}", "save matrices")
+        else:
+            left -= 8 * value.size
+            if left < 0:
+                raise too_large(path, largest - left)
+            found[name] = np.asarray(value, dtype=np.float64)
+    return found
 
 
 def array_columns(name: str, array: Any) -> dict[str, Array] | str:
@@ -120,29 +171,75 @@ def nested_columns(source: str, columns: Mapping[str, Array]) -> dict[str, Any]:
     return nested
 
 
+def _variables(path: Path, largest: int) -> dict[str, Any]:
+    """The variables of a file by name, as scipy has them, once their tags are found sound."""
+    import scipy.io  # noqa: PLC0415  # in the process that reads only
+    from scipy.io.matlab import MatlabOpaque, MatReadWarning  # noqa: PLC0415
+
+    look_at_tags(path, largest)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        # Two variables of one name, or a variable cut off: never a part of a file.
+        warnings.simplefilter("error", MatReadWarning)
+        # scipy calls every object None, strings among them: two are no fault.
+        warnings.filterwarnings("ignore", 'Duplicate variable name "None"', MatReadWarning)
+        found = scipy.io.loadmat(path, appendmat=False, struct_as_record=True)
+    return {
+        # scipy calls opaque objects None; the name is inside.
+        (_text(value, "s0") or name) if isinstance(value, MatlabOpaque) else name: value
+        for name, value in found.items()
+        if not name.startswith("__")
+    }
+
+
 def _collect(
     name: str, value: Any, columns: dict[str, Array], skipped: dict[str, str], depth: int
 ) -> None:
     """Put a variable's columns, or the reason why it has none, in their place."""
-    if isinstance(value, dict):
-        if depth >= _DEPTH:
-            skipped[name] = "is nested too deep; save plain vectors"
+    reason = _unreadable(value)
+    if reason:
+        skipped[name] = reason
+    elif value.dtype.names:
+        if value.size != 1 or depth >= _DEPTH:
+            skipped[name] = f"is an array of {value.size} structs; save each as a file of its own"
             return
-        for part, inner in value.items():
-            _collect(f"{name}.{part}", inner, columns, skipped, depth + 1)
-        return
-    found = array_columns(name, value) if isinstance(value, np.ndarray) else _unreadable(value)
-    if isinstance(found, str):
-        skipped[name] = found
+        for part in value.dtype.names:
+            _collect(f"{name}.{part}", value.flat[0][part], columns, skipped, depth + 1)
     else:
-        columns.update(found)
+        found = array_columns(name, value)
+        if isinstance(found, str):
+            skipped[name] = found
+        else:
+            columns.update(found)
 
 
-def _unreadable(value: Text | Cells | Other) -> str:
-    """Why a MATLAB value is no array of numbers or struct."""
-    if isinstance(value, Text):
-        return "is text"
-    if isinstance(value, Cells):
-        return f"is a cell array; {AS_STRUCT}, or cell2mat"
-    object_like = value.kind.startswith("a MATLAB ")
-    return f"is {value.kind}; {AS_STRUCT}, or writetable" if object_like else f"is {value.kind}"
+def _unreadable(value: Any) -> str:
+    """Why a MATLAB value is no array of numbers or struct; empty when it is one."""
+    import scipy.sparse  # noqa: PLC0415
+    from scipy.io.matlab import MatlabFunction, MatlabObject, MatlabOpaque  # noqa: PLC0415
+
+    if isinstance(value, MatlabOpaque):
+        kind = _text(value, "s2") or "unknown class"
+        return f"is a MATLAB {kind}; {AS_STRUCT}, or writetable"
+    if isinstance(value, MatlabObject):
+        return f"is a MATLAB object of class {value.classname}; {AS_STRUCT}"
+    if isinstance(value, MatlabFunction) or not isinstance(value, np.ndarray):
+        return "is sparse; save full(x)" if scipy.sparse.issparse(value) else "is not numeric"
+    kinds = {"U": "is text", "S": "is text", "O": f"is a cell array; {AS_STRUCT}, or cell2mat"}
+    return kinds.get(value.dtype.kind, "")
+
+
+def _text(value: Any, part: str) -> str:
+    names: Iterator[str] = iter(value.dtype.names or ())
+    return value[part].flat[0].decode("latin-1", "replace") if part in names else ""
+
+
+def _is_text(value: Any) -> bool:
+    return isinstance(value, np.ndarray) and value.dtype.kind in "US"
+
+
+def _rows(value: Any) -> list[str | None]:
+    """The rows of a text without blanks behind them."""
+    if value.nbytes > 4 * _LONGEST:
+        raise ValueError(f"a text of more than {_LONGEST} characters")
+    return [str(row).rstrip() for row in value.ravel()]

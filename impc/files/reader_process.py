@@ -1,7 +1,7 @@
 """The process that reads files by libraries which a damaged file may end, or make take all memory.
 
 It is started by `impc.files.apart` and serves one request after another: a line of JSON comes in,
-eight bytes of length, JSON and columns of float64 go out. It ends when its input ends, when a
+eight bytes of length, JSON and arrays of float64 go out. It ends when its input ends, when a
 request takes too long, and after a request that needed too much memory.
 """
 
@@ -33,6 +33,8 @@ __all__ = ["READERS", "main"]
 
 #: Module, function and library of each format that is read here.
 READERS = {
+    "matlab": ("impc.files.matlab", "read_matlab", "scipy.io"),
+    "matrices": ("impc.files.matlab", "read_matrices", "scipy.io"),
     "matlab73": ("impc.files.matlab73", "read_matlab73", "h5py"),
     "tdms": ("impc.files.tdms", "read_tdms", "nptdms"),
     "c3d": ("impc.files.c3d_analog", "read_c3d", "c3d"),
@@ -100,14 +102,14 @@ def _address_space() -> int:
 
 
 def _answer(request: dict[str, Any]) -> tuple[dict[str, Any], Iterable[Array]]:
-    """The reply and its columns; {"memory": True} for too much, {"refused": ...} for a reason."""
+    """The reply and its arrays; {"memory": True} for too much, {"refused": ...} for a reason."""
     try:
         if request["do"] == "match":
             found = re.fullmatch(request["pattern"], request["text"])
             return {"groups": None if found is None else found.groupdict()}, ()
         module, function, _ = READERS[request["do"]]
         read = getattr(import_module(module), function)
-        table: Table = read(Path(request["path"]), request["largest"])
+        found = read(Path(request["path"]), request["largest"])
     except MemoryError:
         return {"memory": True}, ()
     except ImpcError as error:
@@ -115,17 +117,32 @@ def _answer(request: dict[str, Any]) -> tuple[dict[str, Any], Iterable[Array]]:
     # The libraries meet damaged files with any exception: struct.error, KeyError, AssertionError.
     except Exception as error:
         return _refused(request, damaged(request["path"], error)), ()
+    return _matrices(found) if isinstance(found, dict) else _columns(request, found)
+
+
+def _columns(request: dict[str, Any], table: Table) -> tuple[dict[str, Any], Iterable[Array]]:
     if table.rate is not None and not (math.isfinite(table.rate) and table.rate > 0):
         problem = f"says {table.rate:g} samples per second"
         return {"refused": [request["source"], problem, "export it again with its rate"]}, ()
     told = {
         "names": list(table.columns),
-        "samples": table.samples,
         "units": dict(table.units),
         "rate": table.rate,
         "skipped": dict(table.skipped),
     }
-    return {"table": told}, table.columns.values()
+    lengths = [table.samples] * len(table.columns)
+    return {"table": told, "lengths": lengths}, table.columns.values()
+
+
+def _matrices(found: dict[str, Any]) -> tuple[dict[str, Any], Iterable[Array]]:
+    """Arrays by their shape, row by row behind the reply; lists of names within it."""
+    arrays = {name: value for name, value in found.items() if not isinstance(value, list)}
+    reply = {
+        "shapes": {name: value.shape for name, value in arrays.items()},
+        "texts": {name: value for name, value in found.items() if name not in arrays},
+        "lengths": [value.size for value in arrays.values()],
+    }
+    return reply, [value.ravel() for value in arrays.values()]
 
 
 def _refused(request: dict[str, Any], error: ImpcError) -> dict[str, Any]:

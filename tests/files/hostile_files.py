@@ -178,7 +178,7 @@ def _mat5(folder: Path, *elements: bytes) -> Path:
     return written(folder, mat5_file(*elements), "trial.mat")
 
 
-@_hostile("an element of type 200 where numbers are expected")
+@_hostile("an element of type 200 is out of place")
 def _type_that_does_not_exist(folder: Path) -> Path:
     # scipy's reader looks it up in a table of 20 and ends the process.
     return written(
@@ -186,7 +186,28 @@ def _type_that_does_not_exist(folder: Path) -> Path:
     )
 
 
-@_hostile("GB once it is unpacked")
+@_hostile("an element of type 21 is out of place")
+def _bytes_taken_for_addresses(folder: Path) -> Path:
+    # Behind scipy's table of types stands that of classes: 20 + 1, cells, are objects.
+    numbers = mat5_element(21, b"\x41" * 72)
+    return _mat5(folder, mat5_array(6, (9, 1), "x", numbers))
+
+
+@_hostile("an element of type 21 is out of place")
+def _bytes_taken_for_addresses_in_a_packed_struct(folder: Path) -> Path:
+    inner = mat5_array(6, (9, 1), "", mat5_element(21, b"\x41" * 72))
+    fields = mat5_element(5, struct.pack("<i", 8)) + mat5_element(1, b"a".ljust(8, b"\0"))
+    packed = zlib.compress(mat5_array(2, (1, 1), "s", fields + inner))
+    return _mat5(folder, mat5_element(15, packed, padded=False))
+
+
+@_hostile("an array without flags")
+def _array_without_flags(folder: Path) -> Path:
+    inside = mat5_element(5, bytes(16)) * 2 + mat5_element(1, b"x") + mat5_element(9, bytes(8))
+    return _mat5(folder, mat5_element(14, inside))
+
+
+@_hostile("is damaged and cannot be read")
 def _sizes_that_are_not_there(folder: Path) -> Path:
     numbers = mat5_element(9, bytes(800))
     return written(
@@ -208,7 +229,7 @@ def _packed_variable_that_says_too_little(folder: Path) -> Path:
     return _mat5(folder, mat5_element(15, packed, padded=False))
 
 
-@_hostile("GB once it is unpacked")
+@_hostile("GB to read")
 def _many_packed_variables(folder: Path) -> Path:
     numbers = mat5_element(2, bytes(3_000_000))
     inner = [mat5_array(9, (3_000_000, 1), f"x{index:02}", numbers) for index in range(50)]
@@ -216,18 +237,18 @@ def _many_packed_variables(folder: Path) -> Path:
     return _mat5(folder, *packed)
 
 
-@_hostile("more than 10000 arrays")
+@_hostile("GB to read")
 def _cells_without_end(folder: Path) -> Path:
     return _mat5(folder, mat5_array(1, (2**31 - 1, 9), "x", b""))
 
 
-@_hostile("more than 10000 arrays")
+@_hostile("x is a cell array")
 def _cells_of_nothing(folder: Path) -> Path:
     cells = mat5_element(14, b"") * 300_000
     return _mat5(folder, mat5_array(1, (300_000, 1), "x", cells))
 
 
-@_hostile("more than 16 arrays within one another")
+@_hostile("more than 100 arrays within one another")
 def _cells_within_cells(folder: Path) -> Path:
     inner = mat5_array(6, (1, 1), "", mat5_element(9, bytes(8)))
     for _ in range(2000):
