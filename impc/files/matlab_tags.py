@@ -2,8 +2,10 @@
 
 A file is a header of 128 bytes and a sequence of elements: a tag of 8 bytes (type, length), then as
 many bytes. An array is an element of elements. scipy's reader looks types up in a table without
-looking at its end, so that a flipped bit ends the process or takes bytes of the file for addresses;
-and it takes the memory that a length asks for. Nothing is read here but tags.
+looking at its end, so that a flipped bit ends the process or takes what stands behind the table for
+a type; and it takes the memory that a length asks for. Nothing is read here but tags: whether the
+elements are those that scipy expects is not known, and some that are not end its process. They do
+it at the address zero, as the types that are let through are all in the table or empty in it.
 """
 
 from __future__ import annotations
@@ -42,27 +44,39 @@ def look_at_tags(path: Path, largest: int) -> None:
     DataError
         When they take more than `largest` bytes.
     ValueError
-        When a tag is not sound, or a variable unpacks to another length than it says.
+        When a tag is not sound, or a variable cannot be unpacked to the length that it says.
     """
     content = memoryview(path.read_bytes())
     order = "<" if content[126:128] == b"IM" else ">"  # as scipy has it
-    total = 0
+    left = largest
     for kind, size, inside in _elements(content[128:], order, padded=False):
+        left -= size
+        if left < 0:
+            raise too_large(path, largest - left)
         if kind == _PACKED:
-            begin = zlib.decompressobj().decompress(inside[:256], 8).ljust(8, b"\0")
-            size = 8 + struct.unpack(f"{order}II", begin)[1]  # noqa: PLW2901
-        total += size
-        if total > largest:
-            raise too_large(path, total)
-        if kind == _PACKED:
-            unpacker = zlib.decompressobj()
-            unpacked = unpacker.decompress(inside, size)
-            if unpacker.decompress(unpacker.unconsumed_tail, 1) or not unpacker.eof:
-                raise ValueError("a packed variable is not as long as it says")
-            for each, _, matrix in _elements(memoryview(unpacked), order, padded=False):
+            unpacked = _unpacked(path, inside, order, left)
+            left -= len(unpacked)
+            for each, _, matrix in _elements(unpacked, order, padded=False):
                 _look_into(each, matrix, order, 0)
         else:
             _look_into(kind, inside, order, 0)
+
+
+def _unpacked(path: Path, packed: memoryview, order: str, most: int) -> memoryview:
+    """What zlib packed: as many bytes as the tag in front of it says, and no more than `most`."""
+    try:
+        tag = zlib.decompressobj().decompress(packed, 8).ljust(8, b"\0")
+        size = 8 + struct.unpack(f"{order}II", tag)[1]
+        if size > most:
+            raise too_large(path, size)
+        unpacker = zlib.decompressobj()
+        content = unpacker.decompress(packed, size)
+        surplus = unpacker.decompress(unpacker.unconsumed_tail, 1)  # reads the checksum
+    except zlib.error as error:
+        raise ValueError(str(error)) from None
+    if surplus or not unpacker.eof:
+        raise ValueError("a packed variable is not as long as it says")
+    return memoryview(content)
 
 
 def too_large(path: Path, size: int) -> DataError:

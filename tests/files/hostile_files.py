@@ -186,16 +186,17 @@ def _type_that_does_not_exist(folder: Path) -> Path:
     )
 
 
-@_hostile("an element of type 21 is out of place")
-def _bytes_taken_for_addresses(folder: Path) -> Path:
-    # Behind scipy's table of types stands that of classes: 20 + 1, cells, are objects.
-    numbers = mat5_element(21, b"\x41" * 72)
+@_hostile("an element of type 26 is out of place")
+def _type_behind_the_table(folder: Path) -> Path:
+    # Behind scipy's table of 20 types stands that of classes: it reads 26 as doubles, and what
+    # stands behind both tables as anything.
+    numbers = mat5_element(26, bytes(72))
     return _mat5(folder, mat5_array(6, (9, 1), "x", numbers))
 
 
-@_hostile("an element of type 21 is out of place")
-def _bytes_taken_for_addresses_in_a_packed_struct(folder: Path) -> Path:
-    inner = mat5_array(6, (9, 1), "", mat5_element(21, b"\x41" * 72))
+@_hostile("an element of type 60 is out of place")
+def _type_that_does_not_exist_in_a_packed_struct(folder: Path) -> Path:
+    inner = mat5_array(6, (9, 1), "", mat5_element(60, bytes(72)))
     fields = mat5_element(5, struct.pack("<i", 8)) + mat5_element(1, b"a".ljust(8, b"\0"))
     packed = zlib.compress(mat5_array(2, (1, 1), "s", fields + inner))
     return _mat5(folder, mat5_element(15, packed, padded=False))
