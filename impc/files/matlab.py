@@ -93,24 +93,19 @@ def read_matrices(path: Path, largest: int) -> dict[str, Array | list[str | None
     found: dict[str, Array | list[str | None]] = {}
     left = largest
     for name, value in _variables(path, largest).items():
-        reason = _unreadable(value)
-        kind = getattr(getattr(value, "dtype", None), "kind", "")
-        if kind == "c":
+        if type(value) is np.ndarray and value.dtype.kind in "USO":
+            found[name] = _names(value)
+            continue
+        reason = _unreadable(value).split(";")[0]
+        if reason or value.dtype.names:
+            remedy = "save matrices, and names by cellstr"
+            raise DataError(str(path), f"{name} {reason or 'is a struct'}", remedy)
+        if value.dtype.kind not in "fiub":
             raise DataError(str(path), f"has a complex matrix {name}", "save real numbers")
-        if reason and kind in "US":
-            found[name] = _rows(value)
-        elif reason and type(value) is np.ndarray and kind == "O":
-            cells = value.ravel(order="F")
-            found[name] = [
-                " ".join(map(str, _rows(cell))) if _is_text(cell) else None for cell in cells
-            ]
-        elif reason or kind not in "fiub":
-            raise DataError(str(path), f"{name} {reason or 'is a struct'}", "save matrices")
-        else:
-            left -= 8 * value.size
-            if left < 0:
-                raise too_large(path, largest - left)
-            found[name] = np.asarray(value, dtype=np.float64)
+        left -= 8 * value.size
+        if left < 0:
+            raise too_large(path, largest - left)
+        found[name] = np.asarray(value, dtype=np.float64)
     return found
 
 
@@ -234,12 +229,15 @@ def _text(value: Any, part: str) -> str:
     return value[part].flat[0].decode("latin-1", "replace") if part in names else ""
 
 
-def _is_text(value: Any) -> bool:
-    return isinstance(value, np.ndarray) and value.dtype.kind in "US"
-
-
-def _rows(value: Any) -> list[str | None]:
-    """The rows of a text without blanks behind them."""
+def _names(value: Any) -> list[str | None]:
+    """The rows of a text, or the texts of a cell array; None for a cell of something else."""
+    if value.dtype.kind == "O":
+        rows = [_names(cell) if _is_text(cell) else None for cell in value.ravel(order="F")]
+        return [None if row is None else " ".join(map(str, row)) for row in rows]
     if value.nbytes > 4 * _LONGEST:
         raise ValueError(f"a text of more than {_LONGEST} characters")
     return [str(row).rstrip() for row in value.ravel()]
+
+
+def _is_text(value: Any) -> bool:
+    return isinstance(value, np.ndarray) and value.dtype.kind in "US"

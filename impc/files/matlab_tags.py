@@ -47,7 +47,7 @@ def look_at_tags(path: Path, largest: int) -> None:
         When a tag is not sound, or a variable cannot be unpacked to the length that it says.
     """
     content = memoryview(path.read_bytes())
-    order = "<" if content[126:128] == b"IM" else ">"  # as scipy has it
+    order = "<" if bytes(content[126:128]) == b"IM" else ">"  # as scipy has it
     left = largest
     for kind, size, inside in _elements(content[128:], order, padded=False):
         left -= size

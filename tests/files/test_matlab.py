@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+import scipy.sparse
 
 from impc.errors import DataError, InputError
 from impc.files.apart import matrices_apart
@@ -78,6 +79,7 @@ def test_matrices_of_every_type_and_shape(tmp_path: Path, packed: bool) -> None:
     [
         (np.eye(2) + 1j, "has a complex matrix x"),
         ({"y": 1.0}, "x is a struct"),
+        (scipy.sparse.csc_array(np.eye(2)), "x is sparse"),
         (np.zeros((600, 600), dtype=np.uint8), "would take 0.0 GB once it is unpacked"),
         ("a" * 1_000_001, "a text of more than 1000000 characters"),
     ],
