@@ -164,6 +164,7 @@ def test_matrices_that_are_no_plant(
         ({"states": {"x": 1}}, "that are not names"),
         ({"states": [["x"], []]}, "names 1 states"),
         ({"states": ["x", None]}, "that are not names"),
+        ({"state\x1bs": ["x", "v"]}, "does not know state s"),
     ],
 )
 def test_names_that_are_not_those_of_the_plant(
