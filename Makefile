@@ -5,7 +5,7 @@
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
-.PHONY: help env demo test check docs reproduce wheel slow bench lock clean
+.PHONY: help env demo test check docs reproduce wheel slow coverage search numerics bench fuzz lock clean
 
 PYTHON ?= python3
 # Not to be set from outside: the environment is made with `venv --clear`.
@@ -40,10 +40,14 @@ help:
 	@echo 'make test    set up .venv, then check and pytest: all but the slow tests, the site too'
 	@echo 'make check   ruff check, ruff format --check, mypy --strict'
 	@echo 'make slow    the slow tests'
+	@echo 'make coverage  how often printed intervals hold the truth: the table of docs/fitting.md'
+	@echo 'make search   new examples for the tests by hypothesis, from a seed that is printed'
+	@echo 'make numerics the numerical tests on other processors and dependencies (an hour; needs uv)'
 	@echo 'make docs    build the site in docs/_build/html; warnings are errors, tutorials run (minutes)'
 	@echo 'make reproduce  write docs/reproduction: the dissertation, line by line (half an hour)'
 	@echo 'make wheel   build a wheel, install it in an empty environment, run impc example there'
 	@echo 'make bench   the benchmarks:                     python -m experiments.benchmarks'
+	@echo 'make fuzz    160 000 mutated files, configurations and plants; FUZZ="--seed 1 --cases 1000"'
 	@echo 'make lock    compile both lock files again (needs uv); UPGRADE=--upgrade takes newer versions'
 	@echo 'make clean   remove caches and build products; .venv and results stay'
 	@echo 'PYTHON=python3.12 chooses the Python; the one used otherwise is the first of'
@@ -80,8 +84,32 @@ wheel: env
 slow: env
 	$(PY) -m pytest -m slow
 
+coverage: env
+	$(PY) -m experiments.printed_intervals --recordings 200
+
+# Twenty times the examples of `make test`, other ones each time; SEED=... repeats a search.
+SEED ?= $(shell date +%s)
+search: env
+	@echo 'make search SEED=$(SEED)'
+	IMPC_SEARCH=20 OPENBLAS_NUM_THREADS=1 $(PY) -m pytest -m "not slow" --hypothesis-seed=$(SEED) $(SEARCHED)
+SEARCHED := tests/test_inverse_lqr.py tests/test_equivalent_weights.py tests/test_terminal_set.py
+
+# The floors of pyproject.toml on the oldest Python, the newest there are on the newest.
+numerics: .venv-oldest/.stamp .venv-newest/.stamp
+	.venv-newest/bin/python -m tests.numerics .venv-oldest/bin/python .venv-newest/bin/python
+
+.venv-oldest/.stamp .venv-newest/.stamp: pyproject.toml
+	@$(UV) --version >/dev/null 2>&1 || { echo 'make numerics needs uv: pip install uv' >&2; exit 1; }
+	$(UV) venv -q --clear --python $(if $(findstring oldest,$@),3.11,3.13) $(@D)
+	$(UV) pip install -q --python $(@D) $(if $(findstring oldest,$@),--resolution lowest-direct) -r pyproject.toml --extra dev
+	@touch $@
+
 bench: env
 	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(PY) -m experiments.benchmarks
+
+# Prints its seed; a case that does not end in one line is kept in results/fuzz.
+fuzz: env
+	OPENBLAS_NUM_THREADS=1 $(PY) -m tests.fuzz $(FUZZ)
 
 env: $(PROJECT) $(POLYTOPE)
 

@@ -1,4 +1,4 @@
-"""Coverage of 95 % intervals of the gain: how many of 400 recordings' intervals hold the truth.
+"""What the colour of the residuals does to intervals: how many of 400 hold the true gain.
 
 A cart on a falling track, |force| <= 1 and at its limit 7 % of the time, pushed at random
 for 75 s; its position is recorded with noise of a fifth of its size, white or first-order (0.9).
@@ -74,7 +74,7 @@ def covered(seed: int, root: float) -> Array:
     fit = fit_gain(problem, attempts=1, spread=3.0)
     error = fit.K - true_controller().K
     rows = [
-        np.ravel(error / gain_covariance(fit, colour).entries)
+        np.ravel(error / gain_covariance(fit.problem, fit.K, fit.S, colour).entries)
         for colour in (white_noise, residual_noise)
     ]
     return np.array(rows)

@@ -5,6 +5,9 @@ For every blur the controller, the delay and the lag of the hand are fitted to a
 predicted. VAF is of the cursor's position, mean removed, without the first second. Beside it stands
 delayed feedback of error and velocity, fitted in the same way (`experiments.cursor_baseline`).
 
+Intervals are ranges over fits to trials drawn again with replacement: 39 of them for 95 %. A delay
+or lag whose logarithm has a deviation of 0.5 or more is not determined: it stays where it began.
+
     python -m experiments.cursor_tracking --out results/cursor-tracking
 """
 
@@ -44,12 +47,23 @@ from impc.unknown_limit import with_limit
 from impc.weights_set import linear_range, weights_set
 from plants import cursor_plant
 
-__all__ = ["ConditionResult", "condition_problem", "fit_condition", "left_out_vaf"]
+__all__ = [
+    "ConditionResult",
+    "condition_problem",
+    "fit_condition",
+    "left_out_vaf",
+    "price_ratio",
+    "resampled",
+]
 
 _SECOND = round(RATE)
 _NOMINAL = (0.15, 0.08)
 # Weights count as alike up to this multiple of the least condition number.
 _RATIO = 10.0
+# The range of 39 holds the next one in 95 of 100 cases.
+_RESAMPLES = 39
+# Standard deviation of the logarithm of a delay or lag that the recordings tell.
+_TOLD = 0.5
 
 
 @dataclass(frozen=True)
@@ -63,6 +77,8 @@ class ConditionResult:
     trials : int
     delay, lag : float
         s.
+    delay_determined, lag_determined : bool
+        Whether the recordings tell them.
     vaf_in, vaf_out : list of float
         Of each trial, from all and from the others, %.
     baseline_out, ceiling_out : list of float
@@ -74,6 +90,8 @@ class ConditionResult:
     price_of_error, price_low, price_high : float
         Q_ee at R = 1 in the least conditioned weights, and its range over all weights with the same
         gain and a condition number up to ten times the least.
+    resampled_price, resampled_gain : list of float
+        Price and gain of the error of every fit to trials drawn again.
     limit : str
         What the recordings say of an acceleration limit.
     recorded, simulated, target : list of float
@@ -84,6 +102,8 @@ class ConditionResult:
     trials: int
     delay: float
     lag: float
+    delay_determined: bool
+    lag_determined: bool
     vaf_in: list[float]
     vaf_out: list[float]
     baseline_out: list[float]
@@ -93,6 +113,8 @@ class ConditionResult:
     price_of_error: float
     price_low: float
     price_high: float
+    resampled_price: list[float]
+    resampled_gain: list[float]
     limit: str
     recorded: list[float]
     simulated: list[float]
@@ -129,7 +151,27 @@ def left_out_vaf(condition: Condition, index: int) -> tuple[float, float, Array]
     return _vaf(recorded, cursor), _vaf(recorded, baseline), cursor
 
 
-def fit_condition(condition: Condition) -> ConditionResult:
+def resampled(condition: Condition, count: int, seed: int = 0) -> tuple[list[float], list[float]]:
+    """Price (R = 1) and gain of the error, fitted `count` times to trials drawn with replacement.
+
+    Every pair of weights with one gain has the same price of the error on this plant, so that of
+    the weights at hand will do.
+    """
+    problem = condition_problem(condition)
+    prices, gains = [], []
+    for index in range(count):
+        rng = np.random.default_rng(seed + index)
+        drawn = rng.integers(len(problem.recordings), size=len(problem.recordings))
+        trials = tuple(problem.recordings[trial] for trial in drawn)
+        fitted = fit_controller(replace(problem, recordings=trials))
+        prices.append(float(fitted.weights.Q[0, 0] / fitted.weights.R[0, 0]))
+        gains.append(float(fitted.solution.K[0, 0]))
+    return prices, gains
+
+
+def fit_condition(
+    condition: Condition, seed: int = 0, resamples: int = _RESAMPLES
+) -> ConditionResult:
     """Fit a condition, predict each of its trials, and say what the weights say."""
     problem = condition_problem(condition)
     fitted = fit_controller(problem)
@@ -139,21 +181,23 @@ def fit_condition(condition: Condition) -> ConditionResult:
     ]
     outside = [left_out_vaf(condition, index) for index in range(count)]
     solution = fitted.solution
-    covariance = gain_covariance(
-        replace(fitted.free, K=solution.K, S=solution.S, problem=fitted.problem)
-    )
+    covariance = gain_covariance(fitted.problem, np.array(solution.K), np.array(solution.S))
     plant = fitted.problem.plant
     found = weights_set(gain_fibre(plant, solution.K), _RATIO)
     of_error = np.zeros((plant.n + 1, plant.n + 1))
     of_error[0, 0] = 1.0
     price = linear_range(found, of_error)
     delay, lag = _parameters(fitted)
+    told = np.array(covariance.parameters) < _TOLD
+    prices, gains = resampled(condition, resamples, seed)
     shown = int(np.argsort([item[0] for item in outside])[count // 2])
     return ConditionResult(
         condition.blur,
         count,
         delay,
         lag,
+        bool(told[0]),
+        bool(told[1]),
         inside,
         [item[0] for item in outside],
         [item[1] for item in outside],
@@ -163,6 +207,8 @@ def fit_condition(condition: Condition) -> ConditionResult:
         float(found.least.weights.Q[0, 0]),
         price.low,
         price.high,
+        prices,
+        gains,
         _limit(fitted),
         condition.response[shown].tolist(),
         outside[shown][2].tolist(),
@@ -225,34 +271,66 @@ def _table(results: list[ConditionResult]) -> str:
     lines = [
         "blur px  trials  delay ms  lag ms  VAF in %  VAF out % (least)  delayed feedback %"
         "  free response %"
-        "  K error 1/s^2  K velocity 1/s  gain determined  price of error (range)"
+        "  K error 1/s^2 (interval)  K velocity 1/s  gain determined  price of error (interval)"
         "  acceleration, px/s^2"
     ]
     for item in results:
         lines.append(
-            f"{item.blur:7.0f} {item.trials:7d} {1e3 * item.delay:9.0f} {1e3 * item.lag:7.0f} "
+            f"{item.blur:7.0f} {item.trials:7d} {_time(item.delay, item.delay_determined):>9} "
+            f"{_time(item.lag, item.lag_determined):>7} "
             f"{np.mean(item.vaf_in):9.1f} {np.mean(item.vaf_out):10.1f} ({min(item.vaf_out):5.1f}) "
             f"{np.mean(item.baseline_out):17.1f} {np.mean(item.ceiling_out):15.1f}  "
-            f"{item.gain[0]:11.1f} {item.gain[1]:15.2f} {item.gain_determined:16d} of 7"
-            f"{item.price_of_error:12.3g} ({item.price_low:.3g} to {item.price_high:.3g})  "
+            f"{item.gain[0]:11.1f} ({_span(item.resampled_gain)}) {item.gain[1]:11.2f} "
+            f"{item.gain_determined:16d} of 7"
+            f"{item.price_of_error:12.3g} ({_span(item.resampled_price)})  "
             f"{item.limit}"
         )
     return "\n".join(lines)
+
+
+def _time(seconds: float, determined: bool) -> str:
+    return f"{1e3 * seconds:.0f}" if determined else "n.d."
+
+
+def _span(values: list[float]) -> str:
+    return f"{min(values):.3g} to {max(values):.3g}" if values else "no interval"
+
+
+def price_ratio(results: list[ConditionResult]) -> str:
+    """How much less the error costs under the widest blur than under the least, in words."""
+    first, last = results[0], results[-1]
+    ratios = [
+        one / other for one, other in zip(first.resampled_price, last.resampled_price, strict=False)
+    ]
+    if not ratios:
+        return "Without resampled trials nothing is said of how the price of the error changes."
+    count, least, most = len(first.resampled_price), np.min(ratios), np.max(ratios)
+    level = 100 * (count - 1) / (count + 1)
+    told = "falls" if least > 1 else "is not told from constant: it changes"
+    return (
+        f"From {first.blur:g} to {last.blur:g} px the price of the error {told} by a factor of "
+        f"{first.price_of_error / last.price_of_error:.3g} ({level:.0f} %: {least:.3g} to "
+        f"{most:.3g})."
+    )
 
 
 def main() -> None:
     """Fit every condition; print the table, write figure and result.json."""
     parser = argparse.ArgumentParser(description="Inverse MPC of human target tracking.")
     parser.add_argument("--out", type=Path, default=Path("results", "cursor-tracking"))
+    parser.add_argument("--resamples", type=int, default=_RESAMPLES)
     given = parser.parse_args()
     if not data_file().exists():
         print(f"{data_file().name} is not there: nothing to fit. IMPC_CURSOR_DATA may name it.")
         return
     conditions = read_conditions(data_file())
     with ProcessPoolExecutor(2) as pool:
-        found = pool.map(functools.partial(fit_condition), conditions)
+        fit = functools.partial(fit_condition, resamples=given.resamples)
+        # Seeds of their own: draws of one condition say nothing of another's.
+        found = pool.map(fit, conditions, range(0, 1000 * len(conditions), 1000))
         results = list(tqdm(found, total=len(conditions), unit="condition", disable=None))
     print(_table(results))
+    print(price_ratio(results))
     content: Any = plain({f"{item.blur:g} px": asdict(item) for item in results})
     files = {"result.json": (json.dumps(content, indent=1) + "\n").encode()}
     write_files(given.out, files | cursor_figure(results))

@@ -12,7 +12,7 @@ from __future__ import annotations
 import argparse
 import functools
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,7 +22,7 @@ from experiments.benchmarks.workloads import seat
 from impc.fit_recordings import fit_problem
 from impc.fit_settings import FitSettings
 from impc.fitted_controller import fit_controller
-from impc.gain_covariance import gain_covariance
+from impc.gain_estimate import gain_estimate
 from impc.recording import recording
 
 if TYPE_CHECKING:
@@ -70,17 +70,15 @@ def simulated_subject(seed: int, limit: float, ceiling: float = 0.9) -> Subject:
     trials = noisy_recordings(limit, seed, ceiling)
     problem = fit_problem(plant, trials, FitSettings(u_max=limit))
     fitted = fit_controller(problem)
-    solution = fitted.solution
-    covariance = gain_covariance(
-        replace(fitted.free, K=solution.K, S=solution.S, problem=fitted.problem)
-    )
+    estimate = gain_estimate(fitted)
+    covariance = estimate.covariance
     noise = sum(
         float(np.sum(((noisy.outputs - clean.outputs) / problem.output_scale) ** 2))
         for noisy, clean in zip(trials, work.problem.recordings, strict=True)
     )
     samples = sum(trial.outputs.size for trial in trials)
-    error = solution.K - truth
-    along = covariance.directions @ np.ravel(error @ covariance.T)
+    error = estimate.K - truth
+    along = covariance.along(error)
     return Subject(
         100 * (fitted.misfit**2 - noise) / samples,
         np.ravel(error / covariance.entries),

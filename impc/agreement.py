@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from statsmodels.stats.diagnostic import acorr_ljungbox
 
-from impc.arrays import Array, frozen
+from impc.arrays import Array, Frozen, frozen
+from impc.door import checked
+from impc.errors import InputError
 
 if TYPE_CHECKING:
     from impc.closed_loop import Simulation
@@ -29,7 +31,7 @@ _LEAST_LAGS = 10
 
 
 @dataclass(frozen=True)
-class TrialAgreement:
+class TrialAgreement(Frozen):
     """One trial against its simulation.
 
     Attributes
@@ -53,6 +55,7 @@ class TrialAgreement:
     saturated: float
 
 
+@checked(recorded="i j", simulated="i j")
 def vaf(recorded: Array, simulated: Array) -> Array:
     """Variance accounted for (3.24): (1 - sum (y - y_sim)^2 / sum y^2) 100 %, one for each column.
 
@@ -72,6 +75,7 @@ def vaf(recorded: Array, simulated: Array) -> Array:
     return np.asarray(100 * (1 - share))
 
 
+@checked(recorded="i j", simulated="i j")
 def centred_vaf(recorded: Array, simulated: Array) -> Array:
     """As `vaf`, with the means removed from what was recorded and from what is left.
 
@@ -91,6 +95,7 @@ def centred_vaf(recorded: Array, simulated: Array) -> Array:
     return np.asarray(100 * (1 - share))
 
 
+@checked(residual="i j", lags=1)
 def whiteness(residual: Array, lags: int) -> Array:
     """p-values of Ljung and Box's test that each column is white (Ljung and Box 1978).
 
@@ -105,7 +110,14 @@ def whiteness(residual: Array, lags: int) -> Array:
     -------
     Array
         (p,); NaN where nothing is left to test.
+
+    Raises
+    ------
+    InputError
+        When there are not more samples than lags.
     """
+    if lags >= len(residual):
+        raise InputError("lags", f"got {lags} of {len(residual)} samples", "give fewer")
     values = []
     for column in residual.T:
         if np.ptp(column) == 0:
@@ -137,6 +149,7 @@ def agreement(
     )
 
 
+@checked(u="i m", u_min="~m", u_max="~m")
 def saturated_share(u: Array, u_min: Array, u_max: Array) -> float:
     """Share of samples at which any input stands on a bound, to 1e-6 of it.
 

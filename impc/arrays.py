@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numbers
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -9,16 +10,20 @@ import numpy as np
 from impc.errors import DataError, InputError
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import ArrayLike
 
 __all__ = [
     "Array",
     "BoolArray",
     "Buffer",
+    "Frozen",
     "IntArray",
+    "as_numbers",
     "finite_array",
     "frozen",
+    "require_finite",
     "symmetric_matrix",
+    "with_shape",
 ]
 
 #: An array of float64, of the shape that each docstring gives.
@@ -29,6 +34,20 @@ IntArray = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
 BoolArray = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
 #: An array as compiled code takes it, of any element type.
 Buffer = np.ndarray[Any, np.dtype[Any]]
+
+
+class Frozen:
+    """Base of frozen dataclasses: their arrays stay read-only when copied and out of a pickle.
+
+    numpy makes arrays that can be written of those that it copies or finds in a pickle.
+    """
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        for name, value in state.items():
+            for item in value if isinstance(value, tuple) else (value,):
+                if isinstance(item, np.ndarray):
+                    item.flags.writeable = False
+            object.__setattr__(self, name, value)
 
 
 def frozen(values: ArrayLike) -> Array:
@@ -47,6 +66,58 @@ def frozen(values: ArrayLike) -> Array:
     array = np.array(values, dtype=np.float64)
     array.flags.writeable = False
     return array
+
+
+def as_numbers(name: str, values: ArrayLike) -> Array:
+    """Convert numbers of any kind to float64; what a masked array masks is missing: NaN.
+
+    Lists, tuples, arrays of whole or real numbers, pandas' series and frames. Text, complex
+    numbers and dates are not numbers, although numpy converts some of them.
+
+    Parameters
+    ----------
+    name : str
+        Name of the argument, for the message.
+    values : array_like
+        Of any shape.
+
+    Returns
+    -------
+    Array
+        Of the same shape.
+
+    Raises
+    ------
+    DataError
+        When the values are not real numbers, or have rows of different lengths.
+    """
+    if isinstance(values, np.ma.MaskedArray):
+        if values.dtype.kind not in "biuf":
+            raise _not_numbers(name, f"an array of {values.dtype}")
+        masked: Any = values.astype(np.float64)
+        return np.asarray(masked.filled(np.nan), dtype=np.float64)
+    try:
+        raw = np.asarray(values)
+        if raw.dtype.kind == "O" and all(_is_real(entry) for entry in raw.flat):
+            # Whole numbers beyond int64, fractions, pandas' NA; None would become NaN.
+            real = [np.nan if repr(entry) == "<NA>" else float(entry) for entry in raw.flat]
+            raw = np.array(real, dtype=np.float64).reshape(raw.shape)
+    except (TypeError, ValueError, OverflowError, AttributeError):
+        raise _not_numbers(name, type(values).__name__) from None
+    if raw.dtype.kind not in "biuf":
+        raise _not_numbers(name, f"an array of {raw.dtype}" if raw.shape else str(raw.dtype))
+    with np.errstate(over="ignore"):  # longdouble: infinite, which `finite_array` refuses
+        return np.asarray(raw, dtype=np.float64)
+
+
+def _is_real(entry: object) -> bool:
+    return isinstance(entry, numbers.Real) or repr(entry) == "<NA>"
+
+
+def _not_numbers(name: str, got: str) -> DataError:
+    return DataError(
+        name, f"expected real numbers, got {got}", "give an array or lists of equal length"
+    )
 
 
 def finite_array(name: str, values: ArrayLike, shape: tuple[int | None, ...]) -> Array:
@@ -71,24 +142,65 @@ def finite_array(name: str, values: ArrayLike, shape: tuple[int | None, ...]) ->
     DataError
         When the values are not numbers, have another shape, or are not all finite.
     """
-    try:
-        array = np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise DataError(name, f"expected numbers, got {values!r:.60}", "give an array") from None
+    array = with_shape(name, as_numbers(name, values), shape)
+    require_finite(name, array)
+    return array
+
+
+def with_shape(name: str, array: Array, shape: tuple[int | None, ...]) -> Array:
+    """Return the array when it has the shape.
+
+    Parameters
+    ----------
+    name : str
+        Name of the argument, for the message.
+    array : Array
+        Of any shape.
+    shape : tuple
+        Expected shape; ``None`` where any length will do.
+
+    Returns
+    -------
+    Array
+        Of that shape.
+
+    Raises
+    ------
+    DataError
+        When it has another.
+    """
     wanted = "(" + ", ".join("any" if size is None else str(size) for size in shape) + ")"
     if array.ndim != len(shape) or any(
         size is not None and size != given for size, given in zip(shape, array.shape, strict=True)
     ):
         raise DataError(name, f"expected shape {wanted}, got {array.shape}", "reshape it")
-    bad = np.argwhere(~np.isfinite(array))
-    if len(bad):
-        first = tuple(int(index) for index in bad[0])
-        raise DataError(
-            name,
-            f"{len(bad)} of {array.size} entries are NaN or infinite, the first at {first}",
-            "remove or repair those samples before fitting",
-        )
     return array
+
+
+def require_finite(name: str, array: Array) -> None:
+    """Require that every entry is finite.
+
+    Parameters
+    ----------
+    name : str
+        Name of the argument, for the message.
+    array : Array
+        Of any shape.
+
+    Raises
+    ------
+    DataError
+        With the number of those that are not, and where the first of them is.
+    """
+    if np.all(np.isfinite(array)):
+        return
+    bad = np.argwhere(~np.isfinite(array))
+    first = tuple(int(index) for index in bad[0])
+    raise DataError(
+        name,
+        f"{len(bad)} of {array.size} entries are NaN or infinite, the first at {first}",
+        "remove or repair those samples before fitting",
+    )
 
 
 def symmetric_matrix(name: str, values: ArrayLike, size: int | None = None) -> Array:
@@ -115,13 +227,12 @@ def symmetric_matrix(name: str, values: ArrayLike, size: int | None = None) -> A
     InputError
         When the matrix is not symmetric.
     """
-    scalar = np.ndim(values) == 0  # R of a single input is usually written as a number
-    matrix: NDArray[np.float64] = finite_array(
-        name, np.reshape(values, (1, 1)) if scalar else values, (size, size)
-    )
+    given = as_numbers(name, values)
+    # R of a single input is usually written as a number.
+    matrix = finite_array(name, given.reshape(1, 1) if given.ndim == 0 else given, (size, size))
     if matrix.shape[0] != matrix.shape[1]:
         raise DataError(name, f"expected a square matrix, got {matrix.shape}", "give it square")
     scale = float(np.max(np.abs(matrix), initial=0.0))
     if float(np.max(np.abs(matrix - matrix.T), initial=0.0)) > 1e-9 * scale:
         raise InputError(name, "is not symmetric", "give (M + M')/2")
-    return (matrix + matrix.T) / 2
+    return np.asarray(matrix / 2 + matrix.T / 2)  # no sum beyond the largest number

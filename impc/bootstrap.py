@@ -21,18 +21,19 @@ import numpy as np
 import scipy.signal
 from statsmodels.regression.linear_model import burg
 
-from impc.arrays import Array, frozen
+from impc.arrays import Array, Frozen, frozen
 from impc.closed_loop import simulate
-from impc.errors import InputError
 from impc.fitted_controller import fit_controller
+from impc.gain_estimate import gain_estimate
 from impc.intervals import Interval, entry_names
 from impc.inverse_problem import controller_for, scenarios
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from impc.fitted_controller import FittedController
+    from impc.gain_estimate import GainEstimate
     from impc.inverse_problem import InverseProblem
+    from impc.weights import Weights
 
 __all__ = [
     "DRAWS",
@@ -40,7 +41,6 @@ __all__ = [
     "Replicate",
     "block_length",
     "block_residuals",
-    "bootstrap",
     "bootstrap_intervals",
     "model_residuals",
     "replicate",
@@ -54,13 +54,13 @@ _BEFORE = 500
 
 
 @dataclass(frozen=True)
-class Replicate:
+class Replicate(Frozen):
     """Estimates of one replicate.
 
     Attributes
     ----------
     K : Array
-        (m, n).
+        (m, n), of `gain_estimate`.
     parameters : Array
         Physical parameters in their units (k,).
     """
@@ -69,40 +69,11 @@ class Replicate:
     parameters: Array
 
 
-def bootstrap(
-    fitted: FittedController,
-    count: int,
-    seed: int,
-    resample: Draw,
-    progress: Callable[[int], None] = lambda _: None,
-) -> tuple[Replicate, ...]:
-    """Fit `count` replicates one after the other; `progress` is told each one's number.
-
-    Parameters
-    ----------
-    seed : int
-        All numbers drawn follow from it.
-    resample : Draw
-        `block_residuals` or `model_residuals`.
-
-    Raises
-    ------
-    InputError
-        When there are fewer than two replicates.
-    WeightsError, SolverError
-        When a replicate cannot be fitted.
-    """
-    if count < 2:
-        raise InputError("replicates", f"got {count}", "give at least 2")
-    found = []
-    for index in range(count):
-        found.append(replicate(fitted, index, seed, resample))
-        progress(index)
-    return tuple(found)
-
-
 def replicate(
-    fitted: FittedController,
+    problem: InverseProblem,
+    gain: Array,
+    metric: Array,
+    start: Weights,
     index: int,
     seed: int,
     resample: Draw,
@@ -111,12 +82,18 @@ def replicate(
 
     Parameters
     ----------
+    problem : InverseProblem
+        At the initial states and parameters of the estimate.
+    gain, metric : Array
+        K (m, n) and S (m, m) of the estimate: what is simulated.
+    start : Weights
+        Where the fit begins.
     index : int
         The child of the seed that it draws from, from 0.
     seed : int
         That of the whole bootstrap.
     resample : Draw
-        As in `bootstrap`.
+        `block_residuals` or `model_residuals`.
 
     Raises
     ------
@@ -124,20 +101,20 @@ def replicate(
         When it cannot be fitted.
     """
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index,)))
-    clean, residuals = _split(fitted)
+    clean, residuals = _split(problem, gain, metric)
     drawn = resample(residuals, rng)
     trials = tuple(
         replace(trial, outputs=frozen(outputs + noise))
-        for trial, outputs, noise in zip(fitted.problem.recordings, clean, drawn, strict=True)
+        for trial, outputs, noise in zip(problem.recordings, clean, drawn, strict=True)
     )
-    again = fit_controller(replace(fitted.problem, recordings=trials), fitted.weights)
-    return Replicate(again.solution.K, frozen(_parameters(again.problem)))
+    again = gain_estimate(fit_controller(replace(problem, recordings=trials), start))
+    return Replicate(again.K, frozen(again.parameters))
 
 
 def bootstrap_intervals(
-    fitted: FittedController, replicates: Sequence[Replicate], method: str, level: float
+    estimate: GainEstimate, replicates: Sequence[Replicate], method: str, level: float
 ) -> tuple[Interval, ...]:
-    """Percentile intervals of the entries of K and of the parameters.
+    """Percentile intervals of the entries of K and of the parameters; no ends where not told.
 
     Parameters
     ----------
@@ -146,15 +123,18 @@ def bootstrap_intervals(
     level : float
         Share of the replicates inside, between 0 and 1.
     """
-    names = list(entry_names(fitted.problem.plant))
-    values = [*np.ravel(fitted.solution.K), *_parameters(fitted.problem)]
-    if fitted.problem.family is not None:
-        names += fitted.problem.family.names
+    names = list(entry_names(estimate.problem.plant))
+    if estimate.problem.family is not None:
+        names += estimate.problem.family.names
+    values = np.append(np.ravel(estimate.K), estimate.parameters)
     drawn = np.array([np.append(np.ravel(item.K), item.parameters) for item in replicates])
-    ends = np.quantile(drawn, [0.5 - level / 2, 0.5 + level / 2], axis=0)
+    low, high = np.quantile(drawn, [0.5 - level / 2, 0.5 + level / 2], axis=0)
+    told = np.append(np.ravel(estimate.covariance.told_entries), np.isfinite(estimate.parameters))
+    # Replicates stay where the search began along what is not told: their spread says nothing.
+    low, high = np.where(told, low, -np.inf), np.where(told, high, np.inf)
     return tuple(
-        Interval(name, method, level, float(value), float(low), float(high))
-        for name, value, low, high in zip(names, values, *ends, strict=True)
+        Interval(name, method, level, float(value), float(one), float(other), bool(known))
+        for name, value, one, other, known in zip(names, values, low, high, told, strict=True)
     )
 
 
@@ -230,20 +210,13 @@ def _autoregression(parts: list[Array]) -> Array:
     return np.asarray(chosen)
 
 
-def _split(fitted: FittedController) -> tuple[list[Array], list[Array]]:
+def _split(problem: InverseProblem, gain: Array, metric: Array) -> tuple[list[Array], list[Array]]:
     """Simulated outputs of every trial, and what is left of the recorded ones."""
-    known = replace(fitted.problem, unknown_start=False, family=None, logarithms=frozen([]))
-    controller = controller_for(known, np.array(fitted.solution.K), np.array(fitted.solution.S))
-    runs = [simulate(controller, drive) for drive in scenarios(known)]
-    clean = [np.asarray(run.x @ known.plant.C.T) for run in runs]
+    controller = controller_for(problem, gain, metric)
+    runs = [simulate(controller, drive) for drive in scenarios(problem)]
+    clean = [np.asarray(run.x @ problem.plant.C.T) for run in runs]
     residuals = [
         np.asarray(trial.outputs - outputs)
-        for trial, outputs in zip(known.recordings, clean, strict=True)
+        for trial, outputs in zip(problem.recordings, clean, strict=True)
     ]
     return clean, residuals
-
-
-def _parameters(problem: InverseProblem) -> Array:
-    if problem.family is None:
-        return np.zeros(0)
-    return np.asarray(problem.family.nominal * np.exp(problem.logarithms))

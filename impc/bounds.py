@@ -9,14 +9,17 @@ upper, state lower, each in the order of the signals, so that a row can be named
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from impc.arrays import Array, BoolArray, frozen
+from impc.door import Value, checked
 from impc.errors import BoundsError
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import ArrayLike
 
     from impc.plant import Plant
@@ -25,7 +28,7 @@ __all__ = ["BoundRows", "Bounds", "bound_rows", "box_bounds"]
 
 
 @dataclass(frozen=True)
-class Bounds:
+class Bounds(Value):
     """Lower and upper bounds, infinite where there is none.
 
     Attributes
@@ -36,6 +39,13 @@ class Bounds:
         Input bounds (m,), in the units of the inputs.
     """
 
+    _rules: ClassVar[Mapping[str, Any]] = {
+        "x_min": "~n",
+        "x_max": "~n",
+        "u_min": "~m",
+        "u_max": "~m",
+    }
+
     x_min: Array
     x_max: Array
     u_min: Array
@@ -43,7 +53,7 @@ class Bounds:
 
 
 @dataclass(frozen=True)
-class BoundRows:
+class BoundRows(Value):
     """The finite bounds as rows  E x + F u <= b  of one stage.
 
     Attributes
@@ -63,6 +73,7 @@ class BoundRows:
     names: tuple[str, ...]
 
 
+@checked
 def box_bounds(
     plant: Plant,
     *,
@@ -95,6 +106,7 @@ def box_bounds(
     return Bounds(frozen(lower_x), frozen(upper_x), frozen(lower_u), frozen(upper_u))
 
 
+@checked
 def bound_rows(bounds: Bounds, plant: Plant) -> BoundRows:
     """Return the finite bounds as rows."""
     inputs, states = np.eye(plant.m), np.eye(plant.n)
@@ -125,10 +137,11 @@ def _side(name: str, values: ArrayLike | None, size: int, default: float) -> Arr
     if values is None:
         return np.full(size, default)
     try:
-        given = np.asarray(values, dtype=float)
-        side = np.array(np.broadcast_to(given, (size,)))
-    except (TypeError, ValueError):
-        raise BoundsError(name, f"got {values!r:.60}", f"give a number or {size} of them") from None
+        side = np.array(np.broadcast_to(np.asarray(values, dtype=float), (size,)))
+    except ValueError:
+        raise BoundsError(
+            name, f"got shape {np.shape(values)}", f"give a number or {size} of them"
+        ) from None
     if np.any(np.isnan(side)):
         raise BoundsError(name, f"has NaN: {side.tolist()}", "use inf where there is no bound")
     return side

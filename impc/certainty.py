@@ -7,6 +7,7 @@ an unknown, other horizons (docs/fitting.md, docs/what-may-be-concluded.md).
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -14,7 +15,7 @@ import numpy as np
 
 from impc.alternatives import fit_alternatives
 from impc.bootstrap import DRAWS, bootstrap_intervals, replicate
-from impc.intervals import LEVEL, Interval, covariance_intervals, white_covariance
+from impc.intervals import LEVEL, Interval, covariance_intervals
 from impc.profile_likelihood import profile_likelihood
 from impc.unknown_limit import input_limit
 
@@ -25,9 +26,10 @@ if TYPE_CHECKING:
     from impc.bootstrap import Replicate
     from impc.fit_settings import FitSettings
     from impc.fitted_controller import FittedController
-    from impc.gain_covariance import GainCovariance
+    from impc.gain_estimate import GainEstimate
     from impc.inverse_problem import InverseProblem
     from impc.unknown_limit import LimitEstimate
+    from impc.weights import Weights
     from impc.weights_summary import WeightsSummary
 
 __all__ = ["Certainty", "assess", "count_stages"]
@@ -74,7 +76,7 @@ def count_stages(problem: InverseProblem, settings: FitSettings) -> int:
 def assess(
     problem: InverseProblem,
     fitted: FittedController,
-    covariance: GainCovariance,
+    estimate: GainEstimate,
     weights: tuple[WeightsSummary | None, str],
     settings: FitSettings,
     done: Callable[[str], None],
@@ -86,8 +88,10 @@ def assess(
     ----------
     problem : InverseProblem
         As it was posed.
-    fitted, covariance
-        Its fit, and the covariance at the reported gain.
+    fitted : FittedController
+        Its fit.
+    estimate : GainEstimate
+        Of `gain_estimate`.
     weights : tuple
         Of `weights_summary_or_reason`.
     settings : FitSettings
@@ -104,11 +108,11 @@ def assess(
         When a replicate or the limit cannot be fitted.
     """
     intervals = [
-        *covariance_intervals(fitted, covariance, "sandwich"),
-        *covariance_intervals(fitted, white_covariance(fitted), "cramer-rao"),
+        *covariance_intervals(estimate, estimate.covariance, "sandwich"),
+        *covariance_intervals(estimate, estimate.white, "cramer-rao"),
     ]
     for name in settings.profiles:
-        intervals.append(profile_likelihood(fitted, name).interval)
+        intervals.append(profile_likelihood(estimate, name).interval)
         done(f"profile of {name}")
     limits = []
     for control in range(problem.plant.m if settings.unknown_limit else 0):
@@ -118,7 +122,7 @@ def assess(
     alternatives: tuple[Alternative, ...] = ()
     if settings.horizons:
         alternatives = fit_alternatives(problem, fitted, settings.horizons, settings.settle, done)
-    intervals += _bootstrap(fitted, settings, done, remember)
+    intervals += _bootstrap(fitted.weights, estimate, settings, done, remember)
     return Certainty(tuple(intervals), *weights, tuple(limits), alternatives)
 
 
@@ -127,18 +131,21 @@ def _limit_interval(found: LimitEstimate, control: str) -> Interval:
 
 
 def _bootstrap(
-    fitted: FittedController,
+    weights: Weights,
+    estimate: GainEstimate,
     settings: FitSettings,
     done: Callable[[str], None],
     remember: Callable[[str, Callable[[], Replicate]], Replicate],
 ) -> tuple[Interval, ...]:
     if not settings.replicates:
         return ()
-    draw = DRAWS[settings.bootstrap]
+    draw, K, S = DRAWS[settings.bootstrap], np.array(estimate.K), np.array(estimate.S)
     found = []
     for index in range(settings.replicates):
         name = f"replicate {index + 1}"
-        compute = lambda index=index: replicate(fitted, index, settings.seed, draw)  # noqa: E731
+        compute = functools.partial(
+            replicate, estimate.problem, K, S, weights, index, settings.seed, draw
+        )
         found.append(remember(name, compute))
         done(name)
-    return bootstrap_intervals(fitted, found, settings.bootstrap, LEVEL)
+    return bootstrap_intervals(estimate, found, settings.bootstrap, LEVEL)

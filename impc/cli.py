@@ -7,13 +7,21 @@ import os
 import sys
 from typing import Any
 
+# `python -m impc.cli` puts the working folder first: a numpy.py among recordings is not numpy. The
+# folder of a checkout is left, for the plants in it.
+if __name__ == "__main__" and not (
+    sys.flags.safe_path or os.path.exists(os.path.join(sys.path[0], "impc", "cli.py"))
+):
+    del sys.path[0]
+
 import click
 
-from impc.errors import ImpcError
+from impc.commands.ending import ended, interruptions, own_process
+from impc.exit_status import ExitStatus
+from impc.jit import keep_caches
 
 __all__ = ["main"]
 
-_BAD_INPUT, _INTERRUPTED = 2, 130
 # One module a command, loaded when it is asked for: name -> module, which holds it as `command`.
 _COMMANDS = {
     "cohort": "impc.commands.cohort",
@@ -41,26 +49,31 @@ class _Program(click.Group):
         found: click.Command = importlib.import_module(module).command
         return found
 
+    def make_context(self, *args: Any, **kwargs: Any) -> click.Context:
+        with interruptions():
+            return super().make_context(*args, **kwargs)
+
     def main(self, *args: Any, **kwargs: Any) -> Any:
         # Matrices of ten rows: a second thread of linear algebra costs more than it does. Before
         # numpy is imported, and only in this program; a value of the user's own stands.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-        try:
-            status = super().main(*args, **kwargs | {"standalone_mode": False})
-        except (ImpcError, click.ClickException) as error:
-            message = error.format_message() if isinstance(error, click.ClickException) else error
-            click.echo(f"impc: error: {message}", err=True)
-            sys.exit(_BAD_INPUT)
+
+        def work() -> Any:
+            return click.Group.main(self, *args, **kwargs | {"standalone_mode": False})
+
+        if args or kwargs:  # called from Python
+            sys.exit(ended(work))
+        with own_process():
+            note = keep_caches()
+            status = ended(work)
+            if note and status == ExitStatus.DONE and "numba" in sys.modules:
+                click.echo(f"impc: note: {note}", err=True)
         sys.exit(status)
 
     def invoke(self, ctx: click.Context) -> Any:
-        # Caught here, because click's own handling prints an empty line first.
-        try:
+        # Here, because click's own handling prints an empty line first.
+        with interruptions():
             return super().invoke(ctx)
-        except KeyboardInterrupt as interruption:
-            kept = f"; {interruption}" if interruption.args else ""
-            click.echo(f"impc: interrupted{kept}", err=True)
-            ctx.exit(_INTERRUPTED)
 
 
 # Every command below shows the defaults of its options.

@@ -17,22 +17,28 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from impc.arrays import Array, finite_array, frozen
+from impc.arrays import Array, Frozen, as_numbers, finite_array, frozen
 from impc.bounds import bound_rows
 from impc.compiled import LoopMatrices, run
+from impc.door import Value, checked
 from impc.errors import DataError, InfeasibleError, SolverError
+from impc.infeasibility import proves_infeasible
 from impc.prediction import RowDirections, build_rows, differentiate_rows, directions
+from impc.saturated import differentiate_plan, solve_saturated
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import ArrayLike
 
     from impc.controller import Controller
     from impc.plant import Plant
     from impc.prediction import Directions, Rows
+    from impc.saturated import Plan
 
 __all__ = [
     "PreparedLoop",
@@ -53,9 +59,9 @@ class Status(IntEnum):
     """What happened at a sample.
 
     FREE: the gain keeps every bound. ACTIVE: a bound is active. SOFTENED: a soft bound was
-    exceeded. INFEASIBLE: no input sequence keeps the bounds. UNSOLVED: the active-set method
-    found no answer. DIVERGED: the state left every reasonable range. NOT_REACHED: the simulation
-    ended before.
+    exceeded. INFEASIBLE: it is proved that no input sequence keeps the bounds. UNSOLVED: which
+    input is the answer, or whether there is one, could not be told in double precision. DIVERGED:
+    the state left every reasonable range. NOT_REACHED: the simulation ended before.
     """
 
     FREE = 0
@@ -77,14 +83,14 @@ _SENTENCES = {
     Status.ACTIVE: "a bound is active",
     Status.SOFTENED: "a soft bound was exceeded",
     Status.INFEASIBLE: "no input sequence keeps the bounds",
-    Status.UNSOLVED: "the active-set method found no answer that keeps the rows",
+    Status.UNSOLVED: "the input could not be told in double precision",
     Status.DIVERGED: "the state left every reasonable range",
     Status.NOT_REACHED: "the simulation ended before this sample",
 }
 
 
 @dataclass(frozen=True)
-class Scenario:
+class Scenario(Value):
     """What drives a simulation, in the units of the plant.
 
     Attributes
@@ -94,6 +100,11 @@ class Scenario:
     disturbance : Array
         One row for each sample (steps, d).
     """
+
+    _rules: ClassVar[Mapping[str, Any]] = {
+        "x0": "n",
+        "disturbance": "* d",
+    }
 
     x0: Array
     disturbance: Array
@@ -105,7 +116,7 @@ class Scenario:
 
 
 @dataclass(frozen=True)
-class Simulation:
+class Simulation(Frozen):
     """A closed loop from its first state to its last.
 
     Attributes
@@ -140,7 +151,7 @@ class Simulation:
 
 
 @dataclass(frozen=True)
-class Sensitivity:
+class Sensitivity(Frozen):
     """Derivatives of a `Simulation` along p directions.
 
     Attributes
@@ -171,6 +182,8 @@ class PreparedLoop:
         Plant, gain and inverse metric.
     matrix_directions : LoopMatrices
         Derivatives of plant, gain and metric.
+    unit : Array
+        The nearer bound of each input (m,): what its error is measured by.
     """
 
     controller: Controller
@@ -179,8 +192,10 @@ class PreparedLoop:
     row_directions: RowDirections
     matrices: LoopMatrices
     matrix_directions: LoopMatrices
+    unit: Array
 
 
+@checked(x0="n", steps=(1, 10_000_000))
 def scenario(
     plant: Plant, x0: ArrayLike, steps: int | None = None, disturbance: ArrayLike | None = None
 ) -> Scenario:
@@ -203,16 +218,17 @@ def scenario(
     start = finite_array("x0", x0, (plant.n,))
     count = plant.E.shape[1]
     if disturbance is None:
-        if steps is None or steps < 1:
-            raise DataError("steps", f"got {steps!r} without a disturbance", "give at least 1")
+        if steps is None:
+            raise DataError("steps", "got None without a disturbance", "give at least 1")
         return Scenario(frozen(start), frozen(np.zeros((steps, count))))
-    columns = np.asarray(disturbance)
+    columns = as_numbers("disturbance", disturbance)
     given = finite_array(
         "disturbance", columns[:, None] if columns.ndim == 1 else columns, (steps, count)
     )
     return Scenario(frozen(start), frozen(given))
 
 
+@checked
 def simulate(controller: Controller, given: Scenario) -> Simulation:
     """Simulate the plant of the controller; never raises for what happens on the way.
 
@@ -225,6 +241,7 @@ def simulate(controller: Controller, given: Scenario) -> Simulation:
     return simulation
 
 
+@checked
 def simulate_and_differentiate(
     controller: Controller, given: Scenario, along: Directions
 ) -> tuple[Simulation, Sensitivity]:
@@ -245,33 +262,88 @@ def prepare_loop(controller: Controller, along: Directions) -> PreparedLoop:
         moved,
         _writable(plant.A, plant.B, plant.E, controller.K, inverse),
         _writable(along.A, along.B, along.E, along.K, along.S),
+        np.minimum(-controller.bounds.u_min, controller.bounds.u_max),
     )
 
 
 def run_loop(prepared: PreparedLoop, given: Scenario) -> tuple[Simulation, Sensitivity]:
-    """Simulate one recording of a prepared loop, with its derivatives."""
+    """Simulate one recording of a prepared loop, with its derivatives.
+
+    Samples that were not reached repeat the last state, so that a search can go on with them.
+    """
     plant, along = prepared.controller.plant, prepared.along
     steps, n, m, p = given.steps, plant.n, plant.m, along.count
     x, u = np.zeros((steps + 1, n)), np.zeros((steps, m))
     dx, du = np.zeros((steps + 1, n, p)), np.zeros((steps, m, p))
     status = np.full(steps, Status.NOT_REACHED, dtype=np.int8)
     x[0], dx[0] = given.x0, along.x0
-    weakly_active, failed_row = run(
-        prepared.matrices,
-        prepared.matrix_directions,
-        prepared.rows,
-        prepared.row_directions,
-        np.array(given.disturbance),
-        _divergence(plant, given),
-        x,
-        u,
-        dx,
-        du,
-        status,
-    )
+    multipliers = np.zeros(len(prepared.rows.b))
+    disturbance, divergence = np.array(given.disturbance), _divergence(plant, given)
+    t, weakly_active, plan = 0, 0, None
+    while True:
+        first = t
+        weak, failed_row = run(
+            prepared.matrices,
+            prepared.matrix_directions,
+            prepared.rows,
+            prepared.row_directions,
+            disturbance,
+            divergence,
+            prepared.unit,
+            first,
+            x,
+            u,
+            dx,
+            du,
+            status,
+            multipliers,
+        )
+        weakly_active += weak
+        t = int(np.count_nonzero(status <= Status.SOFTENED))
+        if t == steps or status[t] == Status.DIVERGED:
+            break
+        if status[t] == Status.INFEASIBLE:
+            if proves_infeasible(prepared.controller, prepared.rows, multipliers, x[t]):
+                break
+            status[t], failed_row = Status.UNSOLVED, -1
+        if not _only_inputs_are_bounded(prepared.controller):
+            break
+        plan = _saturated_plan(prepared, x[t], plan if t == first + 1 else None)
+        if not plan.told:
+            break
+        u[t], status[t] = plan.u[0], Status.ACTIVE
+        du[t] = _differentiate_first_input(prepared, plan, dx[t])
     return Simulation(x, u, status, weakly_active, failed_row), Sensitivity(dx, du)
 
 
+def _only_inputs_are_bounded(controller: Controller) -> bool:
+    return controller.terminal is None and not np.any(
+        bound_rows(controller.bounds, controller.plant).on_state
+    )
+
+
+def _saturated_plan(prepared: PreparedLoop, x: Array, last: Plan | None) -> Plan:
+    """Answer of the recursion over the stages, where that of the rows is not told."""
+    controller = prepared.controller
+    sides = np.array(controller.bounds.u_min), np.array(controller.bounds.u_max)
+    metric = np.array(controller.S)
+    return solve_saturated(prepared.matrices, metric, *sides, controller.horizon, x, last)
+
+
+def _differentiate_first_input(prepared: PreparedLoop, plan: Plan, dx: Array) -> Array:
+    controller, along = prepared.controller, prepared.along
+    rows = bound_rows(controller.bounds, controller.plant)
+    sides = np.zeros((3, controller.plant.m, along.count))  # at -1 the last one
+    for row, direction in zip(rows.F, along.bounds, strict=True):
+        j = int(np.flatnonzero(row)[0])
+        sides[int(row[j]), j] = row[j] * direction
+    held = sides[plan.at, np.arange(controller.plant.m)]
+    return differentiate_plan(
+        plan, prepared.matrices, prepared.matrix_directions, np.array(controller.S), held, dx
+    )
+
+
+@checked
 def require_complete(controller: Controller, simulation: Simulation) -> Simulation:
     """Return the simulation when every sample was reached.
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.arrays import Array, frozen
+from impc.arrays import Array, Frozen, frozen
 from impc.held_out import left_out_vaf
 from impc.initial_states import with_fitted_starts
 from impc.inverse_problem import moved, without_bounds
@@ -28,7 +28,7 @@ __all__ = ["MethodComparison", "bounds_of_method", "compare_recordings", "stages
 
 
 @dataclass(frozen=True)
-class MethodComparison:
+class MethodComparison(Frozen):
     """One method.
 
     Attributes

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.arrays import Array, frozen
+from impc.arrays import Array, Frozen, frozen
 from impc.bounds import box_bounds
 from impc.equivalent_weights import least_condition_weights
 from impc.errors import SolverError, WeightsError
@@ -105,7 +105,7 @@ def compare_methods(
 
 
 @dataclass(frozen=True)
-class _Found:
+class _Found(Frozen):
     K: Array | None
     weights: Weights | None
     reason: str

@@ -27,9 +27,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from impc.arrays import Buffer
+from impc.jit import njit
 from impc.prediction import RowDirections, Rows
 
 __all__ = ["CONVERGED", "INCONSISTENT", "UNSOLVED", "LoopMatrices", "run", "solve_dual"]
@@ -41,9 +41,13 @@ CONVERGED, INCONSISTENT, UNSOLVED = 0, 1, 2
 # computed by orthogonalising twice, which leaves rounding of 1e-16; genuine neighbours in the
 # terminal sets of tests/ differ by 1e-5 and more.
 _DEPENDENT = 1e-9
-# The answer must keep every row to this share of the distance between v = 0 and the row, or it is
-# not given out.
-_CHECKED = 1e-8
+# The answer must keep every row, and tell the first input, to this share of the bound, whatever the
+# multipliers are, or it is not given out.
+_CHECKED = 1e-9
+# Rounding of a row at the answer, relative to the sum of the magnitudes of its terms.
+_ROW_ROUNDING = 1e-14
+# Rounding of v, relative to the same.
+_SUM_ROUNDING = 1e-15
 # Rounding of a slack, relative to the largest term in it. It matters where soft rows are given up:
 # their multipliers are the penalty, a million and more.
 _ROUNDING = 1e-14
@@ -126,7 +130,8 @@ def solve_dual(
     Returns
     -------
     status, count : int
-        CONVERGED and the number of free rows; INCONSISTENT and the row that proves it; UNSOLVED.
+        CONVERGED and the number of free rows, an answer to be checked; INCONSISTENT and the row at
+        which it was found, with the combination of rows that should prove it in `lam`; UNSOLVED.
     """
     rows = len(d)
     slack = d.copy()
@@ -149,8 +154,7 @@ def solve_dual(
                     row, worst = r, distance
         if row < 0:
             _refine(gram, d, limit, at_limit, lam, free, count, factor)
-            kept = _verify(gram, d, tolerance, at_limit, lam)
-            return (CONVERGED if kept else UNSOLVED), count
+            return CONVERGED, count
         sign = -1.0 if at_limit[row] else 1.0
         while True:
             new = _append_row(whitened, row, count, factor, basis)
@@ -177,6 +181,10 @@ def solve_dual(
                 if room < length:
                     length, blocked = room, i
             if length == np.inf:
+                lam[:] = 0.0
+                lam[row] = 1.0
+                for i in range(count):
+                    lam[free[i]] = -step[i]
                 return INCONSISTENT, row
             lam[row] += sign * length
             for r in range(rows):
@@ -223,23 +231,6 @@ def _remove(
         free[i] = free[i + 1]
         _accept_row(i, _append_row(whitened, free[i], i, factor, basis), factor, basis)
     return count - 1
-
-
-@njit(cache=True)
-def _verify(gram: Buffer, d: Buffer, tolerance: Buffer, at_limit: Buffer, lam: Buffer) -> bool:
-    """Check the rows and the multipliers of the answer itself."""
-    noise = 10 * _ROUNDING * _largest_pull(gram, lam)
-    for r in range(len(d)):
-        slack = d[r]
-        for i in range(len(d)):
-            if lam[i] != 0.0:
-                slack += gram[r, i] * lam[i]
-        rounding = noise * np.sqrt(gram[r, r])
-        if not at_limit[r] and slack < -max(tolerance[r], _CHECKED * abs(d[r])) - rounding:
-            return False
-        if lam[r] * gram[r, r] < -_CHECKED * abs(d[r]) - rounding:
-            return False
-    return True
 
 
 @njit(cache=True)
@@ -302,13 +293,16 @@ def run(
     drows: RowDirections,
     disturbance: Buffer,
     divergence: float,
+    unit: Buffer,
+    first: int,
     x: Buffer,
     u: Buffer,
     dx: Buffer,
     du: Buffer,
     status: Buffer,
+    lam: Buffer,
 ) -> tuple[int, int]:
-    """Simulate from x[0] and dx[0], with derivatives along p directions (p may be 0).
+    """Simulate from x[first] and dx[first], with derivatives along p directions (p may be 0).
 
     Parameters
     ----------
@@ -318,12 +312,19 @@ def run(
         (steps, d).
     divergence : float
         Entry of a state, in its unit, at which the simulation ends.
+    unit : Buffer
+        What the error of each input is measured by (m,): its nearer bound.
+    first : int
+        Where to begin. When `status` has an answer there, u and du have it too.
     x, u : Buffer
         Written: states (steps + 1, n) after the first, inputs (steps, m).
     dx, du : Buffer
         Written: their derivatives (steps + 1, n, p) after the first, (steps, m, p).
     status : Buffer
         Written up to the sample that ends it: the value of `closed_loop.Status`, (steps,).
+    lam : Buffer
+        Written: the multipliers of the last problem (r,), or the combination of rows that should
+        prove it inconsistent.
 
     Returns
     -------
@@ -331,40 +332,34 @@ def run(
         Number of samples at which the active set is about to change; the row that proved the last
         problem inconsistent, or -1.
     """
-    count = len(rows.b)
-    lam, slack = np.zeros(count), np.empty(count)
-    room = min(count, rows.W.shape[1]) + 1
+    count, width = rows.M.shape
+    room = min(count, width) + 1
+    slack, kept = np.empty(count), _KEPT * rows.b
+    v, dv0 = np.zeros(width), np.zeros(du.shape[1:])
     free, factor = np.empty(room, dtype=np.int64), np.empty((room, room))
-    basis = np.empty((room, rows.W.shape[1]))
-    kept = _KEPT * rows.b
-    v, dv0 = np.zeros(rows.M.shape[1]), np.zeros(du.shape[1:])
+    basis, rounding = np.empty((room, width)), np.empty(width)
+    work = _Workspace(slack, kept, free, factor, basis, v, rounding, dv0)
     plant_moves = bool(np.any(dloop.A) or np.any(dloop.B) or np.any(dloop.E))
-    weakly_active, horizon_inputs = 0, u.shape[1]
-    for t in range(len(u)):
-        needs_qp, soft, near = False, False, False
-        for r in range(count):
-            slack[r] = rows.b[r] - _dot(rows.T[r], x[t])
-            needs_qp |= slack[r] < -kept[r]
-            near |= abs(slack[r]) < _WEAK * rows.b[r]
-        v[:horizon_inputs] = 0.0
-        dv0[:] = 0.0
-        if needs_qp:
-            code, active = solve_dual(
-                rows.W, rows.gram, slack, rows.limit, kept, lam, free, factor, basis
-            )
-            if code != CONVERGED:
-                status[t] = _INFEASIBLE if code == INCONSISTENT else _UNSOLVED
-                _hold(x, dx, t)
-                return weakly_active, active if code == INCONSISTENT else -1
-            _recover(rows, lam, v)
-            soft, near = _classify(rows, slack, lam, v, horizon_inputs)
-            if dx.shape[2]:
-                _differentiate(
-                    loop, dloop, rows, drows, lam, free, factor, active, v, x[t], dx[t], dv0
+    weakly_active = 0
+    for t in range(first, len(u)):
+        if status[t] > _SOFTENED:
+            needs_qp, near = False, False
+            for r in range(count):
+                slack[r] = rows.b[r] - _dot(rows.T[r], x[t])
+                needs_qp |= not slack[r] >= -kept[r]
+                near |= abs(slack[r]) < _WEAK * rows.b[r]
+            v[: u.shape[1]] = 0.0
+            dv0[:] = 0.0
+            status[t] = _FREE
+            if needs_qp:
+                status[t], near, row = _solve(
+                    loop, dloop, rows, drows, unit, work, x[t], dx[t], lam
                 )
-        status[t] = _SOFTENED if soft else (_ACTIVE if needs_qp else _FREE)
-        weakly_active += near
-        _apply(loop, dloop, v, dv0, x[t], dx[t], u[t], du[t])
+                if status[t] > _SOFTENED:
+                    _hold(x, dx, t)
+                    return weakly_active, row
+            weakly_active += near
+            _apply(loop, dloop, v, dv0, x[t], dx[t], u[t], du[t])
         _advance(loop, dloop, plant_moves, disturbance[t], x, dx, u[t], du[t], t)
         size = np.max(np.abs(x[t + 1]))
         if not size < divergence:
@@ -372,6 +367,52 @@ def run(
             _hold(x, dx, t)
             return weakly_active, -1
     return weakly_active, -1
+
+
+class _Workspace(NamedTuple):
+    """Arrays that one sample after the other uses."""
+
+    slack: Buffer
+    kept: Buffer
+    free: Buffer
+    factor: Buffer
+    basis: Buffer
+    v: Buffer
+    rounding: Buffer
+    dv0: Buffer
+
+
+@njit(cache=True)
+def _solve(
+    loop: LoopMatrices,
+    dloop: LoopMatrices,
+    rows: Rows,
+    drows: RowDirections,
+    unit: Buffer,
+    work: _Workspace,
+    x: Buffer,
+    dx: Buffer,
+    lam: Buffer,
+) -> tuple[int, bool, int]:
+    """Write v and dv0 of one sample; return its status, whether its rows are weak, and a row."""
+    slack, free, factor = work.slack, work.free, work.factor
+    code, active = solve_dual(
+        rows.W, rows.gram, slack, rows.limit, work.kept, lam, free, factor, work.basis
+    )
+    if code == INCONSISTENT:
+        return _INFEASIBLE, False, active
+    if code == UNSOLVED:
+        return _UNSOLVED, False, -1
+    _recover(rows, lam, work)
+    soft, near, told = _check(loop.K, rows, lam, work, active, x, unit)
+    if not told:
+        _tighten(rows, work, active)
+        soft, near, told = _check(loop.K, rows, lam, work, active, x, unit)
+    if not told:
+        return _UNSOLVED, False, -1
+    if dx.shape[1]:
+        _differentiate(loop, dloop, rows, drows, lam, free, factor, active, work.v, x, dx, work.dv0)
+    return (_SOFTENED if soft else _ACTIVE), near, -1
 
 
 @njit(cache=True, inline="always")
@@ -390,27 +431,92 @@ def _hold(x: Buffer, dx: Buffer, t: int) -> None:
 
 
 @njit(cache=True)
-def _recover(rows: Rows, lam: Buffer, v: Buffer) -> None:
-    """v = -N' lam."""
+def _recover(rows: Rows, lam: Buffer, work: _Workspace) -> None:
+    """v = -N' lam, and what rounding made of it."""
+    v, rounding = work.v, work.rounding
     v[:] = 0.0
+    rounding[:] = 0.0
     for r in range(len(lam)):
         if lam[r] != 0.0:
             for i in range(len(v)):
-                v[i] -= lam[r] * rows.N[r, i]
+                part = lam[r] * rows.N[r, i]
+                v[i] -= part
+                rounding[i] += _SUM_ROUNDING * abs(part)
 
 
 @njit(cache=True)
-def _classify(rows: Rows, slack: Buffer, lam: Buffer, v: Buffer, inputs: int) -> tuple[bool, bool]:
-    """Whether a soft row was given up, and whether a row is tight without a multiplier."""
-    soft, near = False, False
+def _tighten(rows: Rows, work: _Workspace, active: int) -> None:
+    """Correct v so that the tight rows are tight.
+
+    The price of a soft row is a million and more: what is left of v has lost as many digits.
+    """
+    slack, free, v = work.slack, work.free, work.v
+    column = np.empty(active)
+    for a in range(active):
+        column[a] = slack[free[a]] - _dot(rows.M[free[a]], v)
+    substitute(work.factor, active, column)
+    for a in range(active):
+        for i in range(len(v)):
+            v[i] += column[a] * rows.N[free[a], i]
+
+
+@njit(cache=True)
+def _check(
+    K: Buffer,
+    rows: Rows,
+    lam: Buffer,
+    work: _Workspace,
+    active: int,
+    x: Buffer,
+    unit: Buffer,
+) -> tuple[bool, bool, bool]:
+    """Whether a soft row was given up, a row is tight without a multiplier, the answer is told.
+
+    It is told when every row is kept, and every multiplier has its sign, to a share of the bound
+    that no multiplier enters, and when that and rounding move the first v by no more: by the
+    derivative of v along the right sides of the tight rows (docs/theory.md, section 4).
+    """
+    soft, near, m = False, False, len(unit)
+    slack, free, factor, v = work.slack, work.free, work.factor, work.v
+    wrong = np.empty(len(lam))
     for r in range(len(lam)):
-        left = slack[r] - _dot(rows.M[r], v)
+        left, size, bound = slack[r], rows.b[r], rows.b[r]
+        for i in range(len(x)):
+            size += abs(rows.T[r, i] * x[i])
+        for i in range(len(v)):
+            part = rows.M[r, i] * v[i]
+            left -= part
+            size += abs(part)
+        wrong[r] = abs(left) + _ROW_ROUNDING * size
+        pulled = lam[r] * rows.gram[r, r]
         if lam[r] == rows.limit[r]:
-            soft |= left < -_WEAK * rows.b[r]
+            soft |= left < -_WEAK * bound
+            broken = left > _CHECKED * bound
+        else:
+            broken = not left > -_CHECKED * bound or pulled < -_CHECKED * bound
+        if broken:
+            return soft, near, False
         # A multiplier moves v by lam N: weak when that is nothing beside the row's bound.
-        if abs(left) < _WEAK * rows.b[r] and lam[r] * rows.gram[r, r] < _WEAK * rows.b[r]:
-            near = True
-    return soft, near
+        near |= abs(left) < _WEAK * bound and pulled < _WEAK * bound
+    column, moved = np.empty(active), np.empty(len(v))
+    for i in range(m):
+        for a in range(active):
+            column[a] = rows.N[free[a], i]
+        substitute(factor, active, column)
+        error, size = 0.0, 0.0
+        moved[:] = 0.0
+        moved[i] = 1.0
+        for a in range(active):
+            error += abs(column[a]) * wrong[free[a]]
+            for k in range(len(v)):
+                moved[k] -= column[a] * rows.M[free[a], k]
+        for k in range(len(v)):
+            error += abs(moved[k]) * work.rounding[k]
+        for j in range(len(x)):
+            size += abs(K[i, j] * x[j])
+        if not error <= _CHECKED * min(unit[i], abs(v[i]) + size):
+            return soft, near, False
+    return soft, near, True
 
 
 @njit(cache=True)

@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy.linalg
 
-from impc.arrays import Array, frozen
+from impc.arrays import Array, Frozen, frozen
 from impc.errors import SolverError
 from impc.lqr import gain_gradients, metric_gradients, solve_lqr
 from impc.step_program import StepProgram, block_basis, solve_step
@@ -49,7 +49,7 @@ _LEAST_RADIUS = 1e-10
 
 
 @dataclass(frozen=True)
-class Residual:
+class Residual(Frozen):
     """A residual with its derivatives with respect to K and S.
 
     Attributes
@@ -165,7 +165,7 @@ def conditioned_fit(
         program = _linearise(here, objective)
         step, predicted = solve_step(program, radius)
         decrease = here.objective - predicted
-        stationarity = max(decrease, 0.0) / (here.objective * min(radius, 1.0))
+        stationarity = max(decrease, 0.0) / max(here.objective * min(radius, 1.0), 1e-300)
         if decrease <= tolerance * here.objective:
             break
         there = _try(plant, objective, here, step)

@@ -11,16 +11,19 @@ scale, its bounds, its horizon and its terminal set. The weights are one way to 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from impc.arrays import Array, finite_array, frozen, symmetric_matrix
+from impc.door import Value, checked
 from impc.errors import InputError
 from impc.lqr import is_stable, solve_lqr
 from impc.terminal_set import maximal_invariant_set
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import ArrayLike
 
     from impc.bounds import Bounds
@@ -28,11 +31,14 @@ if TYPE_CHECKING:
     from impc.terminal_set import TerminalSet
     from impc.weights import Weights
 
-__all__ = ["Controller", "gain_controller", "mpc_controller"]
+__all__ = ["LONGEST_HORIZON", "Controller", "gain_controller", "mpc_controller"]
+
+#: Samples; the rows of a horizon take memory in its square, 0.4 GB of these for two bounds.
+LONGEST_HORIZON = 5000
 
 
 @dataclass(frozen=True)
-class Controller:
+class Controller(Value):
     """minimise sum_{k<N} v_k'S v_k  subject to the bounds, x_N in the terminal set.
 
     Attributes
@@ -55,6 +61,12 @@ class Controller:
         answer is that of the hard problem whenever there is one. Input bounds are always hard.
     """
 
+    _rules: ClassVar[Mapping[str, Any]] = {
+        "K": "m n",
+        "S": "m m",
+        "horizon": (1, LONGEST_HORIZON),
+    }
+
     plant: Plant
     K: Array
     S: Array
@@ -74,6 +86,7 @@ class Controller:
         return self.softening * unit**2
 
 
+@checked(horizon=(1, LONGEST_HORIZON))
 def mpc_controller(
     plant: Plant,
     weights: Weights,
@@ -116,6 +129,7 @@ def mpc_controller(
     )
 
 
+@checked(gain="m n", metric="m m", horizon=(1, LONGEST_HORIZON))
 def gain_controller(
     plant: Plant,
     gain: ArrayLike,
@@ -152,10 +166,8 @@ def gain_controller(
     S = np.eye(plant.m) if metric is None else symmetric_matrix("metric", metric, plant.m)
     if np.linalg.eigvalsh(S)[0] <= 0:
         raise InputError("metric", "is not positive definite", "give R + B'PB")
-    if isinstance(horizon, bool) or not isinstance(horizon, (int, np.integer)) or horizon < 1:
-        raise InputError("horizon", f"got {horizon!r}", "give a whole number of at least 1")
     if softening is not None and not 0 < softening < np.inf:
         raise InputError("softening", f"got {softening!r}", "give a positive number, or None")
     terminal = maximal_invariant_set(plant, K, bounds, near=near) if terminal_set else None
     scaled = S * (plant.m / np.trace(S))
-    return Controller(plant, frozen(K), frozen(scaled), bounds, int(horizon), terminal, softening)
+    return Controller(plant, frozen(K), frozen(scaled), bounds, horizon, terminal, softening)

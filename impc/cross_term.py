@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.arrays import Array, finite_array, frozen
+from impc.arrays import Array, Frozen, finite_array, frozen
+from impc.door import checked
 from impc.errors import WeightsError
 from impc.gain_fibre import natural_coordinates, split_blocks
 from impc.lqr import is_stable
@@ -29,7 +30,7 @@ __all__ = ["CrossTerm", "inverse_lqr_cross_term"]
 
 
 @dataclass(frozen=True)
-class CrossTerm:
+class CrossTerm(Frozen):
     """Weights of  x'Qx + 2 x'Su + u'Ru  that have the gain exactly, with the least cross term.
 
     Attributes
@@ -49,6 +50,7 @@ class CrossTerm:
     status: str
 
 
+@checked(gain="m n")
 def inverse_lqr_cross_term(plant: Plant, gain: ArrayLike) -> CrossTerm:
     """Least cross term with which a quadratic cost has exactly the `gain` (m, n).
 

@@ -25,14 +25,19 @@ from impc.errors import SolverError, WeightsError
 from impc.evaluation import Evaluation, evaluate, misfit_or_reason, unusable
 from impc.inverse_problem import controller_for, scenarios
 from impc.lqr import LqrSolution, gain_gradients, solve_lqr
+from impc.one_step import one_step
 from impc.weights import Weights, stage_weights
 
 if TYPE_CHECKING:
     from impc.inverse_problem import InverseProblem
 
-__all__ = ["bryson_weights", "diagonal_weights"]
+__all__ = ["bryson_regulators", "bryson_weights", "diagonal_weights"]
 
-_PRICES = 10.0 ** np.arange(-6, 4)
+# Nine decades below the price of a command as large as the outputs to three above: what angles and
+# torques need, metres and newtons, and plants without units.
+_PRICES = 10.0 ** np.arange(-9, 4)
+# Mean square of an output that is zero throughout.
+_NOTHING = 1e-300
 _SPREAD = 3.0
 # A price that no output tells of starts at this share of the cost of the command.
 _SMALL = 1e-2
@@ -43,28 +48,61 @@ _TOLERANCE = 1e-3
 def bryson_weights(problem: InverseProblem) -> list[Weights]:
     """Weights that price each recorded output by its size (Bryson's rule), over a range of efforts.
 
-    Q = C'diag(1/mean(y^2))C plus 1e-8 of its mean diagonal, R = rho I for rho from 1e-6 to 1e3.
+    Q = C'diag(p/mean(y^2))C plus 1e-8 of its mean diagonal, R = rho I for rho from 1e-9 to 1e3,
+    with p the geometric mean of the outputs' mean(y^2): with all numbers a million times larger the
+    weights are the same.
     """
     plant = problem.plant
     recorded = np.concatenate([trial.outputs for trial in problem.recordings])
-    power = np.maximum(np.mean(recorded**2, axis=0), 1e-300)
-    Q = plant.C.T @ np.diag(1 / power) @ plant.C
+    power = np.maximum(np.mean(recorded**2, axis=0), _NOTHING)
+    seen = power > _NOTHING
+    common = np.exp(np.mean(np.log(power[seen]))) if np.any(seen) else _NOTHING
+    Q = plant.C.T @ np.diag(common / power) @ plant.C
     Q += 1e-8 * np.trace(Q) / plant.n * np.eye(plant.n)
     return [stage_weights(Q, rho * np.eye(plant.m)) for rho in _PRICES]
+
+
+def bryson_regulators(problem: InverseProblem) -> list[tuple[Weights, LqrSolution]]:
+    """Those of `bryson_weights` that have a regulator to working precision, with it.
+
+    Raises
+    ------
+    WeightsError
+        When none has.
+    """
+    found: list[tuple[Weights, LqrSolution]] = []
+    refused: list[WeightsError] = []
+    for weights in bryson_weights(problem):
+        try:
+            found.append((weights, solve_lqr(problem.plant, weights)))
+        except WeightsError as error:  # so cheap a command that R is lost beside B'PB
+            refused.append(error)
+    if not found:
+        raise refused[-1]
+    return found
 
 
 def diagonal_weights(problem: InverseProblem, *, max_evaluations: int = 15) -> Weights:
     """Fit the prices of the states, at given initial states, plant and R = I.
 
+    Where no regulator of `bryson_weights` can be simulated to the end, sample by sample
+    (`one_step`).
+
     `max_evaluations` bounds the number of simulations of all trials.
 
     Raises
     ------
-    SolverError
-        When none of `bryson_weights` can be simulated, or nothing moves in the simulation.
+    WeightsError, SolverError
+        When none of `bryson_weights` has a regulator, or none can be simulated, or nothing moves in
+        the simulation.
     """
     known = replace(problem, unknown_start=False, family=None, logarithms=frozen([]))
-    search = _Prices(known, *_best(known))
+    try:
+        best = _best(known)
+    except SolverError:  # every one diverges, which takes more than a step
+        known = one_step(known)
+        best = _best(known)
+    search = _Prices(known, *best)
     start = search.start
     noise = float(np.linalg.norm(search.at(start).residual)) / np.sqrt(search.samples)
     weight = noise / _SPREAD
@@ -84,12 +122,7 @@ def diagonal_weights(problem: InverseProblem, *, max_evaluations: int = 15) -> W
 def _best(problem: InverseProblem) -> tuple[Weights, LqrSolution]:
     """Of `bryson_weights` those with the least misfit."""
     candidates, reason = [], ""
-    for weights in bryson_weights(problem):
-        try:
-            solution = solve_lqr(problem.plant, weights)
-        except WeightsError as error:
-            reason = str(error)
-            continue
+    for weights, solution in bryson_regulators(problem):
         size, why = misfit_or_reason(problem, solution.K, solution.S)
         reason = reason or why
         if not why:

@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 __all__ = ["EigenvalueRange", "eigenvalue_ranges"]
 
 _STEPS = 3
+# Distance to the dual bound, relative, at which an end counts as proved: 1e-7 on the seat.
+_PROOF = 1e-4
 _SHARES = np.linspace(0.0, 1.0, 11)
 
 
@@ -87,8 +89,8 @@ def eigenvalue_ranges(
             EigenvalueRange(
                 least_top.value if index == n - 1 else low,
                 most_bottom.value if index == 0 else high,
-                index == n - 1,
-                index == 0,
+                index == n - 1 and least_top.value - least_top.bound <= _PROOF * least_top.value,
+                index == 0 and most_bottom.bound - most_bottom.value <= _PROOF * most_bottom.value,
             )
         )
     return tuple(ranges)

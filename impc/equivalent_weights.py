@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 
-from impc.arrays import Array
+from impc.arrays import Array, Frozen
+from impc.door import checked
 from impc.errors import SolverError, WeightsError
 from impc.gain_fibre import GainFibre, gain_fibre, pair_blocks, split_blocks
 from impc.lqr import solve_lqr
@@ -59,7 +60,7 @@ class WeightsMargin:
 
 
 @dataclass(frozen=True)
-class EquivalentWeights:
+class EquivalentWeights(Frozen):
     """Weights that have the gain of a fibre.
 
     Attributes
@@ -87,6 +88,7 @@ class EquivalentWeights:
     gap: float | None
 
 
+@checked
 def weights_margin(fibre: GainFibre) -> WeightsMargin:
     """Say whether any weights have the gain: max t such that X >= t I, mean eigenvalue of X is 1.
 
@@ -116,7 +118,8 @@ def weights_margin(fibre: GainFibre) -> WeightsMargin:
     return WeightsMargin(margin, exist=False, weights=None)
 
 
-def least_condition_weights(fibre: GainFibre) -> EquivalentWeights:
+@checked
+def least_condition_weights(fibre: GainFibre, member: Weights | None = None) -> EquivalentWeights:
     """Return the weights of least condition number that have the gain.
 
     minimise alpha subject to I <= X <= alpha I, X = blkdiag(Q, R) in the fibre.
@@ -126,6 +129,13 @@ def least_condition_weights(fibre: GainFibre) -> EquivalentWeights:
     such program reaches 2e-4 on the seat plant (a condition number of 2e7); from its own answer
     the next reaches 1e-11. As written above it returns twice the least condition number there.
 
+    Parameters
+    ----------
+    fibre : GainFibre
+    member : Weights, optional
+        Weights known to have the gain: where to begin when no program finds any. Weights at the
+        edge of what a program can tell from none (a margin below 1e-9) are found again like this.
+
     Raises
     ------
     WeightsError
@@ -134,7 +144,7 @@ def least_condition_weights(fibre: GainFibre) -> EquivalentWeights:
         When the dual bound stays more than 1e-4 below, or no member is definite to working
         precision in the units of the plant.
     """
-    best = _interior(fibre)
+    best = _interior(fibre, member)
     least, gap, status = condition_number(best), 1.0, ""
     for _ in range(4):
         before = least
@@ -153,6 +163,7 @@ def least_condition_weights(fibre: GainFibre) -> EquivalentWeights:
     return _member(fibre, best, f"least condition number, Clarabel: {status}", gap)
 
 
+@checked
 def analytic_centre(fibre: GainFibre) -> EquivalentWeights:
     """Return the member of largest det Q det R among those with trace(N^-1 R) = m.
 
@@ -190,6 +201,7 @@ def analytic_centre(fibre: GainFibre) -> EquivalentWeights:
     )
 
 
+@checked(count=0, condition_ratio=1)
 def other_weights(
     fibre: GainFibre, count: int = 2, *, condition_ratio: float = 10.0
 ) -> tuple[EquivalentWeights, ...]:
@@ -222,8 +234,15 @@ def other_weights(
     return tuple(_member(fibre, fibre.from_natural(X), status, None) for X in chosen[1:])
 
 
-def _interior(fibre: GainFibre) -> Weights:
-    found = weights_margin(fibre)
+def _interior(fibre: GainFibre, member: Weights | None = None) -> Weights:
+    try:
+        found = weights_margin(fibre)
+    except SolverError:
+        if member is None:
+            raise
+        return member
+    if found.weights is None and member is not None:
+        return member
     if found.weights is None:
         raise WeightsError(
             "gain",

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from impc.arrays import Array, frozen
+from impc.arrays import Array, Frozen, frozen
 from impc.bounds import box_bounds
 from impc.closed_loop import Scenario, Simulation, require_complete, scenario, simulate
 from impc.controller import Controller, gain_controller, mpc_controller
@@ -21,6 +21,7 @@ from impc.gain import fit_gain
 from impc.identifiability import Identifiability, identifiability
 from impc.inverse_lqr import inverse_lqr_gradient, inverse_lqr_lmi
 from impc.inverse_mpc import (
+    CONDITION_WEIGHT,
     auxiliary_weights,
     inverse_mpc,
     inverse_mpc_reduced,
@@ -60,7 +61,7 @@ BOUND = 1.0
 
 
 @dataclass(frozen=True)
-class MethodResult:
+class MethodResult(Frozen):
     """What one method makes of the recording.
 
     Attributes
@@ -103,7 +104,7 @@ class MethodResult:
 
 
 @dataclass(frozen=True)
-class CaseResult:
+class CaseResult(Frozen):
     """One initial state: the truth, the methods in the order of the table, and what was determined.
 
     Attributes
@@ -164,7 +165,10 @@ def run_case(
     truth_weights = true_weights(plant)
     controller = mpc_controller(plant, truth_weights, bounds, HORIZON)
     truth = require_complete(controller, simulate(controller, scenario(plant, CASES[name], STEPS)))
-    problem = inverse_problem(plant, bounds, HORIZON, (recording(plant, truth.x),))
+    # Scale and condition weights as the equations have them: the table is in the plant's own units.
+    problem = inverse_problem(
+        plant, bounds, HORIZON, (recording(plant, truth.x),), output_scale=np.ones(plant.n)
+    )
     runner = _Runner(problem, truth_weights, progress)
 
     gain = runner.timed("feedback_gain", lambda: fit_gain(without_bounds(problem)))
@@ -178,9 +182,14 @@ def run_case(
     )
     runner.add_regulator(auxiliary.weights, 0)
     start = auxiliary.weights if lmi.weights is None else lmi.weights
-    output = runner.timed("inverse_lqr_output", lambda: output_penalty_weights(problem, start))
+    output = runner.timed(
+        "inverse_lqr_output",
+        lambda: output_penalty_weights(problem, start, condition_weight=CONDITION_WEIGHT),
+    )
     runner.add_regulator(output.weights, output.evaluations)
-    direct = runner.timed("inverse_mpc", lambda: inverse_mpc(problem, start))
+    direct = runner.timed(
+        "inverse_mpc", lambda: inverse_mpc(problem, start, condition_weight=CONDITION_WEIGHT)
+    )
     runner.add_constrained(direct.weights, direct.evaluations)
     reduced = runner.timed("inverse_mpc_reduced", lambda: inverse_mpc_reduced(problem))
     runner.add_constrained(reduced.weights, reduced.gain.evaluations)

@@ -1,27 +1,23 @@
-"""What an interrupted command had done: the results of its stages, in one JSON file.
+"""What an interrupted command had done: the results of its stages, one sealed file each.
 
-The file belongs to one set of recordings, settings and plant, told by a digest of all of them; with
-any other it is not used and is written anew.
+They belong to one set of recordings, settings, plant and versions, told by a digest of all of them;
+what belongs to any other, or was damaged, is not used and is done again.
 """
 
 from __future__ import annotations
 
-import hashlib
-import importlib.metadata
-import json
-import os
-from dataclasses import dataclass, field
-from threading import Lock
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from impc.arrays import Array, frozen
 from impc.bootstrap import Replicate
-from impc.errors import OutputError
+from impc.digest import digest, versions
 from impc.fitted_controller import FittedController, fit_controller
 from impc.gain import GainFit
 from impc.inverse_problem import moved
+from impc.kept import Kept
 from impc.lqr import solve_lqr
 from impc.method_estimates import decode_estimate, encode_estimate
 from impc.weights import stage_weights
@@ -33,8 +29,12 @@ if TYPE_CHECKING:
     from impc.fit_settings import FitSettings
     from impc.inverse_problem import InverseProblem
     from impc.method_estimates import Estimate
+    from impc.plant_family import PlantFamily
 
 __all__ = ["FitMemory", "open_memory"]
+
+# Where a family of plants is looked at: two families may agree at their nominal values.
+_FACTORS = (0.9, 1.1)
 
 
 @dataclass(frozen=True)
@@ -43,20 +43,17 @@ class FitMemory:
 
     Attributes
     ----------
-    path : Path
-        The file; its folder is made when the first stage is done.
+    files : Kept
+        One a stage; the folder is made when the first stage is done.
     digest : str
-        Of recordings, settings and plant.
+        Of recordings, settings, plant and versions.
     stages : dict
         Name of stage -> what `_encode` keeps of it.
-    writing : Lock
-        Held while a stage is written down: stages end in several threads.
     """
 
-    path: Path
+    files: Kept
     digest: str
     stages: dict[str, Any] = field(default_factory=dict)
-    writing: Lock = field(default_factory=Lock)
 
     def controller(self, name: str, problem: InverseProblem) -> FittedController:
         """The controller of the stage `name`, remembered or fitted now and then written down.
@@ -107,57 +104,61 @@ class FitMemory:
         """What to tell whoever interrupts the command."""
         if not self.stages:
             return "nothing was done yet"
-        return f"kept in {self.path}: {', '.join(self.stages)}; the same command goes on from there"
+        done = ", ".join(self.stages)
+        return f"kept in {self.files.folder}: {done}; the same command goes on from there"
 
     def forget(self) -> None:
-        """Remove the file: the result has been written."""
-        self.path.unlink(missing_ok=True)
+        """Remove the folder: the result has been written.
+
+        Raises
+        ------
+        OutputError
+            When that cannot be done.
+        """
+        self.files.forget()
 
     def _keep(self, name: str, value: dict[str, Any]) -> None:
-        with self.writing:
-            self.stages[name] = value
-            self._write()
-
-    def _write(self) -> None:
-        staging = self.path.with_suffix(".part")
-        try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            staging.write_text(json.dumps({"digest": self.digest, "stages": self.stages}))
-            os.replace(staging, self.path)
-        except OSError as error:
-            raise OutputError(
-                f"folder {self.path.parent}",
-                f"cannot be written to ({error.strerror})",
-                "give another folder",
-            ) from None
+        self.files.keep(name, self.digest, value)
+        self.stages[name] = value
 
 
 def open_memory(
-    folder: Path, problem: InverseProblem, settings: FitSettings, command: str = "fit"
+    folder: Path,
+    problem: InverseProblem,
+    settings: FitSettings,
+    command: str = "fit",
+    made_of: str = "",
 ) -> FitMemory:
-    """The memory of a command in a folder, empty when there is none for this very problem."""
-    path, digest = folder / f"{command}-in-progress.json", _digest(problem, settings)
-    try:
-        found = json.loads(path.read_text())
-        stages = found["stages"] if found["digest"] == digest else {}
-    except (OSError, ValueError, KeyError, TypeError):  # none, or not ours: begin anew
-        stages = {}
-    return FitMemory(path, digest, stages)
+    """The memory of a command in a folder, empty when there is none for this very problem.
+
+    Parameters
+    ----------
+    folder : Path
+        Where the command writes.
+    problem : InverseProblem
+    settings : FitSettings
+    command : str
+        "fit" or "compare".
+    made_of : str
+        Digest of the files that the problem was made of (`Inputs.digest`).
+    """
+    files = Kept(folder / f"{command}-in-progress")
+    known = digest(_content(problem), settings, made_of, versions())
+    return FitMemory(files, known, files.recall_all(known))
 
 
-def _digest(problem: InverseProblem, settings: FitSettings) -> str:
-    text = hashlib.sha256(f"{importlib.metadata.version('impc')} {settings!r}".encode())
-    plant, bounds = problem.plant, problem.bounds
-    parts = [plant.A, plant.B, plant.E, plant.C, bounds.x_min, bounds.x_max, bounds.u_min]
-    parts += [bounds.u_max, problem.output_scale]
-    for trial in problem.recordings:
-        parts += [trial.outputs, trial.disturbance, trial.x0]
-    if problem.family is not None:
-        text.update(repr(problem.family.names).encode())
-        parts.append(problem.family.nominal)
-    for part in parts:
-        text.update(f"{part.shape}".encode() + np.ascontiguousarray(part).tobytes())
-    return text.hexdigest()
+def _content(problem: InverseProblem) -> tuple[Any, ...]:
+    """All of a problem that has a content: a family of plants is told by some of its plants."""
+    family = problem.family
+    if family is None:
+        return (problem,)
+    plants = [family.make(values) for values in _probes(family)]
+    return replace(problem, family=None), family.names, family.nominal, plants
+
+
+def _probes(family: PlantFamily) -> list[Array]:
+    changes = [np.eye(len(family.nominal)) * (factor - 1) + 1 for factor in _FACTORS]
+    return [family.nominal * row for row in np.concatenate(changes)]
 
 
 def _encode(found: FittedController) -> dict[str, Any]:
@@ -168,6 +169,7 @@ def _encode(found: FittedController) -> dict[str, Any]:
         "misfit": found.misfit,
         "exact": found.exact,
         "converged": found.converged,
+        "metrics": found.metrics.tolist(),
         **_nuisance(found.problem),
         "free": {
             "K": free.K.tolist(),
@@ -176,7 +178,7 @@ def _encode(found: FittedController) -> dict[str, Any]:
             "explained": free.explained,
             "stabilises": free.stabilises,
             "singular_values": free.singular_values.tolist(),
-            "metric_determined": free.metric_determined,
+            "metrics": free.metrics.tolist(),
             "evaluations": free.evaluations,
             "refused": list(free.refused),
             **_nuisance(free.problem),
@@ -205,7 +207,7 @@ def _restore(problem: InverseProblem, kept: dict[str, Any]) -> FittedController:
             free["explained"],
             free["stabilises"],
             frozen(free["singular_values"]),
-            free["metric_determined"],
+            frozen(free["metrics"]),
             free["evaluations"],
             tuple(free["refused"]),
         ),
@@ -214,6 +216,7 @@ def _restore(problem: InverseProblem, kept: dict[str, Any]) -> FittedController:
         kept["misfit"],
         kept["exact"],
         kept["converged"],
+        frozen(kept["metrics"]),
     )
 
 

@@ -21,23 +21,27 @@ from impc.arrays import Array, frozen
 from impc.certainty import assess, count_stages
 from impc.closed_loop import simulate
 from impc.comparison import compare_methods
+from impc.door import checked
 from impc.errors import DataError, SolverError
 from impc.fit_result import FitResult, FittedParameter
 from impc.fit_settings import FitSettings, fit_bounds
 from impc.fitted_controller import FittedController, fit_controller
-from impc.gain_covariance import gain_covariance
+from impc.gain_estimate import gain_estimate
 from impc.held_out import predict
 from impc.identifiability import identifiability
 from impc.intent import intent
+from impc.intent_draws import drawn_gains
 from impc.inverse_problem import InverseProblem, controller_for, inverse_problem, scenarios
 from impc.preliminary import PreliminaryGain, preliminary_gain
+from impc.residual_diagnostics import residual_diagnostics
 from impc.weights_summary import weights_summary_or_reason
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from impc.bootstrap import Replicate
-    from impc.gain_covariance import GainCovariance
+    from impc.gain_estimate import GainEstimate
+    from impc.lqr import LqrSolution
     from impc.plant import Plant
     from impc.plant_family import PlantFamily
     from impc.recording import Recording
@@ -77,6 +81,7 @@ def stages(problem: InverseProblem, settings: FitSettings) -> int:
     return 1 + methods + left_out + count_stages(problem, settings)
 
 
+@checked
 def fit_problem(
     plant: Plant,
     recordings: Sequence[Recording],
@@ -138,13 +143,16 @@ def fit_recordings(
     started = time.perf_counter()
     fitted = progress.controller("fit", problem)
     progress.done("inverse MPC")
-    covariance = _covariance(fitted)
+    estimate = gain_estimate(fitted)
     known = replace(fitted.problem, unknown_start=False, family=None, logarithms=frozen([]))
-    plant, K = known.plant, np.array(fitted.solution.K)
+    plant, K, metrics = known.plant, np.array(fitted.solution.K), np.array(fitted.metrics)
     sizes = _state_sizes(known, fitted)
     with _threads() as pool:
         others = _left_out(pool, problem, settings, progress)
-        whole_set = pool.submit(weights_summary_or_reason, plant, K, sizes)
+        draws: tuple[LqrSolution, ...] = ()
+        if settings.intent_draws:
+            draws = drawn_gains(plant, fitted.weights, estimate.K, estimate.covariance)
+        whole_set = pool.submit(weights_summary_or_reason, plant, K, metrics, sizes, draws)
         methods = compare_methods(fitted, progress.done, _preliminary(problem, settings))
         held_out = []
         for index, other in enumerate(others):
@@ -154,15 +162,15 @@ def fit_recordings(
         progress.done("set of weights")
     runs, bounds = methods[-1].runs, problem.bounds
     certainty = assess(
-        problem, fitted, covariance, weights_found, settings, progress.done, progress.replicate
+        problem, fitted, estimate, weights_found, settings, progress.done, progress.replicate
     )
     return FitResult(
         settings,
         problem,
         fitted,
-        covariance,
-        _parameters(fitted, covariance),
-        intent(plant, K, sizes, fitted.weights),
+        estimate,
+        _parameters(estimate),
+        intent(plant, K, metrics, sizes, fitted.weights),
         identifiability(known, fitted.weights),
         certainty,
         tuple(
@@ -171,6 +179,7 @@ def fit_recordings(
         ),
         tuple(held_out),
         methods,
+        residual_diagnostics(fitted.problem, K, np.array(fitted.solution.S)),
         _terminal_set_difference(known, fitted),
         time.perf_counter() - started,
     )
@@ -225,26 +234,18 @@ def _without(index: int) -> str:
     return f"without trial {index + 1}"
 
 
-def _covariance(fitted: FittedController) -> GainCovariance:
-    """At the gain of the weights, which is the one that is reported."""
-    solution = fitted.solution
-    reported = replace(
-        fitted.free, K=frozen(solution.K), S=frozen(solution.S), problem=fitted.problem
-    )
-    return gain_covariance(reported)
-
-
-def _parameters(
-    fitted: FittedController, covariance: GainCovariance
-) -> tuple[FittedParameter, ...]:
-    family = fitted.problem.family
+def _parameters(estimate: GainEstimate) -> tuple[FittedParameter, ...]:
+    family = estimate.problem.family
     if family is None:
         return ()
-    values = family.nominal * np.exp(fitted.problem.logarithms)
     return tuple(
         FittedParameter(name, float(nominal), float(value), float(value * deviation))
         for name, nominal, value, deviation in zip(
-            family.names, family.nominal, values, covariance.parameters, strict=True
+            family.names,
+            family.nominal,
+            estimate.parameters,
+            estimate.covariance.parameters,
+            strict=True,
         )
     )
 

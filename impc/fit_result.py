@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from impc.lqr import solve_lqr
+from impc.residual_diagnostics import residual_warnings
 
 if TYPE_CHECKING:
     from impc.agreement import TrialAgreement
@@ -13,14 +14,18 @@ if TYPE_CHECKING:
     from impc.certainty import Certainty
     from impc.fit_settings import FitSettings
     from impc.fitted_controller import FittedController
-    from impc.gain_covariance import GainCovariance
+    from impc.gain_estimate import GainEstimate
     from impc.held_out import HeldOut
     from impc.identifiability import Identifiability
     from impc.intent import Intent
     from impc.inverse_problem import InverseProblem
     from impc.method_fit import MethodFit
+    from impc.residual_diagnostics import ResidualDiagnostics
 
 __all__ = ["FitResult", "FittedParameter"]
+
+# Standard deviation of the logarithm of a parameter that the recordings tell.
+_TOLD = 0.5
 
 
 @dataclass(frozen=True)
@@ -42,6 +47,14 @@ class FittedParameter:
     value: float
     deviation: float
 
+    @property
+    def determined(self) -> bool:
+        """Whether the recordings tell it: to a factor of e at 95 %, its logarithm to 0.5.
+
+        What they do not tell stays near its nominal value, where the search began.
+        """
+        return self.deviation < _TOLD * self.value
+
 
 @dataclass(frozen=True)
 class FitResult:
@@ -53,9 +66,9 @@ class FitResult:
     given : InverseProblem
         The problem as it was posed: nominal plant, trials at rest.
     fitted : FittedController
-        Weights and gain; `fitted.problem` holds the initial states and the plant found.
-    covariance : GainCovariance
-        How far the gain is determined.
+        Weights and their gain; `fitted.problem` holds the initial states and the plant found.
+    estimate : GainEstimate
+        The gain that the recordings tell, and how far: what is printed with intervals.
     parameters : tuple of FittedParameter
     intent : Intent
     identifiability : Identifiability
@@ -68,6 +81,8 @@ class FitResult:
         One a trial; empty for a single trial or when not asked for.
     methods : tuple of MethodFit
         Those of `impc.comparison` in their order; the last is inverse MPC.
+    diagnostics : ResidualDiagnostics
+        What the residuals say against the fit.
     terminal_set_difference : float
         Largest change of a scaled output when the terminal set is added (or taken away); NaN when
         the loop with it does not reach the end.
@@ -78,7 +93,7 @@ class FitResult:
     settings: FitSettings
     given: InverseProblem
     fitted: FittedController
-    covariance: GainCovariance
+    estimate: GainEstimate
     parameters: tuple[FittedParameter, ...]
     intent: Intent
     identifiability: Identifiability
@@ -86,6 +101,7 @@ class FitResult:
     trials: tuple[TrialAgreement, ...]
     held_out: tuple[HeldOut, ...]
     methods: tuple[MethodFit, ...]
+    diagnostics: ResidualDiagnostics
     terminal_set_difference: float
     seconds: float
 
@@ -100,6 +116,13 @@ class FitResult:
         found = self.certainty.weights
         over_set = 0.0 if found is None else found.widest_angle
         return max(self.intent.widest_angle, over_set)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What has to be read before any number."""
+        saturated = sum(item.saturated for item in self.trials) / len(self.trials)
+        outputs = self.fitted.problem.plant.outputs
+        return residual_warnings(self.diagnostics, outputs, saturated)
 
     @property
     def inverse_mpc(self) -> MethodFit:

@@ -10,7 +10,7 @@ import numpy as np
 import scipy.signal
 
 from impc.bounds import box_bounds
-from impc.errors import InputError
+from impc.errors import InputError, brief
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -27,6 +27,16 @@ __all__ = ["FitSettings", "fit_bounds", "fit_settings"]
 _RATE_WINDOW = 0.15
 # Percentiles of 95 % lie between replicates only from 20 on.
 _FEWEST = 20
+# Least and most of each number. The most is far beyond any use: it keeps sizes and seconds numbers.
+_RANGES: dict[str, tuple[float, float]] = {
+    "horizon": (1, 5000),
+    "margin": (1, 1000),
+    "settle": (0, 1e6),
+    "replicates": (0, 1_000_000),
+    "seed": (0, 2**63 - 1),
+}
+# A limit of an input is squared and divided by: beyond these the square is no number any more.
+_LIMITS = (1e-100, 1e100)
 
 
 @dataclass(frozen=True)
@@ -68,6 +78,9 @@ class FitSettings:
     profiles : list of str
         Entries of the gain, K.<control>.<state>, and free parameters whose profile likelihood is
         wanted.
+    intent_draws : bool
+        Whether statements on the intent are tried on gains that the recordings allow beside the
+        fitted one (`impc.intent_draws`); without that none is made.
     unknown_limit : bool
         Whether the limit of each input is estimated too.
     horizons : list of int
@@ -87,6 +100,7 @@ class FitSettings:
     bootstrap: Literal["block", "model"] = "block"
     seed: int = 0
     profiles: list[str] = field(default_factory=list)
+    intent_draws: bool = True
     unknown_limit: bool = False
     horizons: list[int] = field(default_factory=list)
 
@@ -107,20 +121,38 @@ def fit_settings(table: Mapping[str, Any]) -> FitSettings:
         settings = msgspec.convert(dict(table), FitSettings, strict=True)
     except msgspec.ValidationError as error:
         raise InputError("[fit]", str(error), "see docs/fitting.md") from None
-    for name, value, least in (
-        ("horizon", settings.horizon, 1),
-        ("margin", settings.margin, 1),
-        ("settle", settings.settle, 0),
-    ):
-        if not least <= value < np.inf:
-            raise InputError(f"[fit] {name}", f"got {value}", f"give at least {least}")
-    if 0 < settings.replicates < _FEWEST or settings.replicates < 0:
+    for name, (least, most) in _RANGES.items():
+        _require_between(name, getattr(settings, name), least, most)
+    if 0 < settings.replicates < _FEWEST:
         raise InputError(
             "[fit] replicates", f"got {settings.replicates}", f"give 0 or at least {_FEWEST}"
         )
-    if any(length < 1 for length in settings.horizons):
-        raise InputError("[fit] horizons", f"got {settings.horizons}", "give at least 1")
+    for length in settings.horizons:
+        _require_between("horizons", length, *_RANGES["horizon"])
+    limits = settings.u_max if isinstance(settings.u_max, list) else [settings.u_max]
+    for limit in limits:
+        if limit is not None and limit != np.inf:
+            _require_between("u_max", limit, *_LIMITS)
+    for name, bound in settings.bounded_states.items():
+        if not isinstance(bound, str) and bound != np.inf:
+            _require_between(f"bounded_states {name}", bound, *_LIMITS)
+    _require_distinct(settings)
     return settings
+
+
+def _require_between(name: str, value: float, least: float, most: float) -> None:
+    if not least <= value <= most:
+        raise InputError(
+            f"[fit] {name}", f"got {brief(value)}", f"give at least {least:.6g}, at most {most:.6g}"
+        )
+
+
+def _require_distinct(settings: FitSettings) -> None:
+    for name in ("free", "feedback_states", "profiles", "horizons"):
+        given = getattr(settings, name)
+        twice = [item for index, item in enumerate(given) if item in given[:index]]
+        if twice:
+            raise InputError(f"[fit] {name}", f"names {twice[0]} twice", "name each once")
 
 
 def fit_bounds(plant: Plant, settings: FitSettings, recordings: Sequence[Recording]) -> Bounds:
@@ -141,7 +173,11 @@ def fit_bounds(plant: Plant, settings: FitSettings, recordings: Sequence[Recordi
         if isinstance(value, str):
             limit = settings.margin * _recorded_maximum(plant, name, value, recordings)
         x_max[plant.states.index(name)] = limit
-    u_max = None if settings.u_max is None else np.asarray(settings.u_max)
+    u_max = None if settings.u_max is None else np.asarray(settings.u_max, dtype=np.float64)
+    if u_max is not None and u_max.shape not in ((), (plant.m,)):
+        raise InputError(
+            "[fit] u_max", f"has {len(u_max)} numbers", f"give one, or {plant.m}, one an input"
+        )
     u_min = None if u_max is None else -u_max
     return box_bounds(plant, x_min=-x_max, x_max=x_max, u_min=u_min, u_max=u_max)
 

@@ -10,22 +10,26 @@ natural coordinates (`natural_fit`) takes the weights that fit best (docs/fittin
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from impc.arrays import Array, frozen
 from impc.diagonal_weights import diagonal_weights
+from impc.door import checked
 from impc.equivalent_weights import least_condition_weights
 from impc.errors import SolverError, WeightsError
 from impc.evaluation import residual_only
-from impc.gain import GainFit, refine_gain
+from impc.gain import EXPLAINED, GainFit, describe_gain, fit_gain
 from impc.gain_fibre import gain_fibre, natural_coordinates
 from impc.initial_states import with_fitted_starts
 from impc.inverse_mpc import auxiliary_weights
+from impc.inverse_problem import recorded_size
 from impc.lqr import solve_lqr
 from impc.natural_fit import in_plant_units, inverse_mpc_natural
 from impc.plant import change_coordinates
+from impc.weights_behind import weights_behind
 
 if TYPE_CHECKING:
     from impc.conditioned_fit import ConditionedFit
@@ -59,9 +63,12 @@ class FittedController:
     misfit : float
         2-norm of the residual with these weights.
     exact : bool
-        Whether the weights have exactly the free gain.
+        Whether the weights have the free gain, and reproduce the recordings to 1e-9 of them.
     converged : bool
         Whether the search for the weights ended.
+    metrics : Array
+        Basis of the metrics that the recordings do not tell from that of the weights (k, m, m), see
+        `GainFit`.
     """
 
     problem: InverseProblem
@@ -71,8 +78,15 @@ class FittedController:
     misfit: float
     exact: bool
     converged: bool
+    metrics: Array
+
+    @property
+    def explained(self) -> bool:
+        """Whether these weights, simulated, reproduce the recordings to 1e-9 of them."""
+        return self.misfit <= EXPLAINED * recorded_size(self.problem)
 
 
+@checked
 def fit_controller(problem: InverseProblem, start: Weights | None = None) -> FittedController:
     """Fit the weights of the constrained controller behind recordings.
 
@@ -89,13 +103,12 @@ def fit_controller(problem: InverseProblem, start: Weights | None = None) -> Fit
     """
     begin = diagonal_weights(problem) if start is None else start
     free = free_gain(problem, begin)
-    if free.explained:
-        try:
-            weights = least_condition_weights(gain_fibre(free.problem.plant, free.K)).weights
-        except WeightsError:
-            pass  # no weights have that gain: the direct form says which come near
-        else:
-            return _finish(free, free.problem, weights, exact=True, converged=True)
+    if free.explained:  # otherwise no weights can have it: the direct form says which come near
+        behind = weights_behind(free)
+        if behind.explained and behind.equivalent is not None:
+            return _finish(
+                behind.gain, free.problem, behind.equivalent.weights, exact=True, converged=True
+            )
     found = inverse_mpc_natural(free.problem, begin, noise_of(free))
     if found.misfit < free.misfit:  # the free gain stands in a local minimum
         free = free_gain(free.problem, found.weights)
@@ -130,18 +143,22 @@ def _again(free: GainFit, begin: Weights, found: ConditionedFit) -> ConditionedF
 def free_gain(problem: InverseProblem, begin: Weights) -> GainFit:
     """The best gain of any kind near that of some weights, with what else the problem lacks."""
     solution = solve_lqr(problem.plant, begin)
-    return refine_gain(problem, np.array(solution.K), np.array(solution.S), spread=_SPREAD)
+    start = np.array(solution.K), np.array(solution.S)
+    return fit_gain(problem, start, attempts=1, regulators=False, spread=_SPREAD)
 
 
 def noise_of(free: GainFit) -> float:
     """Misfit of the free gain, at least that of rounding."""
-    outputs = [trial.outputs / free.problem.output_scale for trial in free.problem.recordings]
-    return max(free.misfit, 1e-9 * float(np.linalg.norm(np.concatenate(outputs))))
+    return max(free.misfit, EXPLAINED * recorded_size(free.problem))
 
 
 def _finish(
     free: GainFit, problem: InverseProblem, weights: Weights, *, exact: bool, converged: bool
 ) -> FittedController:
     solution = solve_lqr(problem.plant, weights)
-    misfit = float(np.linalg.norm(residual_only(problem, solution.K, solution.S)))
-    return FittedController(problem, free, weights, solution, misfit, exact, converged)
+    K, S = np.array(solution.K), np.array(solution.S)
+    metrics = frozen(S[None])
+    if problem.plant.m > 1:
+        metrics = describe_gain(replace(free, problem=problem), K, S).metrics
+    misfit = float(np.linalg.norm(residual_only(problem, K, S)))
+    return FittedController(problem, free, weights, solution, misfit, exact, converged, metrics)

@@ -1,10 +1,12 @@
 """The unknowns of a search for a gain, in coordinates in which a step of one is a large step.
 
-    z = (K T | Cholesky factor of S but its first entry | x0 of each trial | parameters)
+    z = (G^-1 K T | factor of S but its first entry | x0 of each trial | parameters)
 
 T T' is the covariance of the states that the first gain gives when white noise enters at the
-inputs, so that a step of length one moves the command by one unit of that noise, whatever the
-units of the states. On the seat, at four torque limits, a trust region in these coordinates reached
+inputs, and G gives the inputs the size of that noise (`natural_coordinates`; with one input it is
+1), so that a step of length one moves the command by one unit of that noise, whatever the units of
+states and inputs. S = L F F'L' with the first S = LL' and F lower triangular, for the same reason.
+On the seat, at four torque limits, a trust region in these coordinates reached
 the gain from 7 of 11 starts, in raw entries from 5, and in raw entries with columns scaled by the
 Jacobian from 4 (docs/fitting.md; experiments/benchmarks/search.py). No optimal regulator has a
 K T of norm above (tr(B'PB)/R)^(1/2), because white noise costs it tr(B'PB) a sample, of which
@@ -98,9 +100,9 @@ class Coordinates:
         self.problem = problem
         plant = problem.plant
         self.m, self.n, self.trials = plant.m, plant.n, len(problem.recordings)
-        self.T, _ = natural_coordinates(plant, gain)
+        self.T, self.G = natural_coordinates(plant, gain)
         self.start_unit = start_unit(problem, gain)
-        self.factor = np.linalg.cholesky(metric / metric[0, 0])
+        self.first = np.linalg.cholesky(metric * (plant.m / np.trace(metric)))
         self.tril = np.tril_indices(self.m)
         self.refused: list[str] = []
         self.last: tuple[bytes, Compressed] | None = None
@@ -120,7 +122,7 @@ class Coordinates:
         given = np.array([trial.x0 for trial in self.problem.recordings])
         if len(starts):
             given = given + starts.reshape(self.trials, self.n) @ self.start_unit.T
-        gain = np.linalg.solve(self.T.T, flat.reshape(self.m, self.n).T).T
+        gain = self.G @ np.linalg.solve(self.T.T, flat.reshape(self.m, self.n).T).T
         return Point(
             np.asarray(gain, dtype=np.float64),
             self._metric(factor),
@@ -165,12 +167,25 @@ class Coordinates:
     def _pack(self, gain: Array) -> Array:
         shapes = np.diff(np.concatenate([[0], self.ends]))
         nuisance = np.zeros(int(shapes[2] + shapes[3]))
-        return np.concatenate([np.ravel(gain @ self.T), self.factor[self.tril][1:], nuisance])
+        natural = np.linalg.solve(self.G, gain @ self.T)
+        return np.concatenate([natural.ravel(), np.eye(self.m)[self.tril][1:], nuisance])
 
-    def _metric(self, entries: Array) -> Array:
+    def _factor(self, entries: Array) -> Array:
         factor = np.zeros((self.m, self.m))
         factor[self.tril] = np.concatenate([[1.0], entries])
+        return np.asarray(self.first @ factor, dtype=np.float64)
+
+    def _metric(self, entries: Array) -> Array:
+        factor = self._factor(entries)
         return np.asarray(factor @ factor.T)
+
+    def metric_changes(self, z: Array) -> Array:
+        """Change of the metric with each entry of its factor, at z (q,): (k, m, m)."""
+        factor, changes = self._factor(z[self.ends[0] : self.ends[1]]), []
+        for row, column in list(zip(*self.tril, strict=True))[1:]:
+            change = np.outer(self.first[:, row], factor[:, column])
+            changes.append(change + change.T)
+        return np.array(changes).reshape(-1, self.m, self.m)
 
     def _compress(self, found: Evaluation, z: Array) -> Compressed:
         """Factor derivative and residual together, trial by trial, then apply the chain rule."""
@@ -179,8 +194,11 @@ class Coordinates:
             parts.append(found.dS.reshape(-1, self.m**2) @ self._metric_chain(z))
         width = int(self.ends[-1])
         rows, row = [], 0
-        for index, trial in enumerate(self.problem.recordings):
-            mine = slice(row, row + trial.outputs.size)
+        sizes = [trial.outputs.size for trial in self.problem.recordings]
+        if not self.problem.unknown_start:  # no column belongs to one trial: all are one block
+            sizes = [sum(sizes)]
+        for index, size in enumerate(sizes):
+            mine = slice(row, row + size)
             row = mine.stop
             blocks = [part[mine] for part in parts]
             blocks += [found.dx0[mine] @ self.start_unit] if found.dx0.shape[1] else []
@@ -200,22 +218,16 @@ class Coordinates:
         return np.concatenate([shared, own, np.arange(self.ends[2], self.ends[3] + 1)])
 
     def _gain_chain(self) -> Array:
-        return np.asarray(np.kron(np.eye(self.m), np.linalg.inv(self.T).T), dtype=np.float64)
+        return np.asarray(np.kron(self.G, np.linalg.inv(self.T).T), dtype=np.float64)
 
     def _metric_chain(self, z: Array) -> Array:
         """Derivative of the scaled metric with respect to the entries of its factor: (m m, k)."""
-        factor = np.zeros((self.m, self.m))
-        factor[self.tril] = np.concatenate([[1.0], z[self.ends[0] : self.ends[1]]])
-        metric = factor @ factor.T
-        scale = self.m / np.trace(metric)
-        columns = []
-        for row, column in list(zip(*self.tril, strict=True))[1:]:
-            change = np.zeros((self.m, self.m))
-            change[row] = factor[:, column]
-            change = change + change.T
-            # The controller scales the metric to a mean diagonal of 1.
-            columns.append(scale * (change - metric * np.trace(change) / np.trace(metric)).ravel())
-        return np.column_stack(columns)
+        metric = self._metric(z[self.ends[0] : self.ends[1]])
+        # The controller scales the metric to a mean diagonal of 1.
+        scale, trace = self.m / np.trace(metric), np.trace(metric)
+        changes = self.metric_changes(z)
+        flat = [scale * (change - metric * np.trace(change) / trace).ravel() for change in changes]
+        return np.column_stack(flat)
 
 
 @dataclass(frozen=True)

@@ -25,8 +25,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy.linalg
 
-from impc.arrays import Array, finite_array, frozen, symmetric_matrix
-from impc.errors import WeightsError
+from impc.arrays import Array, Frozen, finite_array, frozen, symmetric_matrix
+from impc.door import checked
+from impc.errors import InputError, WeightsError
 from impc.lqr import is_stable, lyapunov_series
 from impc.step_program import block_basis
 from impc.weights import Weights
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
     from impc.plant import Plant
 
 __all__ = [
+    "RANK",
     "GainFibre",
     "floored_covariance",
     "gain_fibre",
@@ -45,16 +47,16 @@ __all__ = [
     "split_blocks",
 ]
 
-# Singular values of the gain condition below this, of the largest, are zero: exact gains leave
-# 1e-15 there (a singular A, or a metric given with its own gain), the seat's smallest is 4e-3.
-_RANK = 1e-10
+#: Singular values of the gain condition below this, of the largest, are zero: exact gains leave
+#: 1e-15 there (a singular A, or a metric given with its own gain), the seat's smallest is 4e-3.
+RANK = 1e-10
 # A direction that the inputs hardly reach is stretched no further than this, in variance; an input
 # direction that the loop hardly reproduces (always, when m > n) no further than that.
 _STATE_FLOOR, _INPUT_FLOOR = 1e-8, 1e-3
 
 
 @dataclass(frozen=True)
-class GainFibre:
+class GainFibre(Frozen):
     """The linear space of the pairs (Q, R) for which the gain is stationary.
 
     Attributes
@@ -100,7 +102,10 @@ class GainFibre:
         return split_blocks(back.T @ X @ back, self.plant.n)
 
 
-def gain_fibre(plant: Plant, gain: ArrayLike, metric: ArrayLike | None = None) -> GainFibre:
+@checked(gain="m n")
+def gain_fibre(
+    plant: Plant, gain: ArrayLike, metric: ArrayLike | None = None, rank: float = RANK
+) -> GainFibre:
     """Compute the space of the weights that have a given gain.
 
     Parameters
@@ -111,12 +116,17 @@ def gain_fibre(plant: Plant, gain: ArrayLike, metric: ArrayLike | None = None) -
         K (m, n) of u = -Kx.
     metric : array_like, optional
         S (m, m), known up to scale: only pairs whose R + B'PB (continuous: R) is a multiple of
-        it. With a single input it says nothing.
+        it. Where the recordings tell less of it, a basis (k, m, m) of the metrics that they leave
+        (`GainFit.metrics`): only pairs whose R + B'PB is in its span. With a single input it says
+        nothing.
+    rank : float
+        Singular values of the conditions below this, of the largest, count as zero. More than the
+        1e-10 of exact gains gives the weights whose gain and metric come near given ones.
 
     Raises
     ------
     DataError, InputError
-        When the gain is not a finite (m, n) matrix or the metric not a symmetric (m, m) one.
+        When the gain is not a finite (m, n) matrix, or a metric not a symmetric (m, m) one.
     WeightsError
         When A - BK is not stable: no weights have such a gain.
     """
@@ -134,9 +144,8 @@ def gain_fibre(plant: Plant, gain: ArrayLike, metric: ArrayLike | None = None) -
     if metric is not None:
         conditions = _add_metric(conditions, R + B.T @ P @ B if plant.discrete else R, G, metric)
     _, singular, directions = np.linalg.svd(conditions.T)
-    rank = int(np.count_nonzero(singular > _RANK * singular[0]))
-    # The metric's scale is one more unknown: it is left out of the pairs, which stay independent.
-    members = np.linalg.qr(directions[rank:, : len(units)].T)[0].T
+    count = int(np.count_nonzero(singular > rank * singular[0]))
+    members = directions[count:]
     return GainFibre(
         plant,
         frozen(K),
@@ -216,8 +225,18 @@ def _lyapunov(plant: Plant, F: Array, stack: Array) -> Array:
 
 
 def _add_metric(conditions: Array, S: Array, G: Array, metric: ArrayLike) -> Array:
-    """Rows S - s metric = 0, with one more unknown s."""
-    given = G.T @ symmetric_matrix("metric", metric, len(G)) @ G
-    rows = np.hstack([conditions, S.reshape(len(S), -1)])
-    scale = np.concatenate([np.zeros(conditions.shape[1]), -given.ravel() / np.linalg.norm(given)])
-    return np.vstack([rows, scale])
+    """Rows that keep S (k, m, m), natural, in the span of the given metrics."""
+    given = [symmetric_matrix("metric", item, len(G)) for item in _stack(metric)]
+    sizes = [float(np.max(np.abs(item))) for item in given]
+    if not given or min(sizes) == 0:
+        raise InputError("metric", "is zero", "give R + B'PB, up to scale")
+    scaled = zip(given, sizes, strict=True)
+    spanned = np.array([(G.T @ (item / size) @ G).ravel() for item, size in scaled]).T
+    basis, _ = np.linalg.qr(spanned / np.linalg.norm(spanned, axis=0))
+    flat = S.reshape(len(S), -1)
+    return np.hstack([conditions, flat - flat @ basis @ basis.T])
+
+
+def _stack(metric: ArrayLike) -> list[ArrayLike]:
+    """One metric, or a basis of them (k, m, m), as a list."""
+    return [metric] if np.ndim(metric) < 3 else list(np.asarray(metric))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.agreement import centred_vaf, vaf
-from impc.arrays import Array, frozen
+from impc.arrays import Array, Frozen, frozen
 from impc.closed_loop import simulate
 from impc.gain_fibre import natural_coordinates
 from impc.initial_states import with_fitted_starts
@@ -22,7 +22,7 @@ __all__ = ["HeldOut", "left_out_vaf", "predict"]
 
 
 @dataclass(frozen=True)
-class HeldOut:
+class HeldOut(Frozen):
     """One trial as the fit of the others predicts it.
 
     Attributes

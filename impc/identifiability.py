@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.arrays import Array, frozen
+from impc.arrays import Array, Frozen, frozen
 from impc.closed_loop import simulate
 from impc.conditioned_fit import Residual, weight_jacobian
+from impc.door import checked
 from impc.equivalent_weights import gain_fibre, other_weights
 from impc.evaluation import evaluate
 from impc.inverse_problem import controller_for, misfit, scenarios
@@ -52,7 +53,7 @@ class OtherWeights:
 
 
 @dataclass(frozen=True)
-class Identifiability:
+class Identifiability(Frozen):
     """Result of `identifiability`.
 
     Attributes
@@ -80,6 +81,7 @@ class Identifiability:
     others: tuple[OtherWeights, ...]
 
 
+@checked
 def identifiability(problem: InverseProblem, weights: Weights) -> Identifiability:
     """Count what the recordings determine at the given weights.
 

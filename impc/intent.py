@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.arrays import Array, frozen
+from impc.arrays import Array, Frozen, frozen
 from impc.equivalent_weights import (
     analytic_centre,
     least_condition_weights,
@@ -38,7 +38,7 @@ _NAMED = 0.05
 
 
 @dataclass(frozen=True)
-class Reading:
+class Reading(Frozen):
     """The intent as one choice of weights shows it.
 
     Attributes
@@ -71,7 +71,7 @@ class Reading:
 
 
 @dataclass(frozen=True)
-class Intent:
+class Intent(Frozen):
     """Readings of the intent behind one gain; the first is the dissertation's.
 
     Attributes
@@ -98,7 +98,7 @@ class Intent:
         return max(item.angle for item in self.readings)
 
 
-def intent(plant: Plant, gain: Array, sizes: Array, fallback: Weights) -> Intent:
+def intent(plant: Plant, gain: Array, metrics: Array, sizes: Array, fallback: Weights) -> Intent:
     """Read the intent from the weights that have a gain.
 
     Parameters
@@ -106,6 +106,8 @@ def intent(plant: Plant, gain: Array, sizes: Array, fallback: Weights) -> Intent
     plant : Plant
     gain : Array
         K (m, n).
+    metrics : Array
+        Basis of the metrics that the recordings do not tell apart (k, m, m), see `GainFit`.
     sizes : Array
         Typical size of each state (n,), positive, in its unit.
     fallback : Weights
@@ -114,7 +116,7 @@ def intent(plant: Plant, gain: Array, sizes: Array, fallback: Weights) -> Intent
     """
     readings: list[Reading] = []
     missing: list[str] = []
-    for rule, choose in _rules(plant, gain, sizes):
+    for rule, choose in _rules(plant, gain, metrics, sizes):
         try:
             found = choose()
         except (WeightsError, SolverError) as error:
@@ -158,9 +160,9 @@ _PLANT_UNITS = "least condition number, plant units (the dissertation's)"
 
 
 def _rules(
-    plant: Plant, gain: Array, sizes: Array
+    plant: Plant, gain: Array, metrics: Array, sizes: Array
 ) -> list[tuple[str, Callable[[], list[Weights]]]]:
-    fibre = gain_fibre(plant, gain)
+    fibre = gain_fibre(plant, gain, metrics)
 
     @functools.cache
     def members() -> WeightsSet:
@@ -168,7 +170,7 @@ def _rules(
         return weights_set(fibre)
 
     def in_units(T: Array) -> list[Weights]:
-        scaled = gain_fibre(change_coordinates(plant, T), gain @ T)
+        scaled = gain_fibre(change_coordinates(plant, T), gain @ T, metrics)
         found = least_condition_weights(scaled).weights
         back = np.linalg.inv(T)
         return [normalised(stage_weights(back.T @ found.Q @ back, found.R))]

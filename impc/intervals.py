@@ -11,22 +11,19 @@ docs/fitting.md says how often each covers the truth.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.stats
 
-from impc.arrays import Array, frozen
-from impc.gain_covariance import gain_covariance
-from impc.residual_noise import white_noise
-
 if TYPE_CHECKING:
-    from impc.fitted_controller import FittedController
+    from impc.arrays import Array
     from impc.gain_covariance import GainCovariance
+    from impc.gain_estimate import GainEstimate
     from impc.plant import Plant
 
-__all__ = ["LEVEL", "Interval", "covariance_intervals", "entry_names", "white_covariance"]
+__all__ = ["LEVEL", "Interval", "covariance_intervals", "entry_names"]
 
 #: Of an interval, where none is asked for.
 LEVEL = 0.95
@@ -48,6 +45,10 @@ class Interval:
         The estimate; None when nothing determines it.
     low, high : float
         Infinite where the recordings set no end.
+    told : bool
+        Whether the recordings tell this number by itself. Where they do not, a covariance's
+        interval is that of a plain least-squares estimate, while the value is kept near where the
+        search began: it holds the truth more often than its level. A bootstrap's has no ends.
     """
 
     name: str
@@ -56,6 +57,7 @@ class Interval:
     value: float | None
     low: float
     high: float
+    told: bool = True
 
 
 def entry_names(plant: Plant) -> tuple[str, ...]:
@@ -63,44 +65,41 @@ def entry_names(plant: Plant) -> tuple[str, ...]:
     return tuple(f"K.{control}.{state}" for control in plant.controls for state in plant.states)
 
 
-def white_covariance(fitted: FittedController) -> GainCovariance:
-    """The Cramér-Rao counterpart of the sandwich covariance, at the gain of the weights."""
-    solution = fitted.solution
-    reported = replace(
-        fitted.free, K=frozen(solution.K), S=frozen(solution.S), problem=fitted.problem
-    )
-    return gain_covariance(reported, white_noise)
-
-
 def covariance_intervals(
-    fitted: FittedController, covariance: GainCovariance, method: str, level: float = LEVEL
+    estimate: GainEstimate, covariance: GainCovariance, method: str, level: float = LEVEL
 ) -> tuple[Interval, ...]:
     """Normal intervals of the entries of K and of the parameters.
 
     Parameters
     ----------
-    fitted : FittedController
+    estimate : GainEstimate
     covariance : GainCovariance
-        At its gain.
+        Its own, for coloured residuals or for white ones.
     method : str
         Name of the covariance, for the record.
     level : float
         Of the interval, between 0 and 1.
     """
     z = float(scipy.stats.norm.ppf(0.5 + level / 2))
-    K = np.ravel(fitted.solution.K)
-    names = entry_names(fitted.problem.plant)
-    half = z * np.ravel(covariance.entries)
+    names = entry_names(estimate.problem.plant)
     found = [
-        Interval(name, method, level, float(value), float(value - size), float(value + size))
-        for name, value, size in zip(names, K, half, strict=True)
+        Interval(name, method, level, float(value), float(value - half), float(value + half), told)
+        for name, value, half, told in zip(
+            names,
+            np.ravel(estimate.K),
+            z * np.ravel(covariance.entries),
+            np.ravel(covariance.told_entries).tolist(),
+            strict=True,
+        )
     ]
-    family = fitted.problem.family
+    family = estimate.problem.family
     if family is not None:
-        values = np.asarray(family.nominal * np.exp(fitted.problem.logarithms))
-        for name, value, deviation in zip(family.names, values, covariance.parameters, strict=True):
+        for name, value, deviation in zip(
+            family.names, estimate.parameters, covariance.parameters, strict=True
+        ):
             low, high = _around(value, z * float(deviation))
-            found.append(Interval(name, method, level, float(value), low, high))
+            told = bool(np.isfinite(deviation))
+            found.append(Interval(name, method, level, float(value), low, high, told))
     return tuple(found)
 
 

@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy.optimize
 
-from impc.arrays import Array, finite_array, frozen
+from impc.arrays import Array, Frozen, finite_array, frozen
 from impc.cross_term import CrossTerm, inverse_lqr_cross_term
+from impc.door import checked
 from impc.equivalent_weights import gain_fibre, least_condition_weights, weights_margin
 from impc.errors import WeightsError
 from impc.lqr import gain_gradients, is_stable, solve_lqr
@@ -36,7 +37,7 @@ __all__ = [
 
 
 @dataclass(frozen=True)
-class InverseLqr:
+class InverseLqr(Frozen):
     """Weights for a gain, or the finding that there are none.
 
     Attributes
@@ -69,6 +70,7 @@ class InverseLqr:
     status: str
 
 
+@checked(gain="m n")
 def inverse_lqr_lmi(plant: Plant, gain: ArrayLike) -> InverseLqr:
     """Weights of least condition number with exactly the gain, if there are any.
 
@@ -101,6 +103,7 @@ def inverse_lqr_lmi(plant: Plant, gain: ArrayLike) -> InverseLqr:
     return _result(solve_lqr(plant, found.weights), K, "lmi", 1, found.status)
 
 
+@checked(gain="m n", max_evaluations=1, floor=0)
 def inverse_lqr_gradient(
     plant: Plant,
     gain: ArrayLike,
@@ -160,7 +163,7 @@ def inverse_lqr_gradient(
 
 
 @dataclass(frozen=True)
-class _FactorSpace:
+class _FactorSpace(Frozen):
     """Q = LL' + f I and R = GG' + f I, the entries of L and G but G[0, 0] as parameters."""
 
     plant: Plant

@@ -7,7 +7,7 @@ weights of least condition number among all those with that gain are one semidef
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,15 +16,16 @@ from impc.arrays import Array
 from impc.closed_loop import simulate
 from impc.conditioned_fit import ConditionedFit, Objective, Residual, conditioned_fit
 from impc.controller import mpc_controller
-from impc.diagonal_weights import bryson_weights
-from impc.equivalent_weights import gain_fibre, least_condition_weights
-from impc.errors import SolverError, WeightsError
+from impc.diagonal_weights import bryson_regulators
+from impc.door import checked
 from impc.evaluation import evaluate
-from impc.gain import GainFit, fit_gain
+from impc.gain import EXPLAINED, GainFit, fit_gain
 from impc.inverse_lqr import inverse_lqr_gradient, inverse_lqr_lmi
-from impc.inverse_problem import scenarios, without_bounds
+from impc.inverse_problem import recorded_size, scenarios, typical_output, without_bounds
 from impc.lqr import solve_lqr
 from impc.weights import Weights, condition_number, normalised, stage_weights
+from impc.weights_behind import weights_behind
+from impc.weights_search import search_weights
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -36,10 +37,12 @@ if TYPE_CHECKING:
     from impc.lqr import LqrSolution
     from impc.plant import Plant
     from impc.terminal_set import TerminalSet
+    from impc.weights_behind import WeightsBehind
 
 __all__ = [
     "AUXILIARY_CONDITION_WEIGHT",
     "CONDITION_WEIGHT",
+    "DirectFit",
     "Inference",
     "ReducedFit",
     "Start",
@@ -54,14 +57,29 @@ __all__ = [
 ]
 
 # c of (3.5) to (3.7) is lost. Small enough that the exact fit wins in the 2-norm (docs/theory.md).
-#: Weight of the condition number in (3.6) and (3.16), against 1 for the misfit.
+#: Weight of the condition number in (3.6) and (3.16), against 1 for a misfit of a typical output.
 CONDITION_WEIGHT = 1e-4
-#: The same in (3.7), against 1 for the distance of the gains.
+#: The same in (3.7), against 1 for a distance as large as the gain in `infer_weights`.
 AUXILIARY_CONDITION_WEIGHT = 1e-3
 # Steps of the direct form inside the reduced one: it need not end, only change the valley.
 _DETOUR = 60
 # Starting weights are kept this definite: the search takes the Cholesky factor of them.
 _LARGEST_START_CONDITION = 1e6
+
+
+@dataclass(frozen=True)
+class DirectFit(ConditionedFit):
+    """Result of `inverse_mpc`: what every `ConditionedFit` says, and whether it explains.
+
+    Attributes
+    ----------
+    explained : bool
+        Whether the constrained controller of the weights reproduces the recordings to 1e-9 of
+        them. Where `converged` is true and this is not, the search ended in a minimum of its
+        objective that leaves a misfit: noise, a model that is wrong, or a local minimum.
+    """
+
+    explained: bool
 
 
 @dataclass(frozen=True)
@@ -74,10 +92,13 @@ class ReducedFit:
         What the recordings determine.
     equivalent : EquivalentWeights or None
         Weights of least condition number with exactly that gain; None when there are none.
-    direct : ConditionedFit or None
-        Weights of the direct form, when none have exactly that gain.
+    direct : DirectFit or None
+        Weights of the direct form, when none have exactly that gain, or those that do fit worse.
+    explained : bool
+        Whether the constrained controller of these weights reproduces the recordings to 1e-9 of
+        them.
     reason : str
-        Why the direct form was needed; empty when it was not.
+        Why not; empty when it does.
     kept_hard : bool
         Whether the controller found reaches every sample with hard state bounds and terminal set,
         which the search had softened; see `verify_hard`.
@@ -85,7 +106,8 @@ class ReducedFit:
 
     gain: GainFit
     equivalent: EquivalentWeights | None
-    direct: ConditionedFit | None
+    direct: DirectFit | None
+    explained: bool
     reason: str
     kept_hard: bool
 
@@ -130,24 +152,23 @@ class Inference:
     ----------
     start : Start
         Lines 1 to 8.
-    fit : ConditionedFit
+    fit : DirectFit
         Line 9.
     """
 
     start: Start
-    fit: ConditionedFit
+    fit: DirectFit
 
 
-def infer_weights(
-    problem: InverseProblem, *, condition_weight: float = CONDITION_WEIGHT
-) -> Inference:
+@checked(condition_weight=0)
+def infer_weights(problem: InverseProblem, *, condition_weight: float | None = None) -> Inference:
     """Table 3.1: from recordings to the weights of the constrained controller behind them.
 
     Parameters
     ----------
     problem : InverseProblem
-    condition_weight : float
-        Weight of the condition number against the 2-norm of the misfit, in (3.6).
+    condition_weight : float, optional
+        Of the direct form, see `inverse_mpc`.
 
     Raises
     ------
@@ -168,6 +189,7 @@ def start_gains(start: Start, plant: Plant) -> list[tuple[Array, Array]]:
     return [(np.array(start.gain.K), pairs[0][1]), *pairs]
 
 
+@checked
 def starting_point(problem: InverseProblem) -> Start:
     """Lines 1 to 8 of Table 3.1: a feedback gain, and the weights of a regulator like it.
 
@@ -182,18 +204,21 @@ def starting_point(problem: InverseProblem) -> Start:
     if lmi.weights is not None:
         return Start(gain, lmi, None, None, lmi.weights)
     gradient = inverse_lqr_gradient(plant, gain.K)
-    auxiliary = auxiliary_weights(plant, gain.K, gradient.weights)
+    weight = AUXILIARY_CONDITION_WEIGHT * (float(np.linalg.norm(gain.K)) or 1.0)
+    auxiliary = auxiliary_weights(plant, gain.K, gradient.weights, condition_weight=weight)
     return Start(gain, lmi, gradient, auxiliary, auxiliary.weights)
 
 
+@checked(condition_weight=0, max_iterations=1)
 def inverse_mpc(
     problem: InverseProblem,
     start: Weights,
     *,
-    condition_weight: float = CONDITION_WEIGHT,
+    condition_weight: float | None = None,
     squared: bool = False,
     max_iterations: int = 200,
-) -> ConditionedFit:
+    explain: bool = True,
+) -> DirectFit:
     """Direct inverse MPC (3.6): misfit of the constrained closed loop plus condition number.
 
     Terminal weight and terminal set follow (Q, R) at every iterate.
@@ -202,28 +227,66 @@ def inverse_mpc(
     ----------
     start : Weights
         Positive definite, from Table 3.1 for example.
-    condition_weight : float
-        Against a fit weight of 1.
+    condition_weight : float, optional
+        Against a fit weight of 1. By default 1e-4 of a typical output (over its scale), so that the
+        answer does not depend on units.
     squared : bool
         Whether the misfit is the square of its 2-norm; see `Objective`.
     max_iterations : int
         Steps that are solved at most.
+    explain : bool
+        Whether weights that explain the recordings are looked for where the minimum does not, and
+        taken instead: the minimum at every condition weight that is small enough (docs/theory.md,
+        section 6). Only in the 2-norm, and without a condition weight of the caller's.
 
     Raises
     ------
     WeightsError, SolverError
         As `conditioned_fit`.
     """
-    objective = Objective(_closed_loop_residual(problem), 1.0, condition_weight, squared)
-    return conditioned_fit(
-        problem.plant, objective, _definite(start), max_iterations=max_iterations
+    weight = condition_weight
+    if weight is None:
+        weight = CONDITION_WEIGHT * typical_output(problem)
+    objective = Objective(_closed_loop_residual(problem), 1.0, weight, squared)
+    fit = conditioned_fit(problem.plant, objective, _definite(start), max_iterations=max_iterations)
+    found = _direct(problem, fit)
+    if found.explained or not explain or squared or condition_weight is not None:
+        return found
+    return _explaining(problem, found, weight)
+
+
+def _direct(problem: InverseProblem, fit: ConditionedFit) -> DirectFit:
+    explained = fit.misfit <= EXPLAINED * recorded_size(problem)
+    values = {item.name: getattr(fit, item.name) for item in fields(ConditionedFit)}
+    return DirectFit(**values, explained=explained)
+
+
+def _explaining(problem: InverseProblem, found: DirectFit, weight: float) -> DirectFit:
+    """Weights of least condition number that explain the recordings, if any; else those given."""
+    near = search_weights(problem, found.weights)
+    start = np.array(near.solution.K), np.array(near.solution.S)
+    behind = weights_behind(fit_gain(problem, start, attempts=1, regulators=False))
+    if not behind.explained or behind.equivalent is None:
+        return found
+    weights, condition = behind.equivalent.weights, behind.equivalent.condition
+    return replace(
+        found,
+        weights=weights,
+        solution=solve_lqr(problem.plant, weights),
+        misfit=behind.misfit,
+        condition=condition,
+        objective=behind.misfit + weight * condition,
+        evaluations=found.evaluations + near.evaluations + behind.gain.evaluations,
+        converged=True,
+        explained=True,
     )
 
 
+@checked(condition_weight=0)
 def inverse_mpc_reduced(
     problem: InverseProblem,
     *starts: tuple[Array, Array],
-    condition_weight: float = CONDITION_WEIGHT,
+    condition_weight: float | None = None,
 ) -> ReducedFit:
     """Reduced inverse MPC: fit the gain through the constrained controller, then one program.
 
@@ -235,61 +298,49 @@ def inverse_mpc_reduced(
     ----------
     starts : pairs of Array
         Gains (m, n) and metrics (m, m) from which the search may start, see `fit_gain`.
-    condition_weight : float
-        Of the direct form.
+    condition_weight : float, optional
+        Of the direct form, see `inverse_mpc`.
 
     Raises
     ------
     SolverError
         When the recordings cannot be simulated from any start.
     """
-    first = fit_gain(problem, *starts, attempts=2)
-    equivalent, reason = _least_condition(problem.plant, first)
-    if equivalent is not None and first.explained:
-        return _with_gain(problem, first, equivalent)
+    first = weights_behind(fit_gain(problem, *starts, attempts=2))
+    if first.explained:
+        return _with_gain(problem, first)
     direct = inverse_mpc(
         problem,
         _most_promising(problem),
         condition_weight=condition_weight,
         max_iterations=_DETOUR,
+        explain=False,
     )
-    end = (np.array(direct.solution.K), np.array(direct.solution.S))
-    second = fit_gain(problem, end, attempts=1)
-    if equivalent is not None and first.misfit <= second.misfit:
-        return _with_gain(problem, first, equivalent)
-    again, _ = _least_condition(problem.plant, second)
-    if again is not None:
-        return _with_gain(problem, second, again)
-    if equivalent is not None:
-        return _with_gain(problem, first, equivalent)
+    end = search_weights(problem, direct.weights).solution
+    second = weights_behind(fit_gain(problem, (np.array(end.K), np.array(end.S)), attempts=1))
+    best = min(first, second, key=lambda item: item.misfit)
+    if best.misfit <= direct.misfit:
+        return _with_gain(problem, best)
     kept = all(run.complete for run in verify_hard(problem, direct.weights))
-    return ReducedFit(first, None, direct, reason, kept)
+    return ReducedFit(first.gain, None, direct, False, first.reason, kept)
 
 
-def _with_gain(problem: InverseProblem, fit: GainFit, equivalent: EquivalentWeights) -> ReducedFit:
-    kept = all(run.complete for run in verify_hard(problem, equivalent.weights))
-    return ReducedFit(fit, equivalent, None, "", kept)
+def _with_gain(problem: InverseProblem, found: WeightsBehind) -> ReducedFit:
+    assert found.equivalent is not None  # its misfit is finite
+    kept = all(run.complete for run in verify_hard(problem, found.equivalent.weights))
+    return ReducedFit(found.gain, found.equivalent, None, found.explained, found.reason, kept)
 
 
 def _most_promising(problem: InverseProblem) -> Weights:
     """Of `bryson_weights` those with the least misfit, whether or not every sample is reached."""
 
-    def distance(weights: Weights) -> float:
-        solution = solve_lqr(problem.plant, weights)
+    def distance(solution: LqrSolution) -> float:
         return float(np.linalg.norm(evaluate(problem, solution.K, solution.S).residual))
 
-    return min(bryson_weights(problem), key=distance)
+    return min(bryson_regulators(problem), key=lambda item: distance(item[1]))[0]
 
 
-def _least_condition(plant: Plant, fit: GainFit) -> tuple[EquivalentWeights | None, str]:
-    """The weights of least condition number with the fitted gain, or why there are none."""
-    try:
-        fibre = gain_fibre(plant, fit.K, fit.S if fit.metric_determined else None)
-        return least_condition_weights(fibre), ""
-    except (WeightsError, SolverError) as error:  # none, or none that could be certified
-        return None, str(error)
-
-
+@checked(gain="m n", condition_weight=0)
 def auxiliary_weights(
     plant: Plant,
     gain: Array,
@@ -328,11 +379,12 @@ def auxiliary_weights(
     )
 
 
+@checked(condition_weight=0)
 def output_penalty_weights(
     problem: InverseProblem,
     start: Weights,
     *,
-    condition_weight: float = CONDITION_WEIGHT,
+    condition_weight: float | None = None,
 ) -> ConditionedFit:
     """Inverse LQR on the outputs (3.16): as `inverse_mpc`, but the loop is the plain regulator.
 
@@ -340,17 +392,20 @@ def output_penalty_weights(
     ----------
     start : Weights
         Positive definite.
-    condition_weight : float
-        Against a fit weight of 1.
+    condition_weight : float, optional
+        Against a fit weight of 1, see `inverse_mpc`.
 
     Raises
     ------
     WeightsError, SolverError
         As `inverse_mpc`.
     """
-    return inverse_mpc(without_bounds(problem), start, condition_weight=condition_weight)
+    return inverse_mpc(
+        without_bounds(problem), start, condition_weight=condition_weight, explain=False
+    )
 
 
+@checked
 def verify_hard(problem: InverseProblem, weights: Weights) -> list[Simulation]:
     """Simulate every recording with hard state bounds and terminal set.
 

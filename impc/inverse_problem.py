@@ -11,18 +11,21 @@ at other values of these (docs/theory.md, section 6; docs/fitting.md).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from impc.arrays import Array, finite_array, frozen
 from impc.bounds import box_bounds
 from impc.closed_loop import Scenario
-from impc.controller import Controller, gain_controller
+from impc.controller import LONGEST_HORIZON, Controller, gain_controller
+from impc.door import Value, checked
 from impc.errors import DataError, InputError
 from impc.plant_family import plant_at
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import ArrayLike
 
     from impc.bounds import Bounds
@@ -38,13 +41,15 @@ __all__ = [
     "inverse_problem",
     "misfit",
     "moved",
+    "recorded_size",
     "scenarios",
+    "typical_output",
     "without_bounds",
 ]
 
 
 @dataclass(frozen=True)
-class InverseProblem:
+class InverseProblem(Value):
     """Find the controller that made the recordings.
 
     Attributes
@@ -69,6 +74,12 @@ class InverseProblem:
         Logarithms of the family's parameters over their nominal values at which `plant` is (k,).
     """
 
+    _rules: ClassVar[Mapping[str, Any]] = {
+        "horizon": (1, LONGEST_HORIZON),
+        "output_scale": "p",
+        "logarithms": "*",
+    }
+
     plant: Plant
     bounds: Bounds
     horizon: int
@@ -81,6 +92,7 @@ class InverseProblem:
     logarithms: Array
 
 
+@checked(horizon=(1, LONGEST_HORIZON), output_scale="p")
 def inverse_problem(
     plant: Plant,
     bounds: Bounds,
@@ -106,7 +118,8 @@ def inverse_problem(
     terminal_set, softening, unknown_start, family
         See `InverseProblem`.
     output_scale : array_like, optional
-        (p,), positive; 1 by default.
+        (p,), positive; by default the root-mean-square of each output over all recordings, so
+        that no answer depends on units. An output that is zero throughout counts as the largest.
 
     Raises
     ------
@@ -117,7 +130,8 @@ def inverse_problem(
     if not recordings:
         raise DataError("recordings", "there are none", "give at least one trial")
     p = len(plant.outputs)
-    scale = finite_array("output_scale", np.ones(p) if output_scale is None else output_scale, (p,))
+    given = _root_mean_square(recordings) if output_scale is None else output_scale
+    scale = finite_array("output_scale", given, (p,))
     if np.any(scale <= 0):
         raise InputError("output_scale", f"got {scale.tolist()}", "give positive numbers")
     return InverseProblem(
@@ -132,6 +146,14 @@ def inverse_problem(
         family,
         frozen(np.zeros(0 if family is None else len(family.names))),
     )
+
+
+def _root_mean_square(recordings: tuple[Recording, ...]) -> Array:
+    outputs = np.concatenate([trial.outputs for trial in recordings])
+    largest = np.max(np.abs(outputs), axis=0)
+    unit = np.where(largest > 0, largest, 1.0)  # squares of 1e200 are none
+    size = largest * np.sqrt(np.mean((outputs / unit) ** 2, axis=0))
+    return np.where(size > 0, size, np.max(size) or 1.0)
 
 
 def moved(problem: InverseProblem, starts: Array, logarithms: Array) -> InverseProblem:
@@ -153,6 +175,7 @@ def moved(problem: InverseProblem, starts: Array, logarithms: Array) -> InverseP
     return replace(problem, plant=plant, recordings=recordings, logarithms=frozen(logarithms))
 
 
+@checked
 def without_bounds(problem: InverseProblem) -> InverseProblem:
     """Return the same problem for a plain feedback gain: no bounds, no terminal set."""
     return replace(problem, bounds=box_bounds(problem.plant), terminal_set=False)
@@ -185,6 +208,18 @@ def controller_for(
 def scenarios(problem: InverseProblem) -> list[Scenario]:
     """What drives each recording."""
     return [Scenario(trial.x0, trial.disturbance[:-1]) for trial in problem.recordings]
+
+
+def recorded_size(problem: InverseProblem) -> float:
+    """2-norm of all recorded outputs, each divided by its scale."""
+    parts = [(trial.outputs / problem.output_scale).ravel() for trial in problem.recordings]
+    return float(np.linalg.norm(np.concatenate(parts)))
+
+
+def typical_output(problem: InverseProblem) -> float:
+    """Root-mean-square of all recorded outputs over their scales: 1 at the default scales."""
+    count = sum(trial.outputs.size for trial in problem.recordings)
+    return recorded_size(problem) / float(np.sqrt(count)) or 1.0
 
 
 def misfit(problem: InverseProblem, simulations: list[Simulation]) -> float:

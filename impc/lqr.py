@@ -19,7 +19,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy.linalg
 
-from impc.arrays import Array, frozen
+from impc.arrays import Array, Frozen, frozen
+from impc.door import checked
 from impc.errors import InputError, WeightsError
 
 if TYPE_CHECKING:
@@ -39,7 +40,7 @@ __all__ = [
 
 
 @dataclass(frozen=True)
-class LqrSolution:
+class LqrSolution(Frozen):
     """A plant, its weights, and the regulator that they make.
 
     Attributes
@@ -65,7 +66,7 @@ class LqrSolution:
 
 
 @dataclass(frozen=True)
-class Gradients:
+class Gradients(Frozen):
     """Derivatives of every entry of a matrix (a, b) with respect to the weights.
 
     Attributes
@@ -80,6 +81,7 @@ class Gradients:
     R: Array
 
 
+@checked
 def solve_lqr(plant: Plant, weights: Weights) -> LqrSolution:
     """Solve the Riccati equation of the plant and the weights.
 
@@ -124,6 +126,7 @@ def solve_lqr(plant: Plant, weights: Weights) -> LqrSolution:
     return LqrSolution(plant, weights, frozen(P), frozen(K), frozen(S), frozen(F))
 
 
+@checked(F="n n")
 def is_stable(F: Array, *, discrete: bool) -> bool:
     """Whether all eigenvalues of F (n, n) decay: |z| < 1 when `discrete`, else Re s < 0."""
     eigenvalues = np.linalg.eigvals(F)
@@ -168,6 +171,7 @@ def lyapunov_series(F: Array, right: Array) -> Array:
     raise _no_solution("the closed loop is not stable to working precision")
 
 
+@checked
 def gain_gradients(solution: LqrSolution) -> Gradients:
     """Exact derivatives of the gain K with respect to Q and R.
 
@@ -187,6 +191,7 @@ def gain_gradients(solution: LqrSolution) -> Gradients:
     return Gradients(gradients.Q.reshape(m, n, n, n), gradients.R.reshape(m, n, m, m))
 
 
+@checked
 def metric_gradients(solution: LqrSolution) -> Gradients:
     """Exact derivatives of the metric S = R + B'PB of a discrete plant: shapes (m, m, ...)."""
     B, m, n = solution.plant.B, solution.plant.m, solution.plant.n

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from impc.arrays import Array, frozen
+from impc.arrays import Array, Frozen, frozen
 from impc.diagonal_weights import diagonal_weights
 from impc.equivalent_weights import least_condition_weights
 from impc.errors import ImpcError, SolverError, WeightsError
@@ -36,6 +36,7 @@ from impc.lqr import is_stable, solve_lqr
 from impc.natural_fit import in_plant_units, inverse_mpc_natural
 from impc.plant import change_coordinates
 from impc.weights import stage_weights
+from impc.weights_behind import weights_behind
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -60,7 +61,7 @@ METHODS = (
 
 
 @dataclass(frozen=True)
-class Estimate:
+class Estimate(Frozen):
     """What one method makes of one set of recordings.
 
     Attributes
@@ -169,12 +170,9 @@ def _weights(find: Callable[[], Weights], reduced: Estimate, plant: Plant) -> Es
 
 
 def _reduced(begin: _Begin, problem: InverseProblem) -> Estimate:
-    free = free_gain(problem, begin.weights)
-    weights, reason = None, ""
-    try:
-        weights = least_condition_weights(gain_fibre(free.problem.plant, free.K)).weights
-    except WeightsError as error:
-        reason = str(error)
+    behind = weights_behind(free_gain(problem, begin.weights))
+    free, reason = behind.gain, behind.reason
+    weights = None if behind.equivalent is None else behind.equivalent.weights
     starts = frozen([trial.x0 for trial in free.problem.recordings])
     return Estimate(
         free.K, free.S, weights, starts, free.problem.logarithms, noise_of(free), 0.0, reason

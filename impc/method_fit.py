@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.agreement import vaf
-from impc.arrays import Array, frozen
+from impc.arrays import Array, Frozen, frozen
 from impc.closed_loop import Simulation, simulate
 from impc.inverse_problem import controller_for, scenarios
 
@@ -24,7 +24,7 @@ __all__ = ["MethodFit", "judge", "without_gain"]
 
 
 @dataclass(frozen=True)
-class MethodFit:
+class MethodFit(Frozen):
     """One method on all recordings.
 
     Attributes

@@ -19,6 +19,7 @@ import scipy.linalg
 
 from impc.arrays import Array, BoolArray, finite_array
 from impc.closed_loop import Simulation, Status
+from impc.door import checked
 from impc.errors import InputError
 from impc.prediction import build_rows
 
@@ -109,6 +110,7 @@ class MpcStep:
     excess: float
 
 
+@checked
 def build_mpc(controller: Controller, solver: str = "daqp") -> MpcSolver:
     """Write the controller's program in CasADi and hand it to a solver.
 
@@ -156,6 +158,7 @@ def build_mpc(controller: Controller, solver: str = "daqp") -> MpcSolver:
     return MpcSolver(controller, rows, solver, function, soft)
 
 
+@checked(x="n")
 def solve_mpc(mpc: MpcSolver, x: ArrayLike) -> MpcStep:
     """Solve the program at a state.
 
@@ -195,6 +198,7 @@ def solve_mpc(mpc: MpcSolver, x: ArrayLike) -> MpcStep:
     return MpcStep(plan[0], plan, states, status, violation)
 
 
+@checked
 def simulate_mpc(mpc: MpcSolver, given: Scenario) -> Simulation:
     """Simulate with a program at every sample; the slow counterpart of `closed_loop.simulate`."""
     plant = mpc.controller.plant

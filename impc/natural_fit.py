@@ -7,11 +7,10 @@ seat (radians beside the states of a delay) all weights near the answer have con
 the same weights have condition numbers of 10 to 100. There it is a mild regulariser, which is what
 (3.6) wants of it, and half a dozen prox-linear steps reach the answer.
 
-    minimise  ||r||^2 / ||r_free||^2 + share * kappa(blkdiag(T'QT, G'RG)) / kappa_start
+    minimise  ||r||^2 / ||r_free||^2 + kappa(blkdiag(T'QT, G'RG)) / kappa_start / samples
 
 r_free is the residual of the gain without weights (`fit_gain`), which says how much is noise; T and
-G are the natural coordinates of the start and stay. What the share of 1e-3 costs in VAF against
-that gain is measured in docs/fitting.md.
+G are the natural coordinates of the start and stay.
 """
 
 from __future__ import annotations
@@ -40,8 +39,11 @@ if TYPE_CHECKING:
 
 __all__ = ["CONDITION_SHARE", "in_plant_units", "inverse_mpc_natural"]
 
-#: What the condition number of the start counts, against a misfit as large as the noise.
-CONDITION_SHARE = 1e-3
+#: What the condition number of the start counts, in squared standard deviations of one sample's
+#: noise. It decides along directions that noise leaves open, and moves no other by as much as its
+#: own deviation; counted against all samples together (1e-3 of the squared misfit) it moved the
+#: gains of long, weakly excited recordings by several, and again at every restart.
+CONDITION_SHARE = 1.0
 # A step that promises less than this, of the objective, is below what the noise decides.
 _TOLERANCE = 1e-5
 
@@ -60,12 +62,12 @@ def inverse_mpc_natural(
     ----------
     problem : InverseProblem
     start : Weights
-        Positive definite. Their gain is kept and the weights of least condition number with it, in
-        natural coordinates, are where the search begins.
+        Positive definite. Their gain and metric are kept, and the weights of least condition number
+        with both, in natural coordinates, are where the search begins.
     noise : float
         2-norm of the residual that no weights are asked to explain; positive.
     condition_share : float
-        What the condition number of the start counts, against a misfit of `noise`.
+        What the condition number of the start counts, against the squared noise of one sample.
     max_iterations : int
         Steps that are solved at most.
 
@@ -82,11 +84,16 @@ def inverse_mpc_natural(
         When the start has no stabilising solution, or the recordings cannot be simulated with it.
     """
     plant = problem.plant
-    gain = solve_lqr(plant, start).K
-    T, G = natural_coordinates(plant, gain)
+    solution = solve_lqr(plant, start)
+    T, G = natural_coordinates(plant, solution.K)
     natural = change_coordinates(plant, T, G)
-    begin = least_condition_weights(gain_fibre(natural, np.linalg.solve(G, gain @ T))).weights
-    share = condition_share / condition_number(begin)
+    fibre = gain_fibre(natural, np.linalg.solve(G, solution.K @ T), G.T @ solution.S @ G)
+    member = split_blocks(
+        pair_blocks((T.T @ start.Q @ T)[None], (G.T @ start.R @ G)[None])[0], plant.n
+    )
+    begin = least_condition_weights(fibre, member).weights
+    samples = sum(trial.outputs.size for trial in problem.recordings)
+    share = condition_share / samples / condition_number(begin)
     objective = Objective(_residual(problem, T, G, noise), 1.0, share, squared=True)
     found = conditioned_fit(
         natural, objective, begin, max_iterations=max_iterations, tolerance=_TOLERANCE

@@ -10,22 +10,23 @@ disturbances has an E with no columns. What the controller makes of it: docs/the
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import scipy.linalg
 
 from impc.arrays import Array, frozen
+from impc.door import Value, checked
 from impc.errors import PlantError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
 __all__ = ["Plant", "as_plant", "change_coordinates"]
 
 
 @dataclass(frozen=True)
-class Plant:
+class Plant(Value):
     """A linear plant with named signals.
 
     Attributes
@@ -37,6 +38,14 @@ class Plant:
     states, controls, disturbances, outputs : tuple of str
         Names of the signals, in the order of the arrays.
     """
+
+    _rules: ClassVar[Mapping[str, Any]] = {
+        "A": "n n",
+        "B": "n m",
+        "E": "n d",
+        "C": "p n",
+        "dt": 0,
+    }
 
     A: Array
     B: Array
@@ -80,6 +89,7 @@ class Plant:
         return self
 
 
+@checked
 def as_plant(system: Any, controls: Sequence[str] | None = None) -> Plant:
     """Read the arrays and names from a `control.StateSpace`.
 
@@ -140,6 +150,7 @@ def as_plant(system: Any, controls: Sequence[str] | None = None) -> Plant:
     return plant
 
 
+@checked(T="n n", G="m m")
 def change_coordinates(plant: Plant, T: Array, G: Array | None = None) -> Plant:
     """Return the plant in z = T^-1 x and v = G^-1 u, T (n, n) and G (m, m); names stay."""
     back = np.linalg.inv(T)

@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from impc.arrays import Array, frozen
+from impc.arrays import Array, Frozen, frozen
+from impc.door import checked
 from impc.errors import InputError, PlantError
 
 if TYPE_CHECKING:
@@ -31,7 +32,7 @@ _ROUGH = 1e-3
 
 
 @dataclass(frozen=True)
-class PlantFamily:
+class PlantFamily(Frozen):
     """A plant for every value of some parameters.
 
     Attributes
@@ -64,6 +65,7 @@ class PlantDifferential(NamedTuple):
     C: Array
 
 
+@checked
 def plant_family(
     make: Callable[[Array], Plant], names: Sequence[str], nominal: Sequence[float]
 ) -> PlantFamily:
@@ -83,12 +85,15 @@ def plant_family(
     InputError
         When a nominal value is not a positive number: give it in a unit in which it is.
     """
+    if len(names) != len(nominal):
+        raise InputError("nominal", f"has {len(nominal)} values", f"give {len(names)}, one a name")
     for name, value in zip(names, nominal, strict=True):
         if not 0 < value < np.inf:
             raise InputError(f"parameter {name}", f"nominal value {value:g}", "give a positive one")
     return PlantFamily(make, tuple(names), frozen(nominal))
 
 
+@checked(logarithms="*")
 def plant_at(family: PlantFamily, logarithms: Array) -> Plant:
     """The plant at nominal * exp(logarithms), logarithms (k,)."""
     return family.make(family.nominal * np.exp(logarithms))

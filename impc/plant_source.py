@@ -1,33 +1,44 @@
-"""A plant from where a user keeps it: an import path with arguments, or a saved state space."""
+"""A plant from where a user keeps it: an import path with arguments, or a saved state space.
+
+A module that comes with the package, or with what is installed, is never looked for in the working
+folder: a file there called plants.py or numpy.py replaces nothing. Only a module of another name is
+looked for there, last, as long as it is being imported. What a user's function does wrong, whatever
+it raises, is one line that names it.
+"""
 
 from __future__ import annotations
 
-import importlib
+import importlib.util
 import inspect
-import json
+import os
 import sys
+import warnings
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import control
 import numpy as np
-import scipy.io
 
-from impc.errors import ImpcError, InputError, PlantError
+from impc.door import checked
+from impc.errors import ImpcError, InputError, PlantError, one_line
 from impc.plant import Plant, as_plant
 from impc.plant_family import PlantFamily, plant_family
+from impc.saved_plant import SAVED, read_matrices, state_space
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from impc.arrays import Array
 
-__all__ = ["PlantSource", "import_function", "make_plant", "plant_family_of", "plant_source"]
-
-_MATRICES = ("A", "B", "C")
-_NAMES = ("states", "inputs", "outputs")
-_FILES = (".mat", ".npz", ".json")
+__all__ = [
+    "PlantSource",
+    "import_function",
+    "make_plant",
+    "plant_family_of",
+    "plant_source",
+    "users_code",
+]
 
 
 @dataclass(frozen=True)
@@ -49,6 +60,7 @@ class PlantSource:
     arguments: Mapping[str, Any]
 
 
+@checked
 def plant_source(name: str, arguments: Mapping[str, Any]) -> PlantSource:
     """Find a plant by import path, or by the name of a .mat, .npz or .json file.
 
@@ -60,39 +72,85 @@ def plant_source(name: str, arguments: Mapping[str, Any]) -> PlantSource:
     InputError
         When there is no such module, function or file, or a matrix is missing.
     """
-    if Path(name).suffix in _FILES:
-        matrices = _read(Path(name))
+    if Path(name).suffix in SAVED:
+        matrices = read_matrices(Path(name))
         return PlantSource(
-            name, lambda **given: _state_space(name, {**matrices, **given}), arguments
+            name, lambda **given: state_space(name, {**matrices, **given}), arguments
         )
     return PlantSource(name, import_function(name), arguments)
 
 
+@checked
 def import_function(path: str) -> Callable[..., Any]:
-    """The function of an import path ``module:function``; the current folder is looked in too.
+    """The function of an import path ``module:function``; see the module's text for where.
 
     Raises
     ------
     InputError
-        When there is no such module or function.
+        When there is no such module or function, or the module cannot be imported.
     """
-    module, colon, function = path.partition(":")
-    if not (module and colon and function):
+    module, _, function = path.partition(":")
+    first = module.partition(".")[0]
+    if not (first and function):
         raise InputError(
             f"plant {path}", "is neither a known name, a file, nor module:function", "see docs"
         )
-    sys.path.insert(0, "")  # a user's own module stands beside the recordings
+    installed = first in sys.modules or importlib.util.find_spec(first) is not None
     try:
-        found: Callable[..., Any] = getattr(importlib.import_module(module), function)
+        with (
+            users_code(f"plant {path}", ImportError, AttributeError),
+            nullcontext() if installed else _beside_the_recordings(),
+        ):
+            found = getattr(importlib.import_module(module), function)
     except (ImportError, AttributeError) as error:
+        hidden = installed and Path(f"{first}.py").exists()
+        remedy = "rename yours: an installed module has its name" if hidden else "check its names"
         raise InputError(
-            f"plant {path}", f"cannot be imported ({error})", "check module and function"
+            f"plant {path}", f"cannot be imported ({one_line(error)})", remedy
         ) from None
+    made: Callable[..., Any] = found
+    return made
+
+
+@contextmanager
+def users_code(name: str, *passing: type[Exception]) -> Iterator[None]:
+    """Run code of a user's, of that `name`: whatever it raises is one line that says so.
+
+    Errors of the package, those of the kinds in `passing` and an interruption from the keyboard
+    stay what they are.
+
+    Raises
+    ------
+    InputError
+        For anything else, a call of `sys.exit` among it.
+    """
+    foreseen: tuple[type[Exception], ...] = (ImpcError, *passing)
+    try:
+        yield
+    except foreseen:
+        raise
+    except BaseException as error:
+        if type(error) is KeyboardInterrupt:
+            raise
+        said = one_line(error)
+        problem = f"ends in {type(error).__name__}{f' ({said})' if said else ''}"
+        raise InputError(name, problem, "correct the function, or what it is given") from None
+
+
+@contextmanager
+def _beside_the_recordings() -> Iterator[None]:
+    """The working folder on the import path, behind all that is installed."""
+    folder = os.getcwd()
+    sys.path.append(folder)
+    try:
+        yield
     finally:
-        sys.path.remove("")
-    return found
+        sys.path.reverse()  # the last one, should it have been there before
+        sys.path.remove(folder)
+        sys.path.reverse()
 
 
+@checked
 def make_plant(source: PlantSource, recorded: Sequence[str], **changed: float) -> Plant:
     """Make the plant; inputs that are recorded are disturbances, the others are controls.
 
@@ -109,21 +167,25 @@ def make_plant(source: PlantSource, recorded: Sequence[str], **changed: float) -
         When the arguments do not fit the function, or what it returns is no usable plant.
     """
     arguments = {**source.arguments, **changed}
+    name = f"plant {source.name}"
     try:
-        system = source.make(**arguments)
+        with users_code(name, TypeError, ValueError, np.exceptions.ComplexWarning):
+            with warnings.catch_warnings():
+                warnings.simplefilter("error", np.exceptions.ComplexWarning)
+                system = source.make(**arguments)
+            inputs = tuple(getattr(system, "input_labels", ()))
+            controls = [item for item in inputs if item not in recorded]
+            if inputs and not controls:
+                raise PlantError(name, "all its inputs are recorded", "one must be the command")
+            return as_plant(system, controls or None)
     except ImpcError:
         raise
+    except np.exceptions.ComplexWarning:  # control.ss would drop the imaginary parts
+        raise PlantError(name, "has complex matrices", "give it real ones") from None
     except (TypeError, ValueError) as error:
         raise InputError(
-            f"plant {source.name}", f"refuses its arguments ({error})", "correct the [plant] table"
+            name, f"refuses its arguments ({one_line(error)})", "correct the [plant] table"
         ) from None
-    names = tuple(getattr(system, "input_labels", ()))
-    controls = [name for name in names if name not in recorded]
-    if names and not controls:
-        raise PlantError(
-            f"plant {source.name}", "all its inputs are recorded", "one must be the command"
-        )
-    return as_plant(system, controls or None)
 
 
 def plant_family_of(
@@ -165,52 +227,3 @@ def _nominal(source: PlantSource, name: str) -> float:
             f"[fit] free {name}", "has no nominal value", f"give {name} in the [plant] table"
         )
     return float(value)
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        if path.suffix == ".json":
-            found = json.loads(path.read_text(encoding="utf-8"))
-        elif path.suffix == ".npz":
-            with np.load(path, allow_pickle=False) as archive:
-                found = {name: archive[name] for name in archive.files}
-        else:
-            found = {
-                name: value
-                for name, value in scipy.io.loadmat(path).items()
-                if not name.startswith("__")
-            }
-    except (OSError, ValueError, NotImplementedError) as error:
-        raise InputError(
-            f"plant {path}", f"cannot be read ({error})", "save A, B, C and dt in it, MATLAB: -v7"
-        ) from None
-    if not isinstance(found, dict):
-        raise InputError(f"plant {path}", "holds no names", "save A, B, C and dt in it")
-    missing = [name for name in (*_MATRICES, "dt") if name not in found]
-    if missing:
-        raise InputError(
-            f"plant {path}", f"lacks {', '.join(missing)}", "save A, B, C and dt in it"
-        )
-    return found
-
-
-def _state_space(name: str, given: Mapping[str, Any]) -> Any:
-    unknown = [key for key in given if key not in (*_MATRICES, "D", "dt", *_NAMES)]
-    if unknown:
-        raise InputError(f"plant {name}", f"does not know {unknown[0]}", f"names: {list(_NAMES)}")
-    try:
-        matrices = {key: np.atleast_2d(np.asarray(given[key], dtype=float)) for key in _MATRICES}
-        dt = float(np.asarray(given["dt"]).item())
-    except (TypeError, ValueError) as error:
-        raise InputError(
-            f"plant {name}", f"is not made of numbers ({error})", "save matrices"
-        ) from None
-    D = np.zeros((len(matrices["C"]), matrices["B"].shape[1]))
-    labels = {key: _labels(given[key]) for key in _NAMES if key in given}
-    return control.ss(*matrices.values(), given.get("D", D), dt, **labels)
-
-
-def _labels(values: Any) -> list[str]:
-    return [
-        str(np.asarray(item).item()).strip() for item in np.ravel(np.asarray(values, dtype=object))
-    ]

@@ -15,13 +15,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy.optimize
 
-from impc.arrays import Array, BoolArray, frozen
-from impc.diagonal_weights import bryson_weights
+from impc.arrays import Array, BoolArray, Frozen, frozen
+from impc.diagonal_weights import bryson_regulators
 from impc.errors import InputError, SolverError
 from impc.evaluation import evaluate, misfit_or_reason
 from impc.gain_coordinates import start_unit
 from impc.inverse_problem import moved, without_bounds
-from impc.lqr import solve_lqr
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -35,7 +34,7 @@ _PARAMETER_UNIT = 1 / 3
 
 
 @dataclass(frozen=True)
-class PreliminaryGain:
+class PreliminaryGain(Frozen):
     """Result of `preliminary_gain`.
 
     Attributes
@@ -87,8 +86,8 @@ def _start(problem: InverseProblem, kept: BoolArray) -> Array:
     metric = np.eye(problem.plant.m)
     best: Array | None = None
     least = np.inf
-    for weights in bryson_weights(problem):
-        gain: Array = np.asarray(solve_lqr(problem.plant, weights).K * kept, dtype=np.float64)
+    for _, solution in bryson_regulators(problem):
+        gain: Array = np.asarray(solution.K * kept, dtype=np.float64)
         for scale in _SCALES:
             misfit, reason = misfit_or_reason(problem, scale * gain, metric)
             if not reason and misfit < least:

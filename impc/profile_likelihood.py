@@ -25,17 +25,15 @@ import scipy.linalg
 import scipy.optimize
 import scipy.stats
 
-from impc.arrays import Array, frozen
+from impc.arrays import Array, Frozen, frozen
 from impc.errors import InputError
 from impc.gain_coordinates import PARAMETER_UNIT, Coordinates
-from impc.gain_covariance import gain_covariance
 from impc.intervals import LEVEL, Interval, entry_names
-from impc.residual_noise import white_noise
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from impc.fitted_controller import FittedController
+    from impc.gain_estimate import GainEstimate
 
 __all__ = ["Profile", "profile_likelihood"]
 
@@ -49,7 +47,7 @@ _ROUNDS = 6
 
 
 @dataclass(frozen=True)
-class Profile:
+class Profile(Frozen):
     """Profile of one number.
 
     Attributes
@@ -65,13 +63,13 @@ class Profile:
     distances: Array
 
 
-def profile_likelihood(fitted: FittedController, name: str, level: float = LEVEL) -> Profile:
+def profile_likelihood(estimate: GainEstimate, name: str, level: float = LEVEL) -> Profile:
     """Profile an entry of K (name K.<control>.<state>) or a parameter fitted with it.
 
     Parameters
     ----------
-    fitted : FittedController
-        Its free gain is where the profile begins: weights do not enter.
+    estimate : GainEstimate
+        Where the profile begins.
     name : str
         K.<control>.<state>, or that of the parameter.
     level : float
@@ -82,7 +80,7 @@ def profile_likelihood(fitted: FittedController, name: str, level: float = LEVEL
     InputError
         When there is no such entry or parameter.
     """
-    search = _Search(fitted, name)
+    search = _Search(estimate, name)
     quantile = float(scipy.stats.chi2.ppf(level, 1))
     ends = search.ends(quantile)
     tried = sorted(search.tried)
@@ -98,18 +96,18 @@ def profile_likelihood(fitted: FittedController, name: str, level: float = LEVEL
 class _Search:
     """Fits with the number held, remembered; offsets are from the fit's, in z units."""
 
-    def __init__(self, fitted: FittedController, name: str) -> None:
-        free = fitted.free
-        self.space = Coordinates(free.problem, np.array(free.K), np.array(free.S))
-        self.direction, self.number = _functional(fitted, self.space, name)
+    def __init__(self, estimate: GainEstimate, name: str) -> None:
+        problem = estimate.problem
+        self.space = Coordinates(problem, np.array(estimate.K), np.array(estimate.S))
+        self.direction, self.number = _functional(estimate, self.space, name)
         self.null = scipy.linalg.null_space(self.direction[None])
-        self.samples = sum(trial.outputs.size for trial in free.problem.recordings)
+        self.samples = sum(trial.outputs.size for trial in problem.recordings)
         misfit = float(np.linalg.norm(self.space.at(self.space.start).residual))
         self.noise = max(misfit, 1e-12) / np.sqrt(self.samples)
         self.target = self.space.with_prior(self.noise / _WIDTH)
         self.tried: dict[float, tuple[float, Array]] = {}
         self.squared(0.0)
-        self.deviation, self.factor = _spread(fitted, name)
+        self.deviation, self.factor = _spread(estimate, name)
 
     def squared(self, offset: float) -> float:
         """m^2 with the number at this offset, from the nearest fit before."""
@@ -186,39 +184,36 @@ class _Search:
 
 
 def _functional(
-    fitted: FittedController, space: Coordinates, name: str
+    estimate: GainEstimate, space: Coordinates, name: str
 ) -> tuple[Array, Callable[[float], float]]:
     """Row a of the number in z, and the number at an offset of a'z."""
-    free = fitted.free
-    entries = entry_names(free.problem.plant)
+    entries = entry_names(estimate.problem.plant)
     row = np.zeros(int(space.ends[-1]))
     if name in entries:
         index = entries.index(name)
         control, state = divmod(index, space.n)
-        mine = slice(control * space.n, (control + 1) * space.n)
-        row[mine] = np.linalg.inv(space.T)[:, state]
-        value = float(free.K[control, state])
+        row[: space.ends[0]] = np.kron(space.G[control], np.linalg.inv(space.T)[:, state])
+        value = float(estimate.K[control, state])
         return row, lambda offset: value + offset
-    family = free.problem.family
+    family = estimate.problem.family
     if family is not None and name in family.names:
         index = family.names.index(name)
         row[int(space.ends[2]) + index] = PARAMETER_UNIT
-        value = float(family.nominal[index] * np.exp(free.problem.logarithms[index]))
+        value = float(estimate.parameters[index])
         return row, lambda offset: float(value * np.exp(offset)) if offset < 700 else np.inf
     known = [*entries, *(family.names if family is not None else ())]
     raise InputError(f"profile of {name}", "there is no such number", f"known: {', '.join(known)}")
 
 
-def _spread(fitted: FittedController, name: str) -> tuple[float, float]:
+def _spread(estimate: GainEstimate, name: str) -> tuple[float, float]:
     """Deviation in units of the offset, and the factor f of the residuals' colour."""
-    free = fitted.free
-    coloured, white = gain_covariance(free), gain_covariance(free, white_noise)
-    entries = entry_names(free.problem.plant)
+    coloured, white = estimate.covariance, estimate.white
+    entries = entry_names(estimate.problem.plant)
     if name in entries:
         index = entries.index(name)
         pair = np.ravel(coloured.entries)[index], np.ravel(white.entries)[index]
     else:
-        family = free.problem.family
+        family = estimate.problem.family
         assert family is not None
         index = family.names.index(name)
         pair = coloured.parameters[index], white.parameters[index]

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from impc.arrays import Array, finite_array, frozen
+from impc.arrays import Array, as_numbers, finite_array, frozen
+from impc.door import Value, checked
 from impc.errors import DataError
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import ArrayLike
 
     from impc.plant import Plant
@@ -19,7 +22,7 @@ __all__ = ["Label", "Recording", "recording"]
 
 
 @dataclass(frozen=True)
-class Label:
+class Label(Value):
     """Whose trial it is; empty where the recording does not say.
 
     Attributes
@@ -39,7 +42,7 @@ class Label:
 
 
 @dataclass(frozen=True)
-class Recording:
+class Recording(Value):
     """One trial.
 
     Attributes
@@ -55,6 +58,12 @@ class Recording:
         What the checks of its file found and let pass, one sentence each.
     """
 
+    _rules: ClassVar[Mapping[str, Any]] = {
+        "outputs": "* p",
+        "disturbance": "* d",
+        "x0": "n",
+    }
+
     outputs: Array
     disturbance: Array
     x0: Array
@@ -67,6 +76,7 @@ class Recording:
         return len(self.outputs)
 
 
+@checked
 def recording(
     plant: Plant,
     outputs: ArrayLike,
@@ -117,4 +127,5 @@ def recording(
 
 
 def _columns(values: ArrayLike) -> ArrayLike:
-    return np.asarray(values)[:, None] if np.ndim(values) == 1 else values
+    array = as_numbers("columns", values)
+    return array[:, None] if array.ndim == 1 else array

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.signal
 
-from impc.arrays import Array, frozen
+from impc.arrays import Array, Frozen, frozen
 
 __all__ = ["ResidualNoise", "residual_noise", "spread_of_sum", "white_noise"]
 
@@ -30,7 +30,7 @@ _BEFORE = 250
 
 
 @dataclass(frozen=True)
-class ResidualNoise:
+class ResidualNoise(Frozen):
     """A model of residuals.
 
     Attributes

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from impc.agreement import saturated_share
-from impc.arrays import Array, finite_array, frozen
+from impc.arrays import Array, Frozen, finite_array, frozen
 from impc.closed_loop import Scenario, Status, prepare_loop, run_loop
 from impc.errors import InputError
 from impc.prediction import directions
@@ -29,7 +29,7 @@ __all__ = ["SubjectTrial", "simulate_subject"]
 
 
 @dataclass(frozen=True)
-class SubjectTrial:
+class SubjectTrial(Frozen):
     """One simulated trial at the recording's rate.
 
     Attributes

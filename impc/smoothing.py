@@ -18,7 +18,7 @@ import scipy.linalg
 import scipy.optimize
 from statsmodels.tsa.statespace.kalman_smoother import KalmanSmoother
 
-from impc.arrays import Array, frozen
+from impc.arrays import Array, Frozen, frozen
 
 if TYPE_CHECKING:
     from impc.inverse_problem import InverseProblem
@@ -34,7 +34,7 @@ _DIFFUSE = 1e6
 
 
 @dataclass(frozen=True)
-class Smoothed:
+class Smoothed(Frozen):
     """One trial, in the units of the plant.
 
     Attributes

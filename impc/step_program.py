@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy.linalg
 
-from impc.arrays import Array, frozen
+from impc.arrays import Array, Frozen, frozen
 from impc.semidefinite import matrix_inequality, norm_bound, solve_semidefinite
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ __all__ = ["StepProgram", "block_basis", "solve_step"]
 
 
 @dataclass(frozen=True)
-class StepProgram:
+class StepProgram(Frozen):
     """Data of the program above.
 
     Attributes

@@ -24,8 +24,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.arrays import Array, IntArray, finite_array, frozen
+from impc.arrays import Array, Frozen, IntArray, finite_array, frozen
 from impc.bounds import BoundRows, bound_rows
+from impc.door import Value, checked
 from impc.errors import BoundsError, InputError, SolverError
 from impc.halfspaces import (
     needed_rows,
@@ -53,7 +54,7 @@ __all__ = [
 
 
 @dataclass(frozen=True)
-class TerminalSet:
+class TerminalSet(Value):
     """The set {x : H x <= h}, without redundant rows, and where each row comes from.
 
     Attributes
@@ -92,7 +93,7 @@ class TerminalSet:
 
 
 @dataclass(frozen=True)
-class _Loop:
+class _Loop(Frozen):
     """Normalised rows (c, n), closed loop, coordinates and limits of one construction."""
 
     normal: Array
@@ -103,6 +104,7 @@ class _Loop:
     max_steps: int
 
 
+@checked(gain="m n", tolerance=0, max_steps=1)
 def maximal_invariant_set(
     plant: Plant,
     gain: ArrayLike,
@@ -172,6 +174,7 @@ def maximal_invariant_set(
     )
 
 
+@checked(tolerance=0)
 def contains(terminal: TerminalSet, x: ArrayLike, tolerance: float | None = None) -> bool:
     """Whether the state x (n,) is in the set, within a fraction of each bound.
 
@@ -182,6 +185,7 @@ def contains(terminal: TerminalSet, x: ArrayLike, tolerance: float | None = None
     return bool(np.all(terminal.H @ state <= terminal.h * (1 + allowed)))
 
 
+@checked
 def invariance_violation(terminal: TerminalSet) -> float:
     """By how much F leaves the set: the largest support of H F x over the set, less h, over h.
 
@@ -198,6 +202,7 @@ def invariance_violation(terminal: TerminalSet) -> float:
     return _excess(terminal, normal @ terminal.F)
 
 
+@checked
 def maximality_violation(terminal: TerminalSet) -> float:
     """By how much the set differs from O_k*, relative to the bounds; capped at 1.
 

@@ -20,7 +20,7 @@ import numpy as np
 import scipy.optimize
 import scipy.stats
 
-from impc.arrays import Array, frozen
+from impc.arrays import Array, Frozen, frozen
 from impc.bounds import bound_rows, box_bounds
 from impc.closed_loop import simulate, simulate_and_differentiate
 from impc.errors import InputError, SolverError, WeightsError
@@ -48,7 +48,7 @@ _ROUNDS = 5
 
 
 @dataclass(frozen=True)
-class LimitEstimate:
+class LimitEstimate(Frozen):
     """What recordings say of the limit of one input.
 
     Attributes

@@ -7,15 +7,18 @@ are compared after `normalised`: R[0, 0] = 1, which for a single input is the R 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import scipy.linalg
 
 from impc.arrays import Array, frozen, symmetric_matrix
+from impc.door import Value, checked
 from impc.errors import WeightsError
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import ArrayLike
 
 __all__ = [
@@ -30,7 +33,7 @@ __all__ = [
 
 
 @dataclass(frozen=True)
-class Weights:
+class Weights(Value):
     """Stage weights of the cost  sum x'Qx + u'Ru.
 
     Attributes
@@ -41,6 +44,11 @@ class Weights:
         Input weight (m, m), symmetric, positive definite.
     """
 
+    _rules: ClassVar[Mapping[str, Any]] = {
+        "Q": "n n",
+        "R": "m m",
+    }
+
     Q: Array
     R: Array
 
@@ -50,6 +58,7 @@ class Weights:
         return np.asarray(scipy.linalg.block_diag(self.Q, self.R))
 
 
+@checked
 def stage_weights(Q: ArrayLike, R: ArrayLike) -> Weights:
     """Check and freeze a pair of weights.
 
@@ -82,23 +91,27 @@ def stage_weights(Q: ArrayLike, R: ArrayLike) -> Weights:
     return Weights(frozen(q), frozen(r))
 
 
+@checked
 def condition_number(weights: Weights) -> float:
     """Condition number of blkdiag(Q, R), the kappa of (3.5); infinite when Q is singular."""
     eigenvalues = np.linalg.eigvalsh(weights.block)
     return float(eigenvalues[-1] / eigenvalues[0]) if eigenvalues[0] > 0 else float("inf")
 
 
+@checked
 def normalised(weights: Weights) -> Weights:
     """Return the same weights scaled to R[0, 0] = 1."""
     scale = float(weights.R[0, 0])
     return Weights(frozen(weights.Q / scale), frozen(weights.R / scale))
 
 
+@checked
 def residual(estimate: Weights, truth: Weights) -> float:
     """Frobenius distance of blkdiag(Q, R) after scaling both to R[0, 0] = 1, equation (3.10)."""
     return float(np.linalg.norm(normalised(estimate).block - normalised(truth).block))
 
 
+@checked
 def cholesky_parameters(weights: Weights) -> Array:
     """Lower-triangular entries (k,) of the Cholesky factors of Q and R, row by row.
 
@@ -120,6 +133,7 @@ def cholesky_parameters(weights: Weights) -> Array:
     return np.concatenate([q_entries, r_entries[1:]])
 
 
+@checked(parameters="*", n=(1, 10_000), m=(1, 10_000))
 def weights_from_parameters(parameters: Array, n: int, m: int) -> Weights:
     """Inverse of `cholesky_parameters`: Q = LL' (n, n), R = GG' (m, m) with G[0, 0] = 1.
 
@@ -129,9 +143,16 @@ def weights_from_parameters(parameters: Array, n: int, m: int) -> Weights:
         (k,), as `cholesky_parameters` gives them.
     n, m : int
         Sizes of Q and R.
+
+    Raises
+    ------
+    WeightsError
+        When there are not as many numbers as these sizes need.
     """
+    count, total = n * (n + 1) // 2, (n * (n + 1) + m * (m + 1)) // 2 - 1
+    if len(parameters) != total:
+        raise WeightsError("parameters", f"has {len(parameters)} numbers", f"give {total}")
     q_factor, r_factor = np.zeros((n, n)), np.zeros((m, m))
-    count = n * (n + 1) // 2
     q_factor[np.tril_indices(n)] = parameters[:count]
     r_factor[np.tril_indices(m)] = np.concatenate([[1.0], parameters[count:]])
     return Weights(frozen(q_factor @ q_factor.T), frozen(r_factor @ r_factor.T))

@@ -8,8 +8,11 @@ semidefinite programs find, and a statement such as "the price of x_1 is above t
 for every member, or for none, or for some. Nothing that the recordings say of the weights can be
 finer than this set (docs/equivalent-weights.md, section 2).
 
-The programs are written as seen from a member X0 = LL' of the set, so that their entries are of
-order one although the condition numbers of plant units may be 1e8 (`least_condition_weights`).
+The programs are written as seen from the analytic centre LL' of the fibre, L^-1 X L^-T, in which
+tr(L^-1 X L^-T) is the same for every X of one scale: all members lie within n + m of it, which
+bounds the variables and makes the dual bounds proofs (`solve_semidefinite`). As seen from the
+member of least condition number, a corner of the cone, members of the seat's set lie at 2e4 and
+farther: what the programs then returned was 1.4e-3 from the optimum and called solved.
 """
 
 from __future__ import annotations
@@ -20,9 +23,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import scipy.linalg
 
-from impc.arrays import Array
-from impc.equivalent_weights import inverse_factor, least_condition_weights
-from impc.errors import InputError
+from impc.arrays import Array, Frozen
+from impc.door import checked
+from impc.equivalent_weights import analytic_centre, inverse_factor, least_condition_weights
+from impc.errors import InputError, SolverError, WeightsError
 from impc.gain_fibre import pair_blocks, split_blocks
 from impc.semidefinite import Cone, matrix_inequality, norm_bound, solve_semidefinite
 
@@ -52,21 +56,23 @@ _GAP, _HALVINGS = 1e-8, 50
 
 
 @dataclass(frozen=True)
-class WeightsSet:
+class WeightsSet(Frozen):
     """The set of the module's text, ready for programs over it.
 
     Attributes
     ----------
     fibre : GainFibre
     least : EquivalentWeights
-        The member of least condition number; the programs are written as seen from it.
+        The member of least condition number.
     limit : float
         Largest condition number in the set.
     first, level : Array
         blkdiag(Q, R) = first + sum_i y_i level_i spans the members: (n + m, n + m) and
-        (k, n + m, n + m), the levels orthonormal as seen from the member of least condition number.
+        (k, n + m, n + m), the levels orthonormal as seen from the analytic centre.
     inverse : Array
-        L^-1 of that member, (n + m, n + m).
+        L^-1 of that centre, (n + m, n + m).
+    reach : float
+        No member has a larger |y|.
     """
 
     fibre: GainFibre
@@ -75,6 +81,7 @@ class WeightsSet:
     first: Array
     level: Array
     inverse: Array
+    reach: float
 
 
 class End(NamedTuple):
@@ -116,6 +123,7 @@ class Range:
     high_weights: Weights
 
 
+@checked
 def weights_set(fibre: GainFibre, ratio: float = 10.0) -> WeightsSet:
     """Prepare the set of weights with condition number up to `ratio` times the least.
 
@@ -124,23 +132,52 @@ def weights_set(fibre: GainFibre, ratio: float = 10.0) -> WeightsSet:
     InputError
         When the ratio is not above 1.
     WeightsError, SolverError
-        As `least_condition_weights`.
+        As `least_condition_weights` and `analytic_centre`.
     """
     if not 1 < ratio < np.inf:
         raise InputError("ratio", f"got {ratio}", "give a number above 1")
     least = least_condition_weights(fibre)
     n, m = fibre.plant.n, fibre.plant.m
-    inverse = inverse_factor(fibre, least.weights)
+    try:
+        centre = analytic_centre(fibre).weights
+    except WeightsError:  # the cost on some combination of states is free but for the limit
+        centre = None
+    view = least.weights if centre is None else centre
+    inverse = inverse_factor(fibre, view)
     raw = pair_blocks(fibre.Q, fibre.R)
     triangle = np.linalg.qr((inverse @ raw @ inverse.T).reshape(len(raw), -1).T, mode="r")
     raw = np.tensordot(np.linalg.inv(triangle).T, raw, 1)
     traces = np.trace(raw[:, n:, n:], axis1=1, axis2=2)
-    # y = first + null space: the members with trace R = m.
-    first = np.tensordot(traces * m / (traces @ traces), raw, 1)
+    first = view.block * (m / np.trace(view.R))
     level = np.tensordot(scipy.linalg.null_space(traces[None]).T, raw, 1)
-    return WeightsSet(fibre, least, ratio * least.condition, first, level, inverse)
+    limit = ratio * least.condition
+    if centre is None:  # X <= limit I, since the least eigenvalue is at most that of R
+        trace = limit * float(np.linalg.norm(inverse)) ** 2
+    else:
+        trace = _largest_trace(fibre, inverse, raw)
+    reach = trace + float(np.linalg.norm(inverse @ first @ inverse.T))
+    return WeightsSet(fibre, least, limit, first, level, inverse, reach)
 
 
+def _largest_trace(fibre: GainFibre, inverse: Array, raw: Array) -> float:
+    """Largest tr(L^-1 X L^-T) of a semidefinite X with trace R = m; `raw` is orthonormal as seen.
+
+    At the analytic centre it is alpha tr(G'RG) for all X = sum c_k raw_k, up to an error e'c of the
+    centre; |c| is at most that trace again, and tr(G'RG) at most m times the largest value of GG'.
+    """
+    n, m = fibre.plant.n, fibre.plant.m
+    seen = np.trace(inverse @ raw @ inverse.T, axis1=1, axis2=2)
+    scale = np.trace(fibre.G.T @ raw[:, n:, n:] @ fibre.G, axis1=1, axis2=2)
+    alpha = float(seen @ scale) / float(scale @ scale)
+    error = float(np.linalg.norm(seen - alpha * scale))
+    if error >= 0.5:
+        raise SolverError(
+            "analytic centre", f"is off by {error:.2g} of a trace", "scale the states and inputs"
+        )
+    return alpha * m * float(np.linalg.norm(fibre.G, 2)) ** 2 / (1 - error)
+
+
+@checked(direction="n+m n+m")
 def linear_range(found: WeightsSet, direction: Array) -> Range:
     """Range of trace(direction blkdiag(Q, R)) over the set, direction symmetric (n + m, n + m).
 
@@ -153,6 +190,7 @@ def linear_range(found: WeightsSet, direction: Array) -> Range:
     return Range(low.value, high.value, low.bound, high.bound, low.weights, high.weights)
 
 
+@checked(direction="n+m n+m")
 def linear_maximum(found: WeightsSet, direction: Array) -> End:
     """Largest trace(direction blkdiag(Q, R)) over the set, direction symmetric (n + m, n + m).
 
@@ -165,6 +203,7 @@ def linear_maximum(found: WeightsSet, direction: Array) -> End:
     return End(-end.value, -end.bound, end.weights)
 
 
+@checked
 def entry_ranges(
     found: WeightsSet, states: Sequence[int] | None = None
 ) -> dict[tuple[int, int], Range]:
@@ -180,6 +219,7 @@ def entry_ranges(
     return ranges
 
 
+@checked(scaling="n")
 def trace_range(found: WeightsSet, scaling: Array) -> Range:
     """Range of trace(D Q D), D = diag(scaling) (n,): the low end is the member of least trace."""
     size = np.zeros(len(found.first))
@@ -187,6 +227,7 @@ def trace_range(found: WeightsSet, scaling: Array) -> Range:
     return linear_range(found, np.diag(size))
 
 
+@checked(scaling="n")
 def nearest_diagonal(found: WeightsSet, scaling: Array) -> End:
     """Member whose D Q D, D = diag(scaling) (n,), has the least off-diagonal part (Frobenius).
 
@@ -199,11 +240,13 @@ def nearest_diagonal(found: WeightsSet, scaling: Array) -> End:
     rows, columns = np.tril_indices(n, -1)
     size = np.sqrt(2.0) * np.outer(scaling, scaling)[rows, columns]
     offset = found.first[rows, columns] * size
-    unit = float(np.linalg.norm(found.least.weights.Q[rows, columns] * size))
+    m = found.fibre.plant.m
+    least = found.least.weights.Q * (m / np.trace(found.least.weights.R))
+    unit = float(np.linalg.norm(least[rows, columns] * size))
     if unit == 0 or len(found.level) == 0:  # diagonal as it is, or there is but one
         return End(unit, unit, found.least.weights)
     vectors = found.level[:, rows, columns] * size / unit
-    # Variables (y, t, s): s bounds the norm.
+    # Variables (y, t, s): s bounds the norm; at the best it is at most 1, that of the least.
     count = len(found.level)
     spread = norm_bound(
         np.vstack([vectors, np.zeros((2, len(rows)))]),
@@ -211,13 +254,17 @@ def nearest_diagonal(found: WeightsSet, scaling: Array) -> End:
         offset=offset / unit,
     )
     solved = solve_semidefinite(
-        np.append(np.zeros(count + 1), 1.0), [*_cones(found, 1), spread], tolerance=_GAP
+        np.append(np.zeros(count + 1), 1.0),
+        [*_cones(found, 1), spread],
+        reach=_reach(found, 1.0),
+        tolerance=_GAP,
     )
     X = _member(found, solved.y)
     value = float(np.linalg.norm(X[rows, columns] * size))
     return End(value, unit * solved.bound, split_blocks(X, n))
 
 
+@checked
 def extreme_eigenvalue(found: WeightsSet, *, largest: bool) -> End:
     """Least largest eigenvalue of Q over the set, or its largest least one.
 
@@ -227,12 +274,17 @@ def extreme_eigenvalue(found: WeightsSet, *, largest: bool) -> End:
         When the program returns no finite point.
     """
     n, count, sign = found.fibre.plant.n, len(found.level), 1.0 if largest else -1.0
-    unit = float(np.linalg.eigvalsh(found.least.weights.Q)[-1 if largest else 0])
-    # Variables (y, t, s): sign (s unit I - Q) >= 0.
-    levels = np.concatenate([-found.level[:, :n, :n] / unit, np.zeros((1, n, n)), np.eye(n)[None]])
-    bound = matrix_inequality(-sign * found.first[:n, :n] / unit, sign * levels)
+    least = found.least.weights.Q * (found.fibre.plant.m / np.trace(found.least.weights.R))
+    unit = float(np.linalg.eigvalsh(least)[-1 if largest else 0])
+    # Variables (y, t, s): sign (s unit I - Q) >= 0, as seen where small eigenvalues decide.
+    view = np.eye(n) / np.sqrt(unit) if largest else found.inverse[:n, :n]
+    levels = np.concatenate([-found.level[:, :n, :n], np.zeros((1, n, n)), unit * np.eye(n)[None]])
+    levels = sign * view @ levels @ view.T
+    bound = matrix_inequality(-sign * view @ found.first[:n, :n] @ view.T, levels)
     objective = np.append(np.zeros(count + 1), sign)
-    solved = solve_semidefinite(objective, [*_cones(found, 1), bound], tolerance=_GAP)
+    # No member's least eigenvalue is above R's mean of 1.
+    reach = _reach(found, 1.0 if largest else 1 / unit)
+    solved = solve_semidefinite(objective, [*_cones(found, 1), bound], reach=reach, tolerance=_GAP)
     X = _member(found, solved.y)
     value = float(np.linalg.eigvalsh(X[:n, :n])[-1 if largest else 0])
     return End(value, sign * unit * solved.bound, split_blocks(X, n))
@@ -244,7 +296,9 @@ def _minimum(found: WeightsSet, direction: Array) -> End:
     scale = float(np.linalg.norm(slopes))
     if scale == 0:  # the same for every member, or there is but one
         return End(constant, constant, found.least.weights)
-    solved = solve_semidefinite(np.append(slopes / scale, 0.0), _cones(found), tolerance=_GAP)
+    solved = solve_semidefinite(
+        np.append(slopes / scale, 0.0), _cones(found), reach=_reach(found), tolerance=_GAP
+    )
     X = _member(found, solved.y)
     bound = constant + scale * solved.bound
     return End(float(np.sum(direction * X)), bound, split_blocks(X, found.fibre.plant.n))
@@ -256,6 +310,7 @@ def _member(found: WeightsSet, y: Array) -> Array:
     A program's error, 1e-8 of the largest weight, can outweigh the least eigenvalue.
     """
     X = found.first + np.tensordot(y[: len(found.level)], found.level, 1)
+    X = (X + X.T) / 2
     n = found.fibre.plant.n
     centre = found.least.weights.block
     centre = centre * ((len(centre) - n) / np.trace(centre[n:, n:]))
@@ -263,7 +318,7 @@ def _member(found: WeightsSet, y: Array) -> Array:
     inside, outside = 0.0, 2.0
     for _ in range(_HALVINGS):
         share = (inside + outside) / 2  # 1, the point itself, comes first
-        values = np.linalg.eigvalsh(centre + share * (X - centre))
+        values = np.linalg.eigvalsh(centre + share * (X - centre))  # as `condition_number` sees it
         if values[0] > 0 and values[-1] <= found.limit * values[0]:
             inside = share
         else:
@@ -274,16 +329,15 @@ def _member(found: WeightsSet, y: Array) -> Array:
 
 
 def _cones(found: WeightsSet, more: int = 0) -> list[Cone]:
-    """t l I <= X <= limit t l I in the variables (y, t), l the least eigenvalue of the centre.
+    """t l I <= X <= limit t l I in the variables (y, t), with l I at most I as seen.
 
     `more` variables follow that do not occur here.
     """
     n, size = found.fibre.plant.n, len(found.first)
-    eigenvalues = np.linalg.eigvalsh(found.least.weights.block)
-    unit = float(eigenvalues[0])
     inverse = found.inverse
     seen_first = inverse @ found.first @ inverse.T
     seen = inverse @ found.level @ inverse.T
+    unit = _floor_unit(found)
     floor = inverse @ inverse.T * unit
     top = found.limit * unit
     cones = []
@@ -296,3 +350,12 @@ def _cones(found: WeightsSet, more: int = 0) -> list[Cone]:
         above = np.concatenate([-found.level[:, block, block] / top, eye, others])
         cones.append(matrix_inequality(-found.first[block, block] / top, above))
     return cones
+
+
+def _floor_unit(found: WeightsSet) -> float:
+    return float(1 / np.linalg.norm(found.inverse, 2) ** 2)
+
+
+def _reach(found: WeightsSet, *more: float) -> Array:
+    """Largest |y|, t and further variables: t l I <= X gives t <= the trace of X as seen."""
+    return np.append(np.full(len(found.level) + 1, found.reach), more)

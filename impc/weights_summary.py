@@ -15,14 +15,18 @@ from impc.arrays import Array
 from impc.eigenvalue_ranges import eigenvalue_ranges
 from impc.errors import SolverError, WeightsError
 from impc.gain_fibre import gain_fibre
+from impc.intent_draws import prices_over_gains, set_of_gain, with_confidence
 from impc.intent_statements import order_statements, sense_statements, widest_dominant_angle
 from impc.weights_set import entry_ranges, weights_set
 
 if TYPE_CHECKING:
     from impc.eigenvalue_ranges import EigenvalueRange
+    from impc.intent_draws import PriceRange
     from impc.intent_statements import Statement
+    from impc.lqr import LqrSolution
     from impc.plant import Plant
     from impc.weights import Weights
+    from impc.weights_set import WeightsSet
 
 __all__ = ["EntryRange", "WeightsSummary", "summarise_weights", "weights_summary_or_reason"]
 
@@ -70,6 +74,13 @@ class WeightsSummary:
     widest_angle : float
         Widest angle found between the dominant direction of D Q D in the least conditioned member
         and in another, degrees; D the typical sizes of the states.
+    drawn : int
+        Number of gains drawn beside the fitted one, for all that follows.
+    prices : tuple of PriceRange
+        Of the named states; empty without draws.
+    angle_of_gain : float
+        Widest angle, over the drawn gains, of the dominant direction of the least conditioned
+        member from that of the fitted gain, degrees; NaN without draws.
     """
 
     dimension: int
@@ -79,10 +90,18 @@ class WeightsSummary:
     eigenvalues: tuple[EigenvalueRange, ...]
     statements: tuple[Statement, ...]
     widest_angle: float
+    drawn: int
+    prices: tuple[PriceRange, ...]
+    angle_of_gain: float
 
 
 def summarise_weights(
-    plant: Plant, gain: Array, sizes: Array, ratio: float = RATIO
+    plant: Plant,
+    gain: Array,
+    metrics: Array,
+    sizes: Array,
+    ratio: float = RATIO,
+    draws: tuple[LqrSolution, ...] = (),
 ) -> WeightsSummary:
     """Run the programs over the set of weights of a gain.
 
@@ -91,17 +110,21 @@ def summarise_weights(
     plant : Plant
     gain : Array
         K (m, n).
+    metrics : Array
+        Basis of the metrics that the recordings do not tell apart (k, m, m), see `GainFit`.
     sizes : Array
         Typical size of each state (n,), positive, in its unit.
     ratio : float
         The set's condition number, in multiples of the least.
+    draws : tuple of LqrSolution
+        Other gains that the recordings allow, of `drawn_gains`.
 
     Raises
     ------
     WeightsError, SolverError
         When no weights have the gain, or a program fails.
     """
-    found = weights_set(gain_fibre(plant, gain), ratio)
+    found = weights_set(gain_fibre(plant, gain, metrics), ratio)
     named = _shown(plant, found.least.weights, sizes)
     names = tuple(plant.states[index] for index in named)
     ranges = entry_ranges(found, named)
@@ -114,6 +137,7 @@ def summarise_weights(
     statements = order_statements(found, sizes, names) + sense_statements(
         found, sizes, names, ranges
     )
+    sets = tuple(set_of_gain(plant, item, metrics, ratio) for item in draws)
     return WeightsSummary(
         found.fibre.dimension - 1,
         found.least.condition,
@@ -123,13 +147,20 @@ def summarise_weights(
             for (i, j), item in ranges.items()
         ),
         eigenvalue_ranges(found, [*members, _at_trace(widest, plant.m)]),
-        statements,
+        with_confidence(statements, sets, sizes) if sets else statements,
         angle,
+        len(sets),
+        prices_over_gains(found, sets, sizes, names) if sets else (),
+        _angle_of_gain(found, sets, sizes),
     )
 
 
 def weights_summary_or_reason(
-    plant: Plant, gain: Array, sizes: Array
+    plant: Plant,
+    gain: Array,
+    metrics: Array,
+    sizes: Array,
+    draws: tuple[LqrSolution, ...] = (),
 ) -> tuple[WeightsSummary | None, str]:
     """The summary, or None and why there is none.
 
@@ -137,13 +168,33 @@ def weights_summary_or_reason(
     ----------
     gain : Array
         K (m, n).
+    metrics : Array
+        (k, m, m), as above.
     sizes : Array
         Typical excursions of the states (n,), in their units.
+    draws : tuple of LqrSolution
+        As in `summarise_weights`.
     """
     try:
-        return summarise_weights(plant, gain, sizes), ""
+        return summarise_weights(plant, gain, metrics, sizes, draws=draws), ""
     except (WeightsError, SolverError) as error:
         return None, str(error)
+
+
+def _angle_of_gain(found: WeightsSet, sets: tuple[WeightsSet | None, ...], sizes: Array) -> float:
+    if not sets:
+        return float("nan")
+    own, widest = _dominant(found, sizes), 0.0
+    for one in sets:
+        # Without a least conditioned member the direction is anywhere.
+        cosine = 0.0 if one is None else abs(float(own @ _dominant(one, sizes)))
+        widest = max(widest, float(np.degrees(np.arccos(min(1.0, cosine)))))
+    return widest
+
+
+def _dominant(found: WeightsSet, sizes: Array) -> Array:
+    D = np.diag(np.asarray(sizes))
+    return np.asarray(np.linalg.eigh(D @ found.least.weights.Q @ D)[1][:, -1])
 
 
 def _shown(plant: Plant, weights: Weights, sizes: Array) -> list[int]:

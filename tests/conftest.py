@@ -8,17 +8,26 @@ from typing import TYPE_CHECKING, Any
 import control
 import numpy as np
 import pytest
+from hypothesis import settings
 from matplotlib.figure import Figure
 
 from impc.bounds import box_bounds
 from impc.plant import as_plant
 from tests.labelled_axes import require_labels
+from tests.support import SEARCH
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from impc.bounds import Bounds
     from impc.plant import Plant
+
+
+# The same examples on every machine and no clock; `make search` draws new ones.
+settings.register_profile(
+    "impc", derandomize=SEARCH == 1, deadline=None, database=None, print_blob=True
+)
+settings.load_profile("impc")
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -13,9 +13,10 @@ import scipy.signal
 from experiments.coverage import cart, noisy_trial
 from impc.arrays import Array
 from impc.bootstrap import (
+    Draw,
+    Replicate,
     block_length,
     block_residuals,
-    bootstrap,
     bootstrap_intervals,
     model_residuals,
     replicate,
@@ -25,8 +26,8 @@ from impc.evaluation import misfit_or_reason
 from impc.fit_recordings import fit_problem
 from impc.fit_settings import FitSettings
 from impc.fitted_controller import FittedController, fit_controller
-from impc.gain_covariance import gain_covariance
-from impc.intervals import Interval, covariance_intervals, entry_names, white_covariance
+from impc.gain_estimate import gain_estimate
+from impc.intervals import Interval, covariance_intervals, entry_names
 from impc.plant import as_plant
 from impc.profile_likelihood import profile_likelihood
 from impc.recording import recording
@@ -46,24 +47,31 @@ def first_order(root: float, samples: int, seed: int) -> Array:
     return np.asarray(scipy.signal.lfilter([1.0], [1.0, -root], white, axis=0)[500:])
 
 
+def drawn(fitted: FittedController, index: int, seed: int, draw: Draw) -> Replicate:
+    at = gain_estimate(fitted)
+    K, S = np.array(at.K), np.array(at.S)
+    return replicate(at.problem, K, S, fitted.weights, index, seed, draw)
+
+
 def width(found: tuple[Interval, ...]) -> Array:
     return np.array([item.high - item.low for item in found])
 
 
 def test_bootstrap_agrees_with_the_sandwich(fitted: FittedController) -> None:
     """30 replicates, seed 4: widths within a third of the sandwich's, for both ways to draw."""
-    sandwich = width(covariance_intervals(fitted, gain_covariance(fitted.free), "sandwich"))
+    estimate = gain_estimate(fitted)
+    sandwich = width(covariance_intervals(estimate, estimate.covariance, "sandwich"))
     for draw in (block_residuals, model_residuals):
-        found = bootstrap(fitted, 30, SEED, draw)
-        ratio = width(bootstrap_intervals(fitted, found, "bootstrap", 0.95)) / sandwich
+        found = [drawn(fitted, index, SEED, draw) for index in range(30)]
+        ratio = width(bootstrap_intervals(estimate, found, "bootstrap", 0.95)) / sandwich
         assert np.all(np.abs(np.log(ratio)) < np.log(1.5)), ratio
 
 
 def test_profile_agrees_with_the_sandwich(fitted: FittedController) -> None:
     """Nearly quadratic, so nearly the same ends."""
-    covariance = gain_covariance(fitted.free)
-    for item in covariance_intervals(fitted, covariance, "sandwich"):
-        found = profile_likelihood(fitted, item.name).interval
+    estimate = gain_estimate(fitted)
+    for item in covariance_intervals(estimate, estimate.covariance, "sandwich"):
+        found = profile_likelihood(estimate, item.name).interval
         assert found.low == pytest.approx(item.low, abs=0.15 * (item.high - item.low))
         assert found.high == pytest.approx(item.high, abs=0.15 * (item.high - item.low))
         assert found.low < found.value < found.high  # type: ignore[operator]
@@ -72,33 +80,31 @@ def test_profile_agrees_with_the_sandwich(fitted: FittedController) -> None:
 def test_plain_intervals_are_narrower_with_coloured_noise() -> None:
     trial = noisy_trial(SEED, 0.9)
     fit = fit_controller(fit_problem(cart(), [trial], FitSettings(horizon=10, u_max=1.0)))
-    plain = width(covariance_intervals(fit, white_covariance(fit), "cramer-rao"))
-    sandwich = width(covariance_intervals(fit, gain_covariance(fit.free), "sandwich"))
+    estimate = gain_estimate(fit)
+    plain = width(covariance_intervals(estimate, estimate.white, "cramer-rao"))
+    sandwich = width(covariance_intervals(estimate, estimate.covariance, "sandwich"))
     assert np.all(sandwich > 2 * plain)
 
 
 def test_profile_against_brute_force(fitted: FittedController) -> None:
     """D at one value against a dense search over the only other entry, initial state refitted."""
-    problem = dataclasses.replace(fitted.free.problem, unknown_start=False)
-    known = dataclasses.replace(
-        fitted, problem=problem, free=dataclasses.replace(fitted.free, problem=problem)
-    )
+    problem = dataclasses.replace(fitted.problem, unknown_start=False)
+    known = gain_estimate(dataclasses.replace(fitted, problem=problem))
     name = entry_names(problem.plant)[0]
     profile = profile_likelihood(known, name)
     value, distance = profile.values[0], profile.distances[0]
-    S = np.array(fitted.free.S)
+    S = np.array(known.S)
 
     def squared(first: float, second: float) -> float:
         return misfit_or_reason(problem, np.array([[first, second]]), S)[0] ** 2
 
-    K = np.array(fitted.free.K)[0]
+    K = np.array(known.K)[0]
     grid = K[1] + np.linspace(-0.5, 0.5, 401)
     held = min(squared(value, second) for second in grid)
     best = profile.values[int(np.argmin(profile.distances))]
     least = min(squared(best, second) for second in grid)
     variance = least / sum(trial.outputs.size for trial in problem.recordings)
-    covariance, white = gain_covariance(known.free), white_covariance(known)
-    factor = max((covariance.entries[0, 0] / white.entries[0, 0]) ** 2, 1.0)
+    factor = max((known.covariance.entries[0, 0] / known.white.entries[0, 0]) ** 2, 1.0)
     assert distance == pytest.approx((held - least) / (variance * factor), rel=0.05, abs=0.05)
 
 
@@ -114,24 +120,23 @@ def test_what_is_not_determined_has_no_end() -> None:
     trial = noisy_trial(SEED, 0.0)
     again = recording(plant, trial.outputs, trial.disturbance)
     problem = fit_problem(plant, [again], FitSettings(horizon=10, u_max=1.0))
-    fitted = fit_controller(problem)
+    estimate = gain_estimate(fit_controller(problem))
     names = entry_names(plant)
-    assert np.isinf(profile_likelihood(fitted, names[2]).interval.high)
-    assert np.isfinite(profile_likelihood(fitted, names[0]).interval.high)
+    assert np.isinf(profile_likelihood(estimate, names[2]).interval.high)
+    assert np.isfinite(profile_likelihood(estimate, names[0]).interval.high)
+    assert estimate.covariance.told_entries.tolist() == [[True, True, False]]
 
 
 def test_an_unknown_name_is_told(fitted: FittedController) -> None:
     with pytest.raises(InputError, match=r"known: K\.force"):
-        profile_likelihood(fitted, "mass")
-    with pytest.raises(InputError, match="at least 2"):
-        bootstrap(fitted, 1, 0, block_residuals)
+        profile_likelihood(gain_estimate(fitted), "mass")
 
 
 def test_a_replicate_depends_on_seed_and_number_only(fitted: FittedController) -> None:
-    alone = replicate(fitted, 3, SEED, block_residuals)
-    among = bootstrap(fitted, 5, SEED, block_residuals)[3]
+    alone = drawn(fitted, 3, SEED, block_residuals)
+    among = [drawn(fitted, index, SEED, block_residuals) for index in range(5)][3]
     np.testing.assert_array_equal(alone.K, among.K)
-    assert not np.array_equal(replicate(fitted, 3, SEED + 1, block_residuals).K, alone.K)
+    assert not np.array_equal(drawn(fitted, 3, SEED + 1, block_residuals).K, alone.K)
 
 
 @pytest.mark.parametrize("draw", [block_residuals, model_residuals])

@@ -99,7 +99,7 @@ def test_aic_is_that_of_the_innovations() -> None:
     ("table", "match"),
     [
         ({"replicates": 5}, "at least 20"),
-        ({"replicates": -1}, "at least 20"),
+        ({"replicates": -1}, "at least 0"),
         ({"horizons": [0]}, "horizons"),
         ({"bootstrap": "other"}, r"\[fit\]"),
     ],

@@ -139,7 +139,7 @@ def test_the_command(tmp_path: Path) -> None:
     assert done.exit_code == 0, done.stderr
     names = {path.name for path in out.iterdir()}
     pictures = {"comparison.png", "comparison.pdf"}
-    assert names == {"report.html", "result.json", "comparison.csv", *pictures}
+    assert names == {"report.html", "result.json", "comparison.csv", ".impc", *pictures}
     found = json.loads((out / "result.json").read_text())["methods"]
     assert list(found) == list(METHODS)
     with (out / "comparison.csv").open() as stream:

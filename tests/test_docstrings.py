@@ -53,10 +53,22 @@ ROOT = Path(__file__).parent.parent
 
 # Modules and packages without an equation to cite, by what they are about instead.
 PLUMBING = {
-    "checks and exceptions": ("impc.arrays", "impc.errors", "plants._checks"),
+    "checks and exceptions": ("impc.arrays", "impc.door", "impc.errors", "plants._checks"),
     "the command line": ("impc.cli", "impc.commands"),
-    "files and what is in them": ("impc.files", "impc.fit_memory", "impc.recording"),
-    "import paths": ("impc.plant_source", "impc.selection.source"),
+    "files and what is in them": (
+        "impc.digest",
+        "impc.files",
+        "impc.fit_memory",
+        "impc.inputs",
+        "impc.kept",
+        "impc.recording",
+    ),
+    "import paths": (
+        "impc.plant_source",
+        "impc.saved_plant",
+        "impc.selection.source",
+        "impc.user_code",
+    ),
     "queues and settings of a study": ("impc.selection.running", "impc.selection.settings"),
     "a study from its folder to its pages": ("impc.cohort",),
     "pages and figures": ("impc.report", "impc.reliability.figures", "impc.reliability.report"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import control
 import cvxpy
 import numpy as np
 import pytest
@@ -9,8 +10,17 @@ import pytest
 from experiments.benchmarks.workloads import example, seat
 from impc.arrays import Array
 from impc.eigenvalue_ranges import eigenvalue_ranges
+from impc.gain_fibre import gain_fibre
+from impc.lqr import solve_lqr
+from impc.plant import as_plant
 from impc.weights import condition_number, stage_weights
-from impc.weights_set import WeightsSet, entry_ranges, extreme_eigenvalue, nearest_diagonal
+from impc.weights_set import (
+    WeightsSet,
+    entry_ranges,
+    extreme_eigenvalue,
+    nearest_diagonal,
+    weights_set,
+)
 from tests.test_weights_set import random_members, set_of
 
 
@@ -56,11 +66,12 @@ def test_program_ends_are_members() -> None:
     for largest in (True, False):
         end = extreme_eigenvalue(found, largest=largest)
         assert condition_number(end.weights) <= found.limit
-        assert end.value == pytest.approx(end.bound, rel=1e-4)
+        assert end.value == pytest.approx(end.bound, rel=1e-6)
+        assert (end.bound <= end.value) == largest
 
 
 def test_nearest_diagonal_against_cvxpy() -> None:
-    """The same program written down by cvxpy, for three states of different size."""
+    """The same program written down by cvxpy, for ten states of different size."""
     found = set_of(seat(1, 1.0), 2.0)
     n = found.fibre.plant.n
     sizes = np.logspace(0, 1, n)
@@ -83,6 +94,34 @@ def test_nearest_diagonal_against_cvxpy() -> None:
     problem.solve(solver=cvxpy.CLARABEL)
     assert ours.value == pytest.approx(scale * problem.value, rel=1e-4)
     assert condition_number(ours.weights) <= found.limit
+
+
+def test_nearest_diagonal_of_the_seat_is_proved() -> None:
+    """105277.96203 is by a barrier method in 400 bits from A, B and K alone, with P for unknown.
+
+    It brackets the optimum to 2e-5. Programs as seen from the member of least condition number
+    ended between 105396 and 105449, whichever the processor, with a gap of 1e-8.
+    """
+    found = set_of(seat(1, 1.0), 2.0)
+    end = nearest_diagonal(found, np.logspace(0, 1, found.fibre.plant.n))
+    assert end.bound <= 105277.96205
+    assert end.value >= 105277.96200
+    assert end.value - end.bound <= 1e-6 * end.value
+    assert condition_number(end.weights) <= found.limit
+
+
+def test_ends_are_proved_without_an_analytic_centre() -> None:
+    """A state that is gone in one step: its cost is free but for the limit."""
+    plant = as_plant(control.ss([[1.2, 0.5], [0.0, 0.0]], [[1.0], [0.3]], np.eye(2), 0, True))
+    K = solve_lqr(plant, stage_weights(np.diag([2.0, 1.0]), 1.0)).K
+    assert abs(np.linalg.det(plant.A - plant.B @ K)) < 1e-12
+    found = weights_set(gain_fibre(plant, K))
+    values = eigenvalues(found, random_members(found, 500))
+    for index, largest in ((-1, True), (0, False)):
+        end = extreme_eigenvalue(found, largest=largest)
+        assert end.value == pytest.approx(end.bound, rel=1e-6)
+        worse = values[:, index] - end.bound
+        assert np.all(worse >= 0) if largest else np.all(worse <= 0)
 
 
 def test_a_diagonal_member_is_found_where_there_is_one() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import control
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from impc.arrays import Array
@@ -22,6 +22,7 @@ from impc.gain_fibre import split_blocks
 from impc.lqr import solve_lqr
 from impc.plant import Plant, as_plant
 from impc.weights import Weights, condition_number, residual, stage_weights
+from tests.support import draws
 
 EXAMPLE = as_plant(control.ss([[2, -1], [1, 0.2]], [[1], [0]], np.eye(2), 0, 1.0))
 INTEGRATOR = as_plant(control.ss([[1, 1], [0, 1]], [[0.5], [1]], np.eye(2), 0, 1.0))
@@ -131,7 +132,7 @@ def test_least_condition_agrees_with_a_fine_grid_over_the_fibre() -> None:
 
 
 @pytest.mark.parametrize(("m", "dt"), [(1, 1.0), (2, 1.0), (2, 0)])
-@settings(max_examples=8, deadline=None, print_blob=True)
+@draws(8)
 @given(seed=st.integers(0, 2**32 - 1), n=st.integers(2, 5))
 def test_the_fibre_contains_the_truth_and_nothing_with_another_gain(
     m: int, dt: float, seed: int, n: int
@@ -148,7 +149,7 @@ def test_the_fibre_contains_the_truth_and_nothing_with_another_gain(
     assert max(member.gain_error for member in members) < 1e-7
 
 
-@settings(max_examples=8, deadline=None, print_blob=True)
+@draws(8)
 @given(seed=st.integers(0, 2**32 - 1), dt=st.sampled_from([0, 1.0]))
 def test_a_metric_narrows_the_fibre_to_weights_with_that_metric(seed: int, dt: float) -> None:
     plant, truth = random_case(seed, 4, 2, dt)

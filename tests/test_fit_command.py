@@ -27,7 +27,8 @@ import control
 
 def cart(mass=1.0):
     system = control.ss([[0, 1], [0.5, -0.3]], [[0, 0], [1 / mass, 1]], [[1, 0]], 0,
-                        inputs=["force", "push"], outputs=["position"])
+                        states=["=1+1", "$\\\\alpha"], inputs=["$\\\\frac{F}$ <i>", "push"],
+                        outputs=["position"])
     return control.c2d(system, 0.05)
 """
 
@@ -127,7 +128,7 @@ def test_the_page_says_what_the_numbers_say(fitted: tuple[Result, Path]) -> None
     assert "Nothing found." in page
     for name in ("residuals.pdf", "intent.png", "methods.pdf", "trajectories-trial-3.pdf"):
         assert (fitted[1] / name).stat().st_size > 5_000
-    assert not (fitted[1] / "fit-in-progress.json").exists()
+    assert not (fitted[1] / "fit-in-progress").exists()
 
 
 def test_the_command_prints_the_table(fitted: tuple[Result, Path]) -> None:
@@ -139,7 +140,7 @@ def test_the_command_prints_the_table(fitted: tuple[Result, Path]) -> None:
 
 
 def test_a_plant_and_a_file_of_ones_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A semicolon file with decimal commas and a hostile label; a plant in the current folder."""
+    """A semicolon file with decimal commas; a plant beside it; names to stumble over."""
     monkeypatch.chdir(tmp_path)
     Path("mine_to_fit.py").write_text(OWN_PLANT)
     rng = np.random.default_rng(0)
@@ -152,14 +153,15 @@ def test_a_plant_and_a_file_of_ones_own(tmp_path: Path, monkeypatch: pytest.Monk
         force = np.clip(-2.5 * x[0] - 2.2 * x[1], -1, 1)
         for _ in range(10):
             x = x + 0.005 * np.array([x[1], 0.5 * x[0] - 0.3 * x[1] + force + value])
-    Path("mine.csv").write_text("\n".join(lines))
+    file = Path(os.fsdecode(b"mine\xff$x^$.csv"))
+    file.write_text("\n".join(lines))
     Path("mine.toml").write_text(
         '[recording]\ntime = "t"\nsubject = "<script>alert(1)</script>"\n'
         '[signals.position]\ncolumn = "pos"\nunit = "m"\n'
         '[signals.push]\ncolumn = "push"\nunit = "N"\n'
         "[plant]\nmass = 1.0\n[fit]\nhorizon = 10\nu_max = 1.0\n"
     )
-    done = run("fit", "mine.csv", "--plant", "mine_to_fit:cart", "--config", "mine.toml",
+    done = run("fit", str(file), "--plant", "mine_to_fit:cart", "--config", "mine.toml",
                "--out", "out")  # fmt: skip
     assert done.exit_code == 0, done.stderr
     found = json.loads(Path("out/result.json").read_text())
@@ -168,6 +170,9 @@ def test_a_plant_and_a_file_of_ones_own(tmp_path: Path, monkeypatch: pytest.Monk
     page = Path("out/report.html").read_text()
     assert "<script>alert" not in page
     assert "&lt;script&gt;alert" in page
+    assert "<i>" not in page
+    assert r"$\frac{F}$ &lt;i&gt;" in page
+    assert found["trials"][0]["trial"] == r"mine\udcff$x^$"
 
 
 @pytest.mark.parametrize("name", DAMAGED)
@@ -233,8 +238,8 @@ def test_an_interrupted_command_says_what_it_kept(
     assert stopped.exit_code == 130
     assert "fit" in stopped.stderr
     assert "the same command goes on from there" in stopped.stderr
-    assert [path.name for path in (tmp_path / "out").iterdir()] == ["fit-in-progress.json"]
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {".impc", "fit-in-progress"}
     done = run(*arguments)
     assert done.exit_code == 0, done.stderr
     assert (tmp_path / "out" / "report.html").exists()
-    assert not (tmp_path / "out" / "fit-in-progress.json").exists()
+    assert not (tmp_path / "out" / "fit-in-progress").exists()

@@ -63,7 +63,7 @@ def cart_trials(count: int, noise: float, samples: int = 300) -> list[Recording]
 @pytest.fixture(scope="module")
 def noisy() -> FitResult:
     trials = noisy_recordings(6.0, SEED, 0.9)
-    settings = FitSettings(u_max=6.0, feedback_states=FEEDBACK)
+    settings = FitSettings(u_max=6.0, feedback_states=FEEDBACK, intent_draws=False)
     return fit_recordings(fit_problem(seat().problem.plant, trials, settings), settings)
 
 
@@ -121,7 +121,9 @@ def test_intent_of_known_weights() -> None:
     """The double integrator with Q = I: the least condition number is 1, whatever v is."""
     plant = as_plant(control.ss([[1, 1], [0, 1]], [[0.5], [1]], np.eye(2), 0, True))
     weights = stage_weights(np.diag([4.0, 1.0]), 1)
-    found = intent(plant, np.array(solve_lqr(plant, weights).K), np.ones(2), weights)
+    found = intent(
+        plant, np.array(solve_lqr(plant, weights).K), np.ones((1, 1, 1)), np.ones(2), weights
+    )
     np.testing.assert_allclose(found.reported.eigenvalues, [1, 4], rtol=1e-5)
     np.testing.assert_allclose(found.reported.dominant, [1, 0], atol=1e-4)
     sentence = dominant_sentence(found.reported, plant, np.array([1.0, 3.0]))
@@ -210,8 +212,9 @@ def test_a_memory_of_another_fit_is_not_used(
     assert open_memory(tmp_path, problem, replace(settings, settle=2.0)).stages == {}
     other = replace(problem, recordings=problem.recordings[:2])
     assert open_memory(tmp_path, other, settings).stages == {}
-    path = tmp_path / "fit-in-progress.json"
-    for text in ("", "{", "[]", json.dumps({"digest": 3})):
+    path = tmp_path / "fit-in-progress" / "fit.json"
+    whole = path.read_text()
+    for text in ("", "{", "[]", json.dumps({"digest": 3}), whole.replace("1", "2", 1)):
         path.write_text(text)
         assert open_memory(tmp_path, problem, settings).stages == {}
 

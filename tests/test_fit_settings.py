@@ -36,6 +36,23 @@ def test_defaults_and_values() -> None:
         ({"u_max": "six"}, "u_max"),
         ({"free": "J1"}, "free"),
         ({"terminal_set": 1}, "terminal_set"),
+        ({"horizon": 2**63}, "horizon: got 9223372036854775808"),
+        ({"horizon": 16**5000}, "horizon: got an integer of about 6021 digits"),
+        ({"horizons": [10, 2**63]}, "horizons"),
+        ({"horizons": [10, 10]}, "horizons: names 10 twice"),
+        ({"margin": 1e308}, "margin"),
+        ({"margin": float("nan")}, "margin"),
+        ({"settle": 1e308}, "settle"),
+        ({"replicates": 2**63}, "replicates"),
+        ({"replicates": 19}, "replicates"),
+        ({"seed": -1}, "seed"),
+        ({"seed": 16**5000}, "seed"),
+        ({"u_max": 1e308}, "u_max"),
+        ({"u_max": 10**400}, "u_max"),
+        ({"u_max": [1.0, -1.0]}, "u_max: got -1.0"),
+        ({"u_max": 5e-324}, "u_max"),
+        ({"bounded_states": {"x": 1e308}}, "bounded_states x"),
+        ({"free": ["mass", "mass"]}, "free: names mass twice"),
     ],
 )
 def test_what_is_wrong_is_named(table: dict[str, Any], says: str) -> None:
@@ -77,3 +94,11 @@ def test_bounds_that_cannot_be_set(seat: Plant, states: dict[str, Any], says: st
     trial = recording(seat, np.ones((100, 2)), np.zeros(100))
     with pytest.raises(ImpcError, match=says):
         fit_bounds(seat, FitSettings(bounded_states=states), [trial])
+
+
+def test_as_many_limits_as_inputs(seat: Plant) -> None:
+    trial = recording(seat, np.ones((300, 2)), np.zeros(300))
+    for given in ([], [1.0, 2.0]):
+        with pytest.raises(ImpcError, match=r"^\[fit\] u_max: has . numbers"):
+            fit_bounds(seat, FitSettings(u_max=given), [trial])
+    assert fit_bounds(seat, FitSettings(u_max=[2.0]), [trial]).u_max[0] == 2.0

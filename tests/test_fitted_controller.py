@@ -20,6 +20,7 @@ from impc.fit_settings import FitSettings
 from impc.fitted_controller import FittedController, fit_controller
 from impc.gain_coordinates import Coordinates
 from impc.gain_covariance import gain_covariance
+from impc.gain_estimate import gain_estimate
 from impc.initial_states import with_fitted_starts
 from impc.inverse_problem import InverseProblem, moved
 from impc.lqr import solve_lqr
@@ -50,10 +51,10 @@ def test_without_noise_all_that_is_determined_comes_out(
     samples = sum(trial.outputs.size for trial in work.problem.recordings)
     assert fitted.exact
     assert 1 - fitted.misfit**2 / samples > 0.99999
-    covariance = gain_covariance(fitted.free)
+    covariance = gain_estimate(fitted).covariance
     determined = covariance.singular_values > 1e-6 * covariance.singular_values[0]
     truth = np.array(work.controller.K)
-    error = covariance.directions @ np.ravel((fitted.solution.K - truth) @ covariance.T)
+    error = covariance.along(fitted.solution.K - truth)
     size = np.linalg.norm(truth @ covariance.T)
     assert np.count_nonzero(determined) >= 9
     assert np.max(np.abs(error[determined])) <= 1e-5 * size
@@ -239,7 +240,7 @@ def test_standard_deviations_of_a_linear_model_are_those_of_theory() -> None:
     here = replace(problem, recordings=(replace(trial, outputs=noisy),))
     K = np.array(work.controller.K)
     fit = fit_controller(problem).free
-    covariance = gain_covariance(replace(fit, K=K, problem=here))
+    covariance = gain_covariance(here, K, np.array(fit.S))
     found = evaluate(here, K, np.eye(1))
     J = np.hstack([found.dK.reshape(len(found.residual), -1), found.dx0])
     scale = np.linalg.norm(J, axis=0)

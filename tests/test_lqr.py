@@ -119,5 +119,5 @@ def test_a_mode_without_weight_is_an_error() -> None:
 
 
 def test_sizes_are_compared(example_plant: Plant) -> None:
-    with pytest.raises(InputError, match=r"the plant needs \(2, 2\) and \(1, 1\)"):
+    with pytest.raises(InputError, match="weights: has 3 states, what stands before it 2"):
         solve_lqr(example_plant, stage_weights(np.eye(3), 1))

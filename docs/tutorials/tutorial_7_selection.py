@@ -89,7 +89,7 @@ size = 2
 replicates = 40
 """,
 )
-terminal("impc select dosing.toml --out select")
+terminal("impc select dosing.toml --model dosing:blood_model --out select")
 
 # %%
 # Intervals of the parameters that can be told, patient by patient:
@@ -97,5 +97,5 @@ show("select/intervals.png")
 
 # %%
 # And which of them are key: explaining, reliable between visits, of several pathways.
-terminal("impc key-parameters dosing.toml --out key-parameters")
+terminal("impc key-parameters dosing.toml --model dosing:blood_model --out key-parameters")
 terminal("cat key-parameters/candidates.csv")

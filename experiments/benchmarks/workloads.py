@@ -120,5 +120,6 @@ def _record(
         controller.horizon,
         tuple(recordings),
         terminal_set=terminal_set,
+        output_scale=np.ones(len(plant.outputs)),  # the objective that peers are given too
     )
     return Workload(weights, controller, tuple(drives), problem)

@@ -1,1 +1,1 @@
-"""Many subjects, many replicates, on one machine or a cluster (dask.distributed)."""
+"""Many subjects, many replicates, on one machine or a cluster."""

@@ -1,61 +1,75 @@
-"""Which study a result belongs to."""
+"""Which study a result belongs to: the digest of all that a unit's fit depends on."""
 
 from __future__ import annotations
 
-import hashlib
-import importlib.metadata
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from impc.cohort.work import FitTask
+from impc.digest import content_digest, digest, source_digest, versions
 from impc.errors import DataError
 
 if TYPE_CHECKING:
-    from pathlib import Path
+    from collections.abc import Mapping, Sequence
 
-    from impc.cohort.study import Study, Unit
+    from impc.files.configuration import Configuration
 
-__all__ = ["fit_task"]
+__all__ = ["require_same_inputs", "unit_digest"]
 
-_EDGE = 1 << 16
 # They say how many replicates there are, not what any of them is.
 _COUNTS = ("replicates",)
 
 
-def fit_task(study: Study, unit: Unit) -> FitTask:
-    """The task of a unit, with the digest of all that its result depends on.
+def unit_digest(
+    files: Sequence[str], plant: str, arguments: Mapping[str, Any], configuration: Configuration
+) -> str:
+    """Of the whole content of recordings, of plant, settings and versions.
 
-    Of a recording count its size and its first and last 64 kB: a study may have terabytes.
+    Parameters
+    ----------
+    files : sequence of str
+        Recordings, one a trial. Their names count too: a name may tell a label, and its ending the
+        format.
+    plant : str
+        Import path, imported already, or file.
+    arguments : mapping
+        Of the plant.
+    configuration : Configuration
+        Signals and settings.
 
     Raises
     ------
     DataError
-        When a recording cannot be opened.
+        When a recording cannot be read.
     """
-    configuration = study.configuration
-    settings = {key: value for key, value in configuration.fit.items() if key not in _COUNTS}
-    text = hashlib.sha256(importlib.metadata.version("impc").encode())
-    for part in (study.plant, sorted(unit.arguments.items()), sorted(settings.items())):
-        text.update(repr(part).encode())
-    text.update(repr((configuration.recording, sorted(configuration.signals.items()))).encode())
-    for file in unit.files:
-        text.update(_edges(file))
-    return FitTask(
-        tuple(str(file.resolve()) for file in unit.files),
-        study.plant,
-        unit.arguments,
-        configuration,
-        text.hexdigest(),
+    return digest(
+        [(Path(name).name, content_digest(Path(name))) for name in files],
+        source_digest(plant, arguments),
+        dict(arguments),
+        configuration.recording,
+        configuration.signals,
+        {key: value for key, value in configuration.fit.items() if key not in _COUNTS},
+        versions(),
     )
 
 
-def _edges(path: Path) -> bytes:
-    try:
-        size = path.stat().st_size
-        with path.open("rb") as stream:
-            first = stream.read(_EDGE)
-            stream.seek(max(size - _EDGE, 0))
-            return f"{size}".encode() + first + stream.read(_EDGE)
-    except OSError as error:
+def require_same_inputs(here: str, wanted: str) -> None:
+    """Refuse to work where the files, the plant or the versions are not those of the client.
+
+    Parameters
+    ----------
+    here : str
+        `unit_digest` as the worker finds it.
+    wanted : str
+        As the client found it.
+
+    Raises
+    ------
+    DataError
+        When they differ.
+    """
+    if here != wanted:
         raise DataError(
-            f"recording {path.name}", f"cannot be opened ({error.strerror})", "check the path"
-        ) from None
+            "worker",
+            "has other recordings, another plant or other versions than this command",
+            "give all machines the same, and start the workers again",
+        )

@@ -1,43 +1,38 @@
 """Run a study: fits and replicates as tasks, results to disk as they come.
 
-Any scheduler of dask.distributed will do. A few tasks per worker are given out at a time, so that
-neither scheduler nor client holds more than that of the study. A unit's replicates follow as soon
-as its fit is written down. A task whose worker dies is given to another one; what cannot be fitted
-is reported and stops nothing else.
+A few tasks per worker are given out at a time, so that nobody holds more than that of the study. A
+unit's replicates follow as soon as its fit is written down. A task whose worker dies is given to
+another one; what cannot be fitted is reported and stops nothing else.
 """
 
 from __future__ import annotations
 
+import json
 import os
-import time
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
-import distributed
 import psutil
 
-from impc.cohort.digest import fit_task
-from impc.cohort.work import fit_unit, replicate_unit
-from impc.errors import DataError
+from impc.cohort.work import FitTask, fit_unit, replicate_unit
+from impc.digest import versions
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-    from distributed import Client
+    from collections.abc import Callable, Iterator, Mapping
 
     from impc.cohort.store import Store
     from impc.cohort.study import Study, Unit
-    from impc.cohort.work import FitTask
+    from impc.cohort.workers import Done, Workers
 
-__all__ = ["Progress", "run_study", "work_left"]
+__all__ = ["Failures", "Progress", "run_study", "work_left"]
 
 # Tasks given out for each thread of the cluster: one that runs, and two that wait for it.
 _AHEAD = 3
-# A task may lose this many workers before it is taken for the cause.
-_RETRIES = 10
 _FIT = -1
+# What a replicate needs of its fit.
+_NEEDED = ("starts", "logarithms", "K", "S", "Q", "R")
 
 
 @dataclass(frozen=True)
@@ -56,6 +51,35 @@ class Progress:
     log: Callable[[str], None] = lambda _: None
 
 
+@dataclass
+class Failures:
+    """What could not be done, and why.
+
+    Attributes
+    ----------
+    units : dict
+        Unit -> reason why it has no fit.
+    replicates : dict
+        Unit -> number of the replicate, from 1 -> reason.
+    """
+
+    units: dict[str, str] = field(default_factory=dict)
+    replicates: dict[str, dict[int, str]] = field(default_factory=dict)
+
+    @property
+    def lines(self) -> list[str]:
+        """A sentence each, for the terminal."""
+        lines = [f"{unit}: {reason}" for unit, reason in self.units.items()]
+        for unit, found in self.replicates.items():
+            first = min(found)
+            more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
+            lines.append(f"{unit}: replicate {first}{more}: {found[first]}")
+        return lines
+
+    def __bool__(self) -> bool:
+        return bool(self.units or self.replicates)
+
+
 @dataclass(frozen=True)
 class _Work:
     """One task: a fit (index -1) or a replicate of a unit."""
@@ -69,74 +93,76 @@ class _Work:
 
 
 def work_left(study: Study, store: Store) -> tuple[int, int]:
-    """Number of tasks done and of all tasks; a unit that failed counts as not begun."""
+    """Number of tasks done and of all tasks; a unit that failed counts as not begun.
+
+    Raises
+    ------
+    InputError
+        When a result in the folder is damaged, or of another run.
+    """
     count = int(study.configuration.fit.get("replicates", 0))
     done = 0
     for unit in study.units:
-        done += store.fit(unit.name) is not None
-        done += sum(store.has_replicate(unit.name, index) for index in range(count))
+        if store.fit(unit.name) is not None:
+            found = (store.replicate(unit.name, index) for index in range(count))
+            done += 1 + sum(item is not None for item in found)
     return done, len(study.units) * (1 + count)
 
 
 def run_study(
-    study: Study, store: Store, client: Client, progress: Progress | None = None
-) -> dict[str, str]:
+    study: Study,
+    tasks: Mapping[str, FitTask],
+    store: Store,
+    workers: Workers,
+    progress: Progress | None = None,
+) -> Failures:
     """Do what is left of a study.
 
     Parameters
     ----------
     study : Study
+    tasks : mapping of str to FitTask
+        Of `study_tasks`; a unit without one is left out.
     store : Store
         Held open by this run.
-    client : distributed.Client
-        Of the scheduler.
+    workers : Workers
     progress : Progress, optional
-
-    Returns
-    -------
-    dict
-        Units that could not be fitted, with the reason of each.
 
     Raises
     ------
     InputError
-        When a unit in the folder was fitted to other recordings or with other settings.
+        When a result in the folder is damaged, or of other recordings, settings, plant or versions.
     OutputError
         When a result cannot be written.
     """
     progress = progress or Progress()
-    run = _Run(study, store, client, progress)
-    failed: dict[str, str] = {}
+    run = _Run(study, tasks, store, workers, progress)
     for unit in study.units:
-        try:
-            run.tasks[unit.name] = fit_task(study, unit)
-        except DataError as error:
-            failed[unit.name] = str(error)
-            store.keep_fit(unit.name, {"reason": str(error), "digest": ""})
-            continue
-        store.require_same(unit.name, run.tasks[unit.name].digest)
-    store.keep_manifest(_manifest(study, run.tasks))
-    progress.log(f"run of {len(study.units)} units on {_threads(client)} threads")
-    for unit in study.units:
-        if unit.name in run.tasks:
+        if unit.name in tasks:
             run.begin(unit)
-    for unit_name, reason in run.drain():
-        failed[unit_name] = reason
-        progress.log(f"{unit_name}: {reason}")
-    progress.log(f"end: {len(failed)} of {len(study.units)} units without a result")
-    return failed
+    manifest = json.dumps(_manifest(study, tasks), indent=1, sort_keys=True) + "\n"
+    store.write("manifest.json", manifest.encode())
+    progress.log(f"run of {len(study.units)} units on {workers.threads} threads")
+    run.drain()
+    return run.failures
 
 
 class _Run:
-    """The queue of one run, and the futures that are out."""
+    """The queue of one run, and how many tasks are out."""
 
-    def __init__(self, study: Study, store: Store, client: Client, progress: Progress) -> None:
-        self.store, self.client, self.progress = store, client, progress
+    def __init__(
+        self,
+        study: Study,
+        tasks: Mapping[str, FitTask],
+        store: Store,
+        workers: Workers,
+        progress: Progress,
+    ) -> None:
+        self.store, self.workers, self.progress, self.tasks = store, workers, progress, tasks
         self.count = int(study.configuration.fit.get("replicates", 0))
-        self.tasks: dict[str, FitTask] = {}
         self.queue: deque[_Work] = deque()
-        self.out: dict[Any, _Work] = {}
-        self.begun = time.time()
+        self.out = 0
+        self.failures = Failures()
 
     def begin(self, unit: Unit) -> None:
         """Queue what a unit lacks."""
@@ -145,56 +171,60 @@ class _Run:
         else:
             self.queue.extend(self._replicates(unit.name))
 
-    def drain(self) -> Iterator[tuple[str, str]]:
-        """Give out tasks and take in results until none is left; yields failures."""
-        make: Any = distributed.as_completed  # distributed types few of its functions
-        waiting = make()
-        self._fill(waiting)
-        for future in waiting:
-            work = self.out.pop(future)
-            content = self._result(future)
-            future.release()
-            if work.index == _FIT:
-                self.store.keep_fit(work.unit, content)
-                if "reason" not in content:
-                    # Before other fits: a unit is finished before the next is begun.
-                    self.queue.extendleft(reversed(list(self._replicates(work.unit))))
-            elif "reason" not in content:
-                self.store.keep_replicate(work.unit, work.index, content)
-            self._tell(work, content)
-            if "reason" in content:
-                yield work.unit, f"{work.name}: {content['reason']}"
-            self._fill(waiting)
+    def drain(self) -> None:
+        """Give out tasks and take in results until none is left."""
+        self._fill()
+        for done in self.workers.results():
+            self.out -= 1
+            self._take(done)
+            self._fill()
 
-    def _fill(self, waiting: Any) -> None:
-        most = _AHEAD * max(_threads(self.client), 1)
-        while self.queue and len(self.out) < most:
+    def _take(self, done: Done) -> None:
+        work = done.key
+        assert isinstance(work, _Work)
+        # A fault of the program itself is a reason like any other.
+        content: dict[str, Any] = {"reason": done.fault} if done.fault else done.value
+        reason = content.get("reason")
+        if reason is not None:
+            self._fail(work, reason)
+        elif work.index == _FIT:
+            self.store.keep_fit(work.unit, content)
+            # Before other fits: a unit is finished before the next is begun.
+            self.queue.extendleft(reversed(list(self._replicates(work.unit))))
+        else:
+            self.store.keep_replicate(work.unit, work.index, content)
+        self._tell(work, content)
+
+    def _fail(self, work: _Work, reason: str) -> None:
+        if work.index == _FIT:
+            self.failures.units[work.unit] = reason
+            self.store.keep_failure(work.unit, None, reason)
+        else:
+            self.failures.replicates.setdefault(work.unit, {})[work.index + 1] = reason
+            self.store.keep_failure(work.unit, work.index, reason)
+        self.progress.log(f"{work.unit}: {work.name}: {reason}")
+
+    def _fill(self) -> None:
+        most = _AHEAD * self.workers.threads
+        while self.queue and self.out < most:
             work = self.queue.popleft()
-            future = self._submit(work)
-            self.out[future] = work
-            waiting.add(future)
+            self._submit(work)
+            self.out += 1
 
-    def _submit(self, work: _Work) -> Any:
+    def _submit(self, work: _Work) -> None:
         task = self.tasks[work.unit]
         if work.index == _FIT:
-            return self.client.submit(fit_unit, task, pure=False, retries=0)
+            self.workers.submit(work, fit_unit, task)
+            return
         fit = self.store.fit(work.unit)
-        keep = ("starts", "logarithms", "Q", "R", "misfit", "exact", "converged")
-        needed = {key: fit[key] for key in keep} if fit is not None else {}
-        return self.client.submit(replicate_unit, task, needed, work.index, pure=False, retries=0)
+        assert fit is not None
+        needed = {key: fit[key] for key in _NEEDED}
+        self.workers.submit(work, replicate_unit, task, needed, work.index)
 
     def _replicates(self, unit: str) -> Iterator[_Work]:
         for index in range(self.count):
-            if not self.store.has_replicate(unit, index):
+            if self.store.replicate(unit, index) is None:
                 yield _Work(unit, index)
-
-    def _result(self, future: Any) -> dict[str, Any]:
-        """What a task returned; a fault of the program itself is a reason like any other."""
-        error = future.exception()
-        if error is not None:
-            return {"reason": f"{type(error).__name__}: {error}", "digest": ""}
-        found: dict[str, Any] = future.result()
-        return found
 
     def _tell(self, work: _Work, content: dict[str, Any]) -> None:
         seconds = float(content.get("seconds", 0.0))
@@ -206,15 +236,12 @@ class _Run:
         )
 
 
-def _threads(client: Any) -> int:
-    return int(sum(client.nthreads().values()))
-
-
-def _manifest(study: Study, tasks: dict[str, FitTask]) -> dict[str, Any]:
+def _manifest(study: Study, tasks: Mapping[str, FitTask]) -> dict[str, Any]:
     return {
         "plant": study.plant,
         "replicates": int(study.configuration.fit.get("replicates", 0)),
         "made": datetime.now(UTC).isoformat(timespec="seconds"),
+        "versions": versions(),
         "units": {
             unit.name: {
                 "subject": unit.subject,

@@ -10,6 +10,7 @@ import pandas as pd
 
 from impc.cohort.comparison import compare_cohort, measures_of
 from impc.cohort.figures import group_figure, memory_figure, subject_figure
+from impc.cohort.study import safe_name
 from impc.cohort.tables import cohort_tables, table_bytes
 from impc.errors import DataError
 from impc.report.rendering import TextTable, embedded, number, plain, render_template
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from impc.cohort.comparison import Comparison
+    from impc.cohort.engine import Failures
     from impc.cohort.store import Store
     from impc.cohort.study import Study, Unit
 
@@ -32,10 +34,18 @@ _QUESTIONS = {
 }
 
 
-def write_report(study: Study, store: Store, command: str) -> None:
+def write_report(study: Study, store: Store, failures: Failures, command: str) -> None:
     """Write units.csv, replicates.csv, intervals.csv, comparisons.csv, result.json, pages, figures.
 
-    The pages end with the `command` that made them.
+    Parameters
+    ----------
+    study : Study
+    store : Store
+        With the results.
+    failures : Failures
+        What the run that has just ended could not do.
+    command : str
+        The pages end with it.
 
     Raises
     ------
@@ -55,25 +65,20 @@ def write_report(study: Study, store: Store, command: str) -> None:
     for unit in study.units:
         subjects.setdefault(unit.subject, []).append(unit)
     for subject, units in subjects.items():
-        store.write(f"subjects/sub-{subject}.html", _subject_page(subject, units, store).encode())
-    store.write("report.html", _page(study, store, tables, compared, subjects, command).encode())
+        page = _subject_page(subject, units, store, failures)
+        store.write(f"subjects/sub-{safe_name(subject)}.html", page.encode())
+    page = _page(study, store, tables, compared, subjects, failures, command)
+    store.write("report.html", page.encode())
     content = {
         "command": command,
         "units": len(study.units),
         "fitted": len(tables["units"]),
-        "failed": _failures(study, store),
+        "failed": failures.units,
+        "failed_replicates": failures.replicates,
+        "digests": store.digests,
         "comparisons": rows,
     }
     store.write("result.json", (json.dumps(plain(content), indent=1) + "\n").encode())
-
-
-def _failures(study: Study, store: Store) -> dict[str, str]:
-    found = {}
-    for unit in study.units:
-        reason = store.failure(unit.name)
-        if reason is not None and store.fit(unit.name) is None:
-            found[unit.name] = reason
-    return found
 
 
 def _page(
@@ -82,9 +87,10 @@ def _page(
     tables: dict[str, pd.DataFrame],
     compared: tuple[Comparison, ...],
     subjects: dict[str, list[Unit]],
+    failures: Failures,
     command: str,
 ) -> str:
-    pictures = {}
+    pictures = {"groups": "", "memory": ""}
     with journal_style():
         if len(tables["units"]):
             measures = _most_telling(compared, tables["units"])
@@ -92,20 +98,20 @@ def _page(
         memory = memory_figure(store.folder / "cohort.log")
         if memory is not None:
             pictures["memory"] = _kept(store, "memory", memory)
-    failures = _failures(study, store)
     count = int(study.configuration.fit.get("replicates", 0))
     return render_template(
         "cohort/cohort_page.html",
         summary=(
             f"{len(tables['units'])} of {len(study.units)} units of {len(subjects)} subjects were "
             f"fitted, {len(tables['replicates'])} bootstrap replicates of "
-            f"{count * len(tables['units'])} done."
+            f"{count * len(tables['units'])} done, {sum(map(len, failures.replicates.values()))} "
+            "failed."
         ),
         findings=_findings(compared),
-        failures=failures,
+        failures=failures.lines,
         comparisons=_comparison_tables(compared),
         units=_unit_table(tables["units"]),
-        subjects=list(subjects),
+        subjects={subject: safe_name(subject) for subject in subjects},
         pictures=pictures,
         command=command,
     )
@@ -188,12 +194,12 @@ def _unit_table(units: pd.DataFrame) -> TextTable | None:
     return TextTable("Every unit. units.csv has all numbers.", heads, rows)
 
 
-def _subject_page(subject: str, units: list[Unit], store: Store) -> str:
+def _subject_page(subject: str, units: list[Unit], store: Store, failures: Failures) -> str:
     sections: list[dict[str, Any]] = []
     for unit in units:
         fit = store.fit(unit.name)
         if fit is None:
-            reason = store.failure(unit.name) or "not fitted yet"
+            reason = failures.units.get(unit.name, "not fitted yet")
             sections.append({"name": unit.name, "reason": reason})
             continue
         with journal_style():
@@ -202,6 +208,7 @@ def _subject_page(subject: str, units: list[Unit], store: Store) -> str:
             {
                 "name": unit.name,
                 "reason": "",
+                "failed": len(failures.replicates.get(unit.name, {})),
                 "picture": picture,
                 "tables": [_fit_table(fit), _gain_table(fit)],
                 "findings": [line for trial in fit["findings"] for line in trial],
@@ -239,15 +246,20 @@ def _gain_table(fit: dict[str, Any]) -> TextTable:
                 (
                     f"{control} from {state}",
                     number(fit["K"][i][j], 4),
-                    number(_nan(fit["K_deviation"][i][j]), 2),
+                    number(_nan(fit["K_deviation"][i][j]), 2)
+                    if fit["K_told"][i][j]
+                    else "not told",
+                    number(fit["K_of_weights"][i][j], 4),
                     number(reported["Q"][j][j]) if i == 0 else "",
                 )
             )
     caption = (
-        "Gain with standard deviations, and prices of the weights of least condition number: a "
-        "choice among all weights with this gain."
+        "Gain with standard deviations (`not told`: the recordings tell this entry only together "
+        "with others), beside the gain of the reported weights; and prices of the weights of least "
+        "condition number: a choice among all weights with the latter gain."
     )
-    return TextTable(caption, ("entry", "gain", "deviation", "price of the state"), tuple(rows))
+    heads = ("entry", "gain", "deviation", "gain of the weights", "price of the state")
+    return TextTable(caption, heads, tuple(rows))
 
 
 def _nan(value: float | None) -> float:

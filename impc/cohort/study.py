@@ -17,25 +17,26 @@ subject, visit and condition make a unit: one fit.
 
 from __future__ import annotations
 
-import csv
 import re
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import msgspec
 
+from impc.cohort.finding import find_by_entities, find_by_pattern, find_by_table
+from impc.cohort.names import checked_name
+from impc.cohort.sheet import column_values, read_sheet
 from impc.errors import InputError
 from impc.files.configuration import Configuration, read_configuration
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping
     from pathlib import Path
 
-__all__ = ["Study", "StudyTable", "Unit", "read_study"]
+    from impc.cohort.finding import Found
 
-_KEYS = ("subject", "visit", "condition", "trial")
-_ENTITIES = {"subject": "sub", "visit": "ses", "condition": "task", "trial": "run"}
-_NAME = r"[^/\\_]+?"
+__all__ = ["Study", "StudyTable", "Unit", "read_study", "safe_name"]
+
 _UNSAFE = re.compile(r"[^A-Za-z0-9.+-]")
 
 
@@ -44,7 +45,7 @@ class StudyTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes
     ----------
-    plant, model : str
+    plant, model : str or None
         As the option of `impc fit`; a model for `impc select`.
     recordings, table, bids : str or None
         Where the recordings are: one of the three.
@@ -52,8 +53,8 @@ class StudyTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         Table of the subjects.
     """
 
-    plant: str = ""
-    model: str = ""
+    plant: str | None = None
+    model: str | None = None
     recordings: str | None = None
     table: str | None = None
     bids: str | None = None
@@ -72,8 +73,8 @@ class Unit:
         By trial.
     group : str
         Empty where participants have none.
-    arguments : dict
-        Of the plant, for this subject.
+    person : dict
+        Other columns of the participants, for this subject.
     """
 
     subject: str
@@ -81,13 +82,18 @@ class Unit:
     condition: str
     files: tuple[Path, ...]
     group: str = ""
-    arguments: dict[str, Any] = field(default_factory=dict)
+    person: Mapping[str, float | str] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
         """Name of its folder: sub-01_ses-1_task-EO."""
         parts = (("sub", self.subject), ("ses", self.visit), ("task", self.condition))
-        return "_".join(f"{key}-{_UNSAFE.sub('-', value)}" for key, value in parts if value)
+        return "_".join(f"{key}-{safe_name(value)}" for key, value in parts if value)
+
+
+def safe_name(name: str) -> str:
+    """A checked `name` as a part of a file's name."""
+    return _UNSAFE.sub("-", name)
 
 
 @dataclass(frozen=True)
@@ -117,165 +123,104 @@ def read_study(path: Path) -> Study:
     ------
     InputError
         When the file or a table cannot be used, no recording is found, a recording has no
-        participant, or two units would have the same name.
+        participant, a name cannot be one, or two units or subjects would have the same.
     """
     configuration = read_configuration(path, "study", "model", "select")
-    try:
-        table = msgspec.convert(configuration.study, StudyTable)
-    except msgspec.ValidationError as error:
-        raise InputError(f"{path}: study", str(error), "see docs/cohorts.md") from None
-    found = _found(path, table)
-    participants = _participants(path.parent / table.participants) if table.participants else {}
+    table = _table(path, configuration)
+    people = _people(path.parent / table.participants) if table.participants else None
     together: dict[tuple[str, str, str], list[tuple[str, Path]]] = {}
-    for labels, file in found:
+    for labels, file in _found(path, table):
         key = (labels["subject"], labels["visit"], labels["condition"])
         together.setdefault(key, []).append((labels["trial"], file))
     units = []
     for key in sorted(together, key=lambda item: tuple(map(_natural, item))):
         trials = sorted(together[key], key=lambda item: (_natural(item[0]), str(item[1])))
-        group, arguments = _of_subject(path, table, participants, key[0])
         files = tuple(file for _, file in trials)
-        units.append(Unit(*key, files, group, dict(configuration.plant) | arguments))
+        if people is None:
+            units.append(Unit(*key, files))
+        elif key[0] in people:
+            units.append(Unit(*key, files, *people[key[0]]))
+        else:
+            raise InputError(
+                f"{path}: subject {key[0]}", f"is not in {table.participants}", "add a row"
+            )
     _require_distinct(path, units)
-    return Study(table.plant, configuration, tuple(units), table.model)
+    return Study(table.plant or "", configuration, tuple(units), table.model or "")
 
 
-def _found(path: Path, table: StudyTable) -> list[tuple[dict[str, str], Path]]:
+def _table(path: Path, configuration: Configuration) -> StudyTable:
+    try:
+        table = msgspec.convert(configuration.study, StudyTable)
+    except msgspec.ValidationError as error:
+        raise InputError(f"{path}: study", str(error), "see docs/cohorts.md") from None
+    for name in table.__struct_fields__:
+        value = getattr(table, name)
+        if value is not None and (not value.strip() or "\0" in value):
+            raise InputError(f"{path}: study.{name}", "is empty", "fill it in, or remove the line")
+    return table
+
+
+def _found(path: Path, table: StudyTable) -> list[Found]:
     given = [name for name in ("recordings", "table", "bids") if getattr(table, name) is not None]
     if len(given) != 1:
         raise InputError(
             f"{path}: study", f"has {', '.join(given) or 'none'} of recordings, table and bids",
             "give exactly one",
         )  # fmt: skip
-    if table.recordings is not None:
-        found = _by_pattern(path, table.recordings)
-    elif table.bids is not None:
-        found = _by_entities(path.parent / table.bids)
-    else:
-        found = _by_table(path.parent / str(table.table))
-    if not found:
-        raise InputError(f"{path}: study.{given[0]}", "matches no file", "check the path")
-    return found
-
-
-def _by_pattern(path: Path, pattern: str) -> list[tuple[dict[str, str], Path]]:
-    names = re.findall(r"\{(\w+)\}", pattern)
-    unknown = [name for name in names if name not in _KEYS]
-    if unknown or "subject" not in names:
-        raise InputError(
-            f"{path}: study.recordings",
-            f"names {', '.join(unknown) or 'no subject'}",
-            f"use {', '.join(f'{{{name}}}' for name in _KEYS)}",
-        )
-    folder = path.parent
-    expression, seen = "", set()
-    for part in re.split(r"(\{\w+\})", pattern):
-        name = part[1:-1]
-        if part.startswith("{") and name in seen:
-            expression += f"(?P={name})"
-        elif part.startswith("{"):
-            expression += f"(?P<{name}>{_NAME})"
-            seen.add(name)
+    where = f"{path}: study.{given[0]}"
+    try:
+        if table.recordings is not None:
+            found = find_by_pattern(where, path.parent, table.recordings)
+        elif table.bids is not None:
+            found = find_by_entities(path.parent / table.bids)
         else:
-            expression += re.escape(part)
-    matching = re.compile(expression)
-    found = []
-    for file in sorted(folder.glob(re.sub(r"\{\w+\}", "*", pattern))):
-        match = matching.fullmatch(file.relative_to(folder).as_posix())
-        if match:
-            found.append((dict.fromkeys(_KEYS, "") | match.groupdict(), file))
+            found = find_by_table(path.parent / str(table.table))
+    except OSError as error:
+        raise InputError(where, f"cannot be looked for ({error.strerror})", "check it") from None
+    if not found:
+        raise InputError(where, "matches no file", "check the path")
     return found
 
 
-def _by_entities(folder: Path) -> list[tuple[dict[str, str], Path]]:
-    endings = {".csv", ".tsv", ".txt", ".mat", ".tdms", ".c3d"}
-    found = []
-    for file in sorted(folder.rglob("sub-*")):
-        if file.suffix.lower() not in endings or not file.is_file():
-            continue
-        entities = dict(re.findall(r"(?:^|_)([a-z]+)-([^_.]+)", file.name))
-        labels = {key: entities.get(short, "") for key, short in _ENTITIES.items()}
-        if labels["subject"]:
-            found.append((labels, file))
-    return found
-
-
-def _by_table(path: Path) -> list[tuple[dict[str, str], Path]]:
-    rows = _rows(path)
-    if rows and not {"file", "subject"} <= set(rows[0]):
-        raise InputError(f"table {path.name}", "lacks a column", "name the columns file, subject")
-    return [
-        ({key: (row.get(key) or "").strip() for key in _KEYS}, path.parent / row["file"].strip())
-        for row in rows
-    ]
-
-
-def _participants(path: Path) -> dict[str, dict[str, str]]:
-    found: dict[str, dict[str, str]] = {}
-    for row in _rows(path):
-        name = (row.get("subject") or row.get("participant_id") or "").strip()
-        if not name:
+def _people(path: Path) -> dict[str, tuple[str, dict[str, float | str]]]:
+    """Subject -> group and the other columns."""
+    sheet = read_sheet(path)
+    named = [name for name in ("subject", "participant_id") if name in sheet.heads]
+    if not named:
+        raise InputError(sheet.where, "lacks a subject", "name the column subject, fill every row")
+    others = [name for name in sheet.heads if name not in (*named, "group")]
+    values = {name: column_values(sheet, name) for name in others}
+    found: dict[str, tuple[str, dict[str, float | str]]] = {}
+    for number, row in enumerate(sheet.rows):
+        text = next((row[name] for name in named if row[name]), "")
+        subject = checked_name(sheet.where, "subject", text.removeprefix("sub-"))
+        if not subject:
             raise InputError(
-                f"table {path.name}", "lacks a subject", "name the column subject, fill every row"
+                sheet.where, "lacks a subject", "name the column subject, fill every row"
             )
-        found[name.removeprefix("sub-")] = {
-            key: (value or "").strip()
-            for key, value in row.items()
-            if key not in ("subject", "participant_id") and key is not None
-        }
+        if subject in found:
+            raise InputError(sheet.where, f"has two rows of subject {subject}", "keep one")
+        person = {name: value for name in others if (value := values[name][number]) is not None}
+        found[subject] = checked_name(sheet.where, "group", row.get("group", "")), person
     return found
-
-
-def _of_subject(
-    path: Path, table: StudyTable, participants: dict[str, dict[str, str]], subject: str
-) -> tuple[str, dict[str, Any]]:
-    """Group and plant arguments of a subject."""
-    if not table.participants:
-        return "", {}
-    if subject not in participants:
-        raise InputError(
-            f"{path}: subject {subject}", f"is not in {table.participants}", "add a row"
-        )
-    row = participants[subject]
-    arguments = {
-        key: _value(value)
-        for key, value in row.items()
-        if key != "group" and value not in ("", "n/a")
-    }
-    return row.get("group", ""), arguments
-
-
-def _value(text: str) -> float | str:
-    try:
-        return float(text)
-    except ValueError:
-        return text
-
-
-def _rows(path: Path) -> list[dict[str, str]]:
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "it is not UTF-8 text"
-        raise InputError(f"table {path.name}", f"cannot be read ({reason})", "check it") from None
-    first = text.partition("\n")[0]
-    delimiter = "\t" if "\t" in first else ";" if ";" in first and "," not in first else ","
-    return list(csv.DictReader(text.splitlines(), delimiter=delimiter))
 
 
 def _natural(text: str) -> tuple[Any, ...]:
     """2 before 10."""
     return tuple(
-        (0, int(part), "") if part.isdigit() else (1, 0, part)
+        (0, int(part), "") if part.isdecimal() else (1, 0, part)
         for part in re.findall(r"\d+|\D+", text)
     )
 
 
 def _require_distinct(path: Path, units: Iterable[Unit]) -> None:
+    """No two units in one folder, no two subjects on one page; capitals make no difference."""
     seen: dict[str, Unit] = {}
+    subjects: dict[str, str] = {}
     for unit in units:
         other = seen.setdefault(unit.name.lower(), unit)
-        if other is not unit:
+        page = subjects.setdefault(safe_name(unit.subject).lower(), unit.subject)
+        if other is not unit or page != unit.subject:
             raise InputError(
                 f"{path}: {unit.name}", "is the name of two units", "use letters, digits, - and +"
             )

@@ -2,7 +2,8 @@
 
     units.csv       a row a unit: labels, VAF, gain, its deviations, dominant direction, parameters
     replicates.csv  a row a replicate: labels, number, gain, parameters
-    intervals.csv   a row an entry of the gain or a parameter: percentiles of the replicates
+    intervals.csv   a row an entry of the gain or a parameter: percentiles of the replicates, empty
+                    where the recordings do not tell the entry by itself
 
 Rows are in the order of the study and columns in that of the plant: the same results give the same
 bytes, whatever ran them. Times and memory are in the log, not here.
@@ -14,6 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
+
+from impc.report.csv_text import csv_bytes
 
 if TYPE_CHECKING:
     from impc.cohort.store import Store
@@ -52,9 +55,8 @@ def cohort_tables(study: Study, store: Store) -> dict[str, pd.DataFrame]:
 
 
 def table_bytes(table: pd.DataFrame) -> bytes:
-    """A table as CSV, numbers to the last digit."""
-    text: str = table.to_csv(index=False, lineterminator="\n")
-    return text.encode()
+    """A table as CSV, numbers to the last digit, no cell a formula."""
+    return csv_bytes(list(table.columns), table.itertuples(index=False, name=None))
 
 
 def _labels(unit: Unit) -> dict[str, Any]:
@@ -72,7 +74,8 @@ def _unit_row(fit: dict[str, Any]) -> dict[str, Any]:
     row |= {f"vaf.{name}": value for name, value in fit["vaf"].items()}
     row |= {f"held_out_vaf.{name}": value for name, value in fit["held_out_vaf"].items()}
     row["saturated"] = fit["saturated"]
-    row |= _gain(fit, "K", fit["K"]) | _gain(fit, "K_deviation", fit["K_deviation"])
+    for name in ("K", "K_deviation", "K_told", "K_of_weights"):
+        row |= _gain(fit, name, fit[name])
     reported = next(iter(fit["readings"].values()))
     row |= _states(fit, "dominant", reported["dominant"])
     row |= _states(fit, "price", np.diag(reported["Q"]))
@@ -98,9 +101,12 @@ def _states(fit: dict[str, Any], name: str, values: Any) -> dict[str, float]:
 
 def _intervals(unit: Unit, fit: dict[str, Any], drawn: pd.DataFrame) -> list[dict[str, Any]]:
     estimate = _gain(fit, "K", fit["K"]) | fit["parameters"]
+    told = _gain(fit, "K", fit["K_told"])
     rows = []
     for name in drawn.columns:
-        low, high = np.quantile(drawn[name], [0.5 - _LEVEL / 2, 0.5 + _LEVEL / 2])
+        # Replicates stay where the search began along what is not told: their spread says nothing.
+        ends = [0.5 - _LEVEL / 2, 0.5 + _LEVEL / 2]
+        low, high = np.quantile(drawn[name], ends) if told.get(name, True) else (np.nan, np.nan)
         rows.append(
             _labels(unit)
             | {

@@ -19,17 +19,17 @@ import psutil
 
 from impc.bootstrap import DRAWS, replicate
 from impc.closed_loop import simulate
+from impc.cohort.digest import require_same_inputs, unit_digest
 from impc.commands.plant import find_plant
 from impc.errors import ImpcError
 from impc.files.reading import read_recordings
 from impc.fit_recordings import fit_problem
 from impc.fit_settings import fit_settings
 from impc.fitted_controller import fit_controller
-from impc.gain_covariance import gain_covariance
+from impc.gain_estimate import gain_estimate
 from impc.held_out import predict
 from impc.intent import intent
 from impc.inverse_problem import controller_for, moved, scenarios
-from impc.lqr import solve_lqr
 from impc.method_fit import judge
 from impc.plant_source import make_plant, plant_family_of
 from impc.report.rendering import plain
@@ -80,8 +80,7 @@ def fit_unit(task: FitTask) -> dict[str, Any]:
         fitted = fit_controller(problem)
         content = _described(problem, fitted, settings)
     except ImpcError as error:
-        return {"reason": str(error), "digest": task.digest}
-    content["digest"] = task.digest
+        return {"reason": str(error)}
     content["seconds"] = time.perf_counter() - started
     content["memory_mb"] = _memory()
     found: dict[str, Any] = plain(content)
@@ -93,12 +92,19 @@ def replicate_unit(task: FitTask, fit: dict[str, Any], index: int) -> dict[str, 
     started = time.perf_counter()
     try:
         problem, settings = _problem(task)
-        fitted = _restored(problem, fit)
-        found = replicate(fitted, index, settings.seed, DRAWS[settings.bootstrap])
+        here = moved(problem, np.array(fit["starts"]), np.array(fit["logarithms"]))
+        found = replicate(
+            here,
+            np.array(fit["K"]),
+            np.array(fit["S"]),
+            stage_weights(fit["Q"], fit["R"]),
+            index,
+            settings.seed,
+            DRAWS[settings.bootstrap],
+        )
     except ImpcError as error:
-        return {"reason": str(error), "digest": task.digest}
+        return {"reason": str(error)}
     content = {
-        "digest": task.digest,
         "K": found.K,
         "parameters": found.parameters,
         "seconds": time.perf_counter() - started,
@@ -112,6 +118,9 @@ def replicate_unit(task: FitTask, fit: dict[str, Any], index: int) -> dict[str, 
 def _problem(task: FitTask) -> tuple[InverseProblem, FitSettings]:
     settings = fit_settings(task.configuration.fit)
     source = find_plant(task.plant, task.arguments)
+    # A worker on another machine, or one that has run for days, may have other files and code.
+    here = unit_digest(task.files, source.name, task.arguments, task.configuration)
+    require_same_inputs(here, task.digest)
     recorded = tuple(task.configuration.signals)
     plant = make_plant(source, recorded)
     family = plant_family_of(source, recorded, settings.free)
@@ -125,19 +134,13 @@ def _described(
     known = replace(fitted.problem, unknown_start=False, family=None, logarithms=np.zeros(0))
     plant, K, S = known.plant, np.array(fitted.solution.K), np.array(fitted.solution.S)
     fit = judge("inverse_mpc", known, problem.bounds, K, S, weights=fitted.weights, seconds=0.0)
-    reported = replace(
-        fitted.free, K=fitted.solution.K, S=fitted.solution.S, problem=fitted.problem
-    )
-    covariance = gain_covariance(reported)
+    estimate = gain_estimate(fitted)
     sizes = np.sqrt(np.mean(np.concatenate([run.x for run in fit.runs]) ** 2, axis=0))
     moving = sizes[sizes > 0]
     sizes = np.maximum(sizes, np.min(moving) if len(moving) else 1.0)
-    readings = intent(plant, K, sizes, fitted.weights)
-    parameters = {}
-    if fitted.problem.family is not None:
-        family = fitted.problem.family
-        values = family.nominal * np.exp(fitted.problem.logarithms)
-        parameters = dict(zip(family.names, values, strict=True))
+    readings = intent(plant, K, np.array(fitted.metrics), sizes, fitted.weights)
+    family = estimate.problem.family
+    names = () if family is None else family.names
     limit = np.minimum(np.abs(problem.bounds.u_max), np.abs(problem.bounds.u_min))
     commands = np.concatenate([np.abs(run.u) for run in fit.runs])
     return {
@@ -146,8 +149,11 @@ def _described(
         "outputs": plant.outputs,
         "trials": len(problem.recordings),
         "samples": sum(trial.samples for trial in problem.recordings),
-        "K": K,
-        "K_deviation": covariance.entries,
+        "K": estimate.K,
+        "S": estimate.S,
+        "K_deviation": estimate.covariance.entries,
+        "K_told": estimate.covariance.told_entries,
+        "K_of_weights": K,
         "Q": fitted.weights.Q,
         "R": fitted.weights.R,
         "misfit": fitted.misfit,
@@ -161,9 +167,9 @@ def _described(
             item.rule: {"Q": item.weights.Q, "dominant": item.dominant, "angle": item.angle}
             for item in readings.readings
         },
-        "parameters": parameters,
-        "starts": [trial.x0 for trial in fitted.problem.recordings],
-        "logarithms": fitted.problem.logarithms,
+        "parameters": dict(zip(names, estimate.parameters, strict=True)),
+        "starts": [trial.x0 for trial in estimate.problem.recordings],
+        "logarithms": estimate.problem.logarithms,
         "findings": [trial.findings for trial in problem.recordings],
         "trajectory": _trajectory(known, fitted),
     }
@@ -194,22 +200,6 @@ def _trajectory(known: InverseProblem, fitted: FittedController) -> dict[str, An
         "recorded": trial.outputs[::step],
         "simulated": (run.x @ known.plant.C.T)[::step],
     }
-
-
-def _restored(problem: InverseProblem, fit: dict[str, Any]) -> FittedController:
-    """What a replicate needs of the fit: weights, gain, initial states and parameters."""
-    from impc.fitted_controller import FittedController  # noqa: PLC0415
-    from impc.gain import GainFit  # noqa: PLC0415
-
-    here = moved(problem, np.array(fit["starts"]), np.array(fit["logarithms"]))
-    weights = stage_weights(fit["Q"], fit["R"])
-    solution = solve_lqr(here.plant, weights)
-    free = GainFit(
-        solution.K, solution.S, here, fit["misfit"], False, True, np.zeros(0), False, 0, ()
-    )
-    return FittedController(
-        here, free, weights, solution, fit["misfit"], fit["exact"], fit["converged"]
-    )
 
 
 def _memory() -> float:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 from tqdm import tqdm
 
-from impc.commands.options import out_option
+from impc.commands.options import out_option, yes_option
 from impc.commands.output import print_files
 from impc.commands.plant import KNOWN
 
@@ -36,15 +37,18 @@ __all__ = ["command"]
     help="What the columns mean, and settings, as for `impc fit`.",
 )
 @out_option("compare", "report.html, result.json, comparison.csv and the figure")
-def command(files: tuple[Path, ...], plant_name: str, config: Path, out: Path) -> None:
+@yes_option
+def command(files: tuple[Path, ...], plant_name: str, config: Path, out: Path, yes: bool) -> None:
     """Compare feedback gain, inverse LQR, inverse KKT and inverse MPC, one file a trial.
 
     Each method is fitted to all trials and to all but each one. What is done when you interrupt it
     is kept in the folder: the same command goes on from there.
     """
     # Imported here: the libraries take seconds to load, and --help needs none.
+    from impc.commands.consent import require_consent  # noqa: PLC0415
     from impc.commands.subject import read_subject  # noqa: PLC0415
     from impc.compare_recordings import compare_recordings, stages  # noqa: PLC0415
+    from impc.effort import fit_effort  # noqa: PLC0415
     from impc.fit_memory import open_memory  # noqa: PLC0415
     from impc.report.compare_report import compare_files, text_table  # noqa: PLC0415
     from impc.report.provenance import fit_provenance  # noqa: PLC0415
@@ -53,7 +57,9 @@ def command(files: tuple[Path, ...], plant_name: str, config: Path, out: Path) -
     require_writable(out)
     subject = read_subject(files, plant_name, config)
     problem, settings = subject.problem, subject.settings
-    memory = open_memory(out, problem, settings, "compare")
+    fits = replace(settings, replicates=0, profiles=[], horizons=[], held_out=True)
+    require_consent(fit_effort(problem, fits), yes)
+    memory = open_memory(out, problem, settings, "compare", subject.inputs.digest)
     with tqdm(
         total=stages(len(problem.recordings)),
         unit="estimate",
@@ -74,7 +80,7 @@ def command(files: tuple[Path, ...], plant_name: str, config: Path, out: Path) -
             raise KeyboardInterrupt(memory.kept()) from None
     names = " ".join(path.name for path in files)
     line = f"impc compare {names} --plant {plant_name} --config {config.name}"
-    provenance = fit_provenance(subject.source, files, line)
+    provenance = fit_provenance(subject.source, subject.inputs, files, line)
     written = write_files(out, compare_files(problem, compared, provenance))
     memory.forget()
     click.echo(text_table(problem, compared))

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 from tqdm import tqdm
 
-from impc.commands.options import out_option
+from impc.commands.options import out_option, yes_option
 from impc.commands.output import print_files
 from impc.commands.plant import KNOWN
 
@@ -34,13 +34,16 @@ __all__ = ["command"]
     help="What the columns mean, and settings; `impc inspect FILE` writes one.",
 )
 @out_option("fit", "report.html, result.json and the figures")
-def command(files: tuple[Path, ...], plant_name: str, config: Path, out: Path) -> None:
+@yes_option
+def command(files: tuple[Path, ...], plant_name: str, config: Path, out: Path, yes: bool) -> None:
     """Fit the controller behind the trials of one subject, one file a trial.
 
     What is done when you interrupt it is kept in the folder: the same command goes on from there.
     """
     # Imported here: the libraries take seconds to load, and --help needs none.
+    from impc.commands.consent import require_consent  # noqa: PLC0415
     from impc.commands.subject import read_subject  # noqa: PLC0415
+    from impc.effort import fit_effort  # noqa: PLC0415
     from impc.fit_memory import open_memory  # noqa: PLC0415
     from impc.fit_recordings import (  # noqa: PLC0415
         FitProgress,
@@ -54,7 +57,8 @@ def command(files: tuple[Path, ...], plant_name: str, config: Path, out: Path) -
     require_writable(out)
     subject = read_subject(files, plant_name, config)
     problem, settings = subject.problem, subject.settings
-    memory = open_memory(out, problem, settings)
+    require_consent(fit_effort(problem, settings), yes)
+    memory = open_memory(out, problem, settings, "fit", subject.inputs.digest)
     with tqdm(
         total=stages(problem, settings),
         unit="stage",
@@ -75,7 +79,7 @@ def command(files: tuple[Path, ...], plant_name: str, config: Path, out: Path) -
             raise KeyboardInterrupt(memory.kept()) from None
     names = " ".join(path.name for path in files)
     line = f"impc fit {names} --plant {plant_name} --config {config.name}"
-    provenance = fit_provenance(subject.source, files, line)
+    provenance = fit_provenance(subject.source, subject.inputs, files, line)
     written = write_files(out, fit_files(result, provenance))
     memory.forget()
     _print(result)
@@ -86,6 +90,8 @@ def _print(result: FitResult) -> None:
     """The table of methods and the intent, as the page has them."""
     from impc.intent import dominant_sentence  # noqa: PLC0415
 
+    for line in result.warnings:
+        click.echo(line)
     plant = result.fitted.problem.plant
     heads = "".join(f"{f'VAF {name}':>16}" for name in plant.outputs)
     click.echo(f"{'method':<20}{heads}{'largest input':>16}  ")

@@ -3,51 +3,57 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
-from impc.commands.options import out_option, scheduler_options
+from impc.commands.numbers import Number
+from impc.commands.options import code_options, out_option, scheduler_options
 from impc.commands.output import print_files
 from impc.commands.select import kept_results, read_model_study, study_runner
+
+if TYPE_CHECKING:
+    from impc.cohort.cluster import Cluster
 
 __all__ = ["command"]
 
 
 @click.command("key-parameters")
 @click.argument("study_file", metavar="STUDY", type=click.Path(path_type=Path))
+@code_options("model")
 @out_option("key-parameters", "report.html, result.json, table and figure")
 @click.option(
     "--bound",
-    type=click.FloatRange(min=0, min_open=True),
+    type=Number(min=0, max=1e6, min_open=True),
     default=0.35,
     help="Largest variance, in halves of the ranges, squared.",
 )
-@click.option("--vaf", type=float, default=69.0, help="Least mean VAF, %.")
-@click.option("--icc", type=float, default=0.75, help="Least ICC(A,k).")
+@click.option("--vaf", type=Number(), default=69.0, help="Least mean VAF, %.")
+@click.option("--icc", type=Number(), default=0.75, help="Least ICC(A,k).")
 @scheduler_options
 def command(
     study_file: Path,
+    model_name: str | None,
+    allowed: bool,
     out: Path,
     bound: float,
     vaf: float,
     icc: float,
-    scheduler: str | None,
-    workers: int | None,
+    cluster: Cluster,
 ) -> None:
     """Key parameters of a study of several subjects and visits.
 
     The study file is that of `impc select`. It may be stopped at any time: the same command goes on
     from there.
     """
-    from impc.report.write import require_writable, write_files  # noqa: PLC0415
+    from impc.report.write import write_files  # noqa: PLC0415
     from impc.selection.key_parameters import key_parameters  # noqa: PLC0415
     from impc.selection.key_report import key_files  # noqa: PLC0415
     from impc.selection.settings import select_settings  # noqa: PLC0415
 
-    require_writable(out)
-    study, source, recorded = read_model_study(study_file)
+    study, source, recorded = read_model_study(study_file, model_name, allowed)
     settings = select_settings(study.configuration.select)
-    with study_runner(source, out, scheduler, workers, 2 * len(recorded)) as run:
+    with study_runner(source, out, cluster, 2 * len(recorded)) as run:
         found = key_parameters(
             source.model, recorded, settings, run,
             bound=bound, least_vaf=vaf, least_reliability=icc,

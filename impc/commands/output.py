@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING
 
 import click
 
+from impc.errors import one_line
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
@@ -18,6 +20,6 @@ def print_files(out: Path, written: Sequence[Path]) -> None:
     kinds: dict[str, list[str]] = {}
     for path in written:
         kinds.setdefault(path.stem, []).append(path.suffix)
-    click.echo(f"\nWritten to {out}:")
+    click.echo(f"\nWritten to {one_line(out)}:")
     for stem, suffixes in kinds.items():
         click.echo(f"  {stem}{' '.join(suffixes)}")

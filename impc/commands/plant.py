@@ -6,11 +6,13 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+    from pathlib import Path
 
+    from impc.cohort.study import Study
     from impc.plant import Plant
     from impc.plant_source import PlantSource
 
-__all__ = ["KNOWN", "find_plant", "load_plant"]
+__all__ = ["KNOWN", "find_plant", "load_plant", "named_plant"]
 
 #: Short names of plants, by their import paths: the library itself knows no plant.
 KNOWN = {
@@ -27,11 +29,27 @@ def find_plant(name: str, arguments: Mapping[str, Any]) -> PlantSource:
     Raises
     ------
     InputError
-        As `plant_source`.
+        As `plant_source`; when an argument is a date or an integer beyond 64 bits.
     """
+    from impc.errors import InputError  # noqa: PLC0415
     from impc.plant_source import plant_source  # noqa: PLC0415
 
+    for key, value in arguments.items():
+        if not _kept(value):
+            kind = type(value).__name__
+            raise InputError(f"[plant] {key}", f"is a {kind} that no result can keep", "see docs")
     return plant_source(KNOWN.get(name, name), arguments)
+
+
+def _kept(value: object) -> bool:
+    """Whether result.json can hold it: no date, no integer beyond 64 bits, at no depth."""
+    if isinstance(value, dict):
+        return all(map(_kept, value.values()))
+    if isinstance(value, list):
+        return all(map(_kept, value))
+    if isinstance(value, int):
+        return value.bit_length() < 64
+    return isinstance(value, (float, str))
 
 
 def load_plant(path: str) -> Plant:
@@ -45,3 +63,32 @@ def load_plant(path: str) -> Plant:
     from impc.plant_source import make_plant, plant_source  # noqa: PLC0415
 
     return make_plant(plant_source(path, {}), ())
+
+
+def named_plant(study_file: Path, study: Study, given: str | None, allowed: bool) -> PlantSource:
+    """The plant of a study, when the command line consents to it.
+
+    Parameters
+    ----------
+    study_file : Path
+        For messages.
+    study : Study
+        As it was read from the file.
+    given : str or None
+        Plant that the command line names.
+    allowed : bool
+        Whether the command line allows the plant that the file names.
+
+    Raises
+    ------
+    InputError
+        When it needs consent and has none, is no code of the user's, or cannot be found.
+    """
+    from impc.user_code import consented_name, require_users_function  # noqa: PLC0415
+
+    where = f"{study_file}: study.plant"
+    name = consented_name(where, study.plant, given, allowed, "plant", tuple(KNOWN))
+    source = find_plant(name, study.configuration.plant)
+    if ":" in source.name:
+        require_users_function(where, source.make)
+    return source

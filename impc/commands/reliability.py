@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING
 import click
 from tqdm import tqdm
 
-from impc.commands.options import out_option
+from impc.commands.options import code_options, out_option
 from impc.commands.output import print_files
-from impc.commands.plant import find_plant
+from impc.commands.plant import named_plant
 
 if TYPE_CHECKING:
     from impc.cohort.study import Study
+    from impc.plant_source import PlantSource
     from impc.reliability.analysis import Trials
 
 __all__ = ["command"]
@@ -22,6 +23,7 @@ __all__ = ["command"]
 
 @click.command("reliability")
 @click.argument("study_file", metavar="STUDY", type=click.Path(path_type=Path))
+@code_options("plant")
 @out_option("reliability", "report.html, result.json, tables and figures")
 @click.option(
     "--last",
@@ -29,7 +31,7 @@ __all__ = ["command"]
     default=3,
     help="How many of a visit's trials count, the last ones.",
 )
-def command(study_file: Path, out: Path, last: int) -> None:
+def command(study_file: Path, plant_name: str | None, allowed: bool, out: Path, last: int) -> None:
     """Reliability of a study of several subjects, visits, conditions and trials.
 
     The study file is that of `impc cohort`.
@@ -38,10 +40,10 @@ def command(study_file: Path, out: Path, last: int) -> None:
     from impc.reliability.analysis import analyse  # noqa: PLC0415
     from impc.reliability.findings import findings  # noqa: PLC0415
     from impc.reliability.report import reliability_files  # noqa: PLC0415
-    from impc.report.write import require_writable, write_files  # noqa: PLC0415
+    from impc.report.write import write_files  # noqa: PLC0415
 
-    require_writable(out)
-    trials = _trials(read_study(study_file), last)
+    study = read_study(study_file)
+    trials = _trials(study, named_plant(study_file, study, plant_name, allowed), last)
     result = analyse(trials)
     files = reliability_files(trials, result, f"impc reliability {study_file.name} --last {last}")
     written = write_files(out, files)
@@ -52,14 +54,14 @@ def command(study_file: Path, out: Path, last: int) -> None:
     print_files(out, written)
 
 
-def _trials(study: Study, last: int) -> Trials:
+def _trials(study: Study, source: PlantSource, last: int) -> Trials:
     from impc.files.reading import read_recordings  # noqa: PLC0415
     from impc.plant_source import make_plant  # noqa: PLC0415
     from impc.reliability.analysis import Trials  # noqa: PLC0415
 
     cells = {}
     recorded = tuple(study.configuration.signals)
-    plant = make_plant(find_plant(study.plant, study.configuration.plant), recorded)
+    plant = make_plant(source, recorded)
     for unit in tqdm(study.units, unit="visit", file=sys.stderr, disable=None, leave=False):
         found = read_recordings(unit.files[-last:], study.configuration, plant)
         cells[unit.subject, unit.visit, unit.condition] = found

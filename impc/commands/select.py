@@ -10,15 +10,17 @@ from typing import TYPE_CHECKING, Any
 import click
 from tqdm import tqdm
 
-from impc.commands.options import out_option, scheduler_options
+from impc.commands.options import code_options, out_option, scheduler_options
 from impc.commands.output import print_files
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from impc.cohort.cluster import Cluster
     from impc.cohort.study import Study
+    from impc.kept import Kept
     from impc.selection.model import Trial
-    from impc.selection.running import Kept, Runner
+    from impc.selection.running import Runner
     from impc.selection.source import ModelSource
 
 __all__ = ["command", "kept_results", "read_model_study", "study_runner"]
@@ -26,24 +28,26 @@ __all__ = ["command", "kept_results", "read_model_study", "study_runner"]
 
 @click.command("select")
 @click.argument("study_file", metavar="STUDY", type=click.Path(path_type=Path))
+@code_options("model")
 @out_option("select", "report.html, result.json, tables and figure")
 @scheduler_options
-def command(study_file: Path, out: Path, scheduler: str | None, workers: int | None) -> None:
+def command(
+    study_file: Path, model_name: str | None, allowed: bool, out: Path, cluster: Cluster
+) -> None:
     """Sensitive parameters of a simulation model (chapter 4), subject by subject and in common.
 
     [study] model names the model by import path, [model] its arguments, [select] the settings. It
     may be stopped at any time: the same command goes on from there.
     """
-    from impc.report.write import require_writable, write_files  # noqa: PLC0415
+    from impc.report.write import write_files  # noqa: PLC0415
     from impc.selection.analysis import select_study  # noqa: PLC0415
     from impc.selection.report import selection_files  # noqa: PLC0415
     from impc.selection.settings import select_settings  # noqa: PLC0415
 
-    require_writable(out)
-    study, source, recorded = read_model_study(study_file)
+    study, source, recorded = read_model_study(study_file, model_name, allowed)
     settings = select_settings(study.configuration.select)
     named = {" visit ".join(part for part in key if part): item for key, item in recorded.items()}
-    with study_runner(source, out, scheduler, workers, 2 * len(named) + 1) as run:
+    with study_runner(source, out, cluster, 2 * len(named) + 1) as run:
         found = select_study(named, settings, run)
     written = write_files(
         out, selection_files(source.model, found, f"impc select {study_file.name}")
@@ -57,25 +61,21 @@ def command(study_file: Path, out: Path, scheduler: str | None, workers: int | N
 
 def kept_results(out: Path) -> Kept:
     """Where results of single tasks wait in the folder `out` until the whole is done."""
-    from impc.selection.running import Kept  # noqa: PLC0415
+    from impc.kept import Kept  # noqa: PLC0415
 
     return Kept(out / "in-progress")
 
 
 @contextmanager
-def study_runner(
-    source: ModelSource, out: Path, scheduler: str | None, workers: int | None, tasks: int
-) -> Iterator[Runner]:
+def study_runner(source: ModelSource, out: Path, cluster: Cluster, tasks: int) -> Iterator[Runner]:
     """Workers with a progress bar; a message about what is kept when it is interrupted.
 
     Parameters
     ----------
     out : Path
         Folder in which results wait, see `kept_results`.
-    scheduler : str or None
-        Address of a running scheduler; None for workers on this machine.
-    workers : int or None
-        How many; None for as many as there are processors.
+    cluster : Cluster
+        Which workers.
     tasks : int
         Of the progress bar.
 
@@ -95,8 +95,8 @@ def study_runner(
             bar.update()
 
         try:
-            with connected(scheduler, workers) as client:
-                yield on_workers(client, source, kept, done)
+            with connected(cluster) as workers:
+                yield on_workers(workers, source, kept, done)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(
                 f"{bar.n} of {tasks} tasks are kept in {kept.folder}; the same command goes on"
@@ -104,22 +104,32 @@ def study_runner(
 
 
 def read_model_study(
-    path: Path,
+    path: Path, given: str | None, allowed: bool
 ) -> tuple[Study, ModelSource, dict[tuple[str, str], tuple[Trial, ...]]]:
     """The study at `path`, its model and all recordings.
+
+    Parameters
+    ----------
+    path : Path
+        The study file.
+    given : str or None
+        Model that the command line names.
+    allowed : bool
+        Whether the command line allows the model that the file names.
 
     Raises
     ------
     InputError, DataError
-        When the file, the model or a recording cannot be used.
+        When the file, the model or a recording cannot be used, or the model needs consent.
     """
     from impc.cohort.study import read_study  # noqa: PLC0415
-    from impc.errors import InputError  # noqa: PLC0415
+    from impc.plant_source import import_function  # noqa: PLC0415
     from impc.selection.source import model_source, read_trials  # noqa: PLC0415
+    from impc.user_code import consented_name, require_users_function  # noqa: PLC0415
 
-    study = read_study(path)
-    if not study.model:
-        raise InputError(f"{path}: study.model", "is missing", 'write model = "module:function"')
+    study, where = read_study(path), f"{path}: study.model"
+    name = consented_name(where, study.model, given, allowed, "model", ())
+    require_users_function(where, import_function(name))
     arguments: dict[str, Any] = dict(study.configuration.model)
-    source = model_source(study.model, arguments)
+    source = model_source(name, arguments)
     return study, source, read_trials(study, source)

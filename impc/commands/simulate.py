@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from impc.commands.numbers import Number
 from impc.commands.options import out_option, seed_option
 from impc.commands.output import print_files
 from impc.commands.simulate_cohort import cohort
@@ -41,37 +42,37 @@ def command() -> None:
 @out_option("subject", "the recordings, subject.toml and truth.json")
 @click.option(
     "--torque-limit",
-    type=click.FloatRange(min=0, min_open=True),
+    type=Number(min=0, max=1e6, min_open=True),
     default=6.0,
     help="Largest torque of the subject, Nm.",
 )
 @click.option("--trials", type=click.IntRange(1, 99), default=3)
 @click.option(
     "--duration",
-    type=click.FloatRange(min=2, max=600),
+    type=Number(min=2, max=600),
     default=30.0,
     help="Of a trial, s.",
 )
 @click.option(
     "--amplitude",
-    type=click.FloatRange(min=0, min_open=True),
+    type=Number(min=0, max=1e6, min_open=True),
     default=5.0,
     help="Of the ternary torque on the seat, Nm.",
 )
 @click.option(
     "--motor-noise",
-    type=click.FloatRange(min=0),
+    type=Number(min=0, max=1e6),
     default=0.3,
     help="Standard deviation of the noise on the torque, Nm.",
 )
 @click.option(
     "--sensor-noise",
-    type=click.FloatRange(min=0),
+    type=Number(min=0, max=1e6),
     default=0.1,
     help="Standard deviation of the noise on the angles, degrees.",
 )
-@click.option("--mass", type=float, default=79.7, help="kg")
-@click.option("--height", type=float, default=1.66, help="m")
+@click.option("--mass", type=Number(), default=79.7, help="kg")
+@click.option("--height", type=Number(), default=1.66, help="m")
 @click.option("--sex", type=click.Choice(["male", "female"]), default="male")
 @seed_option
 @click.option(

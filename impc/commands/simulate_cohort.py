@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from tqdm import tqdm
 
+from impc.commands.numbers import Number
 from impc.commands.options import out_option, seed_option
 
 if TYPE_CHECKING:
@@ -34,20 +35,20 @@ _BETWEEN, _WITHIN = 0.2, 0.05
 )
 @click.option("--visits", type=click.IntRange(1, 9), default=1, help="Of each subject.")
 @click.option("--trials", type=click.IntRange(1, 9), default=3, help="Of each visit.")
-@click.option("--duration", type=click.FloatRange(5, 600), default=30.0, help="s")
+@click.option("--duration", type=Number(5, 600), default=30.0, help="s")
 @click.option(
     "--difference",
-    type=click.FloatRange(min=0.05, max=20),
+    type=Number(min=0.05, max=20),
     default=0.4,
     help="The second group's prices of angles and rates over the first's; 1 for none.",
 )
 @click.option(
     "--torque-limit",
-    type=click.FloatRange(min=1),
+    type=Number(min=1, max=1e6),
     default=6.0,
     help="Largest lumbar torque of a subject, Nm.",
 )
-@click.option("--replicates", type=click.IntRange(min=0), default=20, help="In study.toml.")
+@click.option("--replicates", type=click.IntRange(0, 1_000_000), default=20, help="In study.toml.")
 @seed_option
 def cohort(out: Path, **given: Any) -> None:
     """Subjects on the seat, half of them in each of two groups, in folders named as BIDS has it.

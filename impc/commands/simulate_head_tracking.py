@@ -8,6 +8,7 @@ from typing import Any
 
 import click
 
+from impc.commands.numbers import Number
 from impc.commands.options import out_option, seed_option
 
 __all__ = ["head_tracking"]
@@ -32,7 +33,7 @@ _SPREAD, _VISIT, _VAF = 0.25, 0.05, (82.3, 7.7)
 @click.option("--trials", type=click.IntRange(1, 9), default=3, help="Of each visit.")
 @click.option(
     "--duration",
-    type=click.FloatRange(5, 300),
+    type=Number(5, 300),
     default=30.0,
     help="Of a trial, s.",
 )

@@ -10,6 +10,7 @@ from impc.files.configuration import read_configuration
 from impc.files.reading import read_recordings
 from impc.fit_recordings import fit_problem
 from impc.fit_settings import fit_settings
+from impc.inputs import gather_inputs
 from impc.plant_source import make_plant, plant_family_of
 
 if TYPE_CHECKING:
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from impc.fit_settings import FitSettings
+    from impc.inputs import Inputs
     from impc.inverse_problem import InverseProblem
     from impc.plant_source import PlantSource
 
@@ -33,11 +35,14 @@ class Subject:
     settings : FitSettings
     source : PlantSource
         Of the plant.
+    inputs : Inputs
+        Digests of all files that went in.
     """
 
     problem: InverseProblem
     settings: FitSettings
     source: PlantSource
+    inputs: Inputs
 
 
 def read_subject(files: Sequence[Path], plant_name: str, config: Path) -> Subject:
@@ -64,4 +69,5 @@ def read_subject(files: Sequence[Path], plant_name: str, config: Path) -> Subjec
     plant = make_plant(source, recorded)
     family = plant_family_of(source, recorded, settings.free)
     recordings = read_recordings(files, configuration, plant)
-    return Subject(fit_problem(plant, recordings, settings, family), settings, source)
+    inputs = gather_inputs(files, config, source)
+    return Subject(fit_problem(plant, recordings, settings, family), settings, source, inputs)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import warnings
+from collections import Counter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,8 +23,15 @@ __all__ = ["encode_c3d", "read_c3d"]
 _REMEDY = "install it: pip install 'impc[c3d]'"
 
 
-def read_c3d(path: Path) -> Table:
-    """Read the analog channels of the file at `path`, with their units and rate.
+def read_c3d(path: Path, largest: int) -> Table:
+    """Read the analog channels of a file, with their units and rate.
+
+    Parameters
+    ----------
+    path : Path
+        Of the file.
+    largest : int
+        The most bytes that its arrays may take.
 
     Raises
     ------
@@ -42,6 +50,9 @@ def read_c3d(path: Path) -> Table:
         expected = int(reader.last_frame) - int(reader.first_frame) + 1
         if not reader.analog_used or reader.analog_per_frame < 1:
             raise DataError(source, "has no analog channels", "export them; markers are not read")
+        samples = expected * int(reader.analog_per_frame)
+        if 8 * samples * int(reader.analog_used) > largest:
+            raise DataError(source, "is too large", "export only the channels that are needed")
         frames = [analog for _, _, analog in reader.read_frames(copy=False)]
         if len(frames) < expected:
             raise DataError(
@@ -51,7 +62,7 @@ def read_c3d(path: Path) -> Table:
         units = _units(reader)
         rate = float(reader.analog_rate)
     values = np.concatenate(frames, axis=1)
-    repeated = next((label for label in labels if labels.count(label) > 1), None)
+    repeated = next((label for label, times in Counter(labels).items() if times > 1), None)
     if repeated is not None or len(labels) < len(values):
         problem = f"names two channels {repeated!r}" if repeated is not None else "lacks names"
         raise DataError(source, problem, "give each analog channel its own label")

@@ -9,6 +9,7 @@ import numpy as np
 import scipy.interpolate
 
 from impc.errors import DataError
+from impc.files import measurable
 from impc.files.units import si_unit
 
 if TYPE_CHECKING:
@@ -68,6 +69,7 @@ def read_clock(table: Table, recording: RecordingTable) -> Clock:
     """
     if recording.time is None:
         rate = _told_rate(table, recording)
+        measurable.period_of_a_recording(table.source, 1 / rate)
         time = np.arange(table.samples) / rate
         rows = _cut(table.source, time, recording)
         steps = np.arange(rows.stop - rows.start)
@@ -79,6 +81,7 @@ def read_clock(table: Table, recording: RecordingTable) -> Clock:
         raise DataError(subject, f"has the unit {unit.written!r}", 'write time_unit = "s" or "ms"')
     _require_rising(subject, values)
     time = values * unit.factor
+    measurable.times_of_a_recording(subject, time)
     rows = _cut(table.source, time, recording)
     return _measured(subject, time[rows], rows, recording.fill_gaps)
 
@@ -181,7 +184,8 @@ def _require_rising(subject: str, values: Array) -> None:
             f"has {missing.sum()} missing times, the first in sample {np.argmax(missing) + 1}",
             "repair the clock, or give recording.rate instead",
         )
-    backward = np.diff(values) <= 0
+    with np.errstate(over="ignore"):  # a step of more than the largest number is a step
+        backward = np.diff(values) <= 0
     if backward.any():
         first = int(np.argmax(backward))
         step = values[first + 1] - values[first]
@@ -227,6 +231,8 @@ def _measured(subject: str, time: Array, rows: slice, fill_gaps: float) -> Clock
     intervals = np.diff(time)
     usual = intervals[intervals < _GAP * np.median(intervals)]
     rough = float(np.mean(usual))
+    measurable.period_of_a_recording(subject, rough)
+    measurable.few_gaps(subject, time, rough)
     counts = np.rint(intervals / rough).astype(np.int64)
     if (counts == 0).any():
         first = int(np.argmax(counts == 0))

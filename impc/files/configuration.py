@@ -11,11 +11,13 @@ import difflib
 import math
 import re
 import tomllib
+import warnings
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import msgspec
 
 from impc.errors import InputError
+from impc.files.door import require_ordinary, shown
 from impc.files.units import si_unit
 
 if TYPE_CHECKING:
@@ -148,8 +150,8 @@ def read_configuration(path: Path, *more: str) -> Configuration:
     _check_recording(source, recording)
     signals = {}
     for name, table in tables["signals"].items():
-        signals[name] = _convert(source, f"signals.{name}", table, SignalTable)
-        _check_signal(source, f"signals.{name}", signals[name])
+        signals[name] = _convert(source, f"signals.{shown(name)}", table, SignalTable)
+        _check_signal(source, f"signals.{shown(name)}", signals[name])
     if not signals:
         raise InputError(
             f"{source}: signals", "names no signal", "write a table [signals.NAME] for each"
@@ -161,20 +163,20 @@ _Struct = TypeVar("_Struct", bound=msgspec.Struct)
 
 
 def _parsed(source: str, path: Path) -> dict[str, Any]:
+    if not path.exists() and not path.is_symlink():
+        raise InputError(source, "does not exist", "`impc inspect FILE --out` writes one")
+    require_ordinary(path, _LARGEST, InputError)
     try:
-        if path.stat().st_size > _LARGEST:
-            raise InputError(source, "is too large for a configuration", "give the TOML file")
         return tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except FileNotFoundError:
-        raise InputError(source, "does not exist", "`impc inspect FILE --out` writes one") from None
     except OSError as error:
         reason = error.strerror or type(error).__name__
         raise InputError(source, f"cannot be opened ({reason})", "check the path") from None
     except UnicodeDecodeError:
         raise InputError(source, "is not UTF-8 text", "save it as UTF-8") from None
-    except tomllib.TOMLDecodeError as error:
-        reason = str(error).splitlines()[0]
-        raise InputError(source, f"is not TOML ({reason})", "correct that line") from None
+    except ValueError as error:  # an integer of 5000 digits is no TOMLDecodeError
+        raise InputError(
+            source, f"is not TOML ({shown(str(error), 160)})", "correct that line"
+        ) from None
     except RecursionError:
         raise InputError(source, "is nested too deep", "give a plain TOML file") from None
 
@@ -185,7 +187,7 @@ def _require_known(source: str, place: str, table: Mapping[str, Any], known: Ite
         if key not in names:
             near = difflib.get_close_matches(key, names, n=1, cutoff=0.5)
             remedy = f"did you mean {near[0]}?" if near else f"known: {', '.join(names)}"
-            where = f"{place}.{key}" if place else key
+            where = f"{place}.{shown(key)}" if place else shown(key)
             raise InputError(f"{source}: {where}", "is not known", remedy)
 
 
@@ -221,19 +223,27 @@ def _check_recording(source: str, table: RecordingTable) -> None:
     if table.time_unit is not None and _unit(source, "recording.time_unit", table.time_unit) != (
         "second"
     ):
-        raise refuse("time_unit", f"{table.time_unit!r} is no time", 'write "s", "ms" or "us"')
+        raise refuse(
+            "time_unit", f"{shown(table.time_unit)!r} is no time", 'write "s", "ms" or "us"'
+        )
     if table.pattern is not None:
         _check_pattern(refuse, table, table.pattern)
 
 
 def _check_pattern(refuse: Any, table: RecordingTable, pattern: str) -> None:
     try:
-        groups = re.compile(pattern).groupindex
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # "possible nested set"
+            groups = re.compile(pattern).groupindex
     except (re.error, OverflowError, RecursionError) as error:
-        raise refuse("pattern", f"is no regular expression ({error})", "correct it") from None
+        raise refuse(
+            "pattern", f"is no regular expression ({shown(str(error))})", "correct it"
+        ) from None
     if not groups or not set(groups) <= set(_LABELS):
         named = ", ".join(f"(?P<{name}>...)" for name in _LABELS)
-        raise refuse("pattern", f"has the groups {list(groups)}", f"name some of {named}")
+        raise refuse(
+            "pattern", f"has the groups {shown(str(list(groups)))}", f"name some of {named}"
+        )
     for name in groups:
         if getattr(table, name):
             raise refuse(name, "is given, and in recording.pattern too", "keep one of the two")

@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 import io
 import re
+from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +17,7 @@ import numpy as np
 
 from impc.errors import DataError
 from impc.files.table import make_table
+from impc.files.thousands import require_no_thousands
 from impc.files.units import is_unit
 
 if TYPE_CHECKING:
@@ -32,7 +34,11 @@ __all__ = ["encode_delimited", "read_delimited", "split_heading"]
 _DELIMITERS = {".csv": ",;\t", ".tsv": "\t", ".txt": "\t;, "}
 _NAMES = {",": "commas", ";": "semicolons", "\t": "tabs", " ": "blanks", "|": "bars", ":": "colons"}
 _MISSING = ["", "NaN", "nan", "NAN", "NA", "N/A", "null"]
-_NUMBER = re.compile(r"[+-]?(\d+[.,]?\d*|[.,]\d+)(e[+-]?\d+)?|[+-]?inf(inity)?|nan", re.IGNORECASE)
+# Digits are taken once (++): a field of 50 000 of them and a letter is no matter of a minute.
+_NUMBER = re.compile(
+    r"[+-]?(\d++[.,]?\d*+|[.,]\d++)(e[+-]?\d++)?|[+-]?inf(inity)?|nan", re.IGNORECASE
+)
+_LONGEST = 50_000  # characters of a line: 2000 columns of 24
 _HEAD = 100  # lines in which the first row of numbers must stand
 _HEADING = re.compile(r"(.*\S)\s*[(\[]([^()\[\]]*)[)\]]")
 
@@ -65,15 +71,19 @@ def read_delimited(path: Path) -> Table:
     frame = _frame(source, body, layout)
     columns: dict[str, Array] = {}
     skipped: dict[str, str] = {}
+    floats: dict[int, str] = {}
     numbers = [number for number, _ in body]
     for index, name in enumerate(names):
         if not name and frame[index].isna().all():
             continue  # the empty column behind a delimiter at the end of each line
-        values = _column(source, name, frame[index], numbers)
+        values = _column(source, name, frame[index], numbers, layout.decimal)
         if isinstance(values, str):
             skipped[name] = values
         else:
             columns[name or f"column_{index + 1}"] = values
+            if frame[index].dtype.kind == "f":  # in a column of whole numbers no sign stands
+                floats[index] = name
+    _require_no_thousands(source, floats, body, layout)
     return make_table(source, columns, units, None, skipped)
 
 
@@ -117,6 +127,10 @@ def _lines(source: str, content: bytes) -> list[tuple[int, str]]:
     lines = [(number, line) for number, line in enumerate(split, 1) if line.strip()]
     if not lines:
         raise DataError(source, "is empty", "export it again")
+    long = next(((number, len(line)) for number, line in lines if len(line) > _LONGEST), None)
+    if long is not None:
+        problem = f"line {long[0]} has {long[1]} characters, and {_LONGEST} is the most"
+        raise DataError(source, problem, "export it again, one sample a row")
     return lines
 
 
@@ -213,10 +227,10 @@ def _headings(
         )
     split = [split_heading(item) for item in last]
     names = [name for name, _ in split]
-    repeated = next((name for name in names if name and names.count(name) > 1), None)
+    repeated = _repeated(names)
     if repeated is not None:
         names = list(last)  # angle (deg) beside angle (rad)
-        repeated = next((name for name in names if name and names.count(name) > 1), None)
+        repeated = _repeated(names)
     if repeated is not None:
         raise DataError(source, f"names two columns {repeated!r}", "give each its own name")
     units = {
@@ -225,6 +239,12 @@ def _headings(
         if name and (below or own)
     }
     return names, units
+
+
+def _repeated(names: Sequence[str]) -> str | None:
+    """The first name that comes again; columns without a name do not count."""
+    times = Counter(names)
+    return next((name for name in names if name and times[name] > 1), None)
 
 
 def _are_units(row: Sequence[str]) -> bool:
@@ -254,7 +274,9 @@ def _frame(source: str, body: Sequence[tuple[int, str]], layout: _Layout) -> pd.
         raise DataError(source, problem, "export it again") from None
 
 
-def _column(source: str, name: str, values: pd.Series[Any], lines: Sequence[int]) -> Array | str:
+def _column(
+    source: str, name: str, values: pd.Series[Any], lines: Sequence[int], decimal: str
+) -> Array | str:
     """The numbers of a column, or why it has none."""
     import pandas as pd  # noqa: PLC0415
 
@@ -262,15 +284,34 @@ def _column(source: str, name: str, values: pd.Series[Any], lines: Sequence[int]
         return "holds true and false"
     numbers = pd.to_numeric(values, errors="coerce")
     text = np.asarray(numbers.isna() & values.notna())
+    if decimal == "," and values.dtype.kind not in "fiu":
+        # Beside a word the rest is text to pandas: 2,5 is a number, and 1.000 is none.
+        text = np.array([not _is_number(str(item).strip(), ",") for item in values])
+        text &= np.asarray(values.notna())
     if not text.any():
         return np.asarray(numbers, dtype=np.float64)
     first = int(np.argmax(text))
     written = str(values.iloc[first])[:20]
-    if numbers.notna().any():
+    if numbers.notna().any() or not text.all():
         raise DataError(
             source,
             f"column {name!r} has text in {int(text.sum())} of {len(values)} rows, the first "
             f"{written!r} in line {lines[first]}",
-            "correct those rows or export the column as numbers",
+            "correct those rows or export the column as numbers, without thousands separators",
         )
     return f"is text, such as {written!r} in line {lines[first]}"
+
+
+def _require_no_thousands(
+    source: str, floats: dict[int, str], body: Sequence[tuple[int, str]], layout: _Layout
+) -> None:
+    """Look for thousands where some of the numbers that are not whole have no decimal sign."""
+    signs = sum(line.count(layout.decimal) for _, line in body)
+    if signs >= len(body) * len(floats):
+        return
+    split = None if layout.delimiter == " " else layout.delimiter
+    rows = (
+        (number, _fields(line, layout.delimiter) if '"' in line else line.split(split))
+        for number, line in body
+    )
+    require_no_thousands(source, floats, rows, layout.decimal)

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+import functools
 import os
-import re
-import stat
 import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from impc.errors import DataError, ImpcError, InputError, OutputError
-from impc.files.c3d_analog import encode_c3d, read_c3d
+from impc.files.apart import read_apart
+from impc.files.c3d_analog import encode_c3d
 from impc.files.delimited import encode_delimited, read_delimited
-from impc.files.matlab import encode_matlab, read_matlab
-from impc.files.matlab73 import HDF5_SIGNATURE, matlab73_bytes, read_matlab73
-from impc.files.tdms import encode_tdms, read_tdms
+from impc.files.door import LARGEST, damaged, require_ordinary
+from impc.files.matlab import encode_matlab
+from impc.files.matlab73 import HDF5_SIGNATURE, matlab73_bytes
+from impc.files.tdms import encode_tdms
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -32,9 +33,6 @@ __all__ = [
 
 #: Endings of the formats that are read.
 SUFFIXES = (".csv", ".tsv", ".txt", ".mat", ".tdms", ".c3d")
-#: Bytes of a file, and of its arrays in memory: an hour of 16 channels at 2 kHz.
-LARGEST = 1_000_000_000
-
 # First bytes of what else may carry one of the endings, and what it is.
 _SIGNATURES = {
     b"PK\x03\x04": "a zip archive or an Excel workbook",
@@ -76,12 +74,8 @@ def read_table(path: Path, largest: int = LARGEST) -> Table:
         raise DataError(
             source, "does not fit in memory", "save only the signals that are needed"
         ) from None
-    # The libraries meet damaged files with any exception: struct.error, KeyError, AssertionError.
-    except Exception as error:
-        reason = re.sub(r"\s+", " ", str(error)).strip()[:120] or type(error).__name__
-        raise DataError(
-            source, f"is damaged and cannot be read ({reason})", "copy or export it again"
-        ) from None
+    except Exception as error:  # of our own readers ValueError, of pandas any
+        raise damaged(source, error) from None
 
 
 def write_table(path: Path, table: Table) -> None:
@@ -140,36 +134,13 @@ def _suffix(path: Path, error: type[InputError | OutputError]) -> str:
 
 def _head(path: Path, largest: int) -> bytes:
     """The first bytes of a file that can be read and is neither empty nor too large."""
-    source = str(path)
-    try:
-        found = path.stat()
-    except FileNotFoundError:
-        raise DataError(source, "does not exist", "check the path") from None
-    except (OSError, ValueError) as error:  # ValueError: a zero byte in the name
-        raise _unopened(source, error) from None
-    if stat.S_ISDIR(found.st_mode):
-        raise DataError(source, "is a folder", "name the file in it")
-    if not stat.S_ISREG(found.st_mode):
-        raise DataError(source, "is no ordinary file", "copy it to one")
-    if found.st_size == 0:
-        raise DataError(source, "is empty (0 bytes)", "copy or export it again")
-    if found.st_size > largest:
-        raise DataError(
-            source,
-            f"has {found.st_size / 1e9:.1f} GB, and {largest / 1e9:.1f} GB is the most that is "
-            "read",
-            "export only the signals and seconds that are needed",
-        )
+    require_ordinary(path, largest)
     try:
         with path.open("rb") as file:
             return file.read(1024)
     except OSError as error:
-        raise _unopened(source, error) from None
-
-
-def _unopened(source: str, error: OSError | ValueError) -> DataError:
-    reason = getattr(error, "strerror", None) or str(error)
-    return DataError(source, f"cannot be opened ({reason})", "check the path")
+        reason = error.strerror or type(error).__name__
+        raise DataError(str(path), f"cannot be opened ({reason})", "check the path") from None
 
 
 def _reader(source: str, suffix: str, head: bytes) -> Callable[[Path, int], Table]:
@@ -179,10 +150,10 @@ def _reader(source: str, suffix: str, head: bytes) -> Callable[[Path, int], Tabl
         return _matlab_reader(source, head, found)
     if suffix == ".tdms":
         _require(source, head.startswith(b"TDSm"), suffix, found)
-        return read_tdms
+        return functools.partial(read_apart, "tdms")
     if suffix == ".c3d":
         _require(source, head[1:2] == b"\x50", suffix, found)
-        return lambda path, _: read_c3d(path)
+        return functools.partial(read_apart, "c3d")
     _require(source, not found, suffix, found)
     return lambda path, _: read_delimited(path)
 
@@ -192,10 +163,10 @@ def _matlab_reader(source: str, head: bytes, found: str) -> Callable[[Path, int]
     hdf5 = HDF5_SIGNATURE in (head[:8], head[512:520])
     version = int.from_bytes(head[124:126], "big" if head[126:128] == b"MI" else "little") >> 8
     if hdf5 and (version == 2 or head.startswith(HDF5_SIGNATURE)):
-        return read_matlab73
+        return functools.partial(read_apart, "matlab73")
     _require(source, head.startswith(b"MATLAB "), ".mat", found)
     if version == 1 and not hdf5:
-        return read_matlab
+        return functools.partial(read_apart, "matlab")
     inside, said = ("7.3", "5") if hdf5 else ("5", "7.3")
     if hdf5 or version == 2:
         problem = f"says that it is version {said} and holds version {inside} or damaged data"

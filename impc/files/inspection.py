@@ -22,9 +22,14 @@ if TYPE_CHECKING:
 __all__ = ["clock_column", "draft_configuration", "summary"]
 
 _CLOCKS = ("time", "t", "zeit", "temps", "tiempo", "timestamp", "clock", "seconds", "sec")
+# Units of a clock that tells none, and how many make a second: the first in which the steps are
+# shorter than those of any recording of movement, s.
+_GUESSES = (("s", 1.0), ("ms", 1e3), ("us", 1e6), ("ns", 1e9))
+_SLOWEST = 0.2
 _ALIKE = 0.6  # theta1 and theta_2 are, push and perturbation are not
 
 
+@np.errstate(all="ignore")  # of values of 1e308, the mean is inf
 def summary(table: Table) -> str:
     """A table of the columns: unit, samples, range, mean, missing, and a rate where it rises."""
     heads = ("column", "unit", "samples", "min", "max", "mean", "not finite", "rate")
@@ -43,6 +48,7 @@ def summary(table: Table) -> str:
     return "\n".join(lines)
 
 
+@np.errstate(all="ignore")
 def clock_column(table: Table) -> str | None:
     """The column that is a clock: rising throughout, by its name or else with even steps."""
     rising = [name for name, values in table.columns.items() if _rate(values) is not None]
@@ -50,6 +56,7 @@ def clock_column(table: Table) -> str | None:
     return next(iter(named or rising), None)
 
 
+@np.errstate(all="ignore")
 def draft_configuration(
     table: Table, outputs: Sequence[str] = (), disturbances: Sequence[str] = ()
 ) -> str:
@@ -155,9 +162,8 @@ def _time_unit(told: str | None, step: float) -> tuple[str, str]:
             return told, "as the file says"
     except InputError:
         pass
-    if step >= 0.5:
-        return "ms", "a guess: steps of half a second or more would be long; a counter needs rate"
-    return "s", "a guess"
+    unit, second = next(pair for pair in _GUESSES if step < pair[1] * _SLOWEST or pair[1] == 1e9)
+    return unit, f"a guess: {second / step:.4g} samples per second; a counter needs rate"
 
 
 def _guessed(signals: Sequence[str], columns: Sequence[str]) -> list[tuple[str, str]]:

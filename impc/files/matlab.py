@@ -1,5 +1,8 @@
 """MATLAB .mat files up to version 7 (called v5 after their header), by scipy.
 
+A flipped bit can end the process in scipy's reader. So all tags are looked at first
+(`impc.files.matlab_tags`), and files are read in a process of their own (`impc.files.apart`).
+
 Vectors are columns by their name, the columns of a matrix are `name_1`, `name_2` and so on, numeric
 fields of a struct are `s.field`. The longer side of a matrix is taken as time.
 """
@@ -8,17 +11,13 @@ from __future__ import annotations
 
 import io
 import re
-import struct
 import warnings
-import zlib
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import scipy.io
-import scipy.sparse
-from scipy.io.matlab import MatlabFunction, MatlabObject, MatlabOpaque, MatReadWarning
 
 from impc.errors import DataError, OutputError
+from impc.files.matlab_tags import look_at_tags, too_large
 from impc.files.table import make_table
 
 if TYPE_CHECKING:
@@ -28,12 +27,19 @@ if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.files.table import Table
 
-__all__ = ["array_columns", "encode_matlab", "nested_columns", "read_matlab"]
+__all__ = [
+    "AS_STRUCT",
+    "array_columns",
+    "encode_matlab",
+    "nested_columns",
+    "read_matlab",
+    "read_matrices",
+]
 
 _DEPTH = 8
-_COMPRESSED = 15  # miCOMPRESSED: a variable packed by zlib
-# What a cell, table or object has to become; each sentence ends a reason.
-_AS_STRUCT = 'save a struct of vectors: s = table2struct(T, "ToScalar", true)'
+_LONGEST = 1_000_000  # characters of the names in a saved plant
+#: What a cell, table or object has to become; each sentence ends a reason.
+AS_STRUCT = 'save a struct of vectors: s = table2struct(T, "ToScalar", true)'
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,62}")
 
 
@@ -51,32 +57,56 @@ def read_matlab(path: Path, largest: int) -> Table:
     ------
     DataError
         When it holds no numeric vector or matrix: cells, tables and objects cannot be read.
+    ValueError
+        When it is damaged, or unpacks to more than it says.
     """
-    source = str(path)
-    unpacked = _unpacked(path)
-    if unpacked > largest:
-        raise DataError(
-            source,
-            f"would take {unpacked / 1e9:.1f} GB once it is unpacked",
-            "save only the signals that are needed",
-        )
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        # Two variables of one name, or a variable cut off: never a part of a file.
-        warnings.simplefilter("error", MatReadWarning)
-        # scipy calls every object None, strings among them: two are no fault.
-        warnings.filterwarnings("ignore", 'Duplicate variable name "None"', MatReadWarning)
-        found = scipy.io.loadmat(path, struct_as_record=True)
     columns: dict[str, Array] = {}
     skipped: dict[str, str] = {}
-    for name, value in found.items():
-        if name.startswith("__"):
+    for name, value in _variables(path, largest).items():
+        _collect(name, value, columns, skipped, 0)
+    return make_table(str(path), columns, None, None, skipped)
+
+
+def read_matrices(path: Path, largest: int) -> dict[str, Array | list[str | None]]:
+    """Read the matrices and names of a saved plant from a .mat file of version 5 to 7.
+
+    Parameters
+    ----------
+    path : Path
+        Of the file.
+    largest : int
+        The most bytes that its arrays may take once they are unpacked, as float64.
+
+    Returns
+    -------
+    dict of str to Array or list
+        Real numbers in MATLAB's sizes, (rows, columns) or more; of a text its rows, of a cell array
+        its texts, None for what is no text.
+
+    Raises
+    ------
+    DataError
+        When it holds something else, or too much.
+    ValueError
+        When it is damaged, or unpacks to more than it says.
+    """
+    found: dict[str, Array | list[str | None]] = {}
+    left = largest
+    for name, value in _variables(path, largest).items():
+        if type(value) is np.ndarray and value.dtype.kind in "USO":
+            found[name] = _names(value)
             continue
-        known = name
-        if isinstance(value, MatlabOpaque):  # scipy calls these None; the name is inside
-            known = _text(value, "s0") or name
-        _collect(known, value, columns, skipped, 0)
-    return make_table(source, columns, None, None, skipped)
+        reason = _unreadable(value).split(";")[0]
+        if reason or value.dtype.names:
+            remedy = "save matrices, and names by cellstr"
+            raise DataError(str(path), f"{name} {reason or 'is a struct'}", remedy)
+        if value.dtype.kind not in "fiub":
+            raise DataError(str(path), f"has a complex matrix {name}", "save real numbers")
+        left -= 8 * value.size
+        if left < 0:
+            raise too_large(path, largest - left)
+        found[name] = np.asarray(value, dtype=np.float64)
+    return found
 
 
 def array_columns(name: str, array: Any) -> dict[str, Array] | str:
@@ -97,6 +127,8 @@ def array_columns(name: str, array: Any) -> dict[str, Array] | str:
 
 def encode_matlab(table: Table) -> bytes:
     """The bytes of a v5 .mat file with one column vector for each column; units are not kept."""
+    import scipy.io  # noqa: PLC0415  # a third of a second, for who writes only
+
     content = io.BytesIO()
     vectors = {name: values[:, None] for name, values in table.columns.items()}
     save: Any = scipy.io.savemat  # its stubs know paths only
@@ -134,25 +166,25 @@ def nested_columns(source: str, columns: Mapping[str, Array]) -> dict[str, Any]:
     return nested
 
 
-def _unpacked(path: Path) -> int:
-    """Bytes of all variables once they are unpacked, from the tags in front of them.
+def _variables(path: Path, largest: int) -> dict[str, Any]:
+    """The variables of a file by name, as scipy has them, once their tags are found sound."""
+    import scipy.io  # noqa: PLC0415  # in the process that reads only
+    from scipy.io.matlab import MatlabOpaque, MatReadWarning  # noqa: PLC0415
 
-    `scipy.io.whosmat` would tell, but not in the presence of a table.
-    """
-    total = 0
-    with path.open("rb") as file:
-        order = ">" if file.read(128)[126:] == b"MI" else "<"
-        while len(tag := file.read(8)) == 8:
-            kind, size = struct.unpack(f"{order}II", tag)
-            inner = size
-            if kind == _COMPRESSED:
-                start = file.tell()
-                begin = zlib.decompressobj().decompress(file.read(min(size, 64)), 8)
-                inner = struct.unpack(f"{order}II", begin.ljust(8, b"\0"))[1]
-                file.seek(start)
-            total += inner
-            file.seek(size, 1)
-    return total
+    look_at_tags(path, largest)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        # Two variables of one name, or a variable cut off: never a part of a file.
+        warnings.simplefilter("error", MatReadWarning)
+        # scipy calls every object None, strings among them: two are no fault.
+        warnings.filterwarnings("ignore", 'Duplicate variable name "None"', MatReadWarning)
+        found = scipy.io.loadmat(path, appendmat=False, struct_as_record=True)
+    return {
+        # scipy calls opaque objects None; the name is inside.
+        (_text(value, "s0") or name) if isinstance(value, MatlabOpaque) else name: value
+        for name, value in found.items()
+        if not name.startswith("__")
+    }
 
 
 def _collect(
@@ -178,17 +210,34 @@ def _collect(
 
 def _unreadable(value: Any) -> str:
     """Why a MATLAB value is no array of numbers or struct; empty when it is one."""
+    import scipy.sparse  # noqa: PLC0415
+    from scipy.io.matlab import MatlabFunction, MatlabObject, MatlabOpaque  # noqa: PLC0415
+
     if isinstance(value, MatlabOpaque):
         kind = _text(value, "s2") or "unknown class"
-        return f"is a MATLAB {kind}; {_AS_STRUCT}, or writetable"
+        return f"is a MATLAB {kind}; {AS_STRUCT}, or writetable"
     if isinstance(value, MatlabObject):
-        return f"is a MATLAB object of class {value.classname}; {_AS_STRUCT}"
+        return f"is a MATLAB object of class {value.classname}; {AS_STRUCT}"
     if isinstance(value, MatlabFunction) or not isinstance(value, np.ndarray):
         return "is sparse; save full(x)" if scipy.sparse.issparse(value) else "is not numeric"
-    kinds = {"U": "is text", "S": "is text", "O": f"is a cell array; {_AS_STRUCT}, or cell2mat"}
+    kinds = {"U": "is text", "S": "is text", "O": f"is a cell array; {AS_STRUCT}, or cell2mat"}
     return kinds.get(value.dtype.kind, "")
 
 
 def _text(value: Any, part: str) -> str:
     names: Iterator[str] = iter(value.dtype.names or ())
     return value[part].flat[0].decode("latin-1", "replace") if part in names else ""
+
+
+def _names(value: Any) -> list[str | None]:
+    """The rows of a text, or the texts of a cell array; None for a cell of something else."""
+    if value.dtype.kind == "O":
+        rows = [_names(cell) if _is_text(cell) else None for cell in value.ravel(order="F")]
+        return [None if row is None else " ".join(map(str, row)) for row in rows]
+    if value.nbytes > 4 * _LONGEST:
+        raise ValueError(f"a text of more than {_LONGEST} characters")
+    return [str(row).rstrip() for row in value.ravel()]
+
+
+def _is_text(value: Any) -> bool:
+    return isinstance(value, np.ndarray) and value.dtype.kind in "US"

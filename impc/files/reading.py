@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-import re
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.errors import DataError, InputError
-from impc.files import checks
+from impc.files import checks, measurable
 from impc.files.alignment import misaligned
+from impc.files.apart import match_apart
 from impc.files.clock import column_of, on_even_instants, read_clock
 from impc.files.configuration import UNKNOWN_UNIT
 from impc.files.formats import read_table
-from impc.files.resampling import held_means, instants, same_rate
+from impc.files.resampling import held_means, instants, resampled_samples, same_rate
 from impc.files.units import si_unit
 from impc.recording import Label, recording
 
@@ -65,7 +66,7 @@ def read_recordings(
         When a file cannot be read or a check fails. Nothing is returned then.
     """
     plant.require_discrete()
-    _require_names(configuration, plant)
+    _require_names(configuration, plant)  # before files are read, which may take long
     _require_distinct(paths)
     if not paths:
         raise InputError("recordings", "no file is given", "name at least one")
@@ -84,12 +85,18 @@ def recording_of(table: Table, configuration: Configuration, plant: Plant) -> Re
 
     Raises
     ------
+    InputError
+        When the configuration does not name the plant's signals.
     DataError
         When a check fails.
     """
+    _require_names(configuration, plant)
     entry = configuration.recording
     label = _label(table.source, entry)
     clock = read_clock(table, entry)
+    measurable.comparable_rates(table.source, clock.period, plant.dt)
+    samples = resampled_samples(int(clock.steps[-1]) + 1, clock.period, plant.dt)
+    checks.too_few(table.source, samples, _SAMPLES_A_STATE * plant.n)
     findings = list(clock.findings)
     acting = [name for name in plant.disturbances if name in configuration.signals]
     series: dict[str, Array] = {}
@@ -101,7 +108,6 @@ def recording_of(table: Table, configuration: Configuration, plant: Plant) -> Re
         resample = instants if response else held_means
         series[name] = resample(even, clock.period, plant.dt)
     samples = len(series[plant.outputs[0]])
-    checks.too_few(table.source, samples, _SAMPLES_A_STATE * plant.n)
     findings += _slower(table.source, clock, plant)
     disturbance = np.zeros((samples, len(plant.disturbances)))
     for index, name in enumerate(plant.disturbances):
@@ -136,9 +142,9 @@ def _require_names(configuration: Configuration, plant: Plant) -> None:
 
 
 def _require_distinct(paths: Sequence[Path]) -> None:
-    seen: set[Path] = set()
+    seen: set[str] = set()
     for path in paths:
-        place = Path(path).resolve()
+        place = os.path.realpath(path)  # Path.resolve raises on a circle of links
         if place in seen:
             raise InputError(str(path), "is given twice", "name each trial once")
         seen.add(place)
@@ -148,14 +154,14 @@ def _label(source: str, entry: RecordingTable) -> Label:
     stem = Path(source).stem
     groups: dict[str, str | None] = {}
     if entry.pattern is not None:
-        found = re.fullmatch(entry.pattern, stem)
+        found = match_apart("recording.pattern", entry.pattern, stem)
         if found is None:
             raise DataError(
                 source,
                 f"the name {stem!r} does not match recording.pattern {entry.pattern!r}",
                 "rename the file or correct the pattern",
             )
-        groups = found.groupdict()
+        groups = found
     return Label(
         subject=groups.get("subject") or entry.subject,
         visit=groups.get("visit") or entry.visit,
@@ -166,7 +172,9 @@ def _label(source: str, entry: RecordingTable) -> Label:
 
 def _channel(table: Table, clock: Clock, name: str, entry: SignalTable) -> checks.Channel:
     column, values = column_of(table, entry.column, f"signals.{name}.column")
-    used = entry.sign * (values[clock.rows] - entry.offset)
+    # Beyond the largest number, or a NaN that signals: not finite, and told below.
+    with np.errstate(over="ignore", invalid="ignore"):
+        used = entry.sign * (values[clock.rows] - entry.offset)
     return checks.Channel(table.source, name, column, si_unit(entry.unit), clock.time, used)
 
 
@@ -180,6 +188,7 @@ def _checked(
     """Every check of one channel, those first whose fault would explain the others."""
     found = [
         checks.unit_of_the_file(channel, _told_unit(table, channel.column)),
+        measurable.size(channel),
         checks.missing(channel, recorded.fill_gaps),
         checks.constant(channel),
         checks.degrees_for_radians(channel) if response else "",

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.arrays import frozen
+from impc.arrays import Frozen, frozen
 from impc.errors import DataError
+from impc.files.door import shown
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -18,9 +19,11 @@ if TYPE_CHECKING:
 
 __all__ = ["Table", "make_table"]
 
+_LONGEST = 160  # characters of a name, a unit or a reason: they stand in messages and in TOML
+
 
 @dataclass(frozen=True)
-class Table:
+class Table(Frozen):
     """The numeric columns of one file.
 
     Attributes
@@ -76,9 +79,13 @@ def make_table(
     DataError
         When no column of numbers is left.
     """
-    columns = {_one_line(name): values for name, values in columns.items()}
-    units = {_one_line(name): unit for name, unit in (units or {}).items()}
-    left_out = {_one_line(name): reason for name, reason in (skipped or {}).items()}
+    given, columns = columns, {shown(name, _LONGEST): value for name, value in columns.items()}
+    if len(columns) < len(given):
+        raise DataError(source, "has two columns of one name", "give each its own")
+    units = {shown(name, _LONGEST): shown(unit, _LONGEST) for name, unit in (units or {}).items()}
+    left_out = {
+        shown(name, _LONGEST): shown(reason, _LONGEST) for name, reason in (skipped or {}).items()
+    }
     lengths = Counter(len(values) for values in columns.values() if len(values) > 1)
     if not lengths:
         left_out |= {name: f"has {len(values)} values" for name, values in columns.items()}
@@ -96,8 +103,3 @@ def make_table(
             left_out[name] = f"has {len(values)} values where most columns have {usual}"
     told = {name: unit for name, unit in units.items() if name in kept and unit}
     return Table(source, kept, told, rate, left_out)
-
-
-def _one_line(name: str) -> str:
-    """A name without line breaks and control characters, which would break messages and TOML."""
-    return "".join(character if character.isprintable() else " " for character in name).strip()

@@ -48,14 +48,16 @@ def read_tdms(path: Path, largest: int) -> Table:
         raise DataError(str(path), "needs the package nptdms", _REMEDY) from None
     source = str(path)
     # Opened here, because nptdms leaves a file open when its head is damaged.
-    with _silent(), path.open("rb") as handle, TdmsFile.open(handle) as file:
+    with _silent(), _Bounded(io.FileIO(path)) as handle, TdmsFile.open(handle) as file:
         if file.file_status.incomplete_final_segment:
             raise DataError(
                 source, "ends in the middle of its data", "copy it again, or close it in LabVIEW"
             )
         channels = [channel for group in file.groups() for channel in group.channels()]
-        if 8 * sum(len(channel) for channel in channels) > largest:
-            raise DataError(source, "is too large", "export only the channels that are needed")
+        claimed = sum(len(channel) for channel in channels)
+        if 8 * claimed > largest or claimed > path.stat().st_size:
+            problem = f"is too large or damaged: it says that it has {claimed} values"
+            raise DataError(source, problem, "export only the channels that are needed")
         return _table(source, channels)
 
 
@@ -85,6 +87,19 @@ def encode_tdms(table: Table) -> bytes:
     return content.getvalue()
 
 
+class _Bounded(io.BufferedReader):
+    """A file that is asked for no more than it has: Python takes the memory before it looks."""
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """As of any file; `size` in bytes."""
+        if size is None or size < 0:
+            return super().read()
+        here = self.tell()
+        end = self.seek(0, io.SEEK_END)
+        self.seek(here)
+        return super().read(min(size, max(0, end - here)))
+
+
 def _table(source: str, channels: list[Any]) -> Table:
     names = Counter(channel.name for channel in channels)
     columns: dict[str, Array] = {}
@@ -94,14 +109,14 @@ def _table(source: str, channels: list[Any]) -> Table:
     for channel in channels:
         twice = names[channel.name] > 1
         name = f"{channel.group_name}/{channel.name}" if twice else channel.name
+        if channel.dtype.kind not in "fiubM":
+            skipped[name] = "is complex" if channel.dtype.kind == "c" else "is text"
+            continue
         data = channel[:]
         unit = str(channel.properties.get("unit_string", ""))
         if data.dtype.kind == "M" and len(data):
             data = (data - data[0]) / np.timedelta64(1, "s")
             unit = "s"
-        if data.dtype.kind not in "fiub":
-            skipped[name] = "is complex" if data.dtype.kind == "c" else "is text"
-            continue
         columns[name] = np.asarray(data, dtype=np.float64)
         units[name] = unit
         step = float(channel.properties.get("wf_increment", 0) or 0)

@@ -7,7 +7,9 @@ import re
 from dataclasses import dataclass
 from typing import Any
 
+from impc.door import checked
 from impc.errors import InputError
+from impc.files.door import shown
 
 __all__ = ["Unit", "is_unit", "si_unit"]
 
@@ -49,6 +51,7 @@ class Unit:
         return self.base == "radian"
 
 
+@checked
 @functools.cache
 def si_unit(written: str) -> Unit:
     """What a `written` unit is in SI base units: deg -> 0.01745 rad, "N*m" and "Nm" -> 1 N m.
@@ -110,5 +113,7 @@ def _registry() -> Any:
 
 def _unknown(written: str) -> InputError:
     return InputError(
-        f"unit {written!r}", "is not known", 'write it as in "deg", "rad/s", "N*m", "mV", "1"'
+        f"unit {shown(written, 40)!r}",
+        "is not known",
+        'write it as in "deg", "rad/s", "N*m", "mV", "1"',
     )

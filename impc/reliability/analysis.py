@@ -14,7 +14,7 @@ import numpy as np
 from impc.errors import DataError
 from impc.reliability.anova import learning_trend, paired_tests, visit_anova
 from impc.reliability.cmc import cmc_between, cmc_within
-from impc.reliability.icc import icc, minimal_detectable_change, standard_error_of_measurement
+from impc.reliability.icc import icc, measurement_error
 from impc.reliability.measures import band_energy, passband, rms
 from impc.reliability.transfer import transfer_function
 from impc.reliability.variance_components import variance_components
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.recording import Recording
     from impc.reliability.anova import Anova, PairedTest, Trend
-    from impc.reliability.icc import Form, Icc
+    from impc.reliability.icc import Form, Icc, MeasurementError
     from impc.reliability.measures import Passband
     from impc.reliability.transfer import TransferFunction
     from impc.reliability.variance_components import VarianceComponent
@@ -78,9 +78,9 @@ class MeasureResult:
     scores : Array
         (subjects, visits), NaN where a cell is missing, in the output's unit (squared for energy).
     icc : Icc or None
-        (A,k), between visits.
-    sem, mdc : float
-        Standard error of measurement and minimal detectable change (95 %), in the score's unit.
+        (A,k), between visits, with the generalised interval.
+    error : MeasurementError or None
+        Of the score of one visit, with the minimal detectable change (95 %), in the score's unit.
     anova : Anova or None
     pairs : tuple of PairedTest
     trend : Trend or None
@@ -96,8 +96,7 @@ class MeasureResult:
     condition: str
     scores: Array
     icc: Icc | None
-    sem: float
-    mdc: float
+    error: MeasurementError | None
     anova: Anova | None
     pairs: tuple[PairedTest, ...]
     trend: Trend | None
@@ -231,12 +230,11 @@ def _measure(
 ) -> MeasureResult:
     scores = np.array([[np.mean(cell) if cell else np.nan for cell in row] for row in table])
     notes: list[str] = []
-    found, sem, mdc, anova, trend = None, np.nan, np.nan, None, None
+    found, measured, anova, trend = None, None, None, None
     pairs: tuple[PairedTest, ...] = ()
     try:
-        found = icc(scores, _FORM)
-        sem = standard_error_of_measurement(scores, found.value)
-        mdc = minimal_detectable_change(sem)
+        found = icc(scores, _FORM, method="generalised")
+        measured = measurement_error(scores)
         if found.left_out:
             notes.append(f"{found.left_out} subjects lack a visit and are left out")
         anova = visit_anova(scores)
@@ -255,8 +253,7 @@ def _measure(
         condition,
         scores,
         found,
-        float(sem),
-        float(mdc),
+        measured,
         anova,
         pairs,
         trend,

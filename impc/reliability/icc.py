@@ -16,6 +16,20 @@ n subjects are measured on k occasions. From the two-way analysis of variance
 
 Whether occasions are random or fixed changes the meaning and not the number. Estimates may be
 negative, and are reported as they are.
+
+McGraw and Wong's interval of (A,1) and (A,k) is too narrow where occasions differ and are few; the
+generalised one (Tian and Cappelleri, Statistics in Medicine 23, 2004, 2125) covers there too. With
+U chi-squared over its degrees of freedom it is the range of the ICC of MSR / U_r, MSC / U_c and
+MSE / U_e (docs/reliability.md has how often each covers).
+
+The error of one measurement does not depend on how many are averaged for an ICC. Two measurements
+of a subject on two occasions differ by two occasions and two errors, so
+
+    SEM^2 = var(occasion) + var(error),  estimated by MSW = ((n - 1) MSE + MSC) / n,
+    MDC   = t sqrt(2) SEM,
+
+t Student's with Satterthwaite's degrees of freedom of MSW. SEM is SD sqrt(1 - ICC(A,1)), and not
+with ICC(A,k), the reliability of a mean.
 """
 
 from __future__ import annotations
@@ -37,16 +51,22 @@ __all__ = [
     "Form",
     "Icc",
     "MeanSquares",
+    "MeasurementError",
+    "Method",
     "icc",
     "mean_squares",
-    "minimal_detectable_change",
-    "standard_error_of_measurement",
+    "measurement_error",
 ]
 
 #: One of `FORMS`, for annotations.
 Form = Literal["1", "k", "C,1", "C,k", "A,1", "A,k"]
 #: Names of the forms, as above.
 FORMS: tuple[Form, ...] = ("1", "k", "C,1", "C,k", "A,1", "A,k")
+
+#: How an interval is made: McGraw and Wong's, or the generalised one (absolute agreement only).
+Method = Literal["F", "generalised"]
+# Draws behind a generalised interval: its ends then vary by .01 of its width from seed to seed.
+_DRAWS = 20_000
 
 
 class MeanSquares(NamedTuple):
@@ -97,7 +117,30 @@ class Icc:
     left_out: int
 
 
-def icc(scores: ArrayLike, form: Form = "A,k", level: float = 0.95) -> Icc:
+@dataclass(frozen=True)
+class MeasurementError:
+    """Error of one measurement of one subject.
+
+    Attributes
+    ----------
+    sem : float
+        Standard error of measurement, in the scores' unit.
+    freedom : float
+        Satterthwaite's degrees of freedom of its square; NaN when it is zero.
+    mdc : float
+        Minimal detectable change: what the difference of two measurements exceeds by error alone
+        in 1 - level of all subjects, in the scores' unit.
+    level : float
+        Of the MDC.
+    """
+
+    sem: float
+    freedom: float
+    mdc: float
+    level: float
+
+
+def icc(scores: ArrayLike, form: Form = "A,k", level: float = 0.95, method: Method = "F") -> Icc:
     """Intraclass correlation of scores.
 
     Parameters
@@ -108,22 +151,27 @@ def icc(scores: ArrayLike, form: Form = "A,k", level: float = 0.95) -> Icc:
         One of `FORMS`. Chapter 5 uses (A,k); so does chapter 2 here.
     level : float
         Of the interval, between 0 and 1.
+    method : str
+        "F", or "generalised" for (A,1) and (A,k).
 
     Raises
     ------
     InputError
-        When the form is unknown or the level out of range.
+        When the form is unknown or has no such interval, or the level is out of range.
     DataError
         When fewer than two subjects or two occasions are complete.
     """
     if form not in FORMS:
         raise InputError(f"ICC form {form!r}", "is not known", f"known: {', '.join(FORMS)}")
+    if method != "F" and form not in ("A,1", "A,k"):
+        raise InputError(f"interval {method!r}", f"is not one of ICC({form})", "take 'F'")
     if not 0 < level < 1:
         raise InputError("level", f"got {level}", "give a share between 0 and 1")
     complete, left_out = _complete(scores)
     squares = mean_squares(complete)
     value = _estimate(squares, form)
-    low, high = _interval(squares, form, value, level)
+    limits = _interval if method == "F" else _generalised
+    low, high = limits(squares, form, value, level)
     return Icc(form, value, low, high, level, squares.n, squares.k, left_out)
 
 
@@ -142,33 +190,35 @@ def mean_squares(scores: Array) -> MeanSquares:
     )
 
 
-def standard_error_of_measurement(scores: ArrayLike, correlation: float) -> float:
-    """SEM = SD sqrt(1 - ICC), SD that of all complete scores, in their unit; NaN for ICC > 1.
+def measurement_error(scores: ArrayLike, level: float = 0.95) -> MeasurementError:
+    """Error of one measurement, and the change that it hides.
 
     Parameters
     ----------
     scores : array_like
-        (subjects, occasions), NaN where missing.
-    correlation : float
-        The ICC.
+        (subjects, occasions); subjects with a missing score (NaN) are left out.
+    level : float
+        Of the MDC, between 0 and 1.
 
     Raises
     ------
+    InputError
+        When the level is out of range.
     DataError
         When there are fewer than two complete subjects or two occasions.
     """
-    complete, _ = _complete(scores)
-    return (
-        float(np.std(complete, ddof=1) * np.sqrt(1 - correlation)) if correlation <= 1 else np.nan
-    )
-
-
-def minimal_detectable_change(sem: float, level: float = 0.95) -> float:
-    """Change between two measurements that error alone exceeds in 1 - level: z sqrt(2) SEM.
-
-    In the unit of the `sem`.
-    """
-    return float(scipy.stats.norm.ppf(0.5 + level / 2) * np.sqrt(2) * sem)
+    if not 0 < level < 1:
+        raise InputError("level", f"got {level}", "give a share between 0 and 1")
+    complete = _complete(scores)[0]
+    squares = mean_squares(complete)
+    parts = np.array([(squares.n - 1) * squares.error, squares.occasions])
+    if np.ptp(complete - complete[:, :1]) == 0:
+        return MeasurementError(0.0, float("nan"), 0.0, level)
+    each = np.array([(squares.n - 1) * (squares.k - 1), squares.k - 1])
+    freedom = float(np.sum(parts) ** 2 / np.sum(parts**2 / each))
+    sem = float(np.sqrt(squares.within))
+    quantile = float(scipy.stats.t.ppf(0.5 + level / 2, freedom))
+    return MeasurementError(sem, freedom, quantile * np.sqrt(2) * sem, level)
 
 
 def _complete(scores: ArrayLike) -> tuple[Array, int]:
@@ -224,6 +274,32 @@ def _interval(squares: MeanSquares, form: Form, value: float, level: float) -> t
     low = ratio / scipy.stats.f.ppf(tail, n - 1, freedom)
     high = ratio * scipy.stats.f.ppf(tail, freedom, n - 1)
     return float((low - 1) / (low + k - 1)), float((high - 1) / (high + k - 1))
+
+
+def _generalised(
+    squares: MeanSquares, form: Form, value: float, level: float
+) -> tuple[float, float]:
+    """Tian and Cappelleri's limits; the same draws for every table, so that nothing is random."""
+    if np.isnan(value):
+        return float("nan"), float("nan")
+    if value == 1:
+        return 1.0, 1.0
+    n, k = squares.n, squares.k
+    rng = np.random.default_rng(0)
+    r, c, e = (
+        square / (rng.chisquare(freedom, _DRAWS) / freedom)
+        for square, freedom in (
+            (squares.subjects, n - 1),
+            (squares.occasions, k - 1),
+            (squares.error, (n - 1) * (k - 1)),
+        )
+    )
+    # Occasions whose variance would be negative have none.
+    drawn = (r - e) / (r + (k - 1) * e + k * np.maximum(c - e, 0.0) / n)
+    low, high = np.quantile(drawn, [0.5 - level / 2, 0.5 + level / 2])
+    if form == "A,k":
+        low, high = (_stepped_up(float(end), k) for end in (low, high))
+    return min(float(low), value), max(float(high), value)
 
 
 def _stepped_up(limit: float, k: int) -> float:

@@ -10,7 +10,8 @@ import numpy as np
 
 from impc.reliability.figures import reliability_figures
 from impc.reliability.findings import findings
-from impc.reliability.tables import csv_bytes, reliability_tables
+from impc.reliability.tables import reliability_tables
+from impc.report.csv_text import csv_bytes
 from impc.report.rendering import embedded, plain, render_template
 
 if TYPE_CHECKING:
@@ -45,7 +46,7 @@ def reliability_files(trials: Trials, result: Reliability, command: str) -> dict
     return {
         "report.html": page.encode(),
         "result.json": _json(result, command),
-        **{f"{name}.csv": csv_bytes(table) for name, table in tables.items()},
+        **{f"{name}.csv": csv_bytes(table.heads, table.rows) for name, table in tables.items()},
         **figures,
     }
 
@@ -56,7 +57,9 @@ def _json(result: Reliability, command: str) -> bytes:
         name = f"{item.measure}.{item.output}"
         if item.icc is not None:
             told = {key: getattr(item.icc, key) for key in ("value", "low", "high", "form")}
-            told |= {"sem": item.sem, "mdc": item.mdc, "subjects": item.icc.subjects}
+            told |= {"subjects": item.icc.subjects, "interval": "generalised"}
+            if item.error is not None:
+                told |= {key: getattr(item.error, key) for key in ("sem", "mdc", "freedom")}
             found["icc"].setdefault(name, {})[item.condition] = told
         if item.anova is not None:
             test = asdict(item.anova)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,7 +13,7 @@ from impc.report.rendering import TextTable, number
 if TYPE_CHECKING:
     from impc.reliability.analysis import MeasureResult, Reliability
 
-__all__ = ["csv_bytes", "reliability_tables"]
+__all__ = ["reliability_tables"]
 
 _NUMBERS = {"rms": "2.2", "energy": "2.3"}
 _VISIT_TABLES = {"rms": "2.5", "energy": "2.6"}
@@ -34,15 +32,6 @@ def reliability_tables(result: Reliability) -> dict[str, TextTable]:
     return tables
 
 
-def csv_bytes(table: TextTable) -> bytes:
-    """A table as CSV."""
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(table.heads)
-    writer.writerows(table.rows)
-    return stream.getvalue().encode()
-
-
 def _of(result: Reliability, measure: str) -> list[MeasureResult]:
     return [item for item in result.measures if item.measure == measure]
 
@@ -56,8 +45,8 @@ def _icc_table(result: Reliability, measure: str) -> TextTable:
     rows = []
     for item in _of(result, measure):
         factor, unit = _units(item)
-        found = item.icc
-        if found is None:
+        found, error = item.icc, item.error
+        if found is None or error is None:
             rows.append((item.condition, item.output, "-", "-", "-", "-", "; ".join(item.notes)))
             continue
         rows.append(
@@ -66,15 +55,16 @@ def _icc_table(result: Reliability, measure: str) -> TextTable:
                 item.output,
                 f"{found.value:.2f} ({found.low:.2f}, {found.high:.2f})",
                 band_of(found.value),
-                f"{factor * item.sem:.3g} {unit}",
-                f"{factor * item.mdc:.3g} {unit}",
+                f"{factor * error.sem:.3g} {unit}",
+                f"{factor * error.mdc:.3g} {unit}",
                 "; ".join((f"{found.subjects} subjects", *item.notes)),
             )
         )
     caption = (
         f"Counterpart of table {_NUMBERS[measure]}: between-visit reliability of "
-        f"{MEASURES[measure]}, ICC(A,k) with 95 % interval, standard error of measurement and "
-        "minimal detectable change (95 %)."
+        f"{MEASURES[measure]}, ICC(A,k) of the mean over visits with its generalised 95 % "
+        "interval, which allows for few visits that differ; standard error of measurement and "
+        "minimal detectable change (95 %) of the score of a single visit."
     )
     heads = ("condition", "output", "ICC(A,k)", "band", "SEM", "MDC", "notes")
     return TextTable(caption, heads, tuple(rows))

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from impc.alternatives import verdict
+from impc.intervals import entry_names
 from impc.report.rendering import TextTable, number
 
 if TYPE_CHECKING:
     from impc.certainty import Certainty
+    from impc.fit_result import FitResult
     from impc.intent_statements import Statement
+    from impc.intervals import Interval
     from impc.weights_summary import WeightsSummary
 
 __all__ = [
@@ -18,6 +23,7 @@ __all__ = [
     "entries_table",
     "intervals_table",
     "limit_sentences",
+    "prices_table",
     "set_sentences",
     "statements_table",
 ]
@@ -29,10 +35,13 @@ _METHODS = {
     "model": "model bootstrap",
     "profile": "profile likelihood",
 }
+_NO_ENDS = "not determined"
 
 
-def intervals_table(certainty: Certainty) -> TextTable:
-    """Intervals of every number, a column for each method."""
+def intervals_table(result: FitResult) -> TextTable:
+    """Intervals of every number, a column for each method, beside the gain of the weights."""
+    certainty, plant = result.certainty, result.fitted.problem.plant
+    of_weights = dict(zip(entry_names(plant), np.ravel(result.fitted.solution.K), strict=True))
     methods = [key for key in _METHODS if any(item.method == key for item in certainty.intervals)]
     found = {(item.name, item.method): item for item in certainty.intervals}
     names = list(dict.fromkeys(item.name for item in certainty.intervals))
@@ -43,15 +52,21 @@ def intervals_table(certainty: Certainty) -> TextTable:
         cells = []
         for method in methods:
             item = found.get((name, method))
-            cells.append("-" if item is None else _range(item.low, item.high))
-        rows.append((name, "not determined" if value is None else number(value, 4), *cells))
+            cells.append("-" if item is None else _told(item))
+        shown = "not determined" if value is None else number(value, 4)
+        theirs = number(float(of_weights[name]), 4) if name in of_weights else "-"
+        rows.append((name, shown, *cells, theirs))
     level = certainty.intervals[0].level
     caption = (
-        f"Intervals of {100 * level:.0f} %. Where residuals are coloured, as those of people are, "
-        "the second column is too narrow. Entries of the gain share directions that hardly show in "
-        "the recordings; the table of directions tells which combinations are well determined."
+        f"What the recordings tell, with intervals of {100 * level:.0f} %. Where residuals are "
+        "coloured, as those of people are, the second column is too narrow. An entry that is not "
+        "told takes part in directions that hardly show in the recordings: within the range in "
+        "brackets it cannot be told from others, and the table of directions says which "
+        "combinations are. The last column is the gain of the reported weights. A rule chose "
+        "them, so it has no interval of its own: outside the estimate's, these weights do not "
+        "quite behave as the recordings do."
     )
-    heads = ("number", "value", *(_METHODS[method] for method in methods))
+    heads = ("number", "value", *(_METHODS[method] for method in methods), "gain of the weights")
     return TextTable(caption, heads, tuple(rows))
 
 
@@ -64,25 +79,62 @@ def set_sentences(summary: WeightsSummary) -> tuple[str, ...]:
         f"its members with a condition number up to {summary.limit:.2g}, ten times the least.",
         f"The dominant direction {kept} over the set: it turns by up to "
         f"{summary.widest_angle:.0f} degrees (found by search; more may be possible).",
+        *_over_drawn(summary),
         "The condition number depends on the units of the states, and so does the member that it "
         "chooses. The analytic centre does not.",
     )
 
 
+def _over_drawn(summary: WeightsSummary) -> tuple[str, ...]:
+    if not summary.drawn:
+        return ()
+    return (
+        f"The gain is an estimate too: over {summary.drawn} others that the recordings allow the "
+        f"dominant direction of the weights of least condition number turns by up to "
+        f"{summary.angle_of_gain:.0f} degrees (95 %).",
+    )
+
+
 def statements_table(summary: WeightsSummary) -> TextTable:
     """Statements that hold for every member, and those that members disagree on."""
-    order = {True: 0, False: 0, None: 1}
     rows = tuple(
-        (item.says, _verdict(item), f"{item.low:.3g} to {item.high:.3g}")
-        for item in sorted(summary.statements, key=lambda item: order[item.holds])
+        (item.says, _verdict(item), _over_gains(item), f"{item.low:.3g} to {item.high:.3g}")
+        for item in sorted(summary.statements, key=lambda item: (not item.made, item.holds is None))
+    )
+    tried = (
+        f"The gain is an estimate: each statement was tried on {summary.drawn} other gains that "
+        "the recordings allow. One that holds for all weights of all gains but one at most may be "
+        "made of the subject, at 95 %."
+        if summary.drawn
+        else "The gain is an estimate, and other gains were not tried ([fit] intent_draws): none "
+        "may be made of the subject."
     )
     caption = (
         "Statements on the states that are recorded or cost most, at the size that they have in "
-        "the recordings. "
-        "One that holds for all weights may be said of the subject. The range is that of the "
-        "difference, or of the mixed price, over the price of the state named first."
+        f"the recordings. {tried} The range is that of the difference, or of the mixed price, over "
+        "the price of the state named first, at the fitted gain."
     )
-    return TextTable(caption, ("statement", "over all weights", "range"), rows)
+    heads = ("statement", "at 95 %", "other gains that agree", "range at the fitted gain")
+    return TextTable(caption, heads, rows)
+
+
+def prices_table(summary: WeightsSummary) -> TextTable | None:
+    """Prices of the named states, for the fitted gain and for all that the recordings allow."""
+    if not summary.prices:
+        return None
+    rows = tuple(
+        (
+            item.state,
+            f"{number(item.low)} to {number(item.high)}",
+            f"{number(item.low_drawn)} to {number(item.high_drawn)}",
+        )
+        for item in summary.prices
+    )
+    caption = (
+        "What a typical excursion costs, d^2 Q at trace R = m, over all weights: with the fitted "
+        f"gain, and with it or any of {summary.drawn} others that the recordings allow (95 %)."
+    )
+    return TextTable(caption, ("state", "fitted gain", "95 % interval"), rows)
 
 
 def entries_table(summary: WeightsSummary) -> TextTable:
@@ -144,14 +196,25 @@ def alternatives_table(certainty: Certainty) -> TextTable | None:
 
 
 def _verdict(item: Statement) -> str:
-    if item.holds is None:
-        return "undecided"
+    if not item.made:
+        return "not made"
     return "true for all" if item.holds else "false for all"
+
+
+def _told(item: Interval) -> str:
+    ends = _range(item.low, item.high)
+    return ends if item.told or ends == _NO_ENDS else f"not told ({ends})"
+
+
+def _over_gains(item: Statement) -> str:
+    if item.holds is None:
+        return "weights of the fitted gain disagree"
+    return "not tried" if item.confidence is None else f"{100 * item.confidence:.0f} %"
 
 
 def _range(low: float, high: float) -> str:
     if low == -float("inf") and high == float("inf"):
-        return "not determined"
+        return _NO_ENDS
     left = "no end" if low == -float("inf") else number(low, 4)
     right = "no end" if high == float("inf") else number(high, 4)
     return f"{left} to {right}"

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from impc.report.csv_text import csv_bytes
 from impc.report.fit_sentences import METHOD_LABELS
 from impc.report.rendering import TextTable, embedded, number, plain, render_template
 from impc.report.style import BLUE, DOUBLE_COLUMN, INK, journal_style, new_figure, render
@@ -186,20 +185,25 @@ def _figure(problem: InverseProblem, compared: Sequence[MethodComparison]) -> Fi
 
 def _csv(problem: InverseProblem, compared: Sequence[MethodComparison]) -> bytes:
     plant = problem.plant
-    stream = io.StringIO()
-    writer = csv.writer(stream)
-    writer.writerow(
-        ["method"]
-        + [f"vaf_{name}" for name in plant.outputs]
-        + [f"held_out_vaf_{name}" for name in plant.outputs]
-        + [f"largest_{name}" for name in plant.controls]
-        + ["share_beyond_bound", "seconds", "reason"]
-    )
-    for item in compared:
-        numbers = [*item.fit.vaf, *_held(item), *item.fit.largest_input, item.fit.exceeded]
-        cells = ["" if np.isnan(value) else repr(float(value)) for value in numbers]
-        writer.writerow([item.name, *cells, repr(item.fit.seconds), item.fit.reason])
-    return stream.getvalue().encode()
+    heads = [
+        "method",
+        *(f"vaf_{name}" for name in plant.outputs),
+        *(f"held_out_vaf_{name}" for name in plant.outputs),
+        *(f"largest_{name}" for name in plant.controls),
+        "share_beyond_bound",
+        "seconds",
+        "reason",
+    ]
+    rows = [
+        (
+            item.name,
+            *map(float, (*item.fit.vaf, *_held(item), *item.fit.largest_input, item.fit.exceeded)),
+            item.fit.seconds,
+            item.fit.reason,
+        )
+        for item in compared
+    ]
+    return csv_bytes(heads, rows)
 
 
 def _json(
@@ -232,5 +236,6 @@ def _json(
         "command": provenance.command,
         "versions": dict(provenance.versions),
         "made": provenance.made,
+        "sha256": provenance.inputs.plain(),
     }
     return (json.dumps(plain(content), indent=1, allow_nan=False) + "\n").encode()

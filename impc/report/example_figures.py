@@ -58,7 +58,7 @@ def example_figures(case: CaseResult) -> dict[str, bytes]:
         return {
             f"{name}-case-{case.name}.{kind}": content
             for name, figure in figures.items()
-            for kind, content in render(figure).items()
+            for kind, content in render(figure, mathematics=True).items()
         }
 
 

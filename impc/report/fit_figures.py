@@ -26,7 +26,10 @@ if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.fit_result import FitResult
 
-__all__ = ["display_unit", "fit_figures"]
+__all__ = ["display_unit", "fit_figures", "shown_trials"]
+
+# Trials that are drawn one by one: 500 made a page of 51 MB and took 6.3 GB.
+_MOST_TRIALS = 24
 
 _SOFT = "#8C8C8C"
 _LAGS = 1.0  # s of the autocorrelation
@@ -43,7 +46,7 @@ def fit_figures(result: FitResult) -> dict[str, bytes]:
     with journal_style():
         figures = {
             f"trajectories-trial-{index + 1}": _trajectories(result, index)
-            for index in range(len(result.given.recordings))
+            for index in shown_trials(result)
         }
         figures["residuals"] = _residuals(result)
         figures["intent"] = _intent(result)
@@ -53,6 +56,13 @@ def fit_figures(result: FitResult) -> dict[str, bytes]:
             for name, figure in figures.items()
             for kind, content in render(figure).items()
         }
+
+
+def shown_trials(result: FitResult) -> list[int]:
+    """Trials of a `result` that have a figure: all, or of many those that are explained least."""
+    explained = [float(np.mean(told.vaf)) for told in result.trials]
+    least = sorted(range(len(explained)), key=lambda index: explained[index])
+    return sorted(least[:_MOST_TRIALS])
 
 
 def display_unit(name: str) -> tuple[float, str]:
@@ -137,7 +147,7 @@ def _command(ax: Axes, result: FitResult, index: int, column: int, name: str) ->
 
 def _residuals(result: FitResult) -> Figure:
     plant = result.fitted.problem.plant
-    count, p = len(result.given.recordings), len(plant.outputs)
+    count, p = min(len(result.given.recordings), _MOST_TRIALS), len(plant.outputs)
     figure = new_figure(DOUBLE_COLUMN, 0.4 + 1.3 * p * 1.0)
     axes = np.array(figure.subplots(p, 2, width_ratios=[3, 1], squeeze=False, sharex="col"))
     for column, name in enumerate(plant.outputs):
@@ -147,7 +157,7 @@ def _residuals(result: FitResult) -> Figure:
             for trial, run in zip(result.given.recordings, result.inverse_mpc.runs, strict=True)
         ]
         offset = 6 * max(float(np.std(part)) for part in series)
-        for index, part in enumerate(series):
+        for index, part in enumerate(series[:_MOST_TRIALS]):
             axes[column, 0].plot(
                 np.arange(len(part)) * plant.dt,
                 part - index * offset,

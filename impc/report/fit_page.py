@@ -7,16 +7,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.gain_covariance import DETERMINED
+from impc.gain_covariance import TOLD
 from impc.report.certainty_tables import (
     alternatives_table,
     eigenvalues_table,
     entries_table,
     intervals_table,
     limit_sentences,
+    prices_table,
     set_sentences,
     statements_table,
 )
+from impc.report.fit_figures import shown_trials
 from impc.report.fit_sentences import (
     METHOD_LABELS,
     direction_name,
@@ -46,8 +48,9 @@ def fit_page(result: FitResult, figures: Mapping[str, bytes], provenance: FitPro
         findings=findings(result),
         trajectories=[
             (trial_name(result, index), embedded(figures[f"trajectories-trial-{index + 1}.png"]))
-            for index in range(count)
+            for index in shown_trials(result)
         ],
+        trials=count,
         pictures={
             name: embedded(figures[f"{name}.png"]) for name in ("residuals", "intent", "methods")
         },
@@ -56,7 +59,7 @@ def fit_page(result: FitResult, figures: Mapping[str, bytes], provenance: FitPro
         readings=_readings(result),
         weights_set=_weights_set(result),
         weights_reason=result.certainty.weights_reason,
-        gain=intervals_table(result.certainty),
+        gain=intervals_table(result),
         limits=limit_sentences(result.certainty),
         alternatives=alternatives_table(result.certainty),
         directions=_directions(result),
@@ -150,49 +153,64 @@ def _weights_set(result: FitResult) -> tuple[tuple[str, ...], tuple[TextTable, .
     summary = result.certainty.weights
     if summary is None:
         return (), ()
-    tables = (statements_table(summary), entries_table(summary), eigenvalues_table(summary))
-    return set_sentences(summary), tables
+    prices = prices_table(summary)
+    tables = [statements_table(summary), *([] if prices is None else [prices])]
+    return set_sentences(summary), (*tables, entries_table(summary), eigenvalues_table(summary))
 
 
 def _directions(result: FitResult) -> TextTable:
-    plant, covariance = result.fitted.problem.plant, result.covariance
+    plant, covariance = result.fitted.problem.plant, result.estimate.covariance
     names = tuple(
         state if plant.m == 1 else f"{state} to {control}"
         for control in plant.controls
         for state in plant.states
     )
-    back = np.kron(np.eye(plant.m), np.linalg.inv(covariance.T).T)
+    back = np.kron(np.array(covariance.G), np.linalg.inv(covariance.T).T)
     sizes = np.tile(np.array(result.intent.sizes), plant.m)
     rows = []
     for index, value in enumerate(covariance.singular_values):
         moved = (back @ covariance.directions[index]) * sizes
         relative = value / covariance.singular_values[0]
+        deviation = float(covariance.deviations[index])
         rows.append(
             (
                 str(index + 1),
                 direction_name(moved / np.linalg.norm(moved), names),
                 f"{relative:.1e}",
-                number(float(covariance.deviations[index]), 2)
-                if relative > DETERMINED
-                else "not determined",
+                _deviation(deviation),
             )
         )
     caption = (
         "Directions of the gain, best determined first, as commands at typical states; the "
-        "deviation is relative to the natural size of a gain, so that 1 means all but unknown."
+        "deviation is relative to the natural size of a gain, so that 1 means all but unknown; "
+        f"above {TOLD:g} the recordings do not tell, and the estimate stays near the weights'."
     )
     heads = ("", "direction", "singular value / largest", "standard deviation")
     return TextTable(caption, heads, tuple(rows))
+
+
+def _deviation(value: float) -> str:
+    if np.isinf(value):
+        return "not determined"
+    return number(value, 2) if value < TOLD else f"not told ({number(value, 2)})"
 
 
 def _parameters(result: FitResult) -> TextTable | None:
     if not result.parameters:
         return None
     rows = tuple(
-        (item.name, number(item.nominal, 4), number(item.value, 4), number(item.deviation, 2))
+        (
+            item.name,
+            number(item.nominal, 4),
+            number(item.value, 4) if item.determined else "not determined",
+            number(item.deviation, 2),
+        )
         for item in result.parameters
     )
-    caption = "Physical parameters fitted with the gain (3.19), in SI units."
+    caption = (
+        "Physical parameters fitted with the gain (3.19), in SI units. One that is not determined, "
+        "to a factor of e at 95 %, stays near its nominal value whatever the truth."
+    )
     return TextTable(caption, ("parameter", "nominal", "fitted", "standard deviation"), rows)
 
 

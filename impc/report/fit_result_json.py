@@ -2,11 +2,14 @@
 
     vaf.<output>, held_out_vaf.<output>      %, all trials; the mean of the trials left out
     states, controls, outputs, disturbances  names, in the order of every array below
-    K, S, Q, R, P, horizon, bounds           the controller; weights at R[0][0] = 1
-    covariance                               standard deviations of K, directions and how sure
+    K, S, Q, R, P, horizon, bounds           the controller of the weights, at R[0][0] = 1
+    estimate                                 the gain that the recordings tell, without weights: K,
+                                             deviations, directions, and which of them are told
+    intervals.<number>                       of that gain and of the parameters
+    warnings, residuals                      sentences; the tests behind them
     intent                                   eigenvalues (ascending), dominant, sentence, readings
     identifiability                          rank, free, chosen, singular_values
-    parameters.<name>                        nominal, value, deviation
+    parameters.<name>                        nominal, value, deviation, determined
     trials                                   label, vaf, whiteness, x0, held_out_vaf, findings
     methods.<name>                           K, Q, R, vaf, trial_vaf, largest_input, keeps_bounds,
                                              fell (s, one a trial)
@@ -28,6 +31,7 @@ from impc.report.rendering import plain
 
 if TYPE_CHECKING:
     from impc.fit_result import FitResult
+    from impc.gain_estimate import GainEstimate
     from impc.report.provenance import FitProvenance
 
 __all__ = ["fit_json"]
@@ -67,15 +71,17 @@ def _controller(result: FitResult) -> dict[str, Any]:
 
 
 def _found(result: FitResult) -> dict[str, Any]:
-    covariance, found, intent = result.covariance, result.identifiability, result.intent
+    found, intent = result.identifiability, result.intent
     plant = result.fitted.problem.plant
     return {
-        "covariance": {
-            "K": covariance.entries,
-            "singular_values": covariance.singular_values,
-            "directions": covariance.directions,
-            "deviations": covariance.deviations,
-            "natural_coordinates": covariance.T,
+        "estimate": _estimate(result.estimate),
+        "warnings": result.warnings,
+        "residuals": {
+            name: None if test is None else {**asdict(test), "found": test.found}
+            for name, test in (
+                ("loop_noise", result.diagnostics.loop),
+                ("structure", result.diagnostics.structure),
+            )
         },
         "intent": {
             "eigenvalues": intent.reported.eigenvalues,
@@ -104,7 +110,9 @@ def _found(result: FitResult) -> dict[str, Any]:
             "singular_values": found.singular_values,
         },
         **_certainty(result),
-        "parameters": {item.name: asdict(item) for item in result.parameters},
+        "parameters": {
+            item.name: {**asdict(item), "determined": item.determined} for item in result.parameters
+        },
         "trials": [_trial(result, index) for index in range(len(result.trials))],
         "methods": {
             item.name: {
@@ -121,6 +129,23 @@ def _found(result: FitResult) -> dict[str, Any]:
             }
             for item in result.methods
         },
+    }
+
+
+def _estimate(estimate: GainEstimate) -> dict[str, Any]:
+    covariance = estimate.covariance
+    return {
+        "K": estimate.K,
+        "S": estimate.S,
+        "misfit": estimate.misfit,
+        "deviations": covariance.entries,
+        "told": covariance.told_entries,
+        "singular_values": covariance.singular_values,
+        "directions": covariance.directions,
+        "direction_deviations": covariance.deviations,
+        "told_directions": covariance.told,
+        "natural_coordinates": covariance.T,
+        "natural_inputs": covariance.G,
     }
 
 
@@ -174,5 +199,6 @@ def _made(result: FitResult, provenance: FitProvenance) -> dict[str, Any]:
         "command": provenance.command,
         "versions": dict(provenance.versions),
         "made": provenance.made,
+        "sha256": provenance.inputs.plain(),
         "seconds": result.seconds,
     }

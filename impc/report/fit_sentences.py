@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.gain_covariance import DETERMINED
+from impc.gain_covariance import DETERMINED, TOLD
 from impc.intent import dominant_sentence
 from impc.report.rendering import number
 
@@ -38,6 +38,7 @@ _NAMED = 0.15
 def findings(result: FitResult) -> tuple[str, ...]:
     """The first lines of the page."""
     return (
+        *result.warnings,
         *_agreement(result),
         *_saturation(result),
         *_against_inverse_lqr(result),
@@ -125,20 +126,29 @@ def _against_inverse_lqr(result: FitResult) -> list[str]:
 
 
 def _how_sure(result: FitResult) -> str:
+    summary = result.certainty.weights
+    drawn = (
+        ""
+        if summary is None or not summary.drawn
+        else f" Other gains that the recordings allow turn it by up to "
+        f"{summary.angle_of_gain:.0f} degrees at 95 %."
+    )
     return (
         f"Other weights with exactly the same behaviour turn that direction by up to "
         f"{result.widest_angle:.0f} degrees: so far it was chosen by a rule and not by the "
-        f"subject (section 4)."
+        f"subject (section 4).{drawn}"
     )
 
 
 def _determined(result: FitResult) -> str:
-    found, covariance = result.identifiability, result.covariance
+    found, covariance = result.identifiability, result.estimate.covariance
     values = covariance.singular_values
     count = int(np.count_nonzero(values > DETERMINED * values[0]))
-    told = int(np.count_nonzero(np.array(covariance.deviations) < 1))
+    told = int(np.count_nonzero(covariance.told))
+    entries = int(np.count_nonzero(covariance.told_entries))
     return (
         f"Of the {len(values)} directions of the gain the recordings determine {count} above "
-        f"rounding and {told} to better than their natural size; of the {found.free} directions "
+        f"rounding and {told} to better than {TOLD:g} of their natural size; {entries} of its "
+        f"entries they tell by themselves. Of the {found.free} directions "
         f"of the weights {found.rank}, the other {found.chosen} are a choice."
     )

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
+    from impc.inputs import Inputs
     from impc.plant import Plant
     from impc.plant_source import PlantSource
 
@@ -71,6 +72,8 @@ class FitProvenance:
         Of Python and of the packages that compute.
     made : str
         Date and time, UTC, ISO 8601.
+    inputs : Inputs
+        Digests of all files that went in.
     """
 
     plant_name: str
@@ -79,6 +82,7 @@ class FitProvenance:
     command: str
     versions: Mapping[str, str]
     made: str
+    inputs: Inputs
 
 
 def example_provenance(plant_name: str, plant: Plant) -> Provenance:
@@ -96,8 +100,13 @@ def example_provenance(plant_name: str, plant: Plant) -> Provenance:
     return Provenance(plant_name, plant, settings, _versions(), _now())
 
 
-def fit_provenance(source: PlantSource, files: Sequence[Path], command: str) -> FitProvenance:
-    """Gather the provenance of a fit to `files` by a `command`, now and as installed here."""
+def fit_provenance(
+    source: PlantSource, inputs: Inputs, files: Sequence[Path], command: str
+) -> FitProvenance:
+    """Gather the provenance of a fit to `files` by a `command`, now and as installed here.
+
+    `inputs` are their digests, and that of the plant of `source`.
+    """
     return FitProvenance(
         source.name,
         dict(source.arguments),
@@ -105,6 +114,7 @@ def fit_provenance(source: PlantSource, files: Sequence[Path], command: str) -> 
         command,
         _versions(),
         _now(),
+        inputs,
     )
 
 

@@ -45,7 +45,7 @@ def render_template(name: str, **values: Any) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    return environment.get_template(name).render(**values)
+    return _encodable(environment.get_template(name).render(**values))
 
 
 def embedded(png: bytes) -> str:
@@ -65,7 +65,8 @@ def number(value: float, digits: int = 3) -> str:
 def plain(value: Any) -> Any:
     """A `value` with its arrays and numpy numbers as lists and numbers, at every depth.
 
-    JSON knows neither NaN nor infinity: both become null.
+    JSON knows neither NaN nor infinity: both become null. Bytes of a file's name that are not UTF-8
+    are escaped.
     """
     if isinstance(value, dict):
         return {key: plain(item) for key, item in value.items()}
@@ -75,4 +76,11 @@ def plain(value: Any) -> Any:
         return plain(value.tolist())
     if isinstance(value, float) and not np.isfinite(value):
         return None
+    if isinstance(value, str):
+        return _encodable(value)
     return value
+
+
+def _encodable(text: str) -> str:
+    """The text in UTF-8: Python keeps bytes of a name that are none as halves of characters."""
+    return text.encode("utf-8", "backslashreplace").decode("utf-8")

@@ -15,9 +15,15 @@ from typing import TYPE_CHECKING, Any
 import matplotlib as mpl
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.text import Text
+from matplotlib.ticker import FixedFormatter, FuncFormatter
+
+from impc.errors import one_line
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
+
+    from matplotlib.ticker import Formatter
 
 __all__ = [
     "BLUE",
@@ -112,12 +118,20 @@ def new_figure(width: float, height: float) -> Figure:
     return figure
 
 
-def render(figure: Figure) -> dict[str, bytes]:
-    """Return the figure as ``"png"`` and ``"pdf"``, without date or program name.
+def render(figure: Figure, *, mathematics: bool = False) -> dict[str, bytes]:
+    r"""Return the figure as ``"png"`` and ``"pdf"``, without date or program name.
 
     The same figure gives the same bytes, so that a committed picture changes only when it does.
+
+    Parameters
+    ----------
+    mathematics : bool
+        Whether signs between dollars are set as mathematics: in figures without a name of a user's.
+        Elsewhere a signal called ``$\frac$`` is text as any other.
     """
     files = {}
+    if not mathematics:
+        _set_literally(figure)
     # Once for both files: the layout is half of the time.
     figure.draw_without_rendering()
     figure.set_layout_engine("none")
@@ -126,3 +140,22 @@ def render(figure: Figure) -> dict[str, bytes]:
         figure.savefig(stream, format=kind, dpi=_DPI, metadata=metadata)
         files[kind] = stream.getvalue()
     return files
+
+
+def _set_literally(figure: Figure) -> None:
+    """Let no text be read as mathematics, but the numbers that matplotlib itself writes."""
+    numbers: set[Text] = set()
+    for ax in figure.axes:
+        for axis in (ax.xaxis, ax.yaxis):
+            numbers |= set(axis.findobj(Text)) - {axis.label}
+            formatter = axis.get_major_formatter()
+            if isinstance(formatter, (FuncFormatter, FixedFormatter)):  # names at the ticks
+                axis.set_major_formatter(FuncFormatter(_literal_tick(formatter)))
+    found: set[Text] = set(figure.findobj(Text))
+    for text in found - numbers:
+        text.set_parse_math(False)
+        text.set_text("\n".join(one_line(line) for line in text.get_text().split("\n")))
+
+
+def _literal_tick(names: Formatter) -> Callable[[float, int | None], str]:
+    return lambda value, place: one_line(names(value, place)).replace("$", r"\$")

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.arrays import Array, frozen
+from impc.arrays import Array, Frozen, frozen
 from impc.selection.estimation import estimate, residuals
 from impc.selection.model import Trial
 
@@ -31,7 +31,7 @@ _THREADS = 2
 
 
 @dataclass(frozen=True)
-class BootstrapIntervals:
+class BootstrapIntervals(Frozen):
     """Percentiles of the replicates.
 
     Attributes

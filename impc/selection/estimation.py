@@ -13,7 +13,7 @@ import numpy as np
 import scipy.optimize
 
 from impc.agreement import vaf
-from impc.arrays import Array, IntArray, frozen
+from impc.arrays import Array, Frozen, IntArray, frozen
 from impc.errors import DataError, InputError
 from impc.selection.model import normalised, physical, sensitivity
 
@@ -28,7 +28,7 @@ _TOLERANCE = 1e-10
 
 
 @dataclass(frozen=True)
-class Estimate:
+class Estimate(Frozen):
     """A fit.
 
     Attributes

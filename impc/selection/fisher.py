@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.arrays import Array, frozen
+from impc.arrays import Array, Frozen, frozen
 from impc.selection.model import sensitivity
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ _UNSEEN = 1.0
 
 
 @dataclass(frozen=True)
-class Information:
+class Information(Frozen):
     """Information of all trials together.
 
     Attributes

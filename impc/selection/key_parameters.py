@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.arrays import Array, frozen
+from impc.arrays import Array, Frozen, frozen
 from impc.reliability.icc import icc
 from impc.selection.estimation import Estimate, estimate
 from impc.selection.subject import Nominal, fit_nominal
@@ -70,7 +70,7 @@ class Candidate:
 
 
 @dataclass(frozen=True)
-class KeyParameters:
+class KeyParameters(Frozen):
     """Outcome of the filters.
 
     Attributes

@@ -19,7 +19,7 @@ import numpy as np
 import scipy.linalg
 import scipy.optimize
 
-from impc.arrays import Array, frozen
+from impc.arrays import Array, Frozen, frozen
 from impc.selection.estimation import Estimate, estimate
 from impc.selection.model import normalised, physical, sensitivity
 
@@ -36,7 +36,7 @@ _ROUNDING = 1e-12  # of the steepest slope, in the test of optimality
 
 
 @dataclass(frozen=True)
-class Lasso:
+class Lasso(Frozen):
     """A selection.
 
     Attributes

@@ -18,11 +18,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import casadi as ca
-import numba
 import numpy as np
 import scipy.linalg
 
 from impc.arrays import Array, IntArray
+from impc.jit import njit
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -177,7 +177,7 @@ def _joined(A: Array, B: Array) -> Array:
     return joined
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _states(A: Any, B: Any, given: Any) -> Any:
     samples, n, d = len(given), A.shape[0], B.shape[1]
     x = np.zeros((samples, n))
@@ -192,7 +192,7 @@ def _states(A: Any, B: Any, given: Any) -> Any:
     return x
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _with_derivatives(A: Any, B: Any, dA: Any, dB: Any, given: Any) -> Any:
     samples, n, d, count = len(given), A.shape[0], B.shape[1], len(dA)
     x = np.zeros((samples, n))

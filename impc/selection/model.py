@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.arrays import Array, IntArray, frozen
+from impc.arrays import Array, Frozen, IntArray, frozen
 from impc.errors import InputError
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ _STEP = 1e-4
 
 
 @dataclass(frozen=True)
-class Trial:
+class Trial(Frozen):
     """One recording, in the units of the model's signals.
 
     Attributes
@@ -43,7 +43,7 @@ class Trial:
 
 
 @dataclass(frozen=True)
-class ParametricModel:
+class ParametricModel(Frozen):
     """The model and what is known of its parameters.
 
     Attributes

@@ -19,7 +19,7 @@ import scipy.linalg
 import scipy.optimize
 import scipy.stats
 
-from impc.arrays import Array, frozen
+from impc.arrays import Array, Frozen, frozen
 from impc.selection.estimation import estimate, residuals
 from impc.selection.fisher import fisher_information
 from impc.selection.model import normalised, physical
@@ -47,7 +47,7 @@ __all__ = [
 
 
 @dataclass(frozen=True)
-class FixedBias:
+class FixedBias(Frozen):
     """Shift of the free parameters (in normalised units) for one fixed parameter moved.
 
     Attributes

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 from collections import Counter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from impc.report.csv_text import csv_bytes
 from impc.report.rendering import TextTable, embedded, number, plain, render_template
 from impc.report.style import BLUE, DOUBLE_COLUMN, INK, journal_style, new_figure, render
 
@@ -284,8 +283,4 @@ def _sd(values: np.ndarray[Any, np.dtype[np.float64]]) -> float:
 
 def table_csv(table: TextTable) -> bytes:
     """Encode a table as CSV."""
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(table.heads)
-    writer.writerows(table.rows)
-    return stream.getvalue().encode()
+    return csv_bytes(table.heads, table.rows)

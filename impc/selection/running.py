@@ -1,4 +1,4 @@
-"""The same work on every subject: here one after the other, or on the workers of a scheduler.
+"""The same work on every subject: here one after the other, or on workers.
 
 Workers load the model by its import path; recordings travel with the task. What a task returned is
 kept on disk under a digest of all that went into it, so that an interrupted command goes on.
@@ -7,33 +7,27 @@ kept on disk under a digest of all that went into it, so that an interrupted com
 from __future__ import annotations
 
 import functools
-import hashlib
-import importlib.metadata
 import json
-import os
-import shutil
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
-import distributed
 import msgspec
 import numpy as np
 
 from impc.arrays import frozen
-from impc.errors import ImpcError, OutputError
+from impc.digest import digest, source_digest, versions
+from impc.errors import ImpcError, InputError, SolverError
 from impc.selection.model import Trial
 from impc.selection.source import model_source
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
-    from pathlib import Path
 
-    from distributed import Client
-
+    from impc.cohort.workers import Workers
+    from impc.kept import Kept
     from impc.selection.model import ParametricModel
     from impc.selection.source import ModelSource
 
-__all__ = ["Kept", "Runner", "in_turn", "on_workers"]
+__all__ = ["Runner", "in_turn", "on_workers"]
 
 T = TypeVar("T")
 
@@ -48,51 +42,6 @@ class Runner(Protocol):
         ...
 
 
-@dataclass(frozen=True)
-class Kept:
-    """Results of tasks in a folder, one file each.
-
-    Attributes
-    ----------
-    folder : Path
-        Made when the first result is kept.
-    """
-
-    folder: Path
-
-    def find(self, key: str, kind: type[T]) -> T | None:
-        """What was kept under a key, of that `kind`; None when nothing was, or it is damaged."""
-        try:
-            content = (self.folder / key).read_bytes()
-            return msgspec.msgpack.decode(content, type=kind, dec_hook=_array)
-        except (OSError, msgspec.DecodeError):
-            return None
-
-    def keep(self, key: str, value: object) -> None:
-        """Write the result `value` down under a `key`.
-
-        Raises
-        ------
-        OutputError
-            When that cannot be done.
-        """
-        staging = self.folder / f"{key}.part"
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            staging.write_bytes(msgspec.msgpack.encode(value, enc_hook=np.ndarray.tolist))
-            os.replace(staging, self.folder / key)
-        except OSError as error:
-            raise OutputError(
-                f"folder {self.folder}",
-                f"cannot be written to ({error.strerror})",
-                "give another folder",
-            ) from None
-
-    def forget(self) -> None:
-        """Remove the folder: the final results have been written."""
-        shutil.rmtree(self.folder, ignore_errors=True)
-
-
 def in_turn(model: ParametricModel) -> Runner:
     """One after the other, in this process; nothing is kept."""
 
@@ -105,17 +54,16 @@ def in_turn(model: ParametricModel) -> Runner:
 
 
 def on_workers(
-    client: Client,
+    workers: Workers,
     source: ModelSource,
     kept: Kept,
     done: Callable[[str], None] = lambda _: None,
 ) -> Runner:
-    """On the workers of a scheduler; what is kept already is not done again.
+    """On workers; what is kept already is not done again.
 
     Parameters
     ----------
-    client : distributed.Client
-        Of the scheduler.
+    workers : Workers
     source : ModelSource
         Its import path must be known to the workers too.
     kept : Kept
@@ -127,64 +75,72 @@ def on_workers(
         work: Callable[..., T], kind: type[T], arguments: Mapping[str, tuple[Any, ...]]
     ) -> dict[str, T]:
         found: dict[str, T] = {}
-        keys = {name: _digest(source, work, given) for name, given in arguments.items()}
-        out: dict[Any, str] = {}
+        made_of = _made_of(source.name, source.arguments)
+        keys = {name: _digest(source, made_of, work, given) for name, given in arguments.items()}
         for name, given in arguments.items():
-            before = kept.find(keys[name], kind)
+            before = kept.recall(keys[name], keys[name])
             if before is not None:
-                found[name] = before
+                found[name] = msgspec.convert(before, kind, dec_hook=_array)
                 done(name)
                 continue
-            future = client.submit(
-                _task, source.name, json.dumps(source.arguments), work, given, pure=False
+            workers.submit(
+                name, _task, source.name, json.dumps(source.arguments), made_of, work, given
             )
-            out[future] = name
-        make: Any = distributed.as_completed  # distributed types few of its functions
-        for future in make(list(out)) if out else ():
-            result = future.result()
-            if isinstance(result, ImpcError):
-                raise result
-            found[out[future]] = result
-            kept.keep(keys[out[future]], result)
-            done(out[future])
+        for item in workers.results() if len(found) < len(arguments) else ():
+            name = str(item.key)
+            if item.fault:
+                raise SolverError(f"task {name}", item.fault, "see what its recording has")
+            if isinstance(item.value, ImpcError):
+                raise item.value
+            found[name] = item.value
+            content = msgspec.to_builtins(item.value, enc_hook=np.ndarray.tolist)
+            kept.keep(keys[name], keys[name], content)
+            done(name)
         return {name: found[name] for name in arguments}
 
     return run
 
 
-def _task(name: str, arguments: str, work: Callable[..., Any], given: tuple[Any, ...]) -> Any:
+def _task(
+    name: str, arguments: str, made_of: str, work: Callable[..., Any], given: tuple[Any, ...]
+) -> Any:
     """On a worker; a failure that has a sentence comes back as it is, without the worker's log."""
     try:
-        return work(_model(name, arguments), *given)
+        return work(_model(name, arguments, made_of), *given)
     except ImpcError as error:
         return error
 
 
 @functools.lru_cache(maxsize=4)
-def _model(name: str, arguments: str) -> ParametricModel:
-    return model_source(name, json.loads(arguments)).model
+def _model(name: str, arguments: str, made_of: str) -> ParametricModel:
+    source = model_source(name, json.loads(arguments))
+    if _made_of(name, source.arguments) != made_of:
+        raise InputError(
+            "worker", "has another model or other versions than this command",
+            "give all machines the same, and start the workers again",
+        )  # fmt: skip
+    return source.model
 
 
-def _digest(source: ModelSource, work: Callable[..., Any], given: tuple[Any, ...]) -> str:
-    """Of the package, the model (by name, ranges and an output), the work and its arguments."""
+def _made_of(name: str, arguments: Mapping[str, Any]) -> str:
+    return digest(versions(), source_digest(name, arguments), dict(arguments))
+
+
+def _digest(
+    source: ModelSource, made_of: str, work: Callable[..., Any], given: tuple[Any, ...]
+) -> str:
+    """Of the versions, the model's code and ranges, the work and its arguments.
+
+    Of a model that computes with other files it is an output that tells.
+    """
     model = source.model
-    text = hashlib.sha256()
-    named = importlib.metadata.version("impc"), source.name, source.arguments, model.names
-    text.update(repr((*named, work.__module__, work.__qualname__)).encode())
-    for values in (model.low, model.high, model.typical):
-        text.update(np.ascontiguousarray(values).tobytes())
-    for item in given:
-        trials = item if isinstance(item, tuple) else ()
-        for trial in trials:
-            if isinstance(trial, Trial):
-                text.update(np.ascontiguousarray(trial.input).tobytes())
-                text.update(np.ascontiguousarray(trial.outputs).tobytes())
-        if trials and isinstance(trials[0], Trial):
-            outputs = model.simulate(np.array(model.typical), trials[0].input)
-            text.update(np.ascontiguousarray(outputs).tobytes())
-        else:
-            text.update(repr(item).encode())
-    return text.hexdigest()
+    outputs = [
+        model.simulate(np.array(model.typical), item[0].input)
+        for item in given
+        if isinstance(item, tuple) and item and isinstance(item[0], Trial)
+    ]
+    ranges = model.names, model.low, model.high, model.typical
+    return digest(made_of, ranges, outputs, work.__module__, work.__qualname__, given)
 
 
 def _array(kind: type, value: Any) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -68,6 +69,25 @@ def select_settings(table: Mapping[str, Any]) -> SelectSettings:
         found = msgspec.convert(dict(table), SelectSettings, strict=True)
     except msgspec.ValidationError as error:
         raise InputError("[select]", str(error), "see docs/selection.md") from None
+    _require_in_range(found)
     if found.draw not in ("single", "block"):
         raise InputError("[select] draw", f"got {found.draw!r}", "give single or block")
     return found
+
+
+def _require_in_range(found: SelectSettings) -> None:
+    # More replicates or starts than a thousand a day for a month are a slip of the keyboard.
+    for name, value, least, most in (
+        ("least", found.least, 1, 1000),
+        ("size", found.size, 1, 1000),
+        ("starts", found.starts, 1, 100_000),
+        ("replicates", found.replicates, 2, 100_000),
+        ("seed", found.seed, 0, 2**63 - 1),
+    ):
+        if not least <= value <= most:
+            raise InputError(f"[select] {name}", f"got {value}", f"give {least} to {most}")
+    for bound in (found.bound, *found.bounds):
+        if not 0 < bound < math.inf:
+            raise InputError("[select] bound, bounds", f"got {bound:g}", "give numbers above 0")
+    if not found.bounds:
+        raise InputError("[select] bounds", "is empty", "give one or more, or leave it out")

@@ -22,7 +22,7 @@ import numpy as np
 from impc.errors import InputError
 from impc.files.reading import read_recordings
 from impc.plant import as_plant
-from impc.plant_source import import_function
+from impc.plant_source import import_function, users_code
 from impc.selection.linear import linear_functions
 from impc.selection.model import ParametricModel, Trial, parametric_model
 
@@ -71,7 +71,8 @@ def model_source(name: str, arguments: Mapping[str, Any]) -> ModelSource:
     """
     make = import_function(name)
     try:
-        told = make(**arguments)
+        with users_code(f"model {name}", TypeError, ValueError):
+            told = make(**arguments)
     except (TypeError, ValueError) as error:
         raise InputError(f"model {name}", str(error), "correct the [model] table") from None
     lacking = [key for key in _NEEDED if not isinstance(told, dict) or key not in told]

@@ -26,6 +26,7 @@ _ENVIRONMENT = "makes an environment; the tests run inside one"
 _WHOLE = "runs what these tests are a part of"
 _SITE = "builds the site: four minutes"
 _PUBLISH = "publishes, or needs a network"
+_CERTIFICATES = "needs openssl; tests/cohort/test_cluster.py runs these lines where it is there"
 _CLUSTER = "needs machines of a cluster; tests/cohort starts a scheduler and workers of its own"
 
 #: (page, line) -> why it is not run.
@@ -38,6 +39,9 @@ NOT_RUN = {
     ("docs/contributing.md", "make check"): _WHOLE,
     ("docs/contributing.md", "make test"): _WHOLE,
     ("docs/contributing.md", "make slow"): _WHOLE,
+    ("docs/contributing.md", "make fuzz"): _WHOLE,
+    ("docs/contributing.md", "make search"): _WHOLE,
+    ("docs/contributing.md", "make numerics"): _WHOLE,
     ("docs/contributing.md", "python -m pytest tests/documents -k start"): _WHOLE,
     ("docs/contributing.md", "python -m pytest tests/test_lqr.py"): _WHOLE,
     ("docs/contributing.md", "make docs"): _SITE,
@@ -45,12 +49,32 @@ NOT_RUN = {
         "docs/contributing.md",
         "python -m sphinx -W -D sphinx_gallery_conf.filename_pattern=nothing docs docs/_build/html",
     ): _SITE,
-    ("docs/cohorts.md", "dask scheduler --port 8786"): _CLUSTER,
-    ("docs/cohorts.md", "dask worker tcp://HOST:8786 --nthreads 1 --nworkers 32"): _CLUSTER,
     (
         "docs/cohorts.md",
-        "impc cohort study.toml --out results --scheduler tcp://HOST:8786",
-    ): _CLUSTER,
+        "openssl req -x509 -newkey rsa:2048 -nodes -days 365 -subj /CN=impc-ca"
+        " -keyout ca-key.pem -out ca.pem",
+    ): _CERTIFICATES,
+    (
+        "docs/cohorts.md",
+        "openssl req -newkey rsa:2048 -nodes -subj /CN=impc -keyout key.pem -out request.pem",
+    ): _CERTIFICATES,
+    (
+        "docs/cohorts.md",
+        "openssl x509 -req -in request.pem -CA ca.pem -CAkey ca-key.pem -CAcreateserial"
+        " -days 365 -out cert.pem",
+    ): _CERTIFICATES,
+    ("docs/cohorts.md", "chmod 600 key.pem ca-key.pem"): _CERTIFICATES,
+    **{
+        (
+            "docs/cohorts.md",
+            f"{line} --tls-ca{kind} ca.pem --tls-cert cert.pem --tls-key key.pem",
+        ): (_CLUSTER)
+        for kind, line in (
+            ("-file", "dask scheduler --protocol tls --port 8786"),
+            ("-file", "dask worker tls://HOST:8786 --nthreads 1 --nworkers 32"),
+            ("", "impc cohort study.toml --out results --scheduler tls://HOST:8786"),
+        )
+    },
     (
         "docs/cursor-tracking.md",
         "python -m experiments.cursor_tracking --out results/cursor-tracking",
@@ -69,7 +93,7 @@ NOT_RUN = {
 _SUBJECT = "impc simulate seated-balance --out {0} --duration 4 --formats csv"
 _EASIER = (
     "edit {0}/subject.toml [plant] '[plant]\ndelay_order = 1'",
-    "edit {0}/subject.toml 'horizon = 20' 'held_out = false\nhorizon = 4'",
+    "edit {0}/subject.toml 'horizon = 20' 'held_out = false\nintent_draws = false\nhorizon = 4'",
 )
 _SEAT = tuple(line.format("results/subject") for line in (_SUBJECT, *_EASIER))
 _HERE = tuple(line.format(".") for line in (_SUBJECT, *_EASIER))
@@ -84,7 +108,7 @@ SMALLER = {
     ): Smaller(
         (
             "edit lab.toml [plant] '[plant]\ndelay_order = 1'",
-            "edit lab.toml 'horizon = 20' 'horizon = 4'",
+            "edit lab.toml 'horizon = 20' 'intent_draws = false\nhorizon = 4'",
             "impc fit lab_1.csv --plant seated-balance --config lab.toml --out results/lab",
         ),
         _SHORT,
@@ -96,7 +120,7 @@ SMALLER = {
     ): Smaller(
         (
             "edit subject.toml [plant] '[plant]\ndelay_order = 1'",
-            "edit subject.toml [fit] '[fit]\nheld_out = false\nhorizon = 4'",
+            "edit subject.toml [fit] '[fit]\nheld_out = false\nintent_draws = false\nhorizon = 4'",
             "impc fit trial_*.csv --plant seated-balance --config subject.toml",
         ),
         _SHORT,

@@ -2,36 +2,54 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import re
+import sys
+import tempfile
+import time
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import control
+import distributed
 import numpy as np
 import pytest
+import scipy.io
 from click.testing import CliRunner
 
 from impc.bounds import box_bounds
 from impc.cli import main
 from impc.closed_loop import require_complete, scenario, simulate
 from impc.cohort import cluster
+from impc.cohort.names import checked_name
+from impc.cohort.sheet import Sheet, column_values, read_sheet
 from impc.cohort.store import open_store
 from impc.cohort.study import read_study
+from impc.commands.consent import require_consent
+from impc.commands.plant import find_plant
 from impc.controller import mpc_controller
+from impc.effort import Effort
 from impc.errors import ImpcError
+from impc.files import apart
 from impc.files.alignment import misaligned
 from impc.files.configuration import read_configuration
-from impc.files.reading import read_recordings
+from impc.files.formats import read_table
+from impc.files.reading import read_recordings, recording_of
+from impc.files.table import Table, make_table
 from impc.fit_recordings import fit_problem
 from impc.fit_settings import FitSettings, fit_settings
+from impc.jit import keep_caches
+from impc.kept import Kept
 from impc.lqr import solve_lqr
 from impc.plant import Plant, as_plant
-from impc.plant_source import make_plant, plant_source
+from impc.plant_source import PlantSource, make_plant, plant_source
 from impc.recording import recording
-from impc.report.write import require_writable
+from impc.report.write import owned, require_writable, write_files
 from impc.weights import stage_weights
 from tests.documents.blocks import PAGES
 from tests.files.damaged import DAMAGED, PLANT
+from tests.files.samples import hdf5_mat, pushed_seat, settings
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -90,6 +108,16 @@ def far_start(_: Path) -> None:
     require_complete(controller, simulate(controller, scenario(cart(), x0=[5], steps=3)))
 
 
+def runaway(growth: float, **settings: float) -> None:
+    """A start beyond what the input can stop."""
+    plant = cart(growth)
+    side = settings.pop("x_max", np.inf)
+    bounds = box_bounds(plant, u_min=-0.1, u_max=0.1, x_min=-side, x_max=side)
+    weights, softening = stage_weights(np.eye(1), 1), settings.get("softening")
+    controller = mpc_controller(plant, weights, bounds, 60, terminal_set=False, softening=softening)
+    require_complete(controller, simulate(controller, scenario(plant, x0=[5], steps=400)))
+
+
 def draft_over_a_file(folder: Path) -> str:
     (folder / "a.csv").write_text("t,a\n0,1\n1,2\n")
     return command("inspect", str(folder / "a.csv"), "--out", str(folder / "a.csv"))
@@ -101,14 +129,15 @@ def file_for_a_folder(folder: Path) -> None:
 
 
 def two_runs(folder: Path) -> None:
-    with open_store(folder), open_store(folder):
+    with open_store(folder, {}), open_store(folder, {}):
         pass
 
 
 def another_study(folder: Path) -> None:
-    with open_store(folder) as store:
-        store.keep_fit("sub-1", {"digest": "one"})
-        store.require_same("sub-1", "other")
+    with open_store(folder, {"sub-1": "one"}) as store:
+        store.keep_fit("sub-1", {"K": [[1.0]]})
+    with open_store(folder, {"sub-1": "other"}) as store:
+        store.fit("sub-1")
 
 
 def study_file(folder: Path, text: str) -> Path:
@@ -129,14 +158,149 @@ def no_model(folder: Path) -> str:
     return command("select", str(study), "--out", str(folder / "out"))
 
 
-def no_scheduler(_: Path) -> None:
-    with cluster.connected("tcp://127.0.0.1:9", None):
+def another_command(folder: Path) -> None:
+    with owned(folder / "out", "fit"):
+        write_files(folder / "out", {"report.html": b""})
+    with owned(folder / "out", "compare"):
         pass
+
+
+def results_without_a_list(folder: Path) -> None:
+    (folder / "report.html").write_text("")
+    with owned(folder, "fit"):
+        pass
+
+
+def file_of_ones_own(folder: Path) -> None:
+    (folder / "gain.png").write_text("")
+    with owned(folder, "fit"):
+        write_files(folder, {"gain.png": b""})
+
+
+def damaged_result(folder: Path) -> None:
+    (folder / "fit.json").write_text("{}")
+    Kept(folder).find("fit", "")
+
+
+def no_room(folder: Path) -> None:
+    (folder / "units").write_text("")  # a file where a folder should go
+    Kept(folder / "units").keep("fit", "", {})
+
+
+def own_plant(folder: Path) -> Path:
+    (folder / "s1.csv").write_text("")
+    return study_file(folder, STUDY.replace('"cursor"', '"mine:plant"'))
+
+
+def sheet_of(folder: Path, text: str) -> Sheet:
+    (folder / "t.csv").write_text(text)
+    return read_sheet(folder / "t.csv")
+
+
+def connect(address: str) -> None:
+    with cluster.connected(cluster.Cluster(address)):
+        pass
+
+
+def no_scheduler(_: Path) -> None:
+    connect("tcp://127.0.0.1:9")
+
+
+def lost_scheduler(_: Path) -> None:
+    make: Any = distributed.LocalCluster
+    with make(
+        n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None, silence_logs=60
+    ) as found, cluster.connected(cluster.Cluster(found.scheduler_address)) as workers:  # fmt: skip
+        workers.submit("long", time.sleep, 0.5)
+        found.close()
+        list(workers.results())
 
 
 def everything_recorded(_: Path) -> None:
     source = plant_source("plants:cursor_plant", {})
     make_plant(source, source.make().input_labels)
+
+
+def thousands(folder: Path) -> None:
+    (folder / "t.csv").write_text("t;x\n0;999\n1;1.000\n")
+    read_table(folder / "t.csv")
+
+
+def a_pipe(folder: Path) -> None:
+    os.mkfifo(folder / "t.csv")
+    read_table(folder / "t.csv")
+
+
+def reader_that(ends: str) -> Callable[[Path], None]:
+    """Read by a process that ends so."""
+
+    def read(folder: Path) -> None:
+        hdf5_mat(folder / "t.mat", {"x": np.arange(9.0)})
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(apart, "_current", [])
+            patch.setattr(apart, "_START", f"import os, signal; {ends}")
+            read_table(folder / "t.mat")
+
+    return read
+
+
+def endless_pattern(_: Path) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(apart, "_SECONDS", 1)
+        apart.match_apart("recording.pattern", "(a+)+x", "a" * 60)
+
+
+def clock_in_microseconds(folder: Path) -> None:
+    columns = pushed_seat()
+    table = make_table("t.csv", {**columns, "time": 1e6 * columns["time"]})
+    read_seat(folder, table)
+
+
+def value_of_a_fault(folder: Path) -> None:
+    columns = pushed_seat()
+    read_seat(folder, make_table("t.csv", {**columns, "seat": 1e300 * columns["seat"]}))
+
+
+def read_seat(folder: Path, table: Table) -> None:
+    (folder / "c.toml").write_text(settings())
+    plant = make_plant(plant_source(PLANT, {}), ("perturbation",))
+    recording_of(table, read_configuration(folder / "c.toml"), plant)
+
+
+def saved_plant(**changed: object) -> Callable[[Path], None]:
+    """Make a plant from a file in which something is wrong."""
+
+    def read(folder: Path) -> None:
+        matrices: dict[str, object] = {"A": [[0.5]], "B": [[1.0]], "C": [[1.0]], "dt": 0.1}
+        scipy.io.savemat(folder / "plant.mat", matrices | changed)
+        make_plant(plant_source(str(folder / "plant.mat"), {}), ())
+
+    return read
+
+
+def of_fit(table: dict[str, Any]) -> Callable[[Path], object]:
+    return lambda _: fit_settings(table)
+
+
+def module_of_an_installed_name(folder: Path) -> None:
+    (folder / "control.py").write_text("def stick(): pass")
+    with contextlib.chdir(folder):
+        plant_source("control:stick", {})
+
+
+def caches_without_a_home(folder: Path) -> str:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tempfile, "tempdir", str(folder))
+        for name in ("XDG_CACHE_HOME", "XDG_CONFIG_HOME"):
+            patch.setenv(name, "/proc/none")
+        for name in ("NUMBA_CACHE_DIR", "MPLCONFIGDIR"):
+            patch.setenv(name, "")  # so that it is put back afterwards
+            patch.delenv(name)
+        return f"impc: note: {keep_caches()}"
+
+
+def large_request(seconds: float, gigabytes: float) -> Callable[[Path], object]:
+    return lambda _: require_consent(Effort(seconds, gigabytes), given=False)
 
 
 #: Message -> what provokes it: raises the error, or returns the text.
@@ -151,6 +315,16 @@ PROVOKED: dict[str, Callable[[Path], object]] = {
     "column '...' has text in ... of ... rows": damaged("text in a column"),
     "the file ends in the middle of a row": damaged("truncated csv"),
     "is a MATLAB table; save a struct of vectors": damaged("table object"),
+    "which may be a thousand": thousands,
+    "is no ordinary file": a_pipe,
+    "takes more than ... GB to read": reader_that("os.kill(os.getpid(), signal.SIGKILL)"),
+    "takes longer than ... s to read": reader_that("os.kill(os.getpid(), signal.SIGXCPU)"),
+    "ends the process that reads it (...)": reader_that("os.abort()"),
+    "cannot be matched with '...' in ... s": endless_pattern,
+    "has a sample every ... s, and the plant one every ... s": clock_in_microseconds,
+    "which is no measurement": value_of_a_fault,
+    "has a complex matrix ...": saved_plant(A=np.array([[0.5 + 1j]])),
+    "names ... states and has ...": saved_plant(states=np.array(["x", "v"], dtype=object)),
     "is damaged and cannot be read (...)": damaged("truncated mat"),
     "is not TOML (...)": damaged("configuration that is no toml"),
     "is not known; did you mean ...": damaged("misspelled key"),
@@ -180,6 +354,16 @@ PROVOKED: dict[str, Callable[[Path], object]] = {
     "refuses its arguments (...)": lambda _: make_plant(
         plant_source("plants:cursor_plant", {"size": 3}), ()
     ),
+    "rename yours: an installed module has its name": module_of_an_installed_name,
+    "ends in ... (...); correct the function, or what it is given": lambda _: make_plant(
+        PlantSource("mine:stick", lambda: sys.exit(0), {}), ()
+    ),
+    "[fit] ...: got ...; give at least ..., at most ...": of_fit({"horizon": 2**63}),
+    "names ... twice; name each once": of_fit({"free": ["mass", "mass"]}),
+    "is a ... that no result can keep": lambda _: find_plant("cursor", {"sample_time": 2**64}),
+    "would need ... GB of memory, more than this machine has": large_request(0, 1e9),
+    "this request: would take about ... hours; ...; or say --yes": large_request(1e9, 0),
+    "impc: note: caches are kept in ...": caches_without_a_home,
     "is continuous, a discrete one is needed": lambda _: as_plant(
         control.ss([[-1]], [[1]], [[1]], 0)
     ).require_discrete(),
@@ -192,11 +376,37 @@ PROVOKED: dict[str, Callable[[Path], object]] = {
         cart(1.0), stage_weights(np.zeros((1, 1)), 1)
     ),
     "no input sequence keeps the bound ...": far_start,
+    "the input could not be told in double precision": lambda _: runaway(
+        2.0, x_max=1.0, softening=50.0
+    ),
+    "the state left every reasonable range": lambda _: runaway(1.1),
     "exclude the origin for ...": lambda _: box_bounds(cart(), u_min=1, u_max=2),
     "exists already; give another name, or remove it": draft_over_a_file,
     "... is a file; give another folder": file_for_a_folder,
     "another run is writing to it": two_runs,
-    "was fitted to other recordings or with other settings": another_study,
+    "was fitted to other recordings or with other settings, plant or versions": another_study,
+    "holds results of impc ...; give another folder": another_command,
+    "holds ... of another version or of your own": results_without_a_list,
+    "is not of an earlier run of this command": file_of_ones_own,
+    "is damaged, or not what this program wrote": damaged_result,
+    "cannot be written (...); make room and start again": no_room,
+    "names code that would be run, ...": lambda folder: command(
+        "cohort", str(own_plant(folder)), "--out", str(folder / "out")
+    ),
+    "is no function of a module of yours": lambda folder: command(
+        "cohort", str(own_plant(folder)), "--plant", "os:system", "--out", str(folder / "out")
+    ),
+    "has ... in it; use letters, digits, spaces and . + - _": lambda _: checked_name(
+        "t.csv", "subject", "a/b"
+    ),
+    "row ... has ... cells, the head ...": lambda folder: sheet_of(
+        folder, "subject,mass\n1,70,5\n"
+    ),
+    "which may be thousands; write it with a decimal point": lambda folder: column_values(
+        sheet_of(folder, "subject;mass\n1;1,234\n"), "mass"
+    ),
+    "was lost while tasks were out": lost_scheduler,
+    "needs --tls-..., ...; give the three files": lambda _: connect("tls://127.0.0.1:9"),
     "matches no file; check the path": lambda folder: read_study(study_file(folder, STUDY)),
     "is not in ...; add a row": unknown_subject,
     "study.model: is missing": no_model,

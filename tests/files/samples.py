@@ -21,6 +21,9 @@ __all__ = [
     "CONFIGURATION",
     "csv_text",
     "hdf5_mat",
+    "mat5_array",
+    "mat5_element",
+    "mat5_file",
     "opaque_variable",
     "pushed_seat",
     "save_mat",
@@ -107,12 +110,25 @@ def opaque_variable(name: bytes, kind: bytes) -> bytes:
 
     Class 17 (opaque), then name, kind of object, class, and a reference.
     """
-    sizes = _element(6, struct.pack("<II", 13, 0)) + _element(5, struct.pack("<ii", 6, 1))
-    reference = _element(14, sizes + _element(1, b"") + _element(6, bytes(24)))
-    names = b"".join(_element(1, text) for text in (name, b"MCOS", kind))
-    return _element(14, _element(6, struct.pack("<II", 17, 0)) + names + reference)
+    sizes = mat5_element(6, struct.pack("<II", 13, 0)) + mat5_element(5, struct.pack("<ii", 6, 1))
+    reference = mat5_element(14, sizes + mat5_element(1, b"") + mat5_element(6, bytes(24)))
+    names = b"".join(mat5_element(1, text) for text in (name, b"MCOS", kind))
+    return mat5_element(14, mat5_element(6, struct.pack("<II", 17, 0)) + names + reference)
 
 
-def _element(kind: int, content: bytes) -> bytes:
+def mat5_file(*elements: bytes) -> bytes:
+    """A v5 file of these elements, little-endian."""
+    return b"MATLAB 5.0 MAT-file".ljust(116) + bytes(8) + b"\0\1IM" + b"".join(elements)
+
+
+def mat5_array(kind: int, sizes: tuple[int, ...], name: str, content: bytes) -> bytes:
+    """The element of an array of a class, such as 6 (double), before whose `content` all stands."""
+    flags = mat5_element(6, struct.pack("<II", kind, 0))
+    shape = mat5_element(5, struct.pack(f"<{len(sizes)}i", *sizes))
+    return mat5_element(14, flags + shape + mat5_element(1, name.encode()) + content)
+
+
+def mat5_element(kind: int, content: bytes, padded: bool = True) -> bytes:
     """One element of a v5 file: its type, its length, its bytes, filled up to eight."""
-    return struct.pack("<II", kind, len(content)) + content + bytes(-len(content) % 8)
+    end = bytes(-len(content) % 8) if padded else b""
+    return struct.pack("<II", kind, len(content)) + content + end

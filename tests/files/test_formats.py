@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -102,6 +103,47 @@ def test_headings() -> None:
     assert split_heading("torque[Nm]") == ("torque", "Nm")
     assert split_heading("angle (left)") == ("angle (left)", "")
     assert split_heading("g (g)") == ("g", "g")
+
+
+@pytest.mark.parametrize(
+    ("rows", "says"),
+    [
+        # The decimal sign is a comma: a point can only divide thousands.
+        (["0,5;999", "1,5;1.000"], "text in 1 of 2 rows, the first '1.000' in line 3"),
+        (["0,5;999,5", "1,5;1.000,5"], "text in 1 of 2 rows, the first '1.000,5' in line 3"),
+        # Nothing tells which sign is the decimal one.
+        (["0;999", "1;1.000"], "has whole numbers and '1.000' in line 3, which may be a thousand"),
+        (["0;999", "1;-1,000"], "has whole numbers and '-1,000' in line 3"),
+        (["0;999", "1;12.345", "2;998"], "has whole numbers and '12.345' in line 3"),
+        (['0;"999"', '1;"1.000"'], "has whole numbers and '1.000' in line 3"),
+        (["0;1.234.567", "1;999"], "text in 1 of 2 rows"),
+    ],
+)
+def test_thousands_separators_are_refused(tmp_path: Path, rows: list[str], says: str) -> None:
+    path = tmp_path / "trial.csv"
+    path.write_text("\n".join(["time;force", *rows]) + "\n")
+    with pytest.raises(DataError, match=re.escape(says)):
+        read_table(path)
+
+
+@pytest.mark.parametrize(
+    ("rows", "values"),
+    [
+        (["0;999.000", "1;1000.000"], [999, 1000]),  # decimals in every row
+        (["0;1.000", "1;0.999"], [1, 0.999]),  # no group begins with 0
+        (["0;1.125", "1;2", "2;2.5"], [1.125, 2, 2.5]),
+        (["0,5;1,125", "1,5;-2", "2,5;2,5"], [1.125, -2, 2.5]),
+        (["0;1.125e0", "1;2"], [1.125, 2]),
+        (["0;1.125", "1;"], [1.125, np.nan]),
+        (["0;NaN", "1;1000"], [np.nan, 1000]),
+    ],
+)
+def test_numbers_that_are_no_thousands(
+    tmp_path: Path, rows: list[str], values: list[float]
+) -> None:
+    path = tmp_path / "trial.csv"
+    path.write_text("\n".join(["time;force", *rows]) + "\n")
+    np.testing.assert_array_equal(read_table(path).columns["force"], values)
 
 
 # MATLAB ---------------------------------------------------------------------------------------

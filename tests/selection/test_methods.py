@@ -143,6 +143,9 @@ def test_head_tracking_from_files_to_files(tmp_path: Path) -> None:
     assert "Scaling Kvis, Kvcr, Kccr, B, K together" in page
 
 
+MINE = ("--model", "tests.selection.dosing:blood_model")
+
+
 def blood_study(folder: Path, subjects: int, visits: int) -> Path:
     """Subjects with doses every eight hours for two days."""
     told, rng = blood_model(), np.random.default_rng(SEED)
@@ -183,10 +186,12 @@ replicates = 40
 
 def test_a_model_from_another_field(tmp_path: Path) -> None:
     study = blood_study(tmp_path, 5, 2)
-    done = run("select", str(study), "--out", str(tmp_path / "select"), "--workers", "1")
+    done = run("select", str(study), *MINE, "--out", str(tmp_path / "select"), "--workers", "1")
     assert done.exit_code == 0, done.stderr
     assert "information: ka, ke, V" in done.stdout
-    done = run("key-parameters", str(study), "--out", str(tmp_path / "key"), "--workers", "1")
+    done = run(
+        "key-parameters", str(study), *MINE, "--out", str(tmp_path / "key"), "--workers", "1"
+    )
     assert done.exit_code == 0, done.stderr
     found = json.loads((tmp_path / "key" / "result.json").read_text())
     assert found["chosen"] == ["ka", "ke", "V"]
@@ -201,9 +206,17 @@ def test_faults_are_one_line(tmp_path: Path) -> None:
         ("dosing:blood_model", "dosing:nothing", "nothing"),
         ("bound = 0.05", "bond = 0.05", "is not a setting"),
         ("replicates = 40", "draw = 'x'", "single or block"),
+        ("replicates = 40", "replicates = 0", "[select] replicates"),
+        ("replicates = 40", "replicates = 9223372036854775807", "[select] replicates"),
+        ("replicates = 40", "starts = 0", "[select] starts"),
+        ("replicates = 40", "seed = -1", "[select] seed"),
+        ("replicates = 40", "bounds = []", "[select] bounds"),
+        ("replicates = 40", "bounds = [nan]", "[select] bound"),
+        ("bound = 0.05", "bound = -1.0", "[select] bound"),
+        ("tests.selection.dosing:blood_model", "os:system", "no function of a module of yours"),
     ):
         study.write_text(text.replace(old, new))
-        done = run("select", str(study), "--out", str(tmp_path / "out"), "--workers", "1")
+        done = run("select", str(study), "--allow-model", "--out", str(tmp_path / "out"))
         assert done.exit_code == 2, done.stdout
         assert match in done.stderr
         assert len(done.stderr.strip().splitlines()) == 1

@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 import pytest
 
-from impc.cohort.cluster import connected
+from impc.cohort.cluster import Cluster, connected
 from impc.errors import DataError
+from impc.kept import Kept
 from impc.selection.key_parameters import Refits, refit_subsets
 from impc.selection.model import Trial
-from impc.selection.running import Kept, in_turn, on_workers
+from impc.selection.running import in_turn, on_workers
 from impc.selection.source import model_source
 
 if TYPE_CHECKING:
@@ -32,8 +33,8 @@ def test_workers_give_the_same_and_it_is_kept(tmp_path: Path) -> None:
     arguments = {"a": (doses(), SUBSETS), "b": (doses(), SUBSETS[1:])}
     here = in_turn(source.model)(refit_subsets, Refits, arguments)
     kept = Kept(tmp_path / "kept")
-    with connected(None, 1) as client:
-        there = on_workers(client, source, kept)(refit_subsets, Refits, arguments)
+    with connected(Cluster(workers=1)) as workers:
+        there = on_workers(workers, source, kept)(refit_subsets, Refits, arguments)
     # A client that has nothing: whatever is asked of it fails.
     nobody = cast("Any", None)
     again = on_workers(nobody, source, kept)(refit_subsets, Refits, arguments)
@@ -53,7 +54,7 @@ def test_workers_give_the_same_and_it_is_kept(tmp_path: Path) -> None:
 
 def test_a_fault_on_a_worker_is_its_sentence(tmp_path: Path) -> None:
     source = model_source("tests.selection.dosing:blood_model", {})
-    with connected(None, 1) as client:
-        run = on_workers(client, source, Kept(tmp_path))
+    with connected(Cluster(workers=1)) as workers:
+        run = on_workers(workers, source, Kept(tmp_path))
         with pytest.raises(DataError, match="there are none"):
             run(refit_subsets, Refits, {"a": ((), SUBSETS)})

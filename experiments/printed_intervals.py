@@ -1,0 +1,252 @@
+"""Coverage of the 95 % intervals that a fit prints: how often they hold the true gain.
+
+One, two or three carts on a falling track, each with a force of its own and coupled by springs,
+pushed at random for 80 s; every force is at its limit for some percent of the time. The positions
+are recorded with noise, white or first-order, that leaves a VAF of 90 or 70 % to reach. Each
+recording is fitted as `impc fit` does, and the intervals of the entries of K that the recordings
+tell, and of its told directions, are compared with the truth.
+
+    python -m experiments.printed_intervals --recordings 200
+    python -m experiments.printed_intervals --recordings 200 --random
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import itertools
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import control
+import numpy as np
+import scipy.signal
+from tqdm import tqdm
+
+from impc.bounds import box_bounds
+from impc.closed_loop import require_complete, scenario, simulate
+from impc.controller import Controller, mpc_controller
+from impc.fit_recordings import fit_problem
+from impc.fit_settings import FitSettings
+from impc.fitted_controller import fit_controller
+from impc.gain_estimate import gain_estimate
+from impc.plant import Plant, as_plant
+from impc.recording import Recording, recording
+from impc.weights import stage_weights
+
+if TYPE_CHECKING:
+    from impc.arrays import Array
+    from impc.fitted_controller import FittedController
+
+__all__ = [
+    "Scores",
+    "carts",
+    "fit",
+    "noisy_recording",
+    "random_recording",
+    "regulator",
+    "score",
+    "score_carts",
+    "score_random",
+    "shares",
+    "with_noise",
+]
+
+_HORIZON, _SAMPLES, _HOLD, _BEFORE = 8, 800, 10, 500
+_TWO_SIDED = 1.959964
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Errors of one recording's fit over the standard deviations that are printed with it.
+
+    Attributes
+    ----------
+    entries : Array
+        Of K (m * n,); NaN where the recording does not tell the entry by itself.
+    directions : Array
+        Along the directions of the gain (m * n,), best determined first; NaN where not told.
+    bias : Array
+        Error of each entry of K over its true value (m * n,).
+    """
+
+    entries: Array
+    directions: Array
+    bias: Array
+
+
+def carts(count: int, dt: float = 0.1) -> Plant:
+    """`count` carts in a row on a falling track: positions, then speeds."""
+    n = 2 * count
+    A, force, push = np.zeros((n, n)), np.zeros((n, count)), np.zeros((n, count))
+    for i in range(count):
+        mine = count + i
+        A[i, mine], A[mine, i], A[mine, mine] = 1.0, 0.3, -0.3
+        for other in (i - 1, i + 1):
+            if 0 <= other < count:
+                A[mine, i] -= 0.4
+                A[mine, other] += 0.4
+        force[mine, i], push[mine, i] = 1 + 0.2 * i, 1.0
+    forces = [f"force{i + 1}" for i in range(count)]
+    system = control.ss(
+        A,
+        np.hstack([force, push]),
+        np.eye(count, n),
+        0,
+        inputs=[*forces, *(f"push{i + 1}" for i in range(count))],
+        outputs=[f"position{i + 1}" for i in range(count)],
+    )
+    return as_plant(control.c2d(system, dt), forces)
+
+
+def regulator(plant: Plant) -> Controller:
+    """Prices of 4, 5, ... on positions and 1 on speeds; R is 1 on, .3 beside the diagonal."""
+    m = plant.m
+    Q = np.diag(np.concatenate([4.0 + np.arange(m), np.ones(plant.n - m)]))
+    weights = stage_weights(Q, 0.7 * np.eye(m) + 0.3)
+    bounds = box_bounds(plant, u_min=-1, u_max=1)
+    return mpc_controller(plant, weights, bounds, _HORIZON, terminal_set=False)
+
+
+def noisy_recording(controller: Controller, seed: int, vaf: float, root: float) -> Recording:
+    """One recording of 80 s with noise of that root that leaves a VAF of `vaf` %."""
+    rng = np.random.default_rng(seed)
+    count = controller.plant.E.shape[1]
+    push = np.repeat(rng.choice([-0.8, 0.0, 0.8], (_SAMPLES // _HOLD, count)), _HOLD, axis=0)
+    return with_noise(controller, push, rng, vaf, root)
+
+
+def with_noise(
+    controller: Controller, push: Array, rng: np.random.Generator, vaf: float, root: float
+) -> Recording:
+    """The controller's outputs under a disturbance, with noise."""
+    plant, samples = controller.plant, len(push)
+    run = simulate(controller, scenario(plant, np.zeros(plant.n), disturbance=push))
+    clean = (require_complete(controller, run).x @ plant.C.T)[:samples]
+    white = rng.standard_normal((samples + _BEFORE, clean.shape[1]))
+    noise = scipy.signal.lfilter([np.sqrt(1 - root**2)], [1.0, -root], white, axis=0)[_BEFORE:]
+    size = np.sqrt((100 - vaf) / vaf * np.mean(clean**2, axis=0))
+    return recording(plant, clean + size * noise, push)
+
+
+def random_recording(seed: int, inputs: int, vaf: float) -> tuple[Controller, Recording]:
+    """A random plant of up to five states and random weights; 400 samples, white noise.
+
+    Each limit is what the command without one exceeds for a twentieth of the time.
+    """
+    rng = np.random.default_rng([seed, inputs])
+    n = int(rng.integers(max(2, inputs), 6))
+    outputs, pushes = int(rng.integers(1, n + 1)), int(rng.integers(1, inputs + 1))
+    A = rng.standard_normal((n, n))
+    A *= rng.uniform(0.7, 1.05) / np.max(np.abs(np.linalg.eigvals(A)))
+    B, E = rng.standard_normal((n, inputs)), rng.standard_normal((n, pushes))
+    C = rng.standard_normal((outputs, n))
+    system = control.ss(A, np.hstack([B, E]), C, 0, 0.1)
+    plant = as_plant(system, system.input_labels[:inputs])
+    L = rng.standard_normal((n, n))
+    Q = L @ L.T + 0.1 * np.eye(n)
+    L = rng.standard_normal((inputs, inputs))
+    R = (L @ L.T + 0.3 * np.eye(inputs)) * 10 ** rng.uniform(-1, 1)
+    push = np.repeat(rng.choice([-1.0, 0.0, 1.0], (80, pushes)), 5, axis=0)
+    drive = scenario(plant, np.zeros(n), disturbance=push)
+
+    def controller(limit: Array) -> Controller:
+        bounds = box_bounds(plant, u_min=-limit, u_max=limit)
+        return mpc_controller(plant, stage_weights(Q, R), bounds, 6, terminal_set=False)
+
+    unlimited = np.abs(simulate(controller(np.full(inputs, 1e6)), drive).u)
+    truth = controller(np.quantile(unlimited, 0.95, axis=0))
+    noise = np.random.default_rng([seed, inputs, round(vaf), 0])
+    return truth, with_noise(truth, push, noise, vaf, 0.0)
+
+
+def fit(controller: Controller, trial: Recording) -> FittedController:
+    """Fit a recording as `impc fit` does, under the true limit."""
+    settings = FitSettings(horizon=controller.horizon, u_max=list(controller.bounds.u_max))
+    return fit_controller(fit_problem(controller.plant, [trial], settings))
+
+
+def score(controller: Controller, trial: Recording) -> Scores:
+    """Fit a recording and compare what is printed with the truth."""
+    estimate = gain_estimate(fit(controller, trial))
+    found, error = estimate.covariance, estimate.K - controller.K
+    return Scores(
+        np.where(np.ravel(found.told_entries), np.ravel(error / found.entries), np.nan),
+        np.where(found.told, found.along(error) / found.deviations, np.nan),
+        np.ravel(error / controller.K),
+    )
+
+
+def score_carts(seed: int, inputs: int, vaf: float, root: float) -> Scores:
+    """`score` of one recording of `inputs` carts."""
+    controller = regulator(carts(inputs))
+    return score(controller, noisy_recording(controller, seed, vaf, root))
+
+
+def score_random(seed: int, inputs: int, vaf: float) -> Scores:
+    """`score` of one random plant."""
+    return score(*random_recording(seed, inputs, vaf))
+
+
+def shares(scores: Array) -> Array:
+    """Share of the intervals of 95 % that hold the truth, for each column; NaN is left out."""
+    inside = np.where(np.isnan(scores), np.nan, np.abs(scores) <= _TWO_SIDED)
+    return np.asarray(np.nanmean(inside, axis=0))
+
+
+def _cell(pool: ProcessPoolExecutor, count: int, inputs: int, vaf: float, root: float) -> None:
+    one = functools.partial(score_carts, inputs=inputs, vaf=vaf, root=root)
+    found = list(tqdm(pool.map(one, range(count), chunksize=4), total=count, disable=None))
+    entries = np.array([item.entries for item in found])
+    directions = np.array([item.directions for item in found])
+    bias = 100 * np.median([item.bias[0] for item in found])
+    told = 100 * np.mean(np.isfinite(directions))
+    print(
+        f"| {inputs} | {vaf:g} | {root:g} | {_range(entries)} | {_range(directions)} | "
+        f"{told:.0f} | {bias:+.1f} |",
+        flush=True,
+    )
+
+
+def _random(pool: ProcessPoolExecutor, count: int, inputs: int, vaf: float) -> None:
+    one = functools.partial(score_random, inputs=inputs, vaf=vaf)
+    found = list(tqdm(pool.map(one, range(count), chunksize=4), total=count, disable=None))
+    entries = np.concatenate([item.entries for item in found])[:, None]
+    directions = np.concatenate([item.directions for item in found])[:, None]
+    told = 100 * np.mean(np.isfinite(directions))
+    cells = [f"{100 * shares(scores)[0]:.1f}" for scores in (entries, directions)]
+    print(f"| {inputs}, random | {vaf:g} | 0 | {' | '.join(cells)} | {told:.0f} | |", flush=True)
+
+
+def _range(scores: Array) -> str:
+    """Least, most and mean share of the columns that are told in a quarter of the recordings."""
+    often = np.mean(np.isfinite(scores), axis=0) >= 0.25
+    if not np.any(often):
+        return "none told"
+    percent = 100 * shares(scores[:, often])
+    return f"{np.min(percent):.1f} to {np.max(percent):.1f}, mean {np.mean(percent):.1f}"
+
+
+def main() -> None:
+    """Print a row for each number of inputs, VAF and colour of the noise."""
+    parser = argparse.ArgumentParser(description="Coverage of the intervals that a fit prints.")
+    parser.add_argument("--recordings", type=int, default=200)
+    parser.add_argument("--inputs", type=int, nargs="+", default=[1, 2, 3])
+    parser.add_argument("--vaf", type=float, nargs="+", default=[90.0, 70.0])
+    parser.add_argument("--random", action="store_true", help="a random plant each, white noise")
+    parser.add_argument("--roots", type=float, nargs="+", default=[0.0, 0.8])
+    given = parser.parse_args()
+    print("| inputs | VAF % | root | entries of K, % | directions, % | told, % | bias of K11, % |")
+    print("|---|---|---|---|---|---|---|")
+    with ProcessPoolExecutor(2) as pool:
+        if given.random:
+            for inputs, vaf in itertools.product(given.inputs, given.vaf):
+                _random(pool, given.recordings, inputs, vaf)
+            return
+        for inputs, vaf, root in itertools.product(given.inputs, given.vaf, given.roots):
+            _cell(pool, given.recordings, inputs, vaf, root)
+
+
+if __name__ == "__main__":
+    main()

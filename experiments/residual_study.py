@@ -1,0 +1,139 @@
+"""How often the tests of the residuals speak, on simulated subjects whose noise is known.
+
+The seat, three trials of 30 s at 100 Hz, |u| <= 6 Nm, fitted from the true weights. The subjects:
+
+    recorder     the linear plant, white noise on the angles
+    coloured     the same of first order, root 0.9
+    linear       that of `impc simulate seated-balance` on the linear plant: motor noise of 0.3 Nm
+    default      the same on its own, nonlinear plant
+    motor        the linear plant, motor noise of 1 Nm, which the loop answers
+
+    python -m experiments.residual_study --seeds 20
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import scipy.signal
+from tqdm import tqdm
+
+import plants
+from impc.arrays import Array
+from impc.bounds import box_bounds
+from impc.controller import mpc_controller
+from impc.fit_recordings import fit_problem
+from impc.fit_settings import FitSettings
+from impc.fitted_controller import FittedController, fit_controller
+from impc.plant import Plant, as_plant
+from impc.recording import Recording, recording
+from impc.residual_diagnostics import ResidualDiagnostics, residual_diagnostics
+from impc.simulated_subject import simulate_subject
+from impc.weights import Weights, stage_weights
+
+__all__ = ["SUBJECTS", "Kind", "diagnosed", "fitted_subject"]
+
+_LIMIT = 6.0
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of subject: motor noise (Nm), noise on the angles (degrees) of a root, the plant."""
+
+    motor: float
+    sensor: float
+    root: float
+    linear: bool
+
+
+#: By name. White noise of 0.1 degrees at 1000 samples a second is 0.032 at 100.
+SUBJECTS = {
+    "recorder": Kind(0.0, 0.9, 0.0, linear=True),
+    "coloured": Kind(0.0, 0.9, 0.9, linear=True),
+    "linear": Kind(0.3, 0.032, 0.0, linear=True),
+    "default": Kind(0.3, 0.032, 0.0, linear=False),
+    "motor": Kind(1.0, 0.032, 0.0, linear=True),
+}
+
+
+def fitted_subject(kind: Kind, seed: int, order: int, horizon: int) -> FittedController:
+    """Simulate and fit a subject; `order` is that of the delay's approximant."""
+    plant = as_plant(plants.seated_balance_for(sample_time=0.01, delay_order=order), ["command"])
+    weights = _weights(plant)
+    bounds = box_bounds(plant, u_min=-_LIMIT, u_max=_LIMIT)
+    controller = mpc_controller(plant, weights, bounds, horizon, terminal_set=False)
+    step = _linear_step(plant) if kind.linear else _nonlinear_step(order)
+    rng = np.random.default_rng([seed, 1])
+    trials: list[Recording] = []
+    for number, child in enumerate(np.random.SeedSequence(seed).spawn(3)):
+        torque = plants.ternary_torque(duration=30.0, rate=100.0, seed=100 * seed + number + 1)
+        run = simulate_subject(
+            controller, step, torque, rate=100.0, motor=kind.motor, largest=0.5, seed=child
+        )
+        noise = np.radians(kind.sensor) * _noise(kind.root, run.outputs.shape, rng)
+        trials.append(recording(plant, run.outputs + noise, run.disturbance))
+    settings = FitSettings(horizon=horizon, u_max=_LIMIT)
+    return fit_controller(fit_problem(plant, trials, settings), weights)
+
+
+def diagnosed(seed: int, name: str, order: int = 5, horizon: int = 20) -> ResidualDiagnostics:
+    """Both tests on one subject."""
+    fitted = fitted_subject(SUBJECTS[name], seed, order, horizon)
+    solution = fitted.solution
+    return residual_diagnostics(fitted.problem, np.array(solution.K), np.array(solution.S))
+
+
+def _weights(plant: Plant) -> Weights:
+    v = np.array([0.70, 0.65, 0.22, 0.20])
+    v /= np.linalg.norm(v)
+    Q = 1e-2 * np.eye(plant.n)
+    Q[:4, :4] = 6e5 * np.outer(v, v) + np.diag([2e4, 2e4, 500, 500])
+    return stage_weights(Q, 1)
+
+
+def _linear_step(plant: Plant) -> Any:
+    x, u = ca.SX.sym("x", plant.n), ca.SX.sym("u", plant.m + plant.E.shape[1])
+    both = np.hstack([plant.B, plant.E])
+    return ca.Function("step", [x, u], [ca.DM(np.array(plant.A)) @ x + ca.DM(both) @ u])
+
+
+def _nonlinear_step(order: int) -> Any:
+    return plants.seated_balance_step_for(sample_time=0.01, delay_order=order)
+
+
+def _noise(root: float, shape: tuple[int, ...], rng: np.random.Generator) -> Array:
+    white = rng.standard_normal((shape[0] + 500, *shape[1:]))
+    filtered = scipy.signal.lfilter([np.sqrt(1 - root**2)], [1.0, -root], white, axis=0)
+    return np.asarray(filtered[500:])
+
+
+def main() -> None:
+    """Print, for each kind, how often either test speaks, and the median of what it says."""
+    parser = argparse.ArgumentParser(description="Tests of residuals on known subjects.")
+    parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--order", type=int, default=5)
+    parser.add_argument("--horizon", type=int, default=20)
+    given = parser.parse_args()
+    for name in SUBJECTS:
+        study = functools.partial(diagnosed, name=name, order=given.order, horizon=given.horizon)
+        with ProcessPoolExecutor(2) as pool:
+            found = list(tqdm(pool.map(study, range(given.seeds)), total=given.seeds, disable=None))
+        loops = [item.loop for item in found if item.loop is not None]
+        structures = [item.structure for item in found if item.structure is not None]
+        print(
+            f"{name:<10} noise in the loop {np.mean([item.found for item in loops]):.2f} "
+            f"(share {np.median([np.max(item.shares) for item in loops]):.2f}, ratio "
+            f"{np.median([item.statistic for item in loops]):.0f}); structure "
+            f"{np.mean([item.found for item in structures]):.2f} "
+            f"(share {np.median([item.share for item in structures]):.3f})"
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,142 @@
+"""A small table of a study, recordings or participants: CSV with commas or semicolons, or TSV."""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from impc.errors import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+__all__ = ["Sheet", "column_values", "read_sheet"]
+
+# 100 000 participants of 100 characters are 10 MB.
+_LARGEST = 100_000_000
+_POINT = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
+_COMMA = re.compile(r"[+-]?\d+,\d+([eE][+-]?\d+)?")
+_THOUSANDS = re.compile(r"[+-]?\d{1,3}(,\d{3})+|[+-]?\d{1,3}(\.\d{3})+")
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """The rows of a table.
+
+    Attributes
+    ----------
+    name : str
+        Of its file.
+    heads : tuple of str
+        Names of the columns.
+    rows : tuple of dict
+        Head -> text, its ends stripped.
+    """
+
+    name: str
+    heads: tuple[str, ...]
+    rows: tuple[dict[str, str], ...]
+
+    @property
+    def where(self) -> str:
+        """How messages call it."""
+        return f"table {self.name}"
+
+
+def read_sheet(path: Path) -> Sheet:
+    """Read the table at `path`.
+
+    Raises
+    ------
+    InputError
+        When it cannot be read, is no text, two columns have one name, a row has more or fewer cells
+        than there are columns, or there is no row.
+    """
+    where = f"table {path.name}"
+    text = _text(where, path)
+    first = text.partition("\n")[0]
+    delimiter = "\t" if "\t" in first else ";" if ";" in first else ","
+    try:
+        lines = [line for line in csv.reader(text.splitlines(), delimiter=delimiter) if any(line)]
+    except csv.Error as error:
+        raise InputError(where, f"cannot be read ({error})", "save it again as CSV") from None
+    if len(lines) < 2:
+        raise InputError(where, "has no rows", "write a head and a row for each")
+    heads = tuple(cell.strip() for cell in lines[0])
+    for name in heads:
+        if not name or heads.count(name) > 1:
+            problem = (
+                f"has {heads.count(name)} columns {name!a}" if name else "has an unnamed column"
+            )
+            raise InputError(where, problem, "give each column a name of its own")
+    for number, line in enumerate(lines[1:], start=2):
+        if len(line) != len(heads):
+            raise InputError(
+                where, f"row {number} has {len(line)} cells, the head {len(heads)}",
+                "decimal commas between commas need quotes, or semicolons between the cells",
+            )  # fmt: skip
+    rows = (dict(zip(heads, map(str.strip, line), strict=True)) for line in lines[1:])
+    return Sheet(path.name, heads, tuple(rows))
+
+
+def _text(where: str, path: Path) -> str:
+    try:
+        if path.exists() and not path.is_file():
+            raise InputError(where, "is no ordinary file", "check the path")
+        if path.stat().st_size > _LARGEST:
+            raise InputError(where, f"has more than {_LARGEST // 1_000_000} MB", "check the path")
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "it is not UTF-8 text"
+        raise InputError(where, f"cannot be read ({reason})", "check it") from None
+    if "\0" in text:
+        raise InputError(where, "has a NUL in it", "save it again as UTF-8 text")
+    return text
+
+
+def column_values(sheet: Sheet, name: str) -> list[float | str | None]:
+    """The cells of a column `name`: numbers where all are, else text; None where a cell is empty.
+
+    Decimal commas are read where the column has them throughout.
+
+    Raises
+    ------
+    InputError
+        When a column has decimal points and decimal commas, numbers that may be thousands, or a
+        number that is not finite.
+    """
+    cells = [row[name] for row in sheet.rows]
+    given = [cell for cell in cells if cell not in ("", "n/a")]
+    where = f"{sheet.where}: column {name}"
+    commas = [cell for cell in given if _COMMA.fullmatch(cell)]
+    if not all(_POINT.fullmatch(cell) or _COMMA.fullmatch(cell) for cell in given):
+        _require_no_words_for_numbers(where, given)
+        return [cell if cell in given else None for cell in cells]
+    _require_one_mark(where, given, commas)
+    numbers = {cell: float(cell.replace(",", ".")) for cell in given}
+    for cell, value in numbers.items():
+        if not math.isfinite(value):
+            raise InputError(where, f"has {cell}", "give a finite number, or n/a")
+    return [numbers.get(cell) for cell in cells]
+
+
+def _require_no_words_for_numbers(where: str, given: Sequence[str]) -> None:
+    for cell in given:
+        if cell.lower().lstrip("+-") in ("nan", "na", "inf", "infinity"):
+            raise InputError(where, f"has {cell!a}", "leave the cell empty, or write n/a")
+
+
+def _require_one_mark(where: str, given: Sequence[str], commas: Sequence[str]) -> None:
+    points = [cell for cell in given if "." in cell]
+    if commas and points:
+        raise InputError(
+            where, f"has {points[0]} and {commas[0]}", "write all with points or all with commas"
+        )
+    if commas and all(_THOUSANDS.fullmatch(cell) for cell in commas):
+        raise InputError(
+            where, f"has {commas[0]}, which may be thousands", "write it with a decimal point"
+        )

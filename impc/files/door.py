@@ -1,0 +1,96 @@
+"""At the door of every file: it is ordinary, small enough, and what fails inside is one line."""
+
+from __future__ import annotations
+
+import stat
+from typing import TYPE_CHECKING
+
+from impc.errors import DataError, ImpcError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+__all__ = ["LARGEST", "damaged", "require_ordinary", "shown"]
+
+#: Bytes of a file, and of its arrays in memory: an hour of 16 channels at 2 kHz.
+LARGEST = 1_000_000_000
+
+
+def require_ordinary(path: Path, largest: int, error: type[ImpcError] = DataError) -> int:
+    """Look at a file before it is opened: a pipe would never end, a device neither.
+
+    Parameters
+    ----------
+    path : Path
+        Of the file; links are followed.
+    largest : int
+        Bytes above which it is refused.
+    error : type
+        Of the exception to raise.
+
+    Returns
+    -------
+    int
+        Its size in bytes.
+
+    Raises
+    ------
+    ImpcError
+        Of the type `error`, when there is no such file, or it is a folder, a pipe, a device, empty
+        or too large.
+    """
+    source = str(path)
+    try:
+        found = path.stat()
+    except FileNotFoundError:
+        raise error(source, "does not exist", "check the path") from None
+    except (OSError, ValueError) as fault:  # ValueError: a zero byte in the name
+        reason = getattr(fault, "strerror", None) or str(fault)
+        raise error(source, f"cannot be opened ({reason})", "check the path") from None
+    if stat.S_ISDIR(found.st_mode):
+        raise error(source, "is a folder", "name the file in it")
+    if not stat.S_ISREG(found.st_mode):
+        raise error(source, "is no ordinary file", "copy it to one")
+    if found.st_size == 0:
+        raise error(source, "is empty (0 bytes)", "copy or export it again")
+    if found.st_size > largest:
+        raise error(
+            source,
+            f"has {_size(found.st_size)}, and {_size(largest)} is the most that is read",
+            "export only the signals and seconds that are needed"
+            if error is DataError
+            else "give a smaller one",
+        )
+    return found.st_size
+
+
+def damaged(source: str, fault: Exception) -> DataError:
+    """What a library says of a file that it cannot read, in one line.
+
+    Parameters
+    ----------
+    source : str
+        The file.
+    fault : Exception
+        Of any kind: struct.error, KeyError, AssertionError.
+    """
+    reason = shown(" ".join(str(fault).split()), 120) or type(fault).__name__
+    return DataError(source, f"is damaged and cannot be read ({reason})", "copy or export it again")
+
+
+def shown(text: str, most: int = 80) -> str:
+    """A text of somebody else's in one line of ours.
+
+    Parameters
+    ----------
+    text : str
+        A name, a key, the message of a library.
+    most : int
+        Characters after which it is cut.
+    """
+    line = "".join(mark if mark.isprintable() else " " for mark in text[: 10 * most]).strip()
+    return line if len(line) <= most else f"{line[: most - 3]}..."
+
+
+def _size(size: int) -> str:
+    return f"{size / 1e9:.1f} GB" if size >= 50_000_000 else f"{size / 1e6:.3g} MB"

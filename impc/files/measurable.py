@@ -1,0 +1,148 @@
+"""What no measurement is: numbers and clocks beyond anything recorded, before they are used.
+
+Whatever passes here can be squared, summed and resampled within the memory that the file itself
+took, a few times over.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.errors import DataError
+
+if TYPE_CHECKING:
+    from impc.arrays import Array
+    from impc.files.checks import Channel
+
+__all__ = ["comparable_rates", "few_gaps", "period_of_a_recording", "size", "times_of_a_recording"]
+
+# In SI units. Fourth powers of both are still numbers, and nothing measured comes near.
+_LARGEST, _SMALLEST = 1e50, 1e-50
+_LONGEST = 1e12  # s on a clock: 30 000 years; 1.7e9 is a count from 1970
+_PERIODS = (1e-9, 1e6)  # s
+# The plant's samples for one of the recording: milliseconds taken for seconds are 1000.
+_SLOWER = 50
+_GAPS = 10  # even instants for each sample, where gaps may be filled
+
+
+def size(channel: Channel) -> str:
+    """A channel whose values are too large, or all but nothing.
+
+    Raises
+    ------
+    DataError
+        When a value or the whole span is none that is measured.
+    """
+    finite = np.abs(channel.values[np.isfinite(channel.values)])
+    largest = float(finite.max(initial=0.0))
+    if largest > _LARGEST / channel.unit.factor:
+        first = int(np.argmax(np.abs(channel.values) > _LARGEST / channel.unit.factor))
+        raise DataError(
+            channel.name,
+            f"is {channel.values[first]:.3g} {channel.unit.written} in {channel.at(first)}, which "
+            "is no measurement",
+            f"correct the column, or offset and unit in signals.{channel.signal}",
+        )
+    if 0 < largest < _SMALLEST / channel.unit.factor:
+        raise DataError(
+            channel.name,
+            f"is at most {largest:.3g} {channel.unit.written}, which is no measurement",
+            f"correct the column, or the unit in signals.{channel.signal}",
+        )
+    return ""
+
+
+def times_of_a_recording(subject: str, time: Array) -> None:
+    """The times of a clock.
+
+    Parameters
+    ----------
+    subject : str
+        File and clock, for the message.
+    time : Array
+        (samples,), s, finite and rising.
+
+    Raises
+    ------
+    DataError
+        When it is further from zero than any clock.
+    """
+    furthest = float(max(abs(time[0]), abs(time[-1])))
+    if furthest > _LONGEST:
+        raise DataError(
+            subject, f"reaches {furthest:.3g} s", "correct the clock, or recording.time_unit"
+        )
+
+
+def period_of_a_recording(subject: str, period: float) -> None:
+    """The period of a clock.
+
+    Parameters
+    ----------
+    subject : str
+        File and clock, for the message.
+    period : float
+        s.
+
+    Raises
+    ------
+    DataError
+        When no recorder has it.
+    """
+    if not _PERIODS[0] <= period <= _PERIODS[1]:
+        raise DataError(
+            subject,
+            f"has a sample every {period:.3g} s",
+            f"correct the rate or the clock's unit: {_PERIODS[0]:g} to {_PERIODS[1]:g} s can be",
+        )
+
+
+def comparable_rates(subject: str, period: float, dt: float) -> None:
+    """A clock and the plant's.
+
+    Parameters
+    ----------
+    subject : str
+        File, for the message.
+    period, dt : float
+        Of the recording and of the plant, s.
+
+    Raises
+    ------
+    DataError
+        When the recording is so slow that nearly all of the plant's samples would be made up.
+    """
+    if period > _SLOWER * dt:
+        raise DataError(
+            subject,
+            f"has a sample every {period:.4g} s, and the plant one every {dt:.4g} s",
+            "correct recording.time_unit or rate, or give the plant a longer dt",
+        )
+
+
+def few_gaps(subject: str, time: Array, period: float) -> None:
+    """Gaps of a clock: how many instants it has beside its samples.
+
+    Parameters
+    ----------
+    subject : str
+        File and clock, for the message.
+    time : Array
+        (samples,), s, finite and rising.
+    period : float
+        What is usual between two samples, s.
+
+    Raises
+    ------
+    DataError
+        When nearly all of its even instants would have to be filled.
+    """
+    instants = (time[-1] - time[0]) / period
+    if instants > _GAPS * len(time):
+        raise DataError(
+            subject,
+            f"has {len(time)} samples on {instants:.3g} even instants: the rest are gaps",
+            "cut with recording.start and stop",
+        )

@@ -1,0 +1,56 @@
+"""A file written whole or not at all: the one way in which this package writes one."""
+
+from __future__ import annotations
+
+import os
+from typing import TYPE_CHECKING
+
+from impc.errors import OutputError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+__all__ = ["flush_folder", "write_whole"]
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Write `content` beside `path`, flush to the disk, rename: the whole file, or the one before.
+
+    Its folder is made when it is missing.
+
+    Raises
+    ------
+    OutputError
+        When that cannot be done; a file that was there is as it was.
+    """
+    staging = path.with_name(f".{path.name}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        staging.unlink(missing_ok=True)  # of a run that was killed
+        try:
+            # "x": never through a link that somebody put there.
+            with staging.open("xb") as stream:
+                stream.write(content)
+                stream.flush()
+                os.fsync(stream.fileno())
+            os.replace(staging, path)
+        except BaseException:  # also when interrupted from the keyboard
+            staging.unlink(missing_ok=True)
+            raise
+        flush_folder(path.parent)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise OutputError(
+            f"file {path}", f"cannot be written ({reason})", "make room and start again"
+        ) from None
+
+
+def flush_folder(folder: Path) -> None:
+    """Flush the names in a `folder` to the disk, where the system lets folders be opened."""
+    if os.name != "posix":
+        return
+    number = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(number)
+    finally:
+        os.close(number)

@@ -1,0 +1,102 @@
+"""numba's `njit`, wherever the package is installed.
+
+numba keeps compiled code beside the module or in the user's cache folder, and refuses to compile at
+all where neither can be written. There it is kept in a folder of the user's own among the temporary
+files, or compiled anew in every process. Compiled code is run as it is read: a folder that another
+user could have made or may write to is never used (docs/speed.md).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import stat
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+__all__ = ["keep_caches", "njit"]
+
+F = TypeVar("F", bound="Callable[..., Any]")
+
+
+def njit(**options: Any) -> Callable[[F], F]:
+    """numba's decorator of the same name and `options`; without a cache where none can be kept."""
+    import numba  # noqa: PLC0415  # a quarter of a second, and `keep_caches` needs none
+
+    def decorate(function: F) -> F:
+        make: Any = numba.njit
+        try:
+            found: F = make(**options)(function)
+        except RuntimeError:  # "no locator available for file ..."
+            found = make(**{**options, "cache": False})(function)
+        return found
+
+    return decorate
+
+
+def keep_caches() -> str:
+    """Give numba and matplotlib a folder where they have none; what to tell the user, or nothing.
+
+    To be called before either is imported; processes that are begun later inherit it.
+    """
+    told = []
+    home = _cache_home()
+    if "NUMBA_CACHE_DIR" not in os.environ and not (
+        _writable(Path(__file__).parent / "__pycache__") or _writable(home / "numba")
+    ):
+        told.append("NUMBA_CACHE_DIR")
+    if "MPLCONFIGDIR" not in os.environ and not (
+        _writable(home / "matplotlib") and _writable(_config_home() / "matplotlib")
+    ):
+        told.append("MPLCONFIGDIR")
+    if not told:
+        return ""
+    folder = _private_folder()
+    if folder is None:
+        return "caches are not kept, no folder for them can be written: TMPDIR may name one"
+    for name in told:
+        os.environ[name] = str(folder / name.lower())
+        (folder / name.lower()).mkdir(exist_ok=True)
+    return f"caches are kept in {folder}, for home or installation cannot be written"
+
+
+def _cache_home() -> Path:
+    return Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))
+
+
+def _config_home() -> Path:
+    return Path(os.environ.get("XDG_CONFIG_HOME") or os.path.expanduser("~/.config"))
+
+
+def _writable(folder: Path) -> bool:
+    """Whether files can be made in a folder, or it can be made; nothing is."""
+    for place in (folder, *folder.parents):
+        if place.is_dir():
+            return os.access(place, os.W_OK | os.X_OK) and not _is_kernels(place)
+        if place.exists():
+            return False
+    return False
+
+
+def _is_kernels(place: Path) -> bool:
+    """/proc and /sys: no folder can be made there, though root may write."""
+    return place.parts[:2] in {("/", "proc"), ("/", "sys")}
+
+
+def _private_folder() -> Path | None:
+    """A folder of this user's alone among the temporary files; None where there is none."""
+    import tempfile  # noqa: PLC0415  # seldom needed
+
+    user = os.getuid() if hasattr(os, "getuid") else 0  # Windows: temporary files are the user's
+    try:
+        folder = Path(tempfile.gettempdir(), f"impc-{user}")
+        with contextlib.suppress(FileExistsError):
+            folder.mkdir(mode=0o700)
+        found = folder.lstat()
+    except OSError:
+        return None
+    ours = stat.S_ISDIR(found.st_mode) and found.st_uid == user
+    return folder if ours and (os.name != "posix" or not found.st_mode & 0o077) else None

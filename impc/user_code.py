@@ -1,0 +1,155 @@
+"""Whose code a module is: Python's, installed, or the user's own; and who may have it run.
+
+A study file that names a plant `module:function` asks for that module to be imported and that
+function to be called. Somebody else may have written the file: such a name needs the consent of
+whoever types the command, and must be a function of a module of the user's. The plants of this
+package, and saved matrices, need none (docs/security.md).
+"""
+
+from __future__ import annotations
+
+import importlib.machinery
+import importlib.util
+import inspect
+import sys
+import sysconfig
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from impc.errors import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from importlib.machinery import ModuleSpec
+
+__all__ = ["OURS", "consented_name", "is_installed", "module_file", "require_users_function"]
+
+#: This package's own modules; they are known by their version.
+OURS = ("impc", "plants")
+_DATA = (".mat", ".npz", ".json")
+
+
+def consented_name(
+    where: str, named: str, given: str | None, allowed: bool, option: str, known: tuple[str, ...]
+) -> str:
+    """The plant or model that may be run, when a file names one.
+
+    Parameters
+    ----------
+    where : str
+        How messages call the place in the file.
+    named : str
+        What the file names; empty when it does not.
+    given : str or None
+        What the command line names: it replaces what the file does.
+    allowed : bool
+        Whether the command line allows what the file names.
+    option : str
+        "plant" or "model".
+    known : tuple of str
+        Short names of this package's own.
+
+    Raises
+    ------
+    InputError
+        When nobody names one, the command line does not allow it, or it is no code of the user's.
+    """
+    name = given or named
+    if not name:
+        raise InputError(where, "is missing", f'write {option} = "module:function"')
+    module = name.partition(":")[0]
+    if name in known or Path(name).suffix in _DATA or module == "plants" or ":" not in name:
+        return name  # the last: no name of code at all, and told so by who looks for it
+    if given is None and not allowed:
+        raise InputError(
+            where, f"names code that would be run, {name!a}",
+            f"look at it, then say --{option} {name}, or --allow-{option}",
+        )  # fmt: skip
+    _require_users_module(where, module)
+    return name
+
+
+def _require_users_module(where: str, module: str) -> None:
+    """Before anything is imported."""
+    if not all(part.isidentifier() for part in module.split(".")):
+        raise InputError(where, f"{module[:80]!a} is no module's name", "write module:function")
+    top = module.partition(".")[0]
+    if top in sys.stdlib_module_names or top in sys.builtin_module_names or top == "impc":
+        raise _not_yours(where, module)
+    file = module_file(top, Path())
+    if file is not None and is_installed(file):
+        raise _not_yours(where, module)
+
+
+def require_users_function(where: str, function: Callable[..., Any]) -> None:
+    """Refuse what is no function of the user's or of this package's plants.
+
+    Parameters
+    ----------
+    where : str
+        How messages call the place in the file.
+    function : callable
+        What was found under the name.
+
+    Raises
+    ------
+    InputError
+        When it is something else, or was only imported into the user's module from elsewhere.
+    """
+    module = getattr(function, "__module__", None) or ""
+    file = module_file(module, None)
+    ours = module.partition(".")[0] == "plants"
+    if not inspect.isfunction(function) or not (ours or (file and not is_installed(file))):
+        raise _not_yours(where, f"{module}:{getattr(function, '__name__', '?')}")
+
+
+def _not_yours(where: str, name: str) -> InputError:
+    return InputError(
+        where, f"{name} is no function of a module of yours", "write a function that calls it"
+    )
+
+
+def module_file(name: str, beside: Path | None) -> Path | None:
+    """Where a module comes from, without importing it; None for what is built in or not found.
+
+    Parameters
+    ----------
+    name : str
+        Of the module.
+    beside : Path or None
+        A folder that is looked in too.
+    """
+    if name in sys.modules:
+        file = getattr(sys.modules[name], "__file__", None)
+        return Path(file) if file else None
+    try:
+        spec = _spec(name, beside)
+    except (ImportError, ValueError):
+        return None
+    if spec is None or not spec.has_location or spec.origin is None:
+        return None
+    return Path(spec.origin)
+
+
+def _spec(name: str, beside: Path | None) -> ModuleSpec | None:
+    """By the packages it is in, none of which is imported."""
+    top, *below = name.split(".")
+    spec = importlib.util.find_spec(top)
+    if spec is None and beside is not None:
+        spec = importlib.machinery.PathFinder.find_spec(top, [str(beside)])
+    for part in below:
+        if spec is None or spec.submodule_search_locations is None:
+            return None
+        top = f"{top}.{part}"
+        places = list(spec.submodule_search_locations)
+        spec = importlib.machinery.PathFinder.find_spec(top, places)
+    return spec
+
+
+def is_installed(file: Path) -> bool:
+    """Whether the `file` of a module belongs to Python or was installed."""
+    path = file.resolve()
+    if {"site-packages", "dist-packages"} & set(path.parts):
+        return True
+    libraries = (Path(sysconfig.get_path(key)).resolve() for key in ("stdlib", "platstdlib"))
+    return any(path.is_relative_to(library) for library in libraries)

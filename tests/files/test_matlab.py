@@ -1,0 +1,156 @@
+"""Files of MATLAB's versions 5 to 7: sound ones are read, damaged ones end no process."""
+
+from __future__ import annotations
+
+import importlib.util
+import random
+import subprocess
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+import scipy.sparse
+
+from impc.errors import DataError, InputError
+from impc.files.apart import matrices_apart
+from impc.files.formats import read_table
+from impc.files.matlab_tags import look_at_tags
+from tests.files.samples import mat5_array, mat5_element, mat5_file, pushed_seat, save_mat
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+LARGEST = 10**8
+
+
+def files_of_scipy() -> Iterator[Path]:
+    """Those of version 5 to 7 from the tests of scipy, most of them written by MATLAB."""
+    spec = importlib.util.find_spec("scipy.io.matlab")
+    assert spec is not None
+    assert spec.origin is not None
+    for path in sorted((Path(spec.origin).parent / "tests" / "data").glob("*.mat")):
+        if path.read_bytes().startswith(b"MATLAB 5"):
+            yield path
+
+
+def test_the_tags_of_files_that_matlab_wrote_are_sound() -> None:
+    paths = list(files_of_scipy())
+    if not paths:
+        pytest.skip("this scipy came without its tests")
+    refused = set()
+    for path in paths:
+        try:
+            look_at_tags(path, LARGEST)
+        except ValueError:
+            refused.add(path.name)
+    assert len(paths) > 60
+    assert refused == {"corrupted_zlib_checksum.mat", "corrupted_zlib_data.mat", "malformed1.mat"}
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_matrices_of_every_type_and_shape(tmp_path: Path, packed: bool) -> None:
+    rng = np.random.default_rng(3)
+    kinds = ("f8", "f4", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "?")
+    shapes = ((1, 1), (0, 3), (1, 7), (5, 2), (2, 3, 4))
+    values = {
+        f"x{i}_{j}": (100 * rng.random(shape)).astype(kind)
+        for i, kind in enumerate(kinds)
+        for j, shape in enumerate(shapes)
+    }
+    cells = np.array(["a", "größer", 5.0], dtype=object)
+    texts = {"cells": cells, "text": "θ", "rows": np.array(["ab", "c"]), "none": ""}
+    save_mat(tmp_path / "x.mat", {**values, **texts}, do_compression=packed)
+    found = matrices_apart(tmp_path / "x.mat", LARGEST)
+    assert found.pop("cells") == ["a", "größer", None]
+    assert found.pop("text") == ["θ"]
+    assert found.pop("rows") == ["ab", "c"]
+    assert not any(found.pop("none"))
+    assert set(found) == set(values)
+    for name, value in values.items():
+        assert found[name].shape == value.shape
+        assert found[name].dtype == np.float64
+        np.testing.assert_array_equal(found[name], value)
+
+
+@pytest.mark.parametrize(
+    ("value", "says"),
+    [
+        (np.eye(2) + 1j, "has a complex matrix x"),
+        ({"y": 1.0}, "x is a struct"),
+        (scipy.sparse.csc_array(np.eye(2)), "x is sparse"),
+        (np.zeros((600, 600), dtype=np.uint8), "would take 0.0 GB once it is unpacked"),
+        ("a" * 1_000_001, "a text of more than 1000000 characters"),
+    ],
+)
+def test_what_is_no_matrix_of_a_plant(tmp_path: Path, value: object, says: str) -> None:
+    save_mat(tmp_path / "x.mat", {"x": value})
+    with pytest.raises(InputError, match=says) as caught:
+        matrices_apart(tmp_path / "x.mat", 2_500_000)
+    assert caught.value.subject == f"plant {tmp_path / 'x.mat'}"
+
+
+def test_the_other_byte_order(tmp_path: Path) -> None:
+    def element(kind: int, content: bytes) -> bytes:
+        size = len(content).to_bytes(4, "big")
+        return kind.to_bytes(4, "big") + size + content + bytes(-len(content) % 8)
+
+    numbers = np.arange(6.0)
+    inside = (
+        element(6, np.array([6, 0], ">u4").tobytes())
+        + element(5, np.array([6, 1], ">i4").tobytes())
+        + (1 << 16 | 1).to_bytes(4, "big") + b"x\0\0\0"
+        + element(9, numbers.astype(">f8").tobytes())
+    )  # fmt: skip
+    head = b"MATLAB 5.0 MAT-file".ljust(116) + bytes(8) + b"\1\0MI"
+    (tmp_path / "x.mat").write_bytes(head + element(14, inside))
+    np.testing.assert_array_equal(read_table(tmp_path / "x.mat").columns["x"], numbers)
+
+
+@pytest.mark.parametrize("kind", [*range(-1, 42), 200, 2**31])
+def test_each_type_of_element_is_read_or_refused(tmp_path: Path, kind: int) -> None:
+    # Where numbers stand; scipy's process ends for some of those that do not exist.
+    content = mat5_array(6, (2, 1), "x", mat5_element(kind % 2**32, bytes(16)))
+    (tmp_path / "x.mat").write_bytes(mat5_file(content))
+    if kind in (9, 12, 13):  # sixteen bytes are two numbers
+        assert read_table(tmp_path / "x.mat").samples == 2
+    else:
+        with pytest.raises(DataError, match="is damaged and cannot be read") as caught:
+            read_table(tmp_path / "x.mat")
+        assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_each_flipped_bit_ends_in_one_line_or_is_read(tmp_path: Path, packed: bool) -> None:
+    path = tmp_path / "x.mat"
+    cells = np.array(["a", np.eye(2)], dtype=object)
+    seat = pushed_seat(20)
+    values = {"seat": seat["seat"], "s": {"push": seat["push"]}, "cells": cells, "text": "abc"}
+    save_mat(path, values, do_compression=packed)
+    sound = path.read_bytes()
+    rng = random.Random(14)
+    problems = []
+    for _ in range(300):
+        content = bytearray(sound)
+        content[rng.randrange(128, len(sound))] ^= 1 << rng.randrange(8)
+        path.write_bytes(content)
+        try:
+            read_table(path)
+        except DataError as error:
+            problems.append(error.problem)
+    assert len(problems) > 50
+    assert all(problem.isprintable() for problem in problems)
+    # scipy looks for an imaginary part behind numbers that are said to be complex, and such.
+    ended = [problem for problem in problems if "ends the process" in problem]
+    assert len(ended) <= 3
+
+
+def test_the_process_that_asks_does_not_load_the_library(tmp_path: Path) -> None:
+    save_mat(tmp_path / "x.mat", pushed_seat(20))
+    text = (
+        "import sys; from pathlib import Path; from impc.files.formats import read_table\n"
+        f"print(read_table(Path({str(tmp_path / 'x.mat')!r})).samples, 'scipy.io' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=True)
+    assert done.stdout == "20 False\n"

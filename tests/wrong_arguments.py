@@ -1,0 +1,301 @@
+"""Every public function with right arguments, and what people give in their place."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+import control
+import numpy as np
+import pandas as pd
+import scipy.sparse
+
+from impc import (
+    agreement,
+    bounds,
+    closed_loop,
+    controller,
+    cross_term,
+    equivalent_weights,
+    fitted_controller,
+    gain,
+    gain_fibre,
+    identifiability,
+    inverse_lqr,
+    inverse_mpc,
+    inverse_problem,
+    lqr,
+    mpc,
+    plant,
+    plant_family,
+    plant_source,
+    recording,
+    terminal_set,
+    weights,
+    weights_set,
+)
+from impc.files import units
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+__all__ = ["calls", "wrong_values"]
+
+Call = tuple["Callable[..., Any]", dict[str, Any]]
+
+
+@cache
+def values() -> dict[str, Any]:
+    """One of each value, of a plant of two states, two inputs and one disturbance."""
+    system = control.ss(
+        [[1.1, 0.4], [0.0, 0.8]], [[0.2, 0.1, 0.3], [1, 0.5, 0]], np.eye(2), 0, True
+    )
+    two = plant.as_plant(system, ["u[0]", "u[1]"])
+    box = bounds.box_bounds(two, u_min=-1, u_max=1)
+    pair = weights.stage_weights(np.diag([2.0, 1.0]), np.diag([1.0, 3.0]))
+    law = controller.mpc_controller(two, pair, box, 4)
+    drive = closed_loop.scenario(two, [0.3, -0.2], disturbance=0.1 * np.sin(np.arange(30.0)))
+    run = closed_loop.simulate(law, drive)
+    trial = recording.recording(two, run.x, np.append(drive.disturbance, [[0.0]], axis=0))
+    problem = inverse_problem.inverse_problem(two, box, 4, (trial,))
+    solution = lqr.solve_lqr(two, pair)
+    fibre = gain_fibre.gain_fibre(two, solution.K)
+    return {
+        "system": system,
+        "plant": two,
+        "bounds": box,
+        "weights": pair,
+        "controller": law,
+        "scenario": drive,
+        "simulation": run,
+        "recording": trial,
+        "problem": problem,
+        "solution": solution,
+        "fibre": fibre,
+        "set": weights_set.weights_set(fibre),
+        "mpc": mpc.build_mpc(law),
+        "terminal": law.terminal,
+        "family": plant_family.plant_family(lambda _: two, ["mass"], [1.0]),
+        "source": plant_source.plant_source("plants:yalmip_example", {}),
+    }
+
+
+@cache
+def wrong_values() -> dict[str, Any]:
+    """What is given by mistake: for some arguments it means the same, and then it works."""
+    known = values()
+    masked = np.ma.masked_array(np.ones((30, 2)), mask=False)
+    masked[3, 1] = np.ma.masked
+    return {
+        **{f"a {name}": value for name, value in known.items()},
+        "None": None,
+        "text": "text",
+        "no text": "",
+        "lines": "one\ntwo",
+        "bytes": b"bytes",
+        "True": True,
+        "minus one": -1,
+        "zero": 0,
+        "half": 0.5,
+        "10 ** 400": 10**400,
+        "2 ** 63": 2**63,
+        "2 ** 31 - 1": 2**31 - 1,
+        "NaN": float("nan"),
+        "infinite": float("inf"),
+        "1e308": 1e308,
+        "denormal": 5e-324,
+        "float32": np.float32(0.5),
+        "complex": 1 + 2j,
+        "nothing": np.zeros(0),
+        "a zero-dimensional array": np.array(1.0),
+        "ragged": [[1.0, 2.0], [3.0]],
+        "with None": [[1.0, None], [0.0, 1.0]],
+        "words": ["one", "two"],
+        "numbers as text": [["1", "0"], ["0", "1"]],
+        "complex array": np.eye(2) * 1j,
+        "long": np.ones(1000),
+        "large": np.ones((100, 100)),
+        "three axes": np.ones((2, 2, 2)),
+        "with NaN": np.array([[np.nan, 1.0], [1.0, 1.0]]),
+        "huge": np.full((2, 2), 1e308),
+        "denormals": np.full((2, 2), 5e-324),
+        "dates": np.array(["2026-01-01"], dtype="datetime64[D]"),
+        "objects": np.array([object(), object()]),
+        "records": np.zeros(2, dtype=[("x", float)]),
+        "masked": masked,
+        "masked square": np.ma.masked_array(np.eye(2), mask=[[True, False], [False, False]]),
+        "frame": pd.DataFrame({"x": [1.0, 2.0], "y": [3.0, 4.0]}),
+        "frame of words": pd.DataFrame({"x": ["a", "b"], "y": ["c", "d"]}),
+        "series with NA": pd.Series([1, None], dtype="Int64"),
+        "sparse": scipy.sparse.eye_array(2),
+        "dictionary": {"x": 1.0},
+        "set": {1.0, 2.0},
+        "generator": (item for item in (1.0, 2.0)),
+        "function": len,
+        "type": float,
+        "object": object(),
+    }
+
+
+def fields(kind: type) -> list[str]:
+    return [field.name for field in dataclasses.fields(kind)]
+
+
+def calls() -> list[Call]:
+    """A right call of every public function: name by name, all required and optional arguments."""
+    v = values()
+    K, S = v["solution"].K, v["solution"].S
+    states, size = np.eye(2), np.ones(2)
+    trial = v["recording"]
+    problem = {"problem": v["problem"]}
+    about = {"plant": v["plant"], "gain": K}
+    limits: dict[str, Any] = {"plant": v["plant"], "weights": v["weights"], "bounds": v["bounds"]}
+    return [
+        (plant.as_plant, {"system": v["system"], "controls": ["u[0]", "u[1]"]}),
+        (plant.change_coordinates, {"plant": v["plant"], "T": states, "G": states}),
+        (
+            bounds.box_bounds,
+            {"plant": v["plant"], "x_min": -size, "x_max": 9, "u_min": -1, "u_max": size},
+        ),
+        (bounds.bound_rows, {"bounds": v["bounds"], "plant": v["plant"]}),
+        (weights.stage_weights, {"Q": states, "R": states}),
+        (weights.condition_number, {"weights": v["weights"]}),
+        (weights.normalised, {"weights": v["weights"]}),
+        (weights.residual, {"estimate": v["weights"], "truth": v["weights"]}),
+        (weights.cholesky_parameters, {"weights": v["weights"]}),
+        (weights.weights_from_parameters, {"parameters": np.ones(5), "n": 2, "m": 2}),
+        (
+            recording.recording,
+            {
+                "plant": v["plant"],
+                "outputs": trial.outputs,
+                "disturbance": trial.disturbance,
+                "x0": size,
+                "label": recording.Label("one"),
+                "findings": ("none",),
+            },
+        ),
+        (lqr.solve_lqr, {"plant": v["plant"], "weights": v["weights"]}),
+        (lqr.is_stable, {"F": states / 2, "discrete": True}),
+        (lqr.gain_gradients, {"solution": v["solution"]}),
+        (lqr.metric_gradients, {"solution": v["solution"]}),
+        (
+            terminal_set.maximal_invariant_set,
+            {
+                **about,
+                "bounds": v["bounds"],
+                "tolerance": 1e-9,
+                "max_steps": 500,
+                "near": v["terminal"],
+            },
+        ),
+        (terminal_set.contains, {"terminal": v["terminal"], "x": size, "tolerance": 1e-9}),
+        (terminal_set.invariance_violation, {"terminal": v["terminal"]}),
+        (terminal_set.maximality_violation, {"terminal": v["terminal"]}),
+        (
+            controller.mpc_controller,
+            {**limits, "horizon": 4, "terminal_set": True, "softening": 1e6},
+        ),
+        (
+            controller.gain_controller,
+            {
+                **about,
+                "bounds": v["bounds"],
+                "horizon": 4,
+                "metric": S,
+                "terminal_set": True,
+                "softening": 1e6,
+                "near": v["terminal"],
+            },
+        ),
+        (
+            closed_loop.scenario,
+            {"plant": v["plant"], "x0": size, "steps": 30, "disturbance": np.zeros(30)},
+        ),
+        (closed_loop.scenario, {"plant": v["plant"], "x0": size, "steps": 30}),
+        (closed_loop.simulate, {"controller": v["controller"], "given": v["scenario"]}),
+        (
+            closed_loop.require_complete,
+            {"controller": v["controller"], "simulation": v["simulation"]},
+        ),
+        (
+            inverse_problem.inverse_problem,
+            {
+                "plant": v["plant"],
+                "bounds": v["bounds"],
+                "horizon": 4,
+                "recordings": (trial,),
+                "terminal_set": True,
+                "softening": 1e6,
+                "output_scale": size,
+                "unknown_start": False,
+                "family": v["family"],
+            },
+        ),
+        (inverse_problem.without_bounds, problem),
+        (gain_fibre.gain_fibre, {**about, "metric": S}),
+        (equivalent_weights.weights_margin, {"fibre": v["fibre"]}),
+        (equivalent_weights.least_condition_weights, {"fibre": v["fibre"]}),
+        (equivalent_weights.analytic_centre, {"fibre": v["fibre"]}),
+        (
+            equivalent_weights.other_weights,
+            {"fibre": v["fibre"], "count": 2, "condition_ratio": 10.0},
+        ),
+        (weights_set.weights_set, {"fibre": v["fibre"], "ratio": 10.0}),
+        (weights_set.linear_range, {"found": v["set"], "direction": np.eye(4)}),
+        (weights_set.linear_maximum, {"found": v["set"], "direction": np.eye(4)}),
+        (weights_set.entry_ranges, {"found": v["set"], "states": [0]}),
+        (weights_set.trace_range, {"found": v["set"], "scaling": size}),
+        (weights_set.nearest_diagonal, {"found": v["set"], "scaling": size}),
+        (weights_set.extreme_eigenvalue, {"found": v["set"], "largest": True}),
+        (inverse_lqr.inverse_lqr_lmi, about),
+        (
+            inverse_lqr.inverse_lqr_gradient,
+            {**about, "start": v["weights"], "max_evaluations": 3, "floor": 1e-9},
+        ),
+        (cross_term.inverse_lqr_cross_term, about),
+        (inverse_mpc.infer_weights, {**problem, "condition_weight": 0.0}),
+        (inverse_mpc.starting_point, problem),
+        (
+            inverse_mpc.inverse_mpc,
+            {
+                **problem,
+                "start": v["weights"],
+                "condition_weight": 0.0,
+                "squared": False,
+                "max_iterations": 2,
+            },
+        ),
+        (inverse_mpc.inverse_mpc_reduced, {**problem, "condition_weight": 0.0}),
+        (inverse_mpc.verify_hard, {**problem, "weights": v["weights"]}),
+        (gain.fit_gain, {**problem, "attempts": 1, "max_evaluations": 3, "spread": 10.0}),
+        (fitted_controller.fit_controller, {**problem, "start": v["weights"]}),
+        (identifiability.identifiability, {**problem, "weights": v["weights"]}),
+        (mpc.build_mpc, {"controller": v["controller"], "solver": "daqp"}),
+        (mpc.solve_mpc, {"mpc": v["mpc"], "x": size}),
+        (mpc.simulate_mpc, {"mpc": v["mpc"], "given": v["scenario"]}),
+        (agreement.vaf, {"recorded": trial.outputs, "simulated": trial.outputs}),
+        (agreement.centred_vaf, {"recorded": trial.outputs, "simulated": trial.outputs}),
+        (agreement.whiteness, {"residual": trial.outputs, "lags": 3}),
+        (agreement.saturated_share, {"u": v["simulation"].u, "u_min": -size, "u_max": size}),
+        (plant_source.plant_source, {"name": "plants:yalmip_example", "arguments": {}}),
+        (plant_source.make_plant, {"source": v["source"], "recorded": ["d"]}),
+        (plant_family.plant_family, {"make": len, "names": ["mass"], "nominal": [1.0]}),
+        (plant_family.plant_at, {"family": v["family"], "logarithms": np.zeros(1)}),
+        (units.si_unit, {"written": "deg"}),
+        (plant.Plant, {name: getattr(v["plant"], name) for name in fields(plant.Plant)}),
+        (bounds.Bounds, {name: getattr(v["bounds"], name) for name in fields(bounds.Bounds)}),
+        (weights.Weights, {"Q": states, "R": states}),
+        (recording.Recording, {name: getattr(trial, name) for name in fields(recording.Recording)}),
+        (recording.Label, {"subject": "a", "visit": "b", "condition": "c", "trial": "d"}),
+        (closed_loop.Scenario, {"x0": size, "disturbance": np.zeros((9, 1))}),
+        (
+            controller.Controller,
+            {name: getattr(v["controller"], name) for name in fields(controller.Controller)},
+        ),
+        (
+            inverse_problem.InverseProblem,
+            {name: getattr(v["problem"], name) for name in fields(inverse_problem.InverseProblem)},
+        ),
+    ]
