@@ -98,11 +98,11 @@ def diagonal_weights(problem: InverseProblem, *, max_evaluations: int = 15) -> W
     """
     known = replace(problem, unknown_start=False, family=None, logarithms=frozen([]))
     try:
-        best = _best(known)
+        ranked = _ranked(known)
     except SolverError:  # every one diverges, which takes more than a step
         known = one_step(known)
-        best = _best(known)
-    search = _Prices(known, *best)
+        ranked = _ranked(known)
+    search = _first_usable(known, ranked)
     start = search.start
     noise = float(np.linalg.norm(search.at(start).residual)) / np.sqrt(search.samples)
     weight = noise / _SPREAD
@@ -119,8 +119,8 @@ def diagonal_weights(problem: InverseProblem, *, max_evaluations: int = 15) -> W
     return search.weights(found.x)
 
 
-def _best(problem: InverseProblem) -> tuple[Weights, LqrSolution]:
-    """Of `bryson_weights` those with the least misfit."""
+def _ranked(problem: InverseProblem) -> list[tuple[Weights, LqrSolution]]:
+    """Those of `bryson_weights` that can be simulated, least misfit first."""
     candidates, reason = [], ""
     for weights, solution in bryson_regulators(problem):
         size, why = misfit_or_reason(problem, solution.K, solution.S)
@@ -131,8 +131,25 @@ def _best(problem: InverseProblem) -> tuple[Weights, LqrSolution]:
         raise SolverError(
             "gain", f"no regulator can be simulated: {reason}", "check the plant and the bounds"
         )
-    _, weights, solution = min(candidates, key=lambda item: item[0])
-    return weights, solution
+    candidates.sort(key=lambda item: item[0])
+    return [(weights, solution) for _, weights, solution in candidates]
+
+
+def _first_usable(problem: InverseProblem, ranked: list[tuple[Weights, LqrSolution]]) -> _Prices:
+    """The search from the best weights whose diagonal has a regulator that can be simulated too.
+
+    A price on each state is another regulator than that of Bryson's rule: beside a command that is
+    all but free its Riccati equation may have no solution in double precision.
+    """
+    searches = (_Prices(problem, *item) for item in ranked)
+    reason = ""
+    for search in searches:
+        reason = search.at(search.start).evaluation.reason
+        if not reason:
+            return search
+    raise SolverError(
+        "gain", f"no diagonal weights can be simulated: {reason}", "check the plant and the bounds"
+    )
 
 
 @dataclass(frozen=True)

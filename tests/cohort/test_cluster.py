@@ -21,6 +21,9 @@ from impc.errors import InputError, OutputError
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+# A client whose scheduler is gone leaves its socket to the garbage collector, at any later time.
+pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+
 
 def certificates(folder: Path) -> tuple[Path, Path, Path]:
     """An authority, a certificate that it signed, and its key, as docs/cohorts.md makes them."""
