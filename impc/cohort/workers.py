@@ -63,7 +63,7 @@ class Workers(Protocol):
         ...
 
     def submit(self, key: Hashable, work: Callable[..., Any], *given: Any) -> None:
-        """Give out a task, work(*given), of importable code; its `key` comes back with it."""
+        """Give out a task, ``work(*given)``, of importable code; its `key` comes back with it."""
         ...
 
     def results(self) -> Iterator[Done]:
@@ -106,7 +106,7 @@ class LocalWorkers:
         return len(self._workers)
 
     def submit(self, key: Hashable, work: Callable[..., Any], *given: Any) -> None:
-        """As `Workers.submit`: work(*given) under a `key`.
+        """As `Workers.submit`: ``work(*given)`` under a `key`.
 
         Parameters
         ----------
