@@ -14,7 +14,7 @@ the last digit.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -103,7 +103,7 @@ def _with_gain(fit: GainFit, member: Weights | None = None) -> WeightsBehind:
                 gain_fibre(fit.problem.plant, fit.K, metrics), member
             )
         except (WeightsError, SolverError) as error:
-            best = best if best.reason else _because(best, str(error))
+            best = best if best.reason else replace(best, reason=str(error))
             continue
         misfit = weights_misfit(fit.problem, equivalent.weights)
         if misfit < best.misfit:
@@ -111,10 +111,6 @@ def _with_gain(fit: GainFit, member: Weights | None = None) -> WeightsBehind:
         if best.explained:
             break
     return best
-
-
-def _because(found: WeightsBehind, reason: str) -> WeightsBehind:
-    return WeightsBehind(found.gain, found.equivalent, found.misfit, found.explained, reason)
 
 
 def _judged(fit: GainFit, equivalent: EquivalentWeights, misfit: float) -> WeightsBehind:

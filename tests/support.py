@@ -10,7 +10,13 @@ import numpy as np
 import scipy.optimize
 from hypothesis import settings
 
+from impc.bounds import box_bounds
+from impc.closed_loop import scenario, simulate
+from impc.controller import Controller, mpc_controller
+from impc.inverse_problem import InverseProblem, inverse_problem
 from impc.plant import Plant, as_plant
+from impc.recording import recording
+from impc.weights import Weights, stage_weights
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -79,3 +85,22 @@ def easier_seat(configuration: str) -> str:
     """The seat's TOML with six states for ten and a horizon of 4 for 20: a fit in a tenth."""
     fewer = configuration.replace("[plant]", "[plant]\ndelay_order = 1")
     return fewer.replace("horizon = 20", "horizon = 4")
+
+
+def saturated_problem(
+    rng: np.random.Generator, n: int, m: int
+) -> tuple[Weights, Controller, InverseProblem]:
+    """An exact recording of n states and m inputs, 2 to 30 % of which stand at their bounds."""
+    while True:
+        plant = random_plant(rng, n, m, rng.uniform(0.8, 1.1), d=1)
+        weights = stage_weights(random_weights(rng, n), random_weights(rng, m))
+        bounds = box_bounds(plant, u_min=-1, u_max=1)
+        controller = mpc_controller(plant, weights, bounds, 5, terminal_set=False)
+        push = rng.choice([-1.0, 0.0, 1.0], size=40).repeat(5)
+        for size in 10 * 0.8 ** np.arange(40):
+            run = simulate(controller, scenario(plant, np.zeros(n), disturbance=size * push))
+            saturated = np.mean(np.abs(np.abs(run.u) - 1) < 1e-9)
+            if run.complete and 0.02 < saturated < 0.3:
+                trial = recording(plant, run.x, np.append(size * push, 0))
+                problem = inverse_problem(plant, bounds, 5, (trial,), terminal_set=False)
+                return weights, controller, problem

@@ -5,35 +5,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from impc.bounds import box_bounds
-from impc.closed_loop import scenario, simulate
-from impc.controller import Controller, mpc_controller
+from impc.controller import Controller
 from impc.equivalent_weights import gain_fibre, least_condition_weights
 from impc.inverse_mpc import inverse_mpc_reduced
-from impc.inverse_problem import InverseProblem, inverse_problem
+from impc.inverse_problem import InverseProblem
 from impc.lqr import solve_lqr
-from impc.recording import recording
-from impc.weights import Weights, condition_number, stage_weights
-from tests.support import random_plant, random_weights
+from impc.weights import Weights, condition_number
+from tests.support import saturated_problem
 
 
 def random_problem(seed: int) -> tuple[Weights, Controller, InverseProblem]:
     """2 to 6 states, 1 or 2 inputs, one random disturbance, 2 to 30 % of the inputs saturated."""
     rng = np.random.default_rng([11, seed])
-    n, m = 2 + seed % 5, 1 + seed % 2
-    while True:
-        plant = random_plant(rng, n, m, rng.uniform(0.8, 1.1), d=1)
-        weights = stage_weights(random_weights(rng, n), random_weights(rng, m))
-        bounds = box_bounds(plant, u_min=-1, u_max=1)
-        controller = mpc_controller(plant, weights, bounds, 5, terminal_set=False)
-        push = rng.choice([-1.0, 0.0, 1.0], size=40).repeat(5)
-        for size in 10 * 0.8 ** np.arange(40):
-            run = simulate(controller, scenario(plant, np.zeros(n), disturbance=size * push))
-            saturated = np.mean(np.abs(np.abs(run.u) - 1) < 1e-9)
-            if run.complete and 0.02 < saturated < 0.3:
-                trial = recording(plant, run.x, np.append(size * push, 0))
-                problem = inverse_problem(plant, bounds, 5, (trial,), terminal_set=False)
-                return weights, controller, problem
+    return saturated_problem(rng, 2 + seed % 5, 1 + seed % 2)
 
 
 def solved(seed: int) -> bool:

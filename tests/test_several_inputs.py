@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from impc.bounds import box_bounds
 from impc.closed_loop import scenario, simulate
 from impc.controller import Controller, mpc_controller
 from impc.equivalent_weights import least_condition_weights, other_weights
@@ -17,14 +16,14 @@ from impc.fitted_controller import fit_controller
 from impc.gain import fit_gain
 from impc.gain_fibre import gain_fibre, natural_coordinates
 from impc.inverse_mpc import infer_weights, inverse_mpc_reduced
-from impc.inverse_problem import InverseProblem, inverse_problem
+from impc.inverse_problem import InverseProblem
 from impc.lqr import solve_lqr
 from impc.one_step import regressed_gain
 from impc.recording import recording
 from impc.weights import Weights, stage_weights
 from impc.weights_search import search_weights
 from impc.weights_summary import summarise_weights
-from tests.support import random_plant, random_weights
+from tests.support import saturated_problem
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -36,20 +35,8 @@ REPRODUCED = 1e-7
 def random_problem(seed: int, m: int) -> tuple[Controller, InverseProblem]:
     """2 to 6 states, m inputs, one random disturbance, 2 to 30 % of the inputs saturated."""
     rng = np.random.default_rng([14, m, seed])
-    n = 2 + seed % 5
-    while True:
-        plant = random_plant(rng, n, m, rng.uniform(0.8, 1.1), d=1)
-        weights = stage_weights(random_weights(rng, n), random_weights(rng, m))
-        bounds = box_bounds(plant, u_min=-1, u_max=1)
-        controller = mpc_controller(plant, weights, bounds, 5, terminal_set=False)
-        push = rng.choice([-1.0, 0.0, 1.0], size=40).repeat(5)
-        for size in 10 * 0.8 ** np.arange(40):
-            run = simulate(controller, scenario(plant, np.zeros(n), disturbance=size * push))
-            saturated = np.mean(np.abs(np.abs(run.u) - 1) < 1e-9)
-            if run.complete and 0.02 < saturated < 0.3:
-                trial = recording(plant, run.x, np.append(size * push, 0))
-                problem = inverse_problem(plant, bounds, 5, (trial,), terminal_set=False)
-                return controller, problem
+    _, controller, problem = saturated_problem(rng, 2 + seed % 5, m)
+    return controller, problem
 
 
 def missed(problem: InverseProblem, weights: Weights) -> float:
