@@ -92,7 +92,7 @@ SEED ?= $(shell date +%s)
 search: env
 	@echo 'make search SEED=$(SEED)'
 	IMPC_SEARCH=20 OPENBLAS_NUM_THREADS=1 $(PY) -m pytest -m "not slow" --hypothesis-seed=$(SEED) $(SEARCHED)
-SEARCHED := tests/test_inverse_lqr.py tests/test_equivalent_weights.py tests/test_terminal_set.py
+SEARCHED := tests/inverse/test_inverse_lqr.py tests/inverse/test_equivalent_weights.py tests/control/test_terminal_set.py
 
 # The floors of pyproject.toml on the oldest Python, the newest there are on the newest.
 numerics: .venv-oldest/.stamp .venv-newest/.stamp

@@ -20,17 +20,17 @@ import scipy.signal
 from tqdm import tqdm
 
 from impc.arrays import Array
-from impc.bounds import box_bounds
-from impc.closed_loop import require_complete, scenario, simulate
-from impc.controller import Controller, mpc_controller
-from impc.fit_recordings import fit_problem
-from impc.fit_settings import FitSettings
-from impc.gain import fit_gain
-from impc.gain_covariance import gain_covariance
-from impc.plant import Plant, as_plant
-from impc.recording import Recording, recording
-from impc.residual_noise import residual_noise, white_noise
-from impc.weights import stage_weights
+from impc.assess.covariance import gain_covariance
+from impc.assess.long_run_covariance import residual_noise, white_noise
+from impc.control.closed_loop import require_complete, scenario, simulate
+from impc.control.controller import Controller, mpc_controller
+from impc.inverse.gain_search import fit_gain
+from impc.model.bounds import box_bounds
+from impc.model.plant import Plant, as_plant
+from impc.model.recordings import Recording, recording
+from impc.model.weights import stage_weights
+from impc.studies.fit.settings import FitSettings
+from impc.studies.fit.subject import fit_problem
 
 __all__ = ["cart", "covered", "true_controller"]
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from experiments.cursor_data import ARCMIN_A_PIXEL, RATE
-from impc.report.style import (
+from impc.reporting.style import (
     BLUE,
     DOUBLE_COLUMN,
     GREEN,

@@ -28,23 +28,23 @@ from experiments.cursor_baseline import delayed_feedback, fit_delayed_feedback
 from experiments.cursor_ceiling import fit_step_response, follow
 from experiments.cursor_data import RATE, Condition, data_file, read_conditions
 from experiments.cursor_figure import cursor_figure
-from impc.agreement import centred_vaf
 from impc.arrays import Array, frozen
-from impc.closed_loop import simulate
-from impc.evaluation import misfit_or_reason
-from impc.fit_recordings import fit_problem
-from impc.fit_settings import FitSettings
-from impc.fitted_controller import FittedController, fit_controller
-from impc.gain_covariance import gain_covariance
-from impc.gain_fibre import gain_fibre
-from impc.inverse_problem import InverseProblem, controller_for, scenarios
-from impc.plant import Plant, as_plant
-from impc.plant_family import plant_family
-from impc.recording import recording
-from impc.report.rendering import plain
-from impc.report.write import write_files
-from impc.unknown_limit import with_limit
-from impc.weights_set import linear_range, weights_set
+from impc.assess.bounded_weights import linear_range, weights_set
+from impc.assess.covariance import gain_covariance
+from impc.assess.input_limits import with_limit
+from impc.assess.vaf import centred_vaf
+from impc.control.closed_loop import simulate
+from impc.inverse.noisy_fit import FittedController, fit_controller
+from impc.inverse.problem import InverseProblem, controller_for, scenarios
+from impc.inverse.residuals import misfit_or_reason
+from impc.inverse.solution_set import gain_fibre
+from impc.model.plant import Plant, as_plant
+from impc.model.plant_family import plant_family
+from impc.model.recordings import recording
+from impc.reporting.rendering import plain
+from impc.reporting.writer import write_files
+from impc.studies.fit.settings import FitSettings
+from impc.studies.fit.subject import fit_problem
 from plants import cursor_plant
 
 __all__ = [

@@ -13,7 +13,7 @@ import scipy.optimize
 
 import plants
 from experiments.benchmarks.workloads import seat
-from impc.plant import as_plant
+from impc.model.plant import as_plant
 
 __all__ = ["least_radius"]
 

@@ -23,18 +23,14 @@ import numpy as np
 from tqdm import tqdm
 
 from experiments.benchmarks.workloads import seat
-from impc.agreement import vaf
-from impc.closed_loop import simulate
-from impc.compare_recordings import bounds_of_method
-from impc.fit_recordings import fit_problem
-from impc.fit_settings import FitSettings
-from impc.gain_fibre import natural_coordinates
-from impc.inverse_problem import controller_for
-from impc.method_estimates import METHODS, estimate_all
-from impc.recording import recording
-from impc.report.fit_sentences import METHOD_LABELS
-from impc.report.rendering import plain
-from impc.report.style import (
+from impc.assess.vaf import vaf
+from impc.control.closed_loop import simulate
+from impc.inverse.methods import METHODS, estimate_all
+from impc.inverse.problem import controller_for
+from impc.inverse.solution_set import natural_coordinates
+from impc.model.recordings import recording
+from impc.reporting.rendering import plain
+from impc.reporting.style import (
     BLUE,
     DOUBLE_COLUMN,
     GREEN,
@@ -44,15 +40,19 @@ from impc.report.style import (
     new_figure,
     render,
 )
-from impc.report.write import write_files
+from impc.reporting.writer import write_files
+from impc.studies.compare.subject import bounds_of_method
+from impc.studies.fit.sentences import METHOD_LABELS
+from impc.studies.fit.settings import FitSettings
+from impc.studies.fit.subject import fit_problem
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from impc.arrays import Array
-    from impc.closed_loop import Scenario
-    from impc.inverse_problem import InverseProblem
-    from impc.method_estimates import Estimate
+    from impc.control.closed_loop import Scenario
+    from impc.inverse.methods import Estimate
+    from impc.inverse.problem import InverseProblem
 
 __all__ = ["Cell", "Outcome", "study_cell"]
 

@@ -19,11 +19,11 @@ from tqdm import tqdm
 
 from experiments.benchmarks.workloads import seat
 from impc.arrays import Array
-from impc.bounds import box_bounds
-from impc.closed_loop import Scenario, scenario, simulate
-from impc.controller import Controller
-from impc.mpc import build_mpc, solve_mpc
-from impc.nonlinear_mpc import build_nonlinear_mpc, simulate_nonlinear
+from impc.control.casadi_controller import build_mpc, solve_mpc
+from impc.control.closed_loop import Scenario, scenario, simulate
+from impc.control.controller import Controller
+from impc.control.nonlinear_controller import build_nonlinear_mpc, simulate_nonlinear
+from impc.model.bounds import box_bounds
 from plants.integration import runge_kutta_step
 from plants.seated_balance import nonlinear_dynamics
 

@@ -15,12 +15,12 @@ import numpy as np
 
 import plants
 from impc.arrays import Array
-from impc.bounds import box_bounds
-from impc.controller import Controller, mpc_controller
-from impc.plant import as_plant
-from impc.protocols import critical_stiffness, torque_amplitude
-from impc.simulated_subject import simulate_subject
-from impc.weights import stage_weights
+from impc.control.controller import Controller, mpc_controller
+from impc.model.bounds import box_bounds
+from impc.model.plant import as_plant
+from impc.model.weights import stage_weights
+from impc.studies.protocols import critical_stiffness, torque_amplitude
+from impc.studies.simulated_people import simulate_subject
 
 __all__ = ["subject_balances", "subject_peak"]
 

@@ -24,20 +24,20 @@ import numpy as np
 import scipy.signal
 from tqdm import tqdm
 
-from impc.bounds import box_bounds
-from impc.closed_loop import require_complete, scenario, simulate
-from impc.controller import Controller, mpc_controller
-from impc.fit_recordings import fit_problem
-from impc.fit_settings import FitSettings
-from impc.fitted_controller import fit_controller
-from impc.gain_estimate import gain_estimate
-from impc.plant import Plant, as_plant
-from impc.recording import Recording, recording
-from impc.weights import stage_weights
+from impc.assess.printed_gain import gain_estimate
+from impc.control.closed_loop import require_complete, scenario, simulate
+from impc.control.controller import Controller, mpc_controller
+from impc.inverse.noisy_fit import fit_controller
+from impc.model.bounds import box_bounds
+from impc.model.plant import Plant, as_plant
+from impc.model.recordings import Recording, recording
+from impc.model.weights import stage_weights
+from impc.studies.fit.settings import FitSettings
+from impc.studies.fit.subject import fit_problem
 
 if TYPE_CHECKING:
     from impc.arrays import Array
-    from impc.fitted_controller import FittedController
+    from impc.inverse.noisy_fit import FittedController
 
 __all__ = [
     "Scores",

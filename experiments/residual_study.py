@@ -26,16 +26,16 @@ from tqdm import tqdm
 
 import plants
 from impc.arrays import Array
-from impc.bounds import box_bounds
-from impc.controller import mpc_controller
-from impc.fit_recordings import fit_problem
-from impc.fit_settings import FitSettings
-from impc.fitted_controller import FittedController, fit_controller
-from impc.plant import Plant, as_plant
-from impc.recording import Recording, recording
-from impc.residual_diagnostics import ResidualDiagnostics, residual_diagnostics
-from impc.simulated_subject import simulate_subject
-from impc.weights import Weights, stage_weights
+from impc.assess.diagnostics import ResidualDiagnostics, residual_diagnostics
+from impc.control.controller import mpc_controller
+from impc.inverse.noisy_fit import FittedController, fit_controller
+from impc.model.bounds import box_bounds
+from impc.model.plant import Plant, as_plant
+from impc.model.recordings import Recording, recording
+from impc.model.weights import Weights, stage_weights
+from impc.studies.fit.settings import FitSettings
+from impc.studies.fit.subject import fit_problem
+from impc.studies.simulated_people import simulate_subject
 
 __all__ = ["SUBJECTS", "Kind", "diagnosed", "fitted_subject"]
 

@@ -16,18 +16,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 import plants
-from impc.selection.bootstrap import bootstrap_subset
-from impc.selection.estimation import estimate, free_indices
-from impc.selection.fisher import fisher_information
-from impc.selection.lasso import lasso_of_size, table_c1
-from impc.selection.model import Trial
-from impc.selection.source import model_source
-from impc.selection.subsets import largest_subsets, sweep
+from impc.studies.selection.bootstrap import bootstrap_subset
+from impc.studies.selection.estimation import estimate, free_indices
+from impc.studies.selection.fisher import fisher_information
+from impc.studies.selection.lasso import lasso_of_size, table_c1
+from impc.studies.selection.model import Trial
+from impc.studies.selection.model_source import model_source
+from impc.studies.selection.subsets import largest_subsets, sweep
 
 if TYPE_CHECKING:
     from impc.arrays import Array
-    from impc.selection.fisher import Information
-    from impc.selection.model import ParametricModel
+    from impc.studies.selection.fisher import Information
+    from impc.studies.selection.model import ParametricModel
 
 __all__ = [
     "FIM_SUBSET",

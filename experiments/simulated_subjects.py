@@ -19,15 +19,15 @@ import numpy as np
 from tqdm import tqdm
 
 from experiments.benchmarks.workloads import seat
-from impc.fit_recordings import fit_problem
-from impc.fit_settings import FitSettings
-from impc.fitted_controller import fit_controller
-from impc.gain_estimate import gain_estimate
-from impc.recording import recording
+from impc.assess.printed_gain import gain_estimate
+from impc.inverse.noisy_fit import fit_controller
+from impc.model.recordings import recording
+from impc.studies.fit.settings import FitSettings
+from impc.studies.fit.subject import fit_problem
 
 if TYPE_CHECKING:
     from impc.arrays import Array
-    from impc.recording import Recording
+    from impc.model.recordings import Recording
 
 __all__ = ["Subject", "noisy_recordings", "simulated_subject"]
 

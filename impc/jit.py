@@ -45,7 +45,7 @@ def keep_caches() -> str:
     told = []
     home = _cache_home()
     if "NUMBA_CACHE_DIR" not in os.environ and not (
-        _writable(Path(__file__).parent / "__pycache__") or _writable(home / "numba")
+        _writable(Path(__file__).parent / "control" / "__pycache__") or _writable(home / "numba")
     ):
         told.append("NUMBA_CACHE_DIR")
     if "MPLCONFIGDIR" not in os.environ and not (

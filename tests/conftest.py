@@ -11,16 +11,16 @@ import pytest
 from hypothesis import settings
 from matplotlib.figure import Figure
 
-from impc.bounds import box_bounds
-from impc.plant import as_plant
+from impc.model.bounds import box_bounds
+from impc.model.plant import as_plant
 from tests.labelled_axes import require_labels
 from tests.support import SEARCH
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from impc.bounds import Bounds
-    from impc.plant import Plant
+    from impc.model.bounds import Bounds
+    from impc.model.plant import Plant
 
 
 # The same examples on every machine and no clock; `make search` draws new ones.

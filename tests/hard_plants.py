@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import linprog
 
-from impc.bounds import bound_rows, box_bounds
-from impc.closed_loop import (
+from impc.control.closed_loop import (
     Scenario,
     Simulation,
     Status,
@@ -17,12 +16,13 @@ from impc.closed_loop import (
     scenario,
     simulate,
 )
-from impc.compiled import solve_dual
-from impc.controller import Controller, mpc_controller
+from impc.control.compiled_loop import solve_dual
+from impc.control.constraint_rows import build_rows, directions
+from impc.control.controller import Controller, mpc_controller
+from impc.control.saturated import solve_saturated
 from impc.errors import SolverError
-from impc.prediction import build_rows, directions
-from impc.saturated import solve_saturated
-from impc.weights import Weights, stage_weights
+from impc.model.bounds import bound_rows, box_bounds
+from impc.model.weights import Weights, stage_weights
 from tests.exact_mpc import ExactProgram, exact
 from tests.support import random_plant, random_weights
 

@@ -14,7 +14,7 @@ import pytest
 import impc.jit
 from impc.jit import keep_caches
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[1]
 # Nobody can make a folder there, not even root, who runs the tests of a container.
 NOWHERE = "/proc/none"
 
@@ -77,10 +77,11 @@ def test_nothing_is_said_or_set_where_caches_can_be_kept(
 
 def test_the_library_compiles_in_memory_without_a_place_for_caches(tmp_path: Path) -> None:
     shutil.copytree(ROOT / "impc", tmp_path / "impc", ignore=shutil.ignore_patterns("__pycache__"))
-    (tmp_path / "impc" / "__pycache__").write_text("a file, where numba would make a folder")
+    (tmp_path / "impc/control/__pycache__").write_text("a file, where numba would make a folder")
     code = (
-        "import impc.compiled\n"
-        "print(type(impc.compiled.substitute._cache).__name__, impc.compiled.__file__)\n"
+        "import impc.control.compiled_loop\n"
+        "loop = impc.control.compiled_loop\n"
+        "print(type(loop.substitute._cache).__name__, loop.__file__)\n"
     )
     homeless = {"PYTHONPATH": str(tmp_path), "HOME": NOWHERE, "XDG_CACHE_HOME": NOWHERE}
     words = [sys.executable, "-P", "-c", code]
@@ -88,4 +89,4 @@ def test_the_library_compiles_in_memory_without_a_place_for_caches(tmp_path: Pat
         words, env=os.environ | homeless, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
-    assert done.stdout.split() == ["NullCache", str(tmp_path / "impc" / "compiled.py")]
+    assert done.stdout.split() == ["NullCache", str(tmp_path / "impc/control/compiled_loop.py")]

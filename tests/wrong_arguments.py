@@ -11,31 +11,22 @@ import numpy as np
 import pandas as pd
 import scipy.sparse
 
-from impc import (
-    agreement,
-    bounds,
-    closed_loop,
-    controller,
-    cross_term,
-    equivalent_weights,
-    fitted_controller,
-    gain,
-    gain_fibre,
-    identifiability,
-    inverse_lqr,
-    inverse_mpc,
-    inverse_problem,
-    lqr,
-    mpc,
-    plant,
-    plant_family,
-    plant_source,
-    recording,
-    terminal_set,
-    weights,
-    weights_set,
-)
+from impc.assess import bounded_weights as weights_set
+from impc.assess import identified_directions as identifiability
+from impc.assess import vaf as agreement
+from impc.control import casadi_controller as mpc
+from impc.control import closed_loop, controller, terminal_set
+from impc.files import plant_sources as plant_source
 from impc.files import units
+from impc.inverse import cross_term, equivalent_weights, inverse_lqr
+from impc.inverse import direct_and_reduced as inverse_mpc
+from impc.inverse import gain_search as gain
+from impc.inverse import noisy_fit as fitted_controller
+from impc.inverse import problem as inverse_problem
+from impc.inverse import solution_set as gain_fibre
+from impc.model import bounds, plant, plant_family, weights
+from impc.model import recordings as recording
+from impc.model import riccati as lqr
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -21,11 +21,11 @@ show("example/comparison-case-A.png")
 # The same in Python, one step at a time. The plant is any discrete ``control.StateSpace``.
 import numpy as np
 
-from impc.bounds import box_bounds
-from impc.closed_loop import scenario, simulate
-from impc.controller import mpc_controller
-from impc.plant import as_plant
-from impc.weights import stage_weights
+from impc.model.bounds import box_bounds
+from impc.control.closed_loop import scenario, simulate
+from impc.control.controller import mpc_controller
+from impc.model.plant import as_plant
+from impc.model.weights import stage_weights
 from plants import yalmip_example
 
 plant = as_plant(yalmip_example())
@@ -37,10 +37,10 @@ print("steps at the bound:", int(np.sum(np.abs(recorded.u) > 1 - 1e-9)))
 # %%
 # Inverse MPC: a start from inverse LQR (Table 3.1 of the dissertation), then the search over
 # weights.
-from impc.identifiability import identifiability
-from impc.inverse_mpc import infer_weights
-from impc.inverse_problem import inverse_problem
-from impc.recording import recording
+from impc.assess.identified_directions import identifiability
+from impc.inverse.direct_and_reduced import infer_weights
+from impc.inverse.problem import inverse_problem
+from impc.model.recordings import recording
 
 problem = inverse_problem(plant, bounds, 3, (recording(plant, recorded.x),))
 weights = infer_weights(problem).fit.weights

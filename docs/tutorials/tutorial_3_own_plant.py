@@ -49,11 +49,11 @@ from terminal import RESULTS
 sys.path.insert(0, str(RESULTS))
 from stick import stick
 
-from impc.bounds import box_bounds
-from impc.closed_loop import scenario, simulate
-from impc.controller import mpc_controller
-from impc.plant import as_plant
-from impc.weights import stage_weights
+from impc.model.bounds import box_bounds
+from impc.control.closed_loop import scenario, simulate
+from impc.control.controller import mpc_controller
+from impc.model.plant import as_plant
+from impc.model.weights import stage_weights
 
 plant = as_plant(stick(), controls=["acceleration"])
 bounds = box_bounds(plant, u_min=-3, u_max=3)

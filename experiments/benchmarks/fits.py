@@ -11,19 +11,19 @@ from experiments.benchmarks.peers import casadi_loop, cvxpy_nelder_mead
 from experiments.benchmarks.table import Row, compare
 from experiments.benchmarks.timing import side_by_side
 from experiments.benchmarks.workloads import example, seat
-from impc.inverse_mpc import (
+from impc.inverse.direct_and_reduced import (
     CONDITION_WEIGHT,
     inverse_mpc,
     inverse_mpc_reduced,
     start_gains,
     starting_point,
 )
-from impc.weights import residual
+from impc.model.weights import residual
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from impc.inverse_mpc import ReducedFit
+    from impc.inverse.direct_and_reduced import ReducedFit
 
 __all__ = ["fit_rows"]
 

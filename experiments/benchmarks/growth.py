@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from experiments.benchmarks.table import Row
 from experiments.benchmarks.timing import Timing, side_by_side
 from experiments.benchmarks.workloads import chain_of_masses, seat, with_horizon
-from impc.closed_loop import simulate_and_differentiate
-from impc.prediction import directions
+from impc.control.closed_loop import simulate_and_differentiate
+from impc.control.constraint_rows import directions
 
 if TYPE_CHECKING:
     from collections.abc import Callable

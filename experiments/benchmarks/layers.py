@@ -12,8 +12,8 @@ import numpy as np
 from experiments.benchmarks.table import Row, compare
 from experiments.benchmarks.timing import side_by_side
 from experiments.benchmarks.workloads import Workload, example
-from impc.evaluation import evaluate
-from impc.lqr import solve_lqr
+from impc.inverse.residuals import evaluate
+from impc.model.riccati import solve_lqr
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -9,10 +9,10 @@ import cvxpy as cp
 import numpy as np
 import scipy.optimize
 
-from impc.bounds import bound_rows
 from impc.errors import SolverError
-from impc.lqr import solve_lqr
-from impc.weights import Weights, condition_number, weights_from_parameters
+from impc.model.bounds import bound_rows
+from impc.model.riccati import solve_lqr
+from impc.model.weights import Weights, condition_number, weights_from_parameters
 
 if TYPE_CHECKING:
     from experiments.benchmarks.workloads import Workload

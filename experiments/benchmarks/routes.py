@@ -9,8 +9,8 @@ import numpy as np
 from experiments.benchmarks.table import Row
 from experiments.benchmarks.upper_level import Route, prox_linear, smooth_surrogate
 from experiments.benchmarks.workloads import example, seat
-from impc.inverse_mpc import starting_point
-from impc.weights import stage_weights
+from impc.inverse.direct_and_reduced import starting_point
+from impc.model.weights import stage_weights
 
 if TYPE_CHECKING:
     from pathlib import Path

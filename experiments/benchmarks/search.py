@@ -9,10 +9,10 @@ import scipy.optimize
 
 from experiments.benchmarks.table import Row
 from experiments.benchmarks.workloads import Workload, seat
-from impc.evaluation import evaluate
-from impc.gain_fibre import natural_coordinates
-from impc.inverse_mpc import start_gains, starting_point
-from impc.lqr import is_stable
+from impc.inverse.direct_and_reduced import start_gains, starting_point
+from impc.inverse.residuals import evaluate
+from impc.inverse.solution_set import natural_coordinates
+from impc.model.riccati import is_stable
 
 if TYPE_CHECKING:
     from pathlib import Path

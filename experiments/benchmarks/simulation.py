@@ -11,8 +11,8 @@ from experiments.benchmarks.peers import casadi_loop
 from experiments.benchmarks.table import Row, compare
 from experiments.benchmarks.timing import side_by_side
 from experiments.benchmarks.workloads import seat
-from impc.closed_loop import simulate, simulate_and_differentiate
-from impc.prediction import directions
+from impc.control.closed_loop import simulate, simulate_and_differentiate
+from impc.control.constraint_rows import directions
 
 if TYPE_CHECKING:
     from pathlib import Path

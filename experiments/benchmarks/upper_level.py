@@ -14,16 +14,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy.optimize
 
-from impc.conditioned_fit import Residual, weight_jacobian
-from impc.evaluation import evaluate
-from impc.inverse_mpc import CONDITION_WEIGHT, inverse_mpc
-from impc.lqr import solve_lqr
-from impc.weights import cholesky_parameters, condition_number, weights_from_parameters
+from impc.inverse.direct_and_reduced import CONDITION_WEIGHT, inverse_mpc
+from impc.inverse.proximal_search import Residual, weight_jacobian
+from impc.inverse.residuals import evaluate
+from impc.model.riccati import solve_lqr
+from impc.model.weights import cholesky_parameters, condition_number, weights_from_parameters
 
 if TYPE_CHECKING:
     from impc.arrays import Array
-    from impc.inverse_problem import InverseProblem
-    from impc.weights import Weights
+    from impc.inverse.problem import InverseProblem
+    from impc.model.weights import Weights
 
 __all__ = ["Route", "prox_linear", "smooth_surrogate"]
 

@@ -9,13 +9,13 @@ import control
 import numpy as np
 
 import plants
-from impc.bounds import box_bounds
-from impc.closed_loop import Scenario, require_complete, scenario, simulate
-from impc.controller import Controller, mpc_controller
-from impc.inverse_problem import InverseProblem, inverse_problem
-from impc.plant import Plant, as_plant
-from impc.recording import recording
-from impc.weights import Weights, stage_weights
+from impc.control.closed_loop import Scenario, require_complete, scenario, simulate
+from impc.control.controller import Controller, mpc_controller
+from impc.inverse.problem import InverseProblem, inverse_problem
+from impc.model.bounds import box_bounds
+from impc.model.plant import Plant, as_plant
+from impc.model.recordings import recording
+from impc.model.weights import Weights, stage_weights
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -16,7 +16,7 @@ from experiments.reproduction.key import key_entries
 from experiments.reproduction.page import figure_name, page
 from experiments.reproduction.seat import seat_entries
 from experiments.reproduction.sensitive import sensitive_entries
-from impc.report.write import write_files
+from impc.reporting.writer import write_files
 
 if TYPE_CHECKING:
     from experiments.reproduction.evidence import Evidence

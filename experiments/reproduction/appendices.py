@@ -11,17 +11,17 @@ import numpy as np
 import plants
 from experiments.reproduction.entry import Entry, Verdict, agrees
 from experiments.selection_claims import FIM_SUBSET, mean_subject
-from impc.selection.estimation import estimate, free_indices
-from impc.selection.fisher import fisher_information
-from impc.selection.lasso import lasso_of_size
-from impc.selection.linear import discretised, kronecker_sensitivity
-from impc.selection.model import Trial, normalised, sensitivity
-from impc.selection.subsets import exhaustive, largest_subsets
+from impc.studies.selection.estimation import estimate, free_indices
+from impc.studies.selection.fisher import fisher_information
+from impc.studies.selection.lasso import lasso_of_size
+from impc.studies.selection.linear import discretised, kronecker_sensitivity
+from impc.studies.selection.model import Trial, normalised, sensitivity
+from impc.studies.selection.subsets import exhaustive, largest_subsets
 
 if TYPE_CHECKING:
     from impc.arrays import Array
-    from impc.selection.fisher import Information
-    from impc.selection.model import ParametricModel
+    from impc.studies.selection.fisher import Information
+    from impc.studies.selection.model import ParametricModel
 
 __all__ = ["appendix_entries"]
 
@@ -50,28 +50,31 @@ def _information(
         Entry(
             "(A.1)",
             "Discrete state space with white measurement noise.",
-            ("impc.selection.linear:discretised",),
+            ("impc.studies.selection.linear:discretised",),
             f"{linear.A.shape[0]} states, sampled exactly; {len(outputs)} samples a trial.",
             Verdict.REPRODUCED,
         ),
         Entry(
             "(A.2)",
             "FIM: sum over samples of the outer products of the output's gradient, over sigma^2.",
-            ("impc.selection.fisher:fisher_information",),
+            ("impc.studies.selection.fisher:fisher_information",),
             f"Gradients against central differences: {difference:.0e}.",
             agrees(difference < 1e-6),
         ),
         Entry(
             "(A.3)",
             "The gradient as a recursion with Kronecker products.",
-            ("impc.selection.linear:kronecker_sensitivity",),
+            ("impc.studies.selection.linear:kronecker_sensitivity",),
             f"Against the exact derivative: {kronecker:.0e}.",
             agrees(kronecker < 1e-8),
         ),
         Entry(
             "(A.4), (A.5)",
             "Estimates are asymptotically normal; the inverse of the FIM bounds their covariance.",
-            ("impc.selection.fisher:fisher_information", "impc.selection.estimation:estimate"),
+            (
+                "impc.studies.selection.fisher:fisher_information",
+                "impc.studies.selection.estimation:estimate",
+            ),
             f"{_DRAWS} simulated recordings (seed 0): SD of the five estimates over the bound "
             + ", ".join(f"{item:.2f}" for item in spread)
             + " (sampling error 5 %).",
@@ -80,7 +83,7 @@ def _information(
         Entry(
             "(A.6)",
             "FIM of normalised parameters.",
-            ("impc.selection.fisher:Information",),
+            ("impc.studies.selection.fisher:Information",),
             f"Diagonal from {diagonal.min():.1e} to {diagonal.max():.1e}.",
             Verdict.REPRODUCED,
         ),
@@ -97,7 +100,7 @@ def _lasso(model: ParametricModel, _: Array, trials: list[Trial]) -> list[Entry]
         Entry(
             "(B.1), (C.5)",
             "LASSO: squared error plus lambda times the distance to typical values, norm 1.",
-            ("impc.selection.lasso:proximal_lasso",),
+            ("impc.studies.selection.lasso:proximal_lasso",),
             f"With five free ({names}) the others are at their typical values to {distance:.0e}.",
             agrees(distance == 0),
         ),
@@ -105,7 +108,7 @@ def _lasso(model: ParametricModel, _: Array, trials: list[Trial]) -> list[Entry]
             "Table C.1",
             "Change lambda until the wanted number of parameters is farther than .005 from its"
             " typical value; bounded Nelder and Mead.",
-            ("impc.selection.lasso:table_c1",),
+            ("impc.studies.selection.lasso:table_c1",),
             "Run by `nelder_mead = true` and by `python -m experiments.selection_claims"
             " --nelder-mead`: docs/selection.md.",
             Verdict.IN_KIND,
@@ -126,7 +129,7 @@ def _selection(information: Information) -> list[Entry]:
         Entry(
             "(C.1) to (C.3)",
             "Selection matrices; the FIM of a subset is a submatrix.",
-            ("impc.selection.subsets:subset_variances",),
+            ("impc.studies.selection.subsets:subset_variances",),
             "Indices in place of matrices of zeros and ones.",
             Verdict.REPRODUCED,
         ),
@@ -134,7 +137,10 @@ def _selection(information: Information) -> list[Entry]:
             "(C.4)",
             "Most parameters such that the reciprocal condition number is above machine epsilon and"
             " the largest variance at most v; all 4083 subsets are tried.",
-            ("impc.selection.subsets:exhaustive", "impc.selection.subsets:largest_subsets"),
+            (
+                "impc.studies.selection.subsets:exhaustive",
+                "impc.studies.selection.subsets:largest_subsets",
+            ),
             f"All subsets in {1000 * seconds:.0f} ms: {len(all_of_them.subsets)} of size"
             f" {all_of_them.size} at v = .05, largest variance {worst:.3f}. Growing feasible sets"
             f" one by one finds {'the same' if same else 'others'}.",

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from experiments.reproduction.entry import Entry, Verdict, agrees, drawing, kind
-from impc.reliability.icc import icc
-from impc.reliability.measures import band_energy
+from impc.studies.reliability.icc import icc
+from impc.studies.reliability.measures import band_energy
 from plants.ternary import ternary_sequence
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ def _tables(result: dict[str, Any]) -> list[Entry]:
             "(2.1)",
             "Mean bandpass signal energy: frequency resolution times the sum of the power spectral"
             " density over the passband, the area under the curve.",
-            ("impc.reliability.measures:band_energy",),
+            ("impc.studies.reliability.measures:band_energy",),
             f"A sine of 2 deg has {energy:.4f} deg^2 (2 by Parseval: half the square).",
             agrees(abs(energy - 2) < 1e-9),
             "Whether `mean` carries another factor is lost.",
@@ -52,7 +52,7 @@ def _tables(result: dict[str, Any]) -> list[Entry]:
         Entry(
             "Table 2.1",
             "Height, weight and age of 19 females and 11 males.",
-            ("impc.commands.simulate_reliability",),
+            ("impc.cli.simulate_reliability",),
             "The simulated study draws subjects about 79.7 kg and 1.66 m.",
             Verdict.LOST,
             "The table's numbers are lost.",
@@ -60,7 +60,7 @@ def _tables(result: dict[str, Any]) -> list[Entry]:
         Entry(
             "Table 2.2",
             "ICC between visits of the RMS: excellent.",
-            ("impc.reliability.icc:icc", "impc.reliability.tables"),
+            ("impc.studies.reliability.icc:icc", "impc.studies.reliability.tables"),
             f"{rms[0]:.2f} to {rms[1]:.2f}. On the data of Shrout and Fleiss (1979): "
             f"{published[0]:.2f} and {published[1]:.2f} (.29 and .62 there).",
             kind(rms[0] >= _EXCELLENT),
@@ -69,7 +69,7 @@ def _tables(result: dict[str, Any]) -> list[Entry]:
         Entry(
             "Table 2.3",
             "ICC between visits of the bandpass energy: excellent.",
-            ("impc.reliability.icc:icc", "impc.reliability.tables"),
+            ("impc.studies.reliability.icc:icc", "impc.studies.reliability.tables"),
             f"{band[0]:.2f} to {band[1]:.2f}.",
             kind(band[0] >= _EXCELLENT),
             _STUDY,
@@ -77,7 +77,7 @@ def _tables(result: dict[str, Any]) -> list[Entry]:
         Entry(
             "Table 2.4",
             "CMC of the transfer functions within and between visits.",
-            ("impc.reliability.cmc:cmc_within", "impc.reliability.cmc:cmc_between"),
+            ("impc.studies.reliability.cmc:cmc_within", "impc.studies.reliability.cmc:cmc_between"),
             f"Within {within[0]:.3f} to {within[1]:.3f}, between {between[0]:.3f} to"
             f" {between[1]:.3f}.",
             kind(min(within[0], between[0]) > _EXCELLENT),
@@ -99,7 +99,10 @@ def _figures(result: dict[str, Any]) -> list[Entry]:
         Entry(
             "Figure 2.3",
             "Ternary torque of 5 N m and both angles of a trial.",
-            ("impc.reliability.figures:reliability_figures", "plants.ternary:ternary_torque"),
+            (
+                "impc.studies.reliability.figures:reliability_figures",
+                "plants.ternary:ternary_torque",
+            ),
             f"Sequence of {len(sequence)} steps; its second half is the negative of the first:"
             f" {'yes' if opposite else 'no'}.",
             kind(opposite),
@@ -110,7 +113,7 @@ def _figures(result: dict[str, Any]) -> list[Entry]:
             "Figure 2.4",
             "Power spectral densities of torque and angles; the passband has more than 3 % of the"
             " torque's greatest power.",
-            ("impc.reliability.measures:passband", "impc.reliability.figures"),
+            ("impc.studies.reliability.measures:passband", "impc.studies.reliability.figures"),
             f"Passband {band['low']:.2f} to {band['high']:.2f} Hz. Among excited frequencies: the"
             " sequence has no power at even harmonics, so no raw range is contiguous.",
             Verdict.IN_KIND,
@@ -120,7 +123,7 @@ def _figures(result: dict[str, Any]) -> list[Entry]:
         Entry(
             "Figure 2.5",
             "Transfer functions of one subject over three visits.",
-            ("impc.reliability.transfer:transfer_function",),
+            ("impc.studies.reliability.transfer:transfer_function",),
             "Amplitude and phase, from the torque to each angle, over the passband.",
             Verdict.IN_KIND,
             _STUDY,
@@ -129,7 +132,7 @@ def _figures(result: dict[str, Any]) -> list[Entry]:
         Entry(
             "Figure 2.6",
             "Transfer functions of three subjects.",
-            ("impc.reliability.transfer:transfer_function",),
+            ("impc.studies.reliability.transfer:transfer_function",),
             "The same for three subjects: they differ more than visits do.",
             Verdict.IN_KIND,
             _STUDY,
@@ -143,7 +146,7 @@ def _claims(result: dict[str, Any]) -> list[Entry]:
         Entry(
             "Claim, 2.3",
             item["statement"],
-            ("impc.reliability.findings:findings",),
+            ("impc.studies.reliability.findings:findings",),
             item["numbers"] + ".",
             kind(item["found"]),
             _STUDY
@@ -157,7 +160,10 @@ def _claims(result: dict[str, Any]) -> list[Entry]:
     learnt = Entry(
         "Claim, 2.3",
         "Learning: RMS fell over visits with eyes open and with vibration, energy with vibration.",
-        ("impc.reliability.anova:visit_anova", "impc.reliability.anova:learning_trend"),
+        (
+            "impc.studies.reliability.anova:visit_anova",
+            "impc.studies.reliability.anova:learning_trend",
+        ),
         f"Least of the twelve p values {least:.2f}.",
         kind(least <= _SIGNIFICANT),
         "The simulated subjects do not learn. " + _STUDY,
@@ -165,7 +171,7 @@ def _claims(result: dict[str, Any]) -> list[Entry]:
     protocol = Entry(
         "Claim, 2.2.2",
         "Normalisation: twice the critical stiffness, and the greatest torque that is survived.",
-        ("impc.protocols", "experiments.normalisation"),
+        ("impc.studies.protocols", "experiments.normalisation"),
         "`python -m experiments.normalisation` runs both on the simulated subject.",
         Verdict.IN_KIND,
         "Whether the last success or the first failure is the critical stiffness is not told; here"
@@ -174,7 +180,7 @@ def _claims(result: dict[str, Any]) -> list[Entry]:
     encoder = Entry(
         "Claim, 2.2.2",
         "Encoder and motion capture differ by 0.62 deg RMS.",
-        ("impc.reliability.measures:rms",),
+        ("impc.studies.reliability.measures:rms",),
         "A property of the apparatus.",
         Verdict.LOST,
         "It takes the apparatus.",
@@ -195,7 +201,7 @@ def _p_values(result: dict[str, Any], item: str, measure: str, quoted: str) -> E
         item,
         f"Means over visits, and p values of the analysis of variance (lower and upper body):"
         f" {quoted}.",
-        ("impc.reliability.anova:visit_anova", "impc.reliability.findings:QUOTED"),
+        ("impc.studies.reliability.anova:visit_anova", "impc.studies.reliability.findings:QUOTED"),
         f"p: {found}.",
         Verdict.LOST,
         "The means are lost; p values belong to the thirty subjects. The simulated ones do not"

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.selection_claims import bootstrap_widths, reduced_widths
-from impc.report.write import write_files
+from impc.reporting.writer import write_files
 
 __all__ = ["Evidence", "gather"]
 

@@ -7,28 +7,28 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from experiments.reproduction.entry import Entry, Verdict, agrees, kind
-from impc.bounds import box_bounds
-from impc.closed_loop import scenario, simulate
-from impc.controller import mpc_controller
+from impc.control.casadi_controller import build_mpc, simulate_mpc
+from impc.control.closed_loop import scenario, simulate
+from impc.control.controller import mpc_controller
+from impc.control.terminal_set import invariance_violation, maximal_invariant_set
 from impc.errors import InputError
-from impc.example import BOUND, CASES, HORIZON, STEPS
-from impc.inverse_mpc import infer_weights, inverse_mpc
-from impc.inverse_problem import inverse_problem
-from impc.lqr import solve_lqr
-from impc.mpc import build_mpc, simulate_mpc
-from impc.plant import as_plant
-from impc.recording import recording
-from impc.terminal_set import invariance_violation, maximal_invariant_set
-from impc.weights import cholesky_parameters, stage_weights, weights_from_parameters
+from impc.inverse.direct_and_reduced import infer_weights, inverse_mpc
+from impc.inverse.problem import inverse_problem
+from impc.model.bounds import box_bounds
+from impc.model.plant import as_plant
+from impc.model.recordings import recording
+from impc.model.riccati import solve_lqr
+from impc.model.weights import cholesky_parameters, stage_weights, weights_from_parameters
+from impc.studies.example.cases import BOUND, CASES, HORIZON, STEPS
 from plants import yalmip_example
 
 if TYPE_CHECKING:
     from experiments.reproduction.evidence import Evidence
     from impc.arrays import Array
-    from impc.bounds import Bounds
-    from impc.controller import Controller
-    from impc.inverse_mpc import Inference
-    from impc.plant import Plant
+    from impc.control.controller import Controller
+    from impc.inverse.direct_and_reduced import Inference
+    from impc.model.bounds import Bounds
+    from impc.model.plant import Plant
 
 __all__ = ["STAND_IN", "controller_entries", "example_entries"]
 
@@ -70,7 +70,11 @@ def controller_entries() -> list[Entry]:
             "(3.1)",
             "MPC: least x_N'Px_N + sum of x'Qx + u'Ru over N steps, inside the bounds, x_N in X_f;"
             " the first input is applied.",
-            ("impc.controller:mpc_controller", "impc.mpc:solve_mpc", "impc.closed_loop:simulate"),
+            (
+                "impc.control.controller:mpc_controller",
+                "impc.control.casadi_controller:solve_mpc",
+                "impc.control.closed_loop:simulate",
+            ),
             "The compiled loop and the program solved at every sample differ, over 20 steps of"
             " case B, by at most "
             + ", ".join(f"{gap:.0e} ({name})" for name, gap in gaps.items())
@@ -81,7 +85,7 @@ def controller_entries() -> list[Entry]:
             "(3.2)",
             "It is assumed that ... (the formula is lost; Q >= 0, R > 0, a stabilisable plant, and"
             " detectability fit the discussion).",
-            ("impc.weights:stage_weights", "impc.lqr:solve_lqr"),
+            ("impc.model.weights:stage_weights", "impc.model.riccati:solve_lqr"),
             f"Refused, in one line: {_refusal(np.diag([1.0, -1.0]), 1.0)}",
             Verdict.IN_KIND,
             "The formula is lost; the conditions are those under which (3.3) and (3.4) exist.",
@@ -89,7 +93,7 @@ def controller_entries() -> list[Entry]:
         Entry(
             "(3.3)",
             "LQR gain K of (Q, R); u = -Kx.",
-            ("impc.lqr:solve_lqr",),
+            ("impc.model.riccati:solve_lqr",),
             f"K = [{lqr.K[0, 0]:.5f} {lqr.K[0, 1]:.5f}]; 200 steps of dynamic programming give"
             f" the same to {gain_gap:.0e}.",
             agrees(gain_gap < 1e-9),
@@ -97,14 +101,14 @@ def controller_entries() -> list[Entry]:
         Entry(
             "(3.4)",
             "P solves the discrete algebraic Riccati equation, and is the terminal weight.",
-            ("impc.lqr:solve_lqr",),
+            ("impc.model.riccati:solve_lqr",),
             f"200 steps of dynamic programming give the same P to {riccati_gap:.0e}.",
             agrees(riccati_gap < 1e-9),
         ),
         Entry(
             "Claim, 3.2",
             "X_f is the maximal positive invariant set of the closed loop inside the bounds.",
-            ("impc.terminal_set:maximal_invariant_set",),
+            ("impc.control.terminal_set:maximal_invariant_set",),
             f"{len(terminal.h)} rows, reached after {terminal.determinedness} step; a trajectory"
             f" from inside leaves by at most {invariance_violation(terminal):.0e}.",
             agrees(invariance_violation(terminal) < 1e-9),
@@ -113,7 +117,10 @@ def controller_entries() -> list[Entry]:
             "(3.5)",
             "(Q, R, P) that minimise w1 |vec(Y - Y_ref)| + w2 c kappa, with P from (3.4). Solutions"
             " form a manifold: multiples (aQ, aR, aP) are solutions too.",
-            ("impc.conditioned_fit:conditioned_fit", "impc.inverse_mpc:inverse_mpc"),
+            (
+                "impc.inverse.proximal_search:conditioned_fit",
+                "impc.inverse.direct_and_reduced:inverse_mpc",
+            ),
             f"Inputs with (7Q, 7R) differ by {ray:.0e}. The manifold is larger than multiples: with"
             " one input the law depends on the weights through K alone (docs/theory.md).",
             agrees(ray < 1e-12),
@@ -121,7 +128,10 @@ def controller_entries() -> list[Entry]:
         Entry(
             "(3.6)",
             "The same with R = 1, Q = LL', L lower triangular with positive diagonal.",
-            ("impc.inverse_mpc:inverse_mpc", "impc.weights:cholesky_parameters"),
+            (
+                "impc.inverse.direct_and_reduced:inverse_mpc",
+                "impc.model.weights:cholesky_parameters",
+            ),
             f"From Q = diag(2, 0.5): Q = I to {off:.0e}; L and back:"
             f" {float(np.max(np.abs(factor.Q - np.eye(2)))):.0e}.",
             agrees(off < 1e-6),
@@ -130,7 +140,7 @@ def controller_entries() -> list[Entry]:
             "(3.7)",
             "Auxiliary problem: weights with a gain near the estimated one, and a small condition"
             " number; where inverse MPC starts.",
-            ("impc.inverse_mpc:auxiliary_weights",),
+            ("impc.inverse.direct_and_reduced:auxiliary_weights",),
             "Used on the gradient branch; its result in the example is under (3.14).",
             Verdict.IN_KIND,
             "Whether the gain estimated from data or the one of the gradient problem is fitted is"
@@ -139,7 +149,10 @@ def controller_entries() -> list[Entry]:
         Entry(
             "Table 3.1",
             "The algorithm: gain, LMI; where infeasible gradient and (3.7); then (3.6).",
-            ("impc.inverse_mpc:infer_weights", "impc.inverse_mpc:starting_point"),
+            (
+                "impc.inverse.direct_and_reduced:infer_weights",
+                "impc.inverse.direct_and_reduced:starting_point",
+            ),
             "; ".join(
                 f"case {case}: {'LMI' if inference.start.lmi.feasible else 'gradient'} branch,"
                 f" Q = I to {np.max(np.abs(inference.fit.weights.Q - np.eye(2))):.0e}"
@@ -154,7 +167,7 @@ def controller_entries() -> list[Entry]:
         Entry(
             "Figure 3.1",
             "Block diagram of the loop with MPC, and of the two levels.",
-            ("impc.inverse_mpc",),
+            ("impc.inverse.direct_and_reduced",),
             "docs/architecture.md has the drawing of this package.",
             Verdict.IN_KIND,
             "A drawing of structure, not a result.",
@@ -177,14 +190,14 @@ def example_entries(evidence: Evidence) -> list[Entry]:
         Entry(
             "(3.9)",
             "True weights Q = I, R = 1, so that the condition number is least.",
-            ("impc.example:true_weights",),
+            ("impc.studies.example.cases:true_weights",),
             f"Condition number {case['truth']['condition_number']:g}.",
             Verdict.REPRODUCED,
         ),
         Entry(
             "(3.10)",
             "Residual between estimated and true matrices.",
-            ("impc.weights:residual",),
+            ("impc.model.weights:residual",),
             "; ".join(f"{name} {value:.2g}" for name, value in residuals.items()) + ".",
             Verdict.IN_KIND,
             "Which norm is lost; here that of Frobenius of blkdiag(Q, R).",
@@ -205,7 +218,7 @@ def example_entries(evidence: Evidence) -> list[Entry]:
             "(3.15)",
             "Inverse MPC estimated the weights accurately; its residual is below that of inverse"
             " LQR.",
-            ("impc.inverse_mpc:inverse_mpc",),
+            ("impc.inverse.direct_and_reduced:inverse_mpc",),
             f"Residual {mpc['residual']:.1e}; the least of inverse LQR is {least_lqr:.2g}."
             " The recording determines two of three directions, the condition number chose the"
             " third, which falls on the truth because Q = I has the least there is.",
@@ -214,7 +227,7 @@ def example_entries(evidence: Evidence) -> list[Entry]:
         Entry(
             "(3.16)",
             "Inverse LQR with the penalty on outputs in place of gains.",
-            ("impc.inverse_mpc:output_penalty_weights",),
+            ("impc.inverse.direct_and_reduced:output_penalty_weights",),
             f"Misfit of the states {output['state_misfit']:.3f}.",
             Verdict.IN_KIND,
             "Weights w1, w2 and c are lost.",
@@ -227,7 +240,7 @@ def example_entries(evidence: Evidence) -> list[Entry]:
         Entry(
             "Figure 3.2",
             "States and control with the estimated gain against the reference.",
-            ("impc.report.example_figures",),
+            ("impc.studies.example.figures",),
             f"Good states (misfit {gain['state_misfit']:.3f}); largest |u|"
             f" {gain['max_abs_u']:.3f} against {BOUND:g}.",
             kind(gain["max_abs_u"] > BOUND),
@@ -237,7 +250,7 @@ def example_entries(evidence: Evidence) -> list[Entry]:
         Entry(
             "Figure 3.3",
             "States and control of inverse MPC: a perfect fit.",
-            ("impc.report.example_figures",),
+            ("impc.studies.example.figures",),
             f"Misfit {mpc['state_misfit']:.0e}.",
             kind(mpc["state_misfit"] < 1e-9),
             _LOST_SYSTEM,
@@ -246,7 +259,7 @@ def example_entries(evidence: Evidence) -> list[Entry]:
         Entry(
             "Figure 3.4",
             "States and control of (3.16): worse than figure 3.2.",
-            ("impc.report.example_figures",),
+            ("impc.studies.example.figures",),
             f"Misfit {output['state_misfit']:.3f} against {gain['state_misfit']:.3f}.",
             kind(output["state_misfit"] > gain["state_misfit"]),
             _LOST_SYSTEM,
@@ -255,7 +268,7 @@ def example_entries(evidence: Evidence) -> list[Entry]:
         Entry(
             "Claim, 3.4",
             "The input saturates in the simulation.",
-            ("impc.example:run_case",),
+            ("impc.studies.example.cases:run_case",),
             f"{saturated} of {STEPS} samples.",
             kind(saturated > 0),
             _LOST_SYSTEM,
@@ -263,7 +276,7 @@ def example_entries(evidence: Evidence) -> list[Entry]:
         Entry(
             "Claim, 3.4",
             "Feedback gain and inverse LQR exceed the bound; inverse MPC does not.",
-            ("impc.example:run_case",),
+            ("impc.studies.example.cases:run_case",),
             f"Largest |u|: gain {gain['max_abs_u']:.3f}, (3.16) {output['max_abs_u']:.3f}, inverse"
             f" MPC {mpc['max_abs_u']:.3f}.",
             kind(
@@ -275,7 +288,7 @@ def example_entries(evidence: Evidence) -> list[Entry]:
         Entry(
             "Claim, 3.4",
             "The LMI is infeasible.",
-            ("impc.inverse_lqr:inverse_lqr_lmi",),
+            ("impc.inverse.inverse_lqr:inverse_lqr_lmi",),
             f"Branch of case A: {case['branch']}; B takes the other one.",
             kind(case["branch"] == "gradient"),
             _LOST_SYSTEM,
@@ -283,7 +296,10 @@ def example_entries(evidence: Evidence) -> list[Entry]:
         Entry(
             "Claim, 3.3",
             "Minimising the condition number addresses the uniqueness of the solution.",
-            ("impc.identifiability:identifiability", "impc.equivalent_weights"),
+            (
+                "impc.assess.identified_directions:identifiability",
+                "impc.inverse.equivalent_weights",
+            ),
             f"{case['identifiability']['rank']} of {case['identifiability']['free']} directions"
             " are determined; the condition number chooses the rest, and its choice depends on the"
             " units of the states (docs/equivalent-weights.md).",
@@ -294,7 +310,7 @@ def example_entries(evidence: Evidence) -> list[Entry]:
 
 
 def _stand_in(item: str, says: str, found: str) -> Entry:
-    return Entry(item, says, ("impc.example",), found, Verdict.LOST, _LOST_SYSTEM)
+    return Entry(item, says, ("impc.studies.example.cases",), found, Verdict.LOST, _LOST_SYSTEM)
 
 
 def _dynamic_programming(A: Array, B: Array) -> tuple[Array, Array]:

@@ -9,8 +9,8 @@ import numpy as np
 import plants
 from experiments.reproduction.entry import Entry, Verdict, agrees, kind
 from experiments.selection_claims import mean_subject
-from impc.selection.fisher import fisher_information
-from impc.selection.modern import with_doubled_ranges
+from impc.studies.selection.fisher import fisher_information
+from impc.studies.selection.modern import with_doubled_ranges
 
 if TYPE_CHECKING:
     from experiments.reproduction.evidence import Evidence
@@ -44,14 +44,14 @@ def _key_equations(yaw: dict[str, Any]) -> list[Entry]:
         Entry(
             "(5.2), (5.3)",
             "Least squares over three trials; VAF.",
-            ("impc.selection.estimation:estimate",),
+            ("impc.studies.selection.estimation:estimate",),
             "As (4.3) to (4.5).",
             Verdict.REPRODUCED,
         ),
         Entry(
             "(5.4), (5.5)",
             "Largest subsets whose variance is below v for every subject and visit.",
-            ("impc.selection.subsets:largest_subsets",),
+            ("impc.studies.selection.subsets:largest_subsets",),
             f"At v = .35: {len(yaw['candidates'])} subsets of {yaw['size']}, largest variance"
             f" {worst:.2g}.",
             agrees(worst <= 0.35),
@@ -59,7 +59,10 @@ def _key_equations(yaw: dict[str, Any]) -> list[Entry]:
         Entry(
             "(5.6), (5.7)",
             "Reliability of a subset: its least ICC(A,k); at least .75.",
-            ("impc.selection.key_parameters:key_parameters", "impc.reliability.icc:icc"),
+            (
+                "impc.studies.selection.key_parameters:key_parameters",
+                "impc.studies.reliability.icc:icc",
+            ),
             f"Least of all candidates {least:.2f}.",
             Verdict.REPRODUCED,
         ),
@@ -71,7 +74,7 @@ def _key_tables(yaw: dict[str, Any], pitch: dict[str, Any]) -> list[Entry]:
         Entry(
             "Table 5.1",
             "Height, weight and age of forty subjects.",
-            ("impc.commands.simulate_head_tracking",),
+            ("impc.cli.simulate_head_tracking",),
             "-",
             Verdict.LOST,
             "The table's numbers are lost.",
@@ -90,7 +93,7 @@ def _key_tables(yaw: dict[str, Any], pitch: dict[str, Any]) -> list[Entry]:
             "Table 5.5",
             "The sensitive subsets and their ICC. Yaw: 9 in all, size 3 first at .35. Pitch: 16 in"
             " all, 6 of size 3 by .35.",
-            ("impc.selection.key_report:key_files",),
+            ("impc.studies.selection.key_report:key_files",),
             f"Yaw: {_counts(yaw)}. Pitch: {_counts(pitch)}.",
             Verdict.NOT,
             "Sizes and numbers depend on the subjects. " + _FORTY,
@@ -114,7 +117,7 @@ def _key_tables(yaw: dict[str, Any], pitch: dict[str, Any]) -> list[Entry]:
         Entry(
             "Figure 5.3",
             "The solution space, yaw.",
-            ("impc.selection.key_report:key_files",),
+            ("impc.studies.selection.key_report:key_files",),
             f"Sizes {_sizes(yaw)} (dissertation 2 to 3).",
             Verdict.IN_KIND,
             _FORTY,
@@ -123,7 +126,7 @@ def _key_tables(yaw: dict[str, Any], pitch: dict[str, Any]) -> list[Entry]:
         Entry(
             "Figure 5.3",
             "The solution space, pitch.",
-            ("impc.selection.key_report:key_files",),
+            ("impc.studies.selection.key_report:key_files",),
             f"Sizes {_sizes(pitch)} (dissertation 2 to 4).",
             Verdict.IN_KIND,
             _FORTY,
@@ -143,7 +146,7 @@ def _key_claims(yaw: dict[str, Any], pitch: dict[str, Any]) -> list[Entry]:
         Entry(
             "Claim, 5.3",
             "Three key parameters of twelve, in yaw and in pitch (names lost).",
-            ("impc.selection.key_parameters:key_parameters",),
+            ("impc.studies.selection.key_parameters:key_parameters",),
             "; ".join(f"{name}: {', '.join(axis['chosen'])}" for name, axis in both.items()) + ".",
             kind(all(len(axis["chosen"]) == 3 for axis in both.values())),
             _FORTY,
@@ -151,7 +154,7 @@ def _key_claims(yaw: dict[str, Any], pitch: dict[str, Any]) -> list[Entry]:
         Entry(
             "Claim, 5.3",
             "Feasible at ICC of .75: one in yaw (diversity 2), three in pitch (3, 2, 2).",
-            ("impc.selection.key_parameters:key_parameters",),
+            ("impc.studies.selection.key_parameters:key_parameters",),
             "; ".join(
                 f"{name}: {len(items)} (diversity {', '.join(str(i['diversity']) for i in items)})"
                 for name, items in kept.items()
@@ -164,7 +167,7 @@ def _key_claims(yaw: dict[str, Any], pitch: dict[str, Any]) -> list[Entry]:
         Entry(
             "Claim, 5.3",
             "Mean VAF above 69 %.",
-            ("impc.selection.key_parameters:key_parameters",),
+            ("impc.studies.selection.key_parameters:key_parameters",),
             "; ".join(
                 f"{name}: {min(i['vaf'] for i in items):.1f} to"
                 f" {max(i['vaf'] for i in items):.1f} %"
@@ -177,7 +180,7 @@ def _key_claims(yaw: dict[str, Any], pitch: dict[str, Any]) -> list[Entry]:
         Entry(
             "Claim, 5.3",
             "Sensitive parameters are more reliable than all twelve.",
-            ("impc.selection.key_report:key_files",),
+            ("impc.studies.selection.key_report:key_files",),
             "; ".join(
                 f"{name}: least ICC {_least(axis, 'chosen'):.2f} of the chosen,"
                 f" {_least(axis, 'nominal'):.2f} of all twelve"
@@ -191,7 +194,7 @@ def _key_claims(yaw: dict[str, Any], pitch: dict[str, Any]) -> list[Entry]:
             "Claim, 5.4",
             "Pathways of the subsets: visual 7, proprioceptive 6, vestibular 5, intrinsic 0 of 9"
             " in yaw; 14, 9, 13, 0 of 16 in pitch. The visual delay is in 6 and 14.",
-            ("impc.selection.key_report:key_files",),
+            ("impc.studies.selection.key_report:key_files",),
             "; ".join(f"{name}: {text}" for name, (text, _) in shares.items()) + ".",
             kind(all(intrinsic == 0 for _, intrinsic in shares.values())),
             "Found: the intrinsic pathway is in none. The other counts are the subjects'. "
@@ -200,7 +203,7 @@ def _key_claims(yaw: dict[str, Any], pitch: dict[str, Any]) -> list[Entry]:
         Entry(
             "Claim, 5.4",
             "Widening the bounds of a parameter makes it look more sensitive.",
-            ("impc.selection.modern:with_doubled_ranges",),
+            ("impc.studies.selection.modern:with_doubled_ranges",),
             f"With doubled ranges the normalised information is {doubled:.2f} times as large, the"
             " variance a quarter; the page of `impc select` has the selection that follows.",
             agrees(abs(doubled - 4) < 1e-9),
@@ -222,7 +225,7 @@ def _estimates(item: str, axis: str, result: dict[str, Any], quoted: str) -> Ent
     return Entry(
         item,
         f"{axis}: estimates of all and of the key parameters, by visit; {quoted}.",
-        ("impc.selection.key_report:key_files",),
+        ("impc.studies.selection.key_report:key_files",),
         f"ICC(A,k): {told}.",
         Verdict.LOST,
         "The estimates are lost. " + _FORTY,

@@ -9,9 +9,9 @@ import control
 import numpy as np
 
 from experiments.reproduction.entry import Entry, Verdict, agrees, drawing, kind
-from impc.agreement import vaf
-from impc.inverse_lqr import inverse_lqr_lmi
-from impc.plant import as_plant
+from impc.assess.vaf import vaf
+from impc.inverse.inverse_lqr import inverse_lqr_lmi
+from impc.model.plant import as_plant
 from plants.actuation import delayed_muscle
 from plants.seated_balance import (
     SeatedBalanceParameters,
@@ -88,7 +88,7 @@ def _subject(fit: dict[str, Any], truth: dict[str, Any]) -> list[Entry]:
         Entry(
             "(3.19)",
             "Parameters estimated beside the gains: inertias, lengths, delay, muscle constant.",
-            ("impc.preliminary:preliminary_gain", "impc.plant_family"),
+            ("impc.assess.delayed_feedback:preliminary_gain", "impc.model.plant_family"),
             "Any parameter of a plant function may be freed ([fit] free); in this fit none is.",
             Verdict.LOST,
             "The estimates are lost.",
@@ -96,7 +96,7 @@ def _subject(fit: dict[str, Any], truth: dict[str, Any]) -> list[Entry]:
         Entry(
             "(3.20)",
             "K = [K4, 0]: feedback of angles and rates only, estimated first.",
-            ("impc.preliminary:preliminary_gain",),
+            ("impc.assess.delayed_feedback:preliminary_gain",),
             "[fit] feedback_states does it. It stabilises the seat; with a delay of 80 ms the"
             " gains of the other six states are not zero for any weights we know of.",
             Verdict.IN_KIND,
@@ -105,7 +105,10 @@ def _subject(fit: dict[str, Any], truth: dict[str, Any]) -> list[Entry]:
         Entry(
             "(3.21)",
             "The LQR gain nearest to the estimated one.",
-            ("impc.inverse_mpc:auxiliary_weights", "impc.inverse_lqr:inverse_lqr_gradient"),
+            (
+                "impc.inverse.direct_and_reduced:auxiliary_weights",
+                "impc.inverse.inverse_lqr:inverse_lqr_gradient",
+            ),
             f"From the unbounded estimate: VAF {_both(fit, 'inverse_lqr_gain')} % where that"
             f" estimate itself has {_both(fit, 'feedback_gain')} %.",
             Verdict.LOST,
@@ -114,7 +117,7 @@ def _subject(fit: dict[str, Any], truth: dict[str, Any]) -> list[Entry]:
         Entry(
             "(3.22)",
             "Bounds on angles and rates from the data, on the torque half the lateral strength.",
-            ("impc.fit_settings",),
+            ("impc.studies.fit.settings",),
             f"[fit] bounded_states with a margin, u_max; here {fit['bounds']['u_max'][0]:g} N m.",
             Verdict.IN_KIND,
             "Half the lateral strength, 70 N m, is never reached under a perturbation of 5 N m, so"
@@ -123,7 +126,7 @@ def _subject(fit: dict[str, Any], truth: dict[str, Any]) -> list[Entry]:
         Entry(
             "Figure 3.7",
             "Measured and simulated angles.",
-            ("impc.report.fit_figures",),
+            ("impc.studies.fit.figures",),
             f"VAF {both[0]:.2f} and {both[1]:.2f} %.",
             kind(min(both) > 90),
             _SUBJECT,
@@ -132,14 +135,14 @@ def _subject(fit: dict[str, Any], truth: dict[str, Any]) -> list[Entry]:
         Entry(
             "(3.24)",
             "VAF = (1 - sum (y - yhat)^2 / sum y^2) 100 %.",
-            ("impc.agreement:vaf", "impc.agreement:centred_vaf"),
+            ("impc.assess.vaf:vaf", "impc.assess.vaf:centred_vaf"),
             f"A simulation 10 % too small has {_ten_per_cent():.2f} % (99 by hand).",
             agrees(abs(_ten_per_cent() - 99) < 1e-9),
         ),
         Entry(
             "(3.25)",
             "VAF of the inferred intent.",
-            ("impc.fit_recordings",),
+            ("impc.studies.fit.subject",),
             f"{both[0]:.2f} and {both[1]:.2f} %; with trials left out"
             f" {fit['held_out_vaf']['theta1']:.2f} and {fit['held_out_vaf']['theta2']:.2f} %.",
             Verdict.LOST,
@@ -148,7 +151,7 @@ def _subject(fit: dict[str, Any], truth: dict[str, Any]) -> list[Entry]:
         Entry(
             "Claim, 3.5.3",
             "The LMI is infeasible for the estimated gain.",
-            ("impc.inverse_lqr:inverse_lqr_lmi",),
+            ("impc.inverse.inverse_lqr:inverse_lqr_lmi",),
             f"For the gain estimated without bounds: {lmi.status}."
             f" That gain needs {start['largest_input'][0]:.1f} N m where the subject has"
             f" {fit['bounds']['u_max'][0]:g}; its gain of the lower angle is"
@@ -173,14 +176,18 @@ def _intent(fit: dict[str, Any], truth: dict[str, Any]) -> list[Entry]:
         Entry(
             "(3.23)",
             "x = Tz with the eigenvectors of Q: T'QT is diagonal.",
-            ("impc.intent:intent",),
+            ("impc.assess.intent_rules:intent",),
             f"Off the diagonal at most {off:.0e} of the largest eigenvalue, {values[-1]:.2e}.",
             agrees(off < 1e-9),
         ),
         Entry(
             "(3.26)",
             "The dominant cost: a sum of angles and rates of one sign, angles above rates.",
-            ("impc.intent:intent", "impc.equivalent_weights", "impc.weights_set"),
+            (
+                "impc.assess.intent_rules:intent",
+                "impc.inverse.equivalent_weights",
+                "impc.assess.bounded_weights",
+            ),
             f"{fit['intent']['sentence']} Between rules for choosing Q, all with the same"
             f" gain, this direction turns by up to {max(angles):.0f} degrees"
             f" ({len(readings)} rules).",
@@ -193,7 +200,7 @@ def _intent(fit: dict[str, Any], truth: dict[str, Any]) -> list[Entry]:
         Entry(
             "Claim, 3.6",
             "The delay states come second in the intent.",
-            ("impc.intent:intent",),
+            ("impc.assess.intent_rules:intent",),
             f"Second eigenvalue {values[-2]:.2e}; true ones {true_values[-1]:.2e},"
             f" {true_values[-2]:.2e}.",
             Verdict.NOT,
@@ -203,7 +210,7 @@ def _intent(fit: dict[str, Any], truth: dict[str, Any]) -> list[Entry]:
         Entry(
             "Claim, 3.6",
             "The states were penalised much more than the control effort.",
-            ("impc.intent:intent",),
+            ("impc.assess.intent_rules:intent",),
             f"Largest eigenvalue {values[-1]:.1e} rad^-2 against R = 1 (N m)^-2.",
             Verdict.IN_KIND,
             "The ratio has units: with angles in degrees it is smaller by 3283.",
@@ -211,7 +218,7 @@ def _intent(fit: dict[str, Any], truth: dict[str, Any]) -> list[Entry]:
         Entry(
             "Claim, 3.6",
             "(A, B, Q^(1/2)) is reachable and observable.",
-            ("impc.lqr:solve_lqr",),
+            ("impc.model.riccati:solve_lqr",),
             f"Least eigenvalue of Q {values[0]:.2g}: Q > 0 makes it observable.",
             kind(values[0] > 0),
             _SUBJECT,

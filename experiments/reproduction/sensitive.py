@@ -9,14 +9,14 @@ import numpy as np
 import plants
 from experiments.reproduction.entry import Entry, Verdict, agrees, kind
 from experiments.selection_claims import FIM_SUBSET, mean_subject, nominal_information
-from impc.selection.estimation import estimate, free_indices, pooled_vaf
-from impc.selection.model import normalised, physical
-from impc.selection.subsets import exhaustive, largest_subsets
+from impc.studies.selection.estimation import estimate, free_indices, pooled_vaf
+from impc.studies.selection.model import normalised, physical
+from impc.studies.selection.subsets import exhaustive, largest_subsets
 
 if TYPE_CHECKING:
     from experiments.reproduction.evidence import Evidence
-    from impc.selection.fisher import Information
-    from impc.selection.model import ParametricModel
+    from impc.studies.selection.fisher import Information
+    from impc.studies.selection.model import ParametricModel
 
 __all__ = ["STAND_IN", "sensitive_entries"]
 
@@ -55,7 +55,7 @@ def _equations() -> list[Entry]:
         Entry(
             "(4.2)",
             "Normalised parameter: offset and gain bring the bounds to -1 and 1.",
-            ("impc.selection.model:normalised",),
+            ("impc.studies.selection.model:normalised",),
             f"Bounds become {normalised(model, np.array(model.low))[0]:g} and"
             f" {normalised(model, np.array(model.high))[0]:g}; there and back to {there:.0e}.",
             agrees(there < 1e-12),
@@ -63,7 +63,7 @@ def _equations() -> list[Entry]:
         Entry(
             "(4.3), (4.5)",
             "Least squares of the error, over one trial and over all three.",
-            ("impc.selection.estimation:estimate",),
+            ("impc.studies.selection.estimation:estimate",),
             f"From the true values the five of the FIM move to VAF {fit.vaf[0]:.2f} %, where the"
             f" truth has {closed:.2f}.",
             agrees(fit.vaf[0] >= closed),
@@ -71,7 +71,7 @@ def _equations() -> list[Entry]:
         Entry(
             "(4.4)",
             "VAF.",
-            ("impc.selection.estimation:pooled_vaf",),
+            ("impc.studies.selection.estimation:pooled_vaf",),
             f"{closed:.2f} % at the truth, with noise made for 82.65 %.",
             agrees(abs(closed - 82.65) < 1),
         ),
@@ -92,7 +92,7 @@ def _tables(
         Entry(
             "Table 4.1",
             "Height, weight and age of ten subjects.",
-            ("impc.commands.simulate_head_tracking",),
+            ("impc.cli.simulate_head_tracking",),
             "-",
             Verdict.LOST,
             "The table's numbers are lost.",
@@ -131,7 +131,7 @@ def _tables(
         Entry(
             "Figure 4.2",
             "Best fits of a trial with FIM-5 and LASSO-5.",
-            ("impc.selection.report:selection_files",),
+            ("impc.studies.selection.report:selection_files",),
             f"Mean VAF {fim:.2f} and {lasso:.2f} %.",
             kind(abs(fim - lasso) < 1),
             _TEN,
@@ -139,14 +139,14 @@ def _tables(
         Entry(
             "Figure 4.3",
             "Model-based bootstrap with 1000 replicates.",
-            ("impc.selection.bootstrap:bootstrap_subset",),
+            ("impc.studies.selection.bootstrap:bootstrap_subset",),
             "The same, with a block draw for coloured residuals; the number is a setting.",
             Verdict.REPRODUCED,
         ),
         Entry(
             "Figure 4.4",
             "Size and number of the subsets for ten bounds from .05 to .95: 3 to 5 parameters.",
-            ("impc.selection.subsets:sweep",),
+            ("impc.studies.selection.subsets:sweep",),
             f"{min(sizes)} to {max(sizes)} by the worst case over subjects; at the nominal column"
             f" five at .05, first {first}.",
             kind(min(sizes) == 3),
@@ -185,7 +185,10 @@ def _claims(
         Entry(
             "Claim, 4.3",
             "FIM selects {Kvis, Kccr, tau, tau1A, tauCNS1}, five of twelve.",
-            ("impc.selection.subsets:largest_subsets", "impc.selection.analysis:select_study"),
+            (
+                "impc.studies.selection.subsets:largest_subsets",
+                "impc.studies.selection.analysis:select_study",
+            ),
             f"At the nominal column number {place} of {len(selection.subsets)} subsets of"
             f" {selection.size}. In our cohort, common to all: {', '.join(fim)}.",
             kind(selection.size == 5),
@@ -194,7 +197,7 @@ def _claims(
         Entry(
             "Claim, 4.3",
             "LASSO selects five, {Kvis, Kvcr, Kccr, tau, tauC}; three are common to both.",
-            ("impc.selection.lasso:lasso_of_size", "impc.selection.lasso:table_c1"),
+            ("impc.studies.selection.lasso:lasso_of_size", "impc.studies.selection.lasso:table_c1"),
             f"LASSO {', '.join(lasso)}; common {', '.join(common)}.",
             Verdict.NOT,
             "Which parameters lie far from their typical values is the subjects' own. " + _TEN,
@@ -202,7 +205,7 @@ def _claims(
         Entry(
             "Claim, 4.3",
             "Estimating twelve gains nothing: VAF 82.26 (12), 82.65 (FIM), 81.87 % (LASSO).",
-            ("impc.selection.estimation:pooled_vaf",),
+            ("impc.studies.selection.estimation:pooled_vaf",),
             f"{vafs[0]:.2f}, {vafs[1]:.2f}, {vafs[2]:.2f} %. (Five parameters cannot explain more"
             " than twelve that include them: the dissertation's nominal fits had stopped early.)",
             kind(vafs[0] - vafs[1] < 1),
@@ -211,7 +214,7 @@ def _claims(
         Entry(
             "Claim, 4.3",
             "FIM is 164 times faster than LASSO.",
-            ("impc.selection.analysis:select_study", "experiments.selection_claims"),
+            ("impc.studies.selection.analysis:select_study", "experiments.selection_claims"),
             f"{ratio:.0f} times, against the proximal LASSO.",
             kind(ratio > 10),
             "Another solver on another machine; Table C.1 itself: docs/selection.md.",
@@ -219,7 +222,7 @@ def _claims(
         Entry(
             "Claim, 4.1",
             "4083 subsets of two parameters or more.",
-            ("impc.selection.subsets:exhaustive",),
+            ("impc.studies.selection.subsets:exhaustive",),
             f"2^12 - 1 - 12 = {2**12 - 1 - 12}.",
             Verdict.REPRODUCED,
         ),
@@ -227,7 +230,7 @@ def _claims(
             "Claim, 4.4",
             "Estimating all twelve stops in a randomly found local minimum, by poor"
             " identifiability.",
-            ("impc.selection.fisher:unseen_scalings",),
+            ("impc.studies.selection.fisher:unseen_scalings",),
             f"Explained: rank {information.rank} of 12 at the nominal column. The five torque gains"
             " may be scaled together unseen, so minima are not isolated.",
             agrees(information.rank < 12),
@@ -235,7 +238,10 @@ def _claims(
         Entry(
             "Claim, 4.2.4",
             "Bootstrap intervals, from the 2.5th to the 97.5th percentile.",
-            ("impc.selection.bootstrap:bootstrap_subset", "impc.selection.modern:profile_interval"),
+            (
+                "impc.studies.selection.bootstrap:bootstrap_subset",
+                "impc.studies.selection.modern:profile_interval",
+            ),
             "First subject: "
             + "; ".join(
                 f"{name} {item['low']:.3g} to {item['high']:.3g}" for name, item in first.items()

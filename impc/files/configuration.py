@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 import msgspec
 
 from impc.errors import InputError
-from impc.files.door import require_ordinary, shown
+from impc.files.names import require_ordinary, shown
 from impc.files.units import si_unit
 
 if TYPE_CHECKING:

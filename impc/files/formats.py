@@ -12,9 +12,9 @@ from impc.errors import DataError, ImpcError, InputError, OutputError
 from impc.files.apart import read_apart
 from impc.files.c3d_analog import encode_c3d
 from impc.files.delimited import encode_delimited, read_delimited
-from impc.files.door import LARGEST, damaged, require_ordinary
 from impc.files.matlab import encode_matlab
 from impc.files.matlab73 import HDF5_SIGNATURE, matlab73_bytes
+from impc.files.names import LARGEST, damaged, require_ordinary
 from impc.files.tdms import encode_tdms
 
 if TYPE_CHECKING:

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from impc.errors import ImpcError
-from impc.files.door import damaged, shown
+from impc.files.names import damaged, shown
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -19,7 +19,7 @@ from impc.files.configuration import UNKNOWN_UNIT
 from impc.files.formats import read_table
 from impc.files.resampling import held_means, instants, resampled_samples, same_rate
 from impc.files.units import si_unit
-from impc.recording import Label, recording
+from impc.model.recordings import Label, recording
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from impc.files.configuration import Configuration, RecordingTable, SignalTable
     from impc.files.table import Table
     from impc.files.units import Unit
-    from impc.plant import Plant
-    from impc.recording import Recording
+    from impc.model.plant import Plant
+    from impc.model.recordings import Recording
 
 __all__ = ["read_recordings", "recording_of"]
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from impc.arrays import Frozen, frozen
 from impc.errors import DataError
-from impc.files.door import shown
+from impc.files.names import shown
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -7,9 +7,9 @@ import re
 from dataclasses import dataclass
 from typing import Any
 
-from impc.door import checked
+from impc.checking import checked
 from impc.errors import InputError
-from impc.files.door import shown
+from impc.files.names import shown
 
 __all__ = ["Unit", "is_unit", "si_unit"]
 

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from impc.cohort.study import StudyTable
 from impc.files.configuration import read_configuration
-from impc.fit_settings import fit_settings
-from impc.selection.settings import select_settings
+from impc.studies.cohort.study import StudyTable
+from impc.studies.fit.settings import fit_settings
+from impc.studies.selection.settings import select_settings
 
 if TYPE_CHECKING:
     from pathlib import Path

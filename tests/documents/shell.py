@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 
 from click.testing import CliRunner
 
-from impc.cli import main
+from impc.cli.main import main
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -26,7 +26,9 @@ _ENVIRONMENT = "makes an environment; the tests run inside one"
 _WHOLE = "runs what these tests are a part of"
 _SITE = "builds the site: four minutes"
 _PUBLISH = "publishes, or needs a network"
-_CERTIFICATES = "needs openssl; tests/cohort/test_cluster.py runs these lines where it is there"
+_CERTIFICATES = (
+    "needs openssl; tests/studies/cohort/test_cluster.py runs these lines where it is there"
+)
 _CLUSTER = "needs machines of a cluster; tests/cohort starts a scheduler and workers of its own"
 
 #: (page, line) -> why it is not run.
@@ -43,7 +45,7 @@ NOT_RUN = {
     ("docs/contributing.md", "make search"): _WHOLE,
     ("docs/contributing.md", "make numerics"): _WHOLE,
     ("docs/contributing.md", "python -m pytest tests/documents -k start"): _WHOLE,
-    ("docs/contributing.md", "python -m pytest tests/test_lqr.py"): _WHOLE,
+    ("docs/contributing.md", "python -m pytest tests/model/test_riccati.py"): _WHOLE,
     ("docs/contributing.md", "make docs"): _SITE,
     (
         "docs/contributing.md",
@@ -78,7 +80,7 @@ NOT_RUN = {
     (
         "docs/cursor-tracking.md",
         "python -m experiments.cursor_tracking --out results/cursor-tracking",
-    ): "needs recordings that are no part of the project; tests/test_cursor_tracking.py has them",
+    ): "needs recordings that are no part of the project; test_cursor_tracking.py has them",
     ("docs/release.md", "make wheel"): "builds in the checkout, and needs a network",
     (
         "docs/release.md",

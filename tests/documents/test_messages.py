@@ -18,35 +18,35 @@ import pytest
 import scipy.io
 from click.testing import CliRunner
 
-from impc.bounds import box_bounds
-from impc.cli import main
-from impc.closed_loop import require_complete, scenario, simulate
-from impc.cohort import cluster
-from impc.cohort.names import checked_name
-from impc.cohort.sheet import Sheet, column_values, read_sheet
-from impc.cohort.store import open_store
-from impc.cohort.study import read_study
-from impc.commands.consent import require_consent
-from impc.commands.plant import find_plant
-from impc.controller import mpc_controller
-from impc.effort import Effort
+from impc.cli.consent import require_consent
+from impc.cli.main import main
+from impc.cli.plant import find_plant
+from impc.control.closed_loop import require_complete, scenario, simulate
+from impc.control.controller import mpc_controller
 from impc.errors import ImpcError
 from impc.files import apart
 from impc.files.alignment import misaligned
 from impc.files.configuration import read_configuration
 from impc.files.formats import read_table
+from impc.files.plant_sources import PlantSource, make_plant, plant_source
 from impc.files.reading import read_recordings, recording_of
+from impc.files.sealed import Kept
 from impc.files.table import Table, make_table
-from impc.fit_recordings import fit_problem
-from impc.fit_settings import FitSettings, fit_settings
 from impc.jit import keep_caches
-from impc.kept import Kept
-from impc.lqr import solve_lqr
-from impc.plant import Plant, as_plant
-from impc.plant_source import PlantSource, make_plant, plant_source
-from impc.recording import recording
-from impc.report.write import owned, require_writable, write_files
-from impc.weights import stage_weights
+from impc.model.bounds import box_bounds
+from impc.model.plant import Plant, as_plant
+from impc.model.recordings import recording
+from impc.model.riccati import solve_lqr
+from impc.model.weights import stage_weights
+from impc.reporting.writer import owned, require_writable, write_files
+from impc.studies.cohort import cluster
+from impc.studies.cohort.names import checked_name
+from impc.studies.cohort.sheet import Sheet, column_values, read_sheet
+from impc.studies.cohort.store import open_store
+from impc.studies.cohort.study import read_study
+from impc.studies.effort import Effort
+from impc.studies.fit.settings import FitSettings, fit_settings
+from impc.studies.fit.subject import fit_problem
 from tests.documents.blocks import PAGES
 from tests.files.damaged import DAMAGED, PLANT
 from tests.files.samples import hdf5_mat, pushed_seat, settings

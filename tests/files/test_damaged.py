@@ -7,19 +7,19 @@ from typing import TYPE_CHECKING
 import pytest
 from click.testing import CliRunner
 
-from impc.cli import main
-from impc.commands.plant import find_plant
+from impc.cli.main import main
+from impc.cli.plant import find_plant
 from impc.errors import InputError
 from impc.files.configuration import read_configuration
+from impc.files.plant_sources import make_plant
 from impc.files.reading import read_recordings
-from impc.plant_source import make_plant
 from tests.files.damaged import DAMAGED, PLANT
 from tests.files.samples import csv_text, pushed_seat, settings
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from impc.plant import Plant
+    from impc.model.plant import Plant
 
 
 @pytest.fixture(scope="module")

@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from impc.commands.plant import find_plant
+from impc.cli.plant import find_plant
 from impc.errors import InputError
 from impc.files import apart
 from impc.files.configuration import read_configuration
 from impc.files.formats import read_table
 from impc.files.inspection import draft_configuration, summary
+from impc.files.plant_sources import make_plant
 from impc.files.reading import read_recordings, recording_of
 from impc.files.table import make_table
-from impc.plant_source import make_plant
 from tests.files.damaged import PLANT
 from tests.files.samples import csv_text, pushed_seat, settings
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from impc.arrays import Array
-    from impc.plant import Plant
+    from impc.model.plant import Plant
 
 BASE = pushed_seat()
 TIME = 'time = "time"'

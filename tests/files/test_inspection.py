@@ -11,18 +11,18 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-from impc.cli import main
+from impc.cli.main import main
 from impc.errors import InputError
 from impc.files.configuration import UNKNOWN_UNIT, read_configuration
 from impc.files.formats import write_table
 from impc.files.reading import read_recordings
 from impc.files.table import make_table
-from impc.plant import as_plant
+from impc.model.plant import as_plant
 from plants import seated_balance_plant
 from tests.files.damaged import PLANT
 from tests.files.samples import csv_text, pushed_seat, settings
 
-ROOT = Path(__file__).parent.parent.parent
+ROOT = Path(__file__).parents[2]
 
 
 def inspect(*arguments: object) -> Result:
@@ -131,7 +131,7 @@ def test_findings_are_shown_and_a_plant_is_needed(tmp_path: Path) -> None:
 
 def test_help_loads_no_heavy_library() -> None:
     code = (
-        "import sys, click.testing, impc.cli as c;"
+        "import sys, click.testing, impc.cli.main as c;"
         "r = click.testing.CliRunner().invoke(c.main, ['inspect', '--help']);"
         "heavy = {'pandas', 'scipy', 'pint', 'h5py', 'casadi', 'cvxpy'} & set(sys.modules);"
         "sys.exit(str(heavy) if heavy or r.exit_code else 0)"

@@ -12,8 +12,8 @@ from impc.errors import InputError
 from impc.files.alignment import misaligned
 from impc.files.configuration import read_configuration
 from impc.files.reading import read_recordings
-from impc.plant import as_plant
-from impc.recording import Label
+from impc.model.plant import as_plant
+from impc.model.recordings import Label
 from plants import seated_balance_plant, ternary_torque
 from tests.files.samples import csv_text, pushed_seat, settings
 
@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
     from impc.arrays import Array
     from impc.files.configuration import Configuration
-    from impc.plant import Plant
-    from impc.recording import Recording
+    from impc.model.plant import Plant
+    from impc.model.recordings import Recording
 
 
 @pytest.fixture(scope="module")

@@ -14,10 +14,10 @@ from impc.errors import ImpcError
 from impc.files.configuration import read_configuration
 from impc.files.formats import SUFFIXES, read_table, write_matlab73, write_table
 from impc.files.inspection import draft_configuration, summary
+from impc.files.plant_sources import make_plant, plant_source
 from impc.files.reading import recording_of
 from impc.files.table import make_table
-from impc.plant import as_plant
-from impc.plant_source import make_plant, plant_source
+from impc.model.plant import as_plant
 from tests.files.samples import csv_text, hdf5_mat, pushed_seat, save_mat
 from tests.fuzz.mutation import EDGES, mutated_bytes, mutated_text
 

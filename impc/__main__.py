@@ -1,0 +1,16 @@
+"""`python -m impc`: the same as the command `impc`."""
+
+from __future__ import annotations
+
+import os
+import sys
+
+# `python -m` puts the working folder first: a numpy.py among recordings is not numpy. The folder
+# of a checkout is left, for the plants in it.
+if not (sys.flags.safe_path or os.path.exists(os.path.join(sys.path[0], "impc", "__main__.py"))):
+    del sys.path[0]
+
+from impc.cli.main import main
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,151 @@
+"""How far the numbers of a fit can be trusted: what came from the recordings and what did not.
+
+Always: intervals of the gain and the parameters from their covariance, and the set of weights with
+the fitted gain. When the settings ask for them: bootstrap, profile likelihoods, the input limit as
+an unknown, other horizons (docs/fitting.md, docs/what-may-be-concluded.md).
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.assess.input_limits import input_limit
+from impc.assess.intervals import LEVEL, Interval, covariance_intervals
+from impc.assess.other_models import fit_alternatives
+from impc.assess.profiles import profile_likelihood
+from impc.assess.resampling import DRAWS, bootstrap_intervals, replicate
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from impc.assess.input_limits import LimitEstimate
+    from impc.assess.other_models import Alternative
+    from impc.assess.printed_gain import GainEstimate
+    from impc.assess.resampling import Replicate
+    from impc.assess.weights_ranges import WeightsSummary
+    from impc.inverse.noisy_fit import FittedController
+    from impc.inverse.problem import InverseProblem
+    from impc.model.weights import Weights
+    from impc.studies.fit.settings import FitSettings
+
+__all__ = ["Certainty", "assess", "count_stages"]
+
+
+@dataclass(frozen=True)
+class Certainty:
+    """What is known beside the fit itself.
+
+    Attributes
+    ----------
+    intervals : tuple of Interval
+        By every method that was asked for; the sandwich's come first.
+    weights : WeightsSummary or None
+        The set of weights with the fitted gain; None when its programs fail.
+    weights_reason : str
+        Why there is none; empty otherwise.
+    limits : tuple of LimitEstimate
+        One an input, when asked for.
+    alternatives : tuple of Alternative
+        Other horizons and no limit, when horizons are given; the fit itself comes first.
+    """
+
+    intervals: tuple[Interval, ...]
+    weights: WeightsSummary | None
+    weights_reason: str
+    limits: tuple[LimitEstimate, ...]
+    alternatives: tuple[Alternative, ...]
+
+
+def count_stages(problem: InverseProblem, settings: FitSettings) -> int:
+    """Number of stages that `assess` reports, and one for the set of weights."""
+    limited = int(np.any(np.isfinite(problem.bounds.u_max)))
+    others = [length for length in settings.horizons if length != problem.horizon]
+    return (
+        1
+        + settings.replicates
+        + len(settings.profiles)
+        + (problem.plant.m if settings.unknown_limit else 0)
+        + (1 + limited + len(others) if settings.horizons else 0)
+    )
+
+
+def assess(
+    problem: InverseProblem,
+    fitted: FittedController,
+    estimate: GainEstimate,
+    weights: tuple[WeightsSummary | None, str],
+    settings: FitSettings,
+    done: Callable[[str], None],
+    remember: Callable[[str, Callable[[], Replicate]], Replicate],
+) -> Certainty:
+    """Run what the settings ask for.
+
+    Parameters
+    ----------
+    problem : InverseProblem
+        As it was posed.
+    fitted : FittedController
+        Its fit.
+    estimate : GainEstimate
+        Of `gain_estimate`.
+    weights : tuple
+        Of `weights_summary_or_reason`.
+    settings : FitSettings
+    done : callable
+        Told each stage.
+    remember : callable
+        (name, compute) -> a replicate, from memory or computed now.
+
+    Raises
+    ------
+    InputError
+        When a profile names no number of this fit.
+    WeightsError, SolverError
+        When a replicate or the limit cannot be fitted.
+    """
+    intervals = [
+        *covariance_intervals(estimate, estimate.covariance, "sandwich"),
+        *covariance_intervals(estimate, estimate.white, "cramer-rao"),
+    ]
+    for name in settings.profiles:
+        intervals.append(profile_likelihood(estimate, name).interval)
+        done(f"profile of {name}")
+    limits = []
+    for control in range(problem.plant.m if settings.unknown_limit else 0):
+        limits.append(input_limit(fitted, control))
+        intervals.append(_limit_interval(limits[-1], problem.plant.controls[control]))
+        done(f"limit of {problem.plant.controls[control]}")
+    alternatives: tuple[Alternative, ...] = ()
+    if settings.horizons:
+        alternatives = fit_alternatives(problem, fitted, settings.horizons, settings.settle, done)
+    intervals += _bootstrap(fitted.weights, estimate, settings, done, remember)
+    return Certainty(tuple(intervals), *weights, tuple(limits), alternatives)
+
+
+def _limit_interval(found: LimitEstimate, control: str) -> Interval:
+    return Interval(f"u_max.{control}", "profile", found.level, found.value, found.low, found.high)
+
+
+def _bootstrap(
+    weights: Weights,
+    estimate: GainEstimate,
+    settings: FitSettings,
+    done: Callable[[str], None],
+    remember: Callable[[str, Callable[[], Replicate]], Replicate],
+) -> tuple[Interval, ...]:
+    if not settings.replicates:
+        return ()
+    draw, K, S = DRAWS[settings.bootstrap], np.array(estimate.K), np.array(estimate.S)
+    found = []
+    for index in range(settings.replicates):
+        name = f"replicate {index + 1}"
+        compute = functools.partial(
+            replicate, estimate.problem, K, S, weights, index, settings.seed, draw
+        )
+        found.append(remember(name, compute))
+        done(name)
+    return bootstrap_intervals(estimate, found, settings.bootstrap, LEVEL)

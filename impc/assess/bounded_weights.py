@@ -1,0 +1,361 @@
+"""All weights with a given gain and a condition number up to a limit, and what holds for each.
+
+    { X = blkdiag(Q, R) : X in the fibre of the gain,  trace R = m,  kappa(X) <= limit }
+
+is convex: kappa(X) <= limit says that some t has  t I <= X <= limit t I.  A linear function of the
+weights (an entry, a difference of two prices) therefore has a range over the set that two
+semidefinite programs find, and a statement such as "the price of x_1 is above that of x_2" holds
+for every member, or for none, or for some. Nothing that the recordings say of the weights can be
+finer than this set (docs/equivalent-weights.md, section 2).
+
+The programs are written as seen from the analytic centre LL' of the fibre, L^-1 X L^-T, in which
+tr(L^-1 X L^-T) is the same for every X of one scale: all members lie within n + m of it, which
+bounds the variables and makes the dual bounds proofs (`solve_semidefinite`). As seen from the
+member of least condition number, a corner of the cone, members of the seat's set lie at 2e4 and
+farther: what the programs then returned was 1.4e-3 from the optimum and called solved.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import scipy.linalg
+
+from impc.arrays import Array, Frozen
+from impc.checking import checked
+from impc.errors import InputError, SolverError, WeightsError
+from impc.inverse.equivalent_weights import analytic_centre, inverse_factor, least_condition_weights
+from impc.inverse.semidefinite import Cone, matrix_inequality, norm_bound, solve_semidefinite
+from impc.inverse.solution_set import pair_blocks, split_blocks
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from impc.inverse.equivalent_weights import EquivalentWeights
+    from impc.inverse.solution_set import GainFibre
+    from impc.model.weights import Weights
+
+__all__ = [
+    "End",
+    "Range",
+    "WeightsSet",
+    "entry_ranges",
+    "extreme_eigenvalue",
+    "linear_maximum",
+    "linear_range",
+    "nearest_diagonal",
+    "trace_range",
+    "weights_set",
+]
+
+
+# Relative gap of the programs, and halvings that draw their points inside.
+_GAP, _HALVINGS = 1e-8, 50
+
+
+@dataclass(frozen=True)
+class WeightsSet(Frozen):
+    """The set of the module's text, ready for programs over it.
+
+    Attributes
+    ----------
+    fibre : GainFibre
+    least : EquivalentWeights
+        The member of least condition number.
+    limit : float
+        Largest condition number in the set.
+    first, level : Array
+        blkdiag(Q, R) = first + sum_i y_i level_i spans the members: (n + m, n + m) and
+        (k, n + m, n + m), the levels orthonormal as seen from the analytic centre.
+    inverse : Array
+        L^-1 of that centre, (n + m, n + m).
+    reach : float
+        No member has a larger |y|.
+    """
+
+    fibre: GainFibre
+    least: EquivalentWeights
+    limit: float
+    first: Array
+    level: Array
+    inverse: Array
+    reach: float
+
+
+class End(NamedTuple):
+    """The member at which a program ends, its value, and what no member goes beyond.
+
+    Attributes
+    ----------
+    value : float
+        Of the function at the member.
+    bound : float
+        From the dual program.
+    weights : Weights
+        The member, at trace R = m.
+    """
+
+    value: float
+    bound: float
+    weights: Weights
+
+
+@dataclass(frozen=True)
+class Range:
+    """Least and largest value of a linear function over the set, each with a member that has it.
+
+    Attributes
+    ----------
+    low, high : float
+        Values at the two members.
+    low_bound, high_bound : float
+        What no member goes beyond, by the programs' dual solutions.
+    low_weights, high_weights : Weights
+    """
+
+    low: float
+    high: float
+    low_bound: float
+    high_bound: float
+    low_weights: Weights
+    high_weights: Weights
+
+
+@checked
+def weights_set(fibre: GainFibre, ratio: float = 10.0) -> WeightsSet:
+    """Prepare the set of weights with condition number up to `ratio` times the least.
+
+    Raises
+    ------
+    InputError
+        When the ratio is not above 1.
+    WeightsError, SolverError
+        As `least_condition_weights` and `analytic_centre`.
+    """
+    if not 1 < ratio < np.inf:
+        raise InputError("ratio", f"got {ratio}", "give a number above 1")
+    least = least_condition_weights(fibre)
+    n, m = fibre.plant.n, fibre.plant.m
+    try:
+        centre = analytic_centre(fibre).weights
+    except WeightsError:  # the cost on some combination of states is free but for the limit
+        centre = None
+    view = least.weights if centre is None else centre
+    inverse = inverse_factor(fibre, view)
+    raw = pair_blocks(fibre.Q, fibre.R)
+    triangle = np.linalg.qr((inverse @ raw @ inverse.T).reshape(len(raw), -1).T, mode="r")
+    raw = np.tensordot(np.linalg.inv(triangle).T, raw, 1)
+    traces = np.trace(raw[:, n:, n:], axis1=1, axis2=2)
+    first = view.block * (m / np.trace(view.R))
+    level = np.tensordot(scipy.linalg.null_space(traces[None]).T, raw, 1)
+    limit = ratio * least.condition
+    if centre is None:  # X <= limit I, since the least eigenvalue is at most that of R
+        trace = limit * float(np.linalg.norm(inverse)) ** 2
+    else:
+        trace = _largest_trace(fibre, inverse, raw)
+    reach = trace + float(np.linalg.norm(inverse @ first @ inverse.T))
+    return WeightsSet(fibre, least, limit, first, level, inverse, reach)
+
+
+def _largest_trace(fibre: GainFibre, inverse: Array, raw: Array) -> float:
+    """Largest tr(L^-1 X L^-T) of a semidefinite X with trace R = m; `raw` is orthonormal as seen.
+
+    At the analytic centre it is alpha tr(G'RG) for all X = sum c_k raw_k, up to an error e'c of the
+    centre; |c| is at most that trace again, and tr(G'RG) at most m times the largest value of GG'.
+    """
+    n, m = fibre.plant.n, fibre.plant.m
+    seen = np.trace(inverse @ raw @ inverse.T, axis1=1, axis2=2)
+    scale = np.trace(fibre.G.T @ raw[:, n:, n:] @ fibre.G, axis1=1, axis2=2)
+    alpha = float(seen @ scale) / float(scale @ scale)
+    error = float(np.linalg.norm(seen - alpha * scale))
+    if error >= 0.5:
+        raise SolverError(
+            "analytic centre", f"is off by {error:.2g} of a trace", "scale the states and inputs"
+        )
+    return alpha * m * float(np.linalg.norm(fibre.G, 2)) ** 2 / (1 - error)
+
+
+@checked(direction="n+m n+m")
+def linear_range(found: WeightsSet, direction: Array) -> Range:
+    """Range of trace(direction blkdiag(Q, R)) over the set, direction symmetric (n + m, n + m).
+
+    Raises
+    ------
+    SolverError
+        When a program returns no finite point.
+    """
+    low, high = _minimum(found, direction), linear_maximum(found, direction)
+    return Range(low.value, high.value, low.bound, high.bound, low.weights, high.weights)
+
+
+@checked(direction="n+m n+m")
+def linear_maximum(found: WeightsSet, direction: Array) -> End:
+    """Largest trace(direction blkdiag(Q, R)) over the set, direction symmetric (n + m, n + m).
+
+    Raises
+    ------
+    SolverError
+        When the program returns no finite point.
+    """
+    end = _minimum(found, -direction)
+    return End(-end.value, -end.bound, end.weights)
+
+
+@checked
+def entry_ranges(
+    found: WeightsSet, states: Sequence[int] | None = None
+) -> dict[tuple[int, int], Range]:
+    """Range of every entry Q_ij, i >= j, of the given states (indices), of all by default."""
+    size = len(found.first)
+    chosen = sorted(range(found.fibre.plant.n) if states is None else states)
+    ranges = {}
+    for position, i in enumerate(chosen):
+        for j in chosen[: position + 1]:
+            direction = np.zeros((size, size))
+            direction[i, j] = direction[j, i] = 1.0 if i == j else 0.5
+            ranges[i, j] = linear_range(found, direction)
+    return ranges
+
+
+@checked(scaling="n")
+def trace_range(found: WeightsSet, scaling: Array) -> Range:
+    """Range of trace(D Q D), D = diag(scaling) (n,): the low end is the member of least trace."""
+    size = np.zeros(len(found.first))
+    size[: len(scaling)] = np.asarray(scaling) ** 2
+    return linear_range(found, np.diag(size))
+
+
+@checked(scaling="n")
+def nearest_diagonal(found: WeightsSet, scaling: Array) -> End:
+    """Member whose D Q D, D = diag(scaling) (n,), has the least off-diagonal part (Frobenius).
+
+    Raises
+    ------
+    SolverError
+        When the program returns no finite point.
+    """
+    n = found.fibre.plant.n
+    rows, columns = np.tril_indices(n, -1)
+    size = np.sqrt(2.0) * np.outer(scaling, scaling)[rows, columns]
+    offset = found.first[rows, columns] * size
+    m = found.fibre.plant.m
+    least = found.least.weights.Q * (m / np.trace(found.least.weights.R))
+    unit = float(np.linalg.norm(least[rows, columns] * size))
+    if unit == 0 or len(found.level) == 0:  # diagonal as it is, or there is but one
+        return End(unit, unit, found.least.weights)
+    vectors = found.level[:, rows, columns] * size / unit
+    # Variables (y, t, s): s bounds the norm; at the best it is at most 1, that of the least.
+    count = len(found.level)
+    spread = norm_bound(
+        np.vstack([vectors, np.zeros((2, len(rows)))]),
+        np.append(np.zeros(count + 1), 1.0),
+        offset=offset / unit,
+    )
+    solved = solve_semidefinite(
+        np.append(np.zeros(count + 1), 1.0),
+        [*_cones(found, 1), spread],
+        reach=_reach(found, 1.0),
+        tolerance=_GAP,
+    )
+    X = _member(found, solved.y)
+    value = float(np.linalg.norm(X[rows, columns] * size))
+    return End(value, unit * solved.bound, split_blocks(X, n))
+
+
+@checked
+def extreme_eigenvalue(found: WeightsSet, *, largest: bool) -> End:
+    """Least largest eigenvalue of Q over the set, or its largest least one.
+
+    Raises
+    ------
+    SolverError
+        When the program returns no finite point.
+    """
+    n, count, sign = found.fibre.plant.n, len(found.level), 1.0 if largest else -1.0
+    least = found.least.weights.Q * (found.fibre.plant.m / np.trace(found.least.weights.R))
+    unit = float(np.linalg.eigvalsh(least)[-1 if largest else 0])
+    # Variables (y, t, s): sign (s unit I - Q) >= 0, as seen where small eigenvalues decide.
+    view = np.eye(n) / np.sqrt(unit) if largest else found.inverse[:n, :n]
+    levels = np.concatenate([-found.level[:, :n, :n], np.zeros((1, n, n)), unit * np.eye(n)[None]])
+    levels = sign * view @ levels @ view.T
+    bound = matrix_inequality(-sign * view @ found.first[:n, :n] @ view.T, levels)
+    objective = np.append(np.zeros(count + 1), sign)
+    # No member's least eigenvalue is above R's mean of 1.
+    reach = _reach(found, 1.0 if largest else 1 / unit)
+    solved = solve_semidefinite(objective, [*_cones(found, 1), bound], reach=reach, tolerance=_GAP)
+    X = _member(found, solved.y)
+    value = float(np.linalg.eigvalsh(X[:n, :n])[-1 if largest else 0])
+    return End(value, sign * unit * solved.bound, split_blocks(X, n))
+
+
+def _minimum(found: WeightsSet, direction: Array) -> End:
+    constant = float(np.sum(direction * found.first))
+    slopes = np.tensordot(found.level, direction, 2)
+    scale = float(np.linalg.norm(slopes))
+    if scale == 0:  # the same for every member, or there is but one
+        return End(constant, constant, found.least.weights)
+    solved = solve_semidefinite(
+        np.append(slopes / scale, 0.0), _cones(found), reach=_reach(found), tolerance=_GAP
+    )
+    X = _member(found, solved.y)
+    bound = constant + scale * solved.bound
+    return End(float(np.sum(direction * X)), bound, split_blocks(X, found.fibre.plant.n))
+
+
+def _member(found: WeightsSet, y: Array) -> Array:
+    """The point of a program, drawn towards the centre until it is a member beyond doubt.
+
+    A program's error, 1e-8 of the largest weight, can outweigh the least eigenvalue.
+    """
+    X = found.first + np.tensordot(y[: len(found.level)], found.level, 1)
+    X = (X + X.T) / 2
+    n = found.fibre.plant.n
+    centre = found.least.weights.block
+    centre = centre * ((len(centre) - n) / np.trace(centre[n:, n:]))
+    # The condition number is quasiconvex along the segment.
+    inside, outside = 0.0, 2.0
+    for _ in range(_HALVINGS):
+        share = (inside + outside) / 2  # 1, the point itself, comes first
+        values = np.linalg.eigvalsh(centre + share * (X - centre))  # as `condition_number` sees it
+        if values[0] > 0 and values[-1] <= found.limit * values[0]:
+            inside = share
+        else:
+            outside = share
+        if inside == 1:
+            break
+    return np.asarray(centre + inside * (X - centre))
+
+
+def _cones(found: WeightsSet, more: int = 0) -> list[Cone]:
+    """t l I <= X <= limit t l I in the variables (y, t), with l I at most I as seen.
+
+    `more` variables follow that do not occur here.
+    """
+    n, size = found.fibre.plant.n, len(found.first)
+    inverse = found.inverse
+    seen_first = inverse @ found.first @ inverse.T
+    seen = inverse @ found.level @ inverse.T
+    unit = _floor_unit(found)
+    floor = inverse @ inverse.T * unit
+    top = found.limit * unit
+    cones = []
+    for block in (slice(0, n), slice(n, size)):
+        width = block.stop - block.start
+        others = np.zeros((more, width, width))
+        below = np.concatenate([seen[:, block, block], -floor[None, block, block], others])
+        cones.append(matrix_inequality(seen_first[block, block], below))
+        eye = np.eye(size)[None, block, block]
+        above = np.concatenate([-found.level[:, block, block] / top, eye, others])
+        cones.append(matrix_inequality(-found.first[block, block] / top, above))
+    return cones
+
+
+def _floor_unit(found: WeightsSet) -> float:
+    return float(1 / np.linalg.norm(found.inverse, 2) ** 2)
+
+
+def _reach(found: WeightsSet, *more: float) -> Array:
+    """Largest |y|, t and further variables: t l I <= X gives t <= the trace of X as seen."""
+    return np.append(np.full(len(found.level) + 1, found.reach), more)

@@ -1,0 +1,257 @@
+"""How far a fitted gain is determined: standard deviations under noise of any colour.
+
+To first order a least-squares estimate under stationary noise e_t has the covariance (White 1980,
+Newey and West 1987: the "sandwich", here with a Jacobian that is known; docs/fitting.md)
+
+    H^-1 cov( sum_t J_t' e_t ) H^-1,     H = sum_t J_t' J_t,
+
+J_t being the derivative of the outputs at sample t with respect to everything that was fitted, and
+the middle as `residual_noise` estimates it from the residuals. With white noise it is the
+Cramér-Rao bound.
+
+Beside the gain everything else that was fitted is unknown: initial states, physical parameters
+and, for several inputs, the metric S. The prior of a search (`fit_gain`) is left out: the result
+says what the recordings determine, and in a direction that they hardly do it is wide.
+
+To first order a direction that is not told has no part in those that are; to second order it has,
+and it may be wrong by as much as a gain can be. `curvature` adds that (docs/fitting.md).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.arrays import Array, BoolArray, Frozen, frozen
+from impc.assess.long_run_covariance import ResidualNoise, residual_noise, spread_of_sum
+from impc.inverse.residuals import evaluate, misfit_or_reason, residual_only
+from impc.inverse.solution_set import natural_coordinates
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from impc.inverse.problem import InverseProblem
+    from impc.inverse.residuals import Evaluation
+
+__all__ = ["DETERMINED", "FOREIGN", "TOLD", "GainCovariance", "gain_covariance"]
+
+#: A direction whose singular value is below this, of the largest, is not determined at all.
+DETERMINED = 1e-6
+#: A direction with a larger deviation, of the natural size of a gain, is not told: there the prior
+#: of a search and the curvature of the problem count beside the recordings.
+TOLD = 0.2
+#: An entry is told by itself when what is not told could move it by less than this share of its
+#: deviation, were it wrong by the natural size of a gain: the interval then covers 94.3 % for 95 %.
+FOREIGN = 0.25
+# Of an entry's natural size: a smaller share in a direction is rounding's.
+_SHARE = 1e-6
+_ROUNDING = 1e-10
+_STEPS = (1.0, 0.5, 0.25, 0.125)
+
+
+@dataclass(frozen=True)
+class GainCovariance(Frozen):
+    """What the recordings say of the gain at a fit.
+
+    Directions are of the gain in natural coordinates, G^-1 K T with x = T z and u = G v, row by row
+    (`gain_fibre`): a step of 1 moves the command by one unit of the white input noise that T stands
+    for. No optimal gain is far beyond 1 on this scale.
+
+    Attributes
+    ----------
+    T, G : Array
+        Natural coordinates of states (n, n) and inputs (m, m).
+    singular_values : Array
+        Of the scaled residual's derivative with respect to G^-1 K T, once everything else has taken
+        what it can; largest first (m * n,).
+    directions : Array
+        Right singular vectors, one a row (m * n, m * n).
+    deviations : Array
+        Standard deviation along each direction (m * n,); infinite below 1e-6 of the largest
+        singular value.
+    entries : Array
+        Standard deviation of each entry of K (m, n), in its unit; infinite when a direction
+        without a value takes part in it.
+    foreign : Array
+        What the directions that are not told could move each entry by, were they wrong by the
+        natural size of a gain, over its deviation by those that are (m, n).
+    parameters : Array
+        Standard deviation of the logarithm of each physical parameter (k,).
+    noise : ResidualNoise
+        The colour of the residuals.
+    """
+
+    T: Array
+    G: Array
+    singular_values: Array
+    directions: Array
+    deviations: Array
+    entries: Array
+    foreign: Array
+    parameters: Array
+    noise: ResidualNoise
+
+    def along(self, step: Array) -> Array:
+        """A step of the gain (m, n) as steps along the directions (m * n,)."""
+        return np.asarray(self.directions @ np.ravel(np.linalg.solve(self.G, step @ self.T)))
+
+    @property
+    def told(self) -> BoolArray:
+        """Which directions the recordings tell (m * n,)."""
+        return np.asarray(self.deviations < TOLD)
+
+    @property
+    def told_entries(self) -> BoolArray:
+        """Which entries of K they tell by themselves, not only together with others (m, n)."""
+        return np.asarray(self.foreign < FOREIGN)
+
+
+def gain_covariance(
+    problem: InverseProblem,
+    gain: Array,
+    metric: Array,
+    noise: Callable[[list[Array], int], ResidualNoise] = residual_noise,
+    *,
+    curvature: bool = False,
+) -> GainCovariance:
+    """Covariance of a gain fitted by least squares, and of the parameters fitted with it.
+
+    Parameters
+    ----------
+    problem : InverseProblem
+        At the initial states and the parameters that were found.
+    gain, metric : Array
+        K (m, n) and S (m, m) that were found.
+    noise : callable
+        How the noise is estimated from the residuals, (samples, p) for each trial, and the count
+        of numbers fitted: `residual_noise`, or `white_noise` for the plain
+        Cramér-Rao bound.
+    curvature : bool
+        Whether the deviations of told directions count what those that are not told do to them to
+        second order, were these wrong by their deviation, or by the natural size of a gain.
+    """
+    m, n = problem.plant.m, problem.plant.n
+    T, G = natural_coordinates(problem.plant, gain)
+    found = evaluate(problem, gain, metric)
+    in_units = np.kron(G, np.linalg.inv(T).T)
+    on_gain = found.dK.reshape(-1, m * n) @ in_units
+    nuisance = _nuisance(problem, found)
+    # What the rest can explain is taken out of the gain's columns; the gain's
+    # block of the inverse of H is that of what is left.
+    left = _orthogonal(nuisance)
+    seen = on_gain - left @ (left.T @ on_gain)
+    _, values, directions = np.linalg.svd(seen, full_matrices=False)
+    usable = values > DETERMINED * values[0]
+    colour = noise(
+        _by_trial(problem, found.residual), left.shape[1] + int(np.count_nonzero(usable))
+    )
+    along = seen @ directions[usable].T / values[usable] ** 2
+    spread = spread_of_sum(colour, _by_trial(problem, along))
+    deviations = np.full(m * n, np.inf)
+    deviations[usable] = np.sqrt(np.maximum(np.diag(spread), 0.0))
+    if curvature:
+        told = np.flatnonzero(deviations < TOLD)
+        reach = np.minimum(deviations, 1.0)[:, None] * directions
+        steps = (reach[deviations >= TOLD] @ in_units.T).reshape(-1, m, n)
+        shifts = _shifts(problem, gain, metric, steps) @ along[:, told]
+        spread[np.ix_(told, told)] += shifts.T @ shifts / 2
+        deviations[usable] = np.sqrt(np.maximum(np.diag(spread), 0.0))
+    entries, foreign = _entries(in_units @ directions.T, deviations, spread)
+    return GainCovariance(
+        frozen(T),
+        frozen(G),
+        frozen(values),
+        frozen(directions),
+        frozen(deviations),
+        frozen(entries.reshape(m, n)),
+        frozen(foreign.reshape(m, n)),
+        frozen(_parameter_deviations(problem, on_gain, nuisance, colour)),
+        colour,
+    )
+
+
+def _shifts(problem: InverseProblem, gain: Array, metric: Array, steps: Array) -> Array:
+    """What steps of the gain (k, m, n), forth and back, do to the residual: (2 k, r).
+
+    A step that cannot be simulated is halved, and what it does scaled by the square: the first
+    order of a step that is not told has no part in those that are.
+    """
+    here, shifts = residual_only(problem, gain, metric), []
+    for step in (sign * step for step in steps for sign in (1.0, -1.0)):
+        for share in _STEPS:
+            there = gain + share * step
+            if not misfit_or_reason(problem, there, metric)[1]:
+                shifts.append((residual_only(problem, there, metric) - here) / share**2)
+                break
+    return np.array(shifts).reshape(-1, len(here))
+
+
+def _entries(back: Array, deviations: Array, spread: Array) -> tuple[Array, Array]:
+    """Deviations of the entries, and the share in each of what is not told.
+
+    `back` turns steps along the directions into entries, one direction a column.
+    """
+    usable, told = np.isfinite(deviations), deviations < TOLD
+    own = spread[np.ix_(told[usable], told[usable])]
+    by_itself = np.sqrt(np.maximum(np.diag(back[:, told] @ own @ back[:, told].T), 0.0))
+    size = np.linalg.norm(back, axis=1)
+    untold = np.linalg.norm(back[:, ~told], axis=1)
+    untold[untold <= _SHARE * size] = 0.0
+    foreign = np.divide(untold, by_itself, out=np.full(len(back), np.inf), where=by_itself > 0)
+    whole = np.sqrt(np.maximum(np.diag(back[:, usable] @ spread @ back[:, usable].T), 0.0))
+    whole[np.linalg.norm(back[:, ~usable], axis=1) > _SHARE * size] = np.inf
+    return np.where(foreign < FOREIGN, by_itself, whole), foreign
+
+
+def _by_trial(problem: InverseProblem, rows: Array) -> list[Array]:
+    """Rows of all trials as one (samples, p, ...) array a trial."""
+    p, row, parts = len(problem.plant.outputs), 0, []
+    for trial in problem.recordings:
+        mine = rows[row : row + trial.outputs.size]
+        parts.append(mine.reshape(trial.samples, p, *rows.shape[1:]))
+        row += trial.outputs.size
+    return parts
+
+
+def _nuisance(problem: InverseProblem, found: Evaluation) -> Array:
+    """Columns of what S is told, of initial states, trial by trial, then of parameters."""
+    metric, sizes, _ = np.linalg.svd(found.dS.reshape(len(found.residual), -1), full_matrices=False)
+    # Rounding leaves 1e-15 where S is not told: its scale, and inputs that are never at a bound.
+    columns, row = [metric[:, sizes > _ROUNDING * np.max(sizes)]], 0
+    for trial in problem.recordings:
+        mine = slice(row, row + trial.outputs.size)
+        row = mine.stop
+        block = np.zeros_like(found.dx0)
+        block[mine] = found.dx0[mine]
+        columns.append(block)
+    return np.hstack([*columns, found.dparameters])
+
+
+def _orthogonal(columns: Array) -> Array:
+    """Orthonormal basis of what the columns reach, to 1e-10 of the largest in each one's scale."""
+    size = np.linalg.norm(columns, axis=0)
+    scaled = columns[:, size > 0] / size[size > 0]
+    if scaled.shape[1] == 0:
+        return np.zeros((len(columns), 0))
+    left, values, _ = np.linalg.svd(scaled, full_matrices=False)
+    return np.asarray(left[:, values > _ROUNDING * values[0]])
+
+
+def _parameter_deviations(
+    problem: InverseProblem, on_gain: Array, nuisance: Array, colour: ResidualNoise
+) -> Array:
+    """Standard deviations of the logarithms, everything else being fitted too."""
+    count = len(problem.logarithms)
+    if count == 0:
+        return np.zeros(0)
+    own = nuisance[:, -count:]
+    left = _orthogonal(np.hstack([on_gain, nuisance[:, :-count]]))
+    seen = own - left @ (left.T @ own)
+    _, values, directions = np.linalg.svd(seen, full_matrices=False)
+    if values[-1] <= DETERMINED * np.linalg.norm(own, 2):
+        return np.full(count, np.inf)
+    along = seen @ directions.T / values**2 @ directions
+    spread = spread_of_sum(colour, _by_trial(problem, along))
+    return np.sqrt(np.maximum(np.diag(spread), 0.0))

@@ -1,0 +1,118 @@
+"""What the recordings say of the weights, and what the condition number said in their place.
+
+The closed loop depends on (Q, R) through K and the scale-free S only, so the derivative of the
+outputs with respect to the weights has at most n m + m (m + 1)/2 - 1 directions, whatever was
+recorded (n m + m - 1 when A is invertible: docs/theory.md). The rest of the weights was chosen by
+the condition number.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.arrays import Array, Frozen, frozen
+from impc.checking import checked
+from impc.control.closed_loop import simulate
+from impc.inverse.equivalent_weights import gain_fibre, other_weights
+from impc.inverse.problem import controller_for, misfit, scenarios
+from impc.inverse.proximal_search import Residual, weight_jacobian
+from impc.inverse.proximal_step import block_basis
+from impc.inverse.residuals import evaluate
+from impc.model.riccati import solve_lqr
+from impc.model.weights import Weights, condition_number
+
+if TYPE_CHECKING:
+    from impc.inverse.equivalent_weights import EquivalentWeights
+    from impc.inverse.problem import InverseProblem
+
+__all__ = ["Identifiability", "OtherWeights", "identifiability"]
+
+# Exact derivatives leave singular values of 1e-13 where nothing is determined.
+_DETERMINED = 1e-8
+
+
+@dataclass(frozen=True)
+class OtherWeights:
+    """Weights other than the reported ones, and the misfit of the same recordings with them.
+
+    Attributes
+    ----------
+    weights : Weights
+    condition : float
+        kappa(blkdiag(Q, R)).
+    misfit : float
+        2-norm of the output residual.
+    """
+
+    weights: Weights
+    condition: float
+    misfit: float
+
+
+@dataclass(frozen=True)
+class Identifiability(Frozen):
+    """Result of `identifiability`.
+
+    Attributes
+    ----------
+    singular_values : Array
+        Of the outputs' derivative with respect to relative changes of blkdiag(Q, R) (s,), largest
+        first. Relative: in the coordinates D of dX = L D L', X = L L'.
+    free : int
+        Directions of (Q, R), scale not counted.
+    rank : int
+        How many of them the recordings determine: singular values above 1e-8 of the largest.
+    chosen : int
+        How many the condition number chose: free - rank.
+    tolerance : float
+        That share of the largest.
+    others : tuple of OtherWeights
+        Other weights that explain the recordings equally well.
+    """
+
+    singular_values: Array
+    free: int
+    rank: int
+    chosen: int
+    tolerance: float
+    others: tuple[OtherWeights, ...]
+
+
+@checked
+def identifiability(problem: InverseProblem, weights: Weights) -> Identifiability:
+    """Count what the recordings determine at the given weights.
+
+    Parameters
+    ----------
+    problem : InverseProblem
+    weights : Weights
+        Positive definite; the result of a fit.
+
+    Raises
+    ------
+    WeightsError
+        When the weights have no stabilising Riccati solution.
+    """
+    plant = problem.plant
+    solution = solve_lqr(plant, weights)
+    found = evaluate(problem, solution.K, solution.S)
+    factor = np.linalg.cholesky(weights.block)
+    basis = factor @ block_basis(plant.n, plant.m) @ factor.T
+    residual = Residual(found.residual, found.dK, found.dS, usable=True)
+    values = np.linalg.svd(weight_jacobian(solution, residual, basis), compute_uv=False)
+    rank = int(np.count_nonzero(values > _DETERMINED * values[0]))
+    free = len(basis) - 1
+    metric = solution.S if plant.m > 1 else None
+    fibre = gain_fibre(plant, solution.K, metric)
+    others = tuple(_explain(problem, item) for item in other_weights(fibre, 2))
+    return Identifiability(frozen(values), free, rank, free - rank, _DETERMINED, others)
+
+
+def _explain(problem: InverseProblem, found: EquivalentWeights) -> OtherWeights:
+    solution = solve_lqr(problem.plant, found.weights)
+    controller = controller_for(problem, solution.K, solution.S)
+    runs = [simulate(controller, drive) for drive in scenarios(problem)]
+    return OtherWeights(found.weights, condition_number(found.weights), misfit(problem, runs))

@@ -1,0 +1,296 @@
+"""The input limit of a subject, fitted: what value explains the recordings, or that none shows.
+
+For a limit L the gain, initial states and parameters are fitted again; m(L) is the misfit that is
+left, m(inf) that without a limit. With s^2 the variance of a residual and f the factor by which the
+colour of the residuals widens the deviation of L (f = 1 for white ones),
+
+    D(L) = (m(L)^2 - m(L*)^2) / (s^2 f)
+
+is chi-squared with one degree of freedom at the true limit. Where D(inf) is below its quantile the
+recordings do not tell whether there is a limit at all; they still tell that it is not below the
+least L that D allows (docs/fitting.md).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy.optimize
+import scipy.stats
+
+from impc.arrays import Array, Frozen, frozen
+from impc.assess.long_run_covariance import residual_noise, spread_of_sum, white_noise
+from impc.control.closed_loop import simulate, simulate_and_differentiate
+from impc.control.constraint_rows import directions
+from impc.errors import InputError, SolverError, WeightsError
+from impc.inverse.gain_search import refine_gain
+from impc.inverse.noisy_fit import fit_controller
+from impc.inverse.problem import controller_for, scenarios
+from impc.inverse.residuals import evaluate
+from impc.model.bounds import bound_rows, box_bounds
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from impc.inverse.gain_search import GainFit
+    from impc.inverse.noisy_fit import FittedController
+    from impc.inverse.problem import InverseProblem
+
+__all__ = ["LimitEstimate", "input_limit", "with_limit"]
+
+_SPREAD = 1.0
+# The limit is searched to this share of itself.
+_RESOLUTION = 1e-4
+_GRID, _NEAR = np.geomspace(0.3, 1.05, 10), np.array([0.8, 0.9, 1.0, 1.1, 1.25])
+_ROUNDS = 5
+
+
+@dataclass(frozen=True)
+class LimitEstimate(Frozen):
+    """What recordings say of the limit of one input.
+
+    Attributes
+    ----------
+    value : float or None
+        The limit that fits best; None when none is determined.
+    low, high : float
+        Interval of the given level; `high` is infinite when no limit is determined.
+    level : float
+        Between 0 and 1, 0.95 for 95 %.
+    against_none : float
+        D(inf): how much worse no limit explains the recordings; compare with the quantile.
+    quantile : float
+        Of chi-squared at that level.
+    reason : str
+        In words.
+    limits, distances : Array
+        Limits that were tried (t,), in the input's unit, and D at each (t,), for a picture.
+    """
+
+    value: float | None
+    low: float
+    high: float
+    level: float
+    against_none: float
+    quantile: float
+    reason: str
+    limits: Array
+    distances: Array
+
+
+def with_limit(problem: InverseProblem, limit: float, control: int = 0) -> InverseProblem:
+    """The problem with |u_control| <= limit, or without that bound for an infinite limit.
+
+    Parameters
+    ----------
+    limit : float
+        Positive, in the input's unit.
+    control : int
+        Index of the input.
+    """
+    bounds = problem.bounds
+    u_min, u_max = np.array(bounds.u_min), np.array(bounds.u_max)
+    u_min[control], u_max[control] = -limit, limit
+    changed = box_bounds(
+        problem.plant, x_min=bounds.x_min, x_max=bounds.x_max, u_min=u_min, u_max=u_max
+    )
+    return replace(problem, bounds=changed)
+
+
+def input_limit(
+    fitted: FittedController, control: int = 0, *, level: float = 0.95
+) -> LimitEstimate:
+    """Fit the symmetric limit of one input; the others keep theirs.
+
+    Parameters
+    ----------
+    fitted : FittedController
+        From any limit, or none: its gain is where the searches start.
+    control : int
+        Index of the input.
+    level : float
+        Of the interval.
+
+    Raises
+    ------
+    InputError
+        When there is no such input.
+    SolverError
+        When the recordings cannot be simulated with any limit tried.
+    """
+    if not 0 <= control < fitted.problem.plant.m:
+        raise InputError("control", f"got {control}", f"there are {fitted.problem.plant.m} inputs")
+    search, best = _searched(fitted, control)
+    free = search.fit(np.inf)
+    top = max(_typical_peak(search.fitted, control), search.limit_of(best))
+    noise = best.misfit**2 / search.samples
+    factor = _colour_factor(best, search.limit_of(best), control)
+    quantile = float(scipy.stats.chi2.ppf(level, 1))
+    unit = noise * factor
+
+    def distance(limit: float) -> float:
+        return (search.misfit(limit) ** 2 - best.misfit**2) / unit
+
+    value = search.limit_of(best)
+    none = (free.misfit**2 - best.misfit**2) / unit
+    low = _crossing(distance, value, 0.3 * value, quantile)
+    determined = none > quantile
+    high = _crossing(distance, value, 1.5 * top, quantile) if determined else np.inf
+    limits = np.array(sorted(key for key in search.tried if np.isfinite(key)))
+    distances = np.array([distance(limit) for limit in limits])
+    if determined:
+        reason = f"a limit of {value:.3g} explains the recordings better than none"
+    else:
+        reason = (
+            f"no limit explains the recordings as well as any: if there is one it is at least "
+            f"{low:.3g}; the command of the best regulator without one peaks at {top:.3g}"
+        )
+    return LimitEstimate(
+        value if determined else None,
+        low,
+        float(high),
+        level,
+        none,
+        quantile,
+        reason,
+        frozen(limits),
+        frozen(distances),
+    )
+
+
+def _searched(fitted: FittedController, control: int) -> tuple[_Search, GainFit]:
+    """The best limit, and the search that found it.
+
+    The first round goes over a grid below the largest command that the best regulator without a
+    limit uses. The limit found then gets a controller of its own, fitted from the beginning, from
+    which the next round searches nearby: a gain fitted under a wrong limit is a poor start.
+    """
+    loose = fit_controller(with_limit(fitted.problem, np.inf, control))
+    search = _Search(loose, control)
+    peak = _typical_peak(loose, control)
+    limit = search.limit_of(search.best(peak * _GRID))
+    for _ in range(_ROUNDS):
+        search = _Search(fit_controller(with_limit(fitted.problem, limit, control)), control)
+        best = search.best(limit * _NEAR)
+        before, limit = limit, search.limit_of(best)
+        if abs(limit - before) < 0.01 * before:
+            break
+    return search, best
+
+
+class _Search:
+    """Fits at limits, remembered: each starts from the nearest one before it."""
+
+    def __init__(self, fitted: FittedController, control: int) -> None:
+        self.fitted, self.control = fitted, control
+        self.samples = sum(trial.outputs.size for trial in fitted.problem.recordings)
+        self.tried: dict[float, GainFit | None] = {}
+
+    def fit(self, limit: float) -> GainFit:
+        found = self._try(limit)
+        if found is None:
+            raise SolverError("limit", f"no gain holds with {limit:g}", "check plant and bounds")
+        return found
+
+    def misfit(self, limit: float) -> float:
+        found = self._try(limit)
+        return 1e3 * np.sqrt(self.samples) if found is None else found.misfit
+
+    def best(self, grid: Array) -> GainFit:
+        """The best of a grid, refined by Brent's method between its neighbours."""
+        values = [self.misfit(limit) for limit in grid]
+        index = int(np.argmin(values))
+        ends = grid[max(index - 1, 0)], grid[min(index + 1, len(grid) - 1)]
+        scipy.optimize.minimize_scalar(
+            self.misfit, bounds=ends, method="bounded", options={"xatol": _RESOLUTION * ends[1]}
+        )
+        fits = [fit for fit in self.tried.values() if fit is not None]
+        finite = [fit for fit in fits if np.isfinite(self.limit_of(fit))]
+        if not finite:
+            raise SolverError("limit", "no gain holds with any limit tried", "check the plant")
+        return min(finite, key=lambda fit: fit.misfit)
+
+    def limit_of(self, fit: GainFit) -> float:
+        return float(fit.problem.bounds.u_max[self.control])
+
+    def _try(self, limit: float) -> GainFit | None:
+        if limit not in self.tried:
+            self.tried[limit] = self._fit(limit)
+        return self.tried[limit]
+
+    def _fit(self, limit: float) -> GainFit | None:
+        """From the nearest fit that holds, or from the given one."""
+        known = [(key, fit) for key, fit in self.tried.items() if fit is not None]
+        near = sorted(known, key=lambda item: abs(min(item[0], 1e9) - min(limit, 1e9)))
+        solution = self.fitted.solution
+        starts = [(np.array(fit.K), fit.problem) for _, fit in near[:1]]
+        starts.append((np.array(solution.K), self.fitted.problem))
+        metric = np.array(solution.S)
+        for K, problem in starts:
+            try:
+                return refine_gain(
+                    with_limit(problem, limit, self.control),
+                    K,
+                    metric,
+                    max_evaluations=30,
+                    spread=_SPREAD,
+                )
+            except (SolverError, WeightsError):  # it falls with that limit; the next may not
+                continue
+        return None
+
+
+def _typical_peak(fitted: FittedController, control: int) -> float:
+    """What the command of the weights' regulator exceeds at one sample in two hundred."""
+    K, S = np.array(fitted.solution.K), np.array(fitted.solution.S)
+    controller = controller_for(fitted.problem, K, S)
+    runs = [simulate(controller, drive) for drive in scenarios(fitted.problem)]
+    command = np.concatenate([np.abs(run.u[:, control]) for run in runs])
+    return float(np.quantile(command, 0.995))
+
+
+def _colour_factor(fit: GainFit, limit: float, control: int) -> float:
+    """Variance of the limit for the colour that the residuals show, over that for white ones."""
+    problem = fit.problem
+    controller = controller_for(problem, np.array(fit.K), np.array(fit.S))
+    rows = bound_rows(controller.bounds, problem.plant)
+    moves = np.abs(rows.F[:, control]) * np.isclose(np.abs(rows.b), limit)
+    along = directions(controller, 1, bounds=moves[:, None])
+    found = evaluate(problem, np.array(fit.K), np.array(fit.S))
+    others = found.dK.reshape(len(found.residual), -1)
+    basis, _ = np.linalg.qr(others)
+    residuals, columns, first = [], [], 0
+    raw = []
+    for trial, drive in zip(problem.recordings, scenarios(problem), strict=True):
+        _, sensitivity = simulate_and_differentiate(controller, drive, along)
+        seen = problem.plant.C @ sensitivity.x[..., 0][..., None] / problem.output_scale[:, None]
+        raw.append(seen[..., 0].ravel())
+        mine = slice(first, first + trial.outputs.size)
+        residuals.append(found.residual[mine].reshape(trial.outputs.shape))
+        first = mine.stop
+    column = np.concatenate(raw)
+    column = column - basis @ (basis.T @ column)
+    first = 0
+    for trial in problem.recordings:
+        mine = slice(first, first + trial.outputs.size)
+        columns.append(column[mine].reshape(*trial.outputs.shape, 1))
+        first = mine.stop
+    if not np.any(column):
+        return 1.0
+    coloured = spread_of_sum(residual_noise(residuals), columns)[0, 0]
+    white = spread_of_sum(white_noise(residuals), columns)[0, 0]
+    return float(max(coloured / white, 1.0)) if white > 0 else 1.0
+
+
+def _crossing(
+    distance: Callable[[float], float], inside: float, outside: float, quantile: float
+) -> float:
+    """Limit between two at which D passes the quantile; the outer one when it does not."""
+    if distance(outside) <= quantile:
+        return outside
+    found = scipy.optimize.brentq(
+        lambda limit: distance(limit) - quantile, inside, outside, xtol=1e-3 * inside
+    )
+    return float(found)

@@ -1,0 +1,275 @@
+"""Gains that the recordings allow beside the fitted one, and what of the intent holds for them too.
+
+A statement over all weights with *the* fitted gain forgets that the gain is an estimate. Here gains
+are drawn, each that of some weights X = L exp(D) L', LL' = blkdiag(Q, R) those of the fit:
+
+    log p(D) = -1/2 sum_i (d_i' vec(G^-1 (K(X) - K) T) / s_i)^2 - 1/2 |D|^2 / ln(10)^2 + const
+
+K the estimate (`gain_estimate`), d_i, s_i, G and T those of its `GainCovariance`; what the
+recordings do not tell is limited to weights of the same order of magnitude by the second term.
+Draws are made by elliptical slice sampling (Murray, Adams and MacKay 2010) about the linearised
+posterior, so that the curvature of K(X) counts.
+
+The range of 39 draws holds the next one in 38 of 40 cases: 95 %. A statement is made when it holds
+for all weights with the fitted gain and, of those drawn, in all but one at most.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy.linalg
+
+from impc.arrays import Array
+from impc.assess.bounded_weights import linear_maximum, linear_range, weights_set
+from impc.errors import SolverError, WeightsError
+from impc.inverse.solution_set import gain_fibre
+from impc.model.riccati import gain_gradients, solve_lqr
+from impc.model.weights import stage_weights
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from impc.assess.bounded_weights import WeightsSet
+    from impc.assess.covariance import GainCovariance
+    from impc.assess.intent_statements import Statement
+    from impc.model.plant import Plant
+    from impc.model.riccati import LqrSolution
+    from impc.model.weights import Weights
+
+__all__ = [
+    "DRAWS",
+    "PriceRange",
+    "drawn_gains",
+    "prices_over_gains",
+    "set_of_gain",
+    "with_confidence",
+]
+
+#: Draws whose range is an interval of 95 %.
+DRAWS = 39
+# Of the logarithm of weights that nothing tells: a factor of ten.
+_DECADE = np.log(10.0)
+# Steps of the sampler between two draws that are used.
+_STEPS = 6
+# Natural units of the gain: an exact recording is no sharper than rounding and search leave it.
+_SHARPEST = 1e-6
+
+
+@dataclass(frozen=True)
+class PriceRange:
+    """Price of a typical excursion of a state, d^2 Q_ii at trace R = m.
+
+    Attributes
+    ----------
+    state : str
+        Its name.
+    low, high : float
+        Over all weights with the fitted gain, in the cost's unit.
+    low_drawn, high_drawn : float
+        Over all weights with any gain drawn: 95 %.
+    """
+
+    state: str
+    low: float
+    high: float
+    low_drawn: float
+    high_drawn: float
+
+
+def drawn_gains(
+    plant: Plant,
+    weights: Weights,
+    gain: Array,
+    covariance: GainCovariance,
+    count: int = DRAWS,
+    seed: int = 0,
+) -> tuple[LqrSolution, ...]:
+    """Regulators whose gains the recordings allow.
+
+    Parameters
+    ----------
+    plant : Plant
+    weights : Weights
+        Of the fit.
+    gain : Array
+        What the recordings tell of the gain (m, n), of `gain_estimate`.
+    covariance : GainCovariance
+        Of that estimate.
+    count : int
+        How many.
+    seed : int
+        All numbers drawn follow from it.
+    """
+    rng = np.random.default_rng(seed)
+    n, m = plant.n, plant.m
+    factor = np.linalg.cholesky(weights.block)
+    centre = solve_lqr(plant, weights)
+    deviations = np.maximum(np.array(covariance.deviations), _SHARPEST)
+    basis = _symmetric_blocks(n, m)
+    moved = factor @ basis @ factor.T
+    slopes = gain_gradients(centre)
+    dK = np.einsum("abij,kij->kab", slopes.Q, moved[:, :n, :n])
+    dK += np.einsum("abij,kij->kab", slopes.R, moved[:, n:, n:])
+    derivative = np.array([covariance.along(one) for one in dK]).T
+    # Along what leaves the gain as it is nothing need move: the set of weights has all of it.
+    _, _, moving = np.linalg.svd(derivative, full_matrices=False)
+    basis = np.tensordot(moving, basis, 1)
+    left, values, rows = np.linalg.svd(derivative @ moving.T / deviations[:, None])
+    spread = 1 / np.sqrt(values**2 + 1 / _DECADE**2)
+    basis = np.tensordot(rows, basis, 1)
+    # The linearised posterior has its mean where weights come nearest to the estimate.
+    wrong = covariance.along(centre.K - gain) / deviations
+    mean = -spread * values * (left.T @ wrong)[: len(values)]
+
+    def solution(a: Array) -> LqrSolution:
+        step = np.tensordot((mean + a) * spread, basis, 1)
+        X = factor @ scipy.linalg.expm(step) @ factor.T
+        return solve_lqr(plant, stage_weights(X[:n, :n], X[n:, n:]))
+
+    def excess(a: Array) -> float:
+        """Logarithm of the density over that of the linearised posterior, in which a ~ N(0, I)."""
+        try:
+            K = solution(a).K
+        except (WeightsError, SolverError):
+            return -np.inf
+        off, far = covariance.along(K - gain) / deviations, (mean + a) * spread / _DECADE
+        return float(a @ a - off @ off - far @ far) / 2
+
+    a: Array = np.zeros(len(spread))
+    drawn = []
+    for _ in range(count):
+        for _ in range(_STEPS):
+            a = _slice(a, excess, rng)
+        drawn.append(solution(a))
+    return tuple(drawn)
+
+
+def with_confidence(
+    statements: tuple[Statement, ...], sets: tuple[WeightsSet | None, ...], sizes: Array
+) -> tuple[Statement, ...]:
+    """Statements with the share of the drawn gains for which they hold as well.
+
+    Parameters
+    ----------
+    statements : tuple of Statement
+        Over the weights with the fitted gain; those that do not hold there are left as they are.
+    sets : tuple of WeightsSet or None
+        Of the drawn gains; None where there is none, which counts as a case where nothing holds.
+    sizes : Array
+        Typical excursions of the states (n,), in their units.
+    """
+    return tuple(
+        item
+        if item.holds is None
+        else replace(item, confidence=float(np.mean([_holds(item, one, sizes) for one in sets])))
+        for item in statements
+    )
+
+
+def prices_over_gains(
+    found: WeightsSet, sets: tuple[WeightsSet | None, ...], sizes: Array, states: tuple[str, ...]
+) -> tuple[PriceRange, ...]:
+    """Prices of some states, over the weights of the fitted gain and of those drawn.
+
+    Parameters
+    ----------
+    found : WeightsSet
+        Of the fitted gain.
+    sets : tuple of WeightsSet or None
+        Of the drawn gains.
+    sizes : Array
+        Typical excursions of the states (n,), in their units.
+    states : tuple of str
+        Which.
+    """
+    result = []
+    for name in states:
+        index = found.fibre.plant.states.index(name)
+        direction = np.zeros_like(found.first)
+        direction[index, index] = sizes[index] ** 2
+        own = linear_range(found, direction)
+        drawn = [_range(one, direction) for one in sets]
+        low = min([own.low, *(ends[0] for ends in drawn)])
+        high = max([own.high, *(ends[1] for ends in drawn)])
+        result.append(PriceRange(name, own.low, own.high, low, high))
+    return tuple(result)
+
+
+def set_of_gain(
+    plant: Plant, solution: LqrSolution, metrics: Array, ratio: float
+) -> WeightsSet | None:
+    """The weights of a drawn gain; None where the programs fail.
+
+    Parameters
+    ----------
+    plant : Plant
+    solution : LqrSolution
+        Of `drawn_gains`.
+    metrics : Array
+        Basis of the metrics that the recordings do not tell apart (k, m, m), that of the fit first:
+        the drawn metric takes its place.
+    ratio : float
+        As in `weights_set`.
+    """
+    try:
+        own = np.concatenate([np.array(solution.S)[None], metrics[1:]])
+        return weights_set(gain_fibre(plant, solution.K, own), ratio)
+    except (WeightsError, SolverError):
+        return None
+
+
+def _range(found: WeightsSet | None, direction: Array) -> tuple[float, float]:
+    if found is None:  # nothing is known of this gain's weights: no end
+        return 0.0, np.inf
+    try:
+        ends = linear_range(found, direction)
+    except SolverError:
+        return 0.0, np.inf
+    return ends.low, ends.high
+
+
+def _holds(item: Statement, found: WeightsSet | None, sizes: Array) -> bool:
+    """Whether every member of another set says the same."""
+    if found is None:
+        return False
+    names = found.fibre.plant.states
+    i, j = names.index(item.first), names.index(item.second)
+    direction = np.zeros_like(found.first)
+    if item.kind == "order":
+        direction[i, i], direction[j, j] = sizes[i] ** 2, -(sizes[j] ** 2)
+    else:
+        direction[i, j] = direction[j, i] = sizes[i] * sizes[j] / 2
+    sign = -1.0 if item.holds else 1.0
+    try:
+        return linear_maximum(found, sign * direction).value < 0
+    except SolverError:
+        return False
+
+
+def _slice(a: Array, excess: Callable[[Array], float], rng: np.random.Generator) -> Array:
+    """One step of elliptical slice sampling from N(0, I) times exp(excess)."""
+    other = rng.standard_normal(len(a))
+    level = excess(a) + np.log(rng.uniform())
+    angle = rng.uniform(0, 2 * np.pi)
+    low, high = angle - 2 * np.pi, angle
+    while True:
+        moved = a * np.cos(angle) + other * np.sin(angle)
+        if excess(moved) > level or high - low < 1e-9:
+            return np.asarray(moved if high - low >= 1e-9 else a)
+        low, high = (angle, high) if angle < 0 else (low, angle)
+        angle = rng.uniform(low, high)
+
+
+def _symmetric_blocks(n: int, m: int) -> Array:
+    """Orthonormal basis of blkdiag(D_Q, D_R), symmetric, (k, n + m, n + m)."""
+    found = []
+    for first, last in ((0, n), (n, n + m)):
+        for i in range(first, last):
+            for j in range(first, i + 1):
+                D = np.zeros((n + m, n + m))
+                D[i, j] = D[j, i] = 1.0 if i == j else np.sqrt(0.5)
+                found.append(D)
+    return np.array(found)

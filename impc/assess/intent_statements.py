@@ -1,0 +1,211 @@
+"""What can be said of a subject's intent whatever weights are chosen, and what cannot.
+
+All weights with the fitted gain and a condition number up to a multiple of the least are equally
+good explanations (`weights_set`). A statement about them is worth making if it holds for every one.
+
+    price     d_i^2 Q_ii: what a typical excursion d_i of state i costs
+    order     price of i above price of j: the sign of a linear function, decided exactly
+    sense     Q_ij above or below zero: the two states are priced together or against each other
+    direction the dominant eigenvector of D Q D; its widest angle to that of the least condition
+              number is searched for, not proved: a member that far exists, farther ones may
+
+docs/equivalent-weights.md, section 5, and docs/what-may-be-concluded.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.arrays import Array
+from impc.assess.bounded_weights import linear_maximum, linear_range
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from impc.assess.bounded_weights import Range, WeightsSet
+    from impc.model.weights import Weights
+
+__all__ = ["Statement", "order_statements", "sense_statements", "widest_dominant_angle"]
+
+_FRANK_WOLFE = 12
+# A range that ends this near to zero, of its width, does not tell the sign.
+_TOUCHES = 1e-6
+# 38 of 39, see `intent_draws`.
+_AGREE = 38 / 39 - 1e-9
+
+
+@dataclass(frozen=True)
+class Statement:
+    """A statement about two states.
+
+    Attributes
+    ----------
+    first, second : str
+        Names of the states.
+    says : str
+        In words.
+    holds : bool or None
+        True or False for every member of the set; None when members disagree.
+    low, high : float
+        Range of the linear function whose sign decides, relative to the price of `first` in the
+        member of least condition number.
+    kind : str
+        "order" or "sense".
+    confidence : float or None
+        Share of the gains that the recordings allow for which it holds as well (`intent_draws`);
+        None when that was not looked into, or it does not hold at the fitted gain.
+    """
+
+    first: str
+    second: str
+    says: str
+    holds: bool | None
+    low: float
+    high: float
+    kind: str
+    confidence: float | None = None
+
+    @property
+    def made(self) -> bool:
+        """Whether it may be said of the subject, at 95 %: all drawn gains but one agree."""
+        return self.confidence is not None and self.confidence >= _AGREE
+
+
+def order_statements(
+    found: WeightsSet, sizes: Array, states: tuple[str, ...]
+) -> tuple[Statement, ...]:
+    """Whether the price of one state is above that of another, for every pair of the given ones.
+
+    Parameters
+    ----------
+    sizes : Array
+        Typical excursion of every state (n,), in its unit.
+    states : tuple of str
+        The states to compare; those of the plant's own that a reader can name.
+    """
+    names = found.fibre.plant.states
+    total = len(found.first)
+    statements = []
+    for position, one in enumerate(states):
+        for other in states[position + 1 :]:
+            i, j = names.index(one), names.index(other)
+            direction = np.zeros((total, total))
+            direction[i, i], direction[j, j] = sizes[i] ** 2, -(sizes[j] ** 2)
+            says = f"a typical {one} costs more than a typical {other}"
+            ends = linear_range(found, direction)
+            span = (ends.low_bound, ends.high_bound)  # no member goes beyond
+            statements.append(_statement(found, span, one, other, says, sizes[i], "order"))
+    return tuple(statements)
+
+
+def sense_statements(
+    found: WeightsSet,
+    sizes: Array,
+    states: tuple[str, ...],
+    ranges: Mapping[tuple[int, int], Range],
+) -> tuple[Statement, ...]:
+    """Whether two states are priced together (Q_ij > 0: the same sign costs more).
+
+    Parameters
+    ----------
+    sizes : Array
+        Typical excursions d_i (n,), in the units of the states.
+    states : tuple of str
+        Names of those compared, in pairs.
+    ranges : mapping
+        Of `entry_ranges`, for these states at least.
+    """
+    names = found.fibre.plant.states
+    statements = []
+    for position, one in enumerate(states):
+        for other in states[position + 1 :]:
+            i, j = names.index(one), names.index(other)
+            ends, scale = ranges[max(i, j), min(i, j)], sizes[i] * sizes[j]
+            says = f"{one} and {other} of the same sign cost more than of opposite signs"
+            span = (scale * ends.low_bound, scale * ends.high_bound)
+            statements.append(_statement(found, span, one, other, says, sizes[i], "sense"))
+    return tuple(statements)
+
+
+def widest_dominant_angle(found: WeightsSet, sizes: Array) -> tuple[float, Weights]:
+    """Widest angle found between dominant directions of D Q D, in degrees, and who has it.
+
+    D = diag(sizes), the typical excursions (n,) in the units of the states.
+
+    The direction of the member of least condition number against others: from it and from the
+    members at the ends of the ranges of the largest prices, each improved by steps of Frank and
+    Wolfe (the derivative of an eigenvector is linear in Q, so a step is one program).
+    """
+    n = found.fibre.plant.n
+    D = np.diag(np.asarray(sizes, dtype=np.float64))
+    centre = _dominant(D @ found.least.weights.Q @ D)
+    largest = np.argsort(-np.diag(D @ found.least.weights.Q @ D))[:2]
+    starts = [found.least.weights.block]
+    for index in largest:
+        direction = np.zeros_like(found.first)
+        direction[index, index] = 1.0
+        ends = linear_range(found, direction)
+        starts += [ends.low_weights.block, ends.high_weights.block]
+    best_angle, best = 0.0, found.least.weights.block
+    for start in starts:
+        X = _frank_wolfe(found, D, centre, start)
+        angle = _angle(centre, _dominant(D @ X[:n, :n] @ D))
+        if angle > best_angle:
+            best_angle, best = angle, X
+    return best_angle, type(found.least.weights)(best[:n, :n], best[n:, n:])
+
+
+def _frank_wolfe(found: WeightsSet, D: Array, centre: Array, start: Array) -> Array:
+    """Turn the dominant direction away from the centre's, along segments to extreme members."""
+    n, X = found.fibre.plant.n, start
+    for _ in range(_FRANK_WOLFE):
+        gradient = np.zeros_like(X)
+        gradient[:n, :n] = D @ _turning(D @ X[:n, :n] @ D, centre) @ D
+        end = linear_maximum(found, gradient).weights.block
+        shares = np.linspace(0.0, 1.0, 21)
+        angles = [_angle(centre, _dominant(D @ (X + s * (end - X))[:n, :n] @ D)) for s in shares]
+        step = shares[int(np.argmax(angles))]
+        if step == 0:
+            break
+        X = X + step * (end - X)
+    return X
+
+
+def _turning(Q: Array, centre: Array) -> Array:
+    """Gradient of 1 - (v'centre)^2 with respect to Q, v the dominant eigenvector."""
+    values, vectors = np.linalg.eigh(Q)
+    v, others = vectors[:, -1], vectors[:, :-1]
+    gaps = np.maximum(values[-1] - values[:-1], 1e-9 * values[-1])
+    weight = others @ ((others.T @ centre) / gaps)
+    gradient = -2 * float(v @ centre) * np.outer(weight, v)
+    if np.linalg.norm(gradient) < 1e-9 / values[-1]:  # at the centre itself: any way out
+        gradient = np.outer(others[:, -1], v) / values[-1]
+    return np.asarray((gradient + gradient.T) / 2)
+
+
+def _dominant(Q: Array) -> Array:
+    return np.asarray(np.linalg.eigh((Q + Q.T) / 2)[1][:, -1])
+
+
+def _angle(one: Array, other: Array) -> float:
+    return float(np.degrees(np.arccos(min(1.0, abs(float(one @ other))))))
+
+
+def _statement(
+    found: WeightsSet,
+    span: tuple[float, float],
+    one: str,
+    other: str,
+    says: str,
+    size: float,
+    kind: str,
+) -> Statement:
+    low, high = span
+    index = found.fibre.plant.states.index(one)
+    unit = float(found.least.weights.Q[index, index] * size**2)
+    touches = _TOUCHES * max(abs(low), abs(high))
+    holds = True if low > touches else False if high < -touches else None
+    return Statement(one, other, says, holds, low / unit, high / unit, kind)

@@ -1,0 +1,158 @@
+"""One method's gain on all recordings: how it simulates them, and whether it keeps the bounds.
+
+The measures of docs/comparing.md: VAF (3.24), largest input, share of samples beyond a bound.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.arrays import Array, Frozen, frozen
+from impc.assess.vaf import vaf
+from impc.control.closed_loop import Simulation, simulate
+from impc.inverse.problem import controller_for, scenarios
+
+if TYPE_CHECKING:
+    from impc.inverse.problem import InverseProblem
+    from impc.model.bounds import Bounds
+    from impc.model.weights import Weights
+
+__all__ = ["MethodFit", "judge", "without_gain"]
+
+
+@dataclass(frozen=True)
+class MethodFit(Frozen):
+    """One method on all recordings.
+
+    Attributes
+    ----------
+    name : str
+        Of the method.
+    K : Array or None
+        (m, n); None when the method ended without one.
+    weights : Weights or None
+    runs : tuple of Simulation
+        One a trial; empty without a gain.
+    vaf : Array
+        (3.24) over all trials, % (p,); NaN when a simulation does not reach the end.
+    trial_vaf : Array
+        (trials, p), the same for each.
+    largest_input : Array
+        Largest magnitude of each input (m,).
+    exceeded : float
+        Share of the samples at which an input bound is exceeded, by more than 1e-6 of it.
+    fell : tuple of float or None
+        For each trial the time in s at which the loop left every reasonable range.
+    seconds : float
+        Time that the method took, s.
+    reason : str
+        Why there is no gain; empty otherwise.
+    """
+
+    name: str
+    K: Array | None
+    weights: Weights | None
+    runs: tuple[Simulation, ...]
+    vaf: Array
+    trial_vaf: Array
+    largest_input: Array
+    exceeded: float
+    fell: tuple[float | None, ...]
+    seconds: float
+    reason: str
+
+    @property
+    def keeps_bounds(self) -> bool:
+        """Whether there is a gain and it never exceeds an input bound."""
+        return self.K is not None and self.exceeded == 0
+
+
+def judge(
+    name: str,
+    problem: InverseProblem,
+    bounds: Bounds,
+    gain: Array,
+    metric: Array,
+    *,
+    weights: Weights | None,
+    seconds: float,
+    reason: str = "",
+) -> MethodFit:
+    """Simulate all recordings of a problem with a gain.
+
+    Parameters
+    ----------
+    name : str
+        Of the method.
+    problem : InverseProblem
+        At the initial states to simulate from; its bounds are those that the controller knows.
+    bounds : Bounds
+        Those of the subject, which it may exceed.
+    gain, metric : Array
+        (m, n), (m, m).
+    weights, seconds, reason
+        Kept in the result; the time in s.
+
+    Raises
+    ------
+    InputError, SolverError
+        As `controller_for`.
+    """
+    controller = controller_for(problem, gain, metric)
+    runs = tuple(simulate(controller, drive) for drive in scenarios(problem))
+    commands = np.concatenate([run.u for run in runs])
+    beyond = (commands > bounds.u_max + 1e-6 * np.abs(bounds.u_max)) | (
+        commands < bounds.u_min - 1e-6 * np.abs(bounds.u_min)
+    )
+    return MethodFit(
+        name,
+        frozen(gain),
+        weights,
+        runs,
+        frozen(_pooled_vaf(problem, runs)),
+        frozen([_trial_vaf(problem, index, run) for index, run in enumerate(runs)]),
+        frozen(np.max(np.abs(commands), axis=0)),
+        float(np.mean(np.any(beyond, axis=1))),
+        tuple(None if run.complete else run.reached * problem.plant.dt for run in runs),
+        seconds,
+        reason,
+    )
+
+
+def without_gain(name: str, problem: InverseProblem, seconds: float, reason: str) -> MethodFit:
+    """What is left to say of the method `name` that ended without a gain.
+
+    Its `reason` and the time in s, `seconds`, are kept.
+    """
+    p, m, count = len(problem.plant.outputs), problem.plant.m, len(problem.recordings)
+    return MethodFit(
+        name,
+        None,
+        None,
+        (),
+        frozen(np.full(p, np.nan)),
+        frozen(np.full((count, p), np.nan)),
+        frozen(np.full(m, np.nan)),
+        0.0,
+        (None,) * count,
+        seconds,
+        reason,
+    )
+
+
+def _trial_vaf(problem: InverseProblem, index: int, run: Simulation) -> Array:
+    trial = problem.recordings[index]
+    if not run.complete:
+        return np.full(len(problem.plant.outputs), np.nan)
+    return vaf(trial.outputs, run.x @ problem.plant.C.T)
+
+
+def _pooled_vaf(problem: InverseProblem, runs: tuple[Simulation, ...]) -> Array:
+    if not all(run.complete for run in runs):
+        return np.full(len(problem.plant.outputs), np.nan)
+    recorded = np.concatenate([trial.outputs for trial in problem.recordings])
+    simulated = np.concatenate([run.x @ problem.plant.C.T for run in runs])
+    return vaf(recorded, simulated)

@@ -1,0 +1,161 @@
+"""The same fit with another horizon, or without the limit: what the recordings say for each.
+
+Two measures: VAF of trials that were left out, and Akaike's criterion. Residuals are coloured, so
+the likelihood is that of their innovations under one autoregression of order one for each output,
+taken from the fit itself; over T rows of innovations with covariance V
+
+    AIC = T log det V + 2 k,
+
+k numbers fitted. Every alternative fits as many, so only differences count. Below 2 nobody tells
+two models apart; above 10 the worse one has no support (Burnham and Anderson 2002, 70).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.assess.held_out import left_out_vaf
+from impc.assess.long_run_covariance import residual_noise
+from impc.errors import SolverError, WeightsError
+from impc.inverse.noisy_fit import fit_controller
+from impc.inverse.problem import without_bounds
+from impc.inverse.residuals import residual_only
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from impc.arrays import Array
+    from impc.inverse.noisy_fit import FittedController
+    from impc.inverse.problem import InverseProblem
+
+__all__ = ["Alternative", "fit_alternatives", "verdict"]
+
+_SAME, _RULED_OUT = 2.0, 10.0
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """One way to fit the same recordings.
+
+    Attributes
+    ----------
+    name : str
+        "as fitted", "no limit" or "horizon N".
+    horizon : int
+        In samples.
+    misfit : float
+        2-norm of the residual; infinite when no controller was found.
+    aic : float
+        Above the least of all alternatives.
+    held_out : float
+        Mean VAF over outputs and trials left out, %; NaN with a single trial.
+    reason : str
+        Why there is no controller; empty otherwise.
+    """
+
+    name: str
+    horizon: int
+    misfit: float
+    aic: float
+    held_out: float
+    reason: str
+
+
+def fit_alternatives(
+    problem: InverseProblem,
+    fitted: FittedController,
+    horizons: Sequence[int],
+    settle: float,
+    progress: Callable[[str], None] = lambda _: None,
+) -> tuple[Alternative, ...]:
+    """Fit again without the limit, if there is one, and with each other horizon.
+
+    Parameters
+    ----------
+    problem : InverseProblem
+        As it was posed.
+    fitted : FittedController
+        Its fit, from whose weights the others start.
+    horizons : sequence of int
+        In samples; that of the problem is passed over.
+    settle : float
+        Seconds at the start of a left-out trial that do not count.
+    progress : callable
+        Told the name of each alternative when it is done.
+    """
+    posed = [("as fitted", problem)]
+    if np.any(np.isfinite(problem.bounds.u_max)):
+        posed.append(("no limit", without_bounds(problem)))
+    posed += [
+        (f"horizon {length}", replace(problem, horizon=length))
+        for length in horizons
+        if length != problem.horizon
+    ]
+    roots = np.asarray(residual_noise(_residuals(fitted, fitted.problem)).root)
+    found = []
+    for name, other in posed:
+        found.append(_fit(name, other, fitted, settle, roots))
+        progress(name)
+    least = min(item.aic for item in found)
+    return tuple(replace(item, aic=item.aic - least) for item in found)
+
+
+def verdict(one: Alternative, other: Alternative) -> str:
+    """What the recordings say of one against the other, in a sentence."""
+    if one.reason or other.reason:
+        failed = one if one.reason else other
+        return f"{failed.name}: no controller ({failed.reason})"
+    better, worse = (one, other) if one.aic <= other.aic else (other, one)
+    distance = worse.aic - better.aic
+    pair = f"{better.name} and {worse.name}"
+    if distance < _SAME:
+        return f"the recordings cannot tell {pair} apart (AIC differs by {distance:.1f})"
+    strength = "rule out" if distance > _RULED_OUT else "speak weakly against"
+    return (
+        f"the recordings {strength} {worse.name} beside {better.name} (AIC +{distance:.0f}, "
+        f"held-out VAF {worse.held_out - better.held_out:+.2f} points)"
+    )
+
+
+def _fit(
+    name: str, problem: InverseProblem, fitted: FittedController, settle: float, roots: Array
+) -> Alternative:
+    try:
+        found = fitted if name == "as fitted" else fit_controller(problem, fitted.weights)
+        held = [_left_out(problem, found, index, settle) for index in range(_trials(problem))]
+    except (WeightsError, SolverError) as error:
+        return Alternative(name, problem.horizon, np.inf, np.inf, np.nan, str(error))
+    aic = _criterion(_residuals(found, found.problem), roots)
+    mean = float(np.mean(held)) if held else float("nan")
+    return Alternative(name, problem.horizon, found.misfit, aic, mean, "")
+
+
+def _trials(problem: InverseProblem) -> int:
+    count = len(problem.recordings)
+    return count if count > 1 else 0
+
+
+def _left_out(problem: InverseProblem, found: FittedController, index: int, settle: float) -> Array:
+    others = problem.recordings[:index] + problem.recordings[index + 1 :]
+    fit = fit_controller(replace(problem, recordings=others), found.weights)
+    alone = replace(fit.problem, recordings=(problem.recordings[index],))
+    return left_out_vaf(alone, np.array(fit.solution.K), np.array(fit.solution.S), settle)[0]
+
+
+def _residuals(found: FittedController, problem: InverseProblem) -> list[Array]:
+    flat = residual_only(problem, found.solution.K, found.solution.S)
+    ends = np.cumsum([trial.outputs.size for trial in problem.recordings])[:-1]
+    parts = np.split(flat, ends)
+    return [
+        part.reshape(trial.outputs.shape)
+        for part, trial in zip(parts, problem.recordings, strict=True)
+    ]
+
+
+def _criterion(residuals: list[Array], roots: Array) -> float:
+    innovations = np.concatenate([part[1:] - roots * part[:-1] for part in residuals])
+    covariance = innovations.T @ innovations / len(innovations)
+    return float(len(innovations) * np.linalg.slogdet(covariance)[1])

@@ -1,0 +1,235 @@
+"""Profile likelihood of one number behind a fit: an entry of the gain, or a physical parameter.
+
+The number is held at a value v and everything else - the rest of the gain, initial states, other
+parameters - is fitted again. With m(v) the misfit that is left, s^2 the variance of a residual and
+f >= 1 the factor by which the colour of the residuals widens the variance of the number,
+
+    D(v) = (m(v)^2 - m(v*)^2) / (s^2 f)
+
+is chi-squared with one degree of freedom at the true value, and {v : D(v) <= q} is an interval that
+need not be symmetric and is not fooled by curvature. It ends nowhere if the misfit stays: then the
+recordings do not determine the number. The input limit has a module of its own, `unknown_limit`.
+docs/fitting.md says how often the interval covers the truth.
+
+All of these numbers are affine in the coordinates z of the search (`Coordinates`), c + a'z,
+parameters in their logarithm; the search with a'z held goes on in the null space of a'.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy.linalg
+import scipy.optimize
+import scipy.stats
+
+from impc.arrays import Array, Frozen, frozen
+from impc.assess.intervals import LEVEL, Interval, entry_names
+from impc.errors import InputError
+from impc.inverse.coordinates import PARAMETER_UNIT, Coordinates
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from impc.assess.printed_gain import GainEstimate
+
+__all__ = ["Profile", "profile_likelihood"]
+
+# A prior this much wider than any gain that can be keeps free directions from wandering off.
+_WIDTH = 100.0
+# Steps, in deviations, of the walk that looks for the ends; where D is still low at the last one
+# the recordings set no end.
+_STEPS = (1.0, 2.0, 3.0, 5.0, 8.0, 12.0, 20.0)
+_END = 1e-3
+_ROUNDS = 6
+
+
+@dataclass(frozen=True)
+class Profile(Frozen):
+    """Profile of one number.
+
+    Attributes
+    ----------
+    interval : Interval
+        Method "profile".
+    values, distances : Array
+        Values tried (t,), ascending, in the number's unit, and D at each (t,), for a picture.
+    """
+
+    interval: Interval
+    values: Array
+    distances: Array
+
+
+def profile_likelihood(estimate: GainEstimate, name: str, level: float = LEVEL) -> Profile:
+    """Profile an entry of K (name K.<control>.<state>) or a parameter fitted with it.
+
+    Parameters
+    ----------
+    estimate : GainEstimate
+        Where the profile begins.
+    name : str
+        K.<control>.<state>, or that of the parameter.
+    level : float
+        Of the interval, between 0 and 1.
+
+    Raises
+    ------
+    InputError
+        When there is no such entry or parameter.
+    """
+    search = _Search(estimate, name)
+    quantile = float(scipy.stats.chi2.ppf(level, 1))
+    ends = search.ends(quantile)
+    tried = sorted(search.tried)
+    low, high = (search.number(offset) for offset in ends)
+    best = search.number(search.best_offset())
+    return Profile(
+        Interval(name, "profile", level, best, low, high),
+        frozen([search.number(offset) for offset in tried]),
+        frozen([search.distance(offset) for offset in tried]),
+    )
+
+
+class _Search:
+    """Fits with the number held, remembered; offsets are from the fit's, in z units."""
+
+    def __init__(self, estimate: GainEstimate, name: str) -> None:
+        problem = estimate.problem
+        self.space = Coordinates(problem, np.array(estimate.K), np.array(estimate.S))
+        self.direction, self.number = _functional(estimate, self.space, name)
+        self.null = scipy.linalg.null_space(self.direction[None])
+        self.samples = sum(trial.outputs.size for trial in problem.recordings)
+        misfit = float(np.linalg.norm(self.space.at(self.space.start).residual))
+        self.noise = max(misfit, 1e-12) / np.sqrt(self.samples)
+        self.target = self.space.with_prior(self.noise / _WIDTH)
+        self.tried: dict[float, tuple[float, Array]] = {}
+        self.squared(0.0)
+        self.deviation, self.factor = _spread(estimate, name)
+
+    def squared(self, offset: float) -> float:
+        """m^2 with the number at this offset, from the nearest fit before."""
+        if offset not in self.tried:
+            if self.tried:
+                near = min(self.tried, key=lambda known: abs(known - offset))
+                start = self.null.T @ (self.tried[near][1] - self.space.start)
+            else:
+                start = np.zeros(self.null.shape[1])
+            unit = self.direction / float(self.direction @ self.direction)
+            base = self.space.start + offset * unit
+
+            def residual(w: Array) -> Array:
+                return self.target.residual(base + self.null @ w)
+
+            def derivative(w: Array) -> Array:
+                return np.asarray(self.target.derivative(base + self.null @ w) @ self.null)
+
+            found = scipy.optimize.least_squares(
+                residual, start, jac=derivative, ftol=1e-8, max_nfev=40
+            )
+            z = base + self.null @ found.x
+            self.tried[offset] = (float(np.sum(self.space.at(z).residual ** 2)), z)
+        return self.tried[offset][0]
+
+    def best_offset(self) -> float:
+        return min(self.tried, key=lambda offset: self.tried[offset][0])
+
+    def distance(self, offset: float) -> float:
+        """D."""
+        least = self.tried[self.best_offset()][0]
+        return float((self.squared(offset) - least) / (self.noise**2 * self.factor))
+
+    def ends(self, quantile: float) -> list[float]:
+        """Offsets at which D passes the quantile on either side of its minimum.
+
+        The search itself had a prior, which the profile does not feel: its minimum may be
+        elsewhere, and a walk may find it. Then the walks begin again from there.
+        """
+        ends: list[float] = []
+        for _ in range(_ROUNDS):
+            self._refine()
+            origin = self.best_offset()
+            ends = [self._end(origin, sign, quantile) for sign in (-1.0, 1.0)]
+            if self.best_offset() == origin:
+                break
+        return ends
+
+    def _refine(self) -> None:
+        """Look for the minimum between the neighbours of the best offset so far."""
+        if not np.isfinite(self.deviation):
+            return
+        tried, best = sorted(self.tried), self.best_offset()
+        below = max([item for item in tried if item < best], default=best - self.deviation)
+        above = min([item for item in tried if item > best], default=best + self.deviation)
+        scipy.optimize.minimize_scalar(
+            self.squared,
+            bounds=(below, above),
+            method="bounded",
+            options={"xatol": 0.02 * self.deviation},
+        )
+
+    def _end(self, origin: float, sign: float, quantile: float) -> float:
+        """Offset at which D passes the quantile, infinite when it does not."""
+        if not np.isfinite(self.deviation):
+            return sign * np.inf
+        inside = origin
+        for step in _STEPS:
+            outside = origin + sign * step * self.deviation
+            if self.distance(outside) > quantile:
+                return _crossing(self.distance, inside, outside, quantile)
+            inside = outside
+        return sign * np.inf
+
+
+def _functional(
+    estimate: GainEstimate, space: Coordinates, name: str
+) -> tuple[Array, Callable[[float], float]]:
+    """Row a of the number in z, and the number at an offset of a'z."""
+    entries = entry_names(estimate.problem.plant)
+    row = np.zeros(int(space.ends[-1]))
+    if name in entries:
+        index = entries.index(name)
+        control, state = divmod(index, space.n)
+        row[: space.ends[0]] = np.kron(space.G[control], np.linalg.inv(space.T)[:, state])
+        value = float(estimate.K[control, state])
+        return row, lambda offset: value + offset
+    family = estimate.problem.family
+    if family is not None and name in family.names:
+        index = family.names.index(name)
+        row[int(space.ends[2]) + index] = PARAMETER_UNIT
+        value = float(estimate.parameters[index])
+        return row, lambda offset: float(value * np.exp(offset)) if offset < 700 else np.inf
+    known = [*entries, *(family.names if family is not None else ())]
+    raise InputError(f"profile of {name}", "there is no such number", f"known: {', '.join(known)}")
+
+
+def _spread(estimate: GainEstimate, name: str) -> tuple[float, float]:
+    """Deviation in units of the offset, and the factor f of the residuals' colour."""
+    coloured, white = estimate.covariance, estimate.white
+    entries = entry_names(estimate.problem.plant)
+    if name in entries:
+        index = entries.index(name)
+        pair = np.ravel(coloured.entries)[index], np.ravel(white.entries)[index]
+    else:
+        family = estimate.problem.family
+        assert family is not None
+        index = family.names.index(name)
+        pair = coloured.parameters[index], white.parameters[index]
+    deviation, plain = float(pair[0]), float(pair[1])
+    if not (np.isfinite(deviation) and plain > 0):
+        return np.inf, 1.0
+    return deviation, max((deviation / plain) ** 2, 1.0)
+
+
+def _crossing(
+    distance: Callable[[float], float], inside: float, outside: float, quantile: float
+) -> float:
+    found = scipy.optimize.brentq(
+        lambda offset: distance(offset) - quantile,
+        inside,
+        outside,
+        xtol=_END * abs(outside - inside),
+    )
+    return float(found)

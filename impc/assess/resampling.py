@@ -1,0 +1,222 @@
+"""Bootstrap of a fitted controller: simulate, add residuals drawn again, fit again.
+
+The disturbance is known and the same in every replicate; only the residuals are drawn.
+
+    moving blocks   blocks of the residuals of all trials, laid end to end (Künsch 1989); their
+                    length is that of Politis and White (2004) for a first-order process,
+                    (6 a^2 / (1 - a^2)^2)^(1/3) T^(1/3), the longest of the outputs
+    model           an autoregression for each output by Burg's method, its order by AIC; the rows
+                    of its innovations drawn one by one, so that outputs keep their correlation
+
+Replicate k draws from the k-th child of the seed: the same numbers in any order, on any machine.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy.signal
+from statsmodels.regression.linear_model import burg
+
+from impc.arrays import Array, Frozen, frozen
+from impc.assess.intervals import Interval, entry_names
+from impc.assess.printed_gain import gain_estimate
+from impc.control.closed_loop import simulate
+from impc.inverse.noisy_fit import fit_controller
+from impc.inverse.problem import controller_for, scenarios
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from impc.assess.printed_gain import GainEstimate
+    from impc.inverse.problem import InverseProblem
+    from impc.model.weights import Weights
+
+__all__ = [
+    "DRAWS",
+    "Draw",
+    "Replicate",
+    "block_length",
+    "block_residuals",
+    "bootstrap_intervals",
+    "model_residuals",
+    "replicate",
+]
+
+#: Draws residuals again: (residuals (samples, p) of each trial, generator) -> as many.
+Draw = Callable[[list[Array], np.random.Generator], list[Array]]
+
+_HIGHEST_ORDER = 12
+_BEFORE = 500
+
+
+@dataclass(frozen=True)
+class Replicate(Frozen):
+    """Estimates of one replicate.
+
+    Attributes
+    ----------
+    K : Array
+        (m, n), of `gain_estimate`.
+    parameters : Array
+        Physical parameters in their units (k,).
+    """
+
+    K: Array
+    parameters: Array
+
+
+def replicate(
+    problem: InverseProblem,
+    gain: Array,
+    metric: Array,
+    start: Weights,
+    index: int,
+    seed: int,
+    resample: Draw,
+) -> Replicate:
+    """One replicate, by its number.
+
+    Parameters
+    ----------
+    problem : InverseProblem
+        At the initial states and parameters of the estimate.
+    gain, metric : Array
+        K (m, n) and S (m, m) of the estimate: what is simulated.
+    start : Weights
+        Where the fit begins.
+    index : int
+        The child of the seed that it draws from, from 0.
+    seed : int
+        That of the whole bootstrap.
+    resample : Draw
+        `block_residuals` or `model_residuals`.
+
+    Raises
+    ------
+    WeightsError, SolverError
+        When it cannot be fitted.
+    """
+    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index,)))
+    clean, residuals = _split(problem, gain, metric)
+    drawn = resample(residuals, rng)
+    trials = tuple(
+        replace(trial, outputs=frozen(outputs + noise))
+        for trial, outputs, noise in zip(problem.recordings, clean, drawn, strict=True)
+    )
+    again = gain_estimate(fit_controller(replace(problem, recordings=trials), start))
+    return Replicate(again.K, frozen(again.parameters))
+
+
+def bootstrap_intervals(
+    estimate: GainEstimate, replicates: Sequence[Replicate], method: str, level: float
+) -> tuple[Interval, ...]:
+    """Percentile intervals of the entries of K and of the parameters; no ends where not told.
+
+    Parameters
+    ----------
+    method : str
+        Name of the bootstrap, kept in each interval.
+    level : float
+        Share of the replicates inside, between 0 and 1.
+    """
+    names = list(entry_names(estimate.problem.plant))
+    if estimate.problem.family is not None:
+        names += estimate.problem.family.names
+    values = np.append(np.ravel(estimate.K), estimate.parameters)
+    drawn = np.array([np.append(np.ravel(item.K), item.parameters) for item in replicates])
+    low, high = np.quantile(drawn, [0.5 - level / 2, 0.5 + level / 2], axis=0)
+    told = np.append(np.ravel(estimate.covariance.told_entries), np.isfinite(estimate.parameters))
+    # Replicates stay where the search began along what is not told: their spread says nothing.
+    low, high = np.where(told, low, -np.inf), np.where(told, high, np.inf)
+    return tuple(
+        Interval(name, method, level, float(value), float(one), float(other), bool(known))
+        for name, value, one, other, known in zip(names, values, low, high, told, strict=True)
+    )
+
+
+def block_residuals(residuals: list[Array], rng: np.random.Generator) -> list[Array]:
+    """A `Draw` in moving blocks: `residuals` (samples, p) of each trial to as many, (samples, p).
+
+    `rng` is what is drawn from.
+    """
+    centred = [part - np.mean(part, axis=0) for part in residuals]
+    length = block_length(residuals)
+    drawn = []
+    for part in centred:
+        blocks: list[Array] = []
+        while sum(map(len, blocks)) < len(part):
+            source = centred[rng.integers(len(centred))]
+            first = rng.integers(max(len(source) - length, 0) + 1)
+            blocks.append(source[first : first + length])
+        drawn.append(np.concatenate(blocks)[: len(part)])
+    return drawn
+
+
+def block_length(residuals: list[Array]) -> int:
+    """Samples of a block for `residuals` (samples, p), by the rule of the module's text."""
+    above = sum(np.sum(part[1:] * part[:-1], axis=0) for part in residuals)
+    below = sum(np.sum(part**2, axis=0) for part in residuals)
+    root = np.clip(np.divide(above, below, out=np.zeros_like(below), where=below > 0), -0.99, 0.99)
+    total = sum(map(len, residuals))
+    best = np.max(np.cbrt(6 * root**2 / (1 - root**2) ** 2 * total))
+    return int(np.clip(np.ceil(best), 1, min(map(len, residuals))))
+
+
+def model_residuals(residuals: list[Array], rng: np.random.Generator) -> list[Array]:
+    """A `Draw` by autoregressions: `residuals` (samples, p) of each trial to as many, (samples, p).
+
+    They are fitted to all trials; `rng` is what is drawn from.
+    """
+    centred = [part - np.mean(part, axis=0) for part in residuals]
+    outputs = centred[0].shape[1]
+    models = [_autoregression([part[:, output] for part in centred]) for output in range(outputs)]
+    longest = max(map(len, models))
+    innovations = np.concatenate(
+        [
+            np.column_stack(
+                [scipy.signal.lfilter(model, [1.0], part[:, i]) for i, model in enumerate(models)]
+            )[longest - 1 :]
+            for part in centred
+        ]
+    )
+    drawn = []
+    for part in centred:
+        rows = innovations[rng.integers(len(innovations), size=len(part) + _BEFORE)]
+        columns = [
+            scipy.signal.lfilter([1.0], model, rows[:, i])[_BEFORE:]
+            for i, model in enumerate(models)
+        ]
+        drawn.append(np.column_stack(columns))
+    return drawn
+
+
+#: By the word that `bootstrap` of [fit] gives.
+DRAWS: dict[str, Draw] = {"block": block_residuals, "model": model_residuals}
+
+
+def _autoregression(parts: list[Array]) -> Array:
+    """1, -a_1, ..., -a_r: Burg's on the trials end to end, its order by AIC."""
+    joined = np.concatenate(parts)
+    best, chosen = np.inf, np.array([1.0])
+    for order in range(1, _HIGHEST_ORDER + 1):
+        coefficients, variance = burg(joined, order, demean=False)
+        criterion = len(joined) * np.log(variance) + 2 * order
+        if criterion < best:
+            best, chosen = criterion, np.append(1.0, -coefficients)
+    return np.asarray(chosen)
+
+
+def _split(problem: InverseProblem, gain: Array, metric: Array) -> tuple[list[Array], list[Array]]:
+    """Simulated outputs of every trial, and what is left of the recorded ones."""
+    controller = controller_for(problem, gain, metric)
+    runs = [simulate(controller, drive) for drive in scenarios(problem)]
+    clean = [np.asarray(run.x @ problem.plant.C.T) for run in runs]
+    residuals = [
+        np.asarray(trial.outputs - outputs)
+        for trial, outputs in zip(problem.recordings, clean, strict=True)
+    ]
+    return clean, residuals

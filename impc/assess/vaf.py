@@ -1,0 +1,164 @@
+"""How well a simulation agrees with a recording: VAF (3.24), and whether what is left is noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from statsmodels.stats.diagnostic import acorr_ljungbox
+
+from impc.arrays import Array, Frozen, frozen
+from impc.checking import checked
+from impc.errors import InputError
+
+if TYPE_CHECKING:
+    from impc.control.closed_loop import Simulation
+    from impc.model.plant import Plant
+    from impc.model.recordings import Recording
+
+__all__ = [
+    "TrialAgreement",
+    "agreement",
+    "centred_vaf",
+    "saturated_share",
+    "vaf",
+    "whiteness",
+]
+
+# One second of lags tells a rhythm that was missed; fewer than ten tell nothing.
+_LEAST_LAGS = 10
+
+
+@dataclass(frozen=True)
+class TrialAgreement(Frozen):
+    """One trial against its simulation.
+
+    Attributes
+    ----------
+    vaf : Array
+        (3.24) of each output, % (p,).
+    centred_vaf : Array
+        The same with the means removed, 1 - var(y - y_sim)/var(y), % (p,).
+    whiteness : Array
+        p-value of Ljung and Box's test that the residual is white, one second of lags (p,).
+    rms : Array
+        Root-mean-square residual in the outputs' units (p,).
+    saturated : float
+        Share of the samples at which an input bound is reached.
+    """
+
+    vaf: Array
+    centred_vaf: Array
+    whiteness: Array
+    rms: Array
+    saturated: float
+
+
+@checked(recorded="i j", simulated="i j")
+def vaf(recorded: Array, simulated: Array) -> Array:
+    """Variance accounted for (3.24): (1 - sum (y - y_sim)^2 / sum y^2) 100 %, one for each column.
+
+    Parameters
+    ----------
+    recorded, simulated : Array
+        y and y_sim (samples, p), in one unit.
+
+    Returns
+    -------
+    Array
+        % (p,); NaN where the recorded output is zero throughout.
+    """
+    left = np.sum((recorded - simulated) ** 2, axis=0)
+    total = np.sum(recorded**2, axis=0)
+    share = np.divide(left, total, out=np.full_like(left, np.nan), where=total > 0)
+    return np.asarray(100 * (1 - share))
+
+
+@checked(recorded="i j", simulated="i j")
+def centred_vaf(recorded: Array, simulated: Array) -> Array:
+    """As `vaf`, with the means removed from what was recorded and from what is left.
+
+    Parameters
+    ----------
+    recorded, simulated : Array
+        Outputs (samples, p), in one unit.
+
+    Returns
+    -------
+    Array
+        % (p,); NaN where the recorded output is constant.
+    """
+    left = np.var(recorded - simulated, axis=0)
+    total = np.var(recorded, axis=0)
+    share = np.divide(left, total, out=np.full_like(left, np.nan), where=total > 0)
+    return np.asarray(100 * (1 - share))
+
+
+@checked(residual="i j", lags=1)
+def whiteness(residual: Array, lags: int) -> Array:
+    """p-values of Ljung and Box's test that each column is white (Ljung and Box 1978).
+
+    Parameters
+    ----------
+    residual : Array
+        (samples, p).
+    lags : int
+        How many of the first autocorrelations are tested together.
+
+    Returns
+    -------
+    Array
+        (p,); NaN where nothing is left to test.
+
+    Raises
+    ------
+    InputError
+        When there are not more samples than lags.
+    """
+    if lags >= len(residual):
+        raise InputError("lags", f"got {lags} of {len(residual)} samples", "give fewer")
+    values = []
+    for column in residual.T:
+        if np.ptp(column) == 0:
+            values.append(np.nan)
+            continue
+        values.append(float(acorr_ljungbox(column, lags=[lags])["lb_pvalue"].iloc[0]))
+    return np.array(values)
+
+
+def agreement(
+    plant: Plant, trial: Recording, run: Simulation, u_min: Array, u_max: Array
+) -> TrialAgreement:
+    """Compare a trial with its simulation from the first sample to the last.
+
+    Parameters
+    ----------
+    u_min, u_max : Array
+        Input bounds (m,), for the share of saturated samples.
+    """
+    simulated = run.x @ plant.C.T
+    residual = trial.outputs - simulated
+    lags = min(max(round(1 / plant.dt), _LEAST_LAGS), trial.samples // 5)
+    return TrialAgreement(
+        frozen(vaf(trial.outputs, simulated)),
+        frozen(centred_vaf(trial.outputs, simulated)),
+        frozen(whiteness(residual, max(lags, 1))),
+        frozen(np.sqrt(np.mean(residual**2, axis=0))),
+        saturated_share(run.u, u_min, u_max),
+    )
+
+
+@checked(u="i m", u_min="~m", u_max="~m")
+def saturated_share(u: Array, u_min: Array, u_max: Array) -> float:
+    """Share of samples at which any input stands on a bound, to 1e-6 of it.
+
+    Parameters
+    ----------
+    u : Array
+        Inputs (samples, m).
+    u_min, u_max : Array
+        Their bounds (m,); infinite where there is none.
+    """
+    near = (u >= u_max * (1 - 1e-6)) | (u <= u_min * (1 - 1e-6))  # the origin is strictly inside
+    return float(np.mean(np.any(near, axis=1)))

@@ -1,0 +1,209 @@
+"""What the recordings leave open of the weights of one gain, in a form that a page can print.
+
+Every number is over all weights with the gain whose condition number, in the units of the plant, is
+at most a multiple of the least (`weights_set`; docs/equivalent-weights.md, section 5).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.arrays import Array
+from impc.assess.bounded_weights import entry_ranges, weights_set
+from impc.assess.eigenvalue_ranges import eigenvalue_ranges
+from impc.assess.intent_draws import prices_over_gains, set_of_gain, with_confidence
+from impc.assess.intent_statements import order_statements, sense_statements, widest_dominant_angle
+from impc.errors import SolverError, WeightsError
+from impc.inverse.solution_set import gain_fibre
+
+if TYPE_CHECKING:
+    from impc.assess.bounded_weights import WeightsSet
+    from impc.assess.eigenvalue_ranges import EigenvalueRange
+    from impc.assess.intent_draws import PriceRange
+    from impc.assess.intent_statements import Statement
+    from impc.model.plant import Plant
+    from impc.model.riccati import LqrSolution
+    from impc.model.weights import Weights
+
+__all__ = ["EntryRange", "WeightsSummary", "summarise_weights", "weights_summary_or_reason"]
+
+#: Multiple of the least condition number up to which weights are taken as equally good.
+RATIO = 10.0
+# States whose entries and statements are computed: the recorded ones, then those that cost most at
+# their typical size.
+_NAMED = 4
+
+
+@dataclass(frozen=True)
+class EntryRange:
+    """Range of Q_ij over the set, i and j by name.
+
+    Attributes
+    ----------
+    first, second : str
+        Names of the states i and j.
+    low, high : float
+        At trace R = m.
+    """
+
+    first: str
+    second: str
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class WeightsSummary:
+    """The set of weights of a gain.
+
+    Attributes
+    ----------
+    dimension : int
+        Free directions of the weights that have the gain, scale not counted.
+    least_condition, limit : float
+        Condition numbers: the least, and the largest in the set.
+    entries : tuple of EntryRange
+        Of the states that are recorded or cost most.
+    eigenvalues : tuple of EigenvalueRange
+        Of Q, ascending.
+    statements : tuple of Statement
+        Order and sense of these states.
+    widest_angle : float
+        Widest angle found between the dominant direction of D Q D in the least conditioned member
+        and in another, degrees; D the typical sizes of the states.
+    drawn : int
+        Number of gains drawn beside the fitted one, for all that follows.
+    prices : tuple of PriceRange
+        Of the named states; empty without draws.
+    angle_of_gain : float
+        Widest angle, over the drawn gains, of the dominant direction of the least conditioned
+        member from that of the fitted gain, degrees; NaN without draws.
+    """
+
+    dimension: int
+    least_condition: float
+    limit: float
+    entries: tuple[EntryRange, ...]
+    eigenvalues: tuple[EigenvalueRange, ...]
+    statements: tuple[Statement, ...]
+    widest_angle: float
+    drawn: int
+    prices: tuple[PriceRange, ...]
+    angle_of_gain: float
+
+
+def summarise_weights(
+    plant: Plant,
+    gain: Array,
+    metrics: Array,
+    sizes: Array,
+    ratio: float = RATIO,
+    draws: tuple[LqrSolution, ...] = (),
+) -> WeightsSummary:
+    """Run the programs over the set of weights of a gain.
+
+    Parameters
+    ----------
+    plant : Plant
+    gain : Array
+        K (m, n).
+    metrics : Array
+        Basis of the metrics that the recordings do not tell apart (k, m, m), see `GainFit`.
+    sizes : Array
+        Typical size of each state (n,), positive, in its unit.
+    ratio : float
+        The set's condition number, in multiples of the least.
+    draws : tuple of LqrSolution
+        Other gains that the recordings allow, of `drawn_gains`.
+
+    Raises
+    ------
+    WeightsError, SolverError
+        When no weights have the gain, or a program fails.
+    """
+    found = weights_set(gain_fibre(plant, gain, metrics), ratio)
+    named = _shown(plant, found.least.weights, sizes)
+    names = tuple(plant.states[index] for index in named)
+    ranges = entry_ranges(found, named)
+    members = [
+        weights.block
+        for item in ranges.values()
+        for weights in (item.low_weights, item.high_weights)
+    ]
+    angle, widest = widest_dominant_angle(found, sizes)
+    statements = order_statements(found, sizes, names) + sense_statements(
+        found, sizes, names, ranges
+    )
+    sets = tuple(set_of_gain(plant, item, metrics, ratio) for item in draws)
+    return WeightsSummary(
+        found.fibre.dimension - 1,
+        found.least.condition,
+        found.limit,
+        tuple(
+            EntryRange(plant.states[i], plant.states[j], item.low, item.high)
+            for (i, j), item in ranges.items()
+        ),
+        eigenvalue_ranges(found, [*members, _at_trace(widest, plant.m)]),
+        with_confidence(statements, sets, sizes) if sets else statements,
+        angle,
+        len(sets),
+        prices_over_gains(found, sets, sizes, names) if sets else (),
+        _angle_of_gain(found, sets, sizes),
+    )
+
+
+def weights_summary_or_reason(
+    plant: Plant,
+    gain: Array,
+    metrics: Array,
+    sizes: Array,
+    draws: tuple[LqrSolution, ...] = (),
+) -> tuple[WeightsSummary | None, str]:
+    """The summary, or None and why there is none.
+
+    Parameters
+    ----------
+    gain : Array
+        K (m, n).
+    metrics : Array
+        (k, m, m), as above.
+    sizes : Array
+        Typical excursions of the states (n,), in their units.
+    draws : tuple of LqrSolution
+        As in `summarise_weights`.
+    """
+    try:
+        return summarise_weights(plant, gain, metrics, sizes, draws=draws), ""
+    except (WeightsError, SolverError) as error:
+        return None, str(error)
+
+
+def _angle_of_gain(found: WeightsSet, sets: tuple[WeightsSet | None, ...], sizes: Array) -> float:
+    if not sets:
+        return float("nan")
+    own, widest = _dominant(found, sizes), 0.0
+    for one in sets:
+        # Without a least conditioned member the direction is anywhere.
+        cosine = 0.0 if one is None else abs(float(own @ _dominant(one, sizes)))
+        widest = max(widest, float(np.degrees(np.arccos(min(1.0, cosine)))))
+    return widest
+
+
+def _dominant(found: WeightsSet, sizes: Array) -> Array:
+    D = np.diag(np.asarray(sizes))
+    return np.asarray(np.linalg.eigh(D @ found.least.weights.Q @ D)[1][:, -1])
+
+
+def _shown(plant: Plant, weights: Weights, sizes: Array) -> list[int]:
+    """States that are recorded, then those that cost most."""
+    prices = np.diag(weights.Q) * np.asarray(sizes) ** 2
+    recorded = [index for index, name in enumerate(plant.states) if name in plant.outputs]
+    others = [int(index) for index in np.argsort(-prices, kind="stable")]
+    return sorted(list(dict.fromkeys([*recorded, *others]))[:_NAMED])
+
+
+def _at_trace(weights: Weights, m: int) -> Array:
+    return np.asarray(weights.block * (m / np.trace(weights.R)))

@@ -1,0 +1,112 @@
+"""`impc cohort`: a study of many subjects, on this machine or a cluster."""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+from tqdm import tqdm
+
+from impc.cli.exit_status import ExitStatus
+from impc.cli.options import code_options, out_option, scheduler_options
+from impc.cli.plant import named_plant
+
+if TYPE_CHECKING:
+    from impc.studies.cohort.cluster import Cluster
+    from impc.studies.cohort.engine import Failures
+    from impc.studies.cohort.store import Store
+    from impc.studies.cohort.study import Study
+    from impc.studies.cohort.unit_task import FitTask
+
+__all__ = ["command"]
+
+
+@click.command("cohort")
+@click.argument("study_file", metavar="STUDY", type=click.Path(path_type=Path))
+@code_options("plant")
+@out_option("cohort", "results, tables and report; the same folder again goes on")
+@scheduler_options
+@click.pass_context
+def command(
+    context: click.Context,
+    study_file: Path,
+    plant_name: str | None,
+    allowed: bool,
+    out: Path,
+    cluster: Cluster,
+) -> None:
+    """Fit every subject, visit and condition of a study, with bootstrap replicates.
+
+    Ends with status 1 when a subject could not be fitted, and names the reason. It may be stopped
+    at any time: what is done is kept, and the same command goes on from there.
+    """
+    # Imported here: the libraries take seconds to load, and --help needs none.
+    from impc.studies.cohort.report import write_report  # noqa: PLC0415
+    from impc.studies.cohort.store import Store  # noqa: PLC0415
+    from impc.studies.cohort.study import read_study  # noqa: PLC0415
+    from impc.studies.cohort.tasks import study_tasks, unused_columns  # noqa: PLC0415
+    from impc.studies.fit.settings import fit_settings  # noqa: PLC0415
+
+    study = read_study(study_file)
+    fit_settings(study.configuration.fit)
+    source = named_plant(study_file, study, plant_name, allowed)
+    study = replace(study, plant=source.name)
+    unused = unused_columns(study, source)
+    if unused:
+        click.echo(f"not passed to the plant, which does not take them: {', '.join(unused)}")
+    tasks, unreadable = study_tasks(study, source)
+    store = Store(out, {name: task.digest for name, task in tasks.items()})
+    for unit, reason in unreadable.items():
+        store.keep_failure(unit, None, reason)
+    failures = _run(study, tasks, store, cluster)
+    failures.units |= unreadable
+    write_report(study, store, failures, f"impc cohort {study_file.name}")
+    for line in failures.lines:
+        click.echo(line, err=True)
+    fitted = len(study.units) - len(failures.units)
+    click.echo(f"{fitted} of {len(study.units)} units fitted; {out / 'report.html'}")
+    if failures:
+        context.exit(ExitStatus.PARTIAL)
+
+
+def _run(study: Study, tasks: dict[str, FitTask], store: Store, cluster: Cluster) -> Failures:
+    """Do what is left, with a bar, and a message about what is kept when it is interrupted."""
+    from impc.studies.cohort.cluster import connected  # noqa: PLC0415
+    from impc.studies.cohort.engine import Progress, run_study, work_left  # noqa: PLC0415
+
+    done, total = work_left(study, store)
+
+    def log(line: str) -> None:
+        store.log(f"{datetime.now(UTC).isoformat(timespec='seconds')} {line}")
+
+    with tqdm(
+        total=total, initial=done, unit="task", file=sys.stderr, disable=None, smoothing=0.05
+    ) as bar:
+        begun, here = time.monotonic(), 0
+
+        def told(unit: str, what: str, _: float) -> None:
+            nonlocal here
+            here += 1
+            bar.set_postfix_str(f"{unit} {what}", refresh=False)
+            bar.update()
+            left = (total - done - here) * (time.monotonic() - begun) / here
+            log(f"{done + here} of {total} tasks, {left / 60:.1f} min left")
+
+        try:
+            with connected(cluster) as workers:
+                failures = run_study(study, tasks, store, workers, Progress(told, log))
+        except KeyboardInterrupt:
+            finished, _ = work_left(study, store)
+            raise KeyboardInterrupt(
+                f"{finished} of {total} tasks are kept in {store.folder}; the same command goes on"
+            ) from None
+    log(
+        f"end: {len(failures.units)} of {len(study.units)} units without a result, "
+        f"{sum(map(len, failures.replicates.values()))} replicates failed"
+    )
+    return failures

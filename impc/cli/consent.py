@@ -1,0 +1,49 @@
+"""Before a request that would take hours, or most of a machine's memory, is begun."""
+
+from __future__ import annotations
+
+import sys
+from typing import TYPE_CHECKING
+
+import click
+
+if TYPE_CHECKING:
+    from impc.studies.effort import Effort
+
+__all__ = ["require_consent"]
+
+# What is begun without a question: two hours, and what a machine of 8 GB has to spare.
+_SECONDS, _GIGABYTES = 7200.0, 4.0
+
+
+def require_consent(effort: Effort, given: bool) -> None:
+    """Ask before a large request is begun, unless consent is `given` by --yes.
+
+    Parameters
+    ----------
+    effort : Effort
+        What the request would take.
+    given : bool
+        Whether --yes is.
+
+    Raises
+    ------
+    InputError
+        When the answer is no, there is nobody to ask, or this machine has not that much memory.
+    """
+    import psutil  # noqa: PLC0415  # --help needs none
+
+    from impc.errors import InputError  # noqa: PLC0415
+
+    lower = "lower horizon, replicates or profiles in [fit], or shorten the trials"
+    needs = f"would need {effort.gigabytes:.3g} GB of memory"
+    if effort.gigabytes > psutil.virtual_memory().total / 1e9:
+        raise InputError("this request", f"{needs}, more than this machine has", lower)
+    if given or (effort.seconds <= _SECONDS and effort.gigabytes <= _GIGABYTES):
+        return
+    takes = f"would take about {effort.seconds / 3600:.3g} hours"
+    problem = needs if effort.seconds <= _SECONDS else takes
+    asked = sys.stdin is not None and sys.stdin.isatty()
+    if asked and click.confirm(f"impc: this request {problem}; go on?", err=True):
+        return
+    raise InputError("this request", problem, f"{lower}; or say --yes")

@@ -1,0 +1,97 @@
+"""`impc inspect`: what a recording holds, and a configuration for it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from impc.cli.plant import KNOWN, find_plant
+
+if TYPE_CHECKING:
+    from impc.files.table import Table
+
+__all__ = ["command"]
+
+
+@click.command("inspect")
+@click.argument("file", type=click.Path(path_type=Path))
+@click.option(
+    "--plant",
+    "plant_name",
+    help=f"Whose signals to look for: {', '.join(KNOWN)}, module:function, or a file.",
+)
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    help="Write the configuration there, and not to the screen; no file is written over.",
+)
+@click.option(
+    "--config",
+    type=click.Path(path_type=Path),
+    help="Check the file against this configuration; needs --plant.",
+)
+def command(file: Path, plant_name: str | None, out: Path | None, config: Path | None) -> None:
+    """Show what a recording holds and write a commented configuration for it."""
+    from impc.files.formats import read_table  # noqa: PLC0415  # libraries that --help needs not
+    from impc.files.inspection import summary  # noqa: PLC0415
+
+    if config is not None:
+        _check(file, config, plant_name)
+        return
+    _require_new(out)
+    table = read_table(file)
+    text = _draft(table, plant_name)
+    click.echo(summary(table))
+    if out is None:
+        click.echo("\n" + text, nl=False)
+    else:
+        _write(out, text)
+        click.echo(f"\nWritten to {out}: fill in the units, then run impc fit with it.")
+
+
+def _draft(table: Table, plant_name: str | None) -> str:
+    from impc.files.inspection import draft_configuration  # noqa: PLC0415
+    from impc.files.plant_sources import make_plant  # noqa: PLC0415
+
+    if plant_name is None:
+        return draft_configuration(table)
+    plant = make_plant(find_plant(plant_name, {}), ())
+    # Without a configuration nothing says which input is the command: all but the first.
+    return draft_configuration(table, plant.outputs, plant.controls[1:])
+
+
+def _check(file: Path, config: Path, plant_name: str | None) -> None:
+    """Read the file as `impc fit` does, and say what the checks found."""
+    from impc.errors import InputError  # noqa: PLC0415
+    from impc.files.configuration import read_configuration  # noqa: PLC0415
+    from impc.files.plant_sources import make_plant  # noqa: PLC0415
+    from impc.files.reading import read_recordings  # noqa: PLC0415
+
+    if plant_name is None:
+        raise InputError("--config", "is given without --plant", "name the plant")
+    configuration = read_configuration(config)
+    plant = make_plant(find_plant(plant_name, configuration.plant), tuple(configuration.signals))
+    (trial,) = read_recordings([file], configuration, plant)
+    click.echo(f"{trial.label}: {trial.samples} samples at {1 / plant.dt:g} per second")
+    for finding in trial.findings or ("Nothing was found.",):
+        click.echo(finding)
+
+
+def _require_new(out: Path | None) -> None:
+    from impc.errors import OutputError  # noqa: PLC0415
+
+    if out is not None and out.exists():
+        raise OutputError(str(out), "exists already", "give another name, or remove it")
+
+
+def _write(out: Path, text: str) -> None:
+    from impc.errors import OutputError  # noqa: PLC0415
+
+    try:
+        with out.open("x", encoding="utf-8", newline="\n") as file:
+            file.write(text)
+    except OSError as error:
+        reason = error.strerror or type(error).__name__
+        raise OutputError(str(out), f"cannot be written ({reason})", "give another path") from None

@@ -1,0 +1,115 @@
+"""Options that several commands have alike."""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar, cast
+
+import click
+
+from impc.cli.numbers import LARGEST_SEED
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+__all__ = ["code_options", "out_option", "scheduler_options", "seed_option", "yes_option"]
+
+F = TypeVar("F", bound="Callable[..., Any]")
+
+#: --seed of everything that is simulated.
+seed_option = click.option(
+    "--seed",
+    type=click.IntRange(0, LARGEST_SEED),
+    default=0,
+    help="All numbers drawn follow from it.",
+)
+
+#: --yes of what may take hours, see `impc.cli.consent`.
+yes_option = click.option(
+    "--yes", is_flag=True, help="Do not ask before what takes hours or much memory."
+)
+
+
+def out_option(folder: str, holds: str) -> Callable[[F], F]:
+    """--out: a `folder` inside results/ by default; its help says what it `holds`.
+
+    The command holds its folder while it runs, and owns what it wrote there (`owned`).
+    """
+
+    def added(command: F) -> F:
+        @functools.wraps(command)
+        def holding(*given: Any, out: Path, **named: Any) -> Any:
+            from impc.reporting.writer import owned  # noqa: PLC0415
+
+            name = click.get_current_context().command_path.partition(" ")[2]
+            with owned(out, name):
+                return command(*given, out=out, **named)
+
+        option = click.option(
+            "--out",
+            type=click.Path(path_type=Path),
+            default=Path("results", folder),
+            help=f"Folder for {holds}.",
+        )
+        return option(cast("F", holding))
+
+    return added
+
+
+def scheduler_options(command: F) -> F:
+    """Add --scheduler, its certificates, and --workers to a `command`."""
+    path = click.Path(path_type=Path)
+    options = (
+        click.option(
+            "--scheduler", help="Address of a running Dask scheduler, such as tls://host:8786."
+        ),
+        click.option("--tls-ca", type=path, help="Certificate of whoever signed the scheduler's."),
+        click.option("--tls-cert", type=path, help="Certificate to show to the scheduler."),
+        click.option("--tls-key", type=path, help="Its private key."),
+        click.option(
+            "--workers",
+            type=click.IntRange(1, 1024),
+            help="Workers on this machine; one a core by default.",
+        ),
+    )
+
+    @functools.wraps(command)
+    def connecting(
+        *given: Any,
+        scheduler: str | None,
+        tls_ca: Path | None,
+        tls_cert: Path | None,
+        tls_key: Path | None,
+        workers: int | None,
+        **named: Any,
+    ) -> Any:
+        from impc.studies.cohort.cluster import Cluster  # noqa: PLC0415
+
+        cluster = Cluster(scheduler, workers, tls_ca, tls_cert, tls_key)
+        return command(*given, cluster=cluster, **named)
+
+    found = cast("F", connecting)
+    for option in reversed(options):
+        found = option(found)
+    return found
+
+
+def code_options(kind: str) -> Callable[[F], F]:
+    """--plant and --allow-plant, or --model and --allow-model: consent to run what a file names.
+
+    Parameters
+    ----------
+    kind : str
+        "plant" or "model".
+    """
+    name = click.option(
+        f"--{kind}", f"{kind}_name", help=f"The {kind}, in place of the one that the study names."
+    )
+    allow = click.option(
+        f"--allow-{kind}",
+        "allowed",
+        is_flag=True,
+        help=f"Run the code that the study names as its {kind}.",
+    )
+    return lambda command: name(allow(command))

@@ -1,0 +1,68 @@
+"""`impc reliability`: how repeatable the measures of a test are."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+from tqdm import tqdm
+
+from impc.cli.options import code_options, out_option
+from impc.cli.output import print_files
+from impc.cli.plant import named_plant
+
+if TYPE_CHECKING:
+    from impc.files.plant_sources import PlantSource
+    from impc.studies.cohort.study import Study
+    from impc.studies.reliability.analysis import Trials
+
+__all__ = ["command"]
+
+
+@click.command("reliability")
+@click.argument("study_file", metavar="STUDY", type=click.Path(path_type=Path))
+@code_options("plant")
+@out_option("reliability", "report.html, result.json, tables and figures")
+@click.option(
+    "--last",
+    type=click.IntRange(min=1),
+    default=3,
+    help="How many of a visit's trials count, the last ones.",
+)
+def command(study_file: Path, plant_name: str | None, allowed: bool, out: Path, last: int) -> None:
+    """Reliability of a study of several subjects, visits, conditions and trials.
+
+    The study file is that of `impc cohort`.
+    """
+    from impc.reporting.writer import write_files  # noqa: PLC0415
+    from impc.studies.cohort.study import read_study  # noqa: PLC0415
+    from impc.studies.reliability.analysis import analyse  # noqa: PLC0415
+    from impc.studies.reliability.findings import findings  # noqa: PLC0415
+    from impc.studies.reliability.report import reliability_files  # noqa: PLC0415
+
+    study = read_study(study_file)
+    trials = _trials(study, named_plant(study_file, study, plant_name, allowed), last)
+    result = analyse(trials)
+    files = reliability_files(trials, result, f"impc reliability {study_file.name} --last {last}")
+    written = write_files(out, files)
+    for item in findings(result):
+        click.echo(f"{'found' if item.found else 'not found'}: {item.statement} ({item.numbers})")
+    for line in result.notes:
+        click.echo(line)
+    print_files(out, written)
+
+
+def _trials(study: Study, source: PlantSource, last: int) -> Trials:
+    from impc.files.plant_sources import make_plant  # noqa: PLC0415
+    from impc.files.reading import read_recordings  # noqa: PLC0415
+    from impc.studies.reliability.analysis import Trials  # noqa: PLC0415
+
+    cells = {}
+    recorded = tuple(study.configuration.signals)
+    plant = make_plant(source, recorded)
+    for unit in tqdm(study.units, unit="visit", file=sys.stderr, disable=None, leave=False):
+        found = read_recordings(unit.files[-last:], study.configuration, plant)
+        cells[unit.subject, unit.visit, unit.condition] = found
+    return Trials(tuple(plant.outputs), 1 / plant.dt, cells)

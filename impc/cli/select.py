@@ -1,0 +1,135 @@
+"""`impc select`: which parameters of a model recordings can tell."""
+
+from __future__ import annotations
+
+import sys
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+from tqdm import tqdm
+
+from impc.cli.options import code_options, out_option, scheduler_options
+from impc.cli.output import print_files
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from impc.files.sealed import Kept
+    from impc.studies.cohort.cluster import Cluster
+    from impc.studies.cohort.study import Study
+    from impc.studies.selection.model import Trial
+    from impc.studies.selection.model_source import ModelSource
+    from impc.studies.selection.queue import Runner
+
+__all__ = ["command", "kept_results", "read_model_study", "study_runner"]
+
+
+@click.command("select")
+@click.argument("study_file", metavar="STUDY", type=click.Path(path_type=Path))
+@code_options("model")
+@out_option("select", "report.html, result.json, tables and figure")
+@scheduler_options
+def command(
+    study_file: Path, model_name: str | None, allowed: bool, out: Path, cluster: Cluster
+) -> None:
+    """Sensitive parameters of a simulation model (chapter 4), subject by subject and in common.
+
+    [study] model names the model by import path, [model] its arguments, [select] the settings. It
+    may be stopped at any time: the same command goes on from there.
+    """
+    from impc.reporting.writer import write_files  # noqa: PLC0415
+    from impc.studies.selection.analysis import select_study  # noqa: PLC0415
+    from impc.studies.selection.report import selection_files  # noqa: PLC0415
+    from impc.studies.selection.settings import select_settings  # noqa: PLC0415
+
+    study, source, recorded = read_model_study(study_file, model_name, allowed)
+    settings = select_settings(study.configuration.select)
+    named = {" visit ".join(part for part in key if part): item for key, item in recorded.items()}
+    with study_runner(source, out, cluster, 2 * len(named) + 1) as run:
+        found = select_study(named, settings, run)
+    written = write_files(
+        out, selection_files(source.model, found, f"impc select {study_file.name}")
+    )
+    kept_results(out).forget()
+    names = source.model.names
+    click.echo(f"information: {', '.join(names[index] for index in found.free)}")
+    click.echo(f"LASSO:       {', '.join(names[index] for index in found.lasso)}")
+    print_files(out, written)
+
+
+def kept_results(out: Path) -> Kept:
+    """Where results of single tasks wait in the folder `out` until the whole is done."""
+    from impc.files.sealed import Kept  # noqa: PLC0415
+
+    return Kept(out / "in-progress")
+
+
+@contextmanager
+def study_runner(source: ModelSource, out: Path, cluster: Cluster, tasks: int) -> Iterator[Runner]:
+    """Workers with a progress bar; a message about what is kept when it is interrupted.
+
+    Parameters
+    ----------
+    out : Path
+        Folder in which results wait, see `kept_results`.
+    cluster : Cluster
+        Which workers.
+    tasks : int
+        Of the progress bar.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        When it is interrupted, after the message.
+    """
+    from impc.studies.cohort.cluster import connected  # noqa: PLC0415
+    from impc.studies.selection.queue import on_workers  # noqa: PLC0415
+
+    kept = kept_results(out)
+    with tqdm(total=tasks, unit="task", file=sys.stderr, disable=None, leave=False) as bar:
+
+        def done(name: str) -> None:
+            bar.set_postfix_str(name, refresh=False)
+            bar.update()
+
+        try:
+            with connected(cluster) as workers:
+                yield on_workers(workers, source, kept, done)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(
+                f"{bar.n} of {tasks} tasks are kept in {kept.folder}; the same command goes on"
+            ) from None
+
+
+def read_model_study(
+    path: Path, given: str | None, allowed: bool
+) -> tuple[Study, ModelSource, dict[tuple[str, str], tuple[Trial, ...]]]:
+    """The study at `path`, its model and all recordings.
+
+    Parameters
+    ----------
+    path : Path
+        The study file.
+    given : str or None
+        Model that the command line names.
+    allowed : bool
+        Whether the command line allows the model that the file names.
+
+    Raises
+    ------
+    InputError, DataError
+        When the file, the model or a recording cannot be used, or the model needs consent.
+    """
+    from impc.files.plant_sources import import_function  # noqa: PLC0415
+    from impc.files.user_code import consented_name, require_users_function  # noqa: PLC0415
+    from impc.studies.cohort.study import read_study  # noqa: PLC0415
+    from impc.studies.selection.model_source import model_source, read_trials  # noqa: PLC0415
+
+    study, where = read_study(path), f"{path}: study.model"
+    name = consented_name(where, study.model, given, allowed, "model", ())
+    require_users_function(where, import_function(name))
+    arguments: dict[str, Any] = dict(study.configuration.model)
+    source = model_source(name, arguments)
+    return study, source, read_trials(study, source)

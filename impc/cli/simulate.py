@@ -1,0 +1,253 @@
+"""`impc simulate`: recordings of a subject who is known, for everybody without data."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from impc.cli.numbers import Number
+from impc.cli.options import out_option, seed_option
+from impc.cli.output import print_files
+from impc.cli.simulate_cohort import cohort
+from impc.cli.simulate_head_tracking import head_tracking
+from impc.cli.simulate_reliability import reliability_study
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from impc.control.controller import Controller
+    from impc.files.plant_sources import PlantSource
+    from impc.model.plant import Plant
+    from impc.model.weights import Weights
+    from impc.studies.simulated_people import SubjectTrial
+
+__all__ = ["command"]
+
+_PLANT, _STEP = "plants:seated_balance_for", "plants:seated_balance_step_for"
+_TORQUE = "plants:ternary_torque"
+_ENDINGS = {"csv": ".csv", "tsv": ".tsv", "mat": ".mat", "tdms": ".tdms", "c3d": ".c3d"}
+_FORMATS = (*_ENDINGS, "mat73")
+_RATE, _HORIZON = 1000.0, 20
+
+
+@click.group("simulate")
+def command() -> None:
+    """Make recordings of a simulated subject, with the truth beside them."""
+
+
+@command.command("seated-balance")
+@out_option("subject", "the recordings, subject.toml and truth.json")
+@click.option(
+    "--torque-limit",
+    type=Number(min=0, max=1e6, min_open=True),
+    default=6.0,
+    help="Largest torque of the subject, Nm.",
+)
+@click.option("--trials", type=click.IntRange(1, 99), default=3)
+@click.option(
+    "--duration",
+    type=Number(min=2, max=600),
+    default=30.0,
+    help="Of a trial, s.",
+)
+@click.option(
+    "--amplitude",
+    type=Number(min=0, max=1e6, min_open=True),
+    default=5.0,
+    help="Of the ternary torque on the seat, Nm.",
+)
+@click.option(
+    "--motor-noise",
+    type=Number(min=0, max=1e6),
+    default=0.3,
+    help="Standard deviation of the noise on the torque, Nm.",
+)
+@click.option(
+    "--sensor-noise",
+    type=Number(min=0, max=1e6),
+    default=0.1,
+    help="Standard deviation of the noise on the angles, degrees.",
+)
+@click.option("--mass", type=Number(), default=79.7, help="kg")
+@click.option("--height", type=Number(), default=1.66, help="m")
+@click.option("--sex", type=click.Choice(["male", "female"]), default="male")
+@seed_option
+@click.option(
+    "--formats",
+    default="csv,tsv,mat,mat73,tdms,c3d",
+    help="Which file formats, with commas between.",
+)
+def seated_balance(out: Path, formats: str, **given: Any) -> None:
+    """A person on a seat that tilts sideways, holding it by a constrained controller.
+
+    1000 samples a second; the nonlinear plant of the dissertation with parameters from body mass
+    and height; the weights of the intent that truth.json tells.
+    """
+    # Imported here: the libraries take seconds to load, and --help needs none.
+    from impc.reporting.writer import require_writable, write_files  # noqa: PLC0415
+
+    wanted = _wanted(formats)
+    require_writable(out)
+    person = {key: given[key] for key in ("mass", "height", "sex")}
+    controller = _controller(person, given["torque_limit"])
+    trials = _trials(controller, person, given)
+    files: dict[str, bytes] = {"subject.toml": _configuration(person, given).encode()}
+    files["truth.json"] = (json.dumps(_truth(controller, given), indent=1) + "\n").encode()
+    for number, trial in enumerate(trials, 1):
+        files |= _encoded(f"trial_{number}", trial, wanted)
+    written = write_files(out, files)
+    for number, trial in enumerate(trials, 1):
+        fell = "" if trial.fell is None else f", falls at {trial.fell:.2f} s"
+        share = 100 * trial.saturated
+        click.echo(f"trial {number}: at the torque limit for {share:.1f} % of the time{fell}")
+    print_files(out, written)
+
+
+def _wanted(formats: str) -> tuple[str, ...]:
+    wanted = tuple(part.strip() for part in formats.split(",") if part.strip())
+    for name in wanted or ("",):
+        if name not in _FORMATS:
+            raise click.BadParameter(f"{name!r} is not one of {', '.join(_FORMATS)}")
+    return wanted
+
+
+def _controller(person: dict[str, Any], limit: float) -> Controller:
+    from impc.control.controller import mpc_controller  # noqa: PLC0415
+    from impc.files.plant_sources import make_plant  # noqa: PLC0415
+    from impc.model.bounds import box_bounds  # noqa: PLC0415
+
+    plant = make_plant(_source(_PLANT, person), ("perturbation",))
+    bounds = box_bounds(plant, u_min=-limit, u_max=limit)
+    return mpc_controller(plant, _weights(plant), bounds, _HORIZON, terminal_set=False)
+
+
+def _weights(plant: Plant) -> Weights:
+    """The intent: one direction of angles and rates, little else."""
+    import numpy as np  # noqa: PLC0415
+
+    from impc.model.weights import stage_weights  # noqa: PLC0415
+
+    v = np.array([0.70, 0.65, 0.22, 0.20])
+    v /= np.linalg.norm(v)
+    Q = 1e-2 * np.eye(plant.n)
+    Q[:4, :4] = 6e5 * np.outer(v, v) + np.diag([2e4, 2e4, 500, 500])
+    return stage_weights(Q, 1)
+
+
+def _source(path: str, person: dict[str, Any]) -> PlantSource:
+    from impc.files.plant_sources import plant_source  # noqa: PLC0415
+
+    return plant_source(path, person)
+
+
+def _trials(
+    controller: Controller, person: dict[str, Any], given: dict[str, Any]
+) -> list[SubjectTrial]:
+    import numpy as np  # noqa: PLC0415
+
+    from impc.files.plant_sources import import_function  # noqa: PLC0415
+    from impc.studies.simulated_people import simulate_subject  # noqa: PLC0415
+
+    torque, step = import_function(_TORQUE), _source(_STEP, person).make(**person)
+    seeds = np.random.SeedSequence(given["seed"]).spawn(given["trials"])
+    return [
+        simulate_subject(
+            controller,
+            step,
+            torque(
+                amplitude=given["amplitude"],
+                duration=given["duration"],
+                rate=_RATE,
+                seed=given["seed"] * 100 + number + 1,
+            ),
+            rate=_RATE,
+            motor=given["motor_noise"],
+            sensor=np.radians(given["sensor_noise"]),
+            seed=seed,
+        )
+        for number, seed in enumerate(seeds)
+    ]
+
+
+def _encoded(name: str, trial: SubjectTrial, wanted: Sequence[str]) -> dict[str, bytes]:
+    """One trial in every format: degrees and newton metres, as a laboratory writes them."""
+    import numpy as np  # noqa: PLC0415
+
+    from impc.files.formats import encode_table  # noqa: PLC0415
+    from impc.files.matlab73 import matlab73_bytes  # noqa: PLC0415
+    from impc.files.table import make_table  # noqa: PLC0415
+
+    degrees = np.degrees(trial.outputs)
+    columns = {
+        "time": trial.time,
+        "seat_angle": degrees[:, 0],
+        "trunk_angle": degrees[:, 1],
+        "perturbation": trial.disturbance[:, 0],
+    }
+    units = {"time": "s", "seat_angle": "deg", "trunk_angle": "deg", "perturbation": "Nm"}
+    table = make_table(name, columns, units=units, rate=_RATE)
+    files = {
+        f"{name}{ending}": encode_table(ending, table)
+        for key, ending in _ENDINGS.items()
+        if key in wanted
+    }
+    if "mat73" in wanted:
+        files[f"{name}_v73.mat"] = matlab73_bytes(table)
+    return files
+
+
+def _truth(controller: Controller, given: dict[str, Any]) -> dict[str, Any]:
+    """What a fit of these recordings should find."""
+    import importlib.metadata  # noqa: PLC0415
+
+    weights = _weights(controller.plant)
+    return {
+        "impc": importlib.metadata.version("impc"),
+        "states": list(controller.plant.states),
+        "K": controller.K.tolist(),
+        "Q": weights.Q.tolist(),
+        "R": weights.R.tolist(),
+        "horizon": controller.horizon,
+        "settings": given,
+    }
+
+
+def _configuration(person: dict[str, Any], given: dict[str, Any]) -> str:
+    """A configuration that `impc fit` reads."""
+    return f"""\
+# A simulated subject: what the columns of its recordings mean. truth.json holds what a fit seeks.
+[recording]
+time = "time"
+subject = "simulated"
+pattern = "trial_(?P<trial>[0-9]+)(_v73)?"
+
+[signals.theta1]
+column = "seat_angle"
+unit = "deg"
+limit = 12.0                 # mechanical stop, in this unit
+
+[signals.theta2]
+column = "trunk_angle"
+unit = "deg"
+
+[signals.perturbation]
+column = "perturbation"
+unit = "N*m"
+
+[plant]
+mass = {person["mass"]}
+height = {person["height"]}
+sex = "{person["sex"]}"
+
+[fit]
+horizon = {_HORIZON}                 # samples of 0.01 s
+u_max = {given["torque_limit"]}                  # N m
+"""
+
+
+command.add_command(cohort)
+command.add_command(reliability_study)
+command.add_command(head_tracking)

@@ -1,0 +1,182 @@
+"""`impc simulate reliability-study`: a seated-balance test over visits and conditions."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+from tqdm import tqdm
+
+from impc.cli.options import out_option, seed_option
+from impc.cli.simulate_cohort import random_person
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from impc.arrays import Array
+    from impc.model.plant import Plant
+
+__all__ = ["reliability_study"]
+
+_PLANT, _TORQUE = "plants:seated_balance_for", "plants:ternary_torque"
+_RATE = 100.0
+# 242 steps of 0.12 s: one whole period of the register, so that its lines are lines.
+_DWELL, _DURATION = 0.12, 242 * 0.12
+# Price of angles and rates, size of the sway that the subject makes itself (N m), noise of the two
+# angles (degrees): open eyes, closed eyes, vibration of the trunk's muscles.
+_CONDITIONS = {
+    "EO": (1.0, 4.0, (0.10, 0.30)),
+    "EC": (0.6, 6.0, (0.12, 0.40)),
+    "VIB": (0.75, 7.0, (0.15, 0.60)),
+}
+# Deviations of logarithms: of prices and of sway between subjects, of both at a visit, of sway in a
+# trial; each visit lowers the sway by the learning.
+_PRICE, _SWAY, _VISIT, _TRIAL, _LEARNING = 0.8, 0.4, 0.25, 0.10, -0.03
+# Lean of seat and trunk at a visit, degrees: RMS is about upright and counts it.
+_LEAN = (0.1, 0.8)
+
+
+@click.command("reliability-study")
+@out_option("reliability-data", "the recordings, study.toml and truth.json")
+@click.option("--subjects", type=click.IntRange(2, 999), default=30, help="How many.")
+@click.option("--visits", type=click.IntRange(2, 9), default=3, help="Of each subject.")
+@click.option(
+    "--trials",
+    type=click.IntRange(2, 9),
+    default=3,
+    help="Of each visit and condition.",
+)
+@seed_option
+def reliability_study(out: Path, **given: Any) -> None:
+    """Thirty subjects, three visits, three conditions and three trials on the seat.
+
+    Subjects differ in body; subjects and visits in what angles and rates cost and in how much the
+    body sways; visits in how the body leans; trials in the sway. Closed eyes and vibration change
+    prices, sway and noise. 29.04 s a trial, one period of the ternary torque, 100 samples a second.
+    """
+    import numpy as np  # noqa: PLC0415
+
+    from impc.files.plant_sources import import_function, make_plant, plant_source  # noqa: PLC0415
+    from impc.reporting.writer import require_writable, write_files  # noqa: PLC0415
+
+    require_writable(out)
+    rng = np.random.default_rng(given["seed"])
+    torque = np.asarray(
+        import_function(_TORQUE)(dwell=_DWELL, duration=_DURATION, rate=_RATE), dtype=np.float64
+    )
+    width = max(2, len(str(given["subjects"])))
+    truth: dict[str, Any] = {}
+    numbers = range(given["subjects"])
+    with tqdm(numbers, unit="subject", file=sys.stderr, disable=None, leave=False) as bar:
+        for number in bar:
+            name = f"{number + 1:0{width}d}"
+            plant = make_plant(plant_source(_PLANT, random_person(rng)), ("perturbation",))
+            price, sway = np.exp(np.array([_PRICE, _SWAY]) * rng.standard_normal(2))
+            truth[name] = {"price": float(price), "sway": float(sway)}
+            for visit in range(given["visits"]):
+                files: dict[str, bytes] = {}
+                lean = np.array(_LEAN) * rng.standard_normal(2)
+                for condition in _CONDITIONS:
+                    here, level = np.exp(_VISIT * rng.standard_normal(2)) * (price, sway)
+                    level *= float(np.exp(_LEARNING * visit))
+                    cell = _cell(plant, torque, condition, (float(here), level), lean, given, rng)
+                    stem = f"sub-{name}_ses-{visit + 1}_task-{condition}"
+                    files |= {
+                        f"{stem}_run-{run + 1}_motion.csv": content
+                        for run, content in enumerate(cell)
+                    }
+                write_files(out / f"sub-{name}" / f"ses-{visit + 1}", files)
+    settings = {
+        "price": _PRICE, "sway": _SWAY, "visit": _VISIT, "trial": _TRIAL, "learning": _LEARNING,
+        "lean": _LEAN,
+        "conditions": _CONDITIONS, **given,
+    }  # fmt: skip
+    text = json.dumps({"settings": settings, "subjects": truth}, indent=1) + "\n"
+    write_files(out, {"study.toml": _STUDY.encode(), "truth.json": text.encode()})
+    click.echo(f"{given['subjects']} subjects, {given['visits']} visits: {out / 'study.toml'}")
+
+
+def _cell(
+    plant: Plant,
+    torque: Array,
+    condition: str,
+    size: tuple[float, float],
+    lean: Array,
+    given: dict[str, Any],
+    rng: np.random.Generator,
+) -> list[bytes]:
+    """All trials of a subject's visit in one condition, as files."""
+    import numpy as np  # noqa: PLC0415
+
+    from impc.files.formats import encode_table  # noqa: PLC0415
+    from impc.files.table import make_table  # noqa: PLC0415
+    from impc.model.riccati import solve_lqr  # noqa: PLC0415
+    from impc.model.weights import stage_weights  # noqa: PLC0415
+
+    (price, sway), (factor, own, noise) = size, _CONDITIONS[condition]
+    v = np.array([0.70, 0.65, 0.22, 0.20])
+    v /= np.linalg.norm(v)
+    Q = 1e-2 * np.eye(plant.n)
+    Q[:4, :4] = factor * price * (6e5 * np.outer(v, v) + np.diag([2e4, 2e4, 500, 500]))
+    K = solve_lqr(plant, stage_weights(Q, 1)).K
+    files = []
+    for _ in range(given["trials"]):
+        here = own * sway * float(np.exp(_TRIAL * rng.standard_normal()))
+        outputs = lean + np.degrees(_simulated(plant, K, torque, here, rng))
+        outputs += np.array(noise) * rng.standard_normal(outputs.shape)
+        columns = {
+            "time": np.arange(len(torque)) / _RATE,
+            "seat_angle": outputs[:, 0],
+            "trunk_angle": outputs[:, 1],
+            "perturbation": torque,
+        }
+        units = {"time": "s", "seat_angle": "deg", "trunk_angle": "deg", "perturbation": "Nm"}
+        table = make_table("trial", columns, units=units, rate=_RATE)
+        files.append(encode_table(".csv", table))
+    return files
+
+
+def _simulated(
+    plant: Plant, K: Array, torque: Array, sway: float, rng: np.random.Generator
+) -> Array:
+    """Outputs of x+ = (A - BK) x + E d + B w, after one period that is not recorded."""
+    import numpy as np  # noqa: PLC0415
+    import scipy.signal  # noqa: PLC0415
+
+    driven = np.concatenate([torque, torque])
+    # Sway: noise of a time constant of half a second, as the command's.
+    white = rng.standard_normal((len(driven), plant.m))
+    root = np.exp(-1 / (0.5 * _RATE))
+    own = sway * scipy.signal.lfilter([np.sqrt(1 - root**2)], [1.0, -root], white, axis=0)
+    F, drive = plant.A - plant.B @ K, driven[:, None] @ plant.E.T + own @ plant.B.T
+    x, states = np.zeros(plant.n), np.empty((len(driven), plant.n))
+    for k in range(len(driven)):
+        states[k] = x
+        x = F @ x + drive[k]
+    return np.asarray(states[len(torque) :] @ plant.C.T)
+
+
+_STUDY = """\
+# A simulated reliability study: `impc reliability study.toml --out DIR`.
+[study]
+plant = "seated-balance"
+bids = "."                       # folders and files that are named sub-, ses-, task-, run-
+
+[recording]
+time = "time"
+
+[signals.theta1]
+column = "seat_angle"
+unit = "deg"
+
+[signals.theta2]
+column = "trunk_angle"
+unit = "deg"
+
+[signals.perturbation]
+column = "perturbation"
+unit = "N*m"
+"""

@@ -1,0 +1,73 @@
+"""What the commands for one subject do first: files and configuration to an inverse problem."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from impc.cli.plant import find_plant
+from impc.files.configuration import read_configuration
+from impc.files.inputs import gather_inputs
+from impc.files.plant_sources import make_plant, plant_family_of
+from impc.files.reading import read_recordings
+from impc.studies.fit.settings import fit_settings
+from impc.studies.fit.subject import fit_problem
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from impc.files.inputs import Inputs
+    from impc.files.plant_sources import PlantSource
+    from impc.inverse.problem import InverseProblem
+    from impc.studies.fit.settings import FitSettings
+
+__all__ = ["Subject", "read_subject"]
+
+
+@dataclass(frozen=True)
+class Subject:
+    """The recordings of a subject as an inverse problem.
+
+    Attributes
+    ----------
+    problem : InverseProblem
+    settings : FitSettings
+    source : PlantSource
+        Of the plant.
+    inputs : Inputs
+        Digests of all files that went in.
+    """
+
+    problem: InverseProblem
+    settings: FitSettings
+    source: PlantSource
+    inputs: Inputs
+
+
+def read_subject(files: Sequence[Path], plant_name: str, config: Path) -> Subject:
+    """Read recordings, one file a trial.
+
+    Parameters
+    ----------
+    files : sequence of Path
+        The recordings.
+    plant_name : str
+        Short name, import path or file of the plant.
+    config : Path
+        The configuration.
+
+    Raises
+    ------
+    ImpcError
+        When a file, the configuration or the plant cannot be used; nothing has been written.
+    """
+    configuration = read_configuration(config)
+    settings = fit_settings(configuration.fit)
+    source = find_plant(plant_name, configuration.plant)
+    recorded = tuple(configuration.signals)
+    plant = make_plant(source, recorded)
+    family = plant_family_of(source, recorded, settings.free)
+    recordings = read_recordings(files, configuration, plant)
+    inputs = gather_inputs(files, config, source)
+    return Subject(fit_problem(plant, recordings, settings, family), settings, source, inputs)

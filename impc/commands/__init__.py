@@ -1,1 +1,0 @@
-"""The subcommands of `impc`: each parses, calls and prints; no mathematics."""

@@ -1,0 +1,236 @@
+"""The controller built in CasADi, with a quadratic program at every sample.
+
+`closed_loop` is the fast path of the package. This module is the plain one: the program is written
+symbolically, solved by a named plugin from scratch at every sample, and says what happened. Tests
+hold the two against each other, and both against the program (3.1) written out in u.
+
+    minimise over v_0..v_{N-1} (and slacks s >= 0 of soft rows)   sum v_k'S v_k / 2 + limit's
+    subject to   T x + M v <= b + s
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+import scipy.linalg
+
+from impc.arrays import Array, BoolArray, finite_array
+from impc.checking import checked
+from impc.control.closed_loop import Simulation, Status
+from impc.control.constraint_rows import build_rows
+from impc.errors import InputError
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from impc.control.closed_loop import Scenario
+    from impc.control.constraint_rows import Rows
+    from impc.control.controller import Controller
+
+__all__ = ["SOLVERS", "MpcSolver", "MpcStep", "build_mpc", "simulate_mpc", "solve_mpc"]
+
+# Each is asked for the accuracy that it can deliver: active-set methods end at round-off, the
+# interior-point method of IPOPT at its tolerance, which is tightened from 1e-8.
+_QUADRATIC: dict[str, dict[str, Any]] = {
+    "daqp": {"error_on_fail": False},
+    "qpoases": {"printLevel": "none", "error_on_fail": False, "sparse": False},
+}
+# Slacks enter the cost linearly, so the Hessian is singular, which DAQP does not take; its proximal
+# iterations called feasible programs infeasible. Its slacks get a quadratic cost of this share of
+# their price instead: a relative excess s changes the price by 1e-8 s.
+_DAQP_SLACK = 1e-8
+_IPOPT: dict[str, Any] = {
+    "print_time": False,
+    "error_on_fail": False,
+    "ipopt": {
+        "print_level": 0,
+        "sb": "yes",
+        "tol": 1e-12,
+        "compl_inf_tol": 1e-12,
+        "constr_viol_tol": 1e-12,
+        "acceptable_tol": 1e-11,
+        "bound_relax_factor": 0.0,
+        "hessian_constant": "yes",
+        "jac_c_constant": "yes",
+        "jac_d_constant": "yes",
+    },
+}
+
+#: Names of the solvers that `build_mpc` takes.
+SOLVERS = (*_QUADRATIC, "ipopt")
+
+
+@dataclass(frozen=True)
+class MpcSolver:
+    """A controller and its program, ready to be solved; made by `build_mpc`.
+
+    Attributes
+    ----------
+    controller : Controller
+    rows : Rows
+    name : str
+        Name of the CasADi plugin.
+    function : casadi.Function
+        The solver, taking the state as parameter ``p``.
+    soft : BoolArray
+        Which rows have a slack (r,).
+    """
+
+    controller: Controller
+    rows: Rows
+    name: str
+    function: Any
+    soft: BoolArray
+
+
+@dataclass(frozen=True)
+class MpcStep:
+    """Answer of one program.
+
+    Attributes
+    ----------
+    u : Array
+        Input to apply (m,); the plain gain's when the status is a failure, for inspection only.
+    plan : Array
+        Planned inputs (N, m).
+    states : Array
+        Planned states (N + 1, n).
+    status : Status
+    excess : float
+        Largest violation of a hard row relative to its bound, recomputed from the answer.
+    """
+
+    u: Array
+    plan: Array
+    states: Array
+    status: Status
+    excess: float
+
+
+@checked
+def build_mpc(controller: Controller, solver: str = "daqp") -> MpcSolver:
+    """Write the controller's program in CasADi and hand it to a solver.
+
+    Parameters
+    ----------
+    controller : Controller
+    solver : str
+        One of `SOLVERS`.
+
+    Raises
+    ------
+    InputError
+        When the solver is not one of them.
+    """
+    if solver not in SOLVERS:
+        raise InputError("solver", f"got {solver!r}", f"choose one of {', '.join(SOLVERS)}")
+    rows = build_rows(controller)
+    soft = np.isfinite(rows.limit)
+    x = ca.SX.sym("x", controller.plant.n)
+    v = ca.SX.sym("v", rows.M.shape[1])
+    slack = ca.SX.sym("s", int(soft.sum()))
+    metric = scipy.linalg.block_diag(*[controller.S] * controller.horizon)
+    placed = np.eye(len(rows.b))[:, soft]
+    price = ca.DM(rows.limit[soft])
+    curvature = ca.DM(rows.limit[soft] / rows.b[soft] * (_DAQP_SLACK if solver == "daqp" else 0))
+    program = {
+        "x": ca.vertcat(v, slack),
+        "p": x,
+        "f": (
+            ca.mtimes([v.T, ca.DM(metric), v]) / 2
+            + ca.dot(price, slack)
+            + ca.dot(curvature, slack**2) / 2
+        ),
+        # Divided by b, so that a solver's absolute tolerance is relative to the bound.
+        "g": (
+            ca.mtimes(ca.DM(rows.T / rows.b[:, None]), x)
+            + ca.mtimes(ca.DM(rows.M / rows.b[:, None]), v)
+            - ca.mtimes(ca.DM(placed / rows.b[:, None]), slack)
+        ),
+    }
+    if solver == "ipopt":
+        function = ca.nlpsol("mpc", "ipopt", program, _IPOPT)
+    else:
+        function = ca.qpsol("mpc", solver, program, _QUADRATIC[solver])
+    return MpcSolver(controller, rows, solver, function, soft)
+
+
+@checked(x="n")
+def solve_mpc(mpc: MpcSolver, x: ArrayLike) -> MpcStep:
+    """Solve the program at a state.
+
+    Parameters
+    ----------
+    x : array_like
+        (n,).
+
+    Returns
+    -------
+    MpcStep
+        Check its status before applying its input.
+
+    Raises
+    ------
+    DataError
+        When the state is not finite or of the wrong size.
+    """
+    controller, rows = mpc.controller, mpc.rows
+    state = finite_array("x", x, (controller.plant.n,))
+    width, slacks = rows.M.shape[1], int(mpc.soft.sum())
+    answer = mpc.function(
+        p=state,
+        lbx=np.r_[np.full(width, -np.inf), np.zeros(slacks)],
+        ubx=np.inf,
+        lbg=-np.inf,
+        ubg=1,
+    )
+    solved = bool(mpc.function.stats()["success"])
+    decision = np.asarray(answer["x"]).ravel()
+    v = decision[:width] if solved else np.zeros(width)
+    excess = rows.T @ state + rows.M @ v - rows.b
+    hard = excess[~mpc.soft] / rows.b[~mpc.soft]
+    violation = float(np.max(hard, initial=0.0))
+    status = _judge(solved, violation, excess[mpc.soft] / rows.b[mpc.soft], v)
+    plan, states = _unroll(controller, state, v)
+    return MpcStep(plan[0], plan, states, status, violation)
+
+
+@checked
+def simulate_mpc(mpc: MpcSolver, given: Scenario) -> Simulation:
+    """Simulate with a program at every sample; the slow counterpart of `closed_loop.simulate`."""
+    plant = mpc.controller.plant
+    x, u = np.zeros((given.steps + 1, plant.n)), np.zeros((given.steps, plant.m))
+    status = np.full(given.steps, Status.NOT_REACHED, dtype=np.int8)
+    x[0] = given.x0
+    for t in range(given.steps):
+        step = solve_mpc(mpc, x[t])
+        status[t] = step.status
+        if step.status > Status.SOFTENED:
+            x[t + 1 :] = x[t]
+            break
+        u[t] = step.u
+        x[t + 1] = plant.A @ x[t] + plant.B @ u[t] + plant.E @ given.disturbance[t]
+    return Simulation(x, u, status, 0, -1)
+
+
+def _judge(solved: bool, violation: float, soft_excess: Array, v: Array) -> Status:
+    """Trust the rows, not the solver's flag alone: a hard row broken by 1e-6 is a failure."""
+    if not solved or violation > 1e-6:
+        return Status.INFEASIBLE
+    if np.max(soft_excess, initial=0.0) > 1e-6:
+        return Status.SOFTENED
+    return Status.ACTIVE if np.max(np.abs(v), initial=0.0) > 1e-8 else Status.FREE
+
+
+def _unroll(controller: Controller, x: Array, v: Array) -> tuple[Array, Array]:
+    plant, horizon = controller.plant, controller.horizon
+    moves = v.reshape(horizon, plant.m)
+    plan, states = np.zeros((horizon, plant.m)), np.zeros((horizon + 1, plant.n))
+    states[0] = x
+    for k in range(horizon):
+        plan[k] = moves[k] - controller.K @ states[k]
+        states[k + 1] = plant.A @ states[k] + plant.B @ plan[k]
+    return plan, states

@@ -1,0 +1,396 @@
+"""A plant under the constrained controller, simulated and differentiated in one pass.
+
+At most samples v = 0 keeps every bound and the controller is the gain; only elsewhere a
+least-distance problem is solved (docs/theory.md, section 4). There, with the active rows a
+(multipliers lam) and one direction of change, written d,
+
+    Gram_aa dlam = -N_a q + dM_a v - db_a + dT_a x + T_a dx,     q = dM'lam + dS v
+    dv = -S^-1 q - N_a' dlam
+
+follows from the stationarity S v + M'lam = 0 and the tight rows T_a x + M_a v = b_a. The derivative
+is that of the active set at hand. At a sample where the active set is about to change (a row that
+is tight without a multiplier) it is one-sided: the row counts as inactive there. Such samples are
+counted in the result.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+
+from impc.arrays import Array, Frozen, as_numbers, finite_array, frozen
+from impc.checking import Value, checked
+from impc.control.compiled_loop import LoopMatrices, run
+from impc.control.constraint_rows import RowDirections, build_rows, differentiate_rows, directions
+from impc.control.infeasibility import proves_infeasible
+from impc.control.saturated import differentiate_plan, solve_saturated
+from impc.errors import DataError, InfeasibleError, SolverError
+from impc.model.bounds import bound_rows
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import ArrayLike
+
+    from impc.control.constraint_rows import Directions, Rows
+    from impc.control.controller import Controller
+    from impc.control.saturated import Plan
+    from impc.model.plant import Plant
+
+__all__ = [
+    "PreparedLoop",
+    "Scenario",
+    "Sensitivity",
+    "Simulation",
+    "Status",
+    "prepare_loop",
+    "require_complete",
+    "run_loop",
+    "scenario",
+    "simulate",
+    "simulate_and_differentiate",
+]
+
+
+class Status(IntEnum):
+    """What happened at a sample.
+
+    FREE: the gain keeps every bound. ACTIVE: a bound is active. SOFTENED: a soft bound was
+    exceeded. INFEASIBLE: it is proved that no input sequence keeps the bounds. UNSOLVED: which
+    input is the answer, or whether there is one, could not be told in double precision. DIVERGED:
+    the state left every reasonable range. NOT_REACHED: the simulation ended before.
+    """
+
+    FREE = 0
+    ACTIVE = 1
+    SOFTENED = 2
+    INFEASIBLE = 3
+    UNSOLVED = 4
+    DIVERGED = 5
+    NOT_REACHED = 6
+
+    @property
+    def sentence(self) -> str:
+        """The status in words."""
+        return _SENTENCES[self]
+
+
+_SENTENCES = {
+    Status.FREE: "the gain keeps every bound",
+    Status.ACTIVE: "a bound is active",
+    Status.SOFTENED: "a soft bound was exceeded",
+    Status.INFEASIBLE: "no input sequence keeps the bounds",
+    Status.UNSOLVED: "the input could not be told in double precision",
+    Status.DIVERGED: "the state left every reasonable range",
+    Status.NOT_REACHED: "the simulation ended before this sample",
+}
+
+
+@dataclass(frozen=True)
+class Scenario(Value):
+    """What drives a simulation, in the units of the plant.
+
+    Attributes
+    ----------
+    x0 : Array
+        Initial state (n,).
+    disturbance : Array
+        One row for each sample (steps, d).
+    """
+
+    _rules: ClassVar[Mapping[str, Any]] = {
+        "x0": "n",
+        "disturbance": "* d",
+    }
+
+    x0: Array
+    disturbance: Array
+
+    @property
+    def steps(self) -> int:
+        """Number of samples at which an input is applied."""
+        return len(self.disturbance)
+
+
+@dataclass(frozen=True)
+class Simulation(Frozen):
+    """A closed loop from its first state to its last.
+
+    Attributes
+    ----------
+    x : Array
+        States (steps + 1, n). Samples that were not reached repeat the last state.
+    u : Array
+        Inputs (steps, m).
+    status : Array of Status
+        (steps,).
+    weakly_active : int
+        Number of samples at which the active set is about to change, to 1e-8 of the bound.
+    failed_row : int
+        Row of `Rows` that proved the last problem inconsistent, -1 when none did.
+    """
+
+    x: Array
+    u: Array
+    status: np.ndarray[tuple[int], np.dtype[np.int8]]
+    weakly_active: int
+    failed_row: int
+
+    @property
+    def complete(self) -> bool:
+        """Whether every sample was reached."""
+        return bool(np.all(self.status <= Status.SOFTENED))
+
+    @property
+    def reached(self) -> int:
+        """Number of samples with an input."""
+        return int(np.count_nonzero(self.status <= Status.SOFTENED))
+
+
+@dataclass(frozen=True)
+class Sensitivity(Frozen):
+    """Derivatives of a `Simulation` along p directions.
+
+    Attributes
+    ----------
+    x : Array
+        Of the states (steps + 1, n, p).
+    u : Array
+        Of the inputs (steps, m, p).
+    """
+
+    x: Array
+    u: Array
+
+
+@dataclass(frozen=True)
+class PreparedLoop:
+    """A controller with its rows and derivatives built; made by `prepare_loop`.
+
+    Attributes
+    ----------
+    controller : Controller
+    along : Directions
+        The p directions of the derivatives.
+    rows : Rows
+    row_directions : RowDirections
+        Derivatives of the rows.
+    matrices : LoopMatrices
+        Plant, gain and inverse metric.
+    matrix_directions : LoopMatrices
+        Derivatives of plant, gain and metric.
+    unit : Array
+        The nearer bound of each input (m,): what its error is measured by.
+    """
+
+    controller: Controller
+    along: Directions
+    rows: Rows
+    row_directions: RowDirections
+    matrices: LoopMatrices
+    matrix_directions: LoopMatrices
+    unit: Array
+
+
+@checked(x0="n", steps=(1, 10_000_000))
+def scenario(
+    plant: Plant, x0: ArrayLike, steps: int | None = None, disturbance: ArrayLike | None = None
+) -> Scenario:
+    """Check and freeze an initial state with a number of steps or a disturbance.
+
+    Parameters
+    ----------
+    x0 : array_like
+        (n,).
+    steps : int, optional
+        Needed when there is no disturbance; otherwise its length is taken.
+    disturbance : array_like, optional
+        (steps, d), or (steps,) for a single disturbance.
+
+    Raises
+    ------
+    DataError
+        When something is not finite or of the wrong shape, or neither length is given.
+    """
+    start = finite_array("x0", x0, (plant.n,))
+    count = plant.E.shape[1]
+    if disturbance is None:
+        if steps is None:
+            raise DataError("steps", "got None without a disturbance", "give at least 1")
+        return Scenario(frozen(start), frozen(np.zeros((steps, count))))
+    columns = as_numbers("disturbance", disturbance)
+    given = finite_array(
+        "disturbance", columns[:, None] if columns.ndim == 1 else columns, (steps, count)
+    )
+    return Scenario(frozen(start), frozen(given))
+
+
+@checked
+def simulate(controller: Controller, given: Scenario) -> Simulation:
+    """Simulate the plant of the controller; never raises for what happens on the way.
+
+    Returns
+    -------
+    Simulation
+        With a status for each sample; `require_complete` turns a failure into an error.
+    """
+    simulation, _ = run_loop(prepare_loop(controller, directions(controller, 0)), given)
+    return simulation
+
+
+@checked
+def simulate_and_differentiate(
+    controller: Controller, given: Scenario, along: Directions
+) -> tuple[Simulation, Sensitivity]:
+    """Simulate and differentiate in one pass; see `simulate` and the module's text."""
+    return run_loop(prepare_loop(controller, along), given)
+
+
+def prepare_loop(controller: Controller, along: Directions) -> PreparedLoop:
+    """Build all that does not depend on the recording, so that several trials share it."""
+    plant = controller.plant
+    rows = build_rows(controller)
+    moved = differentiate_rows(controller, along) if along.count else _no_directions(rows)
+    inverse = np.asarray(np.linalg.inv(controller.S), dtype=np.float64)
+    return PreparedLoop(
+        controller,
+        along,
+        rows,
+        moved,
+        _writable(plant.A, plant.B, plant.E, controller.K, inverse),
+        _writable(along.A, along.B, along.E, along.K, along.S),
+        np.minimum(-controller.bounds.u_min, controller.bounds.u_max),
+    )
+
+
+def run_loop(prepared: PreparedLoop, given: Scenario) -> tuple[Simulation, Sensitivity]:
+    """Simulate one recording of a prepared loop, with its derivatives.
+
+    Samples that were not reached repeat the last state, so that a search can go on with them.
+    """
+    plant, along = prepared.controller.plant, prepared.along
+    steps, n, m, p = given.steps, plant.n, plant.m, along.count
+    x, u = np.zeros((steps + 1, n)), np.zeros((steps, m))
+    dx, du = np.zeros((steps + 1, n, p)), np.zeros((steps, m, p))
+    status = np.full(steps, Status.NOT_REACHED, dtype=np.int8)
+    x[0], dx[0] = given.x0, along.x0
+    multipliers = np.zeros(len(prepared.rows.b))
+    disturbance, divergence = np.array(given.disturbance), _divergence(plant, given)
+    t, weakly_active, plan = 0, 0, None
+    while True:
+        first = t
+        weak, failed_row = run(
+            prepared.matrices,
+            prepared.matrix_directions,
+            prepared.rows,
+            prepared.row_directions,
+            disturbance,
+            divergence,
+            prepared.unit,
+            first,
+            x,
+            u,
+            dx,
+            du,
+            status,
+            multipliers,
+        )
+        weakly_active += weak
+        t = int(np.count_nonzero(status <= Status.SOFTENED))
+        if t == steps or status[t] == Status.DIVERGED:
+            break
+        if status[t] == Status.INFEASIBLE:
+            if proves_infeasible(prepared.controller, prepared.rows, multipliers, x[t]):
+                break
+            status[t], failed_row = Status.UNSOLVED, -1
+        if not _only_inputs_are_bounded(prepared.controller):
+            break
+        plan = _saturated_plan(prepared, x[t], plan if t == first + 1 else None)
+        if not plan.told:
+            break
+        u[t], status[t] = plan.u[0], Status.ACTIVE
+        du[t] = _differentiate_first_input(prepared, plan, dx[t])
+    return Simulation(x, u, status, weakly_active, failed_row), Sensitivity(dx, du)
+
+
+def _only_inputs_are_bounded(controller: Controller) -> bool:
+    return controller.terminal is None and not np.any(
+        bound_rows(controller.bounds, controller.plant).on_state
+    )
+
+
+def _saturated_plan(prepared: PreparedLoop, x: Array, last: Plan | None) -> Plan:
+    """Answer of the recursion over the stages, where that of the rows is not told."""
+    controller = prepared.controller
+    sides = np.array(controller.bounds.u_min), np.array(controller.bounds.u_max)
+    metric = np.array(controller.S)
+    return solve_saturated(prepared.matrices, metric, *sides, controller.horizon, x, last)
+
+
+def _differentiate_first_input(prepared: PreparedLoop, plan: Plan, dx: Array) -> Array:
+    controller, along = prepared.controller, prepared.along
+    rows = bound_rows(controller.bounds, controller.plant)
+    sides = np.zeros((3, controller.plant.m, along.count))  # at -1 the last one
+    for row, direction in zip(rows.F, along.bounds, strict=True):
+        j = int(np.flatnonzero(row)[0])
+        sides[int(row[j]), j] = row[j] * direction
+    held = sides[plan.at, np.arange(controller.plant.m)]
+    return differentiate_plan(
+        plan, prepared.matrices, prepared.matrix_directions, np.array(controller.S), held, dx
+    )
+
+
+@checked
+def require_complete(controller: Controller, simulation: Simulation) -> Simulation:
+    """Return the simulation when every sample was reached.
+
+    Raises
+    ------
+    InfeasibleError
+        When a sample has no input that keeps the bounds: names the bound and the sample.
+    SolverError
+        When the loop diverged or the active-set method found no answer.
+    """
+    if simulation.complete:
+        return simulation
+    sample = simulation.reached
+    status = Status(int(simulation.status[sample]))
+    if status is Status.INFEASIBLE:
+        rows = build_rows(controller)
+        name = bound_rows(controller.bounds, controller.plant).names[
+            rows.family[simulation.failed_row]
+        ]
+        stage = int(rows.stage[simulation.failed_row])
+        where = (
+            f"{stage} samples ahead"
+            if stage < controller.horizon
+            else f"in the terminal set, {stage} samples ahead"
+        )
+        raise InfeasibleError(
+            "x0" if sample == 0 else f"sample {sample}",
+            f"no input sequence keeps the bound {name} {where}",
+            "start nearer to the origin, lengthen the horizon, or soften the state bounds",
+        )
+    raise SolverError(
+        f"sample {sample}", status.sentence, "check the plant, the gain and the bounds"
+    )
+
+
+def _writable(*matrices: Array) -> LoopMatrices:
+    """Copies, because read-only arrays are another type to numba and would be compiled again."""
+    return LoopMatrices(*(np.array(matrix, order="C") for matrix in matrices))
+
+
+def _no_directions(rows: Rows) -> RowDirections:
+    return RowDirections(
+        np.zeros((*rows.T.shape, 0)), np.zeros((*rows.M.shape, 0)), np.zeros((len(rows.b), 0))
+    )
+
+
+def _divergence(plant: Plant, given: Scenario) -> float:
+    """State norm that ends a simulation: a million times what drives it, and at least that."""
+    pushes = plant.E @ given.disturbance.T
+    return 1e6 * max(1.0, float(np.max(np.abs(given.x0))), float(np.max(np.abs(pushes), initial=0)))

@@ -1,0 +1,304 @@
+"""The terminal set: the largest set in which the gain alone keeps every bound for ever.
+
+Under u = -Kx the closed loop is x+ = F x, F = A - BK, and the bounds E x + F_u u <= b of one stage
+become G x <= b with G = E - F_u K. The maximal positively invariant set is
+
+    O = {x : G_c F^k x <= b_c  for every bound c and every step k >= 0},    O_k: the steps up to k.
+
+Gilbert and Tan (1991): when every row of step k + 1 already follows from O_k, then O = O_k; the
+first such k, k*, is finite for a stable F and an origin strictly inside the bounds. Each row that
+is kept carries its pair (family c, step k), so that H[i] = G_c F^k can be differentiated through K.
+
+Whether a row follows from others is one linear program. Two facts save most of them: if G_c F^k
+follows from O_{k-1}, then G_c F^(k+1) follows from O_k (put Fx for x), so a bound that has dropped
+out stays out; and a point of the set beyond a row shows that the row is needed. All tolerances are
+relative to the bound: rows are divided by b, the right sides are then 1.
+
+E. G. Gilbert, K. T. Tan, Linear systems with state and control constraints, IEEE TAC 36 (9), 1991.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.arrays import Array, Frozen, IntArray, finite_array, frozen
+from impc.checking import Value, checked
+from impc.control.halfspaces import (
+    needed_rows,
+    redundant_rows,
+    seen_directions,
+    supports,
+    with_mirror,
+)
+from impc.errors import BoundsError, InputError, SolverError
+from impc.model.bounds import BoundRows, bound_rows
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import ArrayLike
+
+    from impc.model.bounds import Bounds
+    from impc.model.plant import Plant
+
+__all__ = [
+    "TerminalSet",
+    "contains",
+    "invariance_violation",
+    "maximal_invariant_set",
+    "maximality_violation",
+]
+
+
+@dataclass(frozen=True)
+class TerminalSet(Value):
+    """The set {x : H x <= h}, without redundant rows, and where each row comes from.
+
+    Attributes
+    ----------
+    H, h : Array
+        Shapes (r, n) and (r,), in the units of the bounds; r = 0 when nothing is bounded.
+    family : IntArray
+        Bound c of each row (r,), an index into ``rows``.
+    step : IntArray
+        Step k of each row (r,): H[i] = ((E - F_u K) F^k)[c] and h[i] = b[c].
+    determinedness : int
+        k*, the last step that adds a row to those before; 0 when there are no rows.
+    tolerance : float
+        Support of a removed row above its bound, relative to the bound, that was accepted.
+    gain : Array
+        K (m, n) of u = -Kx.
+    F : Array
+        Closed loop A - BK, (n, n).
+    rows : BoundRows
+        The bounds of one stage, E x + F_u u <= b.
+    bases : mapping of int to IntArray
+        How the linear programs ended, for ``near=``: bases (c, q) by step, and at 0 those of the
+        last pruning.
+    """
+
+    H: Array
+    h: Array
+    family: IntArray
+    step: IntArray
+    determinedness: int
+    tolerance: float
+    gain: Array
+    F: Array
+    rows: BoundRows
+    bases: Mapping[int, IntArray] = field(repr=False, compare=False)
+
+
+@dataclass(frozen=True)
+class _Loop(Frozen):
+    """Normalised rows (c, n), closed loop, coordinates and limits of one construction."""
+
+    normal: Array
+    F: Array
+    basis: Array
+    mirrored: bool
+    tolerance: float
+    max_steps: int
+
+
+@checked(gain="m n", tolerance=0, max_steps=1)
+def maximal_invariant_set(
+    plant: Plant,
+    gain: ArrayLike,
+    bounds: Bounds,
+    *,
+    tolerance: float = 1e-9,
+    max_steps: int = 500,
+    near: TerminalSet | None = None,
+) -> TerminalSet:
+    """Compute the maximal positively invariant set of a plant under u = -Kx.
+
+    Parameters
+    ----------
+    plant : Plant
+        Discrete.
+    gain : array_like
+        K, shape (m, n), such that A - BK is stable.
+    bounds : Bounds
+        Of the plant's size.
+    tolerance : float
+        A row is redundant when it exceeds its bound by no more than this fraction of the bound.
+    max_steps : int
+        Largest k* to try.
+    near : TerminalSet, optional
+        The set of a similar gain: the bases of its linear programs are tried, and checked,
+        before a program is solved. It changes the time, not the answer.
+
+    Raises
+    ------
+    PlantError
+        When the plant is continuous.
+    DataError, InputError, BoundsError
+        When the gain has the wrong shape or does not stabilise, the bounds are not the plant's,
+        or a setting is out of range.
+    SolverError
+        When k* exceeds max_steps, or a linear program fails.
+    """
+    plant.require_discrete()
+    K = finite_array("gain", gain, (plant.m, plant.n))
+    F = plant.A - plant.B @ K
+    _check(plant, F, bounds, tolerance, max_steps)
+    rows = bound_rows(bounds, plant)
+    normal = (rows.E - rows.F @ K) / rows.b[:, None]
+    basis = seen_directions(_steps(normal, F, plant.n))
+    families, mirror = _half(normal, np.flatnonzero(np.any(normal @ basis, axis=1)))
+    loop = _Loop(normal, F, basis, mirror is not None, tolerance, max_steps)
+    hints = near.bases if near is not None else {}
+    family, step, Z, bases = _grow(loop, families, hints)
+    last = int(np.max(step, initial=0))
+    kept, bases[0] = needed_rows(Z, loop.mirrored, tolerance, hints.get(0))
+    family, step = family[kept], step[kept]
+    if mirror is not None:
+        family, step = np.concatenate([family, mirror[family]]), np.tile(step, 2)
+    order = np.lexsort((family, step))
+    family, step = _read_only(family[order]), _read_only(step[order])
+    return TerminalSet(
+        H=frozen(_steps(normal, F, last + 1)[step, family] * rows.b[family, None]),
+        h=frozen(rows.b[family]),
+        family=family,
+        step=step,
+        determinedness=last,
+        tolerance=float(tolerance),
+        gain=frozen(K),
+        F=frozen(F),
+        rows=rows,
+        bases=bases,
+    )
+
+
+@checked(tolerance=0)
+def contains(terminal: TerminalSet, x: ArrayLike, tolerance: float | None = None) -> bool:
+    """Whether the state x (n,) is in the set, within a fraction of each bound.
+
+    The tolerance is the set's own unless given. Raises DataError when x has another shape.
+    """
+    state = finite_array("x", x, (terminal.H.shape[1],))
+    allowed = terminal.tolerance if tolerance is None else tolerance
+    return bool(np.all(terminal.H @ state <= terminal.h * (1 + allowed)))
+
+
+@checked
+def invariance_violation(terminal: TerminalSet) -> float:
+    """By how much F leaves the set: the largest support of H F x over the set, less h, over h.
+
+    At most about the tolerance when the set is invariant; capped at 1; 0 for a set without rows.
+    With `maximality_violation` it proves the set: invariant and inside the bounds, hence within
+    O; bounded by rows of O only, hence not smaller.
+
+    Raises
+    ------
+    SolverError
+        When a linear program fails.
+    """
+    normal = terminal.H / terminal.h[:, None]
+    return _excess(terminal, normal @ terminal.F)
+
+
+@checked
+def maximality_violation(terminal: TerminalSet) -> float:
+    """By how much the set differs from O_k*, relative to the bounds; capped at 1.
+
+    The larger of two numbers. First, the relative distance of the rows from rows (c, k) computed
+    afresh, by powers of F: every trajectory that keeps the bounds obeys those, so the set is not
+    too small. Second, the largest violation, over the set, of any removed row (c, k <= k*): the
+    set is not too large.
+
+    Raises
+    ------
+    SolverError
+        When a linear program fails.
+    """
+    rows, count = terminal.rows, terminal.determinedness + 1
+    normal = (rows.E - rows.F @ terminal.gain) / rows.b[:, None]
+    powers = np.array([np.linalg.matrix_power(terminal.F, k) for k in range(count)])
+    every = normal @ powers
+    afresh = every[terminal.step, terminal.family]
+    given = terminal.H / terminal.h[:, None]
+    basis = seen_directions(np.concatenate([given, afresh]))
+    error = np.linalg.norm((given - afresh) @ basis, axis=1)
+    wrong = float(np.max(error / np.linalg.norm(afresh @ basis, axis=1), initial=0.0))
+    removed = np.ones(every.shape[:2], dtype=bool)
+    removed[terminal.step, terminal.family] = False
+    return max(wrong, _excess(terminal, every[removed]))
+
+
+def _check(plant: Plant, F: Array, bounds: Bounds, tolerance: float, max_steps: int) -> None:
+    radius = float(np.max(np.abs(np.linalg.eigvals(F))))
+    if not radius < 1:
+        problem = f"does not stabilise the plant: the spectral radius of A - BK is {radius:.6g}"
+        raise InputError("gain", problem, "give the gain of a regulator, such as solve_lqr(...).K")
+    if (bounds.x_min.size, bounds.u_min.size) != (plant.n, plant.m):
+        problem = f"are for {bounds.x_min.size} states and {bounds.u_min.size} inputs"
+        raise BoundsError("bounds", problem, f"the plant has {plant.n} and {plant.m}: box_bounds")
+    if not 0 <= tolerance <= 1e-2 or max_steps < 1:
+        problem = f"are {tolerance!r} and {max_steps!r}"
+        raise InputError("tolerance, max_steps", problem, "give 0 to 0.01, and at least 1")
+
+
+def _steps(normal: Array, F: Array, count: int) -> Array:
+    """Rows (count, c, n) of the steps 0 .. count - 1."""
+    steps = [normal]
+    for _ in range(count - 1):
+        steps.append(steps[-1] @ F)
+    return np.array(steps)
+
+
+def _half(normal: Array, families: IntArray) -> tuple[IntArray, IntArray | None]:
+    """Half of the bounds and the mirror image of each, when all have one; else all, and None."""
+    opposite = np.all(normal[families, None] == -normal[None, families], axis=2)
+    partner = np.argmax(opposite, axis=1) if len(families) else families
+    ahead = np.arange(len(families))
+    # Duplicated bounds share a mirror image: pairing is then not one to one.
+    if not np.all(np.any(opposite, axis=1)) or np.any(partner[partner] != ahead):
+        return families, None
+    mirror = np.arange(len(normal))
+    mirror[families] = families[partner]
+    return families[ahead < partner], mirror
+
+
+def _grow(
+    loop: _Loop, families: IntArray, hints: Mapping[int, IntArray]
+) -> tuple[IntArray, IntArray, Array, dict[int, IntArray]]:
+    """Add steps until every bound has dropped out: family, step and rows Z (r, q) of O_k*."""
+    family, step, k = [families[:0]], [families[:0]], 0
+    blocks, bases = [np.empty((0, loop.basis.shape[1]))], {}
+    rows = loop.normal[families]
+    while len(families):
+        if k > loop.max_steps + 1:
+            raise SolverError(
+                "terminal set",
+                f"is not determined within max_steps = {loop.max_steps} steps",
+                "raise max_steps, or use weights whose closed loop decays faster",
+            )
+        new = rows @ loop.basis
+        if k > 0:
+            Z = with_mirror(np.concatenate(blocks), loop.mirrored)
+            redundant, bases[k] = redundant_rows(new, Z, loop.tolerance, hints.get(k))
+            families, rows, new = families[~redundant], rows[~redundant], new[~redundant]
+        family.append(families)
+        step.append(np.full(len(families), k))
+        blocks.append(new)
+        rows, k = rows @ loop.F, k + 1
+    return np.concatenate(family), np.concatenate(step), np.concatenate(blocks), bases
+
+
+def _excess(terminal: TerminalSet, targets: Array) -> float:
+    """Largest support of the normalised target rows (t, n) over the set, less 1."""
+    if not np.any(targets):
+        return 0.0
+    normal = terminal.H / terminal.h[:, None]
+    basis = seen_directions(np.concatenate([normal, targets]))
+    return float(np.max(supports(normal @ basis, targets @ basis)[0])) - 1.0
+
+
+def _read_only(values: IntArray) -> IntArray:
+    values.flags.writeable = False
+    return values

@@ -1,0 +1,229 @@
+"""A plant from where a user keeps it: an import path with arguments, or a saved state space.
+
+A module that comes with the package, or with what is installed, is never looked for in the working
+folder: a file there called plants.py or numpy.py replaces nothing. Only a module of another name is
+looked for there, last, as long as it is being imported. What a user's function does wrong, whatever
+it raises, is one line that names it.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import inspect
+import os
+import sys
+import warnings
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from impc.checking import checked
+from impc.errors import ImpcError, InputError, PlantError, one_line
+from impc.files.saved_plant import SAVED, read_matrices, state_space
+from impc.model.plant import Plant, as_plant
+from impc.model.plant_family import PlantFamily, plant_family
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping, Sequence
+
+    from impc.arrays import Array
+
+__all__ = [
+    "PlantSource",
+    "import_function",
+    "make_plant",
+    "plant_family_of",
+    "plant_source",
+    "users_code",
+]
+
+
+@dataclass(frozen=True)
+class PlantSource:
+    """How to make a plant.
+
+    Attributes
+    ----------
+    name : str
+        Import path ``module:function`` or file.
+    make : callable
+        Keyword arguments -> `control.StateSpace`.
+    arguments : mapping
+        Arguments as the configuration's [plant] table gives them.
+    """
+
+    name: str
+    make: Callable[..., Any]
+    arguments: Mapping[str, Any]
+
+
+@checked
+def plant_source(name: str, arguments: Mapping[str, Any]) -> PlantSource:
+    """Find a plant by import path, or by the name of a .mat, .npz or .json file.
+
+    A file holds A, B, C and dt, and may hold D, and the names `states`, `inputs`, `outputs`, which
+    the arguments may give as well. A .npz file is read without pickles.
+
+    Raises
+    ------
+    InputError
+        When there is no such module, function or file, or a matrix is missing.
+    """
+    if Path(name).suffix in SAVED:
+        matrices = read_matrices(Path(name))
+        return PlantSource(
+            name, lambda **given: state_space(name, {**matrices, **given}), arguments
+        )
+    return PlantSource(name, import_function(name), arguments)
+
+
+@checked
+def import_function(path: str) -> Callable[..., Any]:
+    """The function of an import path ``module:function``; see the module's text for where.
+
+    Raises
+    ------
+    InputError
+        When there is no such module or function, or the module cannot be imported.
+    """
+    module, _, function = path.partition(":")
+    first = module.partition(".")[0]
+    if not (first and function):
+        raise InputError(
+            f"plant {path}", "is neither a known name, a file, nor module:function", "see docs"
+        )
+    installed = first in sys.modules or importlib.util.find_spec(first) is not None
+    try:
+        with (
+            users_code(f"plant {path}", ImportError, AttributeError),
+            nullcontext() if installed else _beside_the_recordings(),
+        ):
+            found = getattr(importlib.import_module(module), function)
+    except (ImportError, AttributeError) as error:
+        hidden = installed and Path(f"{first}.py").exists()
+        remedy = "rename yours: an installed module has its name" if hidden else "check its names"
+        raise InputError(
+            f"plant {path}", f"cannot be imported ({one_line(error)})", remedy
+        ) from None
+    made: Callable[..., Any] = found
+    return made
+
+
+@contextmanager
+def users_code(name: str, *passing: type[Exception]) -> Iterator[None]:
+    """Run code of a user's, of that `name`: whatever it raises is one line that says so.
+
+    Errors of the package, those of the kinds in `passing` and an interruption from the keyboard
+    stay what they are.
+
+    Raises
+    ------
+    InputError
+        For anything else, a call of `sys.exit` among it.
+    """
+    foreseen: tuple[type[Exception], ...] = (ImpcError, *passing)
+    try:
+        yield
+    except foreseen:
+        raise
+    except BaseException as error:
+        if type(error) is KeyboardInterrupt:
+            raise
+        said = one_line(error)
+        problem = f"ends in {type(error).__name__}{f' ({said})' if said else ''}"
+        raise InputError(name, problem, "correct the function, or what it is given") from None
+
+
+@contextmanager
+def _beside_the_recordings() -> Iterator[None]:
+    """The working folder on the import path, behind all that is installed."""
+    folder = os.getcwd()
+    sys.path.append(folder)
+    try:
+        yield
+    finally:
+        sys.path.reverse()  # the last one, should it have been there before
+        sys.path.remove(folder)
+        sys.path.reverse()
+
+
+@checked
+def make_plant(source: PlantSource, recorded: Sequence[str], **changed: float) -> Plant:
+    """Make the plant; inputs that are recorded are disturbances, the others are controls.
+
+    Parameters
+    ----------
+    recorded : sequence of str
+        Names of recorded signals; those that are no inputs are ignored.
+    **changed : float
+        Arguments that replace those of the source.
+
+    Raises
+    ------
+    InputError, PlantError
+        When the arguments do not fit the function, or what it returns is no usable plant.
+    """
+    arguments = {**source.arguments, **changed}
+    name = f"plant {source.name}"
+    try:
+        with users_code(name, TypeError, ValueError, np.exceptions.ComplexWarning):
+            with warnings.catch_warnings():
+                warnings.simplefilter("error", np.exceptions.ComplexWarning)
+                system = source.make(**arguments)
+            inputs = tuple(getattr(system, "input_labels", ()))
+            controls = [item for item in inputs if item not in recorded]
+            if inputs and not controls:
+                raise PlantError(name, "all its inputs are recorded", "one must be the command")
+            return as_plant(system, controls or None)
+    except ImpcError:
+        raise
+    except np.exceptions.ComplexWarning:  # control.ss would drop the imaginary parts
+        raise PlantError(name, "has complex matrices", "give it real ones") from None
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            name, f"refuses its arguments ({one_line(error)})", "correct the [plant] table"
+        ) from None
+
+
+def plant_family_of(
+    source: PlantSource, recorded: Sequence[str], free: Sequence[str]
+) -> PlantFamily | None:
+    """The plants that differ in the free arguments; None when none is free.
+
+    Parameters
+    ----------
+    recorded : sequence of str
+        Names of recorded signals, as in `make_plant`.
+    free : sequence of str
+        Names of the arguments that are fitted.
+
+    Raises
+    ------
+    InputError
+        When a free argument has no nominal value, neither given nor as the function's default.
+    """
+    if not free:
+        return None
+    nominal = [_nominal(source, name) for name in free]
+
+    def make(values: Array) -> Plant:
+        changed = {name: float(value) for name, value in zip(free, values, strict=True)}
+        return make_plant(source, recorded, **changed)
+
+    return plant_family(make, free, nominal)
+
+
+def _nominal(source: PlantSource, name: str) -> float:
+    if name in source.arguments:
+        value = source.arguments[name]
+    else:
+        parameter = inspect.signature(source.make).parameters.get(name)
+        value = None if parameter is None else parameter.default
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise InputError(
+            f"[fit] free {name}", "has no nominal value", f"give {name} in the [plant] table"
+        )
+    return float(value)

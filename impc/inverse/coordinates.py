@@ -1,0 +1,296 @@
+"""The unknowns of a search for a gain, in coordinates in which a step of one is a large step.
+
+    z = (G^-1 K T | factor of S but its first entry | x0 of each trial | parameters)
+
+T T' is the covariance of the states that the first gain gives when white noise enters at the
+inputs, and G gives the inputs the size of that noise (`natural_coordinates`; with one input it is
+1), so that a step of length one moves the command by one unit of that noise, whatever the units of
+states and inputs. S = L F F'L' with the first S = LL' and F lower triangular, for the same reason.
+On the seat, at four torque limits, a trust region in these coordinates reached
+the gain from 7 of 11 starts, in raw entries from 5, and in raw entries with columns scaled by the
+Jacobian from 4 (docs/fitting.md; experiments/benchmarks/search.py). No optimal regulator has a
+K T of norm above (tr(B'PB)/R)^(1/2), because white noise costs it tr(B'PB) a sample, of which
+R u^2 is a part.
+
+Initial states are measured in those of the trials themselves (`start_unit`), and a parameter in
+thirds of itself.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy.linalg
+
+from impc.arrays import Array
+from impc.control.closed_loop import simulate
+from impc.inverse.problem import controller_for, moved, scenarios
+from impc.inverse.residuals import evaluate
+from impc.inverse.solution_set import floored_covariance, natural_coordinates
+
+if TYPE_CHECKING:
+    from impc.control.terminal_set import TerminalSet
+    from impc.inverse.problem import InverseProblem
+    from impc.inverse.residuals import Evaluation
+
+__all__ = ["PARAMETER_UNIT", "Compressed", "Coordinates", "Point", "WithPrior", "start_unit"]
+
+_BLOCK = 4096
+#: A parameter's coordinate counts thirds of itself.
+PARAMETER_UNIT = 1 / 3
+_START_FLOOR = 1e-8
+
+
+@dataclass(frozen=True)
+class Point:
+    """What a point of a search stands for.
+
+    Attributes
+    ----------
+    K : Array
+        Gain (m, n).
+    S : Array
+        Metric (m, m).
+    starts : Array
+        Initial states (trials, n).
+    logarithms : Array
+        Of the parameters over their nominal values (k,).
+    """
+
+    K: Array
+    S: Array
+    starts: Array
+    logarithms: Array
+
+
+@dataclass(frozen=True)
+class Compressed:
+    """Residual and derivative in bases of the derivative's QR factorisations, trial by trial.
+
+    A search uses their norms and inner products only, which are those of the full ones; a
+    recording of thousands of samples becomes a few dozen rows.
+
+    Attributes
+    ----------
+    residual : Array
+        (r,).
+    jacobian : Array
+        With respect to the q coordinates (r, q).
+    """
+
+    residual: Array
+    jacobian: Array
+
+
+class Coordinates:
+    """The coordinates of one search, and the residual in them.
+
+    Caches the last evaluation, because the residual and its derivative come from one pass.
+
+    Parameters
+    ----------
+    problem : InverseProblem
+    gain, metric : Array
+        K (m, n) and S (m, m) where the search begins.
+    """
+
+    def __init__(self, problem: InverseProblem, gain: Array, metric: Array) -> None:
+        self.problem = problem
+        plant = problem.plant
+        self.m, self.n, self.trials = plant.m, plant.n, len(problem.recordings)
+        self.T, self.G = natural_coordinates(plant, gain)
+        self.start_unit = start_unit(problem, gain)
+        self.first = np.linalg.cholesky(metric * (plant.m / np.trace(metric)))
+        self.tril = np.tril_indices(self.m)
+        self.refused: list[str] = []
+        self.last: tuple[bytes, Compressed] | None = None
+        self.near: TerminalSet | None = None
+        sizes = (
+            self.m * self.n,
+            len(self.tril[0]) - 1,
+            self.trials * self.n if problem.unknown_start else 0,
+            len(problem.logarithms),
+        )
+        self.ends = np.cumsum(sizes)
+        self.start = self._pack(gain)
+
+    def unpack(self, z: Array) -> Point:
+        """The values at z (q,)."""
+        flat, factor, starts, parameters = np.split(z, self.ends[:-1])
+        given = np.array([trial.x0 for trial in self.problem.recordings])
+        if len(starts):
+            given = given + starts.reshape(self.trials, self.n) @ self.start_unit.T
+        gain = self.G @ np.linalg.solve(self.T.T, flat.reshape(self.m, self.n).T).T
+        return Point(
+            np.asarray(gain, dtype=np.float64),
+            self._metric(factor),
+            given,
+            self.problem.logarithms + PARAMETER_UNIT * parameters,
+        )
+
+    def at(self, z: Array) -> Compressed:
+        """Residual and derivative at z (q,)."""
+        key = z.tobytes()
+        if self.last is None or self.last[0] != key:
+            here = self.unpack(z)
+            problem = moved(self.problem, here.starts, here.logarithms)
+            evaluation = evaluate(problem, here.K, here.S, self.near)
+            self.near = evaluation.terminal or self.near
+            if evaluation.reason:
+                self.refused.append(evaluation.reason)
+            self.last = (key, self._compress(evaluation, z))
+        return self.last[1]
+
+    def with_prior(self, weight: float) -> WithPrior:
+        """The residual followed by weight * (z - start); nothing follows for a weight of 0."""
+        return WithPrior(self, weight)
+
+    def without_nuisance(self, z: Array) -> Array:
+        """Derivative at z (q,) with respect to gain and metric that the rest leaves.
+
+        Returns
+        -------
+        Array
+            (r, g), g coordinates of gain and metric: orthogonal to the columns of initial states
+            and parameters.
+        """
+        jacobian = self.at(z).jacobian
+        kept, nuisance = jacobian[:, : self.ends[1]], jacobian[:, self.ends[1] :]
+        if nuisance.shape[1] == 0:
+            return kept
+        left, values, _ = np.linalg.svd(nuisance, full_matrices=False)
+        left = left[:, values > 1e-12 * values[0]]
+        return np.asarray(kept - left @ (left.T @ kept))
+
+    def _pack(self, gain: Array) -> Array:
+        shapes = np.diff(np.concatenate([[0], self.ends]))
+        nuisance = np.zeros(int(shapes[2] + shapes[3]))
+        natural = np.linalg.solve(self.G, gain @ self.T)
+        return np.concatenate([natural.ravel(), np.eye(self.m)[self.tril][1:], nuisance])
+
+    def _factor(self, entries: Array) -> Array:
+        factor = np.zeros((self.m, self.m))
+        factor[self.tril] = np.concatenate([[1.0], entries])
+        return np.asarray(self.first @ factor, dtype=np.float64)
+
+    def _metric(self, entries: Array) -> Array:
+        factor = self._factor(entries)
+        return np.asarray(factor @ factor.T)
+
+    def metric_changes(self, z: Array) -> Array:
+        """Change of the metric with each entry of its factor, at z (q,): (k, m, m)."""
+        factor, changes = self._factor(z[self.ends[0] : self.ends[1]]), []
+        for row, column in list(zip(*self.tril, strict=True))[1:]:
+            change = np.outer(self.first[:, row], factor[:, column])
+            changes.append(change + change.T)
+        return np.array(changes).reshape(-1, self.m, self.m)
+
+    def _compress(self, found: Evaluation, z: Array) -> Compressed:
+        """Factor derivative and residual together, trial by trial, then apply the chain rule."""
+        parts = [found.dK.reshape(-1, self.m * self.n) @ self._gain_chain()]
+        if self.m > 1:
+            parts.append(found.dS.reshape(-1, self.m**2) @ self._metric_chain(z))
+        width = int(self.ends[-1])
+        rows, row = [], 0
+        sizes = [trial.outputs.size for trial in self.problem.recordings]
+        if not self.problem.unknown_start:  # no column belongs to one trial: all are one block
+            sizes = [sum(sizes)]
+        for index, size in enumerate(sizes):
+            mine = slice(row, row + size)
+            row = mine.stop
+            blocks = [part[mine] for part in parts]
+            blocks += [found.dx0[mine] @ self.start_unit] if found.dx0.shape[1] else []
+            blocks += [found.dparameters[mine] * PARAMETER_UNIT, found.residual[mine, None]]
+            triangle = _triangle(blocks)
+            placed = np.zeros((len(triangle), width + 1))
+            placed[:, self._columns(index)] = triangle
+            rows.append(placed)
+        table = np.vstack(rows)
+        return Compressed(table[:, -1], table[:, :-1])
+
+    def _columns(self, trial: int) -> Array:
+        """Where the columns of one trial stand among all."""
+        shared = np.arange(self.ends[1])
+        mine = np.arange(self.n) + self.ends[1] + trial * self.n
+        own = mine if self.problem.unknown_start else mine[:0]
+        return np.concatenate([shared, own, np.arange(self.ends[2], self.ends[3] + 1)])
+
+    def _gain_chain(self) -> Array:
+        return np.asarray(np.kron(self.G, np.linalg.inv(self.T).T), dtype=np.float64)
+
+    def _metric_chain(self, z: Array) -> Array:
+        """Derivative of the scaled metric with respect to the entries of its factor: (m m, k)."""
+        metric = self._metric(z[self.ends[0] : self.ends[1]])
+        # The controller scales the metric to a mean diagonal of 1.
+        scale, trace = self.m / np.trace(metric), np.trace(metric)
+        changes = self.metric_changes(z)
+        flat = [scale * (change - metric * np.trace(change) / trace).ravel() for change in changes]
+        return np.column_stack(flat)
+
+
+@dataclass(frozen=True)
+class WithPrior:
+    """Residual and derivative with the rows of a prior about the start.
+
+    Attributes
+    ----------
+    space : Coordinates
+    weight : float
+        What a step of one away from the start counts in the residual.
+    """
+
+    space: Coordinates
+    weight: float
+
+    def residual(self, z: Array) -> Array:
+        """Rows of the recordings at z (q,), then of the prior: (r + q,), or (r,) without it."""
+        data = self.space.at(z).residual
+        if self.weight == 0:
+            return data
+        return np.concatenate([data, self.weight * (z - self.space.start)])
+
+    def derivative(self, z: Array) -> Array:
+        """Derivative of `residual` at z (q,): (r + q, q), or (r, q) without a prior."""
+        data = self.space.at(z).jacobian
+        if self.weight == 0:
+            return data
+        return np.vstack([data, self.weight * np.eye(len(z))])
+
+
+def start_unit(problem: InverseProblem, gain: Array) -> Array:
+    """Unit of initial states, (n, n), at a `gain` (m, n).
+
+    They are thought of as any other state of their trials.
+
+    A factor of the second moments that the states have when the gain's controller is driven as the
+    recordings were. Where nothing drives it, white noise at the inputs of the size of the outputs.
+    """
+    plant = problem.plant
+    controller = controller_for(problem, gain, np.eye(plant.m))
+    runs = [simulate(controller, drive) for drive in scenarios(problem)]
+    x = np.concatenate([run.x[: run.reached + 1] for run in runs])
+    second = x.T @ x / len(x)
+    if np.all(np.isfinite(second)) and np.all(np.diag(second) > 0):
+        return np.asarray(np.linalg.cholesky(floored_covariance(second, _START_FLOOR)))
+    T, _ = natural_coordinates(plant, gain)
+    scaled = np.concatenate([trial.outputs / problem.output_scale for trial in problem.recordings])
+    natural = float(np.linalg.norm(plant.C @ T / problem.output_scale[:, None]))
+    size = float(np.sqrt(np.sum(np.mean(scaled**2, axis=0))))
+    return size / natural * T if size > 0 and natural > 0 else T
+
+
+def _triangle(columns: list[Array]) -> Array:
+    """R of a QR factorisation of the columns side by side, block by block.
+
+    Blocks of a few thousand rows stay in the processor's cache: a recording ten times as long
+    takes ten times the time, not fifteen.
+    """
+    width = sum(part.shape[1] for part in columns)
+    triangle = np.zeros((0, width))
+    for first in range(0, len(columns[0]), _BLOCK):
+        block = np.hstack([part[first : first + _BLOCK] for part in columns])
+        (upper,) = scipy.linalg.qr(np.vstack([triangle, block]), mode="r", check_finite=False)
+        triangle = np.asarray(upper[:width], dtype=np.float64)
+    return triangle

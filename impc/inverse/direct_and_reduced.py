@@ -1,0 +1,446 @@
+"""Inverse MPC: the weights of the constrained controller that made the recordings.
+
+`infer_weights` is Table 3.1 from end to end. Its last line is the direct form (3.6); the reduced
+form reaches the same weights through the gain: what the recordings determine is K (and S), and the
+weights of least condition number among all those with that gain are one semidefinite program.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.arrays import Array
+from impc.checking import checked
+from impc.control.closed_loop import simulate
+from impc.control.controller import mpc_controller
+from impc.inverse.diagonal_start import bryson_regulators
+from impc.inverse.explaining_weights import weights_behind
+from impc.inverse.gain_search import EXPLAINED, GainFit, fit_gain
+from impc.inverse.inverse_lqr import inverse_lqr_gradient, inverse_lqr_lmi
+from impc.inverse.problem import recorded_size, scenarios, typical_output, without_bounds
+from impc.inverse.proximal_search import ConditionedFit, Objective, Residual, conditioned_fit
+from impc.inverse.residuals import evaluate
+from impc.inverse.weights_search import search_weights
+from impc.model.riccati import solve_lqr
+from impc.model.weights import Weights, condition_number, normalised, stage_weights
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from impc.control.closed_loop import Simulation
+    from impc.control.terminal_set import TerminalSet
+    from impc.inverse.equivalent_weights import EquivalentWeights
+    from impc.inverse.explaining_weights import WeightsBehind
+    from impc.inverse.inverse_lqr import InverseLqr
+    from impc.inverse.problem import InverseProblem
+    from impc.model.plant import Plant
+    from impc.model.riccati import LqrSolution
+
+__all__ = [
+    "AUXILIARY_CONDITION_WEIGHT",
+    "CONDITION_WEIGHT",
+    "DirectFit",
+    "Inference",
+    "ReducedFit",
+    "Start",
+    "auxiliary_weights",
+    "infer_weights",
+    "inverse_mpc",
+    "inverse_mpc_reduced",
+    "output_penalty_weights",
+    "start_gains",
+    "starting_point",
+    "verify_hard",
+]
+
+# c of (3.5) to (3.7) is lost. Small enough that the exact fit wins in the 2-norm (docs/theory.md).
+#: Weight of the condition number in (3.6) and (3.16), against 1 for a misfit of a typical output.
+CONDITION_WEIGHT = 1e-4
+#: The same in (3.7), against 1 for a distance as large as the gain in `infer_weights`.
+AUXILIARY_CONDITION_WEIGHT = 1e-3
+# Steps of the direct form inside the reduced one: it need not end, only change the valley.
+_DETOUR = 60
+# Starting weights are kept this definite: the search takes the Cholesky factor of them.
+_LARGEST_START_CONDITION = 1e6
+
+
+@dataclass(frozen=True)
+class DirectFit(ConditionedFit):
+    """Result of `inverse_mpc`: what every `ConditionedFit` says, and whether it explains.
+
+    Attributes
+    ----------
+    explained : bool
+        Whether the constrained controller of the weights reproduces the recordings to 1e-9 of
+        them. Where `converged` is true and this is not, the search ended in a minimum of its
+        objective that leaves a misfit: noise, a model that is wrong, or a local minimum.
+    """
+
+    explained: bool
+
+
+@dataclass(frozen=True)
+class ReducedFit:
+    """Result of `inverse_mpc_reduced`.
+
+    Attributes
+    ----------
+    gain : GainFit
+        What the recordings determine.
+    equivalent : EquivalentWeights or None
+        Weights of least condition number with exactly that gain; None when there are none.
+    direct : DirectFit or None
+        Weights of the direct form, when none have exactly that gain, or those that do fit worse.
+    explained : bool
+        Whether the constrained controller of these weights reproduces the recordings to 1e-9 of
+        them.
+    reason : str
+        Why not; empty when it does.
+    kept_hard : bool
+        Whether the controller found reaches every sample with hard state bounds and terminal set,
+        which the search had softened; see `verify_hard`.
+    """
+
+    gain: GainFit
+    equivalent: EquivalentWeights | None
+    direct: DirectFit | None
+    explained: bool
+    reason: str
+    kept_hard: bool
+
+    @property
+    def weights(self) -> Weights:
+        """The weights found, scaled to R[0, 0] = 1."""
+        found = self.equivalent if self.direct is None else self.direct
+        assert found is not None  # one of the two is always there: see `inverse_mpc_reduced`
+        return found.weights
+
+
+@dataclass(frozen=True)
+class Start:
+    """Lines 1 to 8 of Table 3.1; what the branch taken did not need is None.
+
+    Attributes
+    ----------
+    gain : GainFit
+        Line 1: feedback gain without bounds.
+    lmi : InverseLqr
+        Line 2; whether it is feasible decides the branch.
+    gradient : InverseLqr or None
+        Line 4.
+    auxiliary : ConditionedFit or None
+        Line 5.
+    weights : Weights
+        Line 5 or 7: where (3.6) starts.
+    """
+
+    gain: GainFit
+    lmi: InverseLqr
+    gradient: InverseLqr | None
+    auxiliary: ConditionedFit | None
+    weights: Weights
+
+
+@dataclass(frozen=True)
+class Inference:
+    """Table 3.1 from end to end.
+
+    Attributes
+    ----------
+    start : Start
+        Lines 1 to 8.
+    fit : DirectFit
+        Line 9.
+    """
+
+    start: Start
+    fit: DirectFit
+
+
+@checked(condition_weight=0)
+def infer_weights(problem: InverseProblem, *, condition_weight: float | None = None) -> Inference:
+    """Table 3.1: from recordings to the weights of the constrained controller behind them.
+
+    Parameters
+    ----------
+    problem : InverseProblem
+    condition_weight : float, optional
+        Of the direct form, see `inverse_mpc`.
+
+    Raises
+    ------
+    WeightsError, SolverError
+        When no starting weights can be found, or the recordings cannot be simulated from them.
+    """
+    start = starting_point(problem)
+    return Inference(start, inverse_mpc(problem, start.weights, condition_weight=condition_weight))
+
+
+def start_gains(start: Start, plant: Plant) -> list[tuple[Array, Array]]:
+    """The gains (m, n) that Table 3.1 passed, with metrics (m, m), as starts for `fit_gain`."""
+    passed = [start.weights]
+    if start.gradient is not None and start.gradient.weights is not None:
+        passed.append(start.gradient.weights)
+    solutions = [solve_lqr(plant, weights) for weights in passed]
+    pairs = [(np.array(item.K), np.array(item.S)) for item in solutions]
+    return [(np.array(start.gain.K), pairs[0][1]), *pairs]
+
+
+@checked
+def starting_point(problem: InverseProblem) -> Start:
+    """Lines 1 to 8 of Table 3.1: a feedback gain, and the weights of a regulator like it.
+
+    Raises
+    ------
+    WeightsError, SolverError
+        As `infer_weights`.
+    """
+    plant = problem.plant
+    gain = fit_gain(without_bounds(problem), attempts=1)
+    lmi = inverse_lqr_lmi(plant, gain.K)
+    if lmi.weights is not None:
+        return Start(gain, lmi, None, None, lmi.weights)
+    gradient = inverse_lqr_gradient(plant, gain.K)
+    weight = AUXILIARY_CONDITION_WEIGHT * (float(np.linalg.norm(gain.K)) or 1.0)
+    auxiliary = auxiliary_weights(plant, gain.K, gradient.weights, condition_weight=weight)
+    return Start(gain, lmi, gradient, auxiliary, auxiliary.weights)
+
+
+@checked(condition_weight=0, max_iterations=1)
+def inverse_mpc(
+    problem: InverseProblem,
+    start: Weights,
+    *,
+    condition_weight: float | None = None,
+    squared: bool = False,
+    max_iterations: int = 200,
+    explain: bool = True,
+) -> DirectFit:
+    """Direct inverse MPC (3.6): misfit of the constrained closed loop plus condition number.
+
+    Terminal weight and terminal set follow (Q, R) at every iterate.
+
+    Parameters
+    ----------
+    start : Weights
+        Positive definite, from Table 3.1 for example.
+    condition_weight : float, optional
+        Against a fit weight of 1. By default 1e-4 of a typical output (over its scale), so that the
+        answer does not depend on units.
+    squared : bool
+        Whether the misfit is the square of its 2-norm; see `Objective`.
+    max_iterations : int
+        Steps that are solved at most.
+    explain : bool
+        Whether weights that explain the recordings are looked for where the minimum does not, and
+        taken instead: the minimum at every condition weight that is small enough (docs/theory.md,
+        section 6). Only in the 2-norm, and without a condition weight of the caller's.
+
+    Raises
+    ------
+    WeightsError, SolverError
+        As `conditioned_fit`.
+    """
+    weight = condition_weight
+    if weight is None:
+        weight = CONDITION_WEIGHT * typical_output(problem)
+    objective = Objective(_closed_loop_residual(problem), 1.0, weight, squared)
+    fit = conditioned_fit(problem.plant, objective, _definite(start), max_iterations=max_iterations)
+    found = _direct(problem, fit)
+    if found.explained or not explain or squared or condition_weight is not None:
+        return found
+    return _explaining(problem, found, weight)
+
+
+def _direct(problem: InverseProblem, fit: ConditionedFit) -> DirectFit:
+    explained = fit.misfit <= EXPLAINED * recorded_size(problem)
+    values = {item.name: getattr(fit, item.name) for item in fields(ConditionedFit)}
+    return DirectFit(**values, explained=explained)
+
+
+def _explaining(problem: InverseProblem, found: DirectFit, weight: float) -> DirectFit:
+    """Weights of least condition number that explain the recordings, if any; else those given."""
+    near = search_weights(problem, found.weights)
+    start = np.array(near.solution.K), np.array(near.solution.S)
+    behind = weights_behind(fit_gain(problem, start, attempts=1, regulators=False))
+    if not behind.explained or behind.equivalent is None:
+        return found
+    weights, condition = behind.equivalent.weights, behind.equivalent.condition
+    return replace(
+        found,
+        weights=weights,
+        solution=solve_lqr(problem.plant, weights),
+        misfit=behind.misfit,
+        condition=condition,
+        objective=behind.misfit + weight * condition,
+        evaluations=found.evaluations + near.evaluations + behind.gain.evaluations,
+        converged=True,
+        explained=True,
+    )
+
+
+@checked(condition_weight=0)
+def inverse_mpc_reduced(
+    problem: InverseProblem,
+    *starts: tuple[Array, Array],
+    condition_weight: float | None = None,
+) -> ReducedFit:
+    """Reduced inverse MPC: fit the gain through the constrained controller, then one program.
+
+    Three searches at most: two for a gain, and when neither explains the recordings, or no weights
+    have the gain found, one that stays among weights (the direct form) and goes on as a search for
+    a gain from where that ends. It passes local minima at gains that no weights have.
+
+    Parameters
+    ----------
+    starts : pairs of Array
+        Gains (m, n) and metrics (m, m) from which the search may start, see `fit_gain`.
+    condition_weight : float, optional
+        Of the direct form, see `inverse_mpc`.
+
+    Raises
+    ------
+    SolverError
+        When the recordings cannot be simulated from any start.
+    """
+    first = weights_behind(fit_gain(problem, *starts, attempts=2))
+    if first.explained:
+        return _with_gain(problem, first)
+    direct = inverse_mpc(
+        problem,
+        _most_promising(problem),
+        condition_weight=condition_weight,
+        max_iterations=_DETOUR,
+        explain=False,
+    )
+    end = search_weights(problem, direct.weights).solution
+    second = weights_behind(fit_gain(problem, (np.array(end.K), np.array(end.S)), attempts=1))
+    best = min(first, second, key=lambda item: item.misfit)
+    if best.misfit <= direct.misfit:
+        return _with_gain(problem, best)
+    kept = all(run.complete for run in verify_hard(problem, direct.weights))
+    return ReducedFit(first.gain, None, direct, False, first.reason, kept)
+
+
+def _with_gain(problem: InverseProblem, found: WeightsBehind) -> ReducedFit:
+    assert found.equivalent is not None  # its misfit is finite
+    kept = all(run.complete for run in verify_hard(problem, found.equivalent.weights))
+    return ReducedFit(found.gain, found.equivalent, None, found.explained, found.reason, kept)
+
+
+def _most_promising(problem: InverseProblem) -> Weights:
+    """Of `bryson_weights` those with the least misfit, whether or not every sample is reached."""
+
+    def distance(solution: LqrSolution) -> float:
+        return float(np.linalg.norm(evaluate(problem, solution.K, solution.S).residual))
+
+    return min(bryson_regulators(problem), key=lambda item: distance(item[1]))[0]
+
+
+@checked(gain="m n", condition_weight=0)
+def auxiliary_weights(
+    plant: Plant,
+    gain: Array,
+    start: Weights | None,
+    *,
+    condition_weight: float = AUXILIARY_CONDITION_WEIGHT,
+) -> ConditionedFit:
+    """Auxiliary problem (3.7): weights whose regulator is near the gain, and well conditioned.
+
+    minimise  ||K(Q, R) - gain||_2 + condition_weight kappa(blkdiag(Q, R))
+
+    Parameters
+    ----------
+    gain : Array
+        (m, n).
+    start : Weights or None
+        Where the search begins; the identity for None.
+    condition_weight : float
+        Against 1 for the distance.
+
+    Raises
+    ------
+    WeightsError
+        When the start has no stabilising Riccati solution.
+    """
+    size = gain.size
+    dK = np.eye(size).reshape(size, *gain.shape)
+    dS = np.zeros((size, plant.m, plant.m))
+
+    def distance(solution: LqrSolution) -> Residual:
+        return Residual((solution.K - gain).ravel(), dK, dS, usable=True)
+
+    begin = stage_weights(np.eye(plant.n), np.eye(plant.m)) if start is None else start
+    return conditioned_fit(
+        plant, Objective(distance, 1.0, condition_weight, squared=False), _definite(begin)
+    )
+
+
+@checked(condition_weight=0)
+def output_penalty_weights(
+    problem: InverseProblem,
+    start: Weights,
+    *,
+    condition_weight: float | None = None,
+) -> ConditionedFit:
+    """Inverse LQR on the outputs (3.16): as `inverse_mpc`, but the loop is the plain regulator.
+
+    Parameters
+    ----------
+    start : Weights
+        Positive definite.
+    condition_weight : float, optional
+        Against a fit weight of 1, see `inverse_mpc`.
+
+    Raises
+    ------
+    WeightsError, SolverError
+        As `inverse_mpc`.
+    """
+    return inverse_mpc(
+        without_bounds(problem), start, condition_weight=condition_weight, explain=False
+    )
+
+
+@checked
+def verify_hard(problem: InverseProblem, weights: Weights) -> list[Simulation]:
+    """Simulate every recording with hard state bounds and terminal set.
+
+    The search softens those rows; this says whether the controller found keeps them. Pass each
+    result to `require_complete` to turn a failure into an error.
+    """
+    controller = mpc_controller(
+        problem.plant,
+        weights,
+        problem.bounds,
+        problem.horizon,
+        terminal_set=problem.terminal_set,
+    )
+    return [simulate(controller, drive) for drive in scenarios(problem)]
+
+
+def _closed_loop_residual(problem: InverseProblem) -> Callable[[LqrSolution], Residual]:
+    near: TerminalSet | None = None
+
+    def residual(solution: LqrSolution) -> Residual:
+        nonlocal near
+        found = evaluate(problem, solution.K, solution.S, near)
+        near = found.terminal or near
+        return Residual(found.residual, found.dK, found.dS, usable=not found.reason)
+
+    return residual
+
+
+def _definite(weights: Weights) -> Weights:
+    """Lift the least eigenvalues of Q and R so that the condition number is at most 1e6."""
+    if condition_number(weights) <= _LARGEST_START_CONDITION:
+        return normalised(weights)
+    floor = float(np.linalg.eigvalsh(weights.block)[-1]) / _LARGEST_START_CONDITION
+    lifted = []
+    for matrix in (weights.Q, weights.R):
+        values, vectors = np.linalg.eigh(matrix)
+        lifted.append((vectors * np.maximum(values, floor)) @ vectors.T)
+    return normalised(stage_weights(*lifted))

@@ -1,0 +1,322 @@
+"""The choice of one pair of weights among all that have a given gain.
+
+The fibre of a gain (`gain_fibre`) is a linear space; its positive definite members are the weights
+with that gain. Three of them have a name here: the one that shows best that any exist, the one of
+least condition number, and the analytic centre. The first and the last do not depend on the units
+of states and inputs, the second does (docs/equivalent-weights.md, section 2).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+
+from impc.arrays import Array, Frozen
+from impc.checking import checked
+from impc.errors import SolverError, WeightsError
+from impc.inverse.semidefinite import matrix_inequality, solve_semidefinite
+from impc.inverse.solution_set import GainFibre, gain_fibre, pair_blocks, split_blocks
+from impc.model.riccati import solve_lqr
+from impc.model.weights import Weights, condition_number, normalised, stage_weights
+
+__all__ = [
+    "EquivalentWeights",
+    "GainFibre",
+    "WeightsMargin",
+    "analytic_centre",
+    "gain_fibre",
+    "inverse_factor",
+    "least_condition_weights",
+    "other_weights",
+    "weights_margin",
+]
+
+# Least eigenvalue, of a mean of 1, from which weights are said to exist: Clarabel errs by 1e-10.
+_MARGIN = 1e-9
+# Relative distance to the dual bound at which a program is not solved again, and counts as failed.
+_GAP, _LARGEST_GAP = 1e-9, 1e-4
+
+
+@dataclass(frozen=True)
+class WeightsMargin:
+    """Whether a fibre has positive definite members, and by how much.
+
+    Attributes
+    ----------
+    margin : float
+        Largest t with blkdiag(Q, R) >= t I in natural coordinates, at a mean eigenvalue of 1: at
+        most 1, independent of units, negative when no member is even semidefinite.
+    exist : bool
+        Whether the margin is above 1e-9.
+    weights : Weights or None
+        The member of that margin, when they exist.
+    """
+
+    margin: float
+    exist: bool
+    weights: Weights | None
+
+
+@dataclass(frozen=True)
+class EquivalentWeights(Frozen):
+    """Weights that have the gain of a fibre.
+
+    Attributes
+    ----------
+    weights : Weights
+        Scaled to R[0, 0] = 1.
+    P : Array
+        Their Riccati solution (n, n), solved anew.
+    condition : float
+        Condition number of blkdiag(Q, R).
+    gain_error : float
+        ||K(Q, R) - K||_F / ||K||_F, with K(Q, R) from that solution.
+    status : str
+        How they were found, and the solver's own word.
+    gap : float or None
+        Of `least_condition_weights`: how much lower, relatively, the condition number could be by
+        the dual bound. None for weights that were not chosen by it.
+    """
+
+    weights: Weights
+    P: Array
+    condition: float
+    gain_error: float
+    status: str
+    gap: float | None
+
+
+@checked
+def weights_margin(fibre: GainFibre) -> WeightsMargin:
+    """Say whether any weights have the gain: max t such that X >= t I, mean eigenvalue of X is 1.
+
+    Raises
+    ------
+    SolverError
+        When neither a member nor the dual bound decides.
+    """
+    basis, n, size = fibre.natural_basis(), fibre.plant.n, fibre.plant.n + fibre.plant.m
+    traces = np.trace(basis, axis1=1, axis2=2)
+    if np.linalg.norm(traces) < 1e-12:  # no member has a positive trace, or there is none but 0
+        return WeightsMargin(-np.inf, exist=False, weights=None)
+    # The trace is eliminated: as an equality, it stops Clarabel at once on one plant in twenty.
+    first = np.tensordot(traces * size / (traces @ traces), basis, 1)
+    level = np.tensordot(scipy.linalg.null_space(traces[None]).T, basis, 1)
+    lowered = np.concatenate([level, -np.eye(size)[None]])
+    parts = (slice(0, n), slice(n, size))
+    cones = [matrix_inequality(first[part, part], lowered[:, part, part]) for part in parts]
+    found = solve_semidefinite(-np.eye(len(lowered))[-1], cones)
+    member = first + np.tensordot(found.y[:-1], level, 1)
+    # From the member itself, not from the solver's word.
+    margin = float(np.linalg.eigvalsh(member)[0])
+    if margin > _MARGIN:
+        return WeightsMargin(margin, exist=True, weights=fibre.from_natural(member))
+    if not abs(margin + found.bound) <= _LARGEST_GAP * max(1.0, -margin):
+        raise SolverError("margin", f"Clarabel: {found.status}, undecided", "scale the states")
+    return WeightsMargin(margin, exist=False, weights=None)
+
+
+@checked
+def least_condition_weights(fibre: GainFibre, member: Weights | None = None) -> EquivalentWeights:
+    """Return the weights of least condition number that have the gain.
+
+    minimise alpha subject to I <= X <= alpha I, X = blkdiag(Q, R) in the fibre.
+
+    A member X0 = LL' of least eigenvalue 1 and largest a sets the scale: the first inequality is
+    written for L^-1 X L^-T, the second divided by a, so that all entries are of order one. One
+    such program reaches 2e-4 on the seat plant (a condition number of 2e7); from its own answer
+    the next reaches 1e-11. As written above it returns twice the least condition number there.
+
+    Parameters
+    ----------
+    fibre : GainFibre
+    member : Weights, optional
+        Weights known to have the gain: where to begin when no program finds any. Weights at the
+        edge of what a program can tell from none (a margin below 1e-9) are found again like this.
+
+    Raises
+    ------
+    WeightsError
+        When no weights have the gain.
+    SolverError
+        When the dual bound stays more than 1e-4 below, or no member is definite to working
+        precision in the units of the plant.
+    """
+    best = _interior(fibre, member)
+    least, gap, status = condition_number(best), 1.0, ""
+    for _ in range(4):
+        before = least
+        found, bound, status = _centred_program(fibre, best)
+        if condition_number(found) < least:
+            best, least = found, condition_number(found)
+        gap = abs(1 - bound / least)  # a bound above the value is as wrong as one below
+        if gap < _GAP or before - least < _GAP * least:
+            break
+    if not gap < _LARGEST_GAP:
+        raise SolverError(
+            "least condition number",
+            f"Clarabel: {status}, condition {least:.6g}, proven only to {gap:.2g}",
+            "use `analytic_centre`, or scale the states",
+        )
+    return _member(fibre, best, f"least condition number, Clarabel: {status}", gap)
+
+
+@checked
+def analytic_centre(fibre: GainFibre) -> EquivalentWeights:
+    """Return the member of largest det Q det R among those with trace(N^-1 R) = m.
+
+    N is the metric of the natural coordinates, so the choice does not depend on the coordinates
+    of states and inputs. With a single input it is the largest det Q with R fixed. Damped Newton.
+
+    Raises
+    ------
+    WeightsError
+        When no weights have the gain, or when the members with that trace are unbounded, which
+        they are if and only if (A, B) is not controllable or, discrete, A - BK is singular: the
+        cost on a combination of states that is out of reach, or gone in one step, is then free.
+    """
+    n, basis = fibre.plant.n, fibre.natural_basis()
+    X = fibre.to_natural(_interior(fibre))
+    traces = np.trace(basis[:, n:, n:], axis1=1, axis2=2)
+    X *= fibre.plant.m / np.trace(X[n:, n:])
+    level = np.tensordot(scipy.linalg.null_space(traces[None]).T, basis, 1)
+    for iteration in range(1, 201):
+        inverse = np.linalg.inv(np.linalg.cholesky(X))
+        seen = (inverse @ level @ inverse.T).reshape(len(level), X.size)
+        # The Newton step of log det: the least-squares solution of sum d_i seen_i = I.
+        step = np.linalg.lstsq(seen.T, np.eye(len(X)).ravel())[0]
+        decrement = float(np.linalg.norm(step @ seen))
+        X = X + np.tensordot(step, level, 1) / (1 + decrement if decrement > 0.25 else 1)
+        if decrement < 1e-9:
+            status = f"analytic centre, {iteration} Newton steps"
+            return _member(fibre, fibre.from_natural(X), status, None)
+        if np.linalg.cond(X) > 1e14:
+            break
+    raise WeightsError(
+        "gain",
+        "leaves the cost on some combination of states free, so there is no analytic centre",
+        "use `least_condition_weights`, or remove states that are out of reach or gone in one step",
+    )
+
+
+@checked(count=0, condition_ratio=1)
+def other_weights(
+    fibre: GainFibre, count: int = 2, *, condition_ratio: float = 10.0
+) -> tuple[EquivalentWeights, ...]:
+    """Return weights clearly unlike those of least condition number, with the same gain.
+
+    From the weights of least condition number, straight along each basis direction of the fibre
+    and its opposite, as far as the condition number stays below the ratio; of these ends the one
+    farthest from all chosen so far, again and again. Distances are spreads of the logarithms of
+    relative eigenvalues, in which neither scale nor units count.
+
+    Parameters
+    ----------
+    count : int
+        How many; fewer come back when the fibre has fewer ends, none when it has one member.
+    condition_ratio : float
+        Largest condition number, as a multiple of the least.
+
+    Raises
+    ------
+    WeightsError, SolverError
+        As `least_condition_weights`.
+    """
+    centre = least_condition_weights(fibre)
+    ends = _ends(fibre, centre.weights, condition_ratio * centre.condition)
+    chosen = [fibre.to_natural(centre.weights)]
+    while ends and len(chosen) <= count:
+        nearest = [min(_distance(end, item) for item in chosen) for end in ends]
+        chosen.append(ends.pop(int(np.argmax(nearest))))
+    status = f"{condition_ratio:g} times the least condition number"
+    return tuple(_member(fibre, fibre.from_natural(X), status, None) for X in chosen[1:])
+
+
+def _interior(fibre: GainFibre, member: Weights | None = None) -> Weights:
+    try:
+        found = weights_margin(fibre)
+    except SolverError:
+        if member is None:
+            raise
+        return member
+    if found.weights is None and member is not None:
+        return member
+    if found.weights is None:
+        raise WeightsError(
+            "gain",
+            f"no positive definite weights have it (margin {found.margin:.3g})",
+            "look for the nearest gain that has: `inverse_lqr_gradient`",
+        )
+    return found.weights
+
+
+def _centred_program(fibre: GainFibre, centre: Weights) -> tuple[Weights, float, str]:
+    """One program of `least_condition_weights`, scaled by a member: (found, bound, status)."""
+    n, eigenvalues = fibre.plant.n, np.linalg.eigvalsh(centre.block)
+    if eigenvalues[0] <= 0:
+        raise SolverError(
+            "least condition number",
+            "the weights are singular to working precision in the units of the plant",
+            "scale the states",
+        )
+    largest = float(eigenvalues[-1] / eigenvalues[0])
+    inverse = inverse_factor(fibre, centre) * np.sqrt(eigenvalues[0])
+    lower = inverse @ inverse.T
+    raw = pair_blocks(fibre.Q, fibre.R)
+    # Orthonormal as seen from the centre: the program's own variables are well scaled too.
+    seen, triangle = np.linalg.qr((inverse @ raw @ inverse.T).reshape(len(raw), -1).T)
+    seen = np.append(seen.T, np.zeros((1, raw[0].size)), axis=0).reshape(-1, *lower.shape)
+    raw = np.tensordot(np.linalg.inv(triangle).T, raw, 1)
+    upper = np.append(-raw / largest, np.eye(len(lower))[None], axis=0)
+    cones = []
+    for block in (slice(0, n), slice(n, len(lower))):
+        cones.append(matrix_inequality(-lower[block, block], seen[:, block, block]))
+        part = upper[:, block, block]
+        cones.append(matrix_inequality(np.zeros(part.shape[1:]), part))
+    found = solve_semidefinite(np.eye(len(upper))[-1], cones)
+    member = split_blocks(np.tensordot(found.y[:-1], raw, 1), n)
+    return member, largest * found.bound, found.status
+
+
+def _ends(fibre: GainFibre, centre: Weights, limit: float) -> list[Array]:
+    """Ends of the rays, in natural coordinates; bisection, for the condition is quasiconvex."""
+    inverse = inverse_factor(fibre, centre)
+    back = np.linalg.inv(inverse)
+    seen = (inverse @ pair_blocks(fibre.Q, fibre.R) @ inverse.T).reshape(fibre.dimension, -1)
+    # Across the centre itself, seen as I, so that every ray leaves the cone.
+    flat = np.eye(len(back)).ravel() / np.sqrt(len(back))
+    across = seen - np.outer(seen @ flat, flat)
+    directions = np.linalg.svd(across, full_matrices=False)[2][: fibre.dimension - 1]
+    rays = np.concatenate([directions, -directions]).reshape(-1, *back.shape)
+    low, high = np.zeros(len(rays)), -1 / np.linalg.eigvalsh(rays)[:, 0]
+    for _ in range(40):
+        middle = (low + high) / 2
+        values = np.linalg.eigvalsh(centre.block + middle[:, None, None] * (back @ rays @ back.T))
+        inside = values[:, -1] <= limit * values[:, 0]
+        low, high = np.where(inside, middle, low), np.where(inside, high, middle)
+    natural = scipy.linalg.block_diag(fibre.T, fibre.G).T @ back
+    return list(natural @ (np.eye(len(back)) + low[:, None, None] * rays) @ natural.T)
+
+
+def _distance(X: Array, Y: Array) -> float:
+    ratios = scipy.linalg.eigvalsh(X, Y)
+    return float(np.std(np.log(np.maximum(ratios, 1e-12 * ratios[-1]))))  # rounding ends there
+
+
+def inverse_factor(fibre: GainFibre, weights: Weights) -> Array:
+    """L^-1 (n + m, n + m) of blkdiag(Q, R) = LL', by way of the natural coordinates.
+
+    It is accurate there. This L is a factor, not a triangular one.
+    """
+    factor = np.linalg.cholesky(fibre.to_natural(weights))
+    return np.linalg.inv(factor) @ scipy.linalg.block_diag(fibre.T, fibre.G).T
+
+
+def _member(fibre: GainFibre, found: Weights, status: str, gap: float | None) -> EquivalentWeights:
+    checked = normalised(stage_weights(found.Q, found.R))
+    solution = solve_lqr(fibre.plant, checked)
+    size = max(float(np.linalg.norm(fibre.gain)), 1e-300)
+    error = float(np.linalg.norm(solution.K - fibre.gain)) / size
+    return EquivalentWeights(checked, solution.P, condition_number(checked), error, status, gap)

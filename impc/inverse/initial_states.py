@@ -1,0 +1,86 @@
+"""The states in which trials start, when the controller is known (docs/fitting.md)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy.optimize
+
+from impc.arrays import Array, frozen
+from impc.inverse.coordinates import start_unit
+from impc.inverse.residuals import evaluate
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from impc.inverse.problem import InverseProblem
+    from impc.inverse.residuals import Evaluation
+
+__all__ = ["with_fitted_starts"]
+
+_EVALUATIONS = 20
+# The first round also counts as noise what saturation keeps from being linear; the second does not.
+_ROUNDS = 2
+
+
+def with_fitted_starts(
+    problem: InverseProblem, gain: Array, metric: Array, samples: int | None = None
+) -> InverseProblem:
+    """Return the problem with each trial's x0 fitted to its first samples under a controller.
+
+    From the given x0, by trust-region least squares. Where the samples leave x0 free it stays: it
+    is given a normal prior of the size of the trial's other states (`start_unit`), which weighs as
+    the residual's own noise does.
+
+    Parameters
+    ----------
+    gain, metric : Array
+        K (m, n) and S (m, m) of that controller.
+    samples : int, optional
+        How many samples of each trial may be looked at; all by default.
+    """
+    fitted = []
+    for trial in problem.recordings:
+        seen = trial.samples if samples is None else min(samples, trial.samples)
+        short = replace(trial, outputs=trial.outputs[:seen], disturbance=trial.disturbance[:seen])
+        one = replace(problem, recordings=(short,), unknown_start=True)
+        fitted.append(replace(trial, x0=frozen(_fit(one, gain, metric))))
+    return replace(problem, recordings=tuple(fitted))
+
+
+def _fit(problem: InverseProblem, gain: Array, metric: Array) -> Array:
+    unit = start_unit(problem, gain)
+    (trial,) = problem.recordings
+    n = problem.plant.n
+
+    def at(z: Array) -> Evaluation:
+        moved = replace(trial, x0=frozen(trial.x0 + unit @ z))
+        return evaluate(replace(problem, recordings=(moved,)), gain, metric)
+
+    z: Array = np.zeros(n)
+    for _ in range(_ROUNDS):
+        z = _round(at, unit, z)
+    return np.asarray(trial.x0 + unit @ z)
+
+
+def _round(at: Callable[[Array], Evaluation], unit: Array, z: Array) -> Array:
+    """One fit from z, with the noise that is left there."""
+    n = len(z)
+    here = at(z)
+    columns = here.dx0 @ unit
+    # What no x0 explains is noise: to first order, the residual beside the derivative's columns.
+    left = here.residual - columns @ np.linalg.lstsq(columns, here.residual)[0]
+    noise = float(np.linalg.norm(left)) / np.sqrt(len(left))
+
+    def residual(z: Array) -> Array:
+        return np.concatenate([at(z).residual, noise * z])
+
+    def derivative(z: Array) -> Array:
+        return np.vstack([at(z).dx0 @ unit, noise * np.eye(n)])
+
+    found = scipy.optimize.least_squares(
+        residual, z, jac=derivative, ftol=1e-10, xtol=1e-12, gtol=1e-15, max_nfev=_EVALUATIONS
+    )
+    return np.asarray(found.x)

@@ -1,0 +1,151 @@
+"""Weights for noisy recordings: the direct form (3.6) in coordinates in which it is well posed.
+
+Noise moves a fitted gain off the gains that any weights have, so the reduced form has no answer.
+The direct form, misfit plus condition number, has one, but in the units of a plant such as the
+seat (radians beside the states of a delay) all weights near the answer have condition numbers of
+1e7, and a condition number that large outweighs any misfit. In natural coordinates (`gain_fibre`)
+the same weights have condition numbers of 10 to 100. There it is a mild regulariser, which is what
+(3.6) wants of it, and half a dozen prox-linear steps reach the answer.
+
+    minimise  ||r||^2 / ||r_free||^2 + kappa(blkdiag(T'QT, G'RG)) / kappa_start / samples
+
+r_free is the residual of the gain without weights (`fit_gain`), which says how much is noise; T and
+G are the natural coordinates of the start and stay.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.arrays import Array, frozen
+from impc.inverse.equivalent_weights import least_condition_weights
+from impc.inverse.proximal_search import Objective, Residual, conditioned_fit
+from impc.inverse.residuals import evaluate
+from impc.inverse.solution_set import gain_fibre, natural_coordinates, pair_blocks, split_blocks
+from impc.model.plant import change_coordinates
+from impc.model.riccati import solve_lqr
+from impc.model.weights import Weights, condition_number, normalised
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from impc.control.terminal_set import TerminalSet
+    from impc.inverse.problem import InverseProblem
+    from impc.inverse.proximal_search import ConditionedFit
+    from impc.model.riccati import LqrSolution
+
+__all__ = ["CONDITION_SHARE", "in_plant_units", "inverse_mpc_natural"]
+
+#: What the condition number of the start counts, in squared standard deviations of one sample's
+#: noise. It decides along directions that noise leaves open, and moves no other by as much as its
+#: own deviation; counted against all samples together (1e-3 of the squared misfit) it moved the
+#: gains of long, weakly excited recordings by several, and again at every restart.
+CONDITION_SHARE = 1.0
+# A step that promises less than this, of the objective, is below what the noise decides.
+_TOLERANCE = 1e-5
+
+
+def inverse_mpc_natural(
+    problem: InverseProblem,
+    start: Weights,
+    noise: float,
+    *,
+    condition_share: float = CONDITION_SHARE,
+    max_iterations: int = 40,
+) -> ConditionedFit:
+    """Direct inverse MPC in natural coordinates, at given initial states and plant.
+
+    Parameters
+    ----------
+    problem : InverseProblem
+    start : Weights
+        Positive definite. Their gain and metric are kept, and the weights of least condition number
+        with both, in natural coordinates, are where the search begins.
+    noise : float
+        2-norm of the residual that no weights are asked to explain; positive.
+    condition_share : float
+        What the condition number of the start counts, against the squared noise of one sample.
+    max_iterations : int
+        Steps that are solved at most.
+
+    Returns
+    -------
+    ConditionedFit
+        Weights and solution in the units of the plant; `misfit` is the 2-norm of the residual,
+        `condition` and `objective` are those of the search, in natural coordinates; `converged`
+        says that the last step promised less than 1e-5 of the objective.
+
+    Raises
+    ------
+    WeightsError, SolverError
+        When the start has no stabilising solution, or the recordings cannot be simulated with it.
+    """
+    plant = problem.plant
+    solution = solve_lqr(plant, start)
+    T, G = natural_coordinates(plant, solution.K)
+    natural = change_coordinates(plant, T, G)
+    fibre = gain_fibre(natural, np.linalg.solve(G, solution.K @ T), G.T @ solution.S @ G)
+    member = split_blocks(
+        pair_blocks((T.T @ start.Q @ T)[None], (G.T @ start.R @ G)[None])[0], plant.n
+    )
+    begin = least_condition_weights(fibre, member).weights
+    samples = sum(trial.outputs.size for trial in problem.recordings)
+    share = condition_share / samples / condition_number(begin)
+    objective = Objective(_residual(problem, T, G, noise), 1.0, share, squared=True)
+    found = conditioned_fit(
+        natural, objective, begin, max_iterations=max_iterations, tolerance=_TOLERANCE
+    )
+    weights = in_plant_units(found.weights, T, G)
+    return replace(
+        found,
+        weights=weights,
+        solution=solve_lqr(plant, weights),
+        misfit=found.misfit * noise,
+        converged=found.iterations < max_iterations,
+    )
+
+
+def in_plant_units(weights: Weights, T: Array, G: Array) -> Weights:
+    """Weights of z = T^-1 x and v = G^-1 u as weights of x and u, scaled to R[0, 0] = 1.
+
+    Parameters
+    ----------
+    T, G : Array
+        (n, n) and (m, m).
+    """
+    z, v = np.linalg.inv(T), np.linalg.inv(G)
+    block = pair_blocks((z.T @ weights.Q @ z)[None], (v.T @ weights.R @ v)[None])[0]
+    return normalised(split_blocks(block, len(T)))
+
+
+def _residual(
+    problem: InverseProblem, T: Array, G: Array, noise: float
+) -> Callable[[LqrSolution], Residual]:
+    """Residual over noise of a regulator given in natural coordinates, u = -G K T^-1 x."""
+    known = replace(problem, unknown_start=False, family=None, logarithms=frozen(np.zeros(0)))
+    z, v = np.linalg.inv(T), np.linalg.inv(G)
+    near: TerminalSet | None = None
+
+    def residual(solution: LqrSolution) -> Residual:
+        nonlocal near
+        metric = v.T @ solution.S @ v
+        found = evaluate(known, G @ solution.K @ z, metric, near)
+        near = found.terminal or near
+        dS = v @ found.dS @ v.T * _scale_ratio(metric, solution.S)
+        dK = np.asarray(G.T @ found.dK @ z.T)
+        usable = not found.reason
+        return Residual(found.residual / noise, dK / noise, dS / noise, usable=usable)
+
+    return residual
+
+
+def _scale_ratio(metric: Array, natural: Array) -> float:
+    """Both metrics are scaled to a mean diagonal of 1 before they are differentiated.
+
+    The residual does not change along the metric's own scale, so the derivative with respect to
+    one scaled metric is that with respect to the other, times the ratio of their scales.
+    """
+    return float(np.trace(natural) / np.trace(metric))

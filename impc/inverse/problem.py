@@ -1,0 +1,231 @@
+"""The inverse problem: recordings, and the closed loop that is to explain them.
+
+For a gain K and a metric S the residual is vec(Y_sim - Y), all recordings in a row and every output
+divided by its scale, and its derivatives with respect to K and S are exact. The weights enter
+through K and S only, so every method of the package is one of two searches over this residual: for
+a gain, or for weights. What else is not known of a recording, the state in which each trial starts
+and physical parameters of the plant, is searched together with the gain; `moved` gives the problem
+at other values of these (docs/theory.md, section 6; docs/fitting.md).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+
+from impc.arrays import Array, finite_array, frozen
+from impc.checking import Value, checked
+from impc.control.closed_loop import Scenario
+from impc.control.controller import LONGEST_HORIZON, Controller, gain_controller
+from impc.errors import DataError, InputError
+from impc.model.bounds import box_bounds
+from impc.model.plant_family import plant_at
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import ArrayLike
+
+    from impc.control.closed_loop import Simulation
+    from impc.control.terminal_set import TerminalSet
+    from impc.model.bounds import Bounds
+    from impc.model.plant import Plant
+    from impc.model.plant_family import PlantFamily
+    from impc.model.recordings import Recording
+
+__all__ = [
+    "InverseProblem",
+    "controller_for",
+    "inverse_problem",
+    "misfit",
+    "moved",
+    "recorded_size",
+    "scenarios",
+    "typical_output",
+    "without_bounds",
+]
+
+
+@dataclass(frozen=True)
+class InverseProblem(Value):
+    """Find the controller that made the recordings.
+
+    Attributes
+    ----------
+    plant : Plant
+    bounds : Bounds
+    horizon : int
+        N, in samples.
+    recordings : tuple of Recording
+    terminal_set : bool
+        Whether the controller ends in its maximal invariant set.
+    softening : float
+        Price of exceeding a state bound or the terminal set during the search, see `Controller`.
+        The rows are verified hard at the end.
+    output_scale : Array
+        What each output is divided by in the residual (p,), in its unit.
+    unknown_start : bool
+        Whether the initial states are searched too, from the `x0` of the recordings.
+    family : PlantFamily or None
+        Plants among which the search goes on; None when the plant is known.
+    logarithms : Array
+        Logarithms of the family's parameters over their nominal values at which `plant` is (k,).
+    """
+
+    _rules: ClassVar[Mapping[str, Any]] = {
+        "horizon": (1, LONGEST_HORIZON),
+        "output_scale": "p",
+        "logarithms": "*",
+    }
+
+    plant: Plant
+    bounds: Bounds
+    horizon: int
+    recordings: tuple[Recording, ...]
+    terminal_set: bool
+    softening: float
+    output_scale: Array
+    unknown_start: bool
+    family: PlantFamily | None
+    logarithms: Array
+
+
+@checked(horizon=(1, LONGEST_HORIZON), output_scale="p")
+def inverse_problem(
+    plant: Plant,
+    bounds: Bounds,
+    horizon: int,
+    recordings: tuple[Recording, ...],
+    *,
+    terminal_set: bool = True,
+    softening: float = 1e6,
+    output_scale: ArrayLike | None = None,
+    unknown_start: bool = False,
+    family: PlantFamily | None = None,
+) -> InverseProblem:
+    """Check and gather an inverse problem.
+
+    Parameters
+    ----------
+    plant : Plant
+        That of the family's nominal values, when there is one.
+    bounds : Bounds
+    horizon : int
+        N, in samples.
+    recordings : tuple of Recording
+    terminal_set, softening, unknown_start, family
+        See `InverseProblem`.
+    output_scale : array_like, optional
+        (p,), positive; by default the root-mean-square of each output over all recordings, so
+        that no answer depends on units. An output that is zero throughout counts as the largest.
+
+    Raises
+    ------
+    PlantError, DataError, InputError
+        When the plant is continuous, there is no recording, or a scale is not positive.
+    """
+    plant.require_discrete()
+    if not recordings:
+        raise DataError("recordings", "there are none", "give at least one trial")
+    p = len(plant.outputs)
+    given = _root_mean_square(recordings) if output_scale is None else output_scale
+    scale = finite_array("output_scale", given, (p,))
+    if np.any(scale <= 0):
+        raise InputError("output_scale", f"got {scale.tolist()}", "give positive numbers")
+    return InverseProblem(
+        plant,
+        bounds,
+        horizon,
+        tuple(recordings),
+        terminal_set,
+        softening,
+        frozen(scale),
+        unknown_start,
+        family,
+        frozen(np.zeros(0 if family is None else len(family.names))),
+    )
+
+
+def _root_mean_square(recordings: tuple[Recording, ...]) -> Array:
+    outputs = np.concatenate([trial.outputs for trial in recordings])
+    largest = np.max(np.abs(outputs), axis=0)
+    unit = np.where(largest > 0, largest, 1.0)  # squares of 1e200 are none
+    size = largest * np.sqrt(np.mean((outputs / unit) ** 2, axis=0))
+    return np.where(size > 0, size, np.max(size) or 1.0)
+
+
+def moved(problem: InverseProblem, starts: Array, logarithms: Array) -> InverseProblem:
+    """Return the problem at other initial states and other parameters.
+
+    Parameters
+    ----------
+    starts : Array
+        Initial states (trials, n).
+    logarithms : Array
+        Of the family's parameters over their nominal values (k,).
+    """
+    recordings = tuple(
+        replace(trial, x0=frozen(x0)) for trial, x0 in zip(problem.recordings, starts, strict=True)
+    )
+    plant = problem.plant
+    if problem.family is not None and not np.array_equal(logarithms, problem.logarithms):
+        plant = plant_at(problem.family, logarithms)
+    return replace(problem, plant=plant, recordings=recordings, logarithms=frozen(logarithms))
+
+
+@checked
+def without_bounds(problem: InverseProblem) -> InverseProblem:
+    """Return the same problem for a plain feedback gain: no bounds, no terminal set."""
+    return replace(problem, bounds=box_bounds(problem.plant), terminal_set=False)
+
+
+def controller_for(
+    problem: InverseProblem, gain: Array, metric: Array, near: TerminalSet | None = None
+) -> Controller:
+    """Return the controller of the problem with that `gain` (m, n) and `metric` (m, m).
+
+    `near` is the terminal set of a gain nearby: the same answer in less time.
+
+    Raises
+    ------
+    InputError, SolverError
+        As `gain_controller`.
+    """
+    return gain_controller(
+        problem.plant,
+        gain,
+        problem.bounds,
+        problem.horizon,
+        metric=metric,
+        terminal_set=problem.terminal_set,
+        softening=problem.softening,
+        near=near,
+    )
+
+
+def scenarios(problem: InverseProblem) -> list[Scenario]:
+    """What drives each recording."""
+    return [Scenario(trial.x0, trial.disturbance[:-1]) for trial in problem.recordings]
+
+
+def recorded_size(problem: InverseProblem) -> float:
+    """2-norm of all recorded outputs, each divided by its scale."""
+    parts = [(trial.outputs / problem.output_scale).ravel() for trial in problem.recordings]
+    return float(np.linalg.norm(np.concatenate(parts)))
+
+
+def typical_output(problem: InverseProblem) -> float:
+    """Root-mean-square of all recorded outputs over their scales: 1 at the default scales."""
+    count = sum(trial.outputs.size for trial in problem.recordings)
+    return recorded_size(problem) / float(np.sqrt(count)) or 1.0
+
+
+def misfit(problem: InverseProblem, simulations: list[Simulation]) -> float:
+    """2-norm of all simulated minus recorded outputs, each divided by its scale."""
+    parts = [
+        (run.x @ problem.plant.C.T - trial.outputs) / problem.output_scale
+        for run, trial in zip(simulations, problem.recordings, strict=True)
+    ]
+    return float(np.linalg.norm(np.concatenate([part.ravel() for part in parts])))

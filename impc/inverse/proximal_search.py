@@ -1,0 +1,274 @@
+"""Weights that fit, and are as well conditioned as the fit allows: (3.5), (3.7), (3.16) and (3.6).
+
+    minimise over (Q, R)   w_fit phi(r(K, S)) + w_cond kappa(blkdiag(Q, R)),
+
+where K and S are the gain and metric of (Q, R), r is any residual of them, and phi is the 2-norm or
+its square. The four equations differ in r alone.
+
+kappa has a kink wherever an extreme eigenvalue is repeated, above all at its least value, Q = I,
+and the 2-norm has one at a perfect fit: both often meet at the answer. A method for smooth
+functions stalls there (docs/conditioned-fit.md has the measurements). So each step keeps both
+kinks and linearises only what is smooth. With X = blkdiag(Q, R) scaled to a least eigenvalue of 1,
+kappa = lambda_max(X) is convex, and the step solves the semidefinite program
+
+    minimise  w_fit phi(r + J dX) + w_cond alpha
+    subject to  I <= X + dX <= alpha I,   ||L^-1 dX L^-T||_F <= radius,   X = L L',
+
+a prox-linear (Gauss-Newton) step in the coordinates of the current Cholesky factor, in which the
+trust region does not depend on the units of the states.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy.linalg
+
+from impc.arrays import Array, Frozen, frozen
+from impc.errors import SolverError
+from impc.inverse.proximal_step import StepProgram, block_basis, solve_step
+from impc.model.riccati import gain_gradients, metric_gradients, solve_lqr
+from impc.model.weights import Weights, condition_number, normalised, stage_weights
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from impc.model.plant import Plant
+    from impc.model.riccati import LqrSolution
+
+__all__ = ["ConditionedFit", "Objective", "Residual", "conditioned_fit", "weight_jacobian"]
+
+
+_STATIONARY = 1e-5
+# In units of the current weights: a step of 1 can double one direction or make it singular.
+_LARGEST_RADIUS = 2.0
+# Below this, relative to the weights, rounding decides whether a step is better.
+_LEAST_RADIUS = 1e-10
+
+
+@dataclass(frozen=True)
+class Residual(Frozen):
+    """A residual with its derivatives with respect to K and S.
+
+    Attributes
+    ----------
+    values : Array
+        (r,).
+    dK : Array
+        (r, m, n).
+    dS : Array
+        (r, m, m).
+    usable : bool
+        Whether it could be computed; otherwise the step that led there is shortened.
+    """
+
+    values: Array
+    dK: Array
+    dS: Array
+    usable: bool
+
+
+@dataclass(frozen=True)
+class Objective:
+    """What is minimised.
+
+    Attributes
+    ----------
+    residual : callable
+        `LqrSolution` -> `Residual`.
+    fit_weight, condition_weight : float
+        w_fit, and w_cond with the c of (3.5) in it.
+    squared : bool
+        Whether phi is the squared norm. The norm itself does not trade fit for conditioning when
+        w_cond is small enough (it is an exact penalty); its square always does.
+    """
+
+    residual: Callable[[LqrSolution], Residual]
+    fit_weight: float
+    condition_weight: float
+    squared: bool
+
+
+@dataclass(frozen=True)
+class ConditionedFit:
+    """Result of `conditioned_fit`.
+
+    Attributes
+    ----------
+    weights : Weights
+        Scaled to R[0, 0] = 1.
+    solution : LqrSolution
+        The regulator that they make.
+    misfit : float
+        2-norm of the residual.
+    condition : float
+        kappa(blkdiag(Q, R)).
+    objective : float
+        What was minimised, at these weights.
+    iterations, evaluations : int
+        Steps solved, and residuals computed.
+    stationarity : float
+        Decrease that the last step promised, relative to the objective and to the step's size.
+    converged : bool
+        Whether that is at most 1e-5.
+    """
+
+    weights: Weights
+    solution: LqrSolution
+    misfit: float
+    condition: float
+    objective: float
+    iterations: int
+    evaluations: int
+    stationarity: float
+    converged: bool
+
+
+def conditioned_fit(
+    plant: Plant,
+    objective: Objective,
+    start: Weights,
+    *,
+    max_iterations: int = 200,
+    tolerance: float = 1e-11,
+) -> ConditionedFit:
+    """Minimise the objective from the given weights.
+
+    Parameters
+    ----------
+    plant : Plant
+    objective : Objective
+    start : Weights
+        Positive definite.
+    max_iterations : int
+        Steps that are solved at most.
+    tolerance : float
+        Decrease, relative to the objective, below which a step is not worth taking.
+
+    Raises
+    ------
+    WeightsError
+        When the start has no stabilising Riccati solution.
+    SolverError
+        When the residual cannot be computed at the start.
+    """
+    here = _point(plant, objective, start)
+    if not here.residual.usable:
+        raise SolverError(
+            "start", "the closed loop cannot be simulated with these weights", "start elsewhere"
+        )
+    radius, evaluations, iteration, stationarity = 0.5, 1, 0, np.inf
+    while iteration < max_iterations:
+        iteration += 1
+        program = _linearise(here, objective)
+        step, predicted = solve_step(program, radius)
+        decrease = here.objective - predicted
+        stationarity = max(decrease, 0.0) / max(here.objective * min(radius, 1.0), 1e-300)
+        if decrease <= tolerance * here.objective:
+            break
+        there = _try(plant, objective, here, step)
+        evaluations += 1
+        ratio = -1.0
+        if there is not None and there.residual.usable:
+            ratio = (here.objective - there.objective) / decrease
+        if ratio > 1e-4 and there is not None:
+            here = there
+        if ratio > 0.75:
+            radius = min(2 * radius, _LARGEST_RADIUS)
+        elif ratio < 0.25:
+            radius = 0.25 * min(radius, float(np.linalg.norm(step)))
+        if radius < _LEAST_RADIUS:
+            break
+    return ConditionedFit(
+        normalised(here.weights),
+        here.solution,
+        float(np.linalg.norm(here.residual.values)),
+        condition_number(here.weights),
+        here.objective,
+        iteration,
+        evaluations,
+        stationarity,
+        stationarity <= _STATIONARY,
+    )
+
+
+def weight_jacobian(solution: LqrSolution, residual: Residual, basis: Array) -> Array:
+    """Derivative of the residual along directions of blkdiag(Q, R): (r, k).
+
+    Parameters
+    ----------
+    basis : Array
+        Directions (k, n + m, n + m), block diagonal.
+    """
+    n = solution.plant.n
+    dQ, dR = basis[:, :n, :n], basis[:, n:, n:]
+    gain = gain_gradients(solution)
+    dK = np.tensordot(gain.Q, dQ, ((2, 3), (1, 2))) + np.tensordot(gain.R, dR, ((2, 3), (1, 2)))
+    total = np.tensordot(residual.dK, dK, 2)
+    if solution.plant.m > 1 and np.any(residual.dS):
+        metric = metric_gradients(solution)
+        dS = np.tensordot(metric.Q, dQ, ((2, 3), (1, 2)))
+        dS += np.tensordot(metric.R, dR, ((2, 3), (1, 2)))
+        # The controller scales S to a mean diagonal of 1.
+        scale = solution.plant.m / np.trace(solution.S)
+        traces = np.trace(dS, axis1=0, axis2=1) / np.trace(solution.S)
+        total += np.tensordot(residual.dS, scale * (dS - solution.S[..., None] * traces), 2)
+    return np.asarray(total)
+
+
+@dataclass(frozen=True)
+class _Point:
+    weights: Weights  # scaled to a least eigenvalue of 1
+    solution: LqrSolution
+    residual: Residual
+    objective: float
+
+
+def _point(plant: Plant, objective: Objective, weights: Weights) -> _Point:
+    least = float(np.linalg.eigvalsh(weights.block)[0])
+    scaled = stage_weights(weights.Q / least, weights.R / least)
+    solution = solve_lqr(plant, scaled)
+    residual = objective.residual(solution)
+    size = float(np.linalg.norm(residual.values))
+    fit = size**2 if objective.squared else size
+    value = objective.fit_weight * fit + objective.condition_weight * condition_number(scaled)
+    return _Point(scaled, solution, residual, value)
+
+
+def _linearise(here: _Point, objective: Objective) -> StepProgram:
+    """The step program in the coordinates D of dX = L D L'."""
+    n = here.solution.plant.n
+    X = here.weights.block
+    L: Array = np.asarray(np.linalg.cholesky(X), dtype=np.float64)
+    basis = block_basis(n, len(X) - n)
+    J = weight_jacobian(here.solution, here.residual, L @ basis @ L.T)
+    # A tall residual enters through its triangular factor: same norm, few rows.
+    factor, triangle = np.linalg.qr(J) if len(J) > J.shape[1] else (np.eye(len(J)), J)
+    shown = factor.T @ here.residual.values
+    hidden = float(np.linalg.norm(here.residual.values - factor @ shown))
+    return StepProgram(
+        X=X,
+        L=L,
+        n=n,
+        basis=basis,
+        jacobian=triangle,
+        residual=shown,
+        rest=hidden,
+        fit_weight=objective.fit_weight,
+        condition_weight=objective.condition_weight,
+        squared=objective.squared,
+    )
+
+
+def _try(plant: Plant, objective: Objective, here: _Point, step: Array) -> _Point | None:
+    """The point at the end of a step, or None when it leaves the cone of definite weights."""
+    n = plant.n
+    X = here.weights.block
+    L = np.linalg.cholesky(X)
+    moved = X + L @ np.tensordot(step, block_basis(n, len(X) - n), 1) @ L.T
+    moved = (moved + moved.T) / 2
+    if scipy.linalg.eigvalsh(moved)[0] <= 0:
+        return None
+    return _point(plant, objective, Weights(frozen(moved[:n, :n]), frozen(moved[n:, n:])))

@@ -1,0 +1,259 @@
+"""The residual of an inverse problem at a gain and a metric, with its exact derivatives.
+
+One pass over each recording gives both (docs/theory.md, section 4). The columns follow what the
+problem does not know: gain, metric for several inputs, initial states, physical parameters.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.arrays import Array
+from impc.control.closed_loop import Status, prepare_loop, run_loop, simulate
+from impc.control.constraint_rows import Directions, directions
+from impc.errors import ImpcError
+from impc.inverse.problem import controller_for, misfit, scenarios
+from impc.model.bounds import bound_rows
+from impc.model.plant_family import plant_differential
+from impc.model.riccati import is_stable
+
+if TYPE_CHECKING:
+    from impc.control.controller import Controller
+    from impc.control.terminal_set import TerminalSet
+    from impc.inverse.problem import InverseProblem
+    from impc.model.plant_family import PlantDifferential
+    from impc.model.recordings import Recording
+
+__all__ = ["Evaluation", "evaluate", "misfit_or_reason", "residual_only", "unusable"]
+
+# What a sample that a trial controller does not reach counts for, in root-mean-square outputs.
+_NOT_REACHED = 1e3
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Residual at one gain and metric.
+
+    Attributes
+    ----------
+    residual : Array
+        (r,), simulated minus recorded outputs, each divided by its scale.
+    dK : Array
+        (r, m, n).
+    dS : Array
+        (r, m, m), with respect to the metric scaled as in `Controller`.
+    dx0 : Array
+        (r, n), with respect to the initial state of the trial that the row belongs to; (r, 0)
+        when the initial states are known.
+    dparameters : Array
+        (r, k), with respect to the logarithms of the parameters of the family; k may be 0.
+    reason : str
+        Why some samples were not reached; empty when all were.
+    weakly_active : int
+        Samples at which the derivative is one-sided.
+    terminal : TerminalSet or None
+        The terminal set, as a hint for the next evaluation nearby.
+    """
+
+    residual: Array
+    dK: Array
+    dS: Array
+    dx0: Array
+    dparameters: Array
+    reason: str
+    weakly_active: int
+    terminal: TerminalSet | None
+
+
+def evaluate(
+    problem: InverseProblem, gain: Array, metric: Array, near: TerminalSet | None = None
+) -> Evaluation:
+    """Residual and exact derivatives at a `gain` (m, n) and a `metric` (m, m).
+
+    `near` as in `controller_for`. A gain that does not stabilise the plant, or a loop that
+    diverges, gives a large finite residual and its reason, so that a search can step back.
+    """
+    plant = problem.plant
+    m, n = plant.m, plant.n
+    # Past the edge of stability lie local minima that a bounded input and a recording that ends
+    # hide; no weights have such a gain. A plain gain is left free: it goes there and comes back.
+    bounded = problem.terminal_set or len(bound_rows(problem.bounds, plant).b) > 0
+    if bounded and not is_stable(plant.A - plant.B @ gain, discrete=True):
+        return unusable(problem, "the gain does not stabilise the plant")
+    try:
+        controller = controller_for(problem, gain, metric, near)
+    except ImpcError as error:
+        return unusable(problem, str(error))
+    layout = _layout(problem)
+    differential = _plant_differential(problem)
+    prepared = prepare_loop(controller, _all_directions(controller, layout, differential))
+    weighting = plant.C / problem.output_scale[:, None]
+    residuals, derivatives, reason, weakly_active = [], [], "", 0
+    for trial, drive in zip(problem.recordings, scenarios(problem), strict=True):
+        run, sensitivity = run_loop(prepared, drive)
+        difference = (run.x @ plant.C.T - trial.outputs) / problem.output_scale
+        weakly_active += run.weakly_active
+        if not run.complete:
+            difference[run.reached + 1 :] = _NOT_REACHED * _scale(problem, trial)
+            reason = f"sample {run.reached}: {Status(int(run.status[run.reached])).sentence}"
+        residuals.append(difference.ravel())
+        derivative = weighting @ sensitivity.x
+        if differential is not None:
+            seen = np.tensordot(run.x, differential.C, ((1,), (1,)))  # dC x: (samples, p, k)
+            derivative[..., layout.parameters] += seen / problem.output_scale[:, None]
+        derivatives.append(derivative.reshape(-1, layout.count))
+    jacobian = np.concatenate(derivatives)
+    return Evaluation(
+        np.concatenate(residuals),
+        jacobian[:, layout.gain].reshape(-1, m, n),
+        _symmetric(jacobian[:, layout.metric], m),
+        jacobian[:, layout.start],
+        jacobian[:, layout.parameters],
+        reason,
+        weakly_active,
+        controller.terminal,
+    )
+
+
+def misfit_or_reason(problem: InverseProblem, gain: Array, metric: Array) -> tuple[float, str]:
+    """2-norm of the residual and an empty string, or infinity and why there is none.
+
+    At a `gain` (m, n) and a `metric` (m, m). A fifth of the time of `evaluate`, which also
+    differentiates.
+    """
+    if not is_stable(problem.plant.A - problem.plant.B @ gain, discrete=True):
+        return np.inf, "the gain does not stabilise the plant"
+    try:
+        controller = controller_for(problem, gain, metric)
+    except ImpcError as error:
+        return np.inf, str(error)
+    runs = [simulate(controller, drive) for drive in scenarios(problem)]
+    for run in runs:
+        if not run.complete:
+            return np.inf, f"sample {run.reached}: {Status(int(run.status[run.reached])).sentence}"
+    return misfit(problem, runs), ""
+
+
+def residual_only(problem: InverseProblem, gain: Array, metric: Array) -> Array:
+    """Residual without derivatives, for differences and comparisons.
+
+    Parameters
+    ----------
+    gain, metric : Array
+        K (m, n) and S (m, m).
+
+    Returns
+    -------
+    Array
+        Simulated minus recorded outputs over their scales (r,), trial by trial, sample by sample.
+
+    Raises
+    ------
+    InputError, SolverError
+        As `controller_for`.
+    """
+    controller = controller_for(problem, gain, metric)
+    runs = [simulate(controller, drive) for drive in scenarios(problem)]
+    return np.concatenate(
+        [
+            ((run.x @ problem.plant.C.T - trial.outputs) / problem.output_scale).ravel()
+            for run, trial in zip(runs, problem.recordings, strict=True)
+        ]
+    )
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """Which directions stand where: gain, metric, initial state, parameters."""
+
+    gain: slice
+    metric: slice
+    start: slice
+    parameters: slice
+
+    @property
+    def count(self) -> int:
+        return int(self.parameters.stop)
+
+
+def _layout(problem: InverseProblem) -> _Layout:
+    m, n = problem.plant.m, problem.plant.n
+    sizes = (
+        m * n,
+        m * (m + 1) // 2 if m > 1 else 0,
+        n if problem.unknown_start else 0,
+        len(problem.logarithms),
+    )
+    ends = np.cumsum((0, *sizes)).tolist()
+    return _Layout(*(slice(a, b) for a, b in itertools.pairwise(ends)))
+
+
+def _plant_differential(problem: InverseProblem) -> PlantDifferential | None:
+    if problem.family is None:
+        return None
+    return plant_differential(problem.family, problem.logarithms)
+
+
+def _all_directions(
+    controller: Controller, layout: _Layout, differential: PlantDifferential | None
+) -> Directions:
+    m, n = controller.K.shape
+    count = layout.count
+    dK = np.zeros((m * n, count))
+    dK[:, layout.gain] = np.eye(m * n)
+    dS = np.zeros((m, m, count))
+    if m > 1:
+        rows, columns = np.tril_indices(m)
+        at = np.arange(layout.metric.start, layout.metric.stop)
+        dS[rows, columns, at] = dS[columns, rows, at] = 1.0
+    dx0 = np.zeros((n, count))
+    width = layout.start.stop - layout.start.start
+    dx0[:, layout.start] = np.eye(n, width)
+    given = {"K": dK, "S": dS, "x0": dx0}
+    if differential is not None:
+        for name in ("A", "B", "E"):
+            part = getattr(differential, name)
+            given[name] = np.zeros((*part.shape[:-1], count))
+            given[name][..., layout.parameters] = part
+    return directions(controller, count, **given)
+
+
+def _symmetric(columns: Array, m: int) -> Array:
+    """Derivatives along symmetric directions as (r, m, m)."""
+    dS = np.zeros((len(columns), m, m))
+    if m > 1:
+        # Off-diagonal directions move two entries at once; half the derivative goes to each.
+        rows, places = np.tril_indices(m)
+        dS[:, rows, places] = columns * np.where(rows == places, 1.0, 0.5)
+        dS[:, places, rows] = dS[:, rows, places]
+    return dS
+
+
+def _scale(problem: InverseProblem, trial: Recording) -> float:
+    return float(np.sqrt(np.mean((trial.outputs / problem.output_scale) ** 2))) or 1.0
+
+
+def unusable(problem: InverseProblem, reason: str) -> Evaluation:
+    """A large finite residual with its reason, for a search to step back from."""
+    m, n = problem.plant.m, problem.plant.n
+    residual = np.concatenate(
+        [
+            np.full(trial.outputs.size, _NOT_REACHED * _scale(problem, trial))
+            for trial in problem.recordings
+        ]
+    )
+    size, starts = len(residual), n if problem.unknown_start else 0
+    return Evaluation(
+        residual,
+        np.zeros((size, m, n)),
+        np.zeros((size, m, m)),
+        np.zeros((size, starts)),
+        np.zeros((size, len(problem.logarithms))),
+        reason,
+        0,
+        None,
+    )

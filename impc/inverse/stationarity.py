@@ -1,0 +1,166 @@
+"""Weights from the stationarity of recorded trajectories: inverse KKT, a method of the literature.
+
+Each stretch of N samples of a trajectory (x_j, u_j) is taken for a plan that was optimal. With the
+adjoint lambda_j of the dynamics it satisfies
+
+    lambda_j = Q x_j + A' lambda_{j+1},        R u_j + B' lambda_{j+1} = 0
+
+wherever no input stands at its bound (there a multiplier takes what is missing, and the row is left
+out). lambda_N, what comes after the stretch, is free. The rows are linear in (Q, R, lambda_N): the
+weights that leave the least sum of squares, Q >= 0, R > 0, trace R = m, are one convex program.
+Keshavarz, Wang, Boyd 2011 (imputing a convex objective); Englert, Vien, Toussaint 2017 (inverse
+KKT).
+
+The method needs no simulation. It takes recorded motion for planned motion, though: a disturbance
+that nobody foresaw is in the first and not in the second, and states and commands have to be
+estimated first (`smoothing`).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.arrays import Array, BoolArray
+from impc.errors import DataError
+from impc.inverse.proximal_step import block_basis
+from impc.inverse.semidefinite import matrix_inequality, norm_bound, solve_semidefinite
+from impc.inverse.smoothing import smoothed_trials
+from impc.inverse.solution_set import natural_coordinates, split_blocks
+from impc.model.weights import normalised, stage_weights
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from impc.inverse.problem import InverseProblem
+    from impc.inverse.smoothing import Smoothed
+    from impc.model.plant import Plant
+    from impc.model.weights import Weights
+
+__all__ = ["inverse_kkt", "stationarity_weights"]
+
+# An input this near to its bound, of the bound, counts as at it.
+_AT_BOUND = 1e-2
+# Least eigenvalue in natural coordinates, where R is about one, and a ridge that decides among
+# weights that leave the same residual.
+_FLOOR, _RIDGE = 1e-6, 1e-6
+
+
+def inverse_kkt(problem: InverseProblem, gain: Array) -> Weights:
+    """Weights of least stationarity residual on smoothed trajectories.
+
+    Parameters
+    ----------
+    problem : InverseProblem
+        Its horizon is the length of the stretches, its input bounds decide which rows count.
+    gain : Array
+        A stabilising gain (m, n), for the units in which the program is solved only.
+
+    Raises
+    ------
+    DataError
+        When every stretch is saturated or the trials are shorter than one.
+    SolverError
+        When the program returns no finite point.
+    """
+    return stationarity_weights(
+        problem.plant,
+        smoothed_trials(problem),
+        problem.horizon,
+        np.array(problem.bounds.u_max),
+        gain,
+    )
+
+
+def stationarity_weights(
+    plant: Plant, trials: Sequence[Smoothed], length: int, u_max: Array, gain: Array
+) -> Weights:
+    """The same for given states and commands.
+
+    Parameters
+    ----------
+    trials : sequence of Smoothed
+    length : int
+        N, samples in a stretch; more than n / m.
+    u_max : Array
+        Bounds of the inputs (m,), infinite where there is none.
+    gain : Array
+        (m, n), as in `inverse_kkt`.
+
+    Raises
+    ------
+    DataError, SolverError
+        As `inverse_kkt`.
+    """
+    n, m = plant.n, plant.m
+    T, G = natural_coordinates(plant, gain)
+    back, forth = np.linalg.inv(T), np.linalg.inv(G)
+    A, B = back @ plant.A @ T, back @ plant.B @ G
+    units = block_basis(n, m)
+    rows: list[Array] = [np.zeros((0, len(units)))]
+    for trial in trials:
+        x, u = trial.x @ back.T, trial.u @ forth.T
+        free = np.abs(trial.u) < (1 - _AT_BOUND) * u_max
+        for first in range(0, len(x) - length + 1, length):
+            mine = slice(first, first + length)
+            rows.append(_stretch(A, B, units, x[mine], u[mine], free[mine]))
+    table = np.vstack(rows)
+    if len(table) == 0:
+        raise DataError(
+            "recordings",
+            f"leave no stretch of {length} samples with more than {n} free commands",
+            "give longer trials or a longer horizon",
+        )
+    triangle = np.asarray(np.linalg.qr(table, mode="r"), dtype=np.float64)
+    theta = _least_squares(triangle, units, n, G)
+    natural = np.tensordot(theta, units, 1)
+    found = split_blocks(natural, n)
+    Q, R = back.T @ found.Q @ back, forth.T @ found.R @ forth
+    return normalised(stage_weights((Q + Q.T) / 2, (R + R.T) / 2))
+
+
+def _stretch(A: Array, B: Array, units: Array, x: Array, u: Array, free: BoolArray) -> Array:
+    """Rows of one stretch (r, k) in the entries of (Q, R), what lambda_N explains taken out."""
+    n = len(B)
+    length = len(x)
+    # Backwards: lambda = (basis of Q) x + power lambda_N.
+    adjoint, power = np.zeros((n, len(units))), np.eye(n)
+    on_weights, on_end = [], []
+    for j in range(length - 1, -1, -1):
+        stationary = (units[:, n:, n:] @ u[j]).T + B.T @ adjoint
+        keep = free[j]
+        on_weights.append(stationary[keep])
+        on_end.append((B.T @ power)[keep])
+        adjoint = (units[:, :n, :n] @ x[j]).T + A.T @ adjoint
+        power = A.T @ power
+    weights, end = np.vstack(on_weights), np.vstack(on_end)
+    if len(end) <= n:
+        return np.zeros((0, len(units)))
+    basis, _ = np.linalg.qr(end)
+    return np.asarray(weights - basis @ (basis.T @ weights))
+
+
+def _least_squares(triangle: Array, units: Array, n: int, G: Array) -> Array:
+    """min ||triangle theta||^2 + ridge ||theta||^2, Q, R >= floor, trace R = m in plant units."""
+    k, size = len(units), units.shape[1]
+    scale = float(np.linalg.norm(triangle, 2))
+    rows = np.vstack([triangle / scale, _RIDGE * np.eye(k)])
+    back = np.linalg.inv(G)
+    trace = np.trace(back.T @ units[:, n:, n:] @ back, axis1=1, axis2=2) / (size - n)
+    # theta = start + null y keeps the trace.
+    start = trace / float(trace @ trace)
+    null = np.linalg.svd(trace[None])[2][1:].T
+    spread = norm_bound(
+        np.vstack([(rows @ null).T, np.zeros((1, len(rows)))]),
+        np.append(np.zeros(k - 1), 1.0),
+        offset=rows @ start,
+    )
+    cones = [spread]
+    constant, levels = np.tensordot(start, units, 1), np.tensordot(null.T, units, 1)
+    for block in (slice(0, n), slice(n, size)):
+        width = block.stop - block.start
+        basis = np.concatenate([levels[:, block, block], np.zeros((1, width, width))])
+        cones.append(matrix_inequality(constant[block, block] - _FLOOR * np.eye(width), basis))
+    solved = solve_semidefinite(np.append(np.zeros(k - 1), 1.0), cones)
+    return np.asarray(start + null @ solved.y[:-1])

@@ -1,0 +1,1 @@
+"""What a controller acts on: plants, bounds, weights, recordings, and the Riccati equation."""

@@ -1,0 +1,159 @@
+"""Box bounds on states and inputs, and their rows  E x + F u <= b.
+
+The bounds of (3.1), as docs/theory.md, section 3, takes them.
+
+Only finite bounds make a row. The order of the rows is fixed: input upper, input lower, state
+upper, state lower, each in the order of the signals, so that a row can be named in a message.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+
+from impc.arrays import Array, BoolArray, frozen
+from impc.checking import Value, checked
+from impc.errors import BoundsError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import ArrayLike
+
+    from impc.model.plant import Plant
+
+__all__ = ["BoundRows", "Bounds", "bound_rows", "box_bounds"]
+
+
+@dataclass(frozen=True)
+class Bounds(Value):
+    """Lower and upper bounds, infinite where there is none.
+
+    Attributes
+    ----------
+    x_min, x_max : Array
+        State bounds (n,), in the units of the states.
+    u_min, u_max : Array
+        Input bounds (m,), in the units of the inputs.
+    """
+
+    _rules: ClassVar[Mapping[str, Any]] = {
+        "x_min": "~n",
+        "x_max": "~n",
+        "u_min": "~m",
+        "u_max": "~m",
+    }
+
+    x_min: Array
+    x_max: Array
+    u_min: Array
+    u_max: Array
+
+
+@dataclass(frozen=True)
+class BoundRows(Value):
+    """The finite bounds as rows  E x + F u <= b  of one stage.
+
+    Attributes
+    ----------
+    E, F, b : Array
+        Shapes (c, n), (c, m) and (c,).
+    on_state : BoolArray
+        Whether the row bounds a state (c,); the others bound an input.
+    names : tuple of str
+        One name a row, such as ``"u <= 1"``.
+    """
+
+    E: Array
+    F: Array
+    b: Array
+    on_state: BoolArray
+    names: tuple[str, ...]
+
+
+@checked
+def box_bounds(
+    plant: Plant,
+    *,
+    x_min: ArrayLike | None = None,
+    x_max: ArrayLike | None = None,
+    u_min: ArrayLike | None = None,
+    u_max: ArrayLike | None = None,
+) -> Bounds:
+    """Check the given bounds against the plant; what is not given is infinite.
+
+    Parameters
+    ----------
+    plant : Plant
+        Gives the sizes and the names.
+    x_min, x_max, u_min, u_max : array_like, optional
+        A number for all signals, or one for each, (n,) and (m,), in their units. The origin is
+        the equilibrium that is regulated to, so it must lie strictly inside.
+
+    Raises
+    ------
+    BoundsError
+        When a bound is NaN, has the wrong length, crosses its counterpart, or excludes the origin.
+    """
+    lower_x = _side("x_min", x_min, plant.n, -np.inf)
+    upper_x = _side("x_max", x_max, plant.n, np.inf)
+    lower_u = _side("u_min", u_min, plant.m, -np.inf)
+    upper_u = _side("u_max", u_max, plant.m, np.inf)
+    _check_pair("x_min, x_max", plant.states, lower_x, upper_x)
+    _check_pair("u_min, u_max", plant.controls, lower_u, upper_u)
+    return Bounds(frozen(lower_x), frozen(upper_x), frozen(lower_u), frozen(upper_u))
+
+
+@checked
+def bound_rows(bounds: Bounds, plant: Plant) -> BoundRows:
+    """Return the finite bounds as rows."""
+    inputs, states = np.eye(plant.m), np.eye(plant.n)
+    sides = (
+        (bounds.u_max, 1.0, plant.controls, False),
+        (bounds.u_min, -1.0, plant.controls, False),
+        (bounds.x_max, 1.0, plant.states, True),
+        (bounds.x_min, -1.0, plant.states, True),
+    )
+    rows: list[tuple[Array, Array, float, bool, str]] = []
+    for limits, sign, names, on_state in sides:
+        for index, limit in enumerate(limits):
+            if np.isfinite(limit):
+                e = sign * states[index] if on_state else np.zeros(plant.n)
+                f = np.zeros(plant.m) if on_state else sign * inputs[index]
+                label = f"{names[index]} {'<=' if sign > 0 else '>='} {limit:g}"
+                rows.append((e, f, sign * float(limit), on_state, label))
+    return BoundRows(
+        E=frozen(np.array([row[0] for row in rows]).reshape(len(rows), plant.n)),
+        F=frozen(np.array([row[1] for row in rows]).reshape(len(rows), plant.m)),
+        b=frozen([row[2] for row in rows]),
+        on_state=np.array([row[3] for row in rows], dtype=bool),
+        names=tuple(row[4] for row in rows),
+    )
+
+
+def _side(name: str, values: ArrayLike | None, size: int, default: float) -> Array:
+    if values is None:
+        return np.full(size, default)
+    try:
+        side = np.array(np.broadcast_to(np.asarray(values, dtype=float), (size,)))
+    except ValueError:
+        raise BoundsError(
+            name, f"got shape {np.shape(values)}", f"give a number or {size} of them"
+        ) from None
+    if np.any(np.isnan(side)):
+        raise BoundsError(name, f"has NaN: {side.tolist()}", "use inf where there is no bound")
+    return side
+
+
+def _check_pair(name: str, signals: tuple[str, ...], lower: Array, upper: Array) -> None:
+    for signal, low, high in zip(signals, lower, upper, strict=True):
+        if low >= high:
+            raise BoundsError(name, f"cross for {signal}: {low:g} >= {high:g}", "swap them")
+        if not low < 0 < high:
+            raise BoundsError(
+                name,
+                f"exclude the origin for {signal}: [{low:g}, {high:g}]",
+                "shift the signal so that its equilibrium is 0",
+            )

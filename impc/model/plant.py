@@ -1,0 +1,195 @@
+"""The plant as arrays: what the rest of the package reads from a `control.StateSpace`.
+
+    x_{t+1} = A x_t + B u_t + E d_t,    y_t = C x_t          (discrete)
+    dx/dt   = A x   + B u   + E d,      y   = C x            (continuous)
+
+u are the inputs that the controller commands, d the recorded disturbances. A plant without
+disturbances has an E with no columns. What the controller makes of it: docs/theory.md, section 1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+import scipy.linalg
+
+from impc.arrays import Array, frozen
+from impc.checking import Value, checked
+from impc.errors import PlantError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+__all__ = ["Plant", "as_plant", "change_coordinates"]
+
+
+@dataclass(frozen=True)
+class Plant(Value):
+    """A linear plant with named signals.
+
+    Attributes
+    ----------
+    A, B, E, C : Array
+        State matrix (n, n), control matrix (n, m), disturbance matrix (n, d), output matrix (p, n).
+    dt : float
+        Sample time in seconds; 0 for continuous time.
+    states, controls, disturbances, outputs : tuple of str
+        Names of the signals, in the order of the arrays.
+    """
+
+    _rules: ClassVar[Mapping[str, Any]] = {
+        "A": "n n",
+        "B": "n m",
+        "E": "n d",
+        "C": "p n",
+        "dt": 0,
+    }
+
+    A: Array
+    B: Array
+    E: Array
+    C: Array
+    dt: float
+    states: tuple[str, ...]
+    controls: tuple[str, ...]
+    disturbances: tuple[str, ...]
+    outputs: tuple[str, ...]
+
+    @property
+    def n(self) -> int:
+        """Number of states."""
+        return self.A.shape[0]
+
+    @property
+    def m(self) -> int:
+        """Number of control inputs."""
+        return self.B.shape[1]
+
+    @property
+    def discrete(self) -> bool:
+        """Whether the plant is sampled."""
+        return self.dt > 0
+
+    def require_discrete(self) -> Plant:
+        """Return the plant itself when it is discrete.
+
+        Raises
+        ------
+        PlantError
+            When it is continuous.
+        """
+        if not self.discrete:
+            raise PlantError(
+                "plant",
+                "is continuous, a discrete one is needed",
+                "sample it: control.c2d(sys, dt)",
+            )
+        return self
+
+
+@checked
+def as_plant(system: Any, controls: Sequence[str] | None = None) -> Plant:
+    """Read the arrays and names from a `control.StateSpace`.
+
+    Parameters
+    ----------
+    system : control.StateSpace or Plant
+        Discrete (``dt`` positive, or True for one second) or continuous (``dt`` zero). A `Plant`
+        is returned as it is.
+    controls : sequence of str, optional
+        Names of the inputs that the controller commands; the others are disturbances. By default
+        every input is a control.
+
+    Returns
+    -------
+    Plant
+
+    Raises
+    ------
+    PlantError
+        When the matrices are missing or not finite, when an output depends directly on an input,
+        when a control is not among the inputs, or when (A, B) is not stabilisable.
+    """
+    if isinstance(system, Plant):
+        return system
+    if not all(hasattr(system, name) for name in ("A", "B", "C", "D", "dt", "input_labels")):
+        kind = type(system).__name__
+        raise PlantError("plant", f"expected a control.StateSpace, got {kind}", "use control.ss")
+    matrices = {name: np.asarray(getattr(system, name), dtype=float) for name in "ABCD"}
+    for name, matrix in matrices.items():
+        if not np.all(np.isfinite(matrix)):
+            raise PlantError(f"plant.{name}", "has NaN or infinite entries", "correct the model")
+    if matrices["A"].shape[0] == 0 or matrices["B"].shape[1] == 0:
+        raise PlantError("plant", "has no states or no inputs", "give at least one of each")
+    if np.any(matrices["D"]):
+        raise PlantError(
+            "plant.D", "is not zero", "delay the output by a sample or drop the feedthrough"
+        )
+    names = tuple(system.input_labels)
+    chosen = names if controls is None else tuple(controls)
+    unknown = [name for name in chosen if name not in names]
+    if unknown or not chosen:
+        raise PlantError(
+            "controls", f"{unknown or 'none given'}: the inputs are {list(names)}", "name some"
+        )
+    rest = tuple(name for name in names if name not in chosen)
+    plant = Plant(
+        A=frozen(matrices["A"]),
+        B=frozen(matrices["B"][:, [names.index(name) for name in chosen]]),
+        E=frozen(matrices["B"][:, [names.index(name) for name in rest]]),
+        C=frozen(matrices["C"]),
+        dt=_sample_time(system.dt),
+        states=tuple(system.state_labels),
+        controls=chosen,
+        disturbances=rest,
+        outputs=tuple(system.output_labels),
+    )
+    _require_stabilisable(plant)
+    return plant
+
+
+@checked(T="n n", G="m m")
+def change_coordinates(plant: Plant, T: Array, G: Array | None = None) -> Plant:
+    """Return the plant in z = T^-1 x and v = G^-1 u, T (n, n) and G (m, m); names stay."""
+    back = np.linalg.inv(T)
+    inputs = np.eye(plant.m) if G is None else G
+    return replace(
+        plant,
+        A=frozen(back @ plant.A @ T),
+        B=frozen(back @ plant.B @ inputs),
+        E=frozen(back @ plant.E),
+        C=frozen(plant.C @ T),
+    )
+
+
+def _sample_time(dt: object) -> float:
+    if dt is None:
+        raise PlantError("plant.dt", "is not given", "set dt, or 0 for a continuous plant")
+    if dt is True:
+        return 1.0
+    return float(dt)  # type: ignore[arg-type]  # python-control: a number from here on
+
+
+def _require_stabilisable(plant: Plant) -> None:
+    """Hautus test on the modes that do not decay: [A - s I, B] must keep full row rank.
+
+    The states are balanced and the inputs scaled first, so that units do not decide. The rank is
+    then taken at 1e-10 of the largest singular value; a mode that is stabilisable by less would
+    need gains beyond the reach of double precision.
+    """
+    A, scaling = scipy.linalg.matrix_balance(plant.A, permute=False)
+    B = np.linalg.solve(scaling, plant.B)
+    B = B / np.maximum(np.max(np.abs(B), axis=0), 1e-300) * max(1.0, np.max(np.abs(A)))
+    for mode in scipy.linalg.eigvals(A):
+        decays = abs(mode) < 1 if plant.discrete else mode.real < 0
+        if decays:
+            continue
+        singular = scipy.linalg.svdvals(np.hstack([A - mode * np.eye(plant.n), B]))
+        if singular[plant.n - 1] <= 1e-10 * singular[0]:
+            raise PlantError(
+                "plant",
+                f"is not stabilisable: no input reaches the mode {mode:.4g}",
+                "add an input or remove that mode",
+            )

@@ -1,0 +1,134 @@
+"""Plants that differ in physical parameters which are not known exactly.
+
+The parameters are positive (masses, lengths, stiffnesses, time constants) and are searched in
+their logarithms about the nominal values. The plant's matrices are analytic functions of them, so
+the derivative is taken by Richardson's extrapolation of central differences of step h and h/2 in
+the logarithm: an error of order h^4 and of rounding/h. At h = 1e-3 both are 1e-12, and the two
+central differences tell how far the extrapolation can be trusted. docs/fitting.md says how a
+parameter is freed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from impc.arrays import Array, Frozen, frozen
+from impc.checking import checked
+from impc.errors import InputError, PlantError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from impc.model.plant import Plant
+
+__all__ = ["PlantDifferential", "PlantFamily", "plant_at", "plant_differential", "plant_family"]
+
+_STEP = 1e-3
+# Difference of the two central differences, relative to the derivative: h^2 for a smooth plant.
+_ROUGH = 1e-3
+
+
+@dataclass(frozen=True)
+class PlantFamily(Frozen):
+    """A plant for every value of some parameters.
+
+    Attributes
+    ----------
+    make : callable
+        Values (k,) in the parameters' units -> `Plant`.
+    names : tuple of str
+        (k,).
+    nominal : Array
+        Values about which they are searched (k,), positive.
+    """
+
+    make: Callable[[Array], Plant]
+    names: tuple[str, ...]
+    nominal: Array
+
+
+class PlantDifferential(NamedTuple):
+    """Derivatives of A, B, E and C with respect to the logarithms; the parameters' axis is last.
+
+    Attributes
+    ----------
+    A, B, E, C : Array
+        (n, n, k), (n, m, k), (n, d, k) and (p, n, k).
+    """
+
+    A: Array
+    B: Array
+    E: Array
+    C: Array
+
+
+@checked
+def plant_family(
+    make: Callable[[Array], Plant], names: Sequence[str], nominal: Sequence[float]
+) -> PlantFamily:
+    """Check and freeze a family.
+
+    Parameters
+    ----------
+    make : callable
+        Values of the parameters (k,), in their units -> plant.
+    names : sequence of str
+        Of the parameters.
+    nominal : sequence of float
+        Their values when nothing is known, in their units; positive.
+
+    Raises
+    ------
+    InputError
+        When a nominal value is not a positive number: give it in a unit in which it is.
+    """
+    if len(names) != len(nominal):
+        raise InputError("nominal", f"has {len(nominal)} values", f"give {len(names)}, one a name")
+    for name, value in zip(names, nominal, strict=True):
+        if not 0 < value < np.inf:
+            raise InputError(f"parameter {name}", f"nominal value {value:g}", "give a positive one")
+    return PlantFamily(make, tuple(names), frozen(nominal))
+
+
+@checked(logarithms="*")
+def plant_at(family: PlantFamily, logarithms: Array) -> Plant:
+    """The plant at nominal * exp(logarithms), logarithms (k,)."""
+    return family.make(family.nominal * np.exp(logarithms))
+
+
+def plant_differential(family: PlantFamily, logarithms: Array) -> PlantDifferential:
+    """Derivatives of the plant's matrices with respect to the logarithms of its parameters.
+
+    At `logarithms` (k,) of the parameters over their nominal values.
+
+    Raises
+    ------
+    PlantError
+        When the plant jumps as a parameter moves by a thousandth.
+    """
+    parts: list[tuple[Array, ...]] = []
+    for index, name in enumerate(family.names):
+        coarse = _central(family, logarithms, index, _STEP)
+        fine = _central(family, logarithms, index, _STEP / 2)
+        for one, other in zip(coarse, fine, strict=True):
+            if np.max(np.abs(one - other), initial=0) > _ROUGH * np.max(np.abs(other), initial=0):
+                raise PlantError(
+                    f"parameter {name}", "the plant is not smooth in it", "do not free it"
+                )
+        parts.append(tuple((4 * b - a) / 3 for a, b in zip(coarse, fine, strict=True)))
+    stacked = [np.stack(group, axis=-1) for group in zip(*parts, strict=True)]
+    return PlantDifferential(*stacked)
+
+
+def _central(
+    family: PlantFamily, logarithms: Array, index: int, step: float
+) -> tuple[Array, Array, Array, Array]:
+    shift = np.zeros(len(family.names))
+    shift[index] = step
+    above, below = plant_at(family, logarithms + shift), plant_at(family, logarithms - shift)
+    pairs = ((above.A, below.A), (above.B, below.B), (above.E, below.E), (above.C, below.C))
+    a, b, e, c = ((up - down) / (2 * step) for up, down in pairs)
+    return a, b, e, c

@@ -1,0 +1,131 @@
+"""A recorded trial as the fits take it: outputs and disturbance on the plant's clock."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+
+from impc.arrays import Array, as_numbers, finite_array, frozen
+from impc.checking import Value, checked
+from impc.errors import DataError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import ArrayLike
+
+    from impc.model.plant import Plant
+
+__all__ = ["Label", "Recording", "recording"]
+
+
+@dataclass(frozen=True)
+class Label(Value):
+    """Whose trial it is; empty where the recording does not say.
+
+    Attributes
+    ----------
+    subject, visit, condition, trial : str
+        Names, as the files or the study give them.
+    """
+
+    subject: str = ""
+    visit: str = ""
+    condition: str = ""
+    trial: str = ""
+
+    def __str__(self) -> str:
+        parts = (self.subject, self.visit, self.condition, self.trial)
+        return " ".join(part for part in parts if part)
+
+
+@dataclass(frozen=True)
+class Recording(Value):
+    """One trial.
+
+    Attributes
+    ----------
+    outputs : Array
+        (samples, p), in the units of the plant's outputs.
+    disturbance : Array
+        (samples, d); row k acts between samples k and k + 1, so that the last is not used.
+    x0 : Array
+        State at the first sample (n,): known, or where a fit of it starts.
+    label : Label
+    findings : tuple of str
+        What the checks of its file found and let pass, one sentence each.
+    """
+
+    _rules: ClassVar[Mapping[str, Any]] = {
+        "outputs": "* p",
+        "disturbance": "* d",
+        "x0": "n",
+    }
+
+    outputs: Array
+    disturbance: Array
+    x0: Array
+    label: Label = Label()
+    findings: tuple[str, ...] = ()
+
+    @property
+    def samples(self) -> int:
+        """Number of samples."""
+        return len(self.outputs)
+
+
+@checked
+def recording(
+    plant: Plant,
+    outputs: ArrayLike,
+    disturbance: ArrayLike | None = None,
+    x0: ArrayLike | None = None,
+    *,
+    label: Label | None = None,
+    findings: tuple[str, ...] = (),
+) -> Recording:
+    """Check a trial against the plant and freeze it.
+
+    Parameters
+    ----------
+    plant : Plant
+        Gives the number of outputs, disturbances and states.
+    outputs : array_like
+        (samples, p), or (samples,) for one output; at least two samples.
+    disturbance : array_like, optional
+        (samples, d), or (samples,) for one; zero by default.
+    x0 : array_like, optional
+        (n,). By default the first output, which must then be the full state; a plant with other
+        outputs starts at rest.
+    label : Label, optional
+    findings : tuple of str
+        What the checks of the file found, for the report.
+
+    Raises
+    ------
+    DataError
+        When something is missing, not finite, or of the wrong shape.
+    """
+    y = finite_array("outputs", _columns(outputs), (None, len(plant.outputs)))
+    if len(y) < 2:
+        raise DataError("outputs", f"has {len(y)} samples", "give at least 2")
+    width = plant.E.shape[1]
+    d = np.zeros((len(y), width)) if disturbance is None else _columns(disturbance)
+    start = x0
+    if start is None:
+        full = plant.C.shape == (plant.n, plant.n) and np.array_equal(plant.C, np.eye(plant.n))
+        start = y[0] if full else np.zeros(plant.n)
+    return Recording(
+        frozen(y),
+        frozen(finite_array("disturbance", d, (len(y), width))),
+        frozen(finite_array("x0", start, (plant.n,))),
+        label or Label(),
+        findings,
+    )
+
+
+def _columns(values: ArrayLike) -> ArrayLike:
+    array = as_numbers("columns", values)
+    return array[:, None] if array.ndim == 1 else array

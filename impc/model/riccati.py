@@ -1,0 +1,247 @@
+"""The linear quadratic regulator, (3.3) and (3.4), and its exact derivatives.
+
+    discrete:    P = F'PF + Q + K'RK,        K = S^-1 B'PA,  S = R + B'PB,  F = A - BK
+    continuous:  0 = F'P + PF + Q + K'RK,    K = R^-1 B'P,   S = R
+
+At the optimum the Riccati equation is stationary in K, so its differential keeps K fixed:
+
+    dP = F'dP F + dQ + K'dR K,      dK = S^-1 (B'dP F - dR K)        (discrete)
+
+A row of dK/d(Q, R) is obtained by the adjoint of this pair: one Lyapunov equation for each entry
+of K, instead of one for each entry of Q.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy.linalg
+
+from impc.arrays import Array, Frozen, frozen
+from impc.checking import checked
+from impc.errors import InputError, WeightsError
+
+if TYPE_CHECKING:
+    from impc.model.plant import Plant
+    from impc.model.weights import Weights
+
+__all__ = [
+    "Gradients",
+    "LqrSolution",
+    "gain_gradients",
+    "gain_plant_differential",
+    "is_stable",
+    "lyapunov_series",
+    "metric_gradients",
+    "solve_lqr",
+]
+
+
+@dataclass(frozen=True)
+class LqrSolution(Frozen):
+    """A plant, its weights, and the regulator that they make.
+
+    Attributes
+    ----------
+    plant : Plant
+    weights : Weights
+    P : Array
+        Riccati solution (n, n), the terminal weight.
+    K : Array
+        Gain (m, n) of u = -Kx.
+    S : Array
+        Metric (m, m) in which the constrained controller stays near the gain: R + B'PB.
+    F : Array
+        Closed loop A - BK, (n, n).
+    """
+
+    plant: Plant
+    weights: Weights
+    P: Array
+    K: Array
+    S: Array
+    F: Array
+
+
+@dataclass(frozen=True)
+class Gradients(Frozen):
+    """Derivatives of every entry of a matrix (a, b) with respect to the weights.
+
+    Attributes
+    ----------
+    Q : Array
+        Shape (a, b, n, n), symmetric in the last two: d entry = sum(Q[a, b] * dQ).
+    R : Array
+        Shape (a, b, m, m), symmetric in the last two.
+    """
+
+    Q: Array
+    R: Array
+
+
+@checked
+def solve_lqr(plant: Plant, weights: Weights) -> LqrSolution:
+    """Solve the Riccati equation of the plant and the weights.
+
+    Parameters
+    ----------
+    plant : Plant
+        Discrete or continuous, stabilisable.
+    weights : Weights
+        Q (n, n) and R (m, m) of the plant's size.
+
+    Raises
+    ------
+    InputError
+        When the sizes differ.
+    WeightsError
+        When no stabilising solution exists: Q leaves a mode on or outside the stability limit
+        without weight.
+    """
+    if weights.Q.shape != (plant.n, plant.n) or weights.R.shape != (plant.m, plant.m):
+        raise InputError(
+            "Q, R",
+            f"have shapes {weights.Q.shape} and {weights.R.shape}",
+            f"the plant needs {(plant.n, plant.n)} and {(plant.m, plant.m)}",
+        )
+    solver = (
+        scipy.linalg.solve_discrete_are if plant.discrete else scipy.linalg.solve_continuous_are
+    )
+    try:
+        P = np.asarray(solver(plant.A, plant.B, weights.Q, weights.R))
+    except (np.linalg.LinAlgError, ValueError) as error:  # ValueError: reordering that failed
+        raise _no_solution(str(error).split(".")[0].lower()) from None
+    P = (P + P.T) / 2
+    if plant.discrete:
+        S = weights.R + plant.B.T @ P @ plant.B
+        K = scipy.linalg.solve(S, plant.B.T @ P @ plant.A, assume_a="pos")
+    else:
+        S = weights.R
+        K = scipy.linalg.solve(S, plant.B.T @ P, assume_a="pos")
+    F = plant.A - plant.B @ K
+    if not is_stable(F, discrete=plant.discrete):
+        raise _no_solution("the closed loop that came out is not stable")
+    return LqrSolution(plant, weights, frozen(P), frozen(K), frozen(S), frozen(F))
+
+
+@checked(F="n n")
+def is_stable(F: Array, *, discrete: bool) -> bool:
+    """Whether all eigenvalues of F (n, n) decay: |z| < 1 when `discrete`, else Re s < 0."""
+    eigenvalues = np.linalg.eigvals(F)
+    if discrete:
+        return bool(np.max(np.abs(eigenvalues)) < 1)
+    return bool(np.max(eigenvalues.real) < 0)
+
+
+def lyapunov_series(F: Array, right: Array) -> Array:
+    """Solve X = F X F' + right for a stack of right sides by Smith's doubling (Smith 1968).
+
+    X = sum F^k right F'^k; each doubling squares F, so the number of products grows with the
+    logarithm of the time constant and the whole stack shares the powers. The relative truncation
+    error is below the unit round-off when the loop ends.
+
+    Parameters
+    ----------
+    F : Array
+        (n, n), stable.
+    right : Array
+        (p, n, n).
+
+    Returns
+    -------
+    Array
+        X of each right side (p, n, n).
+
+    Raises
+    ------
+    WeightsError
+        When F is not stable to working precision.
+    """
+    if not is_stable(F, discrete=True):
+        raise _no_solution("the closed loop is not stable")
+    power, total = np.array(F), np.array(right)
+    for _ in range(60):  # 2^60 samples: beyond any loop that is stable in double precision
+        update = power @ total @ power.T
+        total += update
+        if np.max(np.abs(update), initial=0.0) <= 1e-17 * np.max(np.abs(total), initial=0.0):
+            return total
+        power = power @ power
+    raise _no_solution("the closed loop is not stable to working precision")
+
+
+@checked
+def gain_gradients(solution: LqrSolution) -> Gradients:
+    """Exact derivatives of the gain K with respect to Q and R.
+
+    Returns
+    -------
+    Gradients
+        Of shapes (m, n, n, n) and (m, n, m, m).
+    """
+    B, K, F, S = solution.plant.B, solution.K, solution.F, solution.S
+    m, n = K.shape
+    # <G, dK> = <B S^-1 G F', dP> - <S^-1 G K', dR> for the unit matrix G of each entry.
+    units = np.eye(m * n).reshape(m * n, m, n)
+    inner = scipy.linalg.solve(S, units.transpose(1, 0, 2).reshape(m, -1), assume_a="pos")
+    inner = inner.reshape(m, m * n, n).transpose(1, 0, 2)
+    source = B @ inner @ F.T if solution.plant.discrete else B @ inner
+    gradients = _adjoint(solution, source, -inner @ K.T)
+    return Gradients(gradients.Q.reshape(m, n, n, n), gradients.R.reshape(m, n, m, m))
+
+
+@checked
+def metric_gradients(solution: LqrSolution) -> Gradients:
+    """Exact derivatives of the metric S = R + B'PB of a discrete plant: shapes (m, m, ...)."""
+    B, m, n = solution.plant.B, solution.plant.m, solution.plant.n
+    units = np.eye(m * m).reshape(m * m, m, m)
+    gradients = _adjoint(solution, B @ units @ B.T, units)
+    return Gradients(gradients.Q.reshape(m, m, n, n), gradients.R.reshape(m, m, m, m))
+
+
+def gain_plant_differential(solution: LqrSolution, dA: Array, dB: Array) -> tuple[Array, Array]:
+    """Differentials of K and S of a discrete plant along directions of A and B, weights fixed.
+
+    dP = F'dP F + (dF0'PF + F'P dF0) with dF0 = dA - dB K;
+    dK = S^-1 (B'dP F + dB'PF + B'P dF0), dS = B'dP B + dB'PB + B'P dB.
+
+    Parameters
+    ----------
+    dA, dB : Array
+        Shapes (p, n, n) and (p, n, m).
+
+    Returns
+    -------
+    dK, dS : Array
+        Shapes (p, m, n) and (p, m, m).
+    """
+    B, K, F, S, P = solution.plant.B, solution.K, solution.F, solution.S, solution.P
+    moved = dA - dB @ K
+    source = F.T @ P @ moved
+    dP = lyapunov_series(F.T, source + source.transpose(0, 2, 1))
+    dBP = dB.transpose(0, 2, 1) @ P
+    numerator = B.T @ dP @ F + dBP @ F + B.T @ P @ moved
+    dK = np.asarray(np.linalg.solve(S, numerator), dtype=np.float64)
+    dBPB = dBP @ B
+    return dK, B.T @ dP @ B + dBPB + dBPB.transpose(0, 2, 1)
+
+
+def _adjoint(solution: LqrSolution, source: Array, direct: Array) -> Gradients:
+    """Gradient of <source, dP> + <direct, dR>: the adjoint Lyapunov equation, symmetrised."""
+    F, K = solution.F, solution.K
+    source = (source + source.transpose(0, 2, 1)) / 2
+    if solution.plant.discrete:
+        dual = lyapunov_series(F, source)
+    else:
+        dual = np.array([scipy.linalg.solve_continuous_lyapunov(F, -item) for item in source])
+    on_r = K @ dual @ K.T + direct
+    return Gradients(dual, (on_r + on_r.transpose(0, 2, 1)) / 2)
+
+
+def _no_solution(reason: str) -> WeightsError:
+    return WeightsError(
+        "Q, R",
+        f"have no stabilising Riccati solution ({reason})",
+        "weigh every mode that does not decay by itself",
+    )

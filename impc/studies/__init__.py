@@ -1,0 +1,1 @@
+"""Studies are compositions: methods and assessments on recordings, with their pages."""

@@ -1,0 +1,171 @@
+"""Where tasks run: workers on this machine, or those of a Dask scheduler that somebody started."""
+
+from __future__ import annotations
+
+import logging
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from impc.errors import InputError, OutputError
+from impc.studies.cohort.workers import Done, local_workers
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Hashable, Iterator
+    from pathlib import Path
+
+    from distributed import Client
+
+    from impc.studies.cohort.workers import Workers
+
+__all__ = ["Cluster", "connected"]
+
+_PATIENCE = "10s"
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """Which workers to use.
+
+    Attributes
+    ----------
+    scheduler : str or None
+        Address of a running Dask scheduler; None for this machine.
+    workers : int or None
+        How many on this machine; None for as many as there are processors.
+    tls_ca, tls_cert, tls_key : Path or None
+        For an address tls://: certificate of the authority, one's own, and its private key.
+    """
+
+    scheduler: str | None = None
+    workers: int | None = None
+    tls_ca: Path | None = None
+    tls_cert: Path | None = None
+    tls_key: Path | None = None
+
+
+@contextmanager
+def connected(cluster: Cluster) -> Iterator[Workers]:
+    """The workers of a `cluster` while the block lasts.
+
+    Raises
+    ------
+    InputError
+        When no scheduler answers at the address, or its certificates are missing or refused.
+    """
+    if cluster.scheduler is None:
+        if any((cluster.tls_ca, cluster.tls_cert, cluster.tls_key)):
+            raise InputError("--tls-ca", "is given without --scheduler", "leave it out")
+        with local_workers(cluster.workers) as workers:
+            yield workers
+        return
+    with _client(cluster, cluster.scheduler) as client:
+        yield _SchedulerWorkers(client, cluster.scheduler)
+
+
+@contextmanager
+def _client(cluster: Cluster, address: str) -> Iterator[Client]:
+    import dask  # noqa: PLC0415
+    import distributed  # noqa: PLC0415
+
+    security = _security(cluster, address)
+    patience = {"distributed.comm.timeouts.connect": _PATIENCE}
+    with dask.config.set(patience), _silent("distributed"):
+        try:
+            client = distributed.Client(address, timeout=_PATIENCE, security=security)
+        except (OSError, ValueError, TypeError, TimeoutError) as error:
+            raise InputError(
+                f"scheduler {address}",
+                f"does not answer ({type(error).__name__})",
+                "start one with `dask scheduler`, and give its address and certificates",
+            ) from None
+        with client:
+            yield client
+
+
+@contextmanager
+def _silent(package: str) -> Iterator[None]:
+    """What it would log (112 lines for a lost scheduler), errors say here in one line."""
+    names = [name for name in logging.root.manager.loggerDict if name.startswith(package)]
+    levels = {name: logging.getLogger(name).level for name in names}
+    for name in names:
+        logging.getLogger(name).setLevel(logging.CRITICAL + 1)
+    try:
+        yield
+    finally:
+        for name, level in levels.items():
+            logging.getLogger(name).setLevel(level)
+
+
+def _security(cluster: Cluster, address: str) -> Any:
+    from distributed.security import Security  # noqa: PLC0415
+
+    files = {
+        "--tls-ca": cluster.tls_ca,
+        "--tls-cert": cluster.tls_cert,
+        "--tls-key": cluster.tls_key,
+    }
+    missing = [name for name, path in files.items() if path is None]
+    if not address.startswith("tls://"):
+        if len(missing) < len(files):
+            raise InputError(
+                f"scheduler {address}", "takes no certificates", "give its address as tls://..."
+            )
+        return None
+    if missing:
+        raise InputError(
+            f"scheduler {address}", f"needs {', '.join(missing)}", "give the three files"
+        )
+    for name, path in files.items():
+        if path is None or not path.is_file():
+            raise InputError(f"{name} {path}", "is no file", "check the path")
+    return Security(
+        tls_ca_file=str(cluster.tls_ca),
+        tls_client_cert=str(cluster.tls_cert),
+        tls_client_key=str(cluster.tls_key),
+        require_encryption=True,
+    )
+
+
+class _SchedulerWorkers:
+    """The workers of a scheduler, see `Workers`."""
+
+    def __init__(self, client: Client, address: str) -> None:
+        import distributed  # noqa: PLC0415
+
+        self._client, self._address = client, address
+        self._keys: dict[Any, Hashable] = {}
+        make: Any = distributed.as_completed  # distributed types few of its functions
+        self._out = make()
+
+    @property
+    def threads(self) -> int:
+        """How many tasks run at a time."""
+        client: Any = self._client
+        return max(int(sum(client.nthreads().values())), 1)
+
+    def submit(self, key: Hashable, work: Callable[..., Any], *given: Any) -> None:
+        """As `Workers.submit`."""
+        future = self._client.submit(work, *given, pure=False, retries=0)
+        self._keys[future] = key
+        self._out.add(future)
+
+    def results(self) -> Iterator[Done]:
+        """As `Workers.results`.
+
+        Raises
+        ------
+        OutputError
+            When the scheduler is lost.
+        """
+        for future in self._out:
+            if future.status in ("cancelled", "lost"):
+                raise OutputError(
+                    f"scheduler {self._address}", "was lost while tasks were out",
+                    "start it again: the same command goes on from what is kept",
+                )  # fmt: skip
+            key, error = self._keys.pop(future), future.exception()
+            fault = "" if error is None else " ".join(f"{type(error).__name__}: {error}".split())
+            value = None if error is not None else future.result()
+            future.release()
+            yield Done(key, value, fault)

@@ -1,0 +1,221 @@
+"""Groups and visits of a cohort compared, measure by measure.
+
+    two groups     Welch's t on the subjects' means over their visits, Hedges' g
+    two visits     paired t on subjects who have both, d_z = mean / SD of the differences
+    both           Welch's t on the subjects' changes per visit: whether groups change differently
+    reliability    ICC(A,1) between visits
+
+Several measures are tested at once: beside each p stands Holm's, over the measures of one question.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import scipy.stats
+from statsmodels.stats.multitest import multipletests
+
+from impc.errors import DataError
+from impc.studies.reliability.icc import icc
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import pandas as pd
+
+    from impc.arrays import Array
+
+__all__ = ["Comparison", "compare_cohort", "measures_of"]
+
+_FEWEST = 3
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """One question asked of one measure in one condition.
+
+    Attributes
+    ----------
+    question : str
+        "group", "visit", "change" or "reliability".
+    measure, condition : str
+        Of which, by name.
+    first, second : str
+        What is compared; empty for the reliability.
+    estimate : float
+        Difference of means (second minus first), or the ICC.
+    low, high : float
+        Interval of 95 %; NaN where the method gives none.
+    effect : float
+        Hedges' g or d_z; NaN for the others.
+    p, p_holm : float
+        NaN for the reliability.
+    n : int
+        Subjects.
+    note : str
+        Why there is no number; empty otherwise.
+    """
+
+    question: str
+    measure: str
+    condition: str
+    first: str
+    second: str
+    estimate: float
+    low: float
+    high: float
+    effect: float
+    p: float
+    p_holm: float
+    n: int
+    note: str = ""
+
+
+def measures_of(units: pd.DataFrame) -> tuple[str, ...]:
+    """Columns of the table `units` that are compared: few, chosen before the data are seen.
+
+    Gains on recorded outputs and their rates, prices of recorded outputs in the analytic centre,
+    and VAF. Gains on states of a delay or a muscle, one by one, say little, and every measure makes
+    Holm's correction harder on the others. All gains where no state has an output's name.
+    """
+    outputs = [name.removeprefix("vaf.") for name in units.columns if name.startswith("vaf.")]
+    shown = {*outputs, *(f"{name}_rate" for name in outputs)}
+    gains = [name for name in units.columns if name.startswith("K.")]
+    named = [name for name in gains if name.split(".", 2)[2] in shown]
+    prices = [f"centre_price.{name}" for name in outputs]
+    return tuple(
+        name
+        for name in units.columns
+        if name in (named or gains) or name in prices or name.startswith("vaf.")
+    )
+
+
+def compare_cohort(
+    units: pd.DataFrame, measures: Sequence[str] | None = None
+) -> tuple[Comparison, ...]:
+    """Answer every question that the units allow.
+
+    Parameters
+    ----------
+    units : DataFrame
+        Table "units" of `cohort_tables`.
+    measures : sequence of str, optional
+        Columns; those of `measures_of` by default.
+
+    Raises
+    ------
+    DataError
+        When there is no unit.
+    """
+    if len(units) == 0:
+        raise DataError("cohort", "has no unit with a result", "see the reasons in the report")
+    chosen = measures_of(units) if measures is None else tuple(measures)
+    found: list[Comparison] = []
+    for condition, part in units.groupby("condition", sort=True, dropna=False):
+        told = str(condition)
+        groups = sorted(set(part["group"]) - {""})
+        visits = list(dict.fromkeys(part["visit"]))
+        for one, other in itertools.combinations(groups, 2):
+            found += _holm([_groups(part, name, told, one, other) for name in chosen])
+            if len(visits) > 1:
+                found += _holm([_interaction(part, name, told, one, other) for name in chosen])
+        for one, other in itertools.combinations(visits, 2):
+            found += _holm([_visits(part, name, told, one, other) for name in chosen])
+        if len(visits) > 1:
+            found += [_reliability(part, name, told) for name in chosen]
+    return tuple(found)
+
+
+def _groups(part: pd.DataFrame, measure: str, condition: str, one: str, other: str) -> Comparison:
+    means = part.groupby(["group", "subject"])[measure].mean().dropna()
+    a, b = (np.asarray(means.get(name, [])) for name in (one, other))
+    return _welch("group", measure, condition, one, other, a, b)
+
+
+def _welch(
+    question: str, measure: str, condition: str, one: str, other: str, a: Array, b: Array
+) -> Comparison:
+    n = len(a) + len(b)
+    if min(len(a), len(b)) < _FEWEST:
+        return _nothing(question, measure, condition, one, other, n)
+    test: Any = scipy.stats.ttest_ind(b, a, equal_var=False)
+    interval = test.confidence_interval(0.95)
+    return Comparison(
+        question, measure, condition, one, other, float(b.mean() - a.mean()),
+        float(interval.low), float(interval.high), _hedges(a, b), float(test.pvalue), np.nan, n,
+    )  # fmt: skip
+
+
+def _visits(part: pd.DataFrame, measure: str, condition: str, one: str, other: str) -> Comparison:
+    wide = part.pivot_table(index="subject", columns="visit", values=measure)
+    both = wide[[one, other]].dropna() if {one, other} <= set(wide.columns) else wide.iloc[:0]
+    if len(both) < _FEWEST:
+        return _nothing("visit", measure, condition, one, other, len(both))
+    difference = np.asarray(both[other] - both[one])
+    test: Any = scipy.stats.ttest_1samp(difference, 0.0)
+    interval = test.confidence_interval(0.95)
+    spread = float(difference.std(ddof=1))
+    return Comparison(
+        "visit", measure, condition, one, other, float(difference.mean()), float(interval.low),
+        float(interval.high), float(difference.mean() / spread) if spread else np.nan,
+        float(test.pvalue), np.nan, len(both),
+    )  # fmt: skip
+
+
+def _interaction(
+    part: pd.DataFrame, measure: str, condition: str, one: str, other: str
+) -> Comparison:
+    """Welch's t on each subject's change per visit, its least-squares slope over the visits."""
+    place = {visit: index for index, visit in enumerate(dict.fromkeys(part["visit"]))}
+    slopes: dict[str, list[float]] = {one: [], other: []}
+    for (group, _), rows in part.dropna(subset=[measure]).groupby(["group", "subject"]):
+        if group in slopes and rows["visit"].nunique() > 1:
+            visits = [place[visit] for visit in rows["visit"]]
+            slopes[group].append(float(np.polyfit(visits, rows[measure], 1)[0]))
+    a, b = np.array(slopes[one]), np.array(slopes[other])
+    return _welch("change", measure, condition, one, other, a, b)
+
+
+def _reliability(part: pd.DataFrame, measure: str, condition: str) -> Comparison:
+    wide = part.pivot_table(index="subject", columns="visit", values=measure)
+    try:
+        found = icc(wide.to_numpy(), "A,1")
+    except DataError:
+        return _nothing("reliability", measure, condition, "", "", len(wide.dropna()))
+    return Comparison(
+        "reliability", measure, condition, "", "", found.value, found.low, found.high, np.nan,
+        np.nan, np.nan, found.subjects,
+    )  # fmt: skip
+
+
+def _hedges(a: Array, b: Array) -> float:
+    """Hedges' g: difference over the pooled SD, corrected for small samples."""
+    freedom = len(a) + len(b) - 2
+    pooled = np.sqrt(((len(a) - 1) * a.var(ddof=1) + (len(b) - 1) * b.var(ddof=1)) / freedom)
+    if pooled == 0:
+        return float("nan")
+    return float((b.mean() - a.mean()) / pooled * (1 - 3 / (4 * freedom - 1)))
+
+
+def _nothing(
+    question: str, measure: str, condition: str, one: str, other: str, n: int
+) -> Comparison:
+    nan = float("nan")
+    note = f"too few subjects ({n})"
+    return Comparison(
+        question, measure, condition, one, other, nan, nan, nan, nan, nan, nan, n, note
+    )
+
+
+def _holm(found: list[Comparison]) -> list[Comparison]:
+    usable = [item for item in found if np.isfinite(item.p)]
+    if not usable:
+        return found
+    corrected = iter(multipletests([item.p for item in usable], method="holm")[1])
+    return [
+        replace(item, p_holm=float(next(corrected))) if np.isfinite(item.p) else item
+        for item in found
+    ]

@@ -1,0 +1,103 @@
+"""Figures of a cohort: measures by group, memory over a run, a subject's fit."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from impc.reporting.style import BLUE, DOUBLE_COLUMN, INK, STATE_MARKS, VERMILLION, new_figure
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+__all__ = ["group_figure", "memory_figure", "subject_figure"]
+
+_COLUMNS = 3
+_SOFT = "#8C8C8C"
+_LINE = re.compile(r"memory of worker (\d+) MB, of client (\d+) MB")
+
+
+def group_figure(units: pd.DataFrame, measures: Sequence[str]) -> Figure:
+    """The measures of every unit, by group, from the table `units`; a bar at a group's mean."""
+    groups = sorted(set(units["group"])) or [""]
+    rows = -(-len(measures) // _COLUMNS)
+    figure = new_figure(DOUBLE_COLUMN, 2.0 * rows)
+    axes = np.ravel(figure.subplots(rows, _COLUMNS, squeeze=False))
+    for ax in axes[len(measures) :]:
+        ax.set_visible(False)
+    for ax, name in zip(axes, measures, strict=False):
+        for place, group in enumerate(groups):
+            values = units.loc[units["group"] == group, name].to_numpy(dtype=float)
+            mark = STATE_MARKS[place % len(STATE_MARKS)]
+            # Side by side, in the order of the table: no two points hide each other.
+            spread = place + np.linspace(-0.25, 0.25, len(values)) if len(values) > 1 else [place]
+            ax.plot(
+                spread,
+                values,
+                linestyle="none",
+                marker=mark.marker,
+                color=mark.color,
+                markerfacecolor="white",
+                markersize=3.0,
+            )
+            ax.hlines(np.nanmean(values), place - 0.35, place + 0.35, color=INK, linewidth=1.5)
+        ax.set_xticks(range(len(groups)), [group or "all" for group in groups])
+        ax.set_xlim(-0.6, len(groups) - 0.4)
+        ax.set_ylabel(f"{name} ({_unit(name)})")
+    return figure
+
+
+def memory_figure(log: Path) -> Figure | None:
+    """Memory of workers and client over the tasks of a log; None when it has none."""
+    try:
+        found = _LINE.findall(log.read_text(encoding="utf-8"))
+    except OSError:
+        return None
+    if not found:
+        return None
+    worker, client = np.array(found, dtype=float).T
+    figure = new_figure(DOUBLE_COLUMN, 2.2)
+    ax = figure.subplots()
+    tasks = np.arange(1, len(worker) + 1)
+    ax.plot(tasks, worker, linestyle="none", marker=".", color=BLUE, markersize=3, label="worker")
+    ax.plot(tasks, client, color=VERMILLION, linestyle="--", label="client")
+    ax.set_xlabel("tasks done (-)")
+    ax.set_ylabel("memory (MB)")
+    ax.set_ylim(0, 1.2 * max(worker.max(), client.max()))
+    ax.legend(loc="lower right", ncols=2)
+    return figure
+
+
+def subject_figure(fit: dict[str, Any]) -> Figure:
+    """Recorded and simulated outputs of a unit's first trial, from the content of its `fit`."""
+    shown = fit["trajectory"]
+    recorded, simulated = np.array(shown["recorded"]), np.array(shown["simulated"])
+    figure = new_figure(DOUBLE_COLUMN, 1.3 * recorded.shape[1] + 0.5)
+    axes = np.ravel(figure.subplots(recorded.shape[1], 1, sharex=True, squeeze=False))
+    time = np.arange(len(recorded)) * shown["dt"]
+    for index, ax in enumerate(axes):
+        ax.plot(time, recorded[:, index], color=_SOFT, linewidth=1.6, label="recorded")
+        ax.plot(
+            time,
+            simulated[:, index],
+            color=VERMILLION,
+            linestyle="--",
+            linewidth=1.0,
+            label="simulated",
+        )
+        ax.set_ylabel(f"{fit['outputs'][index]} (SI)")
+    axes[-1].set_xlabel("time (s)")
+    axes[0].legend(loc="upper right", ncols=2, bbox_to_anchor=(1.0, 1.3))
+    return figure
+
+
+def _unit(name: str) -> str:
+    if name.startswith(("vaf.", "held_out_vaf.")):
+        return "%"
+    return "SI units"

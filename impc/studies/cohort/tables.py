@@ -1,0 +1,121 @@
+"""Tables of a cohort, made from the folder: what pandas, R and MATLAB read.
+
+    units.csv       a row a unit: labels, VAF, gain, its deviations, dominant direction, parameters
+    replicates.csv  a row a replicate: labels, number, gain, parameters
+    intervals.csv   a row an entry of the gain or a parameter: percentiles of the replicates, empty
+                    where the recordings do not tell the entry by itself
+
+Rows are in the order of the study and columns in that of the plant: the same results give the same
+bytes, whatever ran them. Times and memory are in the log, not here.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+
+from impc.reporting.csv_text import csv_bytes
+
+if TYPE_CHECKING:
+    from impc.studies.cohort.store import Store
+    from impc.studies.cohort.study import Study, Unit
+
+__all__ = ["cohort_tables", "table_bytes"]
+
+_CENTRE = "analytic centre (no units)"
+_LEVEL = 0.95
+
+
+def cohort_tables(study: Study, store: Store) -> dict[str, pd.DataFrame]:
+    """The tables of the module's text by name; units without a fit are in none."""
+    units, replicates, intervals = [], [], []
+    count = int(study.configuration.fit.get("replicates", 0))
+    for unit in study.units:
+        fit = store.fit(unit.name)
+        if fit is None:
+            continue
+        units.append(_labels(unit) | _unit_row(fit))
+        drawn = []
+        for index in range(count):
+            found = store.replicate(unit.name, index)
+            if found is not None:
+                row = _gain(fit, "K", found["K"])
+                row |= dict(zip(fit["parameters"], found["parameters"], strict=True))
+                drawn.append(row)
+                replicates.append(_labels(unit) | {"replicate": index + 1} | row)
+        if len(drawn) > 1:
+            intervals += _intervals(unit, fit, pd.DataFrame(drawn))
+    return {
+        "units": pd.DataFrame(units),
+        "replicates": pd.DataFrame(replicates),
+        "intervals": pd.DataFrame(intervals),
+    }
+
+
+def table_bytes(table: pd.DataFrame) -> bytes:
+    """A table as CSV, numbers to the last digit, no cell a formula."""
+    return csv_bytes(list(table.columns), table.itertuples(index=False, name=None))
+
+
+def _labels(unit: Unit) -> dict[str, Any]:
+    return {
+        "unit": unit.name,
+        "subject": unit.subject,
+        "visit": unit.visit,
+        "condition": unit.condition,
+        "group": unit.group,
+    }
+
+
+def _unit_row(fit: dict[str, Any]) -> dict[str, Any]:
+    row: dict[str, Any] = {"trials": fit["trials"], "samples": fit["samples"]}
+    row |= {f"vaf.{name}": value for name, value in fit["vaf"].items()}
+    row |= {f"held_out_vaf.{name}": value for name, value in fit["held_out_vaf"].items()}
+    row["saturated"] = fit["saturated"]
+    for name in ("K", "K_deviation", "K_told", "K_of_weights"):
+        row |= _gain(fit, name, fit[name])
+    reported = next(iter(fit["readings"].values()))
+    row |= _states(fit, "dominant", reported["dominant"])
+    row |= _states(fit, "price", np.diag(reported["Q"]))
+    if _CENTRE in fit["readings"]:
+        row |= _states(fit, "centre_price", np.diag(fit["readings"][_CENTRE]["Q"]))
+    row |= fit["parameters"]
+    return row
+
+
+def _gain(fit: dict[str, Any], name: str, values: Any) -> dict[str, float]:
+    return {
+        f"{name}.{control}.{state}": value
+        for control, line in zip(fit["controls"], values, strict=True)
+        for state, value in zip(fit["states"], line, strict=True)
+    }
+
+
+def _states(fit: dict[str, Any], name: str, values: Any) -> dict[str, float]:
+    return {
+        f"{name}.{state}": float(value) for state, value in zip(fit["states"], values, strict=True)
+    }
+
+
+def _intervals(unit: Unit, fit: dict[str, Any], drawn: pd.DataFrame) -> list[dict[str, Any]]:
+    estimate = _gain(fit, "K", fit["K"]) | fit["parameters"]
+    told = _gain(fit, "K", fit["K_told"])
+    rows = []
+    for name in drawn.columns:
+        # Replicates stay where the search began along what is not told: their spread says nothing.
+        ends = [0.5 - _LEVEL / 2, 0.5 + _LEVEL / 2]
+        low, high = np.quantile(drawn[name], ends) if told.get(name, True) else (np.nan, np.nan)
+        rows.append(
+            _labels(unit)
+            | {
+                "name": name,
+                "value": estimate[name],
+                "low": float(low),
+                "high": float(high),
+                "level": _LEVEL,
+                "replicates": len(drawn),
+            }
+        )
+    return rows

@@ -1,0 +1,1 @@
+"""The simulation example of section 3.4."""

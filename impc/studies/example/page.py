@@ -1,0 +1,145 @@
+"""The page that a person reads: what was done, how it came out, what the numbers mean.
+
+Sentences that compare methods are made from the numbers of the run, never written beforehand.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from impc.reporting.provenance import LOST
+from impc.reporting.rendering import embedded, render_template
+from impc.studies.example.figures import FIGURES
+from impc.studies.example.table import (
+    METHODS,
+    Row,
+    compact_weights,
+    determined_sentences,
+    significant,
+    table_rows,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from impc.reporting.provenance import Provenance
+    from impc.studies.example.cases import CaseResult, MethodResult
+
+__all__ = ["render_page"]
+
+
+@dataclass(frozen=True)
+class _Picture:
+    source: str
+    alternative: str
+    caption: str
+
+
+@dataclass(frozen=True)
+class _CaseView:
+    """A case as the template shows it."""
+
+    name: str
+    start: str
+    branch: str
+    rows: tuple[Row, ...]
+    findings: tuple[str, ...]
+    pictures: tuple[_Picture, ...]
+    determined: tuple[str, ...]
+    others: tuple[tuple[str, str, str], ...]
+
+
+def render_page(
+    cases: Sequence[CaseResult], figures: Mapping[str, bytes], provenance: Provenance
+) -> str:
+    """Return the page as one HTML text that needs no other file.
+
+    Parameters
+    ----------
+    cases : sequence of CaseResult
+    figures : mapping of str to bytes
+        PNG files of every case by name, as `example_figures` makes them.
+    provenance : Provenance
+    """
+    return render_template(
+        "studies/example/example_page.html",
+        cases=[_view(case, figures) for case in cases],
+        lost=LOST,
+        methods=METHODS,
+        made=provenance.made,
+        plant=provenance.plant,
+        plant_name=provenance.plant_name,
+        settings=provenance.settings,
+        versions=provenance.versions,
+    )
+
+
+def _view(case: CaseResult, figures: Mapping[str, bytes]) -> _CaseView:
+    found = case.identifiability
+    return _CaseView(
+        name=case.name,
+        start=", ".join(f"{value:g}" for value in case.x0),
+        branch=case.branch,
+        rows=table_rows(case),
+        findings=_findings(case),
+        pictures=_pictures(case, figures),
+        determined=determined_sentences(found)[:1],
+        others=tuple(
+            (compact_weights(item.weights), significant(item.condition), significant(item.misfit))
+            for item in found.others
+        ),
+    )
+
+
+def _findings(case: CaseResult) -> tuple[str, ...]:
+    """What the table shows, in sentences."""
+    kept = [METHODS[item.name].label for item in case.methods if item.bound_kept]
+    broken = [METHODS[item.name].label for item in case.methods if item.bound_kept is False]
+    lines = [f"Keeps the input bound: {'; '.join(kept) or 'no method'}."]
+    lines += [f"Exceeds the input bound: {'; '.join(broken)}."] if broken else []
+    lines += [
+        f"{_label(item)} finds the true weights to {significant(item.residual)}."
+        for item in case.methods
+        if item.residual is not None and item.residual <= 1e-6
+    ]
+    gain, output = case.method("feedback_gain"), case.method("inverse_lqr_output")
+    if gain.state_misfit is not None and output.state_misfit is not None:
+        worse = output.state_misfit > gain.state_misfit
+        lines.append(
+            f"{_label(output)} fits {'worse' if worse else 'no worse'} than the gain it starts "
+            f"from: misfit {output.state_misfit:.6f} against {gain.state_misfit:.6f}."
+        )
+    return tuple(lines)
+
+
+def _label(method: MethodResult) -> str:
+    label = METHODS[method.name].label
+    return label[0].upper() + label[1:]
+
+
+def _pictures(case: CaseResult, figures: Mapping[str, bytes]) -> tuple[_Picture, ...]:
+    pictures = [
+        _Picture(
+            embedded(figures[f"figure-{number}-case-{case.name}.png"]),
+            f"States and control over time: recorded, and as the {label} explains them",
+            f"Counterpart of figure {number}, {label}. (A) The two states and (B) the control. "
+            "Open markers: recorded. Lines: as this method explains them. "
+            f"{_control_sentence(case.method(method))}",
+        )
+        for number, method, label in FIGURES
+    ]
+    terminal = _Picture(
+        embedded(figures[f"terminal-set-case-{case.name}.png"]),
+        "The terminal set in the plane of the two states, with the trajectories",
+        "The terminal set: from any state inside it the true gain alone never exceeds the "
+        "bound. At every sample the controller plans so that it arrives there within its "
+        "horizon. Lines: the trajectory of each method from the same start.",
+    )
+    return (*pictures, terminal)
+
+
+def _control_sentence(method: MethodResult) -> str:
+    if method.bound_kept:
+        return "The control stays inside its bound (white)."
+    return f"The control reaches {method.max_abs_u:.3f}, beyond its bound (grey)."

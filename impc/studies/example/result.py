@@ -1,0 +1,110 @@
+"""result.json: the numbers of a run for other programs.
+
+    cases.<A|B|C>.x0
+    cases.<A|B|C>.truth                 x, u, Q, R, K of the controller that made the recording
+    cases.<A|B|C>.methods.<name>        Q, R, K, state_misfit, max_abs_u, residual, seconds,
+                                        simulations; `feasible` for the LMI
+    cases.<A|B|C>.identifiability       what the recording determined
+
+A key that does not apply is left out: a gain has no Q, an infeasible LMI nothing but `feasible`
+and `seconds`. Matrices are lists of rows.
+"""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from impc.model.weights import condition_number
+from impc.studies.example.cases import true_weights
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from impc.assess.identified_directions import Identifiability
+    from impc.model.weights import Weights
+    from impc.reporting.provenance import Provenance
+    from impc.studies.example.cases import CaseResult, MethodResult
+
+__all__ = ["result_json"]
+
+
+def result_json(cases: Sequence[CaseResult], provenance: Provenance) -> bytes:
+    """Return result.json, UTF-8, one line an array."""
+    plant = provenance.plant
+    content = {
+        "made": provenance.made,
+        "plant": {"name": provenance.plant_name, "A": plant.A, "B": plant.B, "dt": plant.dt},
+        "settings": dict(provenance.settings),
+        "versions": dict(provenance.versions),
+        "cases": {case.name: _case(case) for case in cases},
+    }
+    # NaN is not JSON: a program that meets one should fail here, not in its reader.
+    text = json.dumps(_plain(content), indent=1, allow_nan=False)
+    return (text + "\n").encode()
+
+
+def _case(case: CaseResult) -> dict[str, Any]:
+    truth = _truth(case)
+    return {
+        "x0": case.x0,
+        "branch": case.branch,
+        "truth": truth,
+        # The truth stands among the methods too, so that a reader can compare them in one loop.
+        "methods": {"truth": truth} | {item.name: _method(item) for item in case.methods},
+        "identifiability": _identifiability(case.identifiability),
+    }
+
+
+def _truth(case: CaseResult) -> dict[str, Any]:
+    return {
+        **_weights(true_weights(case.controller.plant)),
+        "K": case.controller.K,
+        "max_abs_u": float(np.max(np.abs(case.truth.u))),
+        "x": case.truth.x,
+        "u": case.truth.u,
+    }
+
+
+def _method(method: MethodResult) -> dict[str, Any]:
+    found: dict[str, Any] = {} if method.weights is None else _weights(method.weights)
+    optional = {
+        "K": method.K,
+        "state_misfit": method.state_misfit,
+        "max_abs_u": method.max_abs_u,
+        "bound_kept": method.bound_kept,
+        "residual": method.residual,
+        "feasible": method.feasible,
+        "x": None if method.simulation is None else method.simulation.x,
+        "u": None if method.simulation is None else method.simulation.u,
+    }
+    found |= {key: value for key, value in optional.items() if value is not None}
+    return found | {"seconds": method.seconds, "simulations": method.simulations}
+
+
+def _weights(weights: Weights) -> dict[str, Any]:
+    return {"Q": weights.Q, "R": weights.R, "condition_number": condition_number(weights)}
+
+
+def _identifiability(found: Identifiability) -> dict[str, Any]:
+    return {
+        "free": found.free,
+        "rank": found.rank,
+        "chosen": found.chosen,
+        "singular_values": found.singular_values,
+        "tolerance": found.tolerance,
+        "others": [
+            {**_weights(item.weights), "state_misfit": item.misfit} for item in found.others
+        ],
+    }
+
+
+def _plain(value: Any) -> Any:
+    """Replace arrays and numpy numbers by lists and numbers, at every depth."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_plain(item) for item in value]
+    return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value

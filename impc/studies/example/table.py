@@ -1,0 +1,226 @@
+"""The table of methods and what the recording determined, as text for terminal and page alike."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.model.weights import normalised
+from impc.studies.example.cases import true_weights
+
+if TYPE_CHECKING:
+    from impc.arrays import Array
+    from impc.assess.identified_directions import Identifiability
+    from impc.model.weights import Weights
+    from impc.studies.example.cases import CaseResult, MethodResult
+
+__all__ = [
+    "COLUMNS",
+    "METHODS",
+    "MethodText",
+    "Row",
+    "compact_weights",
+    "determined_sentences",
+    "significant",
+    "table_rows",
+    "text_table",
+]
+
+
+@dataclass(frozen=True)
+class MethodText:
+    """A method in words.
+
+    Attributes
+    ----------
+    label : str
+        For tables.
+    sentence : str
+        For readers who do not know it.
+    """
+
+    label: str
+    sentence: str
+
+
+#: The true controller and the methods in words, by their names.
+METHODS: dict[str, MethodText] = {
+    "truth": MethodText("true controller", "The MPC that made the recording."),
+    "feedback_gain": MethodText(
+        "feedback gain",
+        "The fixed gain K of u = -Kx that fits the recorded states best. It knows no bounds.",
+    ),
+    "inverse_lqr_lmi": MethodText(
+        "inverse LQR, LMI",
+        "Weights whose optimal gain is exactly that K, of least condition number. "
+        "There may be none: then the program is infeasible.",
+    ),
+    "inverse_lqr_gradient": MethodText(
+        "inverse LQR, gradient", "Weights whose optimal gain comes nearest to that K."
+    ),
+    "inverse_lqr_auxiliary": MethodText(
+        "inverse LQR, auxiliary (3.7)",
+        "The same, with a price on the condition number that keeps the weights away from singular.",
+    ),
+    "inverse_lqr_output": MethodText(
+        "inverse LQR, outputs (3.16)",
+        "Weights whose optimal gain fits the recorded states themselves. It knows no bounds.",
+    ),
+    "inverse_mpc": MethodText(
+        "inverse MPC, direct (3.6)",
+        "Weights whose controller, with its bounds, fits the recorded states.",
+    ),
+    "inverse_mpc_reduced": MethodText(
+        "inverse MPC, reduced",
+        "First the gain of the bounded controller that fits the recorded states, then the weights "
+        "of least condition number that have this gain.",
+    ),
+}
+
+#: Heads of the table.
+COLUMNS = (
+    "method",
+    "Q11 Q12 Q22 / R",
+    "gain K",
+    "misfit",
+    "max |u|",
+    "kept",
+    "(3.10)",
+    "seconds",
+)
+_NONE = "-"
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the table, every cell as text.
+
+    Attributes
+    ----------
+    name : str
+        Of the method: the key in result.json.
+    weights, gain : str
+        Entries; a dash or "infeasible" where there are none.
+    misfit, largest, kept : str
+        2-norm of the state misfit, largest magnitude of the input, whether the bound is kept.
+    residual : str
+        (3.10).
+    seconds : str
+        Time of the method, s.
+    """
+
+    name: str
+    weights: str
+    gain: str
+    misfit: str
+    largest: str
+    kept: str
+    residual: str
+    seconds: str
+
+    @property
+    def cells(self) -> tuple[str, ...]:
+        """The cells in the order of `COLUMNS`."""
+        return (
+            self.name,
+            self.weights,
+            self.gain,
+            self.misfit,
+            self.largest,
+            self.kept,
+            self.residual,
+            self.seconds,
+        )
+
+
+def table_rows(case: CaseResult) -> tuple[Row, ...]:
+    """Return the true controller, then every method, in the order of the table."""
+    truth = Row(
+        name="truth",
+        weights=compact_weights(true_weights(case.controller.plant)),
+        gain=_vector(case.controller.K),
+        misfit=_NONE,
+        largest=_fixed(float(np.max(np.abs(case.truth.u)))),
+        kept="yes",
+        residual=_NONE,
+        seconds=_NONE,
+    )
+    return (truth, *(_method_row(method) for method in case.methods))
+
+
+def text_table(case: CaseResult) -> str:
+    """Return the table in fixed-width columns, for a terminal."""
+    lines = [COLUMNS, *(row.cells for row in table_rows(case))]
+    widths = [max(len(line[i]) for line in lines) for i in range(len(COLUMNS))]
+    return "\n".join(
+        "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip()
+        for line in lines
+    )
+
+
+def determined_sentences(found: Identifiability) -> tuple[str, ...]:
+    """Say what the recording determined, what the condition number chose, and what else fits."""
+    values = ", ".join(significant(value) for value in found.singular_values)
+    first = (
+        f"The recording determined {found.rank} of the {found.free} free directions of (Q, R); "
+        f"the condition number chose {found.chosen}. (Singular values, with scale: {values}.)"
+    )
+    others = (
+        f"Other weights that explain it as well: {compact_weights(item.weights)}, "
+        f"condition number {significant(item.condition)}, misfit {significant(item.misfit)}."
+        for item in found.others
+    )
+    return (first, *others)
+
+
+def compact_weights(weights: Weights) -> str:
+    """Upper triangles of Q and R, scaled to R[0, 0] = 1: ``Q11 Q12 Q22 / R``."""
+    scaled = normalised(weights)
+    q, r = (" ".join(_upper(matrix)) for matrix in (scaled.Q, scaled.R))
+    return f"{q} / {r}"
+
+
+def significant(value: float) -> str:
+    """Three digits of a `value`; whole numbers that are exact to nine digits without a point."""
+    return str(round(value)) if 1 <= abs(value) < 1e6 and _whole(value) else f"{value:.3g}"
+
+
+def _method_row(method: MethodResult) -> Row:
+    if method.feasible is False:
+        weights = "infeasible"
+    else:
+        weights = _NONE if method.weights is None else compact_weights(method.weights)
+    return Row(
+        name=method.name,
+        weights=weights,
+        gain=_NONE if method.K is None else _vector(method.K),
+        misfit=_optional(method.state_misfit),
+        largest=_NONE if method.max_abs_u is None else _fixed(method.max_abs_u),
+        kept={None: _NONE, True: "yes", False: "no"}[method.bound_kept],
+        residual=_optional(method.residual),
+        seconds=_fixed(method.seconds),
+    )
+
+
+def _upper(matrix: Array) -> list[str]:
+    entries = matrix[np.triu_indices(len(matrix))]
+    return [_fixed(float(entry)) for entry in entries] if len(matrix) > 1 else [f"{entries[0]:.4g}"]
+
+
+def _vector(matrix: Array) -> str:
+    return " ".join(_fixed(float(entry)) for entry in matrix.ravel())
+
+
+def _fixed(value: float) -> str:
+    # Adding zero after rounding: -0.0004 is printed as 0.000, not as -0.000.
+    return f"{round(value, 3) + 0.0:.3f}"
+
+
+def _optional(value: float | None) -> str:
+    return _NONE if value is None else f"{value:.3g}"
+
+
+def _whole(value: float) -> bool:
+    return abs(value - round(value)) < 1e-9 * abs(value)

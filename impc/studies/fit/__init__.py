@@ -1,0 +1,1 @@
+"""One subject: the constrained controller behind a few trials."""

@@ -1,0 +1,293 @@
+"""Figures of a fit: trajectories (figure 3.7), residuals, intent, methods."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.reporting.style import (
+    BLUE,
+    DOUBLE_COLUMN,
+    FORBIDDEN,
+    GREEN,
+    INK,
+    VERMILLION,
+    journal_style,
+    new_figure,
+    render,
+)
+from impc.studies.fit.sentences import METHOD_LABELS, trial_name
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from impc.arrays import Array
+    from impc.studies.fit.result import FitResult
+
+__all__ = ["display_unit", "fit_figures", "shown_trials"]
+
+# Trials that are drawn one by one: 500 made a page of 51 MB and took 6.3 GB.
+_MOST_TRIALS = 24
+
+_SOFT = "#8C8C8C"
+_LAGS = 1.0  # s of the autocorrelation
+_WINDOW = 10.0  # s of the comparison
+_METHOD_LINES = {
+    "inverse_mpc": (VERMILLION, "-"),
+    "inverse_lqr_output": (BLUE, "--"),
+    "clipped_lqr": (GREEN, ":"),
+}
+
+
+def fit_figures(result: FitResult) -> dict[str, bytes]:
+    """Draw all figures: PNG and PDF by file name."""
+    with journal_style():
+        figures = {
+            f"trajectories-trial-{index + 1}": _trajectories(result, index)
+            for index in shown_trials(result)
+        }
+        figures["residuals"] = _residuals(result)
+        figures["intent"] = _intent(result)
+        figures["methods"] = _methods(result)
+        return {
+            f"{name}.{kind}": content
+            for name, figure in figures.items()
+            for kind, content in render(figure).items()
+        }
+
+
+def shown_trials(result: FitResult) -> list[int]:
+    """Trials of a `result` that have a figure: all, or of many those that are explained least."""
+    explained = [float(np.mean(told.vaf)) for told in result.trials]
+    least = sorted(range(len(explained)), key=lambda index: explained[index])
+    return sorted(least[:_MOST_TRIALS])
+
+
+def display_unit(name: str) -> tuple[float, str]:
+    """Factor and unit in which the signal `name` is drawn.
+
+    Plants work in SI units and their signals carry none, so angles are told by their names: what
+    begins with theta, angle, yaw, pitch or roll is shown in degrees, everything else as it is.
+    """
+    angles = ("theta", "angle", "yaw", "pitch", "roll")
+    if name.lower().startswith(angles):
+        return float(np.degrees(1.0)), "deg/s" if name.endswith("_rate") else "deg"
+    return 1.0, "SI"
+
+
+def _label(name: str) -> str:
+    return f"{name} ({display_unit(name)[1]})"
+
+
+def _trajectories(result: FitResult, index: int) -> Figure:
+    plant = result.fitted.problem.plant
+    trial, run = result.given.recordings[index], result.inverse_mpc.runs[index]
+    time = np.arange(trial.samples) * plant.dt
+    rows = len(plant.outputs) + plant.m + (1 if np.any(trial.disturbance) else 0)
+    figure = new_figure(DOUBLE_COLUMN, 0.5 + 1.15 * rows)
+    axes = np.atleast_1d(figure.subplots(rows, 1, sharex=True))
+    for column, name in enumerate(plant.outputs):
+        factor, _ = display_unit(name)
+        ax = axes[column]
+        ax.plot(
+            time,
+            factor * trial.outputs[:, column],
+            color=_SOFT,
+            linewidth=1.6,
+            label="recorded",
+            rasterized=True,
+        )
+        simulated = run.x @ plant.C.T
+        ax.plot(
+            time,
+            factor * simulated[:, column],
+            color=VERMILLION,
+            linestyle="--",
+            linewidth=1.0,
+            label="simulated",
+        )
+        ax.set_ylabel(_label(name))
+    for column, name in enumerate(plant.controls):
+        _command(axes[len(plant.outputs) + column], result, index, column, name)
+    if np.any(trial.disturbance):
+        ax = axes[-1]
+        ax.plot(time, trial.disturbance, color=INK, linewidth=0.8, drawstyle="steps-post")
+        ax.set_ylabel(f"{', '.join(plant.disturbances)} (SI)")
+    axes[0].set_title(trial_name(result, index), loc="right")
+    axes[0].legend(loc="upper left", ncols=2, bbox_to_anchor=(0, 1.28))
+    axes[-1].set_xlabel("time (s)")
+    axes[-1].set_xlim(0, time[-1])
+    return figure
+
+
+def _command(ax: Axes, result: FitResult, index: int, column: int, name: str) -> None:
+    dt = result.fitted.problem.plant.dt
+    u = result.inverse_mpc.runs[index].u[:, column]
+    time = np.arange(len(u)) * dt
+    bounds = result.given.bounds
+    for limit in (bounds.u_min[column], bounds.u_max[column]):
+        if np.isfinite(limit):
+            ax.axhline(limit, color=INK, linewidth=0.8, linestyle=":")
+            at = np.isclose(u, limit, rtol=1e-6)
+            ax.fill_between(
+                time,
+                0,
+                1,
+                where=at,
+                transform=ax.get_xaxis_transform(),
+                color=FORBIDDEN,
+                linewidth=0,
+                step="post",
+            )
+    ax.plot(time, u, color=BLUE, linewidth=0.9, drawstyle="steps-post")
+    ax.set_ylabel(f"{name} (SI)")
+
+
+def _residuals(result: FitResult) -> Figure:
+    plant = result.fitted.problem.plant
+    count, p = min(len(result.given.recordings), _MOST_TRIALS), len(plant.outputs)
+    figure = new_figure(DOUBLE_COLUMN, 0.4 + 1.3 * p * 1.0)
+    axes = np.array(figure.subplots(p, 2, width_ratios=[3, 1], squeeze=False, sharex="col"))
+    for column, name in enumerate(plant.outputs):
+        factor, unit = display_unit(name)
+        series = [
+            factor * (trial.outputs - run.x @ plant.C.T)[:, column]
+            for trial, run in zip(result.given.recordings, result.inverse_mpc.runs, strict=True)
+        ]
+        offset = 6 * max(float(np.std(part)) for part in series)
+        for index, part in enumerate(series[:_MOST_TRIALS]):
+            axes[column, 0].plot(
+                np.arange(len(part)) * plant.dt,
+                part - index * offset,
+                color=INK,
+                linewidth=0.4,
+                rasterized=True,
+            )
+        axes[column, 0].set_yticks(
+            [-index * offset for index in range(count)],
+            [trial_name(result, index)[-12:] for index in range(count)],
+        )
+        axes[column, 0].set_ylabel("trial (-)")
+        axes[column, 0].set_title(f"residual of {name}, {offset:.2g} {unit} apart", loc="left")
+        _autocorrelation(axes[column, 1], series, plant.dt)
+    axes[-1, 0].set_xlabel("time (s)")
+    axes[-1, 1].set_xlabel("lag (s)")
+    return figure
+
+
+def _autocorrelation(ax: Axes, series: list[Array], dt: float) -> None:
+    lags = min(round(_LAGS / dt), min(len(part) for part in series) // 4)
+    styles = ("-", "--", ":", "-.")
+    for index, part in enumerate(series):
+        centred = part - np.mean(part)
+        power = float(centred @ centred) or 1.0
+        values = [float(centred[k:] @ centred[: len(centred) - k]) / power for k in range(1, lags)]
+        ax.plot(
+            np.arange(1, lags) * dt,
+            values,
+            color=INK,
+            linewidth=0.8,
+            linestyle=styles[index % len(styles)],
+        )
+    band = 1.96 / np.sqrt(min(len(part) for part in series))
+    ax.axhspan(-band, band, color=FORBIDDEN, linewidth=0)
+    ax.set_ylim(-0.4, 1.0)
+    ax.set_ylabel("autocorrelation (-)")
+    ax.set_title("grey: white noise", loc="left")
+
+
+def _intent(result: FitResult) -> Figure:
+    plant, readings = result.fitted.problem.plant, result.intent.readings
+    figure = new_figure(DOUBLE_COLUMN, 2.9)
+    left, right = figure.subplots(1, 2, width_ratios=[1, 2.2])
+    marks = ("o", "s", "D", "^", "v", "P")
+    for index, reading in enumerate(readings):
+        values = reading.eigenvalues[::-1]
+        left.plot(
+            np.arange(1, len(values) + 1),
+            values,
+            marker=marks[index % 6],
+            linewidth=0.7,
+            color=_shade(index),
+            markerfacecolor="white" if index else _shade(index),
+        )
+        parts = np.abs(reading.dominant * np.array(result.intent.sizes))
+        width = 0.8 / len(readings)
+        right.bar(
+            np.arange(plant.n) + (index - (len(readings) - 1) / 2) * width,
+            100 * parts / np.sum(parts),
+            width,
+            color=_shade(index),
+            edgecolor=INK,
+            linewidth=0.4,
+            hatch=("", "//", "..", "xx", "--", "oo")[index % 6],
+            label=reading.rule,
+        )
+    left.set_yscale("log")
+    left.set_xlabel("eigenvalue of Q, largest first (-)")
+    left.set_ylabel("price at R = 1 (SI)")
+    right.set_xticks(np.arange(plant.n), plant.states, rotation=35, ha="right")
+    right.set_ylabel("share in dominant cost (%)")
+    right.legend(fontsize=5.5, loc="upper right")
+    return figure
+
+
+def _shade(index: int) -> str:
+    return (VERMILLION, BLUE, GREEN, "#E69F00", "#CC79A7", "#BBBBBB")[index % 6]
+
+
+def _methods(result: FitResult) -> Figure:
+    """Ten seconds about the largest disagreement of inverse LQR, in the trial that has it."""
+    plant = result.fitted.problem.plant
+    shown = {item.name: item for item in result.methods if item.name in _METHOD_LINES and item.runs}
+    index, first = _most_telling(result)
+    trial = result.given.recordings[index]
+    window = slice(first, min(first + round(_WINDOW / plant.dt), trial.samples - 1))
+    time = np.arange(window.start, window.stop) * plant.dt
+    figure = new_figure(DOUBLE_COLUMN, 3.4)
+    above, below = figure.subplots(2, 1, sharex=True)
+    factor, _ = display_unit(plant.outputs[0])
+    recorded = factor * trial.outputs[window, 0]
+    above.plot(time, recorded, color=_SOFT, linewidth=1.8, label="recorded")
+    for name, method in shown.items():
+        color, line = _METHOD_LINES[name]
+        run = method.runs[index]
+        output = factor * (run.x @ plant.C.T)[window, 0]
+        above.plot(
+            time, output, color=color, linestyle=line, linewidth=1.1, label=METHOD_LABELS[name]
+        )
+        below.plot(time, run.u[window, 0], color=color, linestyle=line, linewidth=1.0)
+    for limit in (result.given.bounds.u_min[0], result.given.bounds.u_max[0]):
+        if np.isfinite(limit):
+            below.axhline(limit, color=INK, linewidth=0.8, linestyle=":")
+    reach = 1.6 * float(np.max(np.abs(recorded)))
+    above.set_ylim(-reach, reach)
+    above.set_ylabel(_label(plant.outputs[0]))
+    below.set_ylabel(f"{plant.controls[0]} (SI)")
+    largest = max(float(np.max(np.abs(item.runs[index].u[window, 0]))) for item in shown.values())
+    below.set_ylim(-1.1 * largest, 1.1 * largest)
+    below.set_xlabel("time (s)")
+    below.set_xlim(time[0], time[-1])
+    above.legend(ncols=4, loc="upper left", bbox_to_anchor=(0, 1.25))
+    above.set_title(trial_name(result, index), loc="right", y=1.12)
+    return figure
+
+
+def _most_telling(result: FitResult) -> tuple[int, int]:
+    """Trial and first sample of the window in which clipped or plain LQR departs most."""
+    plant, best = result.fitted.problem.plant, (0.0, 0, 0)
+    window = round(_WINDOW / plant.dt)
+    for method in result.methods:
+        if method.name not in ("clipped_lqr", "inverse_lqr_output") or not method.runs:
+            continue
+        for index, run in enumerate(method.runs):
+            own = result.inverse_mpc.runs[index].x @ plant.C.T
+            apart = np.abs((run.x @ plant.C.T - own)[:, 0])
+            stop = run.reached + 1
+            sample = int(np.argmax(np.minimum(apart[:stop], 10 * np.std(own[:, 0]))))
+            if apart[sample] > best[0]:
+                first = max(0, min(sample - window // 2, len(own) - 1 - window))
+                best = (float(apart[sample]), index, first)
+    return best[1], best[2]

@@ -1,0 +1,225 @@
+"""What an interrupted command had done: the results of its stages, one sealed file each.
+
+They belong to one set of recordings, settings, plant and versions, told by a digest of all of them;
+what belongs to any other, or was damaged, is not used and is done again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from impc.arrays import Array, frozen
+from impc.assess.resampling import Replicate
+from impc.files.digests import digest, versions
+from impc.files.sealed import Kept
+from impc.inverse.gain_search import GainFit
+from impc.inverse.methods import decode_estimate, encode_estimate
+from impc.inverse.noisy_fit import FittedController, fit_controller
+from impc.inverse.problem import moved
+from impc.model.riccati import solve_lqr
+from impc.model.weights import stage_weights
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from impc.inverse.methods import Estimate
+    from impc.inverse.problem import InverseProblem
+    from impc.model.plant_family import PlantFamily
+    from impc.studies.fit.settings import FitSettings
+
+__all__ = ["FitMemory", "open_memory"]
+
+# Where a family of plants is looked at: two families may agree at their nominal values.
+_FACTORS = (0.9, 1.1)
+
+
+@dataclass(frozen=True)
+class FitMemory:
+    """Controllers and estimates of the stages done so far.
+
+    Attributes
+    ----------
+    files : Kept
+        One a stage; the folder is made when the first stage is done.
+    digest : str
+        Of recordings, settings, plant and versions.
+    stages : dict
+        Name of stage -> what `_encode` keeps of it.
+    """
+
+    files: Kept
+    digest: str
+    stages: dict[str, Any] = field(default_factory=dict)
+
+    def controller(self, name: str, problem: InverseProblem) -> FittedController:
+        """The controller of the stage `name`, remembered or fitted now and then written down.
+
+        Raises
+        ------
+        WeightsError, SolverError
+            As `fit_controller`.
+        OutputError
+            When the file cannot be written.
+        """
+        if name in self.stages:
+            return _restore(problem, self.stages[name])
+        found = fit_controller(problem)
+        self._keep(name, _encode(found))
+        return found
+
+    def estimate(self, name: str, compute: Callable[[], Estimate]) -> Estimate:
+        """The estimate of the stage `name`, remembered or computed now and then written down.
+
+        Raises
+        ------
+        OutputError
+            When the file cannot be written.
+        """
+        if name in self.stages:
+            return decode_estimate(self.stages[name])
+        found = compute()
+        self._keep(name, encode_estimate(found))
+        return found
+
+    def replicate(self, name: str, compute: Callable[[], Replicate]) -> Replicate:
+        """The bootstrap replicate of the stage `name`, in the same way.
+
+        Raises
+        ------
+        OutputError
+            When the file cannot be written.
+        """
+        if name in self.stages:
+            kept = self.stages[name]
+            return Replicate(frozen(kept["K"]), frozen(kept["parameters"]))
+        found = compute()
+        self._keep(name, {"K": found.K.tolist(), "parameters": found.parameters.tolist()})
+        return found
+
+    def kept(self) -> str:
+        """What to tell whoever interrupts the command."""
+        if not self.stages:
+            return "nothing was done yet"
+        done = ", ".join(self.stages)
+        return f"kept in {self.files.folder}: {done}; the same command goes on from there"
+
+    def forget(self) -> None:
+        """Remove the folder: the result has been written.
+
+        Raises
+        ------
+        OutputError
+            When that cannot be done.
+        """
+        self.files.forget()
+
+    def _keep(self, name: str, value: dict[str, Any]) -> None:
+        self.files.keep(name, self.digest, value)
+        self.stages[name] = value
+
+
+def open_memory(
+    folder: Path,
+    problem: InverseProblem,
+    settings: FitSettings,
+    command: str = "fit",
+    made_of: str = "",
+) -> FitMemory:
+    """The memory of a command in a folder, empty when there is none for this very problem.
+
+    Parameters
+    ----------
+    folder : Path
+        Where the command writes.
+    problem : InverseProblem
+    settings : FitSettings
+    command : str
+        "fit" or "compare".
+    made_of : str
+        Digest of the files that the problem was made of (`Inputs.digest`).
+    """
+    files = Kept(folder / f"{command}-in-progress")
+    known = digest(_content(problem), settings, made_of, versions())
+    return FitMemory(files, known, files.recall_all(known))
+
+
+def _content(problem: InverseProblem) -> tuple[Any, ...]:
+    """All of a problem that has a content: a family of plants is told by some of its plants."""
+    family = problem.family
+    if family is None:
+        return (problem,)
+    plants = [family.make(values) for values in _probes(family)]
+    return replace(problem, family=None), family.names, family.nominal, plants
+
+
+def _probes(family: PlantFamily) -> list[Array]:
+    changes = [np.eye(len(family.nominal)) * (factor - 1) + 1 for factor in _FACTORS]
+    return [family.nominal * row for row in np.concatenate(changes)]
+
+
+def _encode(found: FittedController) -> dict[str, Any]:
+    free = found.free
+    return {
+        "Q": found.weights.Q.tolist(),
+        "R": found.weights.R.tolist(),
+        "misfit": found.misfit,
+        "exact": found.exact,
+        "converged": found.converged,
+        "metrics": found.metrics.tolist(),
+        **_nuisance(found.problem),
+        "free": {
+            "K": free.K.tolist(),
+            "S": free.S.tolist(),
+            "misfit": free.misfit,
+            "explained": free.explained,
+            "stabilises": free.stabilises,
+            "singular_values": free.singular_values.tolist(),
+            "metrics": free.metrics.tolist(),
+            "evaluations": free.evaluations,
+            "refused": list(free.refused),
+            **_nuisance(free.problem),
+        },
+    }
+
+
+def _nuisance(problem: InverseProblem) -> dict[str, Any]:
+    return {
+        "starts": [trial.x0.tolist() for trial in problem.recordings],
+        "logarithms": problem.logarithms.tolist(),
+    }
+
+
+def _restore(problem: InverseProblem, kept: dict[str, Any]) -> FittedController:
+    free = kept["free"]
+    here = _problem(problem, kept)
+    weights = stage_weights(kept["Q"], kept["R"])
+    return FittedController(
+        here,
+        GainFit(
+            frozen(free["K"]),
+            frozen(free["S"]),
+            _problem(problem, free),
+            free["misfit"],
+            free["explained"],
+            free["stabilises"],
+            frozen(free["singular_values"]),
+            frozen(free["metrics"]),
+            free["evaluations"],
+            tuple(free["refused"]),
+        ),
+        weights,
+        solve_lqr(here.plant, weights),
+        kept["misfit"],
+        kept["exact"],
+        kept["converged"],
+        frozen(kept["metrics"]),
+    )
+
+
+def _problem(problem: InverseProblem, kept: dict[str, Any]) -> InverseProblem:
+    starts: Array = np.array(kept["starts"], dtype=np.float64)
+    return moved(problem, starts, np.array(kept["logarithms"], dtype=np.float64))

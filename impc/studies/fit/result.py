@@ -1,0 +1,130 @@
+"""Everything that a fit of a subject found (section 3.5), as values."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from impc.assess.diagnostics import residual_warnings
+from impc.model.riccati import solve_lqr
+
+if TYPE_CHECKING:
+    from impc.arrays import Array
+    from impc.assess.all_intervals import Certainty
+    from impc.assess.diagnostics import ResidualDiagnostics
+    from impc.assess.held_out import HeldOut
+    from impc.assess.identified_directions import Identifiability
+    from impc.assess.intent_rules import Intent
+    from impc.assess.judged import MethodFit
+    from impc.assess.printed_gain import GainEstimate
+    from impc.assess.vaf import TrialAgreement
+    from impc.inverse.noisy_fit import FittedController
+    from impc.inverse.problem import InverseProblem
+    from impc.studies.fit.settings import FitSettings
+
+__all__ = ["FitResult", "FittedParameter"]
+
+# Standard deviation of the logarithm of a parameter that the recordings tell.
+_TOLD = 0.5
+
+
+@dataclass(frozen=True)
+class FittedParameter:
+    """A physical parameter of the plant that was fitted with the gain.
+
+    Attributes
+    ----------
+    name : str
+        An argument of the plant's function.
+    nominal, value : float
+        In its unit.
+    deviation : float
+        Standard deviation of the value, in its unit; infinite when nothing determines it.
+    """
+
+    name: str
+    nominal: float
+    value: float
+    deviation: float
+
+    @property
+    def determined(self) -> bool:
+        """Whether the recordings tell it: to a factor of e at 95 %, its logarithm to 0.5.
+
+        What they do not tell stays near its nominal value, where the search began.
+        """
+        return self.deviation < _TOLD * self.value
+
+
+@dataclass(frozen=True)
+class FitResult:
+    """Result of `fit_recordings`.
+
+    Attributes
+    ----------
+    settings : FitSettings
+    given : InverseProblem
+        The problem as it was posed: nominal plant, trials at rest.
+    fitted : FittedController
+        Weights and their gain; `fitted.problem` holds the initial states and the plant found.
+    estimate : GainEstimate
+        The gain that the recordings tell, and how far: what is printed with intervals.
+    parameters : tuple of FittedParameter
+    intent : Intent
+    identifiability : Identifiability
+        Directions of the weights that the recordings determine, and how many they leave.
+    certainty : Certainty
+        Intervals, the set of weights with this gain, and what else was asked for.
+    trials : tuple of TrialAgreement
+        Of inverse MPC, one a trial.
+    held_out : tuple of HeldOut
+        One a trial; empty for a single trial or when not asked for.
+    methods : tuple of MethodFit
+        Those of `impc.assess.inverse_lqr_beside` in their order; the last is inverse MPC.
+    diagnostics : ResidualDiagnostics
+        What the residuals say against the fit.
+    terminal_set_difference : float
+        Largest change of a scaled output when the terminal set is added (or taken away); NaN when
+        the loop with it does not reach the end.
+    seconds : float
+        Time of the whole fit, s.
+    """
+
+    settings: FitSettings
+    given: InverseProblem
+    fitted: FittedController
+    estimate: GainEstimate
+    parameters: tuple[FittedParameter, ...]
+    intent: Intent
+    identifiability: Identifiability
+    certainty: Certainty
+    trials: tuple[TrialAgreement, ...]
+    held_out: tuple[HeldOut, ...]
+    methods: tuple[MethodFit, ...]
+    diagnostics: ResidualDiagnostics
+    terminal_set_difference: float
+    seconds: float
+
+    @property
+    def reported_P(self) -> Array:  # noqa: N802
+        """Terminal weight (3.4) of the reported weights (n, n)."""
+        return solve_lqr(self.fitted.problem.plant, self.intent.reported.weights).P
+
+    @property
+    def widest_angle(self) -> float:
+        """How far other weights with this gain turn the dominant direction, degrees."""
+        found = self.certainty.weights
+        over_set = 0.0 if found is None else found.widest_angle
+        return max(self.intent.widest_angle, over_set)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What has to be read before any number."""
+        saturated = sum(item.saturated for item in self.trials) / len(self.trials)
+        outputs = self.fitted.problem.plant.outputs
+        return residual_warnings(self.diagnostics, outputs, saturated)
+
+    @property
+    def inverse_mpc(self) -> MethodFit:
+        """The method that the page is about."""
+        return self.methods[-1]

@@ -1,0 +1,204 @@
+"""result.json of a fit: the numbers of the page for other programs.
+
+    vaf.<output>, held_out_vaf.<output>      %, all trials; the mean of the trials left out
+    states, controls, outputs, disturbances  names, in the order of every array below
+    K, S, Q, R, P, horizon, bounds           the controller of the weights, at R[0][0] = 1
+    estimate                                 the gain that the recordings tell, without weights: K,
+                                             deviations, directions, and which of them are told
+    intervals.<number>                       of that gain and of the parameters
+    warnings, residuals                      sentences; the tests behind them
+    intent                                   eigenvalues (ascending), dominant, sentence, readings
+    identifiability                          rank, free, chosen, singular_values
+    parameters.<name>                        nominal, value, deviation, determined
+    trials                                   label, vaf, whiteness, x0, held_out_vaf, findings
+    methods.<name>                           K, Q, R, vaf, trial_vaf, largest_input, keeps_bounds,
+                                             fell (s, one a trial)
+    plant, settings, files, versions, made
+
+Matrices are lists of rows, in SI units. What is not a number, or not determined, is null.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from impc.assess.intent_rules import dominant_sentence
+from impc.reporting.rendering import plain
+
+if TYPE_CHECKING:
+    from impc.assess.printed_gain import GainEstimate
+    from impc.reporting.provenance import FitProvenance
+    from impc.studies.fit.result import FitResult
+
+__all__ = ["fit_json"]
+
+
+def fit_json(result: FitResult, provenance: FitProvenance) -> bytes:
+    """Return result.json, UTF-8."""
+    content = _controller(result) | _found(result) | _made(result, provenance)
+    text = json.dumps(plain(content), indent=1, allow_nan=False)
+    return (text + "\n").encode()
+
+
+def _controller(result: FitResult) -> dict[str, Any]:
+    plant, solution = result.fitted.problem.plant, result.fitted.solution
+    weights = result.intent.reported.weights
+    scale = weights.R[0, 0] / result.fitted.weights.R[0, 0]
+    bounds = result.given.bounds
+    held = np.array([item.vaf for item in result.held_out])
+    return {
+        "vaf": dict(zip(plant.outputs, result.inverse_mpc.vaf, strict=True)),
+        "held_out_vaf": {
+            name: np.mean(held[:, index]) if len(held) else None
+            for index, name in enumerate(plant.outputs)
+        },
+        "states": plant.states,
+        "controls": plant.controls,
+        "outputs": plant.outputs,
+        "disturbances": plant.disturbances,
+        "K": solution.K,
+        "S": solution.S * scale,
+        "Q": weights.Q,
+        "R": weights.R,
+        "P": result.reported_P,
+        "horizon": result.fitted.problem.horizon,
+        "bounds": {name: getattr(bounds, name) for name in ("x_min", "x_max", "u_min", "u_max")},
+    }
+
+
+def _found(result: FitResult) -> dict[str, Any]:
+    found, intent = result.identifiability, result.intent
+    plant = result.fitted.problem.plant
+    return {
+        "estimate": _estimate(result.estimate),
+        "warnings": result.warnings,
+        "residuals": {
+            name: None if test is None else {**asdict(test), "found": test.found}
+            for name, test in (
+                ("loop_noise", result.diagnostics.loop),
+                ("structure", result.diagnostics.structure),
+            )
+        },
+        "intent": {
+            "eigenvalues": intent.reported.eigenvalues,
+            "vectors": intent.reported.vectors,
+            "dominant": intent.reported.dominant,
+            "sentence": dominant_sentence(intent.reported, plant, np.array(intent.sizes)),
+            "widest_angle": result.widest_angle,
+            "state_sizes": intent.sizes,
+            "readings": [
+                {
+                    "rule": item.rule,
+                    "Q": item.weights.Q,
+                    "R": item.weights.R,
+                    "condition_number": item.condition,
+                    "dominant": item.dominant,
+                    "angle": item.angle,
+                }
+                for item in intent.readings
+            ],
+            "missing": intent.missing,
+        },
+        "identifiability": {
+            "rank": found.rank,
+            "free": found.free,
+            "chosen": found.chosen,
+            "singular_values": found.singular_values,
+        },
+        **_certainty(result),
+        "parameters": {
+            item.name: {**asdict(item), "determined": item.determined} for item in result.parameters
+        },
+        "trials": [_trial(result, index) for index in range(len(result.trials))],
+        "methods": {
+            item.name: {
+                "K": item.K,
+                "Q": None if item.weights is None else item.weights.Q,
+                "R": None if item.weights is None else item.weights.R,
+                "vaf": dict(zip(plant.outputs, item.vaf, strict=True)),
+                "trial_vaf": item.trial_vaf,
+                "largest_input": item.largest_input,
+                "keeps_bounds": item.keeps_bounds,
+                "fell": item.fell,
+                "seconds": item.seconds,
+                "reason": item.reason,
+            }
+            for item in result.methods
+        },
+    }
+
+
+def _estimate(estimate: GainEstimate) -> dict[str, Any]:
+    covariance = estimate.covariance
+    return {
+        "K": estimate.K,
+        "S": estimate.S,
+        "misfit": estimate.misfit,
+        "deviations": covariance.entries,
+        "told": covariance.told_entries,
+        "singular_values": covariance.singular_values,
+        "directions": covariance.directions,
+        "direction_deviations": covariance.deviations,
+        "told_directions": covariance.told,
+        "natural_coordinates": covariance.T,
+        "natural_inputs": covariance.G,
+    }
+
+
+def _certainty(result: FitResult) -> dict[str, Any]:
+    found = result.certainty
+    preferred: dict[str, Any] = {}
+    for item in found.intervals:  # the sandwich's come first
+        told = {key: value for key, value in asdict(item).items() if key != "name"}
+        preferred.setdefault(item.name, told)
+    return {
+        "intervals": preferred,
+        "all_intervals": [asdict(item) for item in found.intervals],
+        "weights_set": None if found.weights is None else asdict(found.weights),
+        "limits": [asdict(item) for item in found.limits],
+        "alternatives": [asdict(item) for item in found.alternatives],
+    }
+
+
+def _trial(result: FitResult, index: int) -> dict[str, Any]:
+    trial, told = result.given.recordings[index], result.trials[index]
+    held = result.held_out[index] if result.held_out else None
+    return {
+        **asdict(trial.label),
+        "samples": trial.samples,
+        "findings": trial.findings,
+        "vaf": told.vaf,
+        "centred_vaf": told.centred_vaf,
+        "whiteness": told.whiteness,
+        "rms_residual": told.rms,
+        "saturated": told.saturated,
+        "x0": result.fitted.problem.recordings[index].x0,
+        "held_out_vaf": None if held is None else held.vaf,
+        "held_out_centred_vaf": None if held is None else held.centred_vaf,
+    }
+
+
+def _made(result: FitResult, provenance: FitProvenance) -> dict[str, Any]:
+    plant = result.fitted.problem.plant
+    return {
+        "plant": {
+            "name": provenance.plant_name,
+            "arguments": dict(provenance.plant_arguments),
+            "A": plant.A,
+            "B": plant.B,
+            "E": plant.E,
+            "C": plant.C,
+            "dt": plant.dt,
+        },
+        "settings": asdict(result.settings),
+        "files": provenance.files,
+        "command": provenance.command,
+        "versions": dict(provenance.versions),
+        "made": provenance.made,
+        "sha256": provenance.inputs.plain(),
+        "seconds": result.seconds,
+    }

@@ -1,0 +1,154 @@
+"""What a fit found, in sentences with numbers."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.assess.covariance import DETERMINED, TOLD
+from impc.assess.intent_rules import dominant_sentence
+from impc.reporting.rendering import number
+
+if TYPE_CHECKING:
+    from impc.assess.judged import MethodFit
+    from impc.studies.fit.result import FitResult
+
+__all__ = ["METHOD_LABELS", "direction_name", "findings", "method_note", "trial_name"]
+
+#: Methods in words, by their names.
+METHOD_LABELS = {
+    "preliminary": "preliminary gains and parameters (3.19)",
+    "feedback_gain": "feedback gain, no bounds (3.12)",
+    "inverse_lqr_gain": "inverse LQR, gain penalty (3.7)",
+    "inverse_lqr_output": "inverse LQR, output penalty (3.16)",
+    "inverse_lqr_lmi": "inverse LQR, LMI",
+    "inverse_lqr_gradient": "inverse LQR, gradient",
+    "inverse_lqr_auxiliary": "inverse LQR, gain penalty (3.7)",
+    "inverse_kkt": "inverse KKT",
+    "clipped_lqr": "LQR of inverse MPC, clipped",
+    "inverse_mpc_reduced": "inverse MPC, reduced",
+    "inverse_mpc_direct": "inverse MPC, direct (3.6)",
+    "inverse_mpc": "inverse MPC",
+}
+# Parts of a direction below this are not named.
+_NAMED = 0.15
+
+
+def findings(result: FitResult) -> tuple[str, ...]:
+    """The first lines of the page."""
+    return (
+        *result.warnings,
+        *_agreement(result),
+        *_saturation(result),
+        *_against_inverse_lqr(result),
+        dominant_sentence(
+            result.intent.reported, result.fitted.problem.plant, np.array(result.intent.sizes)
+        ),
+        _how_sure(result),
+        _determined(result),
+    )
+
+
+def trial_name(result: FitResult, index: int) -> str:
+    """Label of the trial `index`, its number where it has none."""
+    return str(result.given.recordings[index].label) or f"trial {index + 1}"
+
+
+def method_note(result: FitResult, method: MethodFit) -> str:
+    """Why a method is no explanation, in a few words; empty when it may be one."""
+    if method.K is None:
+        return method.reason
+    fell = [
+        f"{trial_name(result, index)} at {time:.1f} s"
+        for index, time in enumerate(method.fell)
+        if time is not None
+    ]
+    if fell:
+        return f"falls: {', '.join(fell)}"
+    return "" if method.keeps_bounds else "exceeds the input bound"
+
+
+def direction_name(
+    direction: np.ndarray[tuple[int, ...], np.dtype[np.float64]], names: tuple[str, ...]
+) -> str:
+    """A direction (n,) as a sum of parts called by their `names`, the largest first."""
+    order = np.argsort(-np.abs(direction), kind="stable")
+    parts = [
+        f"{direction[index]:+.2f} {names[index]}"
+        for index in order
+        if abs(direction[index]) >= _NAMED
+    ]
+    return " ".join(parts)
+
+
+def _agreement(result: FitResult) -> list[str]:
+    plant = result.fitted.problem.plant
+    lines = []
+    for index, name in enumerate(plant.outputs):
+        text = f"Inverse MPC accounts for {result.inverse_mpc.vaf[index]:.2f} % of {name} (VAF)"
+        held = [item.vaf[index] for item in result.held_out]
+        if held:
+            text += f", and for {np.mean(held):.2f} % of it in trials that the fit has not seen"
+        lines.append(text + ".")
+    return lines
+
+
+def _saturation(result: FitResult) -> list[str]:
+    limits = np.array(result.given.bounds.u_max)
+    if not np.any(np.isfinite(limits)):
+        return ["The controller was given no bound on its command."]
+    share = 100 * float(np.mean([item.saturated for item in result.trials]))
+    if share == 0:
+        return [
+            "The command never reaches its bound: these recordings cannot tell inverse MPC from "
+            "inverse LQR."
+        ]
+    return [f"The command stands at its bound for {share:.1f} % of the time."]
+
+
+def _against_inverse_lqr(result: FitResult) -> list[str]:
+    methods = {item.name: item for item in result.methods}
+    other, own = methods["inverse_lqr_output"], result.inverse_mpc
+    lines = []
+    if other.K is not None and not np.any(np.isnan(other.vaf)):
+        gain = float(np.mean(own.vaf - other.vaf))
+        kept = "keeps the bound too" if other.keeps_bounds else "exceeds the bound"
+        sign = "more" if gain >= 0 else "less"
+        lines.append(
+            f"Inverse MPC accounts for {abs(gain):.2f} points {sign} than inverse LQR on the "
+            f"outputs, which {kept} (largest command {number(float(other.largest_input[0]))})."
+        )
+    clipped = method_note(result, methods["clipped_lqr"])
+    if clipped.startswith("falls"):
+        lines.append(f"The same gain merely clipped at the bound {clipped}; inverse MPC stands.")
+    return lines
+
+
+def _how_sure(result: FitResult) -> str:
+    summary = result.certainty.weights
+    drawn = (
+        ""
+        if summary is None or not summary.drawn
+        else f" Other gains that the recordings allow turn it by up to "
+        f"{summary.angle_of_gain:.0f} degrees at 95 %."
+    )
+    return (
+        f"Other weights with exactly the same behaviour turn that direction by up to "
+        f"{result.widest_angle:.0f} degrees: so far it was chosen by a rule and not by the "
+        f"subject (section 4).{drawn}"
+    )
+
+
+def _determined(result: FitResult) -> str:
+    found, covariance = result.identifiability, result.estimate.covariance
+    values = covariance.singular_values
+    count = int(np.count_nonzero(values > DETERMINED * values[0]))
+    told = int(np.count_nonzero(covariance.told))
+    entries = int(np.count_nonzero(covariance.told_entries))
+    return (
+        f"Of the {len(values)} directions of the gain the recordings determine {count} above "
+        f"rounding and {told} to better than {TOLD:g} of their natural size; {entries} of its "
+        f"entries they tell by themselves. Of the {found.free} directions "
+        f"of the weights {found.rank}, the other {found.chosen} are a choice."
+    )

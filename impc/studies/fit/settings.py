@@ -1,0 +1,206 @@
+"""Settings of a fit, as the [fit] table of a configuration gives them (docs/fitting.md)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal
+
+import msgspec
+import numpy as np
+import scipy.signal
+
+from impc.errors import InputError, brief
+from impc.model.bounds import box_bounds
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from impc.arrays import Array
+    from impc.model.bounds import Bounds
+    from impc.model.plant import Plant
+    from impc.model.recordings import Recording
+
+__all__ = ["FitSettings", "fit_bounds", "fit_settings"]
+
+# A recorded angle is differentiated over this time, by a parabola: noise of 1 % of the largest
+# angle at 100 Hz then gives a rate of a few per cent of the largest.
+_RATE_WINDOW = 0.15
+# Percentiles of 95 % lie between replicates only from 20 on.
+_FEWEST = 20
+# Least and most of each number. The most is far beyond any use: it keeps sizes and seconds numbers.
+_RANGES: dict[str, tuple[float, float]] = {
+    "horizon": (1, 5000),
+    "margin": (1, 1000),
+    "settle": (0, 1e6),
+    "replicates": (0, 1_000_000),
+    "seed": (0, 2**63 - 1),
+}
+# A limit of an input is squared and divided by: beyond these the square is no number any more.
+_LIMITS = (1e-100, 1e100)
+
+
+@dataclass(frozen=True)
+class FitSettings:
+    """What a user may set of a fit.
+
+    Attributes
+    ----------
+    horizon : int
+        N, in samples.
+    u_max : float or list of float or None
+        Largest magnitude of each input, in its unit; None where there is no bound.
+    bounded_states : dict of str to float or "data"
+        Largest magnitude of states by name, in their SI units. "data" takes the largest recorded
+        value of an output of that name, or of the derivative of output y for a state `y_rate`,
+        times `margin` (3.22).
+    margin : float
+        At 1 the bound lies on the recorded maximum, and a controller that never met a bound would
+        meet one there: on the simulated seat a margin of 1 changes the angles by one to two
+        hundredths of a radian, 1.05 by nothing.
+    terminal_set : bool
+        Whether the controller ends in its maximal invariant set.
+    free : list of str
+        Physical parameters of the plant that are fitted with the gain (3.19).
+    feedback_states : list of str
+        States whose gains the dissertation's preliminary estimate (3.19), (3.20) fits; it is left
+        out when there are none.
+    settle : float
+        Seconds at the start of a left-out trial that serve to find its initial state and do not
+        count in its VAF.
+    held_out : bool
+        Whether each trial is predicted from the others.
+    replicates : int
+        Bootstrap replicates; 0 for none, else at least 20.
+    bootstrap : "block" or "model"
+        How residuals are drawn (`impc.assess.resampling`).
+    seed : int
+        Of the bootstrap.
+    profiles : list of str
+        Entries of the gain, K.<control>.<state>, and free parameters whose profile likelihood is
+        wanted.
+    intent_draws : bool
+        Whether statements on the intent are tried on gains that the recordings allow beside the
+        fitted one (`impc.assess.intent_draws`); without that none is made.
+    unknown_limit : bool
+        Whether the limit of each input is estimated too.
+    horizons : list of int
+        Other horizons, in samples, to compare with; and the fit without limit beside them.
+    """
+
+    horizon: int = 20
+    u_max: float | list[float] | None = None
+    bounded_states: dict[str, float | str] = field(default_factory=dict)
+    margin: float = 1.2
+    terminal_set: bool = False
+    free: list[str] = field(default_factory=list)
+    feedback_states: list[str] = field(default_factory=list)
+    settle: float = 1.0
+    held_out: bool = True
+    replicates: int = 0
+    bootstrap: Literal["block", "model"] = "block"
+    seed: int = 0
+    profiles: list[str] = field(default_factory=list)
+    intent_draws: bool = True
+    unknown_limit: bool = False
+    horizons: list[int] = field(default_factory=list)
+
+
+def fit_settings(table: Mapping[str, Any]) -> FitSettings:
+    """Read the [fit] table of a configuration.
+
+    Raises
+    ------
+    InputError
+        When a key is unknown or a value is of the wrong kind or out of range.
+    """
+    known = FitSettings.__dataclass_fields__
+    unknown = [key for key in table if key not in known]
+    if unknown:
+        raise InputError(f"[fit] {unknown[0]}", "is not a setting", f"known: {', '.join(known)}")
+    try:
+        settings = msgspec.convert(dict(table), FitSettings, strict=True)
+    except msgspec.ValidationError as error:
+        raise InputError("[fit]", str(error), "see docs/fitting.md") from None
+    for name, (least, most) in _RANGES.items():
+        _require_between(name, getattr(settings, name), least, most)
+    if 0 < settings.replicates < _FEWEST:
+        raise InputError(
+            "[fit] replicates", f"got {settings.replicates}", f"give 0 or at least {_FEWEST}"
+        )
+    for length in settings.horizons:
+        _require_between("horizons", length, *_RANGES["horizon"])
+    limits = settings.u_max if isinstance(settings.u_max, list) else [settings.u_max]
+    for limit in limits:
+        if limit is not None and limit != np.inf:
+            _require_between("u_max", limit, *_LIMITS)
+    for name, bound in settings.bounded_states.items():
+        if not isinstance(bound, str) and bound != np.inf:
+            _require_between(f"bounded_states {name}", bound, *_LIMITS)
+    _require_distinct(settings)
+    return settings
+
+
+def _require_between(name: str, value: float, least: float, most: float) -> None:
+    if not least <= value <= most:
+        raise InputError(
+            f"[fit] {name}", f"got {brief(value)}", f"give at least {least:.6g}, at most {most:.6g}"
+        )
+
+
+def _require_distinct(settings: FitSettings) -> None:
+    for name in ("free", "feedback_states", "profiles", "horizons"):
+        given = getattr(settings, name)
+        twice = [item for index, item in enumerate(given) if item in given[:index]]
+        if twice:
+            raise InputError(f"[fit] {name}", f"names {twice[0]} twice", "name each once")
+
+
+def fit_bounds(plant: Plant, settings: FitSettings, recordings: Sequence[Recording]) -> Bounds:
+    """Bounds of the controller: inputs as set, states as set or from the data (3.22).
+
+    Raises
+    ------
+    InputError, BoundsError
+        When a state is unknown or its bound cannot be taken from the data.
+    """
+    x_max = np.full(plant.n, np.inf)
+    for name, value in settings.bounded_states.items():
+        if name not in plant.states:
+            raise InputError(
+                f"[fit] bounded_states {name}", "is not a state", f"known: {list(plant.states)}"
+            )
+        limit = value
+        if isinstance(value, str):
+            limit = settings.margin * _recorded_maximum(plant, name, value, recordings)
+        x_max[plant.states.index(name)] = limit
+    u_max = None if settings.u_max is None else np.asarray(settings.u_max, dtype=np.float64)
+    if u_max is not None and u_max.shape not in ((), (plant.m,)):
+        raise InputError(
+            "[fit] u_max", f"has {len(u_max)} numbers", f"give one, or {plant.m}, one an input"
+        )
+    u_min = None if u_max is None else -u_max
+    return box_bounds(plant, x_min=-x_max, x_max=x_max, u_min=u_min, u_max=u_max)
+
+
+def _recorded_maximum(plant: Plant, name: str, word: str, recordings: Sequence[Recording]) -> float:
+    if word != "data":
+        raise InputError(f"[fit] bounded_states {name}", f"got {word!r}", 'give a number or "data"')
+    if name in plant.outputs:
+        column = plant.outputs.index(name)
+        return max(float(np.max(np.abs(trial.outputs[:, column]))) for trial in recordings)
+    base = name.removesuffix("_rate")
+    if base != name and base in plant.outputs:
+        column = plant.outputs.index(base)
+        return max(_largest_rate(trial.outputs[:, column], plant.dt) for trial in recordings)
+    raise InputError(
+        f"[fit] bounded_states {name}", "is neither an output nor the rate of one", "give a number"
+    )
+
+
+def _largest_rate(values: Array, dt: float) -> float:
+    window = max(5, 2 * round(_RATE_WINDOW / dt / 2) + 1)
+    if len(values) < window:
+        raise InputError("recording", f"has {len(values)} samples", f"give at least {window}")
+    rate = scipy.signal.savgol_filter(values, window, 2, deriv=1, delta=dt)
+    half = window // 2  # at the ends the parabola is one-sided
+    return float(np.max(np.abs(rate[half:-half])))

@@ -1,0 +1,278 @@
+"""Section 3.5 as one function: from the recordings of a subject to a `FitResult`.
+
+Preliminary gain and physical parameters (3.19), bounds (3.22), weights of the constrained
+controller over all trials at once with an initial state for each, VAF (3.24) in and out of sample,
+intent (3.23) to (3.26), and the same recordings by inverse LQR.
+"""
+
+from __future__ import annotations
+
+import functools
+import time
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.arrays import Array, frozen
+from impc.assess.all_intervals import assess, count_stages
+from impc.assess.delayed_feedback import PreliminaryGain, preliminary_gain
+from impc.assess.diagnostics import residual_diagnostics
+from impc.assess.held_out import predict
+from impc.assess.identified_directions import identifiability
+from impc.assess.intent_draws import drawn_gains
+from impc.assess.intent_rules import intent
+from impc.assess.inverse_lqr_beside import compare_methods
+from impc.assess.printed_gain import gain_estimate
+from impc.assess.vaf import agreement
+from impc.assess.weights_ranges import weights_summary_or_reason
+from impc.checking import checked
+from impc.control.closed_loop import simulate
+from impc.errors import DataError, SolverError
+from impc.inverse.noisy_fit import FittedController, fit_controller
+from impc.inverse.problem import InverseProblem, controller_for, inverse_problem, scenarios
+from impc.studies.fit.result import FitResult, FittedParameter
+from impc.studies.fit.settings import FitSettings, fit_bounds
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+
+    from impc.assess.printed_gain import GainEstimate
+    from impc.assess.resampling import Replicate
+    from impc.model.plant import Plant
+    from impc.model.plant_family import PlantFamily
+    from impc.model.recordings import Recording
+    from impc.model.riccati import LqrSolution
+
+__all__ = ["FitProgress", "fit_problem", "fit_recordings", "stages"]
+
+_THREADS = 2
+
+
+@dataclass(frozen=True)
+class FitProgress:
+    """What a caller wants to hear of a fit, and what it remembers of an earlier one.
+
+    Attributes
+    ----------
+    done : callable
+        Told the name of each stage when it is done.
+    controller : callable
+        (name of stage, its problem) -> the controller fitted to it, from memory when it is there
+        (`impc.studies.fit.memory`). By default every one is computed.
+    replicate : callable
+        (name of stage, compute) -> a bootstrap replicate, in the same way.
+    """
+
+    done: Callable[[str], None] = lambda _: None
+    controller: Callable[[str, InverseProblem], FittedController] = lambda _, problem: (
+        fit_controller(problem)
+    )
+    replicate: Callable[[str, Callable[[], Replicate]], Replicate] = lambda _, compute: compute()
+
+
+def stages(problem: InverseProblem, settings: FitSettings) -> int:
+    """Number of stages that `fit_recordings` reports."""
+    methods = 6 if settings.feedback_states else 5
+    trials = len(problem.recordings)
+    left_out = trials if _leaves_out(trials, settings) else 0
+    return 1 + methods + left_out + count_stages(problem, settings)
+
+
+@checked
+def fit_problem(
+    plant: Plant,
+    recordings: Sequence[Recording],
+    settings: FitSettings,
+    family: PlantFamily | None = None,
+) -> InverseProblem:
+    """Pose the inverse problem of a subject: outputs scaled by their size, starts unknown.
+
+    Raises
+    ------
+    DataError, InputError, BoundsError
+        When there is no recording, an output is zero throughout, or a bound cannot be set.
+    """
+    if not recordings:
+        raise DataError("recordings", "there are none", "give at least one trial")
+    outputs = np.concatenate([trial.outputs for trial in recordings])
+    scale = np.sqrt(np.mean(outputs**2, axis=0))
+    for name, size in zip(plant.outputs, scale, strict=True):
+        if size == 0:
+            raise DataError(f"output {name}", "is zero in every trial", "check its column")
+    shortest = min(trial.samples for trial in recordings)
+    least = round(settings.settle / plant.dt) + plant.n
+    if shortest <= least:
+        raise DataError(
+            "recordings",
+            f"the shortest has {shortest} samples, {least} serve to find where it starts",
+            "give longer ones, or lower [fit] settle",
+        )
+    return inverse_problem(
+        plant,
+        fit_bounds(plant, settings, recordings),
+        settings.horizon,
+        tuple(_first_guess(plant, trial) for trial in recordings),
+        terminal_set=settings.terminal_set,
+        output_scale=scale,
+        unknown_start=True,
+        family=family,
+    )
+
+
+def fit_recordings(
+    problem: InverseProblem, settings: FitSettings, progress: FitProgress | None = None
+) -> FitResult:
+    """Fit a subject.
+
+    Parameters
+    ----------
+    problem : InverseProblem
+        Of `fit_problem`.
+    settings : FitSettings
+    progress : FitProgress, optional
+
+    Raises
+    ------
+    WeightsError, SolverError
+        When no regulator can be simulated on these recordings, or no weights are found.
+    """
+    progress = progress or FitProgress()
+    started = time.perf_counter()
+    fitted = progress.controller("fit", problem)
+    progress.done("inverse MPC")
+    estimate = gain_estimate(fitted)
+    known = replace(fitted.problem, unknown_start=False, family=None, logarithms=frozen([]))
+    plant, K, metrics = known.plant, np.array(fitted.solution.K), np.array(fitted.metrics)
+    sizes = _state_sizes(known, fitted)
+    with _threads() as pool:
+        others = _left_out(pool, problem, settings, progress)
+        draws: tuple[LqrSolution, ...] = ()
+        if settings.intent_draws:
+            draws = drawn_gains(plant, fitted.weights, estimate.K, estimate.covariance)
+        whole_set = pool.submit(weights_summary_or_reason, plant, K, metrics, sizes, draws)
+        methods = compare_methods(fitted, progress.done, _preliminary(problem, settings))
+        held_out = []
+        for index, other in enumerate(others):
+            held_out.append(predict(problem, other.result(), fitted, index, settings.settle))
+            progress.done(_without(index))
+        weights_found = whole_set.result()
+        progress.done("set of weights")
+    runs, bounds = methods[-1].runs, problem.bounds
+    certainty = assess(
+        problem, fitted, estimate, weights_found, settings, progress.done, progress.replicate
+    )
+    return FitResult(
+        settings,
+        problem,
+        fitted,
+        estimate,
+        _parameters(estimate),
+        intent(plant, K, metrics, sizes, fitted.weights),
+        identifiability(known, fitted.weights),
+        certainty,
+        tuple(
+            agreement(plant, trial, run, np.array(bounds.u_min), np.array(bounds.u_max))
+            for trial, run in zip(known.recordings, runs, strict=True)
+        ),
+        tuple(held_out),
+        methods,
+        residual_diagnostics(fitted.problem, K, np.array(fitted.solution.S)),
+        _terminal_set_difference(known, fitted),
+        time.perf_counter() - started,
+    )
+
+
+def _first_guess(plant: Plant, trial: Recording) -> Recording:
+    """Where the search for x0 starts: at rest, or in the first output when nothing drives it."""
+    if np.any(trial.disturbance) or np.any(trial.x0):
+        return trial
+    return replace(trial, x0=frozen(np.linalg.pinv(plant.C) @ trial.outputs[0]))
+
+
+def _preliminary(
+    problem: InverseProblem, settings: FitSettings
+) -> Callable[[], PreliminaryGain] | None:
+    if not settings.feedback_states:
+        return None
+    return functools.partial(preliminary_gain, problem, settings.feedback_states)
+
+
+def _leaves_out(trials: int, settings: FitSettings) -> bool:
+    return settings.held_out and trials > 1
+
+
+@contextmanager
+def _threads() -> Iterator[ThreadPoolExecutor]:
+    """A few threads: the compiled loop and the semidefinite solver let others run.
+
+    When the block is left early, by an error or from the keyboard, what is not begun is not begun.
+    """
+    pool = ThreadPoolExecutor(_THREADS)
+    try:
+        yield pool
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _left_out(
+    pool: ThreadPoolExecutor, problem: InverseProblem, settings: FitSettings, progress: FitProgress
+) -> list[Future[FittedController]]:
+    """Controllers fitted to all trials but one."""
+    pending = []
+    for index in range(len(problem.recordings)):
+        if _leaves_out(len(problem.recordings), settings):
+            others = problem.recordings[:index] + problem.recordings[index + 1 :]
+            part = replace(problem, recordings=others)
+            pending.append(pool.submit(progress.controller, _without(index), part))
+    return pending
+
+
+def _without(index: int) -> str:
+    return f"without trial {index + 1}"
+
+
+def _parameters(estimate: GainEstimate) -> tuple[FittedParameter, ...]:
+    family = estimate.problem.family
+    if family is None:
+        return ()
+    return tuple(
+        FittedParameter(name, float(nominal), float(value), float(value * deviation))
+        for name, nominal, value, deviation in zip(
+            family.names,
+            family.nominal,
+            estimate.parameters,
+            estimate.covariance.parameters,
+            strict=True,
+        )
+    )
+
+
+def _state_sizes(known: InverseProblem, fitted: FittedController) -> Array:
+    """Root-mean-square of each state; states that never move count as the least that does."""
+    controller = controller_for(known, np.array(fitted.solution.K), np.array(fitted.solution.S))
+    x = np.concatenate([simulate(controller, drive).x for drive in scenarios(known)])
+    sizes = np.sqrt(np.mean(x**2, axis=0))
+    moving = sizes[sizes > 0]
+    if len(moving) == 0:
+        raise SolverError("simulation", "no state moves", "check the disturbance's column")
+    return np.asarray(np.maximum(sizes, np.min(moving)))
+
+
+def _terminal_set_difference(problem: InverseProblem, fitted: FittedController) -> float:
+    K, S = np.array(fitted.solution.K), np.array(fitted.solution.S)
+    pair = [
+        [
+            simulate(controller_for(replace(problem, terminal_set=with_set), K, S), drive)
+            for drive in scenarios(problem)
+        ]
+        for with_set in (False, True)
+    ]
+    if not all(run.complete for runs in pair for run in runs):
+        return float("nan")
+    return max(
+        float(np.max(np.abs((a.x - b.x) @ problem.plant.C.T / problem.output_scale)))
+        for a, b in zip(*pair, strict=True)
+    )

@@ -1,0 +1,220 @@
+"""What a fit can and cannot tell, as tables and sentences of its page."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.assess.intervals import entry_names
+from impc.assess.other_models import verdict
+from impc.reporting.rendering import TextTable, number
+
+if TYPE_CHECKING:
+    from impc.assess.all_intervals import Certainty
+    from impc.assess.intent_statements import Statement
+    from impc.assess.intervals import Interval
+    from impc.assess.weights_ranges import WeightsSummary
+    from impc.studies.fit.result import FitResult
+
+__all__ = [
+    "alternatives_table",
+    "eigenvalues_table",
+    "entries_table",
+    "intervals_table",
+    "limit_sentences",
+    "prices_table",
+    "set_sentences",
+    "statements_table",
+]
+
+_METHODS = {
+    "sandwich": "colour of the residuals",
+    "cramer-rao": "as if they were white",
+    "block": "block bootstrap",
+    "model": "model bootstrap",
+    "profile": "profile likelihood",
+}
+_NO_ENDS = "not determined"
+
+
+def intervals_table(result: FitResult) -> TextTable:
+    """Intervals of every number, a column for each method, beside the gain of the weights."""
+    certainty, plant = result.certainty, result.fitted.problem.plant
+    of_weights = dict(zip(entry_names(plant), np.ravel(result.fitted.solution.K), strict=True))
+    methods = [key for key in _METHODS if any(item.method == key for item in certainty.intervals)]
+    found = {(item.name, item.method): item for item in certainty.intervals}
+    names = list(dict.fromkeys(item.name for item in certainty.intervals))
+    rows = []
+    for name in names:
+        known = [found[name, method] for method in methods if (name, method) in found]
+        value = known[0].value
+        cells = []
+        for method in methods:
+            item = found.get((name, method))
+            cells.append("-" if item is None else _told(item))
+        shown = "not determined" if value is None else number(value, 4)
+        theirs = number(float(of_weights[name]), 4) if name in of_weights else "-"
+        rows.append((name, shown, *cells, theirs))
+    level = certainty.intervals[0].level
+    caption = (
+        f"What the recordings tell, with intervals of {100 * level:.0f} %. Where residuals are "
+        "coloured, as those of people are, the second column is too narrow. An entry that is not "
+        "told takes part in directions that hardly show in the recordings: within the range in "
+        "brackets it cannot be told from others, and the table of directions says which "
+        "combinations are. The last column is the gain of the reported weights. A rule chose "
+        "them, so it has no interval of its own: outside the estimate's, these weights do not "
+        "quite behave as the recordings do."
+    )
+    heads = ("number", "value", *(_METHODS[method] for method in methods), "gain of the weights")
+    return TextTable(caption, heads, tuple(rows))
+
+
+def set_sentences(summary: WeightsSummary) -> tuple[str, ...]:
+    """What the set of weights is, and what becomes of the dominant direction over it."""
+    kept = "survives" if summary.widest_angle < 10 else "does not survive"
+    return (
+        f"The recordings give the gain. Weights with exactly that gain form a convex set of "
+        f"{summary.dimension} dimensions, all with the same behaviour; the ranges below are over "
+        f"its members with a condition number up to {summary.limit:.2g}, ten times the least.",
+        f"The dominant direction {kept} over the set: it turns by up to "
+        f"{summary.widest_angle:.0f} degrees (found by search; more may be possible).",
+        *_over_drawn(summary),
+        "The condition number depends on the units of the states, and so does the member that it "
+        "chooses. The analytic centre does not.",
+    )
+
+
+def _over_drawn(summary: WeightsSummary) -> tuple[str, ...]:
+    if not summary.drawn:
+        return ()
+    return (
+        f"The gain is an estimate too: over {summary.drawn} others that the recordings allow the "
+        f"dominant direction of the weights of least condition number turns by up to "
+        f"{summary.angle_of_gain:.0f} degrees (95 %).",
+    )
+
+
+def statements_table(summary: WeightsSummary) -> TextTable:
+    """Statements that hold for every member, and those that members disagree on."""
+    rows = tuple(
+        (item.says, _verdict(item), _over_gains(item), f"{item.low:.3g} to {item.high:.3g}")
+        for item in sorted(summary.statements, key=lambda item: (not item.made, item.holds is None))
+    )
+    tried = (
+        f"The gain is an estimate: each statement was tried on {summary.drawn} other gains that "
+        "the recordings allow. One that holds for all weights of all gains but one at most may be "
+        "made of the subject, at 95 %."
+        if summary.drawn
+        else "The gain is an estimate, and other gains were not tried ([fit] intent_draws): none "
+        "may be made of the subject."
+    )
+    caption = (
+        "Statements on the states that are recorded or cost most, at the size that they have in "
+        f"the recordings. {tried} The range is that of the difference, or of the mixed price, over "
+        "the price of the state named first, at the fitted gain."
+    )
+    heads = ("statement", "at 95 %", "other gains that agree", "range at the fitted gain")
+    return TextTable(caption, heads, rows)
+
+
+def prices_table(summary: WeightsSummary) -> TextTable | None:
+    """Prices of the named states, for the fitted gain and for all that the recordings allow."""
+    if not summary.prices:
+        return None
+    rows = tuple(
+        (
+            item.state,
+            f"{number(item.low)} to {number(item.high)}",
+            f"{number(item.low_drawn)} to {number(item.high_drawn)}",
+        )
+        for item in summary.prices
+    )
+    caption = (
+        "What a typical excursion costs, d^2 Q at trace R = m, over all weights: with the fitted "
+        f"gain, and with it or any of {summary.drawn} others that the recordings allow (95 %)."
+    )
+    return TextTable(caption, ("state", "fitted gain", "95 % interval"), rows)
+
+
+def entries_table(summary: WeightsSummary) -> TextTable:
+    """Ranges of entries of Q."""
+    rows = tuple(
+        (f"Q {item.first}, {item.second}", number(item.low), number(item.high))
+        for item in summary.entries
+    )
+    caption = "Range of entries of Q over the set, at trace R = m, by semidefinite programs."
+    return TextTable(caption, ("entry", "least", "most"), rows)
+
+
+def eigenvalues_table(summary: WeightsSummary) -> TextTable:
+    """Ranges of eigenvalues of Q."""
+    count = len(summary.eigenvalues)
+    rows = tuple(
+        (
+            str(count - index),
+            number(item.low) + (" (proved)" if item.low_proved else ""),
+            number(item.high) + (" (proved)" if item.high_proved else ""),
+        )
+        for index, item in reversed(list(enumerate(summary.eigenvalues)))
+    )
+    caption = (
+        "Range of the eigenvalues of Q over the set, largest first. Ends that are not proved are "
+        "values that some member has; others may go farther."
+    )
+    return TextTable(caption, ("eigenvalue", "least", "most"), rows)
+
+
+def limit_sentences(certainty: Certainty) -> tuple[str, ...]:
+    """What the recordings say of the input limit."""
+    return tuple(
+        item.reason[0].upper()
+        + item.reason[1:]
+        + f" (distance of no limit {item.against_none:.1f}, threshold {item.quantile:.1f}; "
+        + f"interval {_range(item.low, item.high)})."
+        for item in certainty.limits
+    )
+
+
+def alternatives_table(certainty: Certainty) -> TextTable | None:
+    """The fit beside other horizons and no limit."""
+    if not certainty.alternatives:
+        return None
+    first = certainty.alternatives[0]
+    rows = []
+    for item in certainty.alternatives:
+        said = "" if item is first else verdict(first, item)
+        rows.append(
+            (item.name, str(item.horizon), number(item.aic), number(item.held_out, 5), said)
+        )
+    caption = (
+        "The same recordings with other horizons and without limit. AIC is above the least, for "
+        "the innovations of the residuals; VAF is of trials left out."
+    )
+    heads = ("fit", "horizon", "AIC above the least", "left out VAF %", "the recordings say")
+    return TextTable(caption, heads, tuple(rows))
+
+
+def _verdict(item: Statement) -> str:
+    if not item.made:
+        return "not made"
+    return "true for all" if item.holds else "false for all"
+
+
+def _told(item: Interval) -> str:
+    ends = _range(item.low, item.high)
+    return ends if item.told or ends == _NO_ENDS else f"not told ({ends})"
+
+
+def _over_gains(item: Statement) -> str:
+    if item.holds is None:
+        return "weights of the fitted gain disagree"
+    return "not tried" if item.confidence is None else f"{100 * item.confidence:.0f} %"
+
+
+def _range(low: float, high: float) -> str:
+    if low == -float("inf") and high == float("inf"):
+        return _NO_ENDS
+    left = "no end" if low == -float("inf") else number(low, 4)
+    right = "no end" if high == float("inf") else number(high, 4)
+    return f"{left} to {right}"

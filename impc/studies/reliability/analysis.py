@@ -1,0 +1,305 @@
+"""The reliability of a study: every measure by output and condition, over subjects and visits.
+
+A score is the mean over the last trials of a visit (three, as in chapter 2). A subject who lacks a
+visit is left out of that analysis, and the result says so.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.errors import DataError
+from impc.studies.reliability.anova import learning_trend, paired_tests, visit_anova
+from impc.studies.reliability.cmc import cmc_between, cmc_within
+from impc.studies.reliability.icc import icc, measurement_error
+from impc.studies.reliability.measures import band_energy, passband, rms
+from impc.studies.reliability.transfer import transfer_function
+from impc.studies.reliability.variance_components import variance_components
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from impc.arrays import Array
+    from impc.model.recordings import Recording
+    from impc.studies.reliability.anova import Anova, PairedTest, Trend
+    from impc.studies.reliability.icc import Form, Icc, MeasurementError
+    from impc.studies.reliability.measures import Passband
+    from impc.studies.reliability.transfer import TransferFunction
+    from impc.studies.reliability.variance_components import VarianceComponent
+
+__all__ = [
+    "MEASURES",
+    "CmcResult",
+    "MeasureResult",
+    "Reliability",
+    "Trials",
+    "analyse",
+]
+
+#: Name of a measure -> what it is.
+MEASURES = {"rms": "root-mean-square about upright", "energy": "mean bandpass signal energy (2.1)"}
+_FORM: Form = "A,k"
+
+
+@dataclass(frozen=True)
+class Trials:
+    """Recordings of a study.
+
+    Attributes
+    ----------
+    outputs : tuple of str
+        Names, in the order of the recordings' columns.
+    rate : float
+        Samples per second.
+    cells : mapping
+        (subject, visit, condition) -> the trials analysed, in order.
+    """
+
+    outputs: tuple[str, ...]
+    rate: float
+    cells: Mapping[tuple[str, str, str], tuple[Recording, ...]]
+
+    def labels(self, index: int) -> tuple[str, ...]:
+        """Subjects (`index` 0), visits (1) or conditions (2) in the order in which they come."""
+        return tuple(dict.fromkeys(key[index] for key in self.cells))
+
+
+@dataclass(frozen=True)
+class MeasureResult:
+    """One measure of one output in one condition.
+
+    Attributes
+    ----------
+    measure, output, condition : str
+        Of which, by name; the measure is one of `MEASURES`.
+    scores : Array
+        (subjects, visits), NaN where a cell is missing, in the output's unit (squared for energy).
+    icc : Icc or None
+        (A,k), between visits, with the generalised interval.
+    error : MeasurementError or None
+        Of the score of one visit, with the minimal detectable change (95 %), in the score's unit.
+    anova : Anova or None
+    pairs : tuple of PairedTest
+    trend : Trend or None
+        Learning: change from visit to visit.
+    components : tuple of VarianceComponent
+        Of subjects, visits and trials; empty when trials are too few.
+    notes : tuple of str
+        Why something is missing.
+    """
+
+    measure: str
+    output: str
+    condition: str
+    scores: Array
+    icc: Icc | None
+    error: MeasurementError | None
+    anova: Anova | None
+    pairs: tuple[PairedTest, ...]
+    trend: Trend | None
+    components: tuple[VarianceComponent, ...]
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class CmcResult:
+    """Coefficients of multiple correlation of one output in one condition, by subject.
+
+    Attributes
+    ----------
+    output, condition : str
+        Of which, by name.
+    within, between : Array
+        (subjects,), NaN where there is none.
+    undefined : int
+        How many are the root of a negative number.
+    """
+
+    output: str
+    condition: str
+    within: Array
+    between: Array
+    undefined: int
+
+
+@dataclass(frozen=True)
+class Reliability:
+    """Everything that is found of a study.
+
+    Attributes
+    ----------
+    subjects, visits, conditions, outputs : tuple of str
+        Names, in the order of the study.
+    band : Passband
+        Of the input.
+    measures : tuple of MeasureResult
+    cmc : tuple of CmcResult
+    responses : mapping
+        (subject, visit, condition) -> transfer function, average over trials.
+    notes : tuple of str
+        On the study as a whole.
+    """
+
+    subjects: tuple[str, ...]
+    visits: tuple[str, ...]
+    conditions: tuple[str, ...]
+    outputs: tuple[str, ...]
+    band: Passband
+    measures: tuple[MeasureResult, ...]
+    cmc: tuple[CmcResult, ...]
+    responses: Mapping[tuple[str, str, str], TransferFunction]
+    notes: tuple[str, ...]
+
+
+def analyse(trials: Trials) -> Reliability:
+    """Analyse a study.
+
+    Raises
+    ------
+    DataError
+        When there is no trial, or the input is constant.
+    """
+    if not trials.cells:
+        raise DataError("study", "has no trial", "check where it looks for recordings")
+    subjects, visits, conditions = (trials.labels(index) for index in range(3))
+    samples = min(item.samples for cell in trials.cells.values() for item in cell)
+    longest = max(item.samples for cell in trials.cells.values() for item in cell)
+    notes = []
+    if longest > samples:
+        notes.append(f"Trials have {samples} to {longest} samples: all were cut to {samples}.")
+    first = next(iter(trials.cells.values()))[0]
+    band = passband(first.disturbance[:samples, 0], trials.rate)
+    measures, cmc = [], []
+    for condition in conditions:
+        for output in range(len(trials.outputs)):
+            for name in MEASURES:
+                table = _trial_scores(trials, name, output, condition, band, samples)
+                measures.append(_measure(name, trials.outputs[output], condition, table, visits))
+            cmc.append(_cmc(trials, output, condition, band, samples))
+    responses = {
+        key: transfer_function(
+            [item.disturbance[:samples, 0] for item in cell],
+            [item.outputs[:samples] for item in cell],
+            trials.rate,
+            band,
+        )
+        for key, cell in trials.cells.items()
+    }
+    return Reliability(
+        subjects,
+        visits,
+        conditions,
+        trials.outputs,
+        band,
+        tuple(measures),
+        tuple(cmc),
+        responses,
+        tuple(notes),
+    )
+
+
+def _trial_scores(
+    trials: Trials, measure: str, output: int, condition: str, band: Passband, samples: int
+) -> list[list[list[float]]]:
+    """Scores of every trial, by subject and visit; an empty list where a cell is missing."""
+
+    def score(trial: Recording) -> float:
+        values = trial.outputs[:samples, output : output + 1]
+        if measure == "rms":
+            return float(rms(values)[0])
+        return float(band_energy(values, trials.rate, band.low, band.high)[0])
+
+    return [
+        [
+            [score(item) for item in trials.cells.get((subject, visit, condition), ())]
+            for visit in trials.labels(1)
+        ]
+        for subject in trials.labels(0)
+    ]
+
+
+def _measure(
+    measure: str,
+    output: str,
+    condition: str,
+    table: list[list[list[float]]],
+    visits: tuple[str, ...],
+) -> MeasureResult:
+    scores = np.array([[np.mean(cell) if cell else np.nan for cell in row] for row in table])
+    notes: list[str] = []
+    found, measured, anova, trend = None, None, None, None
+    pairs: tuple[PairedTest, ...] = ()
+    try:
+        found = icc(scores, _FORM, method="generalised")
+        measured = measurement_error(scores)
+        if found.left_out:
+            notes.append(f"{found.left_out} subjects lack a visit and are left out")
+        anova = visit_anova(scores)
+        pairs = paired_tests(scores, visits)
+        trend = learning_trend(scores)
+    except DataError as error:
+        notes.append(str(error))
+    components: tuple[VarianceComponent, ...] = ()
+    try:
+        components = variance_components(_even(table))
+    except DataError as error:
+        notes.append(f"variance components: {error}")
+    return MeasureResult(
+        measure,
+        output,
+        condition,
+        scores,
+        found,
+        measured,
+        anova,
+        pairs,
+        trend,
+        components,
+        tuple(notes),
+    )
+
+
+def _even(table: list[list[list[float]]]) -> Array:
+    """Scores (subjects, visits, trials) of the subjects with all visits, trials cut alike."""
+    complete = [row for row in table if all(row)]
+    if not complete:
+        raise DataError("scores", "are complete for no subject", "record every visit")
+    fewest = min(len(cell) for row in complete for cell in row)
+    return np.array([[cell[-fewest:] for cell in row] for row in complete])
+
+
+def _cmc(trials: Trials, output: int, condition: str, band: Passband, samples: int) -> CmcResult:
+    within, between, undefined = [], [], 0
+    for subject in trials.labels(0):
+        cells = [trials.cells.get((subject, visit, condition), ()) for visit in trials.labels(1)]
+        present = [cell for cell in cells if cell]
+        fewest = min((len(cell) for cell in present), default=0)
+        pair = [float("nan"), float("nan")]
+        if fewest:
+            curves = np.array(
+                [
+                    [_curve(item, trials.rate, band, samples, output) for item in cell[-fewest:]]
+                    for cell in present
+                ]
+            )
+            for place, (make, count) in enumerate(
+                ((cmc_within, curves.shape[1]), (cmc_between, curves.shape[0]))
+            ):
+                if count > 1:
+                    pair[place] = make(curves)
+                    undefined += np.isnan(pair[place])
+        within.append(pair[0])
+        between.append(pair[1])
+    return CmcResult(
+        trials.outputs[output], condition, np.array(within), np.array(between), int(undefined)
+    )
+
+
+def _curve(trial: Recording, rate: float, band: Passband, samples: int, output: int) -> Array:
+    found = transfer_function(
+        [trial.disturbance[:samples, 0]], [trial.outputs[:samples]], rate, band
+    )
+    return np.asarray(found.response[:, output])

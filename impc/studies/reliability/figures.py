@@ -1,0 +1,121 @@
+"""Figures of a reliability study: counterparts of figures 2.3 to 2.6."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy.signal
+
+from impc.reporting.style import (
+    BLUE,
+    DOUBLE_COLUMN,
+    FORBIDDEN,
+    GREEN,
+    INK,
+    VERMILLION,
+    journal_style,
+    new_figure,
+    render,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from matplotlib.figure import Figure
+
+    from impc.studies.reliability.analysis import Reliability, Trials
+
+__all__ = ["reliability_figures"]
+
+_LINES = ((BLUE, "-"), (VERMILLION, "--"), (GREEN, ":"), (INK, "-."))
+
+
+def reliability_figures(trials: Trials, result: Reliability) -> dict[str, bytes]:
+    """Draw all figures: PNG and PDF by file name."""
+    first = (result.subjects[0], result.visits[0], result.conditions[0])
+    with journal_style():
+        figures = {
+            "time-series": _time_series(trials, result),
+            "spectra": _spectra(trials, result),
+            "transfer-visits": _responses(
+                result, [(first[0], visit, first[2]) for visit in result.visits[:4]], 1, "visit"
+            ),
+            "transfer-subjects": _responses(
+                result, [(name, first[1], first[2]) for name in result.subjects[:4]], 0, "subject"
+            ),
+        }
+        return {
+            f"{name}.{kind}": content
+            for name, figure in figures.items()
+            for kind, content in render(figure).items()
+        }
+
+
+def _time_series(trials: Trials, result: Reliability) -> Figure:
+    """Figure 2.3: input and outputs of one trial."""
+    trial = next(iter(trials.cells.values()))[0]
+    time = np.arange(trial.samples) / trials.rate
+    rows = 1 + len(result.outputs)
+    figure = new_figure(DOUBLE_COLUMN, 1.2 * rows + 0.4)
+    axes = figure.subplots(rows, 1, sharex=True)
+    axes[0].step(time, trial.disturbance[:, 0], where="post", color=INK, linewidth=0.9)
+    axes[0].set_ylabel("perturbation\n(N m)")
+    for index, name in enumerate(result.outputs):
+        ax = axes[1 + index]
+        ax.plot(time, np.degrees(trial.outputs[:, index]), color=BLUE, linewidth=1.0)
+        ax.set_ylabel(f"{name}\n(deg)")
+    axes[-1].set_xlabel("time (s)")
+    for place, ax in enumerate(axes):
+        ax.set_title(f"({'ABCDEFG'[place]})", loc="left")
+    return figure
+
+
+def _spectra(trials: Trials, result: Reliability) -> Figure:
+    """Figure 2.4: power of input and outputs of one trial, the passband shaded."""
+    trial = next(iter(trials.cells.values()))[0]
+    figure = new_figure(DOUBLE_COLUMN, 2.6)
+    axes = figure.subplots(1, 1 + len(result.outputs))
+    excited = result.band.excited
+    signals = [("perturbation", trial.disturbance[:, 0], "N²m²/Hz")]
+    signals += [
+        (name, np.degrees(trial.outputs[:, index]), "deg²/Hz")
+        for index, name in enumerate(result.outputs)
+    ]
+    for ax, (name, values, unit) in zip(axes, signals, strict=True):
+        frequency, power = scipy.signal.periodogram(values, trials.rate, detrend=False)
+        inside = excited[excited < len(power)]
+        ax.axvspan(result.band.low, result.band.high, color=FORBIDDEN, zorder=0)
+        ax.loglog(
+            frequency[inside], power[inside], color=BLUE, marker=".", markersize=2, linewidth=0.6
+        )
+        ax.set_xlabel("frequency (Hz)")
+        ax.set_ylabel(f"{name} ({unit})")
+    return figure
+
+
+def _responses(
+    result: Reliability, keys: Sequence[tuple[str, str, str]], varied: int, word: str
+) -> Figure:
+    """Figures 2.5 and 2.6: amplitude and phase of the averaged estimates of several cells."""
+    figure = new_figure(DOUBLE_COLUMN, 3.6)
+    axes = figure.subplots(2, len(result.outputs), sharex=True, squeeze=False)
+    for (color, line), key in zip(_LINES, keys, strict=False):
+        found = result.responses.get(key)
+        if found is None:
+            continue
+        for index in range(len(result.outputs)):
+            response = np.degrees(1.0) * found.response[:, index]
+            label = f"{word} {key[varied]}"
+            axes[0, index].loglog(
+                found.frequency, np.abs(response), color=color, linestyle=line, label=label
+            )
+            phase = np.degrees(np.unwrap(np.angle(response)))
+            axes[1, index].semilogx(found.frequency, phase, color=color, linestyle=line)
+    for index, name in enumerate(result.outputs):
+        axes[0, index].set_title(f"({'AB'[index % 2]}) {name}", loc="left")
+        axes[1, index].set_xlabel("frequency (Hz)")
+        axes[0, index].set_ylabel("amplitude (deg/(N m))")
+        axes[1, index].set_ylabel("phase (deg)")
+    axes[0, 0].legend(loc="lower left")
+    return figure

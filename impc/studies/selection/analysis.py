@@ -1,0 +1,145 @@
+"""Sensitive parameters of a study (chapter 4): per subject, in common, and for all at once."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.errors import DataError
+from impc.studies.selection.subject import (
+    Chosen,
+    Doubts,
+    Nominal,
+    fit_chosen,
+    fit_nominal,
+    raise_doubts,
+)
+from impc.studies.selection.subsets import largest_subsets, sweep
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from impc.arrays import Array
+    from impc.studies.selection.model import Trial
+    from impc.studies.selection.queue import Runner
+    from impc.studies.selection.settings import SelectSettings
+    from impc.studies.selection.subsets import Selection
+
+__all__ = ["StudySelection", "select_study"]
+
+
+@dataclass(frozen=True)
+class StudySelection:
+    """The study.
+
+    Attributes
+    ----------
+    nominal : mapping
+        Subject (and visit) -> all parameters fitted, information, feasible subsets.
+    worst_case : tuple of Selection
+        (5.5): the variance holds for every subject and visit; a sweep.
+    intersection : tuple of tuple of int
+        Subsets that are among the largest of every subject at the bound (chapter 4).
+    free : tuple of int
+        The subset that is refitted: the best of the worst case at the bound, or at the first bound
+        of the sweep that has one; failing that the most frequent of the subjects'.
+    chosen : mapping
+        Subject -> refit of that subset, intervals, LASSO.
+    lasso : tuple of int
+        What the LASSO selects most often.
+    doubts : Doubts
+        Of the first subject.
+    seconds : mapping
+        "fim", "lasso" and, when it was asked for, "nelder_mead": time in s, mean over subjects.
+    """
+
+    nominal: Mapping[str, Nominal]
+    worst_case: tuple[Selection, ...]
+    intersection: tuple[tuple[int, ...], ...]
+    free: tuple[int, ...]
+    chosen: Mapping[str, Chosen]
+    lasso: tuple[int, ...]
+    doubts: Doubts
+    seconds: Mapping[str, float]
+
+
+def select_study(
+    recorded: Mapping[str, Sequence[Trial]], settings: SelectSettings, run: Runner
+) -> StudySelection:
+    """Select sensitive parameters.
+
+    Parameters
+    ----------
+    recorded : mapping
+        Subject (and visit) -> trials.
+    settings : SelectSettings
+    run : Runner
+        Has the model, and does the work of each subject.
+
+    Raises
+    ------
+    DataError
+        When there is no subject, or no subset is feasible.
+    """
+    if not recorded:
+        raise DataError("study", "has no subject", "check where it looks for recordings")
+    trials = {name: tuple(item) for name, item in recorded.items()}
+    nominal = run(fit_nominal, Nominal, {name: (trials[name], settings) for name in trials})
+    informations = [np.asarray(item.information.F) for item in nominal.values()]
+    worst = sweep(informations, settings.bounds, settings.least)
+    free = _free(informations, worst, nominal, settings)
+    chosen = run(fit_chosen, Chosen, {name: (trials[name], settings, free) for name in trials})
+    first = next(iter(trials))
+    asked = {first: (trials[first], settings, nominal[first], chosen[first].refit)}
+    seconds = {
+        "fim": float(np.mean([item.seconds for item in nominal.values()])),
+        "lasso": float(np.mean([item.seconds_lasso for item in chosen.values()])),
+    }
+    if settings.nelder_mead:
+        spent = [item.seconds_nelder_mead for item in chosen.values()]
+        seconds["nelder_mead"] = float(np.mean(spent))
+    return StudySelection(
+        nominal,
+        worst,
+        _intersection(informations, settings),
+        free,
+        chosen,
+        Counter(item.lasso.selected for item in chosen.values()).most_common(1)[0][0],
+        run(raise_doubts, Doubts, asked)[first],
+        seconds,
+    )
+
+
+def _free(
+    informations: list[Array],
+    worst: tuple[Selection, ...],
+    nominal: Mapping[str, Nominal],
+    settings: SelectSettings,
+) -> tuple[int, ...]:
+    at_bound = largest_subsets(informations, settings.bound, settings.least)
+    for selection in (at_bound, *worst):
+        if selection.subsets:
+            return selection.subsets[0]
+    counted = Counter(
+        subset
+        for item in nominal.values()
+        for selection in item.sweep[:1]
+        for subset in selection.subsets
+    )
+    if not counted:
+        raise DataError(
+            "selection", "no subset is feasible at any bound", "raise [select] bound or lower least"
+        )
+    return counted.most_common(1)[0][0]
+
+
+def _intersection(
+    informations: list[Array], settings: SelectSettings
+) -> tuple[tuple[int, ...], ...]:
+    lists = [
+        set(largest_subsets([F], settings.bound, settings.least).subsets) for F in informations
+    ]
+    return tuple(sorted(set.intersection(*lists)))

@@ -1,0 +1,203 @@
+"""Least squares of a model's free parameters over several trials, within bounds (4.3) to (4.5).
+
+Parameters are normalised; those that are not free stay where they are given. Search by a bounded
+trust region with the model's Jacobian, from one start or several.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy.optimize
+
+from impc.arrays import Array, Frozen, IntArray, frozen
+from impc.assess.vaf import vaf
+from impc.errors import DataError, InputError
+from impc.studies.selection.model import normalised, physical, sensitivity
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from impc.studies.selection.model import ParametricModel, Trial
+
+__all__ = ["Estimate", "estimate", "free_indices", "multi_start", "pooled_vaf", "residuals"]
+
+_TOLERANCE = 1e-10
+
+
+@dataclass(frozen=True)
+class Estimate(Frozen):
+    """A fit.
+
+    Attributes
+    ----------
+    theta : Array
+        All parameters (k,), in their units.
+    free : tuple of int
+        Which of them were fitted.
+    misfit : float
+        Sum of squares.
+    vaf : Array
+        (4.4) over all trials (p,), %.
+    evaluations : int
+        Of the residual.
+    at_bound : tuple of int
+        Free parameters that end on a bound.
+    """
+
+    theta: Array
+    free: tuple[int, ...]
+    misfit: float
+    vaf: Array
+    evaluations: int
+    at_bound: tuple[int, ...]
+
+
+def free_indices(model: ParametricModel, names: Sequence[str]) -> tuple[int, ...]:
+    """Indices of parameters by their `names`.
+
+    Raises
+    ------
+    InputError
+        When there is no such parameter.
+    """
+    for name in names:
+        if name not in model.names:
+            raise InputError(f"parameter {name}", "is not one", f"known: {', '.join(model.names)}")
+    return tuple(model.names.index(name) for name in names)
+
+
+def estimate(
+    model: ParametricModel,
+    trials: Sequence[Trial],
+    free: Sequence[int],
+    start: Array,
+    *,
+    max_evaluations: int = 200,
+) -> Estimate:
+    """Fit the free parameters to all trials at once.
+
+    Parameters
+    ----------
+    model : ParametricModel
+    trials : sequence of Trial
+    free : sequence of int
+        Indices of the parameters that are fitted.
+    start : Array
+        All parameters (k,), in their units; the others keep these values.
+    max_evaluations : int
+        Of the residual, at most.
+
+    Raises
+    ------
+    DataError
+        When there is no trial, or the model does not give finite outputs at the start.
+    """
+    if not trials:
+        raise DataError("trials", "there are none", "give at least one")
+    chosen: IntArray = np.asarray(free, dtype=np.int64)
+    base = normalised(model, np.asarray(start, dtype=np.float64))
+    last: tuple[bytes, Array, Array] | None = None
+
+    def evaluated(t: Array) -> tuple[Array, Array]:
+        nonlocal last
+        if last is None or last[0] != t.tobytes():
+            full = base.copy()
+            full[chosen] = t
+            parts = [_part(model, full, trial, chosen) for trial in trials]
+            residual, jacobian = (np.concatenate(item) for item in zip(*parts, strict=True))
+            last = (t.tobytes(), residual, jacobian)
+        return last[1], last[2]
+
+    def residual(t: Array) -> Array:
+        return evaluated(t)[0]
+
+    def derivative(t: Array) -> Array:
+        return evaluated(t)[1]
+
+    begin = np.clip(base[chosen], -1 + 1e-9, 1 - 1e-9)
+    if not np.all(np.isfinite(evaluated(begin)[0])):
+        raise DataError("model", "is not finite at the start", "start elsewhere")
+    found = scipy.optimize.least_squares(
+        residual,
+        begin,
+        jac=derivative,
+        bounds=(-1.0, 1.0),
+        ftol=_TOLERANCE,
+        xtol=_TOLERANCE,
+        gtol=1e-12,
+        max_nfev=max_evaluations,
+    )
+    full = base.copy()
+    full[chosen] = found.x
+    theta = physical(model, full)
+    stuck = tuple(int(item) for item in chosen[np.abs(found.x) > 1 - 1e-6])
+    return Estimate(
+        frozen(theta),
+        tuple(int(item) for item in chosen),
+        2 * float(found.cost),
+        frozen(pooled_vaf(model, theta, trials)),
+        int(found.nfev),
+        stuck,
+    )
+
+
+def multi_start(
+    model: ParametricModel,
+    trials: Sequence[Trial],
+    free: Sequence[int],
+    starts: int,
+    seed: int,
+    *,
+    spread: float = 0.5,
+) -> tuple[Estimate, ...]:
+    """Fits from the typical values and from points drawn about them, the best first.
+
+    Points at which the model is not finite are drawn again.
+
+    Parameters
+    ----------
+    free : sequence of int
+        Indices of the parameters that are fitted.
+    starts : int
+        How many fits.
+    seed : int
+        All numbers drawn follow from it.
+    spread : float
+        Deviation of the draws, in normalised units.
+    """
+    rng = np.random.default_rng(seed)
+    typical = normalised(model, np.asarray(model.typical))
+    found: list[Estimate] = []
+    begin = typical
+    while len(found) < starts:
+        try:
+            found.append(estimate(model, trials, free, physical(model, begin)))
+        except DataError:
+            if not found:
+                raise
+        moved = typical.copy()
+        chosen = np.asarray(free, dtype=int)
+        moved[chosen] += spread * rng.standard_normal(len(chosen))
+        begin = np.clip(moved, -0.98, 0.98)
+    return tuple(sorted(found, key=lambda item: item.misfit))
+
+
+def residuals(model: ParametricModel, theta: Array, trials: Sequence[Trial]) -> list[Array]:
+    """Outputs recorded minus simulated at theta (k,): (samples, p) for each trial."""
+    return [np.asarray(item.outputs - model.simulate(theta, item.input)) for item in trials]
+
+
+def pooled_vaf(model: ParametricModel, theta: Array, trials: Sequence[Trial]) -> Array:
+    """VAF (4.4) over all trials, % (p,), at theta (k,) in its units."""
+    recorded = np.concatenate([item.outputs for item in trials])
+    simulated = np.concatenate([model.simulate(theta, item.input) for item in trials])
+    return np.asarray(vaf(recorded, simulated))
+
+
+def _part(model: ParametricModel, t: Array, trial: Trial, chosen: IntArray) -> tuple[Array, Array]:
+    outputs, derivative = sensitivity(model, physical(model, t), trial.input, chosen)
+    residual = (outputs - trial.outputs).ravel()
+    return residual, derivative.reshape(residual.size, len(chosen))

@@ -1,0 +1,210 @@
+"""Key parameters (chapter 5): sensitive, explaining, reliable and of several pathways.
+
+Four filters, one after the other, on the subsets that the information allows for every subject and
+visit together (5.5):
+
+    variability        max over subjects and visits of max diag F_s^-1 <= v
+    goodness of fit    mean VAF of the refitted subset above a threshold
+    reliability        min over the subset of ICC(A,k) between visits, at least rho (5.6), (5.7)
+    diversity          number of distinct pathways in the subset; the largest is chosen
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.arrays import Array, Frozen, frozen
+from impc.studies.reliability.icc import icc
+from impc.studies.selection.estimation import Estimate, estimate
+from impc.studies.selection.subject import Nominal, fit_nominal
+from impc.studies.selection.subsets import largest_subsets, sweep
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+
+    from impc.studies.reliability.icc import Icc
+    from impc.studies.selection.model import ParametricModel, Trial
+    from impc.studies.selection.queue import Runner
+    from impc.studies.selection.settings import SelectSettings
+    from impc.studies.selection.subsets import Selection
+
+__all__ = [
+    "Candidate",
+    "KeyParameters",
+    "Refits",
+    "between_visits",
+    "key_parameters",
+    "refit_subsets",
+]
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A sensitive subset and how it does in the other filters.
+
+    Attributes
+    ----------
+    subset : tuple of int
+        Indices of its parameters.
+    variance : float
+        Largest, over subjects and visits, in normalised units.
+    vaf : float
+        Mean over subjects and visits, %.
+    reliability : float
+        Least ICC(A,k) of its parameters; NaN where none is defined.
+    diversity : int
+        Number of pathways.
+    kept : bool
+        Whether it passes goodness of fit and reliability.
+    """
+
+    subset: tuple[int, ...]
+    variance: float
+    vaf: float
+    reliability: float
+    diversity: int
+    kept: bool
+
+
+@dataclass(frozen=True)
+class KeyParameters(Frozen):
+    """Outcome of the filters.
+
+    Attributes
+    ----------
+    selection : Selection
+        Subsets of the first filter.
+    sweep : tuple of Selection
+        The first filter at other bounds.
+    candidates : tuple of Candidate
+        All of them, best first: kept before not, then diversity, then reliability.
+    chosen : tuple of int
+        The first kept one; empty when none is kept.
+    nominal : Array
+        Estimates with all parameters free (parameters, subjects, visits), in physical units.
+    estimates : Array
+        Those of the chosen subset alone (chosen, subjects, visits), in physical units.
+    """
+
+    selection: Selection
+    sweep: tuple[Selection, ...]
+    candidates: tuple[Candidate, ...]
+    chosen: tuple[int, ...]
+    nominal: Array
+    estimates: Array
+
+
+@dataclass(frozen=True)
+class Refits:
+    """Fits of several subsets to one subject and visit.
+
+    Attributes
+    ----------
+    fits : tuple of Estimate
+        One a subset, in their order.
+    """
+
+    fits: tuple[Estimate, ...]
+
+
+def refit_subsets(
+    model: ParametricModel, trials: Sequence[Trial], subsets: tuple[tuple[int, ...], ...]
+) -> Refits:
+    """Fit each of the `subsets` alone, the other parameters at their typical values.
+
+    Raises
+    ------
+    DataError
+        As `estimate`.
+    """
+    typical = np.array(model.typical)
+    return Refits(tuple(estimate(model, trials, subset, typical) for subset in subsets))
+
+
+def key_parameters(
+    model: ParametricModel,
+    recorded: Mapping[tuple[str, str], Sequence[Trial]],
+    settings: SelectSettings,
+    run: Runner,
+    *,
+    bound: float = 0.35,
+    least_vaf: float = 69.0,
+    least_reliability: float = 0.75,
+    most: int = 20,
+) -> KeyParameters:
+    """Choose key parameters of a study of several subjects and visits.
+
+    Parameters
+    ----------
+    model : ParametricModel
+        Its typical values are where fixed parameters stay.
+    recorded : mapping
+        (subject, visit) -> trials.
+    settings : SelectSettings
+        Of the nominal fits, at which the information is taken.
+    run : Runner
+        Does the work of each subject and visit.
+    bound, least_vaf, least_reliability
+        v, VAF in %, rho: chapter 5 has .35, 69 % and .75.
+    most : int
+        How many subsets of the first filter go on, those of least variance.
+    """
+    trials = {" visit ".join(filter(None, key)): tuple(item) for key, item in recorded.items()}
+    nominal = run(fit_nominal, Nominal, {name: (trials[name], settings) for name in trials})
+    informations = [np.asarray(item.information.F) for item in nominal.values()]
+    selection = largest_subsets(informations, bound, settings.least)
+    subsets = selection.subsets[:most]
+    refits = run(refit_subsets, Refits, {name: (trials[name], subsets) for name in trials})
+    candidates = []
+    for place, subset in enumerate(subsets):
+        fits = [item.fits[place] for item in refits.values()]
+        vaf = float(np.mean([np.mean(item.vaf) for item in fits]))
+        reliability = _reliability(_by_visit(recorded, fits, subset))
+        diversity = len({model.pathways[index] for index in subset})
+        kept = vaf > least_vaf and reliability >= least_reliability
+        variance = selection.variances[place]
+        candidates.append(Candidate(subset, variance, vaf, reliability, diversity, kept))
+    candidates.sort(
+        key=lambda item: (not item.kept, -item.diversity, -np.nan_to_num(item.reliability))
+    )
+    chosen = candidates[0].subset if candidates and candidates[0].kept else ()
+    swept = sweep(informations, settings.bounds, settings.least)
+    everything = tuple(range(model.size))
+    alone = [item.fits[subsets.index(chosen)] for item in refits.values()] if chosen else []
+    return KeyParameters(
+        selection,
+        swept,
+        tuple(candidates),
+        chosen,
+        _by_visit(recorded, [item.fit for item in nominal.values()], everything),
+        _by_visit(recorded, alone, chosen),
+    )
+
+
+def _by_visit(
+    keys: Iterable[tuple[str, str]], fits: Sequence[Estimate], subset: tuple[int, ...]
+) -> Array:
+    """Estimates of a subset (len(subset), subjects, visits); NaN where a visit is missing."""
+    pairs = list(keys)
+    subjects = list(dict.fromkeys(subject for subject, _ in pairs))
+    visits = list(dict.fromkeys(visit for _, visit in pairs))
+    values = np.full((len(subset), len(subjects), len(visits)), np.nan)
+    if subset:
+        for (subject, visit), found in zip(pairs, fits, strict=True):
+            place = subjects.index(subject), visits.index(visit)
+            values[:, place[0], place[1]] = np.array(found.theta)[list(subset)]
+    return frozen(values)
+
+
+def _reliability(values: Array) -> float:
+    """(5.6): the least ICC(A,k) of a subset's parameters; NaN without several of both."""
+    told = [between_visits(table) for table in values]
+    return float(np.min([item.value if item else np.nan for item in told]))
+
+
+def between_visits(values: Array) -> Icc | None:
+    """ICC(A,k) of a parameter's `values` (subjects, visits); None without several of both."""
+    return icc(values, "A,k") if min(values.shape) >= 2 else None

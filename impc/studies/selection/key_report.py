@@ -1,0 +1,178 @@
+"""Files of `impc key-parameters`: page, table, result.json, figure of the solution space."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.reporting.rendering import TextTable, embedded, number, plain, render_template
+from impc.reporting.style import BLUE, DOUBLE_COLUMN, INK, journal_style, new_figure, render
+from impc.studies.selection.key_parameters import between_visits
+from impc.studies.selection.report import names_of, table_csv
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from impc.arrays import Array
+    from impc.studies.selection.key_parameters import KeyParameters
+    from impc.studies.selection.model import ParametricModel
+
+__all__ = ["key_files"]
+
+
+def key_files(model: ParametricModel, found: KeyParameters, command: str) -> dict[str, bytes]:
+    """Build all files of `impc key-parameters`; they name the `command`; nothing is written."""
+    rows = tuple(
+        (
+            names_of(model, item.subset),
+            number(item.variance),
+            number(item.vaf, 4),
+            number(item.reliability, 2),
+            str(item.diversity),
+            "kept" if item.kept else "",
+        )
+        for item in found.candidates
+    )
+    heads = ("subset", "largest variance", "mean VAF %", "least ICC(A,k)", "pathways", "")
+    table = TextTable("Subsets and the filters that they pass, best first.", heads, rows)
+    chosen = names_of(model, found.chosen) if found.chosen else "none: no subset passes all filters"
+    with journal_style():
+        pictures = render(_solution_figure(model, found))
+    page = render_template(
+        "studies/selection/selection_page.html",
+        title="Key parameters",
+        findings=[
+            f"{len(found.selection.subsets)} subsets of {found.selection.size} parameters are "
+            f"estimated well enough for every subject and visit (variance at most "
+            f"{found.selection.bound:g}).",
+            f"Chosen: {chosen}.",
+        ],
+        tables=[table, _estimate_table(model, found), _sweep_table(model, found)],
+        picture_source=embedded(pictures["png"]),
+        caption="Counterpart of figure 5.3: subsets in the space of reliability and goodness of "
+        "fit; filled ones pass all filters.",
+        command=command,
+    )
+    content = {
+        "chosen": [model.names[index] for index in found.chosen],
+        "size": found.selection.size,
+        "subsets": len(found.selection.subsets),
+        "sweep": [
+            {
+                "bound": item.bound,
+                "size": item.size,
+                "subsets": [[model.names[index] for index in subset] for subset in item.subsets],
+            }
+            for item in found.sweep
+        ],
+        "icc": {
+            "nominal": dict(zip(model.names, map(_icc, found.nominal), strict=True)),
+            "chosen": dict(
+                zip(
+                    (model.names[index] for index in found.chosen),
+                    map(_icc, found.estimates),
+                    strict=True,
+                )
+            ),
+        },
+        "candidates": [
+            {
+                "names": [model.names[index] for index in item.subset],
+                "variance": item.variance,
+                "vaf": item.vaf,
+                "icc": item.reliability,
+                "diversity": item.diversity,
+                "kept": item.kept,
+            }
+            for item in found.candidates
+        ],
+        "command": command,
+    }
+    return {
+        "report.html": page.encode(),
+        "result.json": (json.dumps(plain(content), indent=1) + "\n").encode(),
+        "candidates.csv": table_csv(table),
+        **{f"solution-space.{kind}": picture for kind, picture in pictures.items()},
+    }
+
+
+def _icc(values: Array) -> dict[str, float]:
+    """With its 95 % interval; NaN where there is none."""
+    told = between_visits(values)
+    return {key: getattr(told, key, np.nan) for key in ("value", "low", "high")}
+
+
+def _estimate_table(model: ParametricModel, found: KeyParameters) -> TextTable:
+    """Counterpart of tables 5.3 and 5.4: mean ± SD over subjects, physical units."""
+    places = {index: place for place, index in enumerate(found.chosen)}
+    visits = [f"visit {number + 1}" for number in range(found.nominal.shape[2])]
+    rows = []
+    for index, name in enumerate(model.names):
+        own = found.estimates[places[index]] if index in places else None
+        rows.append(
+            (
+                name,
+                model.units[index],
+                _mean_sd(found.nominal[index]),
+                _with_interval(found.nominal[index]),
+                *(["fixed"] * len(visits) if own is None else map(_mean_sd, own.T)),
+                "" if own is None else _with_interval(own),
+            )
+        )
+    heads = ("parameter", "unit", "all free", "ICC, all free", *visits, "ICC")
+    title = "Estimates, mean ± SD over subjects; ICC(A,k) between visits with its 95 % interval."
+    return TextTable(title, heads, tuple(rows))
+
+
+def _mean_sd(values: Array) -> str:
+    spread = number(float(np.nanstd(values, ddof=1))) if values.size > 1 else "-"
+    return f"{number(float(np.nanmean(values)))} ± {spread}"
+
+
+def _with_interval(values: Array) -> str:
+    value, low, high = _icc(values).values()
+    return "-" if np.isnan(value) else f"{value:.2f} [{low:.2f}, {high:.2f}]"
+
+
+def _sweep_table(model: ParametricModel, found: KeyParameters) -> TextTable:
+    """How the first filter depends on its bound, and which parameters its subsets have."""
+    rows = []
+    for item in found.sweep:
+        inside = [sum(index in subset for subset in item.subsets) for index in range(model.size)]
+        counts = ", ".join(
+            f"{name} {count}" for name, count in zip(model.names, inside, strict=True) if count
+        )
+        rows.append((f"{item.bound:.2f}", str(item.size), str(len(item.subsets)), counts or "-"))
+    heads = ("variance bound", "size", "subsets", "in how many of them")
+    return TextTable(
+        "The first filter, for every subject and visit at once (5.5).", heads, tuple(rows)
+    )
+
+
+def _solution_figure(model: ParametricModel, found: KeyParameters) -> Figure:
+    figure = new_figure(DOUBLE_COLUMN, 2.8)
+    ax = figure.subplots()
+    markers = "osD^v"
+    for item in found.candidates:
+        if np.isnan(item.reliability):
+            continue
+        ax.plot(
+            item.reliability,
+            item.vaf,
+            marker=markers[min(item.diversity, len(markers)) - 1],
+            color=BLUE if item.kept else INK,
+            markerfacecolor=BLUE if item.kept else "white",
+            linestyle="none",
+        )
+    for diversity in sorted({item.diversity for item in found.candidates}):
+        ax.plot(
+            [], [], marker=markers[min(diversity, len(markers)) - 1], color=INK, linestyle="none",
+            markerfacecolor="white", label=f"{diversity} pathways",
+        )  # fmt: skip
+    ax.set_xlabel("reliability, least ICC(A,k) (-)")
+    ax.set_ylabel("mean VAF (%)")
+    if found.candidates:
+        ax.legend(loc="best")
+    return figure

@@ -1,0 +1,247 @@
+"""LASSO selection (C.5): parameters that leave their typical values when that costs.
+
+    min over t in [-1, 1]^k   (1/N) sum e^2 + lambda ||t - t_typ||_1
+
+`proximal_lasso` solves it as it is: Gauss-Newton steps whose quadratic programs keep the absolute
+values and the bounds, so that parameters land exactly on their typical values. `table_c1` is the
+dissertation's: Nelder and Mead with bounds by t = sin(u), a threshold of 0.005, and lambda moved
+until n parameters are beyond it. Both end with the relaxed refit: the chosen ones by plain least
+squares. The scale of the first term is lost; here it is the mean square in the outputs' unit
+squared.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy.linalg
+import scipy.optimize
+
+from impc.arrays import Array, Frozen, frozen
+from impc.studies.selection.estimation import Estimate, estimate
+from impc.studies.selection.model import normalised, physical, sensitivity
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from impc.studies.selection.model import ParametricModel, Trial
+
+__all__ = ["Lasso", "lasso_of_size", "proximal_lasso", "table_c1"]
+
+_THRESHOLD, _FIRST = 0.005, 0.13
+_CHANGES, _ROUNDS, _HALVINGS = 500, 60, 30
+_ROUNDING = 1e-12  # of the steepest slope, in the test of optimality
+
+
+@dataclass(frozen=True)
+class Lasso(Frozen):
+    """A selection.
+
+    Attributes
+    ----------
+    weight : float
+        lambda.
+    t : Array
+        Normalised parameters (k,).
+    selected : tuple of int
+        Those away from their typical values.
+    refit : Estimate or None
+        Of the selected ones; None when none is.
+    objective : float
+        (C.5) at t.
+    solves : int
+        Problems (C.5) that were solved.
+    """
+
+    weight: float
+    t: Array
+    selected: tuple[int, ...]
+    refit: Estimate | None
+    objective: float
+    solves: int
+
+
+def proximal_lasso(
+    model: ParametricModel, trials: Sequence[Trial], weight: float, start: Array | None = None
+) -> tuple[Array, float]:
+    """Solve (C.5): normalised parameters (k,) and the objective.
+
+    Parameters
+    ----------
+    weight : float
+        lambda.
+    start : Array, optional
+        Normalised parameters (k,); the typical values by default.
+    """
+    typical = normalised(model, np.asarray(model.typical))
+    t = typical.copy() if start is None else np.clip(start, -1, 1)
+
+    def value(at: Array) -> float:
+        return _mean_square(model, trials, at) + weight * float(np.sum(np.abs(at - typical)))
+
+    current, damping = value(t), 1e-6
+    for _ in range(_ROUNDS):
+        H, g = _quadratic(model, trials, t)
+        step = _box_lasso(H + damping * np.eye(len(t)), g, t, typical, weight) - t
+        share, accepted = 1.0, False
+        for _ in range(_HALVINGS):
+            moved = value(t + share * step)
+            if moved < current:
+                accepted = True
+                break
+            share /= 2
+        if not accepted:
+            break
+        gained = current - moved
+        t, current = t + share * step, moved
+        if share < 1:
+            # Shorter programs next time: only whole steps put parameters on their typical values.
+            damping *= 10
+        if gained < 1e-10 * max(current, 1e-300):
+            break
+    return np.asarray(t), current
+
+
+def lasso_of_size(model: ParametricModel, trials: Sequence[Trial], count: int) -> Lasso:
+    """The largest selection of at most `count` parameters along lambda, by bisection."""
+    low, high, solves = 1e-8, 1e3, 0
+    best: tuple[float, Array, float] | None = None
+    for _ in range(40):
+        middle = float(np.sqrt(low * high))
+        t, objective = proximal_lasso(model, trials, middle)
+        solves += 1
+        chosen = _selected(model, t)
+        if len(chosen) <= count:
+            high = middle
+            if best is None or len(chosen) >= len(_selected(model, best[1])):
+                best = (middle, t, objective)
+            if len(chosen) == count:
+                break
+        else:
+            low = middle
+        if high / low < 1.01:
+            break
+    if best is None:
+        best = (high, *proximal_lasso(model, trials, high))
+    return _finished(model, trials, *best, solves)
+
+
+def table_c1(
+    model: ParametricModel, trials: Sequence[Trial], count: int, *, solves: int = 12
+) -> Lasso:
+    """Table C.1: Nelder and Mead, a threshold of 0.005, lambda moved until `count` are beyond it.
+
+    The rule that moves lambda is lost: it is multiplied by 2 when too many parameters moved,
+    divided by 2 when too few, the factor's logarithm halved when the direction changes. At most
+    `solves` problems are solved.
+    """
+    typical = normalised(model, np.asarray(model.typical))
+    weight, factor, before = _FIRST, 2.0, 0
+    for number in range(1, solves + 1):
+
+        def value(u: Array, weight: float = weight) -> float:
+            t = np.sin(u)
+            return _mean_square(model, trials, t) + weight * float(np.sum(np.abs(t - typical)))
+
+        found = scipy.optimize.minimize(
+            value, np.arcsin(np.clip(typical, -1, 1)), method="Nelder-Mead",
+            options={"maxfev": 200 * len(typical)},
+        )  # fmt: skip
+        t = np.sin(found.x)
+        moved = int(np.count_nonzero(np.abs(t - typical) > _THRESHOLD))
+        if moved == count or number == solves:
+            break
+        direction = 1 if moved > count else -1
+        if before and direction != before:
+            factor = float(np.sqrt(factor))
+        weight, before = weight * factor**direction, direction
+    return _finished(model, trials, weight, np.asarray(t), float(found.fun), number, _THRESHOLD)
+
+
+def _finished(
+    model: ParametricModel,
+    trials: Sequence[Trial],
+    weight: float,
+    t: Array,
+    objective: float,
+    solves: int,
+    threshold: float = 0.0,
+) -> Lasso:
+    chosen = _selected(model, t, threshold)
+    start = np.array(model.typical)
+    start[list(chosen)] = physical(model, t)[list(chosen)]
+    refit = estimate(model, trials, chosen, start) if chosen else None
+    return Lasso(weight, frozen(t), chosen, refit, objective, solves)
+
+
+def _selected(model: ParametricModel, t: Array, threshold: float = 0.0) -> tuple[int, ...]:
+    typical = normalised(model, np.asarray(model.typical))
+    return tuple(int(item) for item in np.flatnonzero(np.abs(t - typical) > max(threshold, 1e-12)))
+
+
+def _mean_square(model: ParametricModel, trials: Sequence[Trial], t: Array) -> float:
+    theta, total, count = physical(model, t), 0.0, 0
+    for trial in trials:
+        error = model.simulate(theta, trial.input) - trial.outputs
+        total, count = total + float(np.sum(error**2)), count + error.size
+    return total / count if np.isfinite(total) else np.inf
+
+
+def _quadratic(model: ParametricModel, trials: Sequence[Trial], t: Array) -> tuple[Array, Array]:
+    """H and g of the mean square about t: g'd + d'Hd/2."""
+    size = model.size
+    H, g, count = np.zeros((size, size)), np.zeros(size), 0
+    for trial in trials:
+        outputs, derivative = sensitivity(model, physical(model, t), trial.input)
+        J = derivative.reshape(-1, size)
+        H += J.T @ J
+        g += J.T @ (outputs - trial.outputs).ravel()
+        count += len(J)
+    return 2 * H / count, 2 * g / count
+
+
+def _box_lasso(H: Array, g: Array, t: Array, typical: Array, weight: float) -> Array:
+    """argmin over x in [-1, 1]^k of g'(x - t) + (x - t)'H(x - t)/2 + weight |x - typical|_1.
+
+    Primal active-set method from x = t, for positive definite H. Coordinates at a kink (their
+    typical value) or at a bound are held; the others step to the minimum of the quadratic on their
+    side of the kink, as far as the first kink or bound, which then holds the one that met it. At
+    that minimum the held one whose release gains most is let go; none is: x is the answer.
+    """
+    x, side = t.copy(), np.sign(t - typical)
+    held = (side == 0) | (np.abs(x) == 1)
+    steepest = weight + float(np.max(np.abs(g)))
+    for _ in range(_CHANGES):
+        free = np.flatnonzero(~held)
+        step = np.zeros_like(x)
+        slope = g + H @ (x - t) + weight * side
+        step[free] = -scipy.linalg.solve(H[np.ix_(free, free)], slope[free], assume_a="pos")
+        barrier = np.where((typical - x) * step > 0, typical, np.sign(step))
+        share = np.full(len(x), np.inf)
+        np.divide(barrier - x, step, out=share, where=step != 0)
+        first = int(np.argmin(share))
+        x += min(share[first], 1.0) * step
+        if share[first] < 1:
+            x[first], held[first] = barrier[first], True
+            side[first] = np.sign(x[first] - typical[first])
+            continue
+        gain, towards = _release(g + H @ (x - t), x, side, typical, weight)
+        best = int(np.argmax(np.where(held, gain, 0.0)))
+        if not held[best] or gain[best] <= steepest * _ROUNDING:
+            break
+        held[best] = False
+        side[best] = side[best] or towards[best]
+    return np.asarray(x)
+
+
+def _release(
+    gradient: Array, x: Array, side: Array, typical: Array, weight: float
+) -> tuple[Array, Array]:
+    """How steeply the objective falls when a coordinate leaves its kink or bound, and whereto."""
+    at_kink = side == 0
+    towards = np.where(at_kink, -np.sign(gradient), -np.sign(x))
+    steep = np.where(at_kink, np.abs(gradient) - weight, np.sign(x) * (gradient + weight * side))
+    blocked = at_kink & (typical * towards >= 1)  # typical at a bound: not beyond it
+    return np.where(blocked, 0.0, steep), towards

@@ -1,0 +1,178 @@
+"""A parametric simulation model: any function from parameters and an input to outputs.
+
+Parameters are normalised to [-1, 1] between their bounds (4.2),
+
+    t_i = (theta_i - o_i) / g_i,    o_i = (max + min) / 2,   g_i = (max - min) / 2.
+
+A model may bring its own Jacobian (`impc.studies.selection.linear` makes exact ones for linear
+systems); otherwise central differences of 1e-4 in normalised units are taken, good to about 1e-6.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.arrays import Array, Frozen, IntArray, frozen
+from impc.errors import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+__all__ = ["ParametricModel", "Trial", "normalised", "parametric_model", "physical", "sensitivity"]
+
+_STEP = 1e-4
+
+
+@dataclass(frozen=True)
+class Trial(Frozen):
+    """One recording, in the units of the model's signals.
+
+    Attributes
+    ----------
+    input : Array
+        (samples, d).
+    outputs : Array
+        (samples, p).
+    """
+
+    input: Array
+    outputs: Array
+
+
+@dataclass(frozen=True)
+class ParametricModel(Frozen):
+    """The model and what is known of its parameters.
+
+    Attributes
+    ----------
+    names : tuple of str
+        (k,).
+    low, high, typical : Array
+        Bounds and typical values (k,), in the parameters' units.
+    pathways, units : tuple of str
+        What each belongs to, and its unit (k,).
+    simulate : callable
+        (theta (k,), input (samples, d)) -> outputs (samples, p).
+    jacobian : callable or None
+        (theta, input, free) -> (outputs, their derivative (samples, p, f) with respect to the f
+        parameters whose indices are `free`).
+    """
+
+    names: tuple[str, ...]
+    low: Array
+    high: Array
+    typical: Array
+    pathways: tuple[str, ...]
+    units: tuple[str, ...]
+    simulate: Callable[[Array, Array], Array]
+    jacobian: Callable[[Array, Array, IntArray], tuple[Array, Array]] | None = None
+
+    @property
+    def size(self) -> int:
+        """Number of parameters."""
+        return len(self.names)
+
+    @property
+    def gain(self) -> Array:
+        """g, half the range of each parameter (k,)."""
+        return (self.high - self.low) / 2
+
+
+def parametric_model(
+    names: Sequence[str],
+    low: Sequence[float],
+    high: Sequence[float],
+    typical: Sequence[float],
+    simulate: Callable[[Array, Array], Array],
+    *,
+    pathways: Sequence[str] | None = None,
+    units: Sequence[str] | None = None,
+    jacobian: Callable[[Array, Array, IntArray], tuple[Array, Array]] | None = None,
+) -> ParametricModel:
+    """Check and freeze a model.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Of the k parameters.
+    low, high, typical : sequence of float
+        Bounds and typical values (k,), in their units.
+    simulate : callable
+        (theta (k,), input (samples, d)) -> outputs (samples, p).
+    pathways, units : sequence of str, optional
+        Of each parameter; empty by default.
+    jacobian : callable, optional
+        (theta, input, free) -> outputs and their derivative (samples, p, f) with respect to the f
+        parameters whose indices are `free`, in their units.
+
+    Raises
+    ------
+    InputError
+        When lengths differ, a range is empty, or a typical value lies outside of it.
+    """
+    count = len(names)
+    for name, values in (("low", low), ("high", high), ("typical", typical)):
+        if len(values) != count:
+            raise InputError(name, f"has {len(values)} values", f"give {count}, one a parameter")
+    for name, least, most, value in zip(names, low, high, typical, strict=True):
+        if not least < most:
+            raise InputError(f"parameter {name}", f"range {least:g} to {most:g}", "give low < high")
+        if not least <= value <= most:
+            raise InputError(
+                f"parameter {name}", f"typical value {value:g} lies outside its range", "widen it"
+            )
+    groups = tuple(pathways) if pathways is not None else ("",) * count
+    measured = tuple(units) if units is not None else ("",) * count
+    return ParametricModel(
+        tuple(names), frozen(low), frozen(high), frozen(typical), groups, measured, simulate,
+        jacobian,
+    )  # fmt: skip
+
+
+def normalised(model: ParametricModel, theta: Array) -> Array:
+    """(4.2): parameters theta (k,) in units of half their range about its middle, (k,)."""
+    return np.asarray((theta - (model.high + model.low) / 2) / model.gain)
+
+
+def physical(model: ParametricModel, t: Array) -> Array:
+    """Inverse of `normalised`: t (k,) to parameters in their units, (k,)."""
+    return np.asarray((model.high + model.low) / 2 + model.gain * t)
+
+
+def sensitivity(
+    model: ParametricModel, theta: Array, given: Array, free: IntArray | None = None
+) -> tuple[Array, Array]:
+    """Outputs of the model, and their derivative with respect to normalised parameters.
+
+    Parameters
+    ----------
+    theta : Array
+        (k,), in their units.
+    given : Array
+        Input (samples, d).
+    free : IntArray, optional
+        Indices (f,) of the parameters that are asked for; all by default.
+
+    Returns
+    -------
+    outputs, derivative : Array
+        (samples, p) and (samples, p, f).
+    """
+    along = np.arange(model.size) if free is None else free
+    if model.jacobian is not None:
+        outputs, derivative = model.jacobian(theta, given, along)
+        return outputs, np.asarray(derivative * model.gain[along])
+    outputs = np.asarray(model.simulate(theta, given))
+    t = normalised(model, theta)
+    columns = []
+    for index in along:
+        ends = []
+        for sign in (1.0, -1.0):
+            moved = t.copy()
+            moved[index] += sign * _STEP
+            ends.append(model.simulate(physical(model, moved), given))
+        columns.append((ends[0] - ends[1]) / (2 * _STEP))
+    return outputs, np.stack(columns, axis=-1)

@@ -1,0 +1,286 @@
+"""All files of a selection: page, tables as CSV, result.json, figure."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from impc.reporting.csv_text import csv_bytes
+from impc.reporting.rendering import TextTable, embedded, number, plain, render_template
+from impc.reporting.style import BLUE, DOUBLE_COLUMN, INK, journal_style, new_figure, render
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from matplotlib.figure import Figure
+
+    from impc.studies.selection.analysis import StudySelection
+    from impc.studies.selection.model import ParametricModel
+
+__all__ = ["names_of", "selection_files", "selection_table", "table_csv"]
+
+
+def selection_files(
+    model: ParametricModel, found: StudySelection, command: str
+) -> dict[str, bytes]:
+    """Build all files of `impc select`; they name the `command`; nothing is written."""
+    tables = {
+        "identifiability": _rank_table(model, found),
+        "sweep": _sweep_table(model, found),
+        "intervals": _interval_table(model, found),
+        "methods": selection_table(model, found),
+        "agreement": _agreement_table(model, found),
+        "bias": _bias_table(model, found),
+        "doubt": _three_intervals(model, found),
+    }
+    with journal_style():
+        pictures = render(_interval_figure(model, found))
+    page = render_template(
+        "studies/selection/selection_page.html",
+        title="Sensitive parameters",
+        findings=_findings(model, found),
+        tables=list(tables.values()),
+        picture_source=embedded(pictures["png"]),
+        caption="Widths of the 95 % bootstrap intervals of the chosen parameters, relative to "
+        "their ranges: a point a subject, a bar at the mean.",
+        command=command,
+    )
+    return {
+        "report.html": page.encode(),
+        "result.json": _json(model, found, command),
+        **{f"{name}.csv": table_csv(table) for name, table in tables.items()},
+        **{f"intervals.{kind}": content for kind, content in pictures.items()},
+    }
+
+
+def selection_table(model: ParametricModel, found: StudySelection) -> TextTable:
+    """What each method selects, and what it costs."""
+    vaf = np.mean([np.mean(item.refit.vaf) for item in found.chosen.values()])
+    full = np.mean([np.mean(item.fit.vaf) for item in found.nominal.values()])
+    fits = {
+        "lasso": [item.lasso for item in found.chosen.values()],
+        "nelder_mead": [item.nelder_mead for item in found.chosen.values() if item.nelder_mead],
+    }
+    rows = [
+        ("all parameters", str(model.size), number(float(full), 4), "", ""),
+        (
+            "information (FIM)", names_of(model, found.free), number(float(vaf), 4),
+            f"{found.seconds['fim']:.3g}", "",
+        ),
+    ]  # fmt: skip
+    for label, key in (("LASSO, proximal", "lasso"), ("LASSO, Table C.1", "nelder_mead")):
+        known = [item for item in fits[key] if item.refit is not None]
+        if not known:
+            continue
+        share = np.mean([np.mean(item.refit.vaf) for item in known if item.refit is not None])
+        chosen = Counter(item.selected for item in known).most_common(1)[0][0]
+        rows.append(
+            (
+                label, names_of(model, chosen), number(float(share), 4),
+                f"{found.seconds[key]:.3g}",
+                f"{found.seconds[key] / found.seconds['fim']:.3g}",
+            )
+        )  # fmt: skip
+    heads = ("method", "selected", "mean VAF %", "seconds a subject", "over FIM")
+    return TextTable("Methods of selection.", heads, tuple(tuple(row) for row in rows))
+
+
+def _findings(model: ParametricModel, found: StudySelection) -> list[str]:
+    lines = []
+    ranks = [item.information.rank for item in found.nominal.values()]
+    lines.append(
+        f"Of {model.size} parameters {min(ranks)} to {max(ranks)} directions are identifiable."
+    )
+    for names in dict.fromkeys(names for item in found.nominal.values() for names in item.scalings):
+        lines.append(
+            f"Scaling {', '.join(names)} together changes the outputs by less than their noise."
+        )
+    lines.append(f"Selected by information: {names_of(model, found.free)}.")
+    lines.append(f"Selected by LASSO: {names_of(model, found.lasso) or 'none'}.")
+    both = sorted(set(found.free) & set(found.lasso))
+    lines.append(f"In common: {names_of(model, both) or 'none'}.")
+    return lines
+
+
+def _rank_table(model: ParametricModel, found: StudySelection) -> TextTable:
+    rows = tuple(
+        (
+            name,
+            str(item.information.rank),
+            number(float(np.mean(item.fit.vaf)), 4),
+            ", ".join(model.names[index] for index in item.fit.at_bound) or "-",
+            "; ".join(direction.sentence for direction in item.unseen) or "-",
+        )
+        for name, item in found.nominal.items()
+    )
+    heads = ("subject", "rank", "VAF %", "at a bound", "directions that are not seen")
+    return TextTable("Identifiability, before any selection.", heads, rows)
+
+
+def _sweep_table(model: ParametricModel, found: StudySelection) -> TextTable:
+    rows = []
+    for index, selection in enumerate(found.worst_case):
+        sizes = [item.sweep[index].size for item in found.nominal.values()]
+        rows.append(
+            (
+                f"{selection.bound:.2f}",
+                f"{min(sizes)} to {max(sizes)}",
+                str(selection.size),
+                str(len(selection.subsets)),
+                names_of(model, selection.subsets[0]) if selection.subsets else "-",
+            )
+        )
+    heads = ("variance bound", "size, each subject", "size, all at once (5.5)", "subsets", "best")
+    return TextTable("Largest feasible subsets.", heads, tuple(rows))
+
+
+def _interval_table(model: ParametricModel, found: StudySelection) -> TextTable:
+    rows = []
+    for place, index in enumerate(found.free):
+        values = np.array([item.refit.theta[index] for item in found.chosen.values()])
+        widths = np.array([item.intervals.width[place] for item in found.chosen.values()])
+        rows.append(
+            (
+                model.names[index], model.units[index],
+                f"{values.mean():.4g} ± {_sd(values):.2g}",
+                f"{widths.mean():.3g} ± {_sd(widths):.2g}",
+                f"{100 * widths.mean() / (2 * model.gain[index]):.1f}",
+            )
+        )  # fmt: skip
+    heads = ("parameter", "unit", "estimate", "width of the interval", "% of its range")
+    return TextTable("Chosen parameters, mean ± SD over subjects.", heads, tuple(rows))
+
+
+def _three_intervals(model: ParametricModel, found: StudySelection) -> TextTable:
+    """First subject: percentiles, profile likelihood and the Cramer-Rao bound."""
+    first = next(iter(found.chosen.values()))
+    rows = []
+    for place, index in enumerate(found.free):
+        value, half = first.refit.theta[index], found.doubts.bound[place]
+        ends = (
+            (first.intervals.low[place], first.intervals.high[place]),
+            found.doubts.profile[place],
+            (value - half, value + half),
+        )
+        cells = (f"{low:.4g} to {high:.4g}" for low, high in ends)
+        rows.append((model.names[index], model.units[index], f"{value:.4g}", *cells))
+    heads = ("parameter", "unit", "estimate", "bootstrap", "profile likelihood", "Cramér-Rao bound")
+    caption = (
+        "95 % intervals in the first subject. The last two take the residuals for white; an "
+        "infinite end is not met inside the parameter's range."
+    )
+    return TextTable(caption, heads, tuple(rows))
+
+
+def _finite(ends: tuple[float, float]) -> list[float | None]:
+    """JSON has no infinity."""
+    return [value if np.isfinite(value) else None for value in ends]
+
+
+def _agreement_table(model: ParametricModel, found: StudySelection) -> TextTable:
+    rows = []
+    for rule, subset in found.doubts.agreement.items():
+        shared = len(set(subset) & set(found.free))
+        rows.append((rule, names_of(model, subset) or "-", f"{shared} of {len(found.free)}"))
+    caption = (
+        f"What other rules select in the first subject. The chosen subset's collinearity is "
+        f"{found.doubts.collinearity:.3g}; 10 to 20 is the usual limit."
+    )
+    return TextTable(caption, ("rule", "subset", "shared with the chosen"), tuple(rows))
+
+
+def _bias_table(model: ParametricModel, found: StudySelection) -> TextTable:
+    rows = tuple(
+        (item.name, f"{item.moved:+.2f}", *(f"{value:+.3f}" for value in item.shift))
+        for item in found.doubts.bias
+    )
+    heads = ("fixed parameter", "moved by", *(model.names[index] for index in found.free))
+    caption = (
+        "Bias from fixing, first subject: shift of the chosen parameters when a fixed one is "
+        "elsewhere; all in halves of their ranges."
+    )
+    return TextTable(caption, heads, rows)
+
+
+def _interval_figure(model: ParametricModel, found: StudySelection) -> Figure:
+    figure = new_figure(DOUBLE_COLUMN, 2.4)
+    ax = figure.subplots()
+    for place, index in enumerate(found.free):
+        widths = np.array([item.intervals.width[place] for item in found.chosen.values()])
+        shown = 100 * widths / (2 * model.gain[index])
+        spread = place + np.linspace(-0.2, 0.2, len(shown)) if len(shown) > 1 else [place]
+        ax.plot(spread, shown, linestyle="none", marker="o", color=BLUE, markerfacecolor="white")
+        ax.hlines(shown.mean(), place - 0.3, place + 0.3, color=INK, linewidth=1.5)
+    ax.set_xticks(range(len(found.free)), [model.names[index] for index in found.free])
+    ax.set_ylabel("interval (% of the range)")
+    ax.set_ylim(bottom=0)
+    return figure
+
+
+def _json(model: ParametricModel, found: StudySelection, command: str) -> bytes:
+    def names(subset: Sequence[int]) -> list[str]:
+        return [model.names[index] for index in subset]
+
+    intervals = {
+        subject: {
+            name: {"value": value, "low": low, "high": high}
+            for name, value, low, high in zip(
+                item.intervals.names, item.intervals.value, item.intervals.low, item.intervals.high,
+                strict=True,
+            )
+        }
+        for subject, item in found.chosen.items()
+    }  # fmt: skip
+    content = {
+        "selected": {
+            "fim": names(found.free),
+            "lasso": names(found.lasso),
+            "nelder_mead": {
+                key: names(item.nelder_mead.selected)
+                for key, item in found.chosen.items()
+                if item.nelder_mead is not None
+            },
+        },
+        "common": names(sorted(set(found.free) & set(found.lasso))),
+        "intersection": [names(subset) for subset in found.intersection],
+        "intervals": intervals,
+        "profile": dict(zip(names(found.free), map(_finite, found.doubts.profile), strict=True)),
+        "vaf": {
+            "nominal": {key: item.fit.vaf for key, item in found.nominal.items()},
+            "fim": {key: item.refit.vaf for key, item in found.chosen.items()},
+            "lasso": {
+                key: None if item.lasso.refit is None else item.lasso.refit.vaf
+                for key, item in found.chosen.items()
+            },
+        },
+        "seconds": found.seconds,
+        "rank": {key: item.information.rank for key, item in found.nominal.items()},
+        "unseen_scalings": {key: item.scalings for key, item in found.nominal.items()},
+        "unseen": {
+            key: [direction.shares for direction in item.unseen]
+            for key, item in found.nominal.items()
+        },
+        "sweep": [
+            {"bound": item.bound, "size": item.size, "subsets": [names(s) for s in item.subsets]}
+            for item in found.worst_case
+        ],
+        "command": command,
+    }
+    return (json.dumps(plain(content), indent=1, allow_nan=False) + "\n").encode()
+
+
+def names_of(model: ParametricModel, subset: Sequence[int]) -> str:
+    """Names of a subset, with commas."""
+    return ", ".join(model.names[index] for index in subset)
+
+
+def _sd(values: np.ndarray[Any, np.dtype[np.float64]]) -> float:
+    return float(np.std(values, ddof=1)) if len(values) > 1 else float("nan")
+
+
+def table_csv(table: TextTable) -> bytes:
+    """Encode a table as CSV."""
+    return csv_bytes(table.heads, table.rows)

@@ -1,0 +1,179 @@
+"""Work on one subject: what its recordings tell of all parameters, then of the chosen ones.
+
+The steps of chapter 4, as docs/selection.md lists them.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.assess.resampling import block_residuals
+from impc.studies.selection.bootstrap import (
+    BootstrapIntervals,
+    bootstrap_subset,
+    draw_single,
+)
+from impc.studies.selection.estimation import Estimate, estimate, multi_start
+from impc.studies.selection.fisher import (
+    Information,
+    NullDirection,
+    fisher_information,
+    null_directions,
+    unseen_scalings,
+)
+from impc.studies.selection.lasso import Lasso, lasso_of_size, table_c1
+from impc.studies.selection.modern import (
+    FixedBias,
+    agreement,
+    collinearity,
+    fixed_bias,
+    profile_interval,
+)
+from impc.studies.selection.subsets import Selection, sweep
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from impc.studies.selection.model import ParametricModel, Trial
+    from impc.studies.selection.settings import SelectSettings
+
+__all__ = ["Chosen", "Doubts", "Nominal", "fit_chosen", "fit_nominal", "raise_doubts"]
+
+_DRAW = {"single": draw_single, "block": block_residuals}
+
+
+@dataclass(frozen=True)
+class Nominal:
+    """All parameters of one subject, and what the recordings tell of them.
+
+    Attributes
+    ----------
+    fit : Estimate
+        All parameters fitted.
+    information : Information
+        At that estimate.
+    unseen : tuple of NullDirection
+    scalings : tuple of tuple of str
+        Parameters that may be scaled together unseen.
+    sweep : tuple of Selection
+    seconds : float
+        Time of information and sweep, s.
+    """
+
+    fit: Estimate
+    information: Information
+    unseen: tuple[NullDirection, ...]
+    scalings: tuple[tuple[str, ...], ...]
+    sweep: tuple[Selection, ...]
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """The chosen parameters of one subject, and what the LASSO would have chosen.
+
+    Attributes
+    ----------
+    refit : Estimate
+        Others at typical values.
+    intervals : BootstrapIntervals
+    lasso : Lasso
+    nelder_mead : Lasso or None
+        Table C.1, when asked for.
+    seconds_lasso, seconds_nelder_mead : float
+        Time of each, s.
+    """
+
+    refit: Estimate
+    intervals: BootstrapIntervals
+    lasso: Lasso
+    nelder_mead: Lasso | None
+    seconds_lasso: float
+    seconds_nelder_mead: float
+
+
+@dataclass(frozen=True)
+class Doubts:
+    """What a reviewer asks of the chosen parameters, in one subject.
+
+    Attributes
+    ----------
+    agreement : dict
+        Rule -> its best subset.
+    collinearity : float
+        Brun's index of the chosen parameters.
+    bias : tuple of FixedBias
+    profile : tuple of (float, float)
+        Ends of the profile likelihood's 95 % interval of each chosen parameter.
+    bound : tuple of float
+        Half width of the Cramer-Rao 95 % interval of each, in its unit.
+    """
+
+    agreement: dict[str, tuple[int, ...]]
+    collinearity: float
+    bias: tuple[FixedBias, ...]
+    profile: tuple[tuple[float, float], ...]
+    bound: tuple[float, ...]
+
+
+def fit_nominal(
+    model: ParametricModel, trials: Sequence[Trial], settings: SelectSettings
+) -> Nominal:
+    """Fit all parameters; information, rank, unseen directions and feasible subsets."""
+    nominal = multi_start(model, trials, range(model.size), settings.starts, settings.seed)[0]
+    started = time.perf_counter()
+    found = fisher_information(model, np.array(nominal.theta), trials)
+    swept = sweep([found.F], settings.bounds, settings.least)
+    seconds = time.perf_counter() - started
+    return Nominal(
+        nominal, found, null_directions(model, found), unseen_scalings(model, found), swept, seconds
+    )
+
+
+def fit_chosen(
+    model: ParametricModel,
+    trials: Sequence[Trial],
+    settings: SelectSettings,
+    chosen: tuple[int, ...],
+) -> Chosen:
+    """Fit chosen parameters, with intervals; and select by LASSO for comparison."""
+    refit = estimate(model, trials, chosen, np.array(model.typical))
+    intervals = bootstrap_subset(
+        model, trials, refit, settings.replicates, settings.seed, _DRAW[settings.draw]
+    )
+    started = time.perf_counter()
+    lasso = lasso_of_size(model, trials, settings.size)
+    between = time.perf_counter()
+    nelder_mead = table_c1(model, trials, settings.size) if settings.nelder_mead else None
+    ended = time.perf_counter()
+    return Chosen(refit, intervals, lasso, nelder_mead, between - started, ended - between)
+
+
+def raise_doubts(
+    model: ParametricModel,
+    trials: Sequence[Trial],
+    settings: SelectSettings,
+    nominal: Nominal,
+    refit: Estimate,
+) -> Doubts:
+    """Other rules of selection, collinearity, bias from fixing, profile likelihood."""
+    chosen = list(refit.free)
+    rules = agreement(model, trials, np.array(nominal.fit.theta), settings.bound)
+    best = {
+        rule: (item.subsets[0] if item.subsets else ()) if isinstance(item, Selection) else item
+        for rule, item in rules.items()
+    }
+    local = fisher_information(model, np.array(refit.theta), trials)
+    covariance = np.linalg.pinv(np.asarray(local.F)[np.ix_(chosen, chosen)], hermitian=True)
+    half = 1.96 * np.sqrt(np.diag(covariance)) * model.gain[chosen]
+    return Doubts(
+        best,
+        collinearity(nominal.information, chosen),
+        fixed_bias(model, trials, refit),
+        tuple(profile_interval(model, trials, refit, index) for index in chosen),
+        tuple(float(item) for item in half),
+    )

@@ -1,0 +1,109 @@
+"""All that a fit can be asked about its own certainty, on the cart; alternatives against truth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from experiments.coverage import cart, noisy_trial, true_controller
+from impc.assess.other_models import Alternative, fit_alternatives, verdict
+from impc.errors import InputError
+from impc.inverse.noisy_fit import fit_controller
+from impc.studies.fit.result import FitResult
+from impc.studies.fit.settings import FitSettings, fit_settings
+from impc.studies.fit.subject import FitProgress, fit_problem, fit_recordings, stages
+
+SEEDS = (11, 12, 13)
+EXTRAS = FitSettings(
+    horizon=10,
+    u_max=1.0,
+    replicates=20,
+    bootstrap="model",
+    profiles=["K.force.x[1]"],
+    unknown_limit=True,
+    horizons=[1, 10, 20],
+)
+
+
+@pytest.fixture(scope="module")
+def result() -> FitResult:
+    trials = [noisy_trial(seed, 0.0) for seed in SEEDS]
+    heard: list[str] = []
+    problem = fit_problem(cart(), trials, EXTRAS)
+    found = fit_recordings(problem, EXTRAS, FitProgress(heard.append))
+    assert len(heard) == stages(problem, EXTRAS)
+    return found
+
+
+def test_every_interval_holds_the_truth(result: FitResult) -> None:
+    """Seeds 11 to 13, chosen before the run; 95 % intervals of two entries and the limit."""
+    truth = dict(zip(("K.force.x[0]", "K.force.x[1]"), true_controller().K[0], strict=True))
+    truth["u_max.force"] = 1.0
+    methods = {item.method for item in result.certainty.intervals}
+    assert methods == {"sandwich", "cramer-rao", "model", "profile"}
+    for item in result.certainty.intervals:
+        assert item.low < truth[item.name] < item.high, item
+        assert item.value is not None
+
+
+def test_the_set_of_weights_is_described(result: FitResult) -> None:
+    found = result.certainty.weights
+    assert found is not None
+    assert found.dimension == 1
+    Q = result.intent.reported.weights.Q
+    for item in found.entries:
+        i, j = (result.fitted.problem.plant.states.index(n) for n in (item.first, item.second))
+        assert item.low <= Q[i, j] * (1 + 1e-6) + 1e-9
+        assert Q[i, j] <= item.high + 1e-6 * abs(item.high)
+    for value, ends in zip(np.linalg.eigvalsh(Q), found.eigenvalues, strict=True):
+        assert ends.low * (1 - 1e-6) <= value <= ends.high * (1 + 1e-6)
+    assert len(found.statements) == 2
+
+
+def test_the_limit_is_told_from_none_and_short_horizons_too(result: FitResult) -> None:
+    """The truth has a limit of 1 and N = 10: no limit is ruled out, N = 20 is not told apart."""
+    by_name = {item.name: item for item in result.certainty.alternatives}
+    assert list(by_name) == ["as fitted", "no limit", "horizon 1", "horizon 20"]
+    first = by_name["as fitted"]
+    assert "rule out no limit" in verdict(first, by_name["no limit"])
+    assert by_name["no limit"].held_out < first.held_out
+    assert "cannot tell" in verdict(first, by_name["horizon 20"])
+
+
+def test_verdicts() -> None:
+    one = Alternative("as fitted", 10, 1.0, 0.0, 90.0, "")
+    assert "cannot tell" in verdict(one, replace(one, name="b", aic=1.9))
+    assert "speak weakly against b" in verdict(one, replace(one, name="b", aic=5.0))
+    assert "rule out b" in verdict(one, replace(one, name="b", aic=50.0))
+    assert "rule out as fitted" in verdict(replace(one, aic=50.0), replace(one, name="b"))
+    assert "no controller (why)" in verdict(one, replace(one, name="b", reason="why"))
+
+
+def test_aic_is_that_of_the_innovations() -> None:
+    """White residuals of one output: T log of the mean square, up to the common constant."""
+    trial = noisy_trial(SEEDS[0], 0.0)
+    problem = fit_problem(cart(), [trial], EXTRAS)
+    fitted = fit_controller(problem)
+    found = fit_alternatives(problem, fitted, [20], 1.0)
+    misfits = np.array([item.misfit for item in found])
+    expected = trial.samples * np.log(misfits**2)
+    differences = np.array([item.aic for item in found]) - (expected - np.min(expected))
+    # The root of white residuals is not quite zero: a few units of hundreds.
+    assert np.max(np.abs(differences)) < 0.05 * np.max(expected - np.min(expected)) + 1.0
+    assert all(np.isnan(item.held_out) for item in found)
+
+
+@pytest.mark.parametrize(
+    ("table", "match"),
+    [
+        ({"replicates": 5}, "at least 20"),
+        ({"replicates": -1}, "at least 0"),
+        ({"horizons": [0]}, "horizons"),
+        ({"bootstrap": "other"}, r"\[fit\]"),
+    ],
+)
+def test_settings_are_checked(table: dict[str, object], match: str) -> None:
+    with pytest.raises(InputError, match=match):
+        fit_settings(table)

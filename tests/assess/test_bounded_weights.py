@@ -1,0 +1,170 @@
+"""All weights with a gain: members behave alike, ranges are met and never passed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from experiments.benchmarks.workloads import Workload, chain_of_masses, example, seat
+from impc.arrays import Array
+from impc.assess.bounded_weights import (
+    WeightsSet,
+    entry_ranges,
+    linear_range,
+    trace_range,
+    weights_set,
+)
+from impc.assess.intent_statements import order_statements, sense_statements, widest_dominant_angle
+from impc.control.closed_loop import simulate
+from impc.control.controller import mpc_controller
+from impc.errors import InputError
+from impc.inverse.solution_set import gain_fibre, pair_blocks, split_blocks
+from impc.model.riccati import solve_lqr
+from impc.model.weights import condition_number, stage_weights
+
+SEED = 2
+
+
+def set_of(work: Workload, ratio: float = 10.0) -> WeightsSet:
+    return weights_set(gain_fibre(work.problem.plant, work.controller.K), ratio)
+
+
+def random_members(found: WeightsSet, count: int) -> list[Array]:
+    """Points along random rays from the least conditioned member to the edge of the set."""
+    rng = np.random.default_rng(SEED)
+    centre = found.least.weights.block
+    m = found.fibre.plant.m
+    centre = centre * (m / np.trace(centre[-m:, -m:]))
+    members = []
+    for _ in range(count):
+        ray = np.tensordot(rng.standard_normal(len(found.level)), found.level, 1)
+        low, high = 0.0, 1.0
+        while _inside(found, centre + high * ray) and high < 1e12:
+            high *= 2
+        for _ in range(60):
+            middle = (low + high) / 2
+            low, high = (middle, high) if _inside(found, centre + middle * ray) else (low, middle)
+        members.append(centre + low * ray)
+        members.append(centre + rng.uniform() * low * ray)
+    return members
+
+
+def _inside(found: WeightsSet, X: Array) -> bool:
+    values = np.linalg.eigvalsh(X)
+    return bool(values[0] > 0 and values[-1] <= found.limit * values[0])
+
+
+@pytest.mark.parametrize("make", [example, lambda: seat(1, 10.0)], ids=["example", "seat"])
+def test_members_give_the_same_trajectories(make) -> None:  # type: ignore[no-untyped-def]
+    """Sampled weights, made into controllers from scratch, through bounds and all: 1e-9."""
+    work = make()
+    found = set_of(work)
+    truth = simulate(work.controller, work.drives[0])
+    plant = work.problem.plant
+    size = float(np.max(np.abs(truth.x @ plant.C.T)))
+    for X in random_members(found, 5):
+        weights = split_blocks(X, plant.n)
+        controller = mpc_controller(
+            plant,
+            stage_weights(weights.Q, weights.R),
+            work.controller.bounds,
+            work.controller.horizon,
+            terminal_set=work.controller.terminal is not None,
+        )
+        run = simulate(controller, work.drives[0])
+        np.testing.assert_allclose(run.x @ plant.C.T, truth.x @ plant.C.T, atol=1e-9 * max(1, size))
+
+
+def test_ranges_are_those_of_random_search_with_two_states() -> None:
+    """Never passed, and met to 1 % of their width: 4000 rays."""
+    found = set_of(example())
+    sampled = np.array(random_members(found, 4000))
+    for (i, j), ends in entry_ranges(found).items():
+        width = ends.high - ends.low
+        assert np.min(sampled[:, i, j]) >= ends.low - 1e-9 * width
+        assert np.max(sampled[:, i, j]) <= ends.high + 1e-9 * width
+        assert np.min(sampled[:, i, j]) <= ends.low + 0.01 * width
+        assert np.max(sampled[:, i, j]) >= ends.high - 0.01 * width
+
+
+def test_ranges_of_several_inputs_are_never_passed() -> None:
+    """Ten states, one of the chain's workloads; the ends themselves are members."""
+    work = chain_of_masses(6, 100)
+    found = set_of(work)
+    sampled = np.array(random_members(found, 100))
+    for i, j in ((0, 0), (2, 1), (5, 5)):
+        direction = np.zeros_like(found.first)
+        direction[i, j] += 0.5
+        direction[j, i] += 0.5
+        ends = linear_range(found, direction)
+        width = ends.high - ends.low
+        assert np.min(sampled[:, i, j]) >= ends.low - 1e-7 * width
+        assert np.max(sampled[:, i, j]) <= ends.high + 1e-7 * width
+        assert abs(ends.low - ends.low_bound) <= 1e-5 * width
+        assert abs(ends.high - ends.high_bound) <= 1e-5 * width
+        for weights in (ends.low_weights, ends.high_weights):
+            assert condition_number(weights) <= found.limit * (1 + 1e-4)
+            K = solve_lqr(work.problem.plant, stage_weights(weights.Q, weights.R)).K
+            np.testing.assert_allclose(K, work.controller.K, atol=1e-6 * np.max(np.abs(K)))
+
+
+def test_least_trace_is_below_that_of_every_member() -> None:
+    found = set_of(example())
+    ends = trace_range(found, np.array([1.0, 2.0]))
+    traces = [X[0, 0] + 4 * X[1, 1] for X in random_members(found, 300)]
+    assert ends.low * (1 - 1e-9) <= min(traces) <= ends.low * 1.02
+    assert max(traces) <= ends.high * (1 + 1e-9)
+
+
+def test_statements_agree_with_sampled_members() -> None:
+    found = set_of(example(), 1.5)
+    sizes, names = np.array([1.0, 3.0]), found.fibre.plant.states
+    sampled = random_members(found, 300)
+    for statement, values in (
+        (order_statements(found, sizes, names)[0], [X[0, 0] - 9 * X[1, 1] for X in sampled]),
+        (sense_statements(found, sizes, names, entry_ranges(found))[0], [X[0, 1] for X in sampled]),
+    ):
+        signs = {bool(value > 0) for value in values}
+        if statement.holds is None:
+            assert signs == {True, False}
+        else:
+            assert signs == {statement.holds}
+    assert order_statements(found, sizes, names)[0].holds is False
+
+
+def test_widest_angle_is_at_least_that_of_sampled_members() -> None:
+    found = set_of(example(), 3.0)
+    sizes = np.array([1.0, 2.0])
+    angle, weights = widest_dominant_angle(found, sizes)
+    D = np.diag(sizes)
+
+    def dominant(
+        Q: Array,
+    ) -> Array:
+        return np.asarray(np.linalg.eigh(D @ Q @ D)[1][:, -1])
+
+    centre = dominant(found.least.weights.Q)
+    sampled = [
+        np.degrees(np.arccos(min(1.0, abs(float(centre @ dominant(X[:2, :2]))))))
+        for X in random_members(found, 2000)
+    ]
+    assert angle >= max(sampled) - 0.5
+    reached = np.degrees(np.arccos(abs(float(centre @ dominant(weights.Q)))))
+    assert reached == pytest.approx(angle, abs=1e-6)
+    assert condition_number(stage_weights(weights.Q, weights.R)) <= found.limit * (1 + 1e-6)
+
+
+def test_a_ratio_must_leave_room() -> None:
+    with pytest.raises(InputError, match="ratio"):
+        set_of(example(), 1.0)
+
+
+def test_fibre_members_span_the_set() -> None:
+    """Every member of the set is in the fibre: the levels are combinations of its basis."""
+    found = set_of(seat(1, 1.0))
+    basis = pair_blocks(found.fibre.Q, found.fibre.R)
+    scaled = np.array([found.inverse @ X @ found.inverse.T for X in basis]).reshape(len(basis), -1)
+    seen = np.array([found.inverse @ X @ found.inverse.T for X in found.level])
+    seen = seen.reshape(len(seen), -1)
+    q, _ = np.linalg.qr(scaled.T)
+    np.testing.assert_allclose(q @ (q.T @ seen.T), seen.T, atol=1e-8)

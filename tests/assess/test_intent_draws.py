@@ -1,0 +1,97 @@
+"""Gains that recordings allow: their spread, and statements on intent that survive it or do not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from experiments.coverage import cart, noisy_trial
+from experiments.cursor_tracking import ConditionResult, price_ratio
+from impc.assess.covariance import GainCovariance, gain_covariance
+from impc.assess.intent_draws import drawn_gains
+from impc.assess.weights_ranges import summarise_weights
+from impc.inverse.noisy_fit import FittedController, fit_controller
+from impc.model.riccati import solve_lqr
+from impc.studies.fit.result import FittedParameter
+from impc.studies.fit.settings import FitSettings
+from impc.studies.fit.subject import fit_problem
+from impc.studies.fit.tables import prices_table, set_sentences, statements_table
+
+SIZES = np.array([1.0, 1.0])
+
+
+@pytest.fixture(scope="module")
+def fitted() -> tuple[FittedController, GainCovariance]:
+    settings = FitSettings(horizon=10, u_max=1.0)
+    found = fit_controller(fit_problem(cart(), [noisy_trial(3, 0.0)], settings))
+    K, S = np.array(found.solution.K), np.array(found.solution.S)
+    return found, gain_covariance(found.problem, K, S)
+
+
+def test_drawn_gains_spread_as_their_covariance(
+    fitted: tuple[FittedController, GainCovariance],
+) -> None:
+    """300 gains: centre to 0.2 deviations, deviations along both directions to 15 %."""
+    found, covariance = fitted
+    drawn = drawn_gains(cart(), found.weights, found.solution.K, covariance, 300)
+    off = np.array([covariance.along(one.K - found.solution.K) for one in drawn])
+    scaled = off / covariance.deviations
+    np.testing.assert_allclose(np.std(scaled, axis=0), 1.0, atol=0.15)
+    assert np.all(np.abs(np.mean(scaled, axis=0)) < 0.2)
+    for one in drawn[:5]:
+        np.testing.assert_allclose(solve_lqr(cart(), one.weights).K, one.K)
+    again = drawn_gains(cart(), found.weights, found.solution.K, covariance, 2)
+    np.testing.assert_array_equal(again[1].K, drawn[1].K)
+
+
+def test_a_statement_is_made_only_when_other_gains_agree(
+    fitted: tuple[FittedController, GainCovariance],
+) -> None:
+    """The same gain and the same weights: told to its deviations, and all but unknown."""
+    found, covariance = fitted
+    K, metrics = np.array(found.solution.K), np.array(found.metrics)
+    bare = summarise_weights(cart(), K, metrics, SIZES)
+    held = [item for item in bare.statements if item.holds is not None]
+    assert held, "at the fitted gain a price is above the other"
+    assert not any(item.made for item in bare.statements), "nothing was tried"
+    outcomes = {}
+    for name, deviations in (("told", covariance.deviations), ("unknown", np.full(2, np.inf))):
+        draws = drawn_gains(cart(), found.weights, K, replace(covariance, deviations=deviations))
+        outcomes[name] = summarise_weights(cart(), K, metrics, SIZES, draws=draws)
+        assert [item.holds for item in outcomes[name].statements] == [
+            item.holds for item in bare.statements
+        ]
+    assert any(item.made for item in outcomes["told"].statements)
+    assert not any(item.made for item in outcomes["unknown"].statements)
+    assert outcomes["unknown"].angle_of_gain > outcomes["told"].angle_of_gain
+    for near, far in zip(outcomes["told"].prices, outcomes["unknown"].prices, strict=True):
+        assert far.low_drawn <= near.low_drawn <= near.low <= near.high <= near.high_drawn
+        assert near.high_drawn < far.high_drawn
+    told, unknown = (statements_table(outcomes[name]) for name in ("told", "unknown"))
+    assert any(row[1] == "true for all" or row[1] == "false for all" for row in told.rows)
+    assert all(row[1] == "not made" for row in unknown.rows)
+    assert "39 other gains" in told.caption
+    assert "none may be made" in statements_table(bare).caption
+    assert prices_table(bare) is None
+    assert any("over 39 others" in line for line in set_sentences(outcomes["told"]))
+
+
+def test_a_parameter_that_stays_where_it_began_is_not_determined() -> None:
+    assert not FittedParameter("lag", 0.08, 0.0812, 0.0812 * 1400).determined
+    assert not FittedParameter("lag", 0.08, 0.0812, np.inf).determined
+    assert FittedParameter("delay", 0.08, 0.09, 0.009).determined
+
+
+def test_the_ratio_of_prices_has_an_interval() -> None:
+    """It falls only where all resampled fits say so."""
+    one = ConditionResult(
+        11.0, 9, 0.1, 0.08, True, False, [], [], [], [], [1.0, 1.0], 3, 1e6, 1e6, 1e6,
+        [5e5, 2e6], [1.0, 2.0], "", [], [], [],
+    )  # fmt: skip
+    other = replace(one, blur=29.0, price_of_error=1e3, resampled_price=[1e2, 1e4])
+    assert "falls by a factor of 1e+03 (33 %: 200 to 5e+03)" in price_ratio([one, other])
+    crossing = replace(other, resampled_price=[1e2, 1e7])
+    assert "is not told from constant" in price_ratio([one, crossing])
+    assert "nothing is said" in price_ratio([replace(one, resampled_price=[]), other])

@@ -1,0 +1,166 @@
+"""Bootstrap and profile likelihood beside the covariance, on the cart and on known noise."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import control
+import numpy as np
+import pytest
+import scipy.linalg
+import scipy.signal
+
+from experiments.coverage import cart, noisy_trial
+from impc.arrays import Array
+from impc.assess.intervals import Interval, covariance_intervals, entry_names
+from impc.assess.printed_gain import gain_estimate
+from impc.assess.profiles import profile_likelihood
+from impc.assess.resampling import (
+    Draw,
+    Replicate,
+    block_length,
+    block_residuals,
+    bootstrap_intervals,
+    model_residuals,
+    replicate,
+)
+from impc.errors import InputError
+from impc.inverse.noisy_fit import FittedController, fit_controller
+from impc.inverse.residuals import misfit_or_reason
+from impc.model.plant import as_plant
+from impc.model.recordings import recording
+from impc.studies.fit.settings import FitSettings
+from impc.studies.fit.subject import fit_problem
+
+SEED = 4
+
+
+@pytest.fixture(scope="module", params=[0.0, 0.9], ids=["white", "coloured"])
+def fitted(request: pytest.FixtureRequest) -> FittedController:
+    trial = noisy_trial(SEED, request.param)
+    return fit_controller(fit_problem(cart(), [trial], FitSettings(horizon=10, u_max=1.0)))
+
+
+def first_order(root: float, samples: int, seed: int) -> Array:
+    rng = np.random.default_rng(seed)
+    white = rng.standard_normal((samples + 500, 2)) @ np.array([[1.0, 0.6], [0.0, 0.8]])
+    return np.asarray(scipy.signal.lfilter([1.0], [1.0, -root], white, axis=0)[500:])
+
+
+def drawn(fitted: FittedController, index: int, seed: int, draw: Draw) -> Replicate:
+    at = gain_estimate(fitted)
+    K, S = np.array(at.K), np.array(at.S)
+    return replicate(at.problem, K, S, fitted.weights, index, seed, draw)
+
+
+def width(found: tuple[Interval, ...]) -> Array:
+    return np.array([item.high - item.low for item in found])
+
+
+def test_bootstrap_agrees_with_the_sandwich(fitted: FittedController) -> None:
+    """30 replicates, seed 4: widths within a third of the sandwich's, for both ways to draw."""
+    estimate = gain_estimate(fitted)
+    sandwich = width(covariance_intervals(estimate, estimate.covariance, "sandwich"))
+    for draw in (block_residuals, model_residuals):
+        found = [drawn(fitted, index, SEED, draw) for index in range(30)]
+        ratio = width(bootstrap_intervals(estimate, found, "bootstrap", 0.95)) / sandwich
+        assert np.all(np.abs(np.log(ratio)) < np.log(1.5)), ratio
+
+
+def test_profile_agrees_with_the_sandwich(fitted: FittedController) -> None:
+    """Nearly quadratic, so nearly the same ends."""
+    estimate = gain_estimate(fitted)
+    for item in covariance_intervals(estimate, estimate.covariance, "sandwich"):
+        found = profile_likelihood(estimate, item.name).interval
+        assert found.low == pytest.approx(item.low, abs=0.15 * (item.high - item.low))
+        assert found.high == pytest.approx(item.high, abs=0.15 * (item.high - item.low))
+        assert found.low < found.value < found.high  # type: ignore[operator]
+
+
+def test_plain_intervals_are_narrower_with_coloured_noise() -> None:
+    trial = noisy_trial(SEED, 0.9)
+    fit = fit_controller(fit_problem(cart(), [trial], FitSettings(horizon=10, u_max=1.0)))
+    estimate = gain_estimate(fit)
+    plain = width(covariance_intervals(estimate, estimate.white, "cramer-rao"))
+    sandwich = width(covariance_intervals(estimate, estimate.covariance, "sandwich"))
+    assert np.all(sandwich > 2 * plain)
+
+
+def test_profile_against_brute_force(fitted: FittedController) -> None:
+    """D at one value against a dense search over the only other entry, initial state refitted."""
+    problem = dataclasses.replace(fitted.problem, unknown_start=False)
+    known = gain_estimate(dataclasses.replace(fitted, problem=problem))
+    name = entry_names(problem.plant)[0]
+    profile = profile_likelihood(known, name)
+    value, distance = profile.values[0], profile.distances[0]
+    S = np.array(known.S)
+
+    def squared(first: float, second: float) -> float:
+        return misfit_or_reason(problem, np.array([[first, second]]), S)[0] ** 2
+
+    K = np.array(known.K)[0]
+    grid = K[1] + np.linspace(-0.5, 0.5, 401)
+    held = min(squared(value, second) for second in grid)
+    best = profile.values[int(np.argmin(profile.distances))]
+    least = min(squared(best, second) for second in grid)
+    variance = least / sum(trial.outputs.size for trial in problem.recordings)
+    factor = max((known.covariance.entries[0, 0] / known.white.entries[0, 0]) ** 2, 1.0)
+    assert distance == pytest.approx((held - least) / (variance * factor), rel=0.05, abs=0.05)
+
+
+def test_what_is_not_determined_has_no_end() -> None:
+    """A third state that nothing reaches: its entry of the gain shows nowhere."""
+    base = cart()
+    A, B = (
+        scipy.linalg.block_diag(base.A, np.array([[0.5]])),
+        np.vstack([np.hstack([base.B, base.E]), [0, 0]]),
+    )
+    system = control.ss(A, B, np.hstack([base.C, [[0]]]), 0, base.dt, inputs=["force", "push"])
+    plant = as_plant(system, ["force"])
+    trial = noisy_trial(SEED, 0.0)
+    again = recording(plant, trial.outputs, trial.disturbance)
+    problem = fit_problem(plant, [again], FitSettings(horizon=10, u_max=1.0))
+    estimate = gain_estimate(fit_controller(problem))
+    names = entry_names(plant)
+    assert np.isinf(profile_likelihood(estimate, names[2]).interval.high)
+    assert np.isfinite(profile_likelihood(estimate, names[0]).interval.high)
+    assert estimate.covariance.told_entries.tolist() == [[True, True, False]]
+
+
+def test_an_unknown_name_is_told(fitted: FittedController) -> None:
+    with pytest.raises(InputError, match=r"known: K\.force"):
+        profile_likelihood(gain_estimate(fitted), "mass")
+
+
+def test_a_replicate_depends_on_seed_and_number_only(fitted: FittedController) -> None:
+    alone = drawn(fitted, 3, SEED, block_residuals)
+    among = [drawn(fitted, index, SEED, block_residuals) for index in range(5)][3]
+    np.testing.assert_array_equal(alone.K, among.K)
+    assert not np.array_equal(drawn(fitted, 3, SEED + 1, block_residuals).K, alone.K)
+
+
+@pytest.mark.parametrize("draw", [block_residuals, model_residuals])
+@pytest.mark.parametrize("root", [0.0, 0.9])
+def test_drawn_residuals_have_the_colour_of_the_given(draw, root: float) -> None:  # type: ignore[no-untyped-def]
+    """Variance, correlation of the outputs and of neighbours; 40 draws of 2 x 2000 samples."""
+    given = [first_order(root, 2000, SEED), first_order(root, 1500, SEED + 1)]
+    rng = np.random.default_rng(SEED)
+    drawn = [draw(given, rng) for _ in range(40)]
+    assert [part.shape for part in drawn[0]] == [(2000, 2), (1500, 2)]
+
+    def moments(trials: list[Array]) -> Array:
+        lagged = sum(part[1:].T @ part[:-1] for part in trials) / sum(map(len, trials))
+        return np.concatenate([np.cov(np.concatenate(trials).T).ravel(), np.ravel(lagged)])
+
+    found = np.mean([moments(part) for part in drawn], axis=0)
+    expected = moments([part - part.mean(axis=0) for part in given])
+    np.testing.assert_allclose(found, expected, atol=0.08 * np.max(np.abs(expected)))
+
+
+def test_block_length_of_first_order_noise() -> None:
+    """The closed form of Politis and White at the estimated root."""
+    given = [first_order(0.9, 4000, SEED)]
+    assert block_length(given) == pytest.approx(
+        np.cbrt(6 * 0.81 / (1 - 0.81) ** 2 * 4000), rel=0.15
+    )
+    assert block_length([np.zeros((50, 1))]) == 1

@@ -1,0 +1,57 @@
+"""VAF by hand, whiteness against its definition, saturation by counting."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.signal
+import scipy.stats
+
+from impc.assess.vaf import centred_vaf, saturated_share, vaf, whiteness
+
+
+def test_vaf_by_hand() -> None:
+    recorded = np.array([[3.0, 1.0], [4.0, 1.0]])
+    simulated = np.array([[3.0, 0.0], [3.0, 1.0]])
+    np.testing.assert_allclose(vaf(recorded, simulated), [100 * (1 - 1 / 25), 50.0])
+    # The second output does not vary: there is no variance to account for.
+    np.testing.assert_allclose(centred_vaf(recorded, simulated), [0.0, np.nan])
+
+
+def test_vaf_of_an_output_that_is_zero_is_not_a_number() -> None:
+    assert np.isnan(vaf(np.zeros((5, 1)), np.ones((5, 1)))[0])
+
+
+def test_a_shift_counts_in_vaf_and_not_in_the_centred_one() -> None:
+    y = np.sin(np.arange(100.0))[:, None]
+    assert centred_vaf(y, y + 1)[0] == pytest.approx(100)
+    assert vaf(y, y + 1)[0] < 0
+
+
+def test_whiteness_is_ljung_and_box() -> None:
+    """Q = N (N + 2) sum rho_k^2 / (N - k), chi-squared; seed 1."""
+    noise = np.random.default_rng(1).standard_normal(500)
+    centred = noise - np.mean(noise)
+    lags = 20
+    rho = [
+        float(centred[k:] @ centred[: len(centred) - k]) / float(centred @ centred)
+        for k in range(1, lags + 1)
+    ]
+    statistic = 500 * 502 * sum(r**2 / (500 - k) for k, r in enumerate(rho, 1))
+    expected = scipy.stats.chi2.sf(statistic, lags)
+    assert whiteness(noise[:, None], lags)[0] == pytest.approx(expected, rel=1e-9)
+
+
+def test_coloured_residuals_are_told() -> None:
+    noise = np.random.default_rng(2).standard_normal((2000, 1))
+    coloured = scipy.signal.lfilter([1.0], [1.0, -0.5], noise, axis=0)
+    assert whiteness(coloured, 50)[0] < 1e-6
+    assert np.isnan(whiteness(np.zeros((100, 1)), 10)[0])
+
+
+def test_saturated_share_counts_samples() -> None:
+    u = np.array([[1.0, 0.0], [0.5, 0.0], [0.2, -2.0], [0.0, 0.0]])
+    limits = np.array([1.0, 2.0])
+    assert saturated_share(u, -limits, limits) == 0.5
+    free = np.full(2, np.inf)
+    assert saturated_share(u, -free, free) == 0.0

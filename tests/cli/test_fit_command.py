@@ -1,0 +1,253 @@
+"""`impc simulate` and `impc fit` from files to files, as their users type them."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from impc.cli.main import main
+from impc.files.configuration import read_configuration
+from impc.files.plant_sources import make_plant, plant_source
+from impc.files.reading import read_recordings
+from impc.studies.fit.settings import fit_settings
+from impc.studies.fit.subject import fit_problem, fit_recordings
+from tests.files.damaged import DAMAGED, PLANT
+from tests.support import easier_seat
+
+OWN_PLANT = """
+import control
+
+def cart(mass=1.0):
+    system = control.ss([[0, 1], [0.5, -0.3]], [[0, 0], [1 / mass, 1]], [[1, 0]], 0,
+                        states=["=1+1", "$\\\\alpha"], inputs=["$\\\\frac{F}$ <i>", "push"],
+                        outputs=["position"])
+    return control.c2d(system, 0.05)
+"""
+
+
+def run(*arguments: str) -> Result:
+    return CliRunner().invoke(main, list(arguments))
+
+
+@pytest.fixture(scope="module")
+def subject(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("subject")
+    done = run("simulate", "seated-balance", "--out", str(folder), "--duration", "6")
+    assert done.exit_code == 0, done.stderr
+    return folder
+
+
+def without_draws(configuration: Path) -> Path:
+    """The same fit without other gains for the statements: they are half of its time."""
+    text = configuration.read_text(encoding="utf-8")
+    quick = configuration.with_name("quick.toml")
+    quick.write_text(text.replace("[fit]", "[fit]\nintent_draws = false"), encoding="utf-8")
+    return quick
+
+
+@pytest.fixture(scope="module")
+def fitted(subject: Path) -> tuple[Result, Path]:
+    out = subject / "fit"
+    files = [str(subject / f"trial_{number}.csv") for number in (1, 2, 3)]
+    config = str(without_draws(subject / "subject.toml"))
+    done = run("fit", *files, "--plant", "seated-balance", "--config", config, "--out", str(out))
+    assert done.exit_code == 0, done.stderr
+    return done, out
+
+
+def test_the_subject_is_written_in_every_format(subject: Path) -> None:
+    names = {path.name for path in subject.iterdir() if path.is_file()}
+    for number in (1, 2, 3):
+        for ending in (".csv", ".tsv", ".mat", "_v73.mat", ".tdms", ".c3d"):
+            assert f"trial_{number}{ending}" in names
+    truth = json.loads((subject / "truth.json").read_text())
+    assert np.array(truth["K"]).shape == (1, 10)
+    configuration = read_configuration(subject / "subject.toml")
+    plant = make_plant(
+        plant_source("plants:seated_balance_for", configuration.plant), tuple(configuration.signals)
+    )
+    first = read_recordings([subject / "trial_1.csv"], configuration, plant)[0]
+    for ending in (".tsv", ".mat", "_v73.mat", ".tdms", ".c3d"):
+        other = read_recordings([subject / f"trial_1{ending}"], configuration, plant)[0]
+        np.testing.assert_allclose(other.outputs, first.outputs, atol=1e-7)
+        np.testing.assert_allclose(other.disturbance, first.disturbance, atol=1e-6)
+
+
+def test_the_same_seed_gives_the_same_bytes(subject: Path, tmp_path: Path) -> None:
+    again = run("simulate", "seated-balance", "--out", str(tmp_path), "--duration", "6",
+                "--formats", "csv,mat73")  # fmt: skip
+    assert again.exit_code == 0
+    names = ("trial_2.csv", "subject.toml")
+    for name in names:
+        assert (tmp_path / name).read_bytes() == (subject / name).read_bytes()
+    assert not (tmp_path / "trial_1.tdms").exists()
+
+
+def test_result_json_is_the_fit(fitted: tuple[Result, Path], subject: Path) -> None:
+    """Against a fit of the same files without command and report."""
+    found = json.loads((fitted[1] / "result.json").read_text())
+    configuration = read_configuration(subject / "subject.toml")
+    plant = make_plant(
+        plant_source("plants:seated_balance_for", configuration.plant), tuple(configuration.signals)
+    )
+    files = [subject / f"trial_{number}.csv" for number in (1, 2, 3)]
+    recordings = read_recordings(files, configuration, plant)
+    settings = replace(fit_settings(configuration.fit), held_out=False, intent_draws=False)
+    result = fit_recordings(fit_problem(plant, recordings, settings), settings)
+    np.testing.assert_allclose(found["K"], result.fitted.solution.K, rtol=1e-6)
+    assert found["horizon"] == 20
+    assert found["bounds"]["u_max"] == [6.0]
+    assert found["bounds"]["x_max"] == [None] * 10
+    for index, name in enumerate(("theta1", "theta2")):
+        assert found["vaf"][name] == pytest.approx(result.inverse_mpc.vaf[index])
+        assert found["vaf"][name] > 99.5
+        assert found["methods"]["inverse_lqr_output"]["vaf"][name] < found["vaf"][name]
+    Q, R, P = (np.array(found[key]) for key in "QRP")
+    A, B = np.array(found["plant"]["A"]), np.array(found["plant"]["B"])
+    K = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
+    np.testing.assert_allclose(K, found["K"], rtol=1e-6, atol=1e-6 * np.max(np.abs(K)))
+    np.testing.assert_allclose(
+        P, A.T @ P @ A - A.T @ P @ B @ K + Q, atol=1e-7 * float(np.max(np.abs(P)))
+    )
+    values = found["intent"]["eigenvalues"]
+    np.testing.assert_allclose(values, np.linalg.eigvalsh(Q), rtol=1e-6, atol=1e-9 * values[-1])
+    assert abs(np.dot(found["intent"]["dominant"], found["intent"]["vectors"])[-1]) > 1 - 1e-9
+    assert found["identifiability"]["rank"] == result.identifiability.rank
+    assert [trial["trial"] for trial in found["trials"]] == ["1", "2", "3"]
+
+
+def test_the_page_says_what_the_numbers_say(fitted: tuple[Result, Path]) -> None:
+    found = json.loads((fitted[1] / "result.json").read_text())
+    page = (fitted[1] / "report.html").read_text()
+    assert f"{found['vaf']['theta1']:.2f} % of theta1" in page
+    assert f"by up to {found['intent']['widest_angle']:.0f} degrees" in page
+    assert "inverse LQR, output penalty (3.16)" in page
+    assert not re.search("https?:", page)
+    assert page.count("<img") == 6
+    assert len(page) < 4_000_000
+    assert "Nothing found." in page
+    for name in ("residuals.pdf", "intent.png", "methods.pdf", "trajectories-trial-3.pdf"):
+        assert (fitted[1] / name).stat().st_size > 5_000
+    assert not (fitted[1] / "fit-in-progress").exists()
+
+
+def test_the_command_prints_the_table(fitted: tuple[Result, Path]) -> None:
+    printed = fitted[0].stdout
+    for name in ("feedback_gain", "inverse_lqr_output", "clipped_lqr", "inverse_mpc"):
+        assert f"\n{name} " in printed
+    assert "VAF of trials left out, theta1" in printed
+    assert "degrees: so far it is not the subject's" in printed
+
+
+def test_a_plant_and_a_file_of_ones_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A semicolon file with decimal commas; a plant beside it; names to stumble over."""
+    monkeypatch.chdir(tmp_path)
+    Path("mine_to_fit.py").write_text(OWN_PLANT)
+    rng = np.random.default_rng(0)
+    push = np.repeat(rng.choice([-0.85, 0.0, 0.85], 60), 10)
+    x = np.zeros(2)
+    lines = ["t;pos;push"]
+    for index, value in enumerate(push):
+        shown = ";".join(f"{v:.9f}".replace(".", ",") for v in (index * 0.05, x[0], value))
+        lines.append(shown)
+        force = np.clip(-2.5 * x[0] - 2.2 * x[1], -1, 1)
+        for _ in range(10):
+            x = x + 0.005 * np.array([x[1], 0.5 * x[0] - 0.3 * x[1] + force + value])
+    file = Path(os.fsdecode(b"mine\xff$x^$.csv"))
+    file.write_text("\n".join(lines))
+    Path("mine.toml").write_text(
+        '[recording]\ntime = "t"\nsubject = "<script>alert(1)</script>"\n'
+        '[signals.position]\ncolumn = "pos"\nunit = "m"\n'
+        '[signals.push]\ncolumn = "push"\nunit = "N"\n'
+        "[plant]\nmass = 1.0\n[fit]\nhorizon = 10\nu_max = 1.0\n"
+    )
+    done = run("fit", str(file), "--plant", "mine_to_fit:cart", "--config", "mine.toml",
+               "--out", "out")  # fmt: skip
+    assert done.exit_code == 0, done.stderr
+    found = json.loads(Path("out/result.json").read_text())
+    assert found["vaf"]["position"] > 99
+    assert found["held_out_vaf"]["position"] is None
+    page = Path("out/report.html").read_text()
+    assert "<script>alert" not in page
+    assert "&lt;script&gt;alert" in page
+    assert "<i>" not in page
+    assert r"$\frac{F}$ &lt;i&gt;" in page
+    assert found["trials"][0]["trial"] == r"mine\udcff$x^$"
+
+
+@pytest.mark.parametrize("name", DAMAGED)
+def test_a_damaged_recording_ends_in_one_line_and_nothing_else(name: str, tmp_path: Path) -> None:
+    damage = DAMAGED[name]
+    folder = tmp_path / "in"
+    folder.mkdir()
+    path, text = damage.make(folder)
+    config = tmp_path / "subject.toml"
+    config.write_text(text)
+    out = tmp_path / "out"
+    done = run("fit", str(path), "--plant", PLANT, "--config", str(config),
+               "--out", str(out))  # fmt: skip
+    assert done.exit_code == 2
+    assert done.stdout == ""
+    assert done.stderr.startswith("impc: error: ")
+    assert done.stderr.count("\n") == 1
+    assert damage.phrase in done.stderr
+    assert not out.exists()
+    if path.exists() and path.is_file():
+        os.remove(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (("u_max = 6.0", 'u_max = "six"'), "u_max"),
+        (("horizon = 20", "horizn = 20"), "horizn"),
+        (("mass = 79.7", "mass = -3"), "mass"),
+        (("mass = 79.7", "weight = 3"), "weight"),
+        (("[signals.theta2]", "[signals.theta3]"), "theta3"),
+    ],
+)
+def test_a_configuration_that_cannot_be(
+    subject: Path, tmp_path: Path, change: tuple[str, str], says: str
+) -> None:
+    text = (subject / "subject.toml").read_text()
+    assert change[0] in text
+    config = tmp_path / "subject.toml"
+    config.write_text(text.replace(*change))
+    shutil.copy(subject / "trial_1.csv", tmp_path)
+    done = run("fit", str(tmp_path / "trial_1.csv"), "--plant", "seated-balance",
+               "--config", str(config), "--out", str(tmp_path / "out"))  # fmt: skip
+    assert done.exit_code == 2
+    assert done.stderr.count("\n") == 1
+    assert says in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_interrupted_command_says_what_it_kept(
+    subject: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    (tmp_path / "easier.toml").write_text(easier_seat((subject / "subject.toml").read_text()))
+    arguments = ("fit", *[str(subject / f"trial_{n}.csv") for n in (1, 2)], "--plant",
+                 "seated-balance", "--config", str(tmp_path / "easier.toml"), "--out",
+                 str(tmp_path / "out"))  # fmt: skip
+    with monkeypatch.context() as patch:
+        patch.setattr("impc.studies.fit.subject.compare_methods", interrupt)
+        stopped = run(*arguments)
+    assert stopped.exit_code == 130
+    assert "fit" in stopped.stderr
+    assert "the same command goes on from there" in stopped.stderr
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {".impc", "fit-in-progress"}
+    done = run(*arguments)
+    assert done.exit_code == 0, done.stderr
+    assert (tmp_path / "out" / "report.html").exists()
+    assert not (tmp_path / "out" / "fit-in-progress").exists()

@@ -1,0 +1,160 @@
+"""The `impc` command, from its arguments to its exit status."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner, Result
+
+import impc.studies.example.cases
+from impc.cli.main import main
+from impc.errors import SolverError
+from impc.model.plant import Plant
+from impc.studies.example.cases import run_case
+from impc.studies.example.table import METHODS, determined_sentences
+
+ROOT = Path(__file__).parents[2]
+
+
+def run(*arguments: str) -> Result:
+    return CliRunner().invoke(main, list(arguments))
+
+
+@pytest.fixture(scope="module")
+def case_b(tmp_path_factory: pytest.TempPathFactory) -> tuple[Result, Path]:
+    folder = tmp_path_factory.mktemp("out") / "example"
+    return run("example", "--case", "B", "--out", str(folder)), folder
+
+
+def test_example_writes_the_files_that_it_names(case_b: tuple[Result, Path]) -> None:
+    result, folder = case_b
+    assert result.exit_code == 0
+    assert result.stderr == ""
+    names = {path.name for path in folder.iterdir()}
+    assert {
+        "report.html",
+        "result.json",
+        "figure-3.2-case-B.png",
+        "terminal-set-case-B.pdf",
+    } < names
+    listed = result.stdout.split("Written to ")[1]
+    assert all(path.stem in listed for path in folder.iterdir() if path.name != ".impc")
+
+
+def test_example_prints_the_table_and_what_was_determined(
+    case_b: tuple[Result, Path], example_plant: Plant
+) -> None:
+    printed = case_b[0].stdout
+    assert "are lost" in printed
+    assert "LMI branch" in printed
+    for name in METHODS:
+        assert f"\n{name} " in printed
+    found = run_case(example_plant, "B").identifiability
+    assert determined_sentences(found)[0].split("(Sing")[0] in printed
+
+
+def test_result_json_is_the_run(case_b: tuple[Result, Path], example_plant: Plant) -> None:
+    cases = json.loads((case_b[1] / "result.json").read_text(encoding="utf-8"))["cases"]
+    assert list(cases) == ["B"]
+    again = run_case(example_plant, "B")
+    assert cases["B"]["x0"] == again.x0.tolist()
+    assert cases["B"]["truth"]["x"] == again.truth.x.tolist()
+    assert cases["B"]["truth"]["u"] == again.truth.u.tolist()
+    methods = cases["B"]["methods"]
+    assert methods["inverse_lqr_lmi"]["feasible"] is True
+    for name in ("inverse_mpc", "inverse_mpc_reduced"):
+        assert methods[name]["residual"] <= 1e-6
+    for method in again.methods:
+        assert method.K is not None
+        found = methods[method.name]
+        assert found["K"] == [pytest.approx(row) for row in method.K.tolist()]
+        assert found["state_misfit"] == pytest.approx(method.state_misfit, abs=1e-9)
+        assert found["max_abs_u"] == pytest.approx(method.max_abs_u)
+        assert ("Q" in found) == ("R" in found) == (method.weights is not None)
+        assert {"seconds", "simulations"} <= set(found)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "names"),
+    [
+        (("example", "--case", "D"), "--case"),
+        (("example", "--wrong"), "--wrong"),
+        (("exam",), "exam"),
+        (("--wrong",), "--wrong"),
+        (("simulate", "seated-balance", "--motor-noise", "nan"), "--motor-noise"),
+        (("simulate", "seated-balance", "--amplitude", "1e308"), "--amplitude"),
+        (("simulate", "seated-balance", "--mass", "-inf"), "--mass"),
+        (("simulate", "seated-balance", "--seed", "9" * 400), "--seed"),
+        (("simulate", "cohort", "--duration", "nan"), "--duration"),
+        (("simulate", "cohort", "--replicates", str(2**63)), "--replicates"),
+        (("key-parameters", "study.toml", "--bound", "nan"), "--bound"),
+        (("select", "study.toml", "--workers", "1000000000"), "--workers"),
+        (("fit", "a\nb.csv", "--plant", "cursor", "--config", "\udcff.toml"), r"\xff.toml"),
+    ],
+)
+def test_bad_arguments_get_one_line(arguments: tuple[str, ...], names: str) -> None:
+    result = run(*arguments)
+    check_one_line(result, 2)
+    assert names in result.stderr
+
+
+@pytest.mark.parametrize("below", ["file", "file/below", "file/far/below"])
+def test_a_folder_that_cannot_be_written_gets_one_line_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, below: str
+) -> None:
+    (tmp_path / "file").write_bytes(b"mine")
+
+    def unwanted(*_: object, **__: object) -> None:
+        raise AssertionError("the folder is checked before the work")
+
+    monkeypatch.setattr(impc.studies.example.cases, "run_case", unwanted)
+    result = run("example", "--out", str(tmp_path / below))
+    check_one_line(result, 2)
+    assert str(tmp_path / "file") in result.stderr
+    assert os.listdir(tmp_path) == ["file"]
+    assert (tmp_path / "file").read_bytes() == b"mine"
+
+
+@pytest.mark.parametrize(
+    ("error", "status"),
+    [(SolverError("HiGHS", "stopped", "try again"), 2), (KeyboardInterrupt(), 130)],
+)
+def test_a_failure_of_the_work_gets_one_line_and_no_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException, status: int
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise error
+
+    monkeypatch.setattr(impc.studies.example.cases, "run_case", fail)
+    check_one_line(run("example", "--out", str(tmp_path / "new" / "folder")), status)
+    assert os.listdir(tmp_path) == []
+
+
+def test_version_and_help() -> None:
+    assert run("--version").stdout.startswith("impc, version ")
+    for arguments in ((), ("--help",)):
+        assert "example" in run(*arguments).stdout
+    assert "are lost" in run("example", "--help").stdout
+
+
+def test_help_loads_no_solver() -> None:
+    code = (
+        "import sys, impc.cli.main; print(sorted({'casadi', 'cvxpy', 'numba'} & set(sys.modules)))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == "[]"
+
+
+def check_one_line(result: Result, status: int) -> None:
+    assert result.exit_code == status
+    assert result.stdout == ""
+    assert result.stderr.startswith("impc: ")
+    assert result.stderr.count("\n") == 1
+    assert result.stderr.endswith("\n")

@@ -1,0 +1,271 @@
+"""Exact sensitivities against central differences, and what the closed loop does not depend on."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.optimize import linprog
+
+from impc.control.closed_loop import (
+    Scenario,
+    Simulation,
+    Status,
+    require_complete,
+    scenario,
+    simulate,
+    simulate_and_differentiate,
+)
+from impc.control.compiled_loop import CONVERGED, INCONSISTENT, solve_dual
+from impc.control.constraint_rows import Directions, directions
+from impc.control.controller import Controller, gain_controller, mpc_controller
+from impc.errors import SolverError
+from impc.model.bounds import Bounds, bound_rows, box_bounds
+from impc.model.plant import Plant
+from impc.model.weights import stage_weights
+from tests.support import random_plant, random_weights
+
+
+def moved(
+    controller: Controller, drive: Scenario, part: str, index: tuple[int, ...], step: float
+) -> Simulation:
+    """The closed loop with one number of the problem changed by a step."""
+    if part == "x0":
+        x0 = np.array(drive.x0)
+        x0[index] += step
+        return simulate(controller, Scenario(x0, drive.disturbance))
+    if part == "bounds":
+        return simulate(with_bound(controller, index[0], step), drive)
+    owner: Any = controller.plant if part in ("A", "B", "E") else controller
+    matrix = np.array(getattr(owner, part))
+    matrix[index] += step
+    if part == "S":
+        matrix[index[::-1]] = matrix[index]
+    changed: Any = replace(owner, **{part: matrix})
+    return simulate(
+        replace(controller, plant=changed) if owner is controller.plant else changed, drive
+    )
+
+
+def with_bound(controller: Controller, row: int, step: float) -> Controller:
+    """One bound moved by a step, the price of its excess kept."""
+    rows = bound_rows(controller.bounds, controller.plant)
+    names = ("x_min", "x_max", "u_min", "u_max")
+    sides = {name: np.array(getattr(controller.bounds, name)) for name in names}
+    unit = (rows.E if rows.on_state[row] else rows.F)[row]
+    signal = int(np.argmax(np.abs(unit)))
+    name = ("x" if rows.on_state[row] else "u") + ("_max" if unit[signal] > 0 else "_min")
+    sides[name][signal] += unit[signal] * step
+    changed = replace(controller, bounds=Bounds(**sides))
+    if controller.softening is None:
+        return changed
+    # The penalty is a number of its own, not one of the directions.
+    return replace(changed, softening=controller.softening * controller.penalty / changed.penalty)
+
+
+def entries(controller: Controller) -> list[tuple[str, tuple[int, ...]]]:
+    """Every number that the closed loop can be differentiated with respect to."""
+    plant = controller.plant
+    shapes = {
+        "K": controller.K.shape,
+        "S": controller.S.shape,
+        "x0": (plant.n,),
+        "bounds": bound_rows(controller.bounds, plant).b.shape,
+        "A": plant.A.shape,
+        "B": plant.B.shape,
+        "E": plant.E.shape,
+    }
+    return [
+        (part, index)
+        for part, shape in shapes.items()
+        for index in np.ndindex(*shape)
+        if part != "S" or index[0] >= index[1]
+    ]
+
+
+def unit_directions(
+    controller: Controller, wanted: list[tuple[str, tuple[int, ...]]]
+) -> Directions:
+    along = directions(controller, len(wanted))
+    for column, (part, index) in enumerate(wanted):
+        array = getattr(along, part)
+        array[(*index, column)] = 1.0
+        if part == "S":
+            array[(*index[::-1], column)] = 1.0
+    return along
+
+
+def problem(seed: int, softening: float | None) -> tuple[Controller, Scenario, Simulation]:
+    """A random loop with input bounds, and mostly state bounds and a terminal set, at work."""
+    n, m = 2 + seed % 3, 1 + seed % 3
+    x_max = 1.5 if seed % 2 else np.inf
+    for attempt in range(10):
+        rng = np.random.default_rng([seed, attempt])
+        plant = random_plant(rng, n, m, 1.1, d=1)
+        weights = stage_weights(random_weights(rng, n), random_weights(rng, m))
+        bounds = box_bounds(plant, u_min=-0.4, u_max=0.5, x_min=-x_max, x_max=x_max)
+        controller = mpc_controller(plant, weights, bounds, 3, softening=softening)
+        push = 0.05 * rng.normal(size=25)
+        direction = rng.normal(size=n)
+        for size in 5 * 0.9 ** np.arange(60):
+            drive = scenario(plant, size * direction, disturbance=push)
+            run = simulate(controller, drive)
+            if run.complete and np.any(run.status > Status.FREE) and run.weakly_active == 0:
+                return controller, drive, run
+    raise AssertionError(f"seed {seed} has no active bound")
+
+
+@pytest.mark.parametrize("softening", [None, 50.0])
+@pytest.mark.parametrize("seed", range(100))
+def test_jacobian_equals_central_differences(seed: int, softening: float | None) -> None:
+    """Two hundred random loops, every number of each."""
+    controller, drive, _ = problem(seed, softening)
+    check_jacobian(controller, drive)
+
+
+@pytest.mark.parametrize("x0", [(1, 3), (2, 3), (2, 1)])
+def test_jacobian_of_the_example_equals_central_differences(
+    example_plant: Plant, example_bounds: Bounds, x0: tuple[int, int]
+) -> None:
+    controller = mpc_controller(example_plant, stage_weights(np.eye(2), 1), example_bounds, 3)
+    check_jacobian(controller, scenario(example_plant, x0, 20))
+
+
+def check_jacobian(controller: Controller, drive: Scenario) -> None:
+    """Compare every derivative with differences of fourth order, to 1e-6."""
+    wanted = entries(controller)
+    _, exact = simulate_and_differentiate(controller, drive, unit_directions(controller, wanted))
+    for column, (part, index) in enumerate(wanted):
+        errors = []
+        # The longer differences may reach across a change of the active set, the shorter ones have
+        # more rounding: one of them must agree.
+        for step in (1e-4, 1e-5, 1e-6, 1e-7):
+            near, far = (
+                [moved(controller, drive, part, index, sign * s) for sign in (1, -1)]
+                for s in (step, 2 * step)
+            )
+            worst = 0.0
+            for quantity in ("x", "u"):
+                inner, outer = (
+                    getattr(pair[0], quantity) - getattr(pair[1], quantity) for pair in (near, far)
+                )
+                difference = (8 * inner - outer) / (12 * step)  # fourth order
+                error = np.max(np.abs(getattr(exact, quantity)[..., column] - difference))
+                worst = max(worst, error / max(1.0, float(np.max(np.abs(difference)))))
+            errors.append(worst)
+        assert min(errors) < 1e-6, f"{part}{index}: {errors}"
+
+
+def test_soft_rows_are_part_of_the_comparison() -> None:
+    used = [problem(seed, 50.0)[2].status for seed in range(8)]
+    assert any(Status.SOFTENED in status for status in used)
+    assert any(Status.ACTIVE in status for status in used)
+
+
+def test_active_terminal_rows_are_differentiated(example_plant: Plant) -> None:
+    """A start at which the terminal set is active: the trajectory without it differs."""
+    bounds = box_bounds(example_plant, u_min=-1, u_max=1)
+    weights = stage_weights(np.eye(2), 1)
+    controller = mpc_controller(example_plant, weights, bounds, 2)
+    bare = mpc_controller(example_plant, weights, bounds, 2, terminal_set=False)
+    for x0 in np.ndindex(40, 40):
+        drive = scenario(example_plant, np.array(x0) / 10, 12)
+        run, without = simulate(controller, drive), simulate(bare, drive)
+        differs = np.max(np.abs(run.x - without.x)) > 1e-3
+        if run.complete and differs and run.weakly_active == 0:
+            break
+    assert run.complete
+    assert differs
+    wanted = [("K", (0, 0)), ("K", (0, 1)), ("bounds", (0,))]
+    _, exact = simulate_and_differentiate(controller, drive, unit_directions(controller, wanted))
+    step = 1e-7
+    for column, (part, index) in enumerate(wanted):
+        up, down = (
+            # The set is computed anew for the changed gain or bound.
+            simulate(
+                gain_controller(
+                    example_plant,
+                    controller.K + sign * step * _unit(part, index),
+                    box_bounds(example_plant, u_min=-1, u_max=1 + sign * step * (part == "bounds")),
+                    2,
+                ),
+                drive,
+            )
+            for sign in (1, -1)
+        )
+        difference = (up.x - down.x) / (2 * step)
+        np.testing.assert_allclose(exact.x[..., column], difference, rtol=1e-5, atol=1e-6)
+
+
+def _unit(part: str, index: tuple[int, ...]) -> np.ndarray:
+    unit = np.zeros((1, 2))
+    if part == "K":
+        unit[index] = 1
+    return unit
+
+
+def test_weights_with_the_same_gain_give_the_same_trajectories(
+    example_plant: Plant, example_bounds: Bounds
+) -> None:
+    """The two Q of the reference that have the gain of Q = I, R = 1 to its printed digits."""
+    drive = scenario(example_plant, [2, 3], 20)
+    true = simulate(
+        mpc_controller(example_plant, stage_weights(np.eye(2), 1), example_bounds, 3), drive
+    )
+    for Q in ([[1.3, 0.06], [0.06, 0.712]], [[0.5, -0.1], [-0.1, 1.48]]):
+        controller = mpc_controller(example_plant, stage_weights(Q, 1), example_bounds, 3)
+        np.testing.assert_allclose(simulate(controller, drive).x, true.x, atol=1e-12)
+
+
+def test_samples_at_a_change_of_the_active_set_are_counted(
+    example_plant: Plant, example_bounds: Bounds
+) -> None:
+    controller = mpc_controller(
+        example_plant, stage_weights(np.eye(2), 1), example_bounds, 3, terminal_set=False
+    )
+    x = np.array([1 / controller.K[0, 0], 0.0])  # u = -Kx is exactly at the bound
+    run = simulate(controller, scenario(example_plant, x, 1))
+    assert run.weakly_active == 1
+    assert simulate(controller, scenario(example_plant, 0.9 * x, 1)).weakly_active == 0
+
+
+def test_a_diverging_loop_is_named(example_plant: Plant) -> None:
+    bounds = box_bounds(example_plant, u_min=-0.1, u_max=0.1)
+    controller = mpc_controller(
+        example_plant, stage_weights(np.eye(2), 1), bounds, 3, terminal_set=False
+    )
+    run = simulate(controller, scenario(example_plant, [5, 5], 400))
+    assert not run.complete
+    assert np.all(np.isfinite(run.x))
+    with pytest.raises(SolverError, match="left every reasonable range"):
+        require_complete(controller, run)
+
+
+def test_dual_solver_calls_random_infeasible_rows_inconsistent() -> None:
+    """Against scipy's linear programming, which decides feasibility by another method."""
+    seed = 4
+    print("seed", seed)
+    rng = np.random.default_rng(seed)
+    seen = []
+    for _ in range(300):
+        rows, width = int(rng.integers(3, 16)), int(rng.integers(1, 6))
+        W, d = rng.normal(size=(rows, width)), rng.normal(size=rows) + 0.4
+        if rng.random() < 0.3:
+            W[-1] = -W[0]  # parallel rows, as a lower and an upper bound are
+        room = min(rows, width) + 1
+        lam = np.zeros(rows)
+        code, _ = solve_dual(
+            W, W @ W.T, d, np.full(rows, np.inf), np.full(rows, 1e-12), lam,
+            np.empty(room, dtype=np.int64), np.empty((room, room)), np.empty((room, width)),
+        )  # fmt: skip
+        verdict = linprog(np.zeros(width), A_ub=W, b_ub=d, bounds=(None, None), method="highs")
+        assert code == (INCONSISTENT if verdict.status == 2 else CONVERGED)
+        seen.append(code)
+        if code == CONVERGED:
+            v = -W.T @ lam
+            assert np.all(W @ v <= d + 1e-9)
+            assert np.all(lam >= 0)
+            assert abs(lam @ (W @ v - d)) <= 1e-8
+    assert 30 < seen.count(INCONSISTENT) < 270

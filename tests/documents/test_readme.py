@@ -1,0 +1,39 @@
+"""The README keeps its word: its first lines, and its table. Its blocks run in tests/documents."""
+
+from __future__ import annotations
+
+import pytest
+
+from impc.model.plant import Plant
+from impc.studies.example.cases import run_case
+from impc.studies.example.table import text_table
+from tests.documents.blocks import PAGES, blocks
+
+README = PAGES["README.md"].read_text(encoding="utf-8")
+
+
+def close(shown: str, found: str) -> bool:
+    """Whether two cells agree; numbers to a few digits, because solvers differ in the last ones."""
+    try:
+        return float(found) == pytest.approx(float(shown), rel=2e-2, abs=2e-3)
+    except ValueError:
+        return shown == found
+
+
+def test_the_first_lines_are_the_two_commands() -> None:
+    first = README.split("```")[1].split()
+    assert first[:3] == ["sh", "make", "demo"]
+    assert "make test" in README.split("```")[1]
+    assert README.index("make demo") < 200
+
+
+def test_the_table_is_what_comes_out(example_plant: Plant) -> None:
+    texts = (block.text for block in blocks("README.md") if block.language == "text")
+    shown = next(text for text in texts if "feedback_gain" in text)
+    found = text_table(run_case(example_plant, "A"))
+    shown_rows, found_rows = shown.splitlines(), found.splitlines()
+    assert len(shown_rows) == len(found_rows)
+    assert shown_rows[0].split() == found_rows[0].split()
+    for shown_row, found_row in zip(shown_rows[1:], found_rows[1:], strict=True):
+        cells = list(zip(shown_row.split()[:-1], found_row.split()[:-1], strict=True))
+        assert all(close(*pair) for pair in cells), cells  # the last cell is a time

@@ -1,0 +1,129 @@
+"""Faults injected into everything that writes: no space at each write, a kill at each rename.
+
+Afterwards a folder holds the files of one run, or says that it does not; what is kept reads as it
+was written, or is done again; and the next run ends as if nothing had happened.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from impc.errors import OutputError
+from impc.files.sealed import Kept
+from impc.reporting.writer import owned, write_files
+
+OLD = {"report.html": b"old", "figure_9.png": b"old", "sub/old.csv": b"old"}
+NEW = {"report.html": b"new", "result.json": b"new", "sub/new.csv": b"new"}
+STAGES = {"fit": {"K": [[1.5]]}, "without trial 1": {"K": [[2.5]]}}
+
+
+def work(folder: Path, files: dict[str, bytes]) -> None:
+    """What a command does: stages one by one, then its files, and the stages go."""
+    with owned(folder, "fit"):
+        kept = Kept(folder / "fit-in-progress")
+        for name, content in STAGES.items():
+            if kept.recall(name, "digest") is None:
+                kept.keep(name, "digest", content)
+        assert kept.recall_all("digest") == STAGES
+        write_files(folder, files)
+        kept.forget()
+
+
+def shown(folder: Path) -> dict[str, bytes]:
+    """All files that somebody sees."""
+    found = {path.relative_to(folder): path for path in folder.rglob("*") if path.is_file()}
+    return {
+        name.as_posix(): path.read_bytes()
+        for name, path in found.items()
+        if not any(part.startswith(".") or part.endswith("-in-progress") for part in name.parts)
+    }
+
+
+def test_no_space_at_each_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The disk fills at the first, second, ... flush or rename; the old run's files stay whole."""
+    work(tmp_path, OLD)
+    failures = 0
+    while True:
+        with monkeypatch.context() as patch:
+            _fail_at(patch, failures)
+            said = ""
+            try:
+                work(tmp_path, NEW)
+            except OutputError as error:
+                said = str(error)
+        if not said:
+            break
+        assert "No space left on device" in said
+        assert "\n" not in said
+        failures += 1
+        found = shown(tmp_path)
+        assert found in (OLD, NEW) or "INCOMPLETE.txt" in found
+        assert not list(tmp_path.rglob("*.part"))
+    # Each stage, file, notice and list has a flush and a rename; what is kept is not kept again.
+    assert failures >= 10
+    assert shown(tmp_path) == NEW
+
+
+def _fail_at(patch: pytest.MonkeyPatch, place: int) -> None:
+    left = place
+
+    def full(call: Any) -> Any:
+        def wrapped(*given: Any, **named: Any) -> Any:
+            nonlocal left
+            left -= 1
+            if left == -1:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            return call(*given, **named)
+
+        return wrapped
+
+    for name in ("fsync", "replace"):
+        patch.setattr(os, name, full(getattr(os, name)))
+
+
+KILLED = """
+import os, sys
+from pathlib import Path
+from tests.files.test_faults import NEW, work
+left, replace = int(sys.argv[2]), os.replace
+def killed(*given):
+    global left
+    left -= 1
+    if left == -1:
+        os._exit(9)
+    replace(*given)
+os.replace = killed
+work(Path(sys.argv[1]), NEW)
+"""
+
+
+def test_a_kill_at_each_rename(tmp_path: Path) -> None:
+    kills, told = 0, 0
+    while True:
+        folder = tmp_path / str(kills)
+        work(folder, OLD)
+        done = subprocess.run(
+            [sys.executable, "-c", KILLED, str(folder), str(kills)], check=False,
+            cwd=Path(__file__).parents[2], timeout=120,
+        )  # fmt: skip
+        found = shown(folder)
+        told += "INCOMPLETE.txt" in found
+        assert found in (OLD, NEW) or "INCOMPLETE.txt" in found
+        kept = Kept(folder / "fit-in-progress").recall_all("digest")
+        assert kept.items() <= STAGES.items()
+        work(folder, NEW)
+        assert shown(folder) == NEW
+        assert {path.name for path in folder.iterdir()} == {*NEW, "sub", ".impc"} - {"sub/new.csv"}
+        if done.returncode == 0:
+            break
+        assert done.returncode == 9
+        kills += 1
+    assert kills >= 6
+    assert told >= 3

@@ -1,0 +1,69 @@
+"""Names of signals, subjects and files are text, wherever they are written."""
+
+from __future__ import annotations
+
+import csv
+import io
+from typing import Any
+
+import numpy as np
+from matplotlib.text import Text
+
+from impc.reporting.csv_text import csv_bytes
+from impc.reporting.rendering import plain
+from impc.reporting.style import journal_style, new_figure, render
+
+HOSTILE = (
+    r"$\frac{x}$", "$x^$", "a$b", r"\$5$", "{", "<b>&", "=1+1", "\udcff", "a\x00b", "\u202egnp",
+)  # fmt: skip
+
+
+def test_no_name_is_mathematics_on_a_figure() -> None:
+    """Each name as title, label, note, in the legend and at a tick, beside powers of ten."""
+    with journal_style():
+        figure = new_figure(8, 6)
+        left, right = figure.subplots(1, 2)
+        for index, name in enumerate(HOSTILE):
+            left.loglog([1, 1000], [1, 1e5], label=name)
+            right.annotate(name, (0.5, index))
+        left.legend()
+        left.set_title(HOSTILE[0], loc="left")
+        left.set_xlabel(f"{HOSTILE[1]} (s)")
+        left.set_ylabel(f"{HOSTILE[0]} (-)")
+        right.plot([0, 1])
+        right.set_xlabel("name (-)")
+        right.set_ylabel("name (-)")
+        right.set_xticks(range(len(HOSTILE)), HOSTILE, rotation=35)
+        right.set_yticks([0, 1])
+        right.set_yticklabels(HOSTILE[:2])
+        assert {"png", "pdf"} == set(render(figure))
+        texts: list[Any] = figure.findobj(Text)
+        drawn = [text.get_text() for text in texts]
+        set_as = [text._preprocess_math(text.get_text()) for text in texts]
+    shown = [said for said, mathematics in set_as if not mathematics]
+    numbers = [text for text, (_, how) in zip(drawn, set_as, strict=True) if how]
+    assert numbers
+    assert all(text.startswith(r"$\mathdefault{") for text in numbers)
+    for name in HOSTILE:
+        read = name.encode("unicode_escape").decode() if not name.isprintable() else name
+        assert sum(read.replace(r"\udcff", r"\xff") == said for said in shown) >= 3, name
+
+
+def test_no_cell_of_a_table_is_a_formula_and_numbers_stay_numbers() -> None:
+    texts = ["=1+1", "+1+cmd|' /C calc'!A0", "-2+3", "@SUM(A1)", "\t=1", "-0.5;=2", "-a"]
+    plain_texts = ["-1.5e-3", "+0.12 deg", "-0.5 (-0.7, -0.3)", "-", "a=b", "", "-inf", "+3.2 deg²"]
+    rows = [[*texts, *plain_texts, -1.5, np.float64(0.1), 3, None, float("nan"), True]]
+    written = csv_bytes(["=head"] * len(rows[0]), rows)
+    heads, found = csv.reader(io.StringIO(written.decode()))
+    assert set(heads) == {"'=head"}
+    for text, cell in zip(texts, found, strict=False):
+        assert cell.startswith("'")
+        assert cell[1:] == text.replace("\t", r"\t")
+    assert found[len(texts) : len(texts) + len(plain_texts)] == plain_texts
+    assert found[-6:] == ["-1.5", "0.1", "3", "", "", "True"]
+    assert csv_bytes(["a"], [["\udcff\n"]]) == rb"a" + b"\n" + rb"\xff\n" + b"\n"
+
+
+def test_json_takes_names_that_are_not_utf_8() -> None:
+    """Pages do too: tests/cli/test_fit_command.py has a file of such a name."""
+    assert plain({"file": ["m\udcff"]}) == {"file": [r"m\udcff"]}

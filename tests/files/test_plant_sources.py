@@ -1,0 +1,285 @@
+"""Plants by import path and from files, and what is said of those that cannot be used."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from pathlib import Path
+
+import control
+import numpy as np
+import pytest
+import scipy.io
+
+import plants
+from impc.errors import ImpcError, InputError, PlantError
+from impc.files.plant_sources import (
+    PlantSource,
+    import_function,
+    make_plant,
+    plant_family_of,
+    plant_source,
+)
+from impc.studies.selection.model_source import model_source
+from tests.files.samples import mat5_array, mat5_element, mat5_file
+
+A, B, C = [[1.0, 0.1], [0.0, 1.0]], [[0.005, 0.0], [0.1, 0.1]], [[1.0, 0.0]]
+
+
+def test_an_import_path_with_arguments() -> None:
+    source = plant_source("plants:seated_balance_plant", {"delay_order": 3})
+    plant = make_plant(source, ("theta1", "theta2", "perturbation"))
+    assert plant.n == 8
+    assert plant.controls == ("command",)
+    assert plant.disturbances == ("perturbation",)
+    assert make_plant(source, ("perturbation",), delay_order=2).n == 7
+
+
+def test_a_module_beside_the_recordings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = "import control\ndef cart(mass=2.0):\n    return control.ss(1, 1 / mass, 1, 0, 0.1)\n"
+    (tmp_path / "mine_for_the_test.py").write_text(text)
+    monkeypatch.chdir(tmp_path)
+    source = plant_source("mine_for_the_test:cart", {})
+    assert make_plant(source, ()).B[0, 0] == 0.5
+    family = plant_family_of(source, (), ["mass"])
+    assert family is not None
+    assert family.nominal.tolist() == [2.0]
+    assert family.make(np.array([4.0])).B[0, 0] == 0.25
+
+
+def test_the_working_folder_is_last_and_not_left_on_the_path(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A user's module finds its neighbours, and nothing installed is replaced by one of them."""
+    (tmp_path / "mine_of_two.py").write_text(
+        "import neighbour_of_mine, statsmodels\nmake = neighbour_of_mine.make\n"
+    )
+    (tmp_path / "neighbour_of_mine.py").write_text(
+        "import sys\nwhere = sys.path[-1]\ndef make(): return None\n"
+    )
+    for name in ("plants", "statsmodels"):
+        (tmp_path / f"{name}.py").write_text("raise SystemExit\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delitem(sys.modules, "statsmodels", raising=False)
+    path = list(sys.path)
+    found = import_function("mine_of_two:make")
+    assert sys.modules[found.__module__].where == str(tmp_path)
+    assert sys.path == path
+    assert import_function("plants:cursor_plant").__module__ == "plants.cursor"
+    with pytest.raises(InputError, match="rename yours: an installed module has its name"):
+        import_function("plants:mine")
+
+
+class OwnInterrupt(KeyboardInterrupt):
+    """Not from the keyboard."""
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        SystemExit(0), MemoryError(), RecursionError("too deep"), OwnInterrupt("a\nb"),
+        GeneratorExit(), StopIteration(), ZeroDivisionError("division by zero"),
+        UserWarning("look"), OverflowError("too large"), AttributeError("none"),
+    ],
+    ids=lambda error: type(error).__name__,
+)  # fmt: skip
+def test_whatever_a_plant_raises_is_one_line_that_names_it(error: BaseException) -> None:
+    def make() -> object:
+        raise error
+
+    with pytest.raises(InputError, match=rf"^plant mine:make: ends in {type(error).__name__}") as e:
+        make_plant(PlantSource("mine:make", make, {}), ())
+    assert str(e.value).isprintable()
+
+
+def test_the_keyboard_interrupts_a_plant() -> None:
+    def make() -> object:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        make_plant(PlantSource("mine:make", make, {}), ())
+
+
+def test_a_module_that_ends_the_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "ending_plant.py").write_text("import sys\nsys.exit(0)\n")
+    (tmp_path / "broken_plant.py").write_text("def cart(:\n")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match="plant ending_plant:x: ends in SystemExit"):
+        plant_source("ending_plant:x", {})
+    with pytest.raises(InputError, match="plant broken_plant:x: ends in SyntaxError"):
+        plant_source("broken_plant:x", {})
+
+
+def test_a_model_that_ends_the_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "ending_model.py").write_text("def model(): raise SystemExit(0)\n")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match="model ending_model:model: ends in SystemExit"):
+        model_source("ending_model:model", {})
+
+
+@pytest.mark.parametrize("suffix", ["mat", "npz", "json"])
+def test_a_saved_state_space(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"plant.{suffix}"
+    matrices = {"A": A, "B": B, "C": C, "D": [[0.0, 0.0]], "dt": 0.1}
+    if suffix == "mat":
+        names = np.array(["force", "push"], dtype=object)
+        scipy.io.savemat(path, {**matrices, "inputs": names})
+    elif suffix == "npz":
+        np.savez(path, A=A, B=B, C=C, D=[[0.0, 0.0]], dt=0.1)
+    else:
+        path.write_text(json.dumps(matrices))
+    given = {} if suffix == "mat" else {"inputs": ["force", "push"]}
+    plant = make_plant(plant_source(str(path), given), ("push",))
+    np.testing.assert_array_equal(plant.A, A)
+    np.testing.assert_array_equal(plant.E[:, 0], np.array(B)[:, 1])
+    assert plant.controls == ("force",)
+    assert plant.dt == 0.1
+
+
+def test_a_free_parameter_of_the_seat() -> None:
+    def make(J2: float = 1.0) -> object:
+        return plants.seated_balance_plant(plants.SeatedBalanceParameters(J2=J2))
+
+    source = plant_source("plants:seated_balance_plant", {})
+    moving = type(source)("seat", make, {"J2": 1.3})
+    family = plant_family_of(moving, ("perturbation",), ["J2"])
+    assert family is not None
+    assert family.nominal.tolist() == [1.3]
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "says"),
+    [
+        ("seat", {}, "neither a known name, a file, nor module:function"),
+        (".here:f", {}, "neither a known name, a file, nor module:function"),
+        ("plants:no_such", {}, "cannot be imported"),
+        ("no_such_module:f", {}, "cannot be imported"),
+        ("plants:seated_balance_plant", {"weight": 3}, "refuses its arguments"),
+        ("nowhere.mat", {}, "does not exist"),
+        ("nowhere.json", {}, "does not exist"),
+    ],
+)
+def test_what_cannot_be_used_is_said_in_one_line(
+    name: str, arguments: dict[str, object], says: str
+) -> None:
+    with pytest.raises(InputError, match=says) as caught:
+        make_plant(plant_source(name, arguments), ())
+    assert "\n" not in str(caught.value)
+
+
+def test_files_that_hold_no_plant(tmp_path: Path) -> None:
+    path = tmp_path / "plant.json"
+    for text, says in (
+        ('{"A": [[1]], "B": [[1]], "C": [[1]]}', "lacks dt"),
+        ("[1, 2]", "holds no names"),
+        ("{", "cannot be read"),
+        ('{"A": [["x"]], "B": [[1]], "C": [[1]], "dt": 1}', "not made of numbers in rows"),
+        ('{"A": [[1]], "B": [[1, 2]], "C": [[1, 2]], "dt": 1}', "plant"),
+    ):
+        path.write_text(text)
+        with pytest.raises(ImpcError, match=says) as caught:
+            make_plant(plant_source(str(path), {}), ())
+        assert "\n" not in str(caught.value)
+    np.savez(tmp_path / "objects.npz", A=np.array([{"a": 1}], dtype=object))
+    with pytest.raises(InputError, match="cannot be read"):
+        plant_source(str(tmp_path / "objects.npz"), {})
+
+
+def test_a_plant_without_a_command() -> None:
+    source = plant_source("plants:seated_balance_plant", {})
+    with pytest.raises(PlantError, match="all its inputs are recorded"):
+        make_plant(source, ("command", "perturbation"))
+
+
+def test_a_free_parameter_without_a_value() -> None:
+    source = plant_source("plants:seated_balance_plant", {})
+    with pytest.raises(InputError, match="no nominal value"):
+        plant_family_of(source, (), ["mass"])
+
+
+def test_what_a_function_returns_must_be_a_state_space() -> None:
+    source = plant_source("builtins:dict", {})
+    with pytest.raises(PlantError, match=r"expected a control\.StateSpace"):
+        make_plant(source, ())
+
+
+@pytest.mark.parametrize("suffix", ["mat", "npz"])
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"A": np.array(A) + 1j}, "complex"),
+        ({"D": np.array([[1j, 0]])}, "complex"),
+        ({"dt": 0.1 + 1j}, "complex"),
+        ({"dt": np.inf}, r"beyond 1e\+70 in dt"),
+        ({"A": 1e200 * np.array(A)}, r"beyond 1e\+70 in A"),
+        ({"dt": [0.1, 0.2]}, "dt that is not one number"),
+        ({"C": np.array([["1", "0"]])}, "not made of numbers in rows"),
+        ({"A": np.array([A, A])}, "not made of numbers in rows"),
+    ],
+)
+def test_matrices_that_are_no_plant(
+    tmp_path: Path, suffix: str, change: dict[str, object], says: str
+) -> None:
+    path = tmp_path / f"plant.{suffix}"
+    matrices: dict[str, object] = {"A": A, "B": B, "C": C, "dt": 0.1, **change}
+    if suffix == "mat":
+        scipy.io.savemat(path, matrices)
+    else:
+        np.savez(path, **matrices)  # type: ignore[arg-type]  # its stub knows arrays only
+    with pytest.raises(InputError, match=says) as caught:
+        make_plant(plant_source(str(path), {}), ())
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("names", "says"),
+    [
+        ({"states": ["x", "v", "a"]}, "names 3 states and has 2"),
+        ({"states": ["x"]}, "names 1 states and has 2"),
+        ({"inputs": ["force"]}, "names 1 inputs and has 2"),
+        ({"outputs": ["x", "y"]}, "names 2 outputs and has 1"),
+        ({"states": ["x", "x"]}, "names two states 'x'"),
+        ({"states": {"x": 1}}, "that are not names"),
+        ({"states": [["x"], []]}, "names 1 states"),
+        ({"states": ["x", None]}, "that are not names"),
+        ({"state\x1bs": ["x", "v"]}, "does not know state s"),
+    ],
+)
+def test_names_that_are_not_those_of_the_plant(
+    tmp_path: Path, names: dict[str, object], says: str
+) -> None:
+    path = tmp_path / "plant.json"
+    path.write_text(json.dumps({"A": A, "B": B, "C": C, "dt": 0.1, **names}))
+    with pytest.raises(InputError, match=says):
+        make_plant(plant_source(str(path), {}), ())
+
+
+def test_files_of_plants_that_are_hostile(tmp_path: Path) -> None:
+    def refused(name: str, content: bytes, says: str) -> None:
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(InputError, match=says) as caught:
+            plant_source(str(tmp_path / name), {})
+        assert "\n" not in str(caught.value)
+
+    refused("deep.json", b"[" * 100_000, "nested too deep")
+    refused("digits.json", b'{"A": ' + b"1" * 5000 + b"}", "cannot be read")
+    refused("bytes.json", b"\xff", "cannot be read")
+    refused("none.json", b"", "is empty")
+    refused("cut.npz", b"PK\x03\x04" + bytes(200), "cannot be read")
+    numbers = mat5_element(200, bytes(72))  # a type that does not exist
+    refused("crash.mat", mat5_file(mat5_array(6, (3, 3), "A", numbers)), "of type 200")
+    np.savez_compressed(tmp_path / "bomb.npz", A=np.zeros(10_000_000))
+    refused("bomb.npz", (tmp_path / "bomb.npz").read_bytes(), "too large once it is unpacked")
+    os.mkfifo(tmp_path / "pipe.json")
+    with pytest.raises(InputError, match="is no ordinary file"):
+        plant_source(str(tmp_path / "pipe.json"), {})
+
+
+def test_a_function_whose_plant_is_complex() -> None:
+    def make() -> object:
+        return control.ss(np.array([[0.5 + 1j]]), 1, 1, 0, 0.1)
+
+    source = plant_source("plants:seated_balance_plant", {})
+    with pytest.raises(PlantError, match="has complex matrices"):
+        make_plant(type(source)("mine", make, {}), ())

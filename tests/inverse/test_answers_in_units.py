@@ -1,0 +1,106 @@
+"""The same recording in other units has the same answer."""
+
+from __future__ import annotations
+
+import control
+import numpy as np
+import pytest
+
+from impc.control.closed_loop import scenario, simulate
+from impc.control.controller import mpc_controller
+from impc.inverse.direct_and_reduced import infer_weights, inverse_mpc_reduced
+from impc.inverse.gain_search import fit_gain
+from impc.inverse.noisy_fit import fit_controller
+from impc.inverse.problem import InverseProblem, inverse_problem
+from impc.model.bounds import box_bounds
+from impc.model.plant import Plant, as_plant, change_coordinates
+from impc.model.recordings import recording
+from impc.model.riccati import solve_lqr
+from impc.model.weights import stage_weights
+from impc.studies.example.cases import CASES
+from tests.inverse.test_several_inputs import random_problem
+
+UNITS = [1e-12, 1e-5, 1e5, 1e12]
+
+
+def recorded(scale: float, name: str) -> InverseProblem:
+    """The example with all numbers, bounds too, `scale` times as large."""
+    plant = as_plant(control.ss([[2, -1], [1, 0.2]], [[1], [0]], np.eye(2), 0, True))
+    bounds = box_bounds(plant, u_min=-scale, u_max=scale)
+    controller = mpc_controller(plant, stage_weights(np.eye(2), 1), bounds, 3)
+    run = simulate(controller, scenario(plant, x0=scale * np.array(CASES[name]), steps=20))
+    return inverse_problem(plant, bounds, 3, (recording(plant, run.x),))
+
+
+@pytest.mark.parametrize("name", ["A", "B"])
+def test_table_3_1_does_not_depend_on_a_common_unit(name: str) -> None:
+    """With numbers 1e12 times as large it returned (1.19, -.79) for (1.494, -.881)."""
+    plain = infer_weights(recorded(1.0, name))
+    truth = solve_lqr(plain.fit.solution.plant, stage_weights(np.eye(2), 1)).K
+    for scale in [1.0, *UNITS]:
+        found = infer_weights(recorded(scale, name))
+        assert found.fit.explained
+        np.testing.assert_allclose(found.fit.solution.K, truth, rtol=1e-9)
+        evaluations = found.start.gain.evaluations + found.fit.evaluations
+        assert evaluations < 1.5 * (plain.start.gain.evaluations + plain.fit.evaluations)
+
+
+@pytest.mark.parametrize("scale", UNITS)
+def test_two_inputs_do_not_depend_on_a_common_unit(scale: float) -> None:
+    controller, problem = random_problem(2, 2)
+    plant, (trial,) = problem.plant, problem.recordings
+    bounds = box_bounds(plant, u_min=-scale, u_max=scale)
+    scaled = recording(plant, scale * trial.outputs, scale * trial.disturbance)
+    other = inverse_problem(plant, bounds, 5, (scaled,), terminal_set=False)
+    found = inverse_mpc_reduced(other)
+    assert found.explained
+    np.testing.assert_allclose(found.gain.K, controller.K, rtol=1e-9, atol=1e-10)
+    assert found.gain.evaluations < 2 * inverse_mpc_reduced(problem).gain.evaluations
+    np.testing.assert_allclose(fit_controller(other).solution.K, controller.K, rtol=1e-8, atol=1e-9)
+
+
+def in_units(problem: InverseProblem, states: np.ndarray, inputs: np.ndarray) -> InverseProblem:
+    """x = diag(states) z, u = diag(inputs) v."""
+    T, G = np.diag(states), np.diag(inputs)
+    moved: Plant = change_coordinates(problem.plant, T, G)
+    outputs = problem.plant.C @ T
+    plant = as_plant(
+        control.ss(
+            moved.A,
+            np.hstack([moved.B, moved.E]),
+            np.eye(moved.n),
+            0,
+            True,
+            inputs=[*(f"u{i}" for i in range(moved.m)), "d0"],
+        ),
+        [f"u{i}" for i in range(moved.m)],
+    )
+    (trial,) = problem.recordings
+    bounds = box_bounds(plant, u_min=-1 / inputs, u_max=1 / inputs)
+    z = np.linalg.solve(outputs, trial.outputs.T).T
+    return inverse_problem(
+        plant,
+        bounds,
+        problem.horizon,
+        (recording(plant, z, trial.disturbance),),
+        terminal_set=False,
+    )
+
+
+def test_states_and_inputs_in_units_of_their_own() -> None:
+    """Millimetres and kilometres side by side: K of the new units is G^-1 K T."""
+    controller, problem = random_problem(2, 2)
+    states, inputs = np.array([1e-3, 1.0, 1e3, 10.0]), np.array([100.0, 0.01])
+    found = fit_gain(in_units(problem, states, inputs))
+    assert found.explained
+    expected = controller.K * states / inputs[:, None]
+    np.testing.assert_allclose(found.K / expected, np.ones_like(expected), rtol=1e-9)
+
+
+def test_output_scale_is_the_size_of_each_output() -> None:
+    problem = recorded(1.0, "A")
+    size = np.sqrt(np.mean(problem.recordings[0].outputs ** 2, axis=0))
+    np.testing.assert_allclose(problem.output_scale, size, rtol=1e-12)
+    plant, outputs = problem.plant, np.array([[0.0, 3.0], [0.0, 4.0]])
+    silent = inverse_problem(plant, problem.bounds, 3, (recording(plant, outputs),))
+    np.testing.assert_allclose(silent.output_scale, [np.sqrt(12.5)] * 2, rtol=1e-12)

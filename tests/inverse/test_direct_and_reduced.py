@@ -1,0 +1,326 @@
+"""Recovering the controller: the example of section 3.4, and problems with known answers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from impc.assess.identified_directions import identifiability
+from impc.control.closed_loop import Status, require_complete, scenario, simulate
+from impc.control.controller import gain_controller, mpc_controller
+from impc.inverse.direct_and_reduced import (
+    AUXILIARY_CONDITION_WEIGHT,
+    CONDITION_WEIGHT,
+    auxiliary_weights,
+    infer_weights,
+    inverse_mpc,
+    inverse_mpc_reduced,
+    output_penalty_weights,
+    start_gains,
+    starting_point,
+    verify_hard,
+)
+from impc.inverse.equivalent_weights import gain_fibre, least_condition_weights
+from impc.inverse.gain_search import fit_gain
+from impc.inverse.problem import InverseProblem, controller_for, inverse_problem, without_bounds
+from impc.inverse.proximal_search import Residual, weight_jacobian
+from impc.inverse.proximal_step import block_basis
+from impc.inverse.residuals import evaluate, residual_only
+from impc.model.bounds import Bounds, box_bounds
+from impc.model.plant import Plant
+from impc.model.recordings import recording
+from impc.model.riccati import solve_lqr
+from impc.model.weights import (
+    Weights,
+    cholesky_parameters,
+    condition_number,
+    residual,
+    stage_weights,
+    weights_from_parameters,
+)
+from impc.studies.example.cases import CASES, run_case
+from tests.support import nelder_mead, random_plant, random_weights
+
+IDENTITY = stage_weights(np.eye(2), 1)
+
+
+def example(plant: Plant, bounds: Bounds, case: str) -> InverseProblem:
+    controller = mpc_controller(plant, IDENTITY, bounds, 3)
+    run = require_complete(controller, simulate(controller, scenario(plant, CASES[case], 20)))
+    return inverse_problem(plant, bounds, 3, (recording(plant, run.x),))
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_table_3_1_recovers_the_weights(
+    example_plant: Plant, example_bounds: Bounds, case: str
+) -> None:
+    problem = example(example_plant, example_bounds, case)
+    found = infer_weights(problem)
+    assert residual(found.fit.weights, IDENTITY) <= 1e-6
+    reduced = inverse_mpc_reduced(problem, *start_gains(found.start, example_plant))
+    assert residual(reduced.weights, IDENTITY) <= 1e-6
+    assert reduced.kept_hard
+    squared = inverse_mpc(problem, found.start.weights, squared=True)
+    assert residual(squared.weights, IDENTITY) <= 1e-6
+    for run in verify_hard(problem, found.fit.weights):
+        assert run.complete
+    assert (found.start.lmi.weights is None) == (case != "B")
+    assert (found.start.auxiliary is None) == (case == "B")
+
+
+def test_the_dissertations_comparison_shows_in_case_A(example_plant: Plant) -> None:
+    result = run_case(example_plant, "A")
+    gain, output = result.method("feedback_gain"), result.method("inverse_lqr_output")
+    assert result.branch == "gradient"
+    assert run_case(example_plant, "B").branch == "LMI"
+    assert gain.K is not None
+    np.testing.assert_allclose(gain.K, [[1.21183, -0.71277]], atol=1e-5)
+    assert gain.state_misfit == pytest.approx(0.2333, abs=1e-4)
+    assert gain.max_abs_u == pytest.approx(1.2295, abs=1e-4)
+    assert not gain.bound_kept
+    assert not output.bound_kept
+    assert output.state_misfit is not None
+    assert gain.state_misfit is not None
+    assert output.state_misfit > gain.state_misfit
+    for name in ("inverse_mpc", "inverse_mpc_reduced"):
+        assert result.method(name).bound_kept
+    assert not result.method("inverse_lqr_lmi").feasible
+    assert result.identifiability.rank == 2
+    assert result.identifiability.free == 3
+    assert result.identifiability.chosen == 1
+
+
+def test_example_identifiability_shows_other_weights_that_explain_the_data(
+    example_plant: Plant, example_bounds: Bounds
+) -> None:
+    problem = example(example_plant, example_bounds, "A")
+    found = identifiability(problem, IDENTITY)
+    assert found.singular_values[2] < 1e-10 * found.singular_values[0]
+    assert len(found.others) == 2
+    first, second = (item.weights.Q for item in found.others)
+    assert np.linalg.norm(first - second) > 0.1
+    for item in found.others:
+        assert item.misfit < 1e-9
+        assert np.linalg.norm(item.weights.Q - np.eye(2)) > 0.1
+
+
+def auxiliary_objective(plant: Plant, gain: np.ndarray, weights: Weights) -> float:
+    distance = np.linalg.norm(solve_lqr(plant, weights).K - gain)
+    return float(distance + AUXILIARY_CONDITION_WEIGHT * condition_number(weights))
+
+
+def test_auxiliary_problem_reaches_what_a_derivative_free_search_reaches(
+    example_plant: Plant,
+) -> None:
+    gain = np.array([[1.21183, -0.71277]])
+    found = auxiliary_weights(example_plant, gain, IDENTITY)
+    best = auxiliary_objective(example_plant, gain, found.weights)
+    assert found.objective == pytest.approx(best, rel=1e-9)
+    # The reference's Q_0 (section 3, case A), from Nelder-Mead on its own scaling of the weights.
+    assert best <= auxiliary_objective(
+        example_plant, gain, stage_weights([[0.1901, 0.0716], [0.0716, 0.2163]], 1)
+    )
+    for seed in range(3):
+        start = np.random.default_rng(seed).normal(size=3)
+        search = nelder_mead(
+            lambda z: auxiliary_objective(example_plant, gain, weights_from_parameters(z, 2, 1)),
+            start,
+            2000,
+        )
+        assert best <= search + 1e-9
+
+
+def test_output_penalty_reaches_what_a_derivative_free_search_reaches(
+    example_plant: Plant, example_bounds: Bounds
+) -> None:
+    problem = example(example_plant, example_bounds, "A")
+    linear = without_bounds(problem)
+
+    def objective(weights: Weights) -> float:
+        solution = solve_lqr(example_plant, weights)
+        distance = np.linalg.norm(residual_only(linear, solution.K, solution.S))
+        return float(distance + CONDITION_WEIGHT * condition_number(weights))
+
+    found = output_penalty_weights(problem, IDENTITY)
+    search = nelder_mead(
+        lambda z: objective(weights_from_parameters(z, 2, 1)),
+        cholesky_parameters(found.weights) + 0.03,
+        1500,
+    )
+    assert objective(found.weights) <= search + 1e-8
+
+
+def test_direct_form_tends_to_the_reduced_one_with_noise(
+    example_plant: Plant, example_bounds: Bounds
+) -> None:
+    clean = example(example_plant, example_bounds, "B")
+    rng = np.random.default_rng(0)
+    noisy = clean.recordings[0].outputs + 0.01 * rng.normal(size=(21, 2))
+    problem = inverse_problem(
+        example_plant, example_bounds, 3, (recording(example_plant, noisy, x0=[2, 3]),)
+    )
+    reduced = inverse_mpc_reduced(problem)
+    assert reduced.equivalent is not None
+    distances = []
+    for weight in (1e-2, 1e-3, 1e-4, 1e-5):
+        direct = inverse_mpc(problem, IDENTITY, condition_weight=weight)
+        distances.append(residual(direct.weights, reduced.weights))
+    assert np.all(np.diff(distances) < 0)
+    assert distances[-1] < 1e-3
+
+
+def test_squared_misfit_trades_and_the_norm_does_not(
+    example_plant: Plant, example_bounds: Bounds
+) -> None:
+    """With exact data and true weights away from the identity: docs/theory.md, section 6."""
+    true = stage_weights([[4.0, 0.5], [0.5, 1.0]], 2.0)
+    controller = mpc_controller(example_plant, true, example_bounds, 3)
+    run = require_complete(controller, simulate(controller, scenario(example_plant, [2, 3], 20)))
+    problem = inverse_problem(example_plant, example_bounds, 3, (recording(example_plant, run.x),))
+    reduced = inverse_mpc_reduced(problem)
+    assert np.linalg.norm(reduced.gain.K - controller.K) < 1e-9
+    assert condition_number(reduced.weights) <= condition_number(true) * (1 + 1e-7)
+    norm = inverse_mpc(problem, IDENTITY)
+    square = inverse_mpc(problem, IDENTITY, squared=True)
+    assert norm.misfit < 1e-9
+    assert residual(norm.weights, reduced.weights) < 1e-5
+    assert square.misfit > 1e-6
+    assert square.condition < norm.condition
+
+
+def test_two_inputs_recover_gain_and_metric_while_bounds_are_active() -> None:
+    rng = np.random.default_rng(3)
+    plant = random_plant(rng, 3, 2, 1.1)
+    true = stage_weights(random_weights(rng, 3), random_weights(rng, 2))
+    bounds = box_bounds(plant, u_min=-0.3, u_max=0.3)
+    controller = mpc_controller(plant, true, bounds, 4)
+    recordings = []
+    for _ in range(40):
+        run = simulate(controller, scenario(plant, rng.normal(size=3), 15))
+        if run.complete and Status.ACTIVE in run.status:
+            recordings.append(recording(plant, run.x))
+    problem = inverse_problem(plant, bounds, 4, tuple(recordings))
+    found = inverse_mpc_reduced(problem)
+    np.testing.assert_allclose(found.gain.K, controller.K, atol=1e-6)
+    assert found.gain.metric_determined
+    np.testing.assert_allclose(
+        found.gain.S / np.trace(found.gain.S), controller.S / np.trace(controller.S), atol=1e-6
+    )
+    fibre = gain_fibre(plant, controller.K, solve_lqr(plant, true).S)
+    best = least_condition_weights(fibre).condition
+    assert condition_number(found.weights) == pytest.approx(best, rel=1e-4)
+    counts = identifiability(problem, found.weights)
+    assert counts.free == 8
+    assert counts.rank == 3 * 2 + 2 - 1  # docs/theory.md, section 2: n m + m - 1
+    # Without an active bound the metric stays in the dark: only the gain is determined.
+    calm = simulate(controller, scenario(plant, [1e-3, 0, 0], 15))
+    quiet = inverse_problem(plant, bounds, 4, (recording(plant, calm.x),))
+    assert not fit_gain(quiet).metric_determined
+
+
+@pytest.mark.parametrize("inputs", [1, 2])
+def test_jacobian_in_the_weights_equals_central_differences(inputs: int) -> None:
+    """Terminal set, gain and metric all follow the weights; bounds are active."""
+    rng = np.random.default_rng(inputs)
+    plant = random_plant(rng, 3, inputs, 1.1)
+    Q, R = random_weights(rng, 3), random_weights(rng, inputs)
+    bounds = box_bounds(plant, u_min=-0.3, u_max=0.4, x_min=-2, x_max=2)
+    controller = mpc_controller(plant, stage_weights(Q, R), bounds, 3)
+    for size in 5 * 0.9 ** np.arange(60):
+        run = simulate(controller, scenario(plant, size * np.ones(3), 15))
+        if run.complete and Status.ACTIVE in run.status:
+            break
+    problem = inverse_problem(plant, bounds, 3, (recording(plant, 0.9 * run.x, x0=run.x[0]),))
+    solution = solve_lqr(plant, stage_weights(Q, R))
+    found = evaluate(problem, solution.K, solution.S)
+    basis = block_basis(3, inputs)
+    exact = weight_jacobian(
+        solution, Residual(found.residual, found.dK, found.dS, usable=True), basis
+    )
+    for index, member in enumerate(basis):
+        errors = []
+        for step in (1e-5, 1e-6):
+            sides = [
+                solve_lqr(plant, stage_weights(Q + s * member[:3, :3], R + s * member[3:, 3:]))
+                for s in (step, -step)
+            ]
+            up, down = (residual_only(problem, side.K, side.S) for side in sides)
+            difference = (up - down) / (2 * step)
+            scale = max(1.0, float(np.max(np.abs(difference))))
+            errors.append(float(np.max(np.abs(exact[:, index] - difference))) / scale)
+        assert min(errors) < 1e-6
+
+
+def test_a_gain_no_weights_have_is_said_and_the_direct_form_continues(
+    example_plant: Plant, example_bounds: Bounds
+) -> None:
+    """A recording made by a gain that is not a regulator's."""
+    gain = np.array([[1.21183, -0.71277]])
+    controller = gain_controller(example_plant, gain, example_bounds, 3)
+    run = require_complete(
+        controller, simulate(controller, scenario(example_plant, [0.5, 0.7], 20))
+    )
+    problem = inverse_problem(example_plant, example_bounds, 3, (recording(example_plant, run.x),))
+    found = inverse_mpc_reduced(problem)
+    np.testing.assert_allclose(found.gain.K, gain, atol=1e-7)
+    assert found.equivalent is None
+    assert found.direct is not None
+    assert "weights" in found.reason
+    assert found.direct.misfit > 1e-3
+
+
+def test_a_search_steps_back_from_gains_that_do_not_stabilise(
+    example_plant: Plant, example_bounds: Bounds
+) -> None:
+    problem = example(example_plant, example_bounds, "A")
+    found = evaluate(problem, np.zeros((1, 2)), np.eye(1))
+    assert found.reason == "the gain does not stabilise the plant"
+    assert np.all(np.isfinite(found.residual))
+    assert np.linalg.norm(found.residual) > 1e3
+    assert controller_for(problem, np.array([[1.5, -0.9]]), np.eye(1)).softening is not None
+
+
+def test_starting_point_alone_is_table_3_1_without_its_last_line(
+    example_plant: Plant, example_bounds: Bounds
+) -> None:
+    problem = example(example_plant, example_bounds, "A")
+    start = starting_point(problem)
+    assert start.gradient is not None
+    assert start.auxiliary is not None
+    assert start.weights is start.auxiliary.weights
+
+
+def test_a_recording_that_breaks_a_state_bound_is_fitted_softly_and_said_so(
+    example_plant: Plant,
+) -> None:
+    """A push beyond the bound: no hard controller passes it, the soft one explains it."""
+    rng = np.random.default_rng(5)
+    plant = random_plant(rng, 3, 1, 1.1, d=1)
+    bounds = box_bounds(plant, u_min=-1, u_max=1, x_min=-0.5, x_max=0.5)
+    true = mpc_controller(plant, stage_weights(np.eye(3), 1), bounds, 6, softening=1e6)
+    push = 0.8 * rng.normal(size=40)
+    run = simulate(true, scenario(plant, 0.2 * np.ones(3), disturbance=push))
+    assert Status.SOFTENED in run.status
+    trial = recording(plant, run.x, np.append(push, 0.0))
+    problem = inverse_problem(plant, bounds, 6, (trial,), softening=1e6)
+    found = inverse_mpc_reduced(problem)
+    assert not found.kept_hard
+    np.testing.assert_allclose(found.gain.K, true.K, atol=1e-6)
+
+
+def test_an_iterate_that_diverges_is_named_and_finite(
+    example_plant: Plant, example_bounds: Bounds
+) -> None:
+    """A gain that gives the bounded input too little to do, from a start that needs it."""
+    problem = example(example_plant, example_bounds, "A")
+    outputs = np.vstack([2.5 * problem.recordings[0].outputs, np.zeros((200, 2))])
+    far = inverse_problem(
+        example_plant,
+        example_bounds,
+        3,
+        (recording(example_plant, outputs),),
+        terminal_set=False,
+    )
+    found = evaluate(far, np.array([[1.02, -0.72]]), np.eye(1))
+    assert "the state left every reasonable range" in found.reason
+    assert np.all(np.isfinite(found.residual))

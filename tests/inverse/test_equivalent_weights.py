@@ -1,0 +1,287 @@
+"""The fibre of a gain and the weights chosen from it: `impc.inverse.equivalent_weights`."""
+
+from __future__ import annotations
+
+import control
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from impc.arrays import Array
+from impc.errors import DataError, WeightsError
+from impc.inverse.equivalent_weights import (
+    EquivalentWeights,
+    analytic_centre,
+    gain_fibre,
+    least_condition_weights,
+    other_weights,
+    weights_margin,
+)
+from impc.inverse.solution_set import split_blocks
+from impc.model.plant import Plant, as_plant
+from impc.model.riccati import solve_lqr
+from impc.model.weights import Weights, condition_number, residual, stage_weights
+from tests.support import draws
+
+EXAMPLE = as_plant(control.ss([[2, -1], [1, 0.2]], [[1], [0]], np.eye(2), 0, 1.0))
+INTEGRATOR = as_plant(control.ss([[1, 1], [0, 1]], [[0.5], [1]], np.eye(2), 0, 1.0))
+
+# Priess et al. 2015, the feasible example (T1), continuous.
+PRIESS = as_plant(
+    control.ss(
+        [[0, 1, 7, 9], [4, -8, -5, -3], [8, -7, 7, -6], [10, -5, -5, -5]],
+        [[2, 2, 5, -9], [-1, 1, 5, -9], [-3, 9, -3, 1], [7, -4, 1, 6]],
+        np.eye(4),
+        0,
+    )
+)
+PRIESS_GAIN = np.array(
+    [
+        [2.376, -1.328, 1.188, 1.847],
+        [4.294, -0.8621, 3.77, 1.509],
+        [-2.279, 1.366, -2.067, -1.323],
+        [-2.7, -0.06092, -2.036, -0.7217],
+    ]
+)
+
+
+def random_case(seed: int, n: int, m: int, dt: float) -> tuple[Plant, Weights]:
+    rng = np.random.default_rng(seed)
+    plant = as_plant(control.ss(rng.normal(size=(n, n)), rng.normal(size=(n, m)), np.eye(n), 0, dt))
+    q, r = rng.normal(size=(n, n)), rng.normal(size=(m, m))
+    return plant, stage_weights(q @ q.T + 0.1 * np.eye(n), r @ r.T + 0.1 * np.eye(m))
+
+
+def seat() -> tuple[Plant, Weights]:
+    from plants.seated_balance import seated_balance_plant  # noqa: PLC0415  # CasADi, for two tests
+
+    plant = as_plant(seated_balance_plant(), controls=["command"])
+    direction = np.array([0.70, 0.65, 0.22, 0.20])
+    direction /= np.linalg.norm(direction)
+    Q = 1e-2 * np.eye(10)
+    Q[:4, :4] = 6e5 * np.outer(direction, direction) + np.diag([2e4, 2e4, 500.0, 500.0])
+    return plant, stage_weights(Q, 1.0)
+
+
+def rescaled(plant: Plant, states: Array) -> Plant:
+    """The same plant with x = states @ z."""
+    back = np.linalg.inv(states)
+    system = control.ss(
+        back @ plant.A @ states, back @ plant.B, plant.C @ states, 0, plant.dt, inputs=plant.m
+    )
+    return as_plant(system)
+
+
+def test_published_example_has_the_least_condition_number_of_the_reference() -> None:
+    found = least_condition_weights(gain_fibre(PRIESS, PRIESS_GAIN))
+    assert found.condition == pytest.approx(15.84287, abs=5e-6)
+    assert found.gain_error < 1e-11
+    assert found.gap is not None
+    assert found.gap < 1e-8
+    scaled = found.weights.block / np.linalg.eigvalsh(found.weights.block)[0]
+    Q = [
+        [13.6214, -1.173, 4.0657, 2.7301],
+        [-1.173, 7.3251, 3.4964, -2.4546],
+        [4.0657, 3.4964, 4.9217, 0.1421],
+        [2.7301, -2.4546, 0.1421, 4.4088],
+    ]
+    R = [
+        [10.5486, 0.3483, 6.5105, -1.7114],
+        [0.3483, 4.3186, 1.8088, 3.5052],
+        [6.5105, 1.8088, 6.9223, -0.4818],
+        [-1.7114, 3.5052, -0.4818, 6.5442],
+    ]
+    np.testing.assert_allclose(scaled[:4, :4], Q, atol=2e-4)
+    np.testing.assert_allclose(scaled[4:, 4:], R, atol=2e-4)
+
+
+@pytest.mark.parametrize(
+    ("plant", "gain", "condition", "Q"),
+    [
+        (INTEGRATOR, [[0.434483, 1.028466]], 1.0, [[1, 0], [0, 1]]),
+        (INTEGRATOR, [[0.692029, 1.226288]], 4.0, [[4, 0], [0, 1]]),
+        (EXAMPLE, [[1.351294, -0.836590]], 3.2588, np.divide(
+            [[1.32597, 0.39116], [0.39116, 1.46938]], 3.25881)),
+    ],
+)  # fmt: skip
+def test_least_condition_of_the_examples(
+    plant: Plant, gain: list[list[float]], condition: float, Q: Array
+) -> None:
+    found = least_condition_weights(gain_fibre(plant, gain))
+    assert found.condition == pytest.approx(condition, abs=7e-5)  # the gain has six decimals
+    np.testing.assert_allclose(found.weights.Q, Q, atol=3e-5)
+    assert found.gain_error < 1e-14
+
+
+def test_least_condition_agrees_with_a_fine_grid_over_the_fibre() -> None:
+    fibre = gain_fibre(EXAMPLE, [[1.351294, -0.836590]])
+    angles = np.linspace(0, np.pi, 200_001)
+    coordinates = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    Q, R = np.tensordot(coordinates, fibre.Q, 1), np.tensordot(coordinates, fibre.R, 1)
+    values = np.concatenate([np.linalg.eigvalsh(Q), R[:, :, 0]], axis=1) * np.sign(R[:, 0])
+    least, largest = values.min(axis=1), values.max(axis=1)
+    conditions = np.where(least > 0, largest / np.maximum(least, 1e-300), np.inf)
+    found = least_condition_weights(fibre)
+    assert found.condition <= conditions.min()
+    assert found.condition == pytest.approx(conditions.min(), rel=1e-4)
+    # The analytic centre, against the same grid.
+    volumes = np.where(least > 0, np.linalg.det(Q) / R[:, 0, 0] ** 2, 0.0)
+    best = Q[np.argmax(volumes)] / R[np.argmax(volumes)]
+    np.testing.assert_allclose(analytic_centre(fibre).weights.Q, best, rtol=1e-3)
+
+
+@pytest.mark.parametrize(("m", "dt"), [(1, 1.0), (2, 1.0), (2, 0)])
+@draws(8)
+@given(seed=st.integers(0, 2**32 - 1), n=st.integers(2, 5))
+def test_the_fibre_contains_the_truth_and_nothing_with_another_gain(
+    m: int, dt: float, seed: int, n: int
+) -> None:
+    plant, truth = random_case(seed, n, m, dt)
+    solution = solve_lqr(plant, truth)
+    fibre = gain_fibre(plant, solution.K)
+    X, basis = fibre.to_natural(truth), fibre.natural_basis()
+    inside = np.tensordot(np.tensordot(basis, X, 2), basis, 1)
+    assert np.linalg.norm(X - inside) < 1e-8 * np.linalg.norm(X)
+    found = least_condition_weights(fibre)
+    assert found.condition <= condition_number(truth) * (1 + 1e-8)
+    members: list[EquivalentWeights] = [found, *other_weights(fibre, 3)]
+    assert max(member.gain_error for member in members) < 1e-7
+
+
+@draws(8)
+@given(seed=st.integers(0, 2**32 - 1), dt=st.sampled_from([0, 1.0]))
+def test_a_metric_narrows_the_fibre_to_weights_with_that_metric(seed: int, dt: float) -> None:
+    plant, truth = random_case(seed, 4, 2, dt)
+    solution = solve_lqr(plant, truth)
+    free = gain_fibre(plant, solution.K)
+    # Only S up to scale may matter.
+    fibre = gain_fibre(plant, solution.K, 3.0 * solution.S)
+    assert fibre.dimension == free.dimension - 1  # m - 1: see the next test
+    found = least_condition_weights(fibre)
+    assert found.condition <= condition_number(truth) * (1 + 1e-8)
+    S = solve_lqr(plant, found.weights).S
+    np.testing.assert_allclose(
+        S / np.trace(S), solution.S / np.trace(solution.S), rtol=1e-6, atol=1e-8
+    )
+
+
+@pytest.mark.parametrize(("n", "m"), [(3, 2), (4, 2), (5, 3), (6, 3)])
+def test_gain_and_metric_determine_m_minus_1_numbers_more_than_the_gain(n: int, m: int) -> None:
+    """S K A^-1 B = B'PB is symmetric: of the m(m+1)/2 numbers of S, the gain leaves m free."""
+    plant, truth = random_case(1, n, m, 1.0)
+    solution = solve_lqr(plant, truth)
+    numbers = n * (n + 1) // 2 + m * (m + 1) // 2
+    assert gain_fibre(plant, solution.K).dimension == numbers - n * m
+    assert gain_fibre(plant, solution.K, solution.S).dimension == numbers - n * m - (m - 1)
+
+
+def test_seat_plant() -> None:
+    plant, truth = seat()
+    fibre = gain_fibre(plant, solve_lqr(plant, truth).K)
+    assert fibre.dimension == 46
+    assert fibre.singular_values[-1] > 1e-3 * fibre.singular_values[0]
+    found = least_condition_weights(fibre)
+    # The 1.69e7 of the reference belongs to another realisation of the delay.
+    assert found.condition == pytest.approx(2.368523e7, rel=1e-4)
+    assert found.gap is not None
+    assert found.gap < 1e-6
+    assert found.condition < condition_number(truth)
+    centre, *others = analytic_centre(fibre), *other_weights(fibre)
+    assert len(others) == 2
+    for member in (found, centre, *others):
+        assert member.gain_error < 1e-9
+    eigenvalues, vectors = np.linalg.eigh(centre.weights.Q)
+    np.testing.assert_allclose(eigenvalues[-3:], [2.8e4, 9.5e4, 8.9e5], rtol=0.05)
+    np.testing.assert_allclose(np.abs(vectors[:2, -1]), [0.625, 0.779], atol=0.01)
+
+
+def test_margin_and_centre_do_not_depend_on_units_but_the_least_condition_does() -> None:
+    plant, truth = seat()
+    scale = np.diag(np.logspace(-3, 2, 10))
+    other = rescaled(plant, scale)
+    moved = stage_weights(scale @ truth.Q @ scale, truth.R)
+    fibres = [gain_fibre(a, solve_lqr(a, w).K) for a, w in ((plant, truth), (other, moved))]
+    first, second = (weights_margin(fibre).margin for fibre in fibres)
+    assert second == pytest.approx(first, rel=1e-6)
+    centre, again = (analytic_centre(fibre).weights for fibre in fibres)
+    np.testing.assert_allclose(scale @ centre.Q @ scale, again.Q, rtol=1e-5, atol=1e-6)
+    lowest = [least_condition_weights(fibre).condition for fibre in fibres]
+    assert not np.isclose(lowest[0], lowest[1], rtol=0.5)
+
+
+def test_analytic_centre_with_two_inputs_does_not_depend_on_their_coordinates() -> None:
+    plant, truth = random_case(3, 4, 2, 1.0)
+    gain = solve_lqr(plant, truth).K
+    inputs = np.array([[1.0, 0.4], [0.0, 50.0]])
+    moved = as_plant(control.ss(plant.A, plant.B @ inputs, plant.C, 0, 1.0))
+    centre = analytic_centre(gain_fibre(plant, gain)).weights
+    other = analytic_centre(gain_fibre(moved, np.linalg.solve(inputs, gain))).weights
+    expected = stage_weights(centre.Q, inputs.T @ centre.R @ inputs)
+    assert residual(expected, other) < 1e-6 * np.linalg.norm(other.block)
+
+
+def test_a_gain_that_no_weights_have() -> None:
+    fibre = gain_fibre(EXAMPLE, [[1.21183, -0.71277]])
+    found = weights_margin(fibre)
+    assert not found.exist
+    assert found.weights is None
+    assert found.margin < -1
+    for function in (least_condition_weights, analytic_centre, other_weights):
+        with pytest.raises(WeightsError, match="no positive definite weights"):
+            function(fibre)
+
+
+def test_a_gain_that_does_not_stabilise_is_refused() -> None:
+    with pytest.raises(WeightsError, match="not stable"):
+        gain_fibre(EXAMPLE, [[0.0, 0.0]])
+    with pytest.raises(DataError, match="shape"):
+        gain_fibre(EXAMPLE, [0.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("A", "B"),
+    [
+        ([[2, 1], [0, 0.5]], [[1], [0]]),  # not controllable
+        ([[1.1, 0, 0], [1, 0, 0], [0, 1, 0]], [[1], [0], [0]]),  # singular A, hence A - BK
+    ],
+)
+def test_an_unbounded_fibre_has_a_least_condition_but_no_centre(A: object, B: object) -> None:
+    plant = as_plant(control.ss(A, B, np.eye(len(np.asarray(A))), 0, 1.0))
+    gain = solve_lqr(plant, stage_weights(np.eye(plant.n), 1.0)).K
+    fibre = gain_fibre(plant, gain)
+    assert least_condition_weights(fibre).condition == pytest.approx(1.0, abs=1e-9)
+    with pytest.raises(WeightsError, match="no analytic centre"):
+        analytic_centre(fibre)
+
+
+@pytest.mark.parametrize("seed", [55, 107, 199, 209, 306])
+def test_a_fibre_with_members_is_never_called_empty(seed: int) -> None:
+    """Clarabel stopped at its first iterations on these while the trace was an equality."""
+    size = {55: (8, 2, 1.0), 107: (6, 3, 1.0), 199: (8, 2, 1.0), 209: (8, 3, 1.0), 306: (8, 3, 0)}
+    plant, truth = random_case(seed, *size[seed])
+    found = weights_margin(gain_fibre(plant, solve_lqr(plant, truth).K))
+    assert found.exist
+    assert found.margin > 1e-6
+
+
+def test_others_are_unlike_and_a_single_member_has_none() -> None:
+    fibre = gain_fibre(INTEGRATOR, [[0.434483, 1.028466]])
+    found, others = least_condition_weights(fibre), other_weights(fibre)
+    assert len(others) == 2
+    for member in others:
+        assert member.condition == pytest.approx(10 * found.condition, rel=1e-6)
+        assert residual(member.weights, found.weights) > 0.5
+        assert member.gain_error < 1e-14
+    assert residual(others[0].weights, others[1].weights) > 0.5
+    single = gain_fibre(as_plant(control.ss([[1.2]], [[1]], [[1]], 0, 1.0)), [[0.7]])
+    assert other_weights(single) == ()
+    assert residual(analytic_centre(single).weights, least_condition_weights(single).weights) < 1e-9
+
+
+def test_basis_is_orthonormal_in_natural_coordinates() -> None:
+    basis = gain_fibre(PRIESS, PRIESS_GAIN).natural_basis()
+    assert basis.shape == (4, 8, 8)
+    np.testing.assert_allclose(np.tensordot(basis, basis, ((1, 2), (1, 2))), np.eye(4), atol=1e-9)
+    member = split_blocks(basis[0], 4)
+    np.testing.assert_allclose(member.Q, basis[0][:4, :4], atol=1e-12)

@@ -1,0 +1,251 @@
+"""Fits with unknown initial states and parameters, without noise and with it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.signal
+
+import plants
+from experiments.benchmarks.workloads import Workload, seat
+from experiments.simulated_subjects import simulated_subject
+from impc.assess.covariance import gain_covariance
+from impc.assess.inverse_lqr_beside import compare_methods
+from impc.assess.long_run_covariance import ResidualNoise, residual_noise, spread_of_sum
+from impc.assess.printed_gain import gain_estimate
+from impc.control.closed_loop import scenario, simulate
+from impc.inverse.coordinates import Coordinates
+from impc.inverse.diagonal_start import diagonal_weights
+from impc.inverse.initial_states import with_fitted_starts
+from impc.inverse.noisy_fit import FittedController, fit_controller
+from impc.inverse.problem import InverseProblem, moved
+from impc.inverse.residuals import evaluate
+from impc.model.plant import as_plant
+from impc.model.plant_family import plant_at, plant_differential, plant_family
+from impc.model.recordings import recording
+from impc.model.riccati import solve_lqr
+from impc.studies.fit.settings import FitSettings
+from impc.studies.fit.subject import fit_problem
+
+
+def clean_problem(limit: float, trials: int = 3) -> tuple[Workload, InverseProblem]:
+    work = seat(trials, 30.0, limit)
+    plant = work.problem.plant
+    recordings = [recording(plant, t.outputs, t.disturbance) for t in work.problem.recordings]
+    return work, fit_problem(plant, recordings, FitSettings(u_max=limit))
+
+
+@pytest.fixture(scope="module", params=[70.0, 6.0, 4.5], ids="{}Nm".format)
+def clean(request: pytest.FixtureRequest) -> tuple[Workload, FittedController]:
+    work, problem = clean_problem(request.param)
+    return work, fit_controller(problem)
+
+
+def test_without_noise_all_that_is_determined_comes_out(
+    clean: tuple[Workload, FittedController],
+) -> None:
+    """VAF above 99.999 %, and the gain to 1e-5 along every determined direction."""
+    work, fitted = clean
+    samples = sum(trial.outputs.size for trial in work.problem.recordings)
+    assert fitted.exact
+    assert 1 - fitted.misfit**2 / samples > 0.99999
+    covariance = gain_estimate(fitted).covariance
+    determined = covariance.singular_values > 1e-6 * covariance.singular_values[0]
+    truth = np.array(work.controller.K)
+    error = covariance.along(fitted.solution.K - truth)
+    size = np.linalg.norm(truth @ covariance.T)
+    assert np.count_nonzero(determined) >= 9
+    assert np.max(np.abs(error[determined])) <= 1e-5 * size
+
+
+def test_inverse_mpc_against_inverse_lqr(clean: tuple[Workload, FittedController]) -> None:
+    """It wins and keeps the limit where the subject saturates, and equals where none is active."""
+    work, fitted = clean
+    methods = {item.name: item for item in compare_methods(fitted)}
+    mpc = methods["inverse_mpc"]
+    limit = float(work.controller.bounds.u_max[0])
+    assert mpc.keeps_bounds
+    for name in ("feedback_gain", "inverse_lqr_gain", "inverse_lqr_output"):
+        if limit == 70.0:
+            np.testing.assert_allclose(methods[name].vaf, mpc.vaf, atol=1e-6)
+        else:
+            assert np.all(methods[name].vaf < mpc.vaf - 0.1)
+            assert not methods[name].keeps_bounds
+    fell = [time for time in methods["clipped_lqr"].fell if time is not None]
+    assert bool(fell) == (limit == 4.5)
+    assert mpc.fell == (None,) * 3
+
+
+def test_noisy_subjects_reach_the_ceiling_within_their_deviations() -> None:
+    """Seeds 0 to 2 at 6 Nm; `python -m experiments.simulated_subjects` has a hundred of each."""
+    subjects = [simulated_subject(seed, 6.0) for seed in range(3)]
+    assert max(item.below_ceiling for item in subjects) < 0.5
+    inside = [np.abs(item.entries) <= 3 for item in subjects]
+    assert np.mean(inside) >= 0.97
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("limit", [70.0, 6.0, 4.5])
+def test_a_hundred_noisy_subjects(limit: float) -> None:
+    """Seeds 0 to 99: within half a point of the ceiling, every entry inside for 97 of 100."""
+    subjects = [simulated_subject(seed, limit) for seed in range(100)]
+    assert max(item.below_ceiling for item in subjects) < 0.5
+    inside = np.array([np.abs(item.entries) <= 3 for item in subjects])
+    assert np.all(np.mean(inside, axis=0) >= 0.97)
+
+
+def test_initial_states_are_found() -> None:
+    """From rest as the first guess, with the true controller, to the rounding of a short trial."""
+    work, _ = clean_problem(6.0, 1)
+    controller, plant = work.controller, work.problem.plant
+    rng = np.random.default_rng(7)
+    x = simulate(controller, work.drives[0]).x
+    x0 = x[500 + rng.integers(100)]
+    drive = scenario(plant, x0, disturbance=work.drives[0].disturbance[500:1500])
+    run = simulate(controller, drive)
+    trial = recording(plant, run.x @ plant.C.T, np.vstack([drive.disturbance, [[0.0]]]))
+    problem = replace(work.problem, recordings=(trial,), unknown_start=True)
+    K, S = np.array(controller.K), np.array(controller.S)
+    (found,) = with_fitted_starts(problem, K, S).recordings
+    size = np.sqrt(np.mean(x**2, axis=0))
+    np.testing.assert_allclose(found.x0[:4], x0[:4], atol=1e-6 * float(np.max(size[:4])))
+    seen = simulate(controller, scenario(plant, found.x0, disturbance=drive.disturbance))
+    np.testing.assert_allclose(seen.x @ plant.C.T, trial.outputs, atol=1e-8)
+
+
+def seat_family() -> tuple[InverseProblem, Workload]:
+    """Unknown moment of inertia and muscle time constant, from nominal values 20 % off."""
+    work, problem = clean_problem(6.0, 2)
+    truth = plants.SeatedBalanceParameters()
+
+    def make(values: np.ndarray[tuple[int, ...], np.dtype[np.float64]]):  # type: ignore[no-untyped-def]
+        changed = replace(truth, J2=float(values[0]), tau_m=float(values[1]))
+        return as_plant(plants.seated_balance_plant(changed), ["command"])
+
+    family = plant_family(make, ["J2", "tau_m"], [1.2 * truth.J2, 0.8 * truth.tau_m])
+    start = plant_at(family, np.zeros(2))
+    return replace(problem, plant=start, family=family, logarithms=np.zeros(2)), work
+
+
+def test_plant_differential_equals_differences() -> None:
+    problem, _ = seat_family()
+    assert problem.family is not None
+    here = np.array([0.05, -0.1])
+    exact = plant_differential(problem.family, here)
+    for index in range(2):
+        step = np.zeros(2)
+        step[index] = 1e-5
+        ahead, behind = (plant_at(problem.family, here + sign * step) for sign in (1, -1))
+        for name in ("A", "B", "E", "C"):
+            rough = (getattr(ahead, name) - getattr(behind, name)) / 2e-5
+            scale = max(1.0, float(np.max(np.abs(rough))))
+            np.testing.assert_allclose(getattr(exact, name)[..., index], rough, atol=1e-7 * scale)
+
+
+def test_every_column_of_the_search_equals_differences() -> None:
+    """Gain, initial states and parameters together, in the coordinates of the search."""
+    problem, work = seat_family()
+    space = Coordinates(problem, np.array(work.controller.K), np.eye(1))
+    rng = np.random.default_rng(3)
+    z = space.start + 0.02 * rng.standard_normal(len(space.start))
+    # The compressed residual turns with z; its norm does not: compare the gradient of its square.
+    gradient = space.at(z).jacobian.T @ space.at(z).residual
+    for index in [*rng.choice(len(z), 12, replace=False).tolist(), len(z) - 1, len(z) - 2]:
+        step = np.zeros(len(z))
+        step[index] = 1e-6
+        ahead, behind = (np.sum(space.at(z + sign * step).residual ** 2) / 2 for sign in (1, -1))
+        rough = (ahead - behind) / 2e-6
+        assert rough == pytest.approx(
+            gradient[index], rel=2e-5, abs=1e-5 * np.max(np.abs(gradient))
+        )
+
+
+def test_physical_parameters_are_found_with_the_gain() -> None:
+    problem, work = seat_family()
+    fitted = fit_controller(problem)
+    truth = plants.SeatedBalanceParameters()
+    assert problem.family is not None
+    found = problem.family.nominal * np.exp(fitted.problem.logarithms)
+    np.testing.assert_allclose(found, [truth.J2, truth.tau_m], rtol=1e-5)
+    samples = sum(trial.outputs.size for trial in work.problem.recordings)
+    assert 1 - fitted.misfit**2 / samples > 0.99999
+
+
+def test_an_evaluation_knows_what_a_problem_lacks() -> None:
+    problem, work = seat_family()
+    found = evaluate(problem, np.array(work.controller.K), np.eye(1))
+    assert found.dx0.shape == (len(found.residual), 10)
+    assert found.dparameters.shape == (len(found.residual), 2)
+    known = replace(problem, unknown_start=False, family=None, logarithms=np.zeros(0))
+    other = evaluate(known, np.array(work.controller.K), np.eye(1))
+    assert other.dx0.shape == (len(found.residual), 0)
+    np.testing.assert_array_equal(other.dK, found.dK)
+
+
+def test_moved_changes_starts_and_plant() -> None:
+    problem, _ = seat_family()
+    starts = np.ones((2, 10))
+    there = moved(problem, starts, np.array([0.1, 0.0]))
+    assert [trial.x0.tolist() for trial in there.recordings] == starts.tolist()
+    assert not np.array_equal(there.plant.A, problem.plant.A)
+
+
+def test_diagonal_weights_come_near() -> None:
+    """Nearer than the best of Bryson's rule, from which they start."""
+    _, problem = clean_problem(6.0, 1)
+    solution = solve_lqr(problem.plant, diagonal_weights(problem))
+    found = evaluate(problem, solution.K, solution.S)
+    samples = problem.recordings[0].outputs.size
+    assert np.linalg.norm(found.residual) ** 2 / samples < 0.1
+
+
+def test_colour_of_a_first_order_process() -> None:
+    """Seed 5: the spread of a plain sum is N times the spectral density at zero, 1/(1 - a)^2."""
+    rng = np.random.default_rng(5)
+    noise = rng.standard_normal((40000, 1))
+    for a in (0.0, 0.5, 0.9):
+        series = scipy.signal.lfilter([1.0], [1.0, -a], noise, axis=0)
+        found = residual_noise([series])
+        assert found.root[0] == pytest.approx(a, abs=0.01)
+        spread = spread_of_sum(found, [np.ones((10000, 1, 1))])[0, 0]
+        assert spread / 10000 == pytest.approx(1 / (1 - a) ** 2, rel=0.05)
+
+
+def test_spread_of_a_weighted_sum_is_that_of_its_toeplitz_matrix() -> None:
+    """Known colour, two outputs: against the full covariance matrix of the noise."""
+    a, rng = np.array([0.6, -0.3]), np.random.default_rng(8)
+    mixing = np.array([[1.0, 0.4], [0.0, 0.8]])
+    found = ResidualNoise(a, (mixing @ mixing.T)[None])
+    samples, before = 30, 200
+    columns = rng.standard_normal((samples, 2, 3))
+    response = np.zeros((samples, 2, before + samples, 2))  # of e_t to eps_s
+    for t in range(samples):
+        for s in range(before + t + 1):
+            response[t, :, s, :] = np.diag(a ** (before + t - s)) @ mixing
+    weighted = np.tensordot(columns, response, ((0, 1), (0, 1))).reshape(3, -1)
+    np.testing.assert_allclose(spread_of_sum(found, [columns]), weighted @ weighted.T, rtol=1e-9)
+
+
+def test_standard_deviations_of_a_linear_model_are_those_of_theory() -> None:
+    """White noise, no bound: the sandwich is sigma^2 (J'J)^-1 of the full problem."""
+    subject_noise = 1e-6
+    work, problem = clean_problem(70.0, 1)
+    rng = np.random.default_rng(11)
+    trial = problem.recordings[0]
+    noisy = trial.outputs + subject_noise * problem.output_scale * rng.standard_normal(
+        trial.outputs.shape
+    )
+    here = replace(problem, recordings=(replace(trial, outputs=noisy),))
+    K = np.array(work.controller.K)
+    fit = fit_controller(problem).free
+    covariance = gain_covariance(here, K, np.array(fit.S))
+    found = evaluate(here, K, np.eye(1))
+    J = np.hstack([found.dK.reshape(len(found.residual), -1), found.dx0])
+    scale = np.linalg.norm(J, axis=0)
+    inverse = np.linalg.pinv((J / scale).T @ (J / scale), rcond=1e-15)
+    theory = subject_noise * np.sqrt(np.diag(inverse)) / scale
+    usable = np.isfinite(covariance.entries[0])
+    assert np.count_nonzero(usable) > 0
+    np.testing.assert_allclose(covariance.entries[0][usable], theory[:10][usable], rtol=0.1)

@@ -1,0 +1,210 @@
+"""Weights of two and three inputs: what is reported, simulated, is what was recorded."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from impc.assess.weights_ranges import summarise_weights
+from impc.control.closed_loop import scenario, simulate
+from impc.control.controller import Controller, mpc_controller
+from impc.errors import ImpcError
+from impc.inverse.direct_and_reduced import infer_weights, inverse_mpc_reduced
+from impc.inverse.equivalent_weights import least_condition_weights, other_weights
+from impc.inverse.gain_search import fit_gain
+from impc.inverse.noisy_fit import fit_controller
+from impc.inverse.one_step import regressed_gain
+from impc.inverse.problem import InverseProblem
+from impc.inverse.solution_set import gain_fibre, natural_coordinates
+from impc.inverse.weights_search import search_weights
+from impc.model.recordings import recording
+from impc.model.riccati import solve_lqr
+from impc.model.weights import Weights, stage_weights
+from tests.support import saturated_problem
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+# What is asked of reported weights, of the recorded outputs.
+REPRODUCED = 1e-7
+
+
+def random_problem(seed: int, m: int) -> tuple[Controller, InverseProblem]:
+    """2 to 6 states, m inputs, one random disturbance, 2 to 30 % of the inputs saturated."""
+    rng = np.random.default_rng([14, m, seed])
+    _, controller, problem = saturated_problem(rng, 2 + seed % 5, m)
+    return controller, problem
+
+
+def missed(problem: InverseProblem, weights: Weights) -> float:
+    """Simulated minus recorded outputs over the recorded ones: by the controller, from weights."""
+    plant = problem.plant
+    controller = mpc_controller(
+        plant, weights, problem.bounds, problem.horizon, terminal_set=problem.terminal_set
+    )
+    (trial,) = problem.recordings
+    run = simulate(controller, scenario(plant, trial.x0, disturbance=trial.disturbance[:-1]))
+    scale = np.asarray(problem.output_scale)
+    error = (run.x @ plant.C.T - trial.outputs) / scale
+    return float(np.linalg.norm(error) / np.linalg.norm(trial.outputs / scale))
+
+
+def by_fit(problem: InverseProblem) -> tuple[Weights, bool]:
+    found = fit_controller(problem)
+    assert found.explained or not found.exact
+    return found.weights, found.explained
+
+
+def by_reduced(problem: InverseProblem) -> tuple[Weights, bool]:
+    found = inverse_mpc_reduced(problem)
+    assert found.explained == (not found.reason)
+    return found.weights, found.explained
+
+
+def by_direct(problem: InverseProblem) -> tuple[Weights, bool]:
+    found = infer_weights(problem).fit
+    return found.weights, found.explained
+
+
+PATHS = {"fit": by_fit, "reduced": by_reduced, "direct": by_direct}
+
+
+def outcomes(
+    path: Callable[[InverseProblem], tuple[Weights, bool]], m: int, seeds: range
+) -> dict[int, str]:
+    """Per problem that is not reproduced: "said so", or how far a silent answer missed."""
+    found = {}
+    for seed in seeds:
+        _, problem = random_problem(seed, m)
+        try:
+            weights, explained = path(problem)
+        except ImpcError as error:
+            found[seed] = f"said so: {error}"
+            continue
+        miss = missed(problem, weights)
+        if miss > REPRODUCED:
+            found[seed] = f"missed by {miss:.2g}" if explained else "said so"
+    return found
+
+
+@pytest.mark.parametrize("m", [2, 3])
+@pytest.mark.parametrize("path", ["fit", "reduced"])
+def test_reported_weights_reproduce_the_recording(path: str, m: int) -> None:
+    """At seeds 0 to 4 the weights missed it by 0.1 to 60 %, and were called exact."""
+    assert outcomes(PATHS[path], m, range(5)) == {}
+
+
+@pytest.mark.parametrize(
+    ("m", "seed"),
+    [
+        pytest.param(2, 2, marks=pytest.mark.slow),
+        pytest.param(2, 8, marks=pytest.mark.slow),
+        (3, 1),
+    ],
+)
+def test_direct_form_reproduces_the_recording(m: int, seed: int) -> None:
+    """At seeds 2 and 8 it ended with a misfit of 8e-5 and 3e-5, and called that converged."""
+    assert outcomes(by_direct, m, range(seed, seed + 1)) == {}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("m", [2, 3])
+@pytest.mark.parametrize("path", sorted(PATHS))
+def test_ninety_nine_in_a_hundred_are_reproduced_and_no_miss_is_silent(path: str, m: int) -> None:
+    found = outcomes(PATHS[path], m, range(300))
+    print(path, m, found)
+    assert all(text.startswith("said so") for text in found.values())
+    assert len(found) <= 3
+
+
+@pytest.mark.parametrize(("m", "seed"), [(2, 3), (3, 2)])
+def test_metric_is_kept_along_what_is_told_of_it(m: int, seed: int) -> None:
+    """Some of S is not told: weights that share what is told behave alike, others do not."""
+    controller, problem = random_problem(seed, m)
+    plant = problem.plant
+    fit = fit_gain(problem, (np.array(controller.K), np.array(controller.S)), attempts=1)
+    assert fit.explained
+    assert not fit.metric_determined
+    assert 1 < len(fit.metrics) < m * (m + 1) // 2
+    kept = gain_fibre(plant, controller.K, fit.metrics)
+    for weights in (least_condition_weights(kept).weights, other_weights(kept, 1)[0].weights):
+        assert missed(problem, weights) < 1e-6
+    dropped = least_condition_weights(gain_fibre(plant, controller.K)).weights
+    assert missed(problem, dropped) > 1e-3
+
+
+def test_set_of_weights_has_the_metric_in_it() -> None:
+    _, problem = random_problem(0, 2)
+    fitted = fit_controller(problem)
+    assert len(fitted.metrics) == 1
+    plant, K = problem.plant, np.array(fitted.solution.K)
+    numbers = plant.n * (plant.n + 1) // 2 + plant.m * (plant.m + 1) // 2
+    found = summarise_weights(plant, K, np.array(fitted.metrics), np.ones(plant.n))
+    # n m + m - 1 numbers are told, and one is the scale.
+    assert found.dimension == numbers - (plant.n * plant.m + plant.m - 1) - 1
+
+
+def test_fibre_of_a_metric_in_a_span() -> None:
+    """Every member's R + B'PB is in the span, and the span of all metrics asks nothing."""
+    controller, problem = random_problem(2, 3)
+    plant = problem.plant
+    metric = np.array(controller.S)
+    other = np.diag([1.0, 0.0, 0.0])
+    fibre = gain_fibre(plant, controller.K, np.array([metric, other]))
+    span = np.array([metric.ravel(), other.ravel()]).T
+    for weights in (least_condition_weights(fibre), *other_weights(fibre, 2)):
+        S = solve_lqr(plant, weights.weights).S.ravel()
+        left = S - span @ np.linalg.lstsq(span, S)[0]
+        assert np.linalg.norm(left) < 1e-8 * np.linalg.norm(S)
+    every = [np.outer(a, b) + np.outer(b, a) for a in np.eye(3) for b in np.eye(3)]
+    free = gain_fibre(plant, controller.K)
+    assert gain_fibre(plant, controller.K, np.array(every)).dimension == free.dimension
+
+
+def test_search_for_weights_ends_at_weights_that_explain() -> None:
+    controller, problem = random_problem(1, 2)
+    weights = least_condition_weights(gain_fibre(problem.plant, controller.K)).weights
+    assert missed(problem, weights) > 1e-3
+    found = search_weights(problem, weights)
+    assert missed(problem, found.weights) < 1e-9
+
+
+def test_gain_of_most_samples_is_the_gain() -> None:
+    controller, problem = random_problem(4, 2)
+    found = regressed_gain(problem)
+    assert found is not None
+    np.testing.assert_allclose(found, controller.K, rtol=1e-8, atol=1e-9)
+
+
+def test_weights_at_the_edge_of_those_that_a_program_finds() -> None:
+    """Their margin is below 1e-9: known members are found again, none is made up without one."""
+    _, problem = random_problem(2, 2)
+    plant = problem.plant
+    thin = stage_weights(np.diag([1e-11, 1.0, 1.0, 1.0]), np.eye(2))
+    solution = solve_lqr(plant, thin)
+    fibre = gain_fibre(plant, solution.K, solution.S)
+    found = least_condition_weights(fibre, thin)
+    assert found.gain_error < 1e-8
+
+
+def test_a_noisy_fit_stays_where_it_ended() -> None:
+    """Begun at its own answer the gain moved by a fifth of its error along weak directions."""
+    controller, clean = random_problem(1, 2)
+    (trial,) = clean.recordings
+    scale = np.asarray(clean.output_scale)
+    noise = 0.15 * scale * np.random.default_rng(1).standard_normal(trial.outputs.shape)
+    noisy = recording(clean.plant, trial.outputs + noise, trial.disturbance, trial.x0)
+    problem = replace(clean, recordings=(noisy,))
+    found = fit_controller(problem)
+    again = fit_controller(problem, found.weights)
+    T, G = natural_coordinates(clean.plant, np.array(controller.K))
+    moved, error = (
+        float(np.linalg.norm(np.linalg.solve(G, difference @ T)))
+        for difference in (again.solution.K - found.solution.K, found.free.K - controller.K)
+    )
+    assert found.converged
+    assert not found.explained
+    assert moved < 0.1 * error

@@ -1,0 +1,90 @@
+"""Inverse KKT: exact where its assumption holds, and smoothing against simulated states."""
+
+from __future__ import annotations
+
+import cvxpy
+import numpy as np
+import pytest
+
+from experiments.benchmarks.workloads import example, seat
+from impc.arrays import Array
+from impc.control.closed_loop import simulate
+from impc.errors import DataError
+from impc.inverse.smoothing import Smoothed, smoothed_trials
+from impc.inverse.stationarity import stationarity_weights
+from impc.model.riccati import solve_lqr
+from impc.model.weights import stage_weights
+from tests.support import random_plant, random_weights
+
+SEED = 6
+
+
+def optimal_runs(seed: int, n: int, m: int) -> tuple[object, Array, list[Smoothed]]:
+    """Undisturbed regulators from random starts: every stretch is an optimal plan."""
+    rng = np.random.default_rng(seed)
+    plant = random_plant(rng, n, m, 1.1)
+    weights = stage_weights(random_weights(rng, n), random_weights(rng, m))
+    K = np.array(solve_lqr(plant, weights).K)
+    runs = []
+    for _ in range(5):
+        x, states, commands = rng.standard_normal(n), [], []
+        for _ in range(25):
+            states.append(x)
+            commands.append(-K @ x)
+            x = plant.A @ x + plant.B @ commands[-1]
+        runs.append(Smoothed(np.array(states), np.array(commands)))
+    return plant, K, runs
+
+
+@pytest.mark.parametrize("size", [(2, 1), (3, 1), (3, 2)], ids=str)
+def test_optimal_plans_give_back_their_gain(size: tuple[int, int]) -> None:
+    plant, K, runs = optimal_runs(SEED, *size)
+    found = stationarity_weights(plant, runs, 12, np.full(size[1], np.inf), K)  # type: ignore[arg-type]
+    again = solve_lqr(plant, found).K  # type: ignore[arg-type]
+    np.testing.assert_allclose(again, K, atol=1e-4 * np.max(np.abs(K)))
+
+
+def test_the_residual_is_that_of_the_stationarity_conditions() -> None:
+    """The same least-squares problem by cvxpy, every lambda a variable of its own."""
+    plant, K, runs = optimal_runs(SEED + 1, 2, 1)
+    rng = np.random.default_rng(SEED)
+    noisy = [Smoothed(run.x, run.u + 0.05 * rng.standard_normal(run.u.shape)) for run in runs]
+    found = stationarity_weights(plant, noisy, 25, np.array([np.inf]), K)  # type: ignore[arg-type]
+    Q = cvxpy.Variable((2, 2), PSD=True)
+    rows, constraints = [], []
+    for run in noisy:
+        adjoint = cvxpy.Variable((26, 2))
+        A, B = plant.A, plant.B  # type: ignore[attr-defined]
+        constraints.append(adjoint[:-1] == run.x @ Q + adjoint[1:] @ A)
+        rows.append(run.u + adjoint[1:] @ B)
+    objective = cvxpy.Minimize(cvxpy.sum_squares(cvxpy.vstack(rows)))
+    cvxpy.Problem(objective, constraints).solve(solver=cvxpy.CLARABEL)
+    other = solve_lqr(plant, stage_weights(Q.value, 1)).K  # type: ignore[arg-type]
+    ours = solve_lqr(plant, found).K  # type: ignore[arg-type]
+    np.testing.assert_allclose(ours, other, atol=2e-3 * np.max(np.abs(K)))
+
+
+def test_saturated_rows_are_left_out() -> None:
+    """All commands at the bound: nothing is left, and that is said."""
+    plant, K, runs = optimal_runs(SEED, 2, 1)
+    with pytest.raises(DataError, match="no stretch"):
+        stationarity_weights(plant, runs, 12, np.array([1e-300]), K)  # type: ignore[arg-type]
+
+
+def test_smoothing_finds_states_and_commands() -> None:
+    """Exact outputs of the disturbed seat: angles to 1e-5, rates to 1 % of their size."""
+    work = seat(1, 20.0)
+    (found,) = smoothed_trials(work.problem)
+    run = simulate(work.controller, work.drives[0])
+    size = np.sqrt(np.mean(run.x**2, axis=0))
+    error = np.max(np.abs(found.x - run.x)[20:-20], axis=0) / size
+    assert np.all(error[:2] < 1e-4)
+    assert np.all(error[2:4] < 1e-2)
+
+
+def test_smoothing_of_a_two_state_plant_gives_its_command() -> None:
+    work = example()
+    (found,) = smoothed_trials(work.problem)
+    run = simulate(work.controller, work.drives[0])
+    np.testing.assert_allclose(found.x[1:-1], run.x[1:-1], atol=2e-2)
+    np.testing.assert_allclose(found.u[1:-2], run.u[1:-1], atol=5e-2)

@@ -1,0 +1,84 @@
+"""A small study for the tests: carts on a falling track, fitted in a tenth of a second."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import control
+import numpy as np
+
+from experiments.coverage import cart
+from impc.control.closed_loop import require_complete, scenario, simulate
+from impc.control.controller import mpc_controller
+from impc.model.bounds import box_bounds
+from impc.model.recordings import Recording, recording
+from impc.model.weights import stage_weights
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+__all__ = ["cart_plant", "subject_trial", "write_study"]
+
+_SAMPLES, _DT = 600, 0.05
+
+
+def cart_plant(drag: float = 0.3) -> Any:
+    """The plant of `experiments.coverage.cart` as the command takes it."""
+    A, B = [[0.0, 1.0], [0.5, -drag]], [[0.0, 0.0], [1.0, 1.0]]
+    names: dict[str, Any] = {"inputs": ["force", "push"], "outputs": ["position"]}
+    return control.c2d(control.ss(A, B, [[1.0, 0.0]], 0, **names), _DT)
+
+
+def subject_trial(seed: int, price: float = 4.0) -> Recording:
+    """A trial of a subject with Q = diag(price, 1), with white noise of a fifth."""
+    plant, rng = cart(), np.random.default_rng(seed)
+    bounds = box_bounds(plant, u_min=-1, u_max=1)
+    weights = stage_weights(np.diag([price, 1.0]), 1)
+    controller = mpc_controller(plant, weights, bounds, 10, terminal_set=False)
+    push = np.repeat(rng.choice([-0.8, 0.0, 0.8], _SAMPLES // 10), 10)
+    run = require_complete(
+        controller, simulate(controller, scenario(plant, np.zeros(2), disturbance=push))
+    )
+    clean = (run.x @ plant.C.T)[:_SAMPLES]
+    noise = 0.2 * np.sqrt(np.mean(clean**2)) * rng.standard_normal(clean.shape)
+    return recording(plant, clean + noise, push)
+
+
+def write_study(
+    folder: Path, subjects: int, visits: int = 1, replicates: int = 0, seed: int = 0
+) -> Path:
+    """Write a study of one trial a visit; returns study.toml."""
+    rng = np.random.default_rng(seed)
+    people = ["subject,group,drag"]
+    for number in range(1, subjects + 1):
+        group = "a" if number <= subjects / 2 else "b"
+        people.append(f"{number:02d},{group},0.3")
+        price = (4.0 if group == "a" else 8.0) * float(np.exp(0.1 * rng.standard_normal()))
+        for visit in range(1, visits + 1):
+            trial = subject_trial(int(rng.integers(2**31)), price)
+            rows = np.column_stack([np.arange(_SAMPLES) * _DT, trial.outputs, trial.disturbance])
+            path = folder / f"sub-{number:02d}" / f"cart_{visit}.csv"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            np.savetxt(path, rows, delimiter=",", header="time,position,push", comments="")
+    (folder / "people.csv").write_text("\n".join(people) + "\n")
+    text = f"""\
+[study]
+plant = "tests.studies.cohort.carts:cart_plant"
+recordings = "sub-{{subject}}/cart_{{visit}}.csv"
+participants = "people.csv"
+[recording]
+time = "time"
+[signals.position]
+column = "position"
+unit = "m"
+[signals.push]
+column = "push"
+unit = "N"
+[fit]
+horizon = 10
+u_max = 1.0
+held_out = false
+replicates = {replicates}
+"""
+    (folder / "study.toml").write_text(text)
+    return folder / "study.toml"

@@ -1,0 +1,82 @@
+"""A study without recordings and its results, made up: what the folder and the pages need."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from impc.files.configuration import Configuration, RecordingTable
+from impc.studies.cohort.finding import KEYS
+from impc.studies.cohort.study import Study, Unit
+from impc.studies.cohort.unit_task import FitTask
+from impc.studies.cohort.workers import Done
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Hashable, Iterator
+
+__all__ = ["Here", "fit_of", "made_up_study", "replicate_of", "tasks_of"]
+
+
+def made_up_study(subjects: int, replicates: int = 0, **labels: str) -> Study:
+    """Subjects 1, 2, ... of one visit in two groups."""
+    assert set(labels) <= set(KEYS)
+    configuration = Configuration(RecordingTable(), {}, fit={"replicates": replicates})
+    units = tuple(
+        Unit(str(number + 1), "1", "", (), "ab"[number % 2]) for number in range(subjects)
+    )
+    return Study("plants:cursor_plant", configuration, units)
+
+
+def tasks_of(study: Study) -> dict[str, FitTask]:
+    """A task for each unit, its digest the unit's name turned round."""
+    return {
+        unit.name: FitTask((), study.plant, {}, study.configuration, unit.name[::-1])
+        for unit in study.units
+    }
+
+
+def fit_of(seed: int) -> dict[str, Any]:
+    """What `impc.studies.cohort.unit_task.fit_unit` returns."""
+    rng = np.random.default_rng(seed)
+    gain = [rng.standard_normal(2).tolist()]
+    weights = {"Q": [[1.0, 0.0], [0.0, 2.0]], "dominant": [0.6, 0.8], "angle": 1.0}
+    return {
+        "states": ["position", "position_rate"], "controls": ["force"], "outputs": ["position"],
+        "trials": 2, "samples": 100, "K": gain, "K_deviation": [[0.1, None]],
+        "K_told": [[True, False]], "K_of_weights": gain, "S": [[1.0]],
+        "Q": weights["Q"], "R": [[1.0]], "misfit": 0.1, "exact": True, "converged": True,
+        "vaf": {"position": 98.0 + rng.random()}, "held_out_vaf": {"position": None},
+        "saturated": 0.1, "state_sizes": [1.0, 1.0],
+        "readings": {"least condition": weights, "analytic centre (no units)": weights},
+        "parameters": {"mass": 2.0 + rng.random()}, "starts": [[0.0, 0.0]], "logarithms": [0.0],
+        "findings": [[]],
+        "trajectory": {"dt": 0.1, "recorded": [[0.0], [1.0]], "simulated": [[0.0], [0.9]]},
+        "seconds": 0.1, "memory_mb": 100.0,
+    }  # fmt: skip
+
+
+def replicate_of(seed: int) -> dict[str, Any]:
+    """What `impc.studies.cohort.unit_task.replicate_unit` returns."""
+    rng = np.random.default_rng([seed, 1])
+    return {
+        "K": [rng.standard_normal(2).tolist()], "parameters": [2.0 + rng.random()],
+        "seconds": 0.1, "memory_mb": 100.0,
+    }  # fmt: skip
+
+
+class Here:
+    """Workers that are this process."""
+
+    threads = 1
+
+    def __init__(self) -> None:
+        self.waiting: list[tuple[Any, Callable[..., Any], tuple[Any, ...]]] = []
+
+    def submit(self, key: Hashable, work: Callable[..., Any], *given: Any) -> None:
+        self.waiting.append((key, work, given))
+
+    def results(self) -> Iterator[Done]:
+        while self.waiting:
+            key, work, given = self.waiting.pop(0)
+            yield Done(key, work(*given))

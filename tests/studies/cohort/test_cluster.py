@@ -1,0 +1,168 @@
+"""A scheduler with certificates: who has them works on it, who has not is told so in one line."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import distributed
+import pytest
+from distributed.security import Security
+
+from impc.errors import InputError, OutputError
+from impc.studies.cohort import cluster
+from impc.studies.cohort.cluster import Cluster, connected
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+# A client whose scheduler is gone leaves its socket to the garbage collector, at any later time.
+pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+
+
+def certificates(folder: Path) -> tuple[Path, Path, Path]:
+    """An authority, a certificate that it signed, and its key, as docs/cohorts.md makes them."""
+    page = (Path(__file__).parents[3] / "docs" / "cohorts.md").read_text()
+    lines = [line for line in page.splitlines() if line.startswith("openssl ")]
+    for line in lines:
+        subprocess.run(line.split(" #")[0], shell=True, cwd=folder, check=True, capture_output=True)
+    return folder / "ca.pem", folder / "cert.pem", folder / "key.pem"
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]:
+    if shutil.which("openssl") is None:
+        pytest.skip("openssl makes the certificates")
+    return certificates(tmp_path_factory.mktemp("one"))
+
+
+@pytest.fixture
+def scheduler(files: tuple[Path, Path, Path]) -> Iterator[Any]:
+    """One with a worker, in this process."""
+    ca, cert, key = map(str, files)
+    security = Security(
+        tls_ca_file=ca, tls_scheduler_cert=cert, tls_scheduler_key=key, tls_worker_cert=cert,
+        tls_worker_key=key, tls_client_cert=cert, tls_client_key=key, require_encryption=True,
+    )  # fmt: skip
+    make: Any = distributed.LocalCluster
+    level = logging.getLogger("distributed").level
+    with make(
+        n_workers=1, threads_per_worker=1, processes=False, protocol="tls://", host="127.0.0.1",
+        security=security, dashboard_address=None, silence_logs=60,
+    ) as found:  # fmt: skip
+        yield found
+    logging.getLogger("distributed").setLevel(level)
+
+
+def test_a_scheduler_with_certificates(scheduler: Any, files: tuple[Path, Path, Path]) -> None:
+    address = scheduler.scheduler_address
+    assert address.startswith("tls://")
+    with connected(Cluster(address, None, *files)) as workers:
+        assert workers.threads == 1
+        workers.submit("one", abs, -2)
+        workers.submit("two", int, "x\ny")
+        found = {done.key: done for done in workers.results()}
+    assert found["one"].value == 2
+    assert found["two"].fault.startswith("ValueError: ")
+    assert "\n" not in found["two"].fault
+
+
+@pytest.mark.parametrize("missing", [0, 1, 2])
+def test_certificates_that_are_missing(
+    missing: int, files: tuple[Path, Path, Path], tmp_path: Path
+) -> None:
+    given: list[Path | None] = list(files)
+    for other, says in ((None, "needs --tls-"), (tmp_path / "none.pem", "is no file")):
+        given[missing] = other
+        with (
+            pytest.raises(InputError, match=says),
+            connected(Cluster("tls://127.0.0.1:9", None, *given)),
+        ):
+            pytest.fail("entered")
+    with (
+        pytest.raises(InputError, match="takes no certificates"),
+        connected(Cluster("tcp://127.0.0.1:9", None, *files)),
+    ):
+        pytest.fail("entered")
+    with (
+        pytest.raises(InputError, match="without --scheduler"),
+        connected(Cluster(None, None, *files)),
+    ):
+        pytest.fail("entered")
+
+
+def test_certificates_of_somebody_else(
+    scheduler: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cluster, "_PATIENCE", "1s")
+    others = certificates(tmp_path)
+    broken = tmp_path / "broken.pem"
+    broken.write_text("no certificate")
+    for given in (others, (broken, *others[1:])):
+        with (
+            pytest.raises(InputError, match="does not answer") as caught,
+            connected(Cluster(scheduler.scheduler_address, None, *given)),
+        ):
+            pytest.fail("entered")
+        assert "\n" not in str(caught.value)
+
+
+def test_a_scheduler_that_is_lost(
+    scheduler: Any, files: tuple[Path, Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cluster, "_PATIENCE", "1s")
+    with connected(Cluster(scheduler.scheduler_address, None, *files)) as workers:
+        workers.submit("long", time.sleep, 0.5)
+        scheduler.close()
+        with pytest.raises(OutputError, match="was lost") as caught:
+            list(workers.results())
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.slow
+def test_a_scheduler_that_is_killed_leaves_no_log(tmp_path: Path) -> None:
+    """In processes of their own, ended by SIGKILL: one line, where Dask itself logs 112."""
+    place = tmp_path / "scheduler.json"
+    quiet: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    common = ["--no-dashboard", "--scheduler-file", str(place)]
+    server = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1"]
+    worker = [sys.executable, "-m", "distributed.cli.dask_worker", "--nthreads", "1"]
+    started = [
+        subprocess.Popen([*server, "--port", "0", *common], **quiet),
+        subprocess.Popen([*worker, *common, "--local-directory", str(tmp_path)], **quiet),
+    ]
+    code = (
+        "import json, sys, time\n"
+        "from impc.studies.cohort.cluster import Cluster, connected\n"
+        "from impc.errors import ImpcError\n"
+        "try:\n"
+        "    with connected(Cluster(json.load(open(sys.argv[1]))['address'])) as workers:\n"
+        "        for number in range(100):\n"
+        "            workers.submit(number, time.sleep, 0.5)\n"
+        "        for done in workers.results():\n"
+        "            print(done.key, flush=True)\n"
+        "except ImpcError as error:\n"
+        "    print(error, file=sys.stderr)\n"
+    )
+    try:
+        while not place.exists():
+            time.sleep(0.05)
+        client = subprocess.Popen(
+            [sys.executable, "-c", code, str(place)], stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        assert client.stdout is not None
+        client.stdout.readline()
+        started[0].kill()
+        _, said = client.communicate(timeout=120)
+    finally:
+        for process in started:
+            process.kill()
+            process.wait()
+    assert len(said.splitlines()) == 1
+    assert "was lost while tasks were out" in said

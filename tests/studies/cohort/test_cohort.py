@@ -1,0 +1,225 @@
+"""`impc cohort`: the same table whatever runs it and whatever dies, and what fails is said."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pandas as pd
+import psutil
+import pytest
+
+from impc.studies.cohort.store import open_store
+from tests.studies.cohort.carts import write_study
+
+ROOT = Path(__file__).parents[3]
+SEED = 8
+REPLICATES = 20
+TABLES = ("units.csv", "replicates.csv", "intervals.csv")
+
+
+def command(study: Path, out: Path, *more: str) -> list[str]:
+    return [
+        sys.executable, "-m", "impc", "cohort", str(study), "--out", str(out),
+        "--plant", "tests.studies.cohort.carts:cart_plant", *more,
+    ]  # fmt: skip
+
+
+def run(study: Path, out: Path, *more: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        command(study, out, *more), cwd=ROOT, capture_output=True, text=True, check=False
+    )
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_study(tmp_path_factory.mktemp("study"), 2, visits=2, replicates=REPLICATES)
+
+
+@pytest.fixture(scope="module")
+def undisturbed(study: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("undisturbed")
+    done = run(study, out, "--workers", "2")
+    assert done.returncode == 0, done.stderr
+    return out
+
+
+def same_tables(one: Path, other: Path) -> None:
+    for name in TABLES:
+        assert (one / name).read_bytes() == (other / name).read_bytes(), name
+
+
+def test_the_tables_are_whole(undisturbed: Path) -> None:
+    units = pd.read_csv(undisturbed / "units.csv", dtype={"subject": str})
+    assert len(units) == 4
+    assert set(units["group"]) == {"a", "b"}
+    replicates = pd.read_csv(undisturbed / "replicates.csv")
+    assert len(replicates) == 4 * REPLICATES
+    assert not replicates.duplicated(["unit", "replicate"]).any()
+    intervals = pd.read_csv(undisturbed / "intervals.csv")
+    inside = (intervals["low"] < intervals["value"]) & (intervals["value"] < intervals["high"])
+    assert inside.mean() > 0.9
+    assert (undisturbed / "subjects" / "sub-01.html").exists()
+    found = json.loads((undisturbed / "result.json").read_text())
+    assert found["fitted"] == 4
+
+
+def workers_of(process: psutil.Process) -> list[psutil.Process]:
+    """Processes that compute: those with no child of their own."""
+    children = process.children(recursive=True)
+    names = [" ".join(item.cmdline()) for item in children if item.is_running()]
+    return [
+        item
+        for item, name in zip(children, names, strict=False)
+        if "spawn_main" in name and not item.children()
+    ]
+
+
+def test_workers_and_client_may_die(study: Path, undisturbed: Path, tmp_path: Path) -> None:
+    """Five workers killed at random and the client once; seed 8.
+
+    A machine so fast that a run ends before all of its workers were killed has killed fewer.
+    """
+    rng = random.Random(SEED)
+    out = tmp_path / "out"
+    killed = 0
+    for kills, kill_client in ((3, True), (2, False)):
+        before = len(list(out.rglob("replicate-*.json")))
+        client = subprocess.Popen(
+            command(study, out, "--workers", "2"), cwd=ROOT, stderr=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+        )  # fmt: skip
+        process = psutil.Process(client.pid)
+        for _ in range(kills):
+            workers: list[psutil.Process] = []
+            while client.poll() is None and not workers:
+                time.sleep(0.005)
+                if len(list(out.rglob("replicate-*.json"))) > before + 4:
+                    workers = workers_of(process)
+            if not workers:
+                break
+            os.kill(rng.choice(workers).pid, signal.SIGKILL)
+            killed += 1
+            before = len(list(out.rglob("replicate-*.json")))
+        if kill_client and client.poll() is None:
+            family = [process, *process.children(recursive=True)]
+            os.kill(client.pid, signal.SIGKILL)
+            client.wait()
+            for item in family[1:]:
+                if item.is_running():
+                    item.kill()
+            assert not (out / "units.csv").exists()
+        else:
+            assert client.wait() == 0
+    assert 1 <= killed <= 5
+    same_tables(out, undisturbed)
+    log = (out / "cohort.log").read_text()
+    finished = [
+        line.split(" in ")[0].split(" ", 1)[1] for line in log.splitlines() if ": replicate" in line
+    ]
+    assert len(finished) == len(set(finished)), "a replicate was written twice"
+
+
+def test_going_on_repeats_nothing(study: Path, undisturbed: Path) -> None:
+    stamps = {path: path.stat().st_mtime_ns for path in undisturbed.rglob("units/**/*.json")}
+    done = run(study, undisturbed, "--workers", "1")
+    assert done.returncode == 0, done.stderr
+    assert {path: path.stat().st_mtime_ns for path in stamps} == stamps
+
+
+def test_a_scheduler_of_ones_own(study: Path, undisturbed: Path, tmp_path: Path) -> None:
+    """Scheduler and two workers started apart: the same bytes."""
+    place = tmp_path / "scheduler.json"
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    start = [sys.executable, "-m", "distributed.cli.dask_scheduler"]
+    arguments = ["--host", "127.0.0.1", "--port", "0", "--no-dashboard"]
+    started = [
+        subprocess.Popen(
+            [*start, *arguments, "--scheduler-file", str(place)], env=environment, **quiet
+        )  # type: ignore[call-overload]
+    ]
+    worker = [sys.executable, "-m", "distributed.cli.dask_worker", "--nthreads", "1"]
+    for _ in range(2):
+        started.append(
+            subprocess.Popen(
+                [*worker, "--no-dashboard", "--scheduler-file", str(place), "--local-directory",
+                 str(tmp_path)],
+                env=environment, cwd=ROOT, **quiet,
+            )  # type: ignore[call-overload]
+        )  # fmt: skip
+    try:
+        while not place.exists():
+            time.sleep(0.05)
+        address = json.loads(place.read_text())["address"]
+        done = run(study, tmp_path / "out", "--scheduler", address)
+        assert done.returncode == 0, done.stderr
+    finally:
+        for process in reversed(started):
+            process.terminate()
+        for process in started:
+            process.wait()
+    same_tables(tmp_path / "out", undisturbed)
+
+
+def test_no_scheduler_is_one_line(study: Path, tmp_path: Path) -> None:
+    done = run(study, tmp_path / "out", "--scheduler", "tcp://127.0.0.1:9")
+    assert done.returncode == 2
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert "does not answer" in done.stderr
+
+
+def test_two_runs_into_one_folder_are_refused(study: Path, tmp_path: Path) -> None:
+    with open_store(tmp_path, {}):
+        done = run(study, tmp_path, "--workers", "1")
+    assert done.returncode == 2
+    assert "another run is writing to it" in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("subjects", "damaged"),
+    [(5, (1, 3, 4)), pytest.param(30, (4, 11, 29), marks=pytest.mark.slow)],
+)
+def test_damaged_recordings_stop_nobody_else(
+    tmp_path: Path, subjects: int, damaged: tuple[int, ...]
+) -> None:
+    """Three of them: results of the others, three reasons, status 1; mended, the rest follows."""
+    study = write_study(tmp_path, subjects)
+    names = [tmp_path / f"sub-{number:02d}" / "cart_1.csv" for number in damaged]
+    whole = {path: path.read_bytes() for path in names}
+    names[0].write_bytes(b"")
+    names[1].write_bytes(whole[names[1]][:2000] + b"abc,def,ghi\n")
+    names[2].write_bytes(whole[names[2]].replace(b"position", b"elsewhere"))
+    out = tmp_path / "out"
+    done = run(study, out, "--workers", "1")
+    assert done.returncode == 1, done.stderr
+    found = json.loads((out / "result.json").read_text())
+    assert found["fitted"] == subjects - 3
+    assert set(found["failed"]) == {f"sub-{number:02d}_ses-1" for number in damaged}
+    assert len(pd.read_csv(out / "units.csv")) == subjects - 3
+    reasons = [line for line in done.stderr.splitlines() if line.startswith("sub-")]
+    assert len(reasons) == 3
+    assert f"{subjects - 3} of {subjects} units fitted" in done.stdout
+    for path, content in whole.items():
+        path.write_bytes(content)
+    again = run(study, out, "--workers", "1")
+    assert again.returncode == 0, again.stderr
+    assert len(pd.read_csv(out / "units.csv")) == subjects
+
+
+def test_other_settings_are_refused(study: Path, undisturbed: Path) -> None:
+    text = study.read_text()
+    try:
+        study.write_text(text.replace("horizon = 10", "horizon = 5"))
+        done = run(study, undisturbed, "--workers", "1")
+    finally:
+        study.write_text(text)
+    assert done.returncode == 2
+    assert "other recordings or with other settings" in done.stderr

@@ -1,0 +1,106 @@
+"""Groups and visits compared: against scipy's own tests, and p-values without a difference."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+import scipy.stats
+
+from experiments.coverage import cart
+from impc.errors import DataError
+from impc.inverse.noisy_fit import fit_controller
+from impc.studies.cohort.comparison import compare_cohort
+from impc.studies.fit.settings import FitSettings
+from impc.studies.fit.subject import fit_problem
+from tests.studies.cohort.carts import subject_trial
+
+SEED = 15
+SETTINGS = FitSettings(horizon=10, u_max=1.0)
+
+
+def table(subjects: int, visits: int, shift: float = 0.0, seed: int = SEED) -> pd.DataFrame:
+    """Scores with subject and visit effects; the second group is shifted."""
+    rng = np.random.default_rng(seed)
+    rows = []
+    for number in range(subjects):
+        group = "a" if number < subjects // 2 else "b"
+        own = rng.standard_normal()
+        for visit in range(visits):
+            score = own + shift * (group == "b") + 0.5 * rng.standard_normal()
+            rows.append((str(number), str(visit + 1), "", group, score, rng.standard_normal()))
+    return pd.DataFrame(rows, columns=["subject", "visit", "condition", "group", "K.u.x", "vaf.y"])
+
+
+def test_groups_are_welch_on_subject_means() -> None:
+    units = table(20, 2, 1.0)
+    found = {item.measure: item for item in compare_cohort(units) if item.question == "group"}[
+        "K.u.x"
+    ]
+    means = units.groupby(["group", "subject"])["K.u.x"].mean()
+    a, b = means["a"].to_numpy(), means["b"].to_numpy()
+    expected = scipy.stats.ttest_ind(b, a, equal_var=False)
+    assert found.p == pytest.approx(expected.pvalue)
+    assert found.estimate == pytest.approx(b.mean() - a.mean())
+    assert found.low < found.estimate < found.high
+    pooled = np.sqrt((a.var(ddof=1) + b.var(ddof=1)) / 2)
+    assert found.effect == pytest.approx((b.mean() - a.mean()) / pooled * (1 - 3 / (4 * 18 - 1)))
+
+
+def test_visits_are_paired() -> None:
+    units = table(12, 2)
+    found = {item.measure: item for item in compare_cohort(units) if item.question == "visit"}
+    wide = units.pivot_table(index="subject", columns="visit", values="K.u.x")
+    expected = scipy.stats.ttest_rel(wide["2"], wide["1"])
+    assert found["K.u.x"].p == pytest.approx(expected.pvalue)
+    ps = sorted(item.p for item in found.values())
+    assert sorted(item.p_holm for item in found.values())[0] == pytest.approx(min(2 * ps[0], 1))
+
+
+def test_a_different_change_is_found_and_reliability_too() -> None:
+    units = table(40, 2)
+    changed = (units["group"] == "b") & (units["visit"] == "2")
+    units.loc[changed, "K.u.x"] += 2.0
+    found = {(item.question, item.measure): item for item in compare_cohort(units)}
+    assert found["change", "K.u.x"].p < 1e-6
+    assert found["change", "vaf.y"].p > 1e-3
+    assert found["reliability", "vaf.y"].low < 0 < found["reliability", "vaf.y"].high
+
+
+def test_few_subjects_are_said() -> None:
+    found = compare_cohort(table(4, 1))
+    assert {item.note for item in found} == {"too few subjects (4)"}
+    with pytest.raises(DataError, match="no unit"):
+        compare_cohort(table(0, 1))
+
+
+def cohort_p(seed: int, difference: float, subjects: int = 10) -> float:
+    """p of the gain's first entry between two groups of carts, fitted."""
+    rng = np.random.default_rng([SEED, seed])
+    rows = []
+    for number in range(subjects):
+        group = "a" if number < subjects // 2 else "b"
+        price = 4.0 * (difference if group == "b" else 1.0) * np.exp(0.2 * rng.standard_normal())
+        trial = subject_trial(int(rng.integers(2**31)), float(price))
+        fitted = fit_controller(fit_problem(cart(), [trial], SETTINGS))
+        rows.append((str(number), "1", "", group, fitted.solution.K[0, 0]))
+    units = pd.DataFrame(rows, columns=["subject", "visit", "condition", "group", "K.force.x"])
+    (found,) = compare_cohort(units)
+    return found.p
+
+
+def test_a_planted_difference_is_found() -> None:
+    assert cohort_p(0, 3.0) < 0.01
+
+
+def test_without_a_difference_p_values_are_uniform() -> None:
+    """Two measures in 40 tables of two groups of five; seeds 0 to 39."""
+    ps = [item.p for seed in range(40) for item in compare_cohort(table(10, 1, seed=seed))]
+    assert scipy.stats.kstest(ps, "uniform").pvalue > 0.01
+
+
+@pytest.mark.slow
+def test_without_a_difference_p_values_of_fits_are_uniform() -> None:
+    """200 cohorts of two groups of five, each subject fitted; seeds 0 to 199."""
+    ps = [cohort_p(seed, 1.0) for seed in range(200)]
+    assert scipy.stats.kstest(ps, "uniform").pvalue > 0.01

@@ -1,0 +1,181 @@
+"""What a cohort keeps: right or refused, whatever happened to the folder."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+
+from impc.errors import ImpcError, InputError, OutputError
+from impc.studies.cohort import engine
+from impc.studies.cohort.engine import Failures, run_study, work_left
+from impc.studies.cohort.report import write_report
+from impc.studies.cohort.store import Store, open_store
+from impc.studies.cohort.tables import cohort_tables, table_bytes
+from tests.studies.cohort.made_up import Here, fit_of, made_up_study, replicate_of, tasks_of
+
+REPLICATES = 3
+STUDY = made_up_study(2, REPLICATES)
+TASKS = tasks_of(STUDY)
+DIGESTS = {name: task.digest for name, task in TASKS.items()}
+NAMES = [unit.name for unit in STUDY.units]
+
+
+def filled(folder: Path) -> Store:
+    store = Store(folder, DIGESTS)
+    for seed, name in enumerate(NAMES):
+        store.keep_fit(name, fit_of(seed))
+        for index in range(REPLICATES):
+            store.keep_replicate(name, index, replicate_of(10 * seed + index))
+    return store
+
+
+def tables(store: Store) -> dict[str, bytes]:
+    return {name: table_bytes(table) for name, table in cohort_tables(STUDY, store).items()}
+
+
+def test_tables_hold_what_was_kept(tmp_path: Path) -> None:
+    found = cohort_tables(STUDY, filled(tmp_path))
+    assert len(found["units"]) == 2
+    assert len(found["replicates"]) == 2 * REPLICATES
+    assert found["units"]["K.force.position"].tolist() == [
+        fit_of(seed)["K"][0][0] for seed in (0, 1)
+    ]
+    assert work_left(STUDY, Store(tmp_path, DIGESTS)) == (8, 8)
+
+
+def test_a_flipped_byte_anywhere_is_refused_or_means_the_same(tmp_path: Path) -> None:
+    """Every file, forty places each: what is read is what was written, or an error of one line."""
+    store = filled(tmp_path)
+    right = tables(store)
+    refused = 0
+    for path in sorted((tmp_path / "units").rglob("*.json")):
+        whole = path.read_bytes()
+        for place in range(0, len(whole), max(len(whole) // 40, 1)):
+            changed = bytearray(whole)
+            changed[place] ^= 1 << (place % 8)
+            path.write_bytes(changed)
+            said = ""
+            try:
+                assert tables(store) == right, (path, place)
+            except ImpcError as error:
+                said, refused = str(error), refused + 1
+            assert "\n" not in said
+        path.write_bytes(whole)
+    assert refused > 250
+    assert tables(store) == right
+
+
+@pytest.mark.parametrize("text", ["", "{}", "[]", "null", "3", '"x"', "[" * 100_000, "\udcff{}"])
+def test_what_is_no_result_is_refused(tmp_path: Path, text: str) -> None:
+    store = filled(tmp_path)
+    for name in ("fit", "replicate-0001"):
+        path = tmp_path / "units" / NAMES[0] / f"{name}.json"
+        whole = path.read_bytes()
+        path.write_bytes(text.encode("utf-8", "surrogateescape"))
+        with pytest.raises(InputError, match="is damaged") as caught:
+            tables(store)
+        assert "\n" not in str(caught.value)
+        path.write_bytes(whole)
+
+
+def test_results_of_another_subject_number_or_run_are_refused(tmp_path: Path) -> None:
+    store = filled(tmp_path)
+    one, other = (tmp_path / "units" / name for name in NAMES)
+    for source, target in (
+        (other / "replicate-0001.json", one / "replicate-0001.json"),
+        (one / "replicate-0000.json", one / "replicate-0001.json"),
+        (other / "fit.json", one / "fit.json"),
+    ):
+        whole = target.read_bytes()
+        shutil.copy(source, target)
+        with pytest.raises(InputError, match="other recordings or with other settings"):
+            tables(store)
+        target.write_bytes(whole)
+    later = Store(tmp_path, {**DIGESTS, NAMES[1]: "of another horizon"})
+    with pytest.raises(InputError, match="other recordings or with other settings"):
+        run_study(STUDY, TASKS, later, Here())
+
+
+def test_an_edited_number_is_refused(tmp_path: Path) -> None:
+    store = filled(tmp_path)
+    path = tmp_path / "units" / NAMES[0] / "replicate-0000.json"
+    found = json.loads(path.read_text())
+    found["content"]["K"][0][0] += 1e-9
+    path.write_text(json.dumps(found))
+    with pytest.raises(InputError, match="is damaged"):
+        tables(store)
+
+
+def test_a_unit_whose_recording_is_gone_has_no_result(tmp_path: Path) -> None:
+    filled(tmp_path)
+    assert Store(tmp_path, {NAMES[1]: DIGESTS[NAMES[1]]}).fit(NAMES[0]) is None
+
+
+def refusing(*_: Any) -> dict[str, Any]:
+    return {"reason": "no regulator can be simulated"}
+
+
+def run_and_report(folder: Path, monkeypatch: pytest.MonkeyPatch, fit: Any, draw: Any) -> Failures:
+    monkeypatch.setattr(engine, "fit_unit", fit)
+    monkeypatch.setattr(engine, "replicate_unit", draw)
+    with open_store(folder, DIGESTS) as store:
+        failures = run_study(STUDY, TASKS, store, Here())
+        write_report(STUDY, store, failures, "impc cohort study.toml")
+    return failures
+
+
+@pytest.mark.usefixtures("blank_figures")
+def test_failed_replicates_are_said_and_no_unit_is_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def draw(task: object, fit: object, index: int) -> dict[str, Any]:
+        return refusing() if index == 1 else replicate_of(index)
+
+    failures = run_and_report(tmp_path, monkeypatch, lambda _: fit_of(0), draw)
+    assert failures.units == {}
+    assert [line.partition(": no")[0] for line in failures.lines] == [
+        f"{name}: replicate 2" for name in NAMES
+    ]
+    found = json.loads((tmp_path / "result.json").read_text())
+    assert (found["units"], found["fitted"], found["failed"]) == (2, 2, {})
+    assert found["failed_replicates"] == {
+        name: {"2": "no regulator can be simulated"} for name in NAMES
+    }
+    assert found["digests"] == DIGESTS
+    assert "2 failed" in (tmp_path / "report.html").read_text()
+    assert (tmp_path / "units" / NAMES[0] / "replicate-0001-failed.json").exists()
+    # Done later: the reason goes.
+    again = run_and_report(tmp_path, monkeypatch, refusing, lambda *_: replicate_of(7))
+    assert not again
+    assert not list(tmp_path.rglob("*failed*"))
+    assert len(pd.read_csv(tmp_path / "replicates.csv")) == 6
+
+
+@pytest.mark.usefixtures("blank_figures")
+def test_no_unit_fitted_is_a_report_of_reasons(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    failures = run_and_report(tmp_path, monkeypatch, refusing, refusing)
+    assert failures.lines == [f"{name}: no regulator can be simulated" for name in NAMES]
+    assert "0 of 2 units" in (tmp_path / "report.html").read_text()
+    assert json.loads((tmp_path / "result.json").read_text())["fitted"] == 0
+
+
+def test_no_room_for_the_log_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "cohort.log").mkdir()
+    with pytest.raises(OutputError, match=r"cohort\.log: cannot be written") as caught:
+        Store(tmp_path, DIGESTS).log("run")
+    assert "\n" not in str(caught.value)
+
+
+def test_formulas_are_no_cells() -> None:
+    table = pd.DataFrame(
+        {"unit": ["=HYPERLINK(1)", "@SUM(1)", "-2", "sub-1"], "=K": [-1.5, 2, 3, 4]}
+    )
+    text = table_bytes(table).decode()
+    assert text == "unit,'=K\n'=HYPERLINK(1),-1.5\n'@SUM(1),2.0\n-2,3.0\nsub-1,4.0\n"

@@ -1,0 +1,222 @@
+"""Reading a study: patterns, tables, BIDS-like names, participants, and what is wrong with them."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from impc.errors import InputError
+from impc.files.plant_sources import PlantSource, plant_source
+from impc.studies.cohort.study import read_study
+from impc.studies.cohort.tasks import study_tasks, unused_columns
+
+SIGNALS = """
+[signals.position]
+column = "position"
+unit = "m"
+"""
+
+
+def study(folder: Path, text: str) -> Path:
+    path = folder / "study.toml"
+    path.write_text(f"[study]\nplant = 'cursor'\n{text}\n{SIGNALS}")
+    return path
+
+
+def touch(folder: Path, *names: str) -> None:
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text("x")
+
+
+def test_a_pattern_groups_trials_into_units(tmp_path: Path) -> None:
+    touch(tmp_path, "d/s1/v1_EO_2.csv", "d/s1/v1_EO_10.csv", "d/s2/v1_EC_1.csv", "d/other.csv")
+    found = read_study(
+        study(tmp_path, 'recordings = "d/s{subject}/v{visit}_{condition}_{trial}.csv"')
+    )
+    assert [unit.name for unit in found.units] == ["sub-1_ses-1_task-EO", "sub-2_ses-1_task-EC"]
+    # 2 before 10.
+    assert [file.name for file in found.units[0].files] == ["v1_EO_2.csv", "v1_EO_10.csv"]
+
+
+def test_a_name_may_come_twice_and_must_agree(tmp_path: Path) -> None:
+    touch(tmp_path, "sub-1/sub-1_a.csv", "sub-1/sub-2_a.csv")
+    found = read_study(study(tmp_path, 'recordings = "sub-{subject}/sub-{subject}_a.csv"'))
+    assert [unit.name for unit in found.units] == ["sub-1"]
+
+
+def test_bids_names(tmp_path: Path) -> None:
+    touch(
+        tmp_path,
+        "sub-01/ses-1/sub-01_ses-1_task-EO_run-1_motion.csv",
+        "sub-01/ses-1/sub-01_ses-1_task-EO_run-2_motion.csv",
+        "sub-01/ses-1/sub-01_ses-1_task-EO_run-2_motion.json",
+        "sub-01/ses-2/sub-01_ses-2_task-EO_run-1_motion.csv",
+        "sub-01/ses-2/.impc-k3/new/sub-01_ses-2_task-EO_run-2_motion.csv",
+    )
+    found = read_study(study(tmp_path, 'bids = "."'))
+    assert [(unit.name, len(unit.files)) for unit in found.units] == [
+        ("sub-01_ses-1_task-EO", 2),
+        ("sub-01_ses-2_task-EO", 1),
+    ]
+
+
+def test_a_table_and_participants(tmp_path: Path) -> None:
+    touch(tmp_path, "x.csv", "y.csv")
+    (tmp_path / "t.tsv").write_text("file\tsubject\ttrial\nx.csv\tA\t1\ny.csv\tA\t2\n")
+    (tmp_path / "p.tsv").write_text("participant_id\tgroup\tmass\tsex\nsub-A\told\t70\tmale\n")
+    found = read_study(study(tmp_path, 'table = "t.tsv"\nparticipants = "p.tsv"'))
+    (unit,) = found.units
+    assert unit.group == "old"
+    assert unit.person == {"mass": 70.0, "sex": "male"}
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ("", "exactly one"),
+        ('recordings = "{subject}.csv"\nbids = "."', "exactly one"),
+        ('recordings = "{person}.csv"', "names person"),
+        ('recordings = "{trial}.csv"', "names no subject"),
+        ('recordings = "none-{subject}.csv"', "matches no file"),
+        ('recordings = "{subject}.csv"\nparticipants = "missing.csv"', "cannot be read"),
+        ('recordings = "{subject}.csv"\nparticipants = "p.csv"', "is not in p.csv"),
+        ('recordings = "{subject}.csv"\nparticipants = "q.csv"', "lacks a subject"),
+        ('table = "q.csv"', "lacks a column"),
+        ('recordings = "{subject}.csv"\nspeed = 1', "unknown field"),
+    ],
+)
+def test_faults_are_one_sentence(tmp_path: Path, text: str, match: str) -> None:
+    touch(tmp_path, "1.csv")
+    (tmp_path / "p.csv").write_text("subject,group\nother,a\n")
+    (tmp_path / "q.csv").write_text("name,group\nother,a\n")
+    with pytest.raises(InputError, match=match) as caught:
+        read_study(study(tmp_path, text))
+    assert "\n" not in str(caught.value)
+
+
+HOSTILE = [
+    ("table = 't.csv'", "file,subject\n1.csv,../../../../evil\n", "begins oddly|has '/' in it"),
+    ("table = 't.csv'", "file,subject\n1.csv,a/b\n", "has '/' in it"),
+    ("table = 't.csv'", "file,subject\n1.csv,a\\b\n", "in it"),
+    ("table = 't.csv'", "file,subject\n1.csv,=HYPERLINK(1)\n", "has '=' in it"),
+    ("table = 't.csv'", "file,subject\n1.csv,@SUM(A1)\n", "has '@' in it"),
+    ("table = 't.csv'", "file,subject\n1.csv,.hidden\n", "begins oddly"),
+    ("table = 't.csv'", "file,subject\n1.csv,<b>\n", "has '<' in it"),
+    ("table = 't.csv'", "file,subject\n1.csv,$x$\n", "in it"),
+    ("table = 't.csv'", "file,subject\n1.csv,\u202eb\n", "in it"),
+    ("table = 't.csv'", f"file,subject\n1.csv,{'a' * 300}\n", "has 300 characters"),
+    ("table = 't.csv'", "file,subject\n1.csv,a\0b\n", "has a NUL"),
+    ("table = 't.csv'", "file,subject\n", "has no rows"),
+    ("table = 't.csv'", "", "has no rows"),
+    ("table = 't.csv'", "\n\n\n", "has no rows"),
+    ("table = 't.csv'", "file,subject,subject\n1.csv,a,b\n", "has 2 columns 'subject'"),
+    ("table = 't.csv'", "file,subject,\n1.csv,a,b\n", "unnamed column"),
+    ("table = 't.csv'", "file,subject\n1.csv\n", "row 2 has 1 cells"),
+    ("table = 't.csv'", "file,subject\n1.csv,a,b\n", "row 2 has 3 cells"),
+    ("table = 't.csv'", "file,subject\n1.csv,\n", "without file or subject"),
+    ("table = 't.csv'", "file,subject\n1.csv,a\n1.csv,a\n", "twice"),
+    ("table = 't.csv'", 'file,subject\n"1.csv,a\n', "no rows|cells"),
+    ("table = '.'", "", "is no ordinary file"),
+    ("table = ''", "", "study.table: is empty"),
+    ("bids = ''", "", "study.bids: is empty"),
+    ("bids = ' '", "", "study.bids: is empty"),
+    ("recordings = ''", "", "study.recordings: is empty"),
+    ('recordings = "{subject}\\u0000.csv"', "", "study.recordings: is empty"),
+    ("recordings = '{subject}.csv'\nparticipants = ''", "", "study.participants: is empty"),
+    ("recordings = '/nowhere/{subject}.csv'", "", "matches no file"),
+    ("recordings = '{subject}/**x/{trial}.csv'", "", "cannot be"),
+    ("recordings = '**/{subject}.csv'", "", "cannot be"),
+    ("recordings = '{subject}.{csv'", "", "cannot be"),
+    ("recordings = '{}{subject}.csv'", "", "cannot be"),
+    ("recordings = '{subject!r}.csv'", "", "names no subject"),
+    ("recordings = '[{subject}.csv'", "", "matches no file"),
+    ("recordings = '{subject}*.csv'", "", "matches no file"),
+]
+
+
+@pytest.mark.parametrize(("text", "rows", "match"), HOSTILE)
+def test_hostile_studies_are_one_sentence(tmp_path: Path, text: str, rows: str, match: str) -> None:
+    touch(tmp_path, "1.csv")
+    (tmp_path / "t.csv").write_bytes(rows.encode())
+    with pytest.raises(InputError, match=match) as caught:
+        read_study(study(tmp_path, text))
+    assert str(caught.value).isprintable()
+
+
+PEOPLE = [
+    ("subject;mass\n1;70,5\n", {"mass": 70.5}),
+    ('subject,mass\n1,"70,5"\n', {"mass": 70.5}),
+    ("subject\tmass\n1\t70,5\n", {"mass": 70.5}),
+    ("subject;mass;note\n1;70,5;a, b\n", {"mass": 70.5, "note": "a, b"}),
+    ("subject,mass,sex\n1,1e2,n/a\n", {"mass": 100.0}),
+    ("subject,mass\n1,1_000\n", {"mass": "1_000"}),
+    ("subject;mass\n1;70.5\n2;70,5\n", "points or all with commas"),
+    ('subject,mass\n1,"1,234"\n', "may be thousands"),
+    ("subject;mass\n1;70,500\n", "may be thousands"),
+    ("subject,mass\n1,nan\n", "leave the cell empty"),
+    ("subject,mass\n1,-inf\n", "leave the cell empty"),
+    ("subject,mass\n1,1e999\n", "give a finite number"),
+    ("subject,mass\n1,70\n1,80\n", "two rows of subject 1"),
+    ("subject,mass,mass\n1,70,80\n", "has 2 columns 'mass'"),
+    ("subject,mass\n1,70,5\n", "row 2 has 3 cells"),
+    ("subject,group\n1,a/b\n", "has '/' in it"),
+    ("subject,mass\n", "has no rows"),
+]
+
+
+@pytest.mark.parametrize(("text", "expected"), PEOPLE)
+def test_participants(tmp_path: Path, text: str, expected: str | dict[str, float | str]) -> None:
+    touch(tmp_path, "s1.csv")
+    (tmp_path / "p.csv").write_text(text)
+    path = study(tmp_path, 'recordings = "s{subject}.csv"\nparticipants = "p.csv"')
+    if isinstance(expected, str):
+        with pytest.raises(InputError, match=expected):
+            read_study(path)
+    else:
+        assert read_study(path).units[0].person == expected
+
+
+@pytest.mark.parametrize("name", [b"s1\xff.csv", b"s1\n2.csv", b"s1\x1b[2J.csv"])
+def test_file_names_that_are_no_text(tmp_path: Path, name: bytes) -> None:
+    (tmp_path / os.fsdecode(name)).write_text("x")
+    with pytest.raises(InputError, match="in it") as caught:
+        read_study(study(tmp_path, 'recordings = "s{subject}.csv"'))
+    assert str(caught.value).isprintable()
+
+
+def test_accents_composed_and_not_are_one_name(tmp_path: Path) -> None:
+    (tmp_path / "t.csv").write_text("file,subject,trial\n1.csv,Ren\u00e9,1\n2.csv,Rene\u0301,2\n")
+    (unit,) = read_study(study(tmp_path, "table = 't.csv'")).units
+    assert (unit.subject, len(unit.files)) == ("Ren\u00e9", 2)
+    assert unit.name.isascii()
+
+
+def test_an_absolute_pattern_and_brackets_in_it(tmp_path: Path) -> None:
+    touch(tmp_path, "d[1]/s1.csv", "d1/s2.csv")
+    found = read_study(
+        study(tmp_path, f'recordings = "{tmp_path.as_posix()}/d[1]/s{{subject}}.csv"')
+    )
+    assert [unit.subject for unit in found.units] == ["1"]
+
+
+def test_columns_that_the_plant_does_not_take(tmp_path: Path) -> None:
+    """A column `age` is no argument of the plant: it is left out, and said."""
+    touch(tmp_path, "s1.csv")
+    (tmp_path / "p.csv").write_text("subject,age,drag\n1,44,0.5\n")
+    path = study(tmp_path, 'recordings = "s{subject}.csv"\nparticipants = "p.csv"')
+    found, source = read_study(path), plant_source("tests.studies.cohort.carts:cart_plant", {})
+    assert unused_columns(found, source) == ("age",)
+    tasks, failed = study_tasks(found, source)
+    assert tasks["sub-1"].arguments == {"drag": 0.5}
+    assert failed == {}
+    saved = PlantSource("p.json", lambda **_: None, {})
+    assert unused_columns(found, saved) == ("age", "drag")
+
+
+def test_names_that_fall_together_are_refused(tmp_path: Path) -> None:
+    touch(tmp_path, "a b.csv", "a-b.csv")
+    with pytest.raises(InputError, match="two units"):
+        read_study(study(tmp_path, 'recordings = "{subject}.csv"'))

@@ -1,0 +1,167 @@
+"""`impc compare`: methods on the cart against truth, and the command from files to files."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from experiments.coverage import cart, noisy_trial, true_controller
+from impc.arrays import Array
+from impc.cli.main import main
+from impc.inverse.methods import METHODS, Estimate, decode_estimate, encode_estimate
+from impc.studies.compare.subject import MethodComparison, compare_recordings, stages
+from impc.studies.fit.memory import open_memory
+from impc.studies.fit.settings import FitSettings
+from impc.studies.fit.subject import fit_problem
+from tests.support import easier_seat
+
+SETTINGS = FitSettings(horizon=10, u_max=1.0)
+
+
+@pytest.fixture(scope="module")
+def compared() -> dict[str, MethodComparison]:
+    problem = fit_problem(cart(), [noisy_trial(seed, 0.0) for seed in (21, 22)], SETTINGS)
+    heard: list[str] = []
+
+    def remember(stage: str, compute) -> Estimate:  # type: ignore[no-untyped-def]
+        heard.append(stage)
+        return compute()  # type: ignore[no-any-return]
+
+    found = compare_recordings(problem, 1.0, remember)
+    assert len(heard) == stages(2)
+    assert [item.name for item in found] == list(METHODS)
+    return {item.name: item for item in found}
+
+
+def gain_error(item: MethodComparison) -> float:
+    truth = true_controller().K
+    assert item.fit.K is not None
+    return float(np.linalg.norm(item.fit.K - truth) / np.linalg.norm(truth))
+
+
+def test_inverse_mpc_finds_the_gain_and_keeps_the_limit(
+    compared: dict[str, MethodComparison],
+) -> None:
+    for name in ("inverse_mpc_direct", "inverse_mpc_reduced"):
+        assert gain_error(compared[name]) < 0.05
+        assert compared[name].fit.keeps_bounds
+    feedback = compared["feedback_gain"]
+    assert gain_error(feedback) > 2 * gain_error(compared["inverse_mpc_direct"])
+    assert not feedback.fit.keeps_bounds
+
+
+def test_left_out_trials(compared: dict[str, MethodComparison]) -> None:
+    ours = compared["inverse_mpc_direct"]
+    assert ours.held_out.shape == (2, 1)
+    # Noise of 20 % leaves 1 / 1.04 to explain.
+    assert np.all(np.abs(ours.held_out - 100 / 1.04) < 1.5)
+    assert np.mean(compared["feedback_gain"].held_out) < np.mean(ours.held_out)
+
+
+def test_exceeding_is_counted_sample_by_sample(compared: dict[str, MethodComparison]) -> None:
+    fit = compared["feedback_gain"].fit
+    u: Array = np.concatenate([run.u for run in fit.runs])
+    assert fit.exceeded == pytest.approx(float(np.mean(np.abs(u) > 1 + 1e-6)))
+    assert fit.largest_input[0] == pytest.approx(float(np.max(np.abs(u))))
+
+
+def test_estimates_go_through_json(compared: dict[str, MethodComparison]) -> None:
+    problem = fit_problem(cart(), [noisy_trial(21, 0.0)], SETTINGS)
+    kept: dict[str, Estimate] = {}
+
+    def remember(stage: str, compute) -> Estimate:  # type: ignore[no-untyped-def]
+        kept[stage] = compute()
+        return kept[stage]
+
+    compare_recordings(problem, 1.0, remember)
+    for estimate in kept.values():
+        again = decode_estimate(json.loads(json.dumps(encode_estimate(estimate))))
+        assert again.reason == estimate.reason
+        if estimate.K is None:
+            assert again.K is None
+        else:
+            np.testing.assert_array_equal(again.K, estimate.K)
+
+
+def test_an_interrupted_comparison_goes_on(tmp_path: Path) -> None:
+    """Interrupted in the middle: what is done is not done again, and the end is the same."""
+    problem = fit_problem(cart(), [noisy_trial(seed, 0.0) for seed in (21, 22)], SETTINGS)
+    whole = compare_recordings(problem, 1.0)
+    count = 0
+
+    def broken(stage: str, compute) -> Estimate:  # type: ignore[no-untyped-def]
+        nonlocal count
+        count += 1
+        if count == 7:
+            raise KeyboardInterrupt
+        return open_memory(tmp_path, problem, SETTINGS, "compare").estimate(stage, compute)
+
+    with pytest.raises(KeyboardInterrupt):
+        compare_recordings(problem, 1.0, broken)
+    computed = []
+    memory = open_memory(tmp_path, problem, SETTINGS, "compare")
+    assert len(memory.stages) == 6
+
+    def going_on(stage: str, compute) -> Estimate:  # type: ignore[no-untyped-def]
+        def counted() -> Estimate:
+            computed.append(stage)
+            return compute()  # type: ignore[no-any-return]
+
+        return memory.estimate(stage, counted)
+
+    again = compare_recordings(problem, 1.0, going_on)
+    assert len(computed) == stages(2) - 6
+    for one, other in zip(whole, again, strict=True):
+        np.testing.assert_array_equal(one.fit.vaf, other.fit.vaf)
+        np.testing.assert_array_equal(one.held_out, other.held_out)
+
+
+def test_the_command(tmp_path: Path) -> None:
+    runner = CliRunner()
+    made = runner.invoke(
+        main,
+        ["simulate", "seated-balance", "--out", str(tmp_path), "--duration", "5",
+         "--formats", "csv"],
+    )  # fmt: skip
+    assert made.exit_code == 0, made.stderr
+    files = [str(tmp_path / f"trial_{number}.csv") for number in (1, 2)]
+    config = tmp_path / "subject.toml"
+    config.write_text(easier_seat(config.read_text()))
+    out = tmp_path / "out"
+    arguments = ["--plant", "seated-balance", "--config", str(config)]
+    done = runner.invoke(main, ["compare", *files, *arguments, "--out", str(out)])
+    assert done.exit_code == 0, done.stderr
+    names = {path.name for path in out.iterdir()}
+    pictures = {"comparison.png", "comparison.pdf"}
+    assert names == {"report.html", "result.json", "comparison.csv", ".impc", *pictures}
+    found = json.loads((out / "result.json").read_text())["methods"]
+    assert list(found) == list(METHODS)
+    with (out / "comparison.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    for row in rows:
+        told = found[row["method"]]["vaf"]["theta1"]
+        assert row["vaf_theta1"] == ("" if told is None else repr(told))
+    page = (out / "report.html").read_text()
+    assert not re.search("https?:", page)
+    assert "inverse KKT" in page
+    assert "inverse MPC, direct (3.6)" in done.stdout
+
+
+def test_a_bad_file_ends_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("")
+    (tmp_path / "c.toml").write_text("")
+    out = tmp_path / "out"
+    done = CliRunner().invoke(
+        main,
+        ["compare", str(tmp_path / "a.csv"), "--plant", "seated-balance", "--config",
+         str(tmp_path / "c.toml"), "--out", str(out)],
+    )  # fmt: skip
+    assert done.exit_code == 2
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert not out.exists()

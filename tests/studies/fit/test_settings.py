@@ -1,0 +1,104 @@
+"""The [fit] table: what it sets, what it refuses, and bounds from the data."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import plants
+from impc.errors import ImpcError
+from impc.model.plant import Plant, as_plant
+from impc.model.recordings import recording
+from impc.studies.fit.settings import FitSettings, fit_bounds, fit_settings
+
+
+@pytest.fixture(scope="module")
+def seat() -> Plant:
+    return as_plant(plants.seated_balance_plant(), ["command"])
+
+
+def test_defaults_and_values() -> None:
+    assert fit_settings({}) == FitSettings()
+    given = fit_settings({"horizon": 30, "u_max": 6, "free": ["J1"], "settle": 2})
+    assert (given.horizon, given.u_max, given.free, given.settle) == (30, 6.0, ["J1"], 2.0)
+
+
+@pytest.mark.parametrize(
+    ("table", "says"),
+    [
+        ({"horizn": 3}, "horizn"),
+        ({"horizon": 0}, "horizon"),
+        ({"horizon": 2.5}, "horizon"),
+        ({"margin": 0.5}, "margin"),
+        ({"settle": -1}, "settle"),
+        ({"u_max": "six"}, "u_max"),
+        ({"free": "J1"}, "free"),
+        ({"terminal_set": 1}, "terminal_set"),
+        ({"horizon": 2**63}, "horizon: got 9223372036854775808"),
+        ({"horizon": 16**5000}, "horizon: got an integer of about 6021 digits"),
+        ({"horizons": [10, 2**63]}, "horizons"),
+        ({"horizons": [10, 10]}, "horizons: names 10 twice"),
+        ({"margin": 1e308}, "margin"),
+        ({"margin": float("nan")}, "margin"),
+        ({"settle": 1e308}, "settle"),
+        ({"replicates": 2**63}, "replicates"),
+        ({"replicates": 19}, "replicates"),
+        ({"seed": -1}, "seed"),
+        ({"seed": 16**5000}, "seed"),
+        ({"u_max": 1e308}, "u_max"),
+        ({"u_max": 10**400}, "u_max"),
+        ({"u_max": [1.0, -1.0]}, "u_max: got -1.0"),
+        ({"u_max": 5e-324}, "u_max"),
+        ({"bounded_states": {"x": 1e308}}, "bounded_states x"),
+        ({"free": ["mass", "mass"]}, "free: names mass twice"),
+    ],
+)
+def test_what_is_wrong_is_named(table: dict[str, Any], says: str) -> None:
+    with pytest.raises(ImpcError, match=says) as caught:
+        fit_settings(table)
+    assert "\n" not in str(caught.value)
+
+
+def test_bounds_from_the_data(seat: Plant) -> None:
+    """A sinusoid of 0.1 rad at 1 Hz: its largest rate is 0.2 pi rad/s."""
+    time = np.arange(3000) / 100
+    angle = 0.1 * np.sin(2 * np.pi * time)
+    trial = recording(seat, np.column_stack([angle, -angle / 2]), np.zeros(3000))
+    settings = FitSettings(
+        u_max=5.0,
+        margin=1.5,
+        bounded_states={"theta1": "data", "theta1_rate": "data", "theta2": 0.2},
+    )
+    bounds = fit_bounds(seat, settings, [trial])
+    np.testing.assert_allclose(bounds.x_max[0], 0.15, rtol=1e-3)
+    np.testing.assert_allclose(bounds.x_max[2], 1.5 * 0.2 * np.pi, rtol=0.03)
+    assert bounds.x_max[1] == 0.2
+    assert np.all(np.isinf(bounds.x_max[3:]))
+    np.testing.assert_array_equal(bounds.x_min, -bounds.x_max)
+    assert (bounds.u_min[0], bounds.u_max[0]) == (-5.0, 5.0)
+    assert np.isinf(fit_bounds(seat, FitSettings(), [trial]).u_max[0])
+
+
+@pytest.mark.parametrize(
+    ("states", "says"),
+    [
+        ({"theta3": 1.0}, "is not a state"),
+        ({"theta1": "twice"}, "twice"),
+        ({"muscle_torque": "data"}, "neither an output nor the rate of one"),
+        ({"theta1": -1.0}, "x_min, x_max"),
+    ],
+)
+def test_bounds_that_cannot_be_set(seat: Plant, states: dict[str, Any], says: str) -> None:
+    trial = recording(seat, np.ones((100, 2)), np.zeros(100))
+    with pytest.raises(ImpcError, match=says):
+        fit_bounds(seat, FitSettings(bounded_states=states), [trial])
+
+
+def test_as_many_limits_as_inputs(seat: Plant) -> None:
+    trial = recording(seat, np.ones((300, 2)), np.zeros(300))
+    for given in ([], [1.0, 2.0]):
+        with pytest.raises(ImpcError, match=r"^\[fit\] u_max: has . numbers"):
+            fit_bounds(seat, FitSettings(u_max=given), [trial])
+    assert fit_bounds(seat, FitSettings(u_max=[2.0]), [trial]).u_max[0] == 2.0

@@ -1,0 +1,272 @@
+"""A subject from recordings to a result: what is in it, remembering, and intent."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import control
+import numpy as np
+import pytest
+
+from experiments.benchmarks.workloads import seat
+from experiments.simulated_subjects import noisy_recordings
+from impc.assess.delayed_feedback import preliminary_gain
+from impc.assess.intent_rules import dominant_sentence, intent
+from impc.assess.vaf import vaf
+from impc.control.closed_loop import scenario, simulate
+from impc.control.controller import mpc_controller
+from impc.errors import DataError, InputError, SolverError
+from impc.inverse.noisy_fit import fit_controller
+from impc.inverse.problem import InverseProblem
+from impc.model.bounds import box_bounds
+from impc.model.plant import Plant, as_plant, change_coordinates
+from impc.model.recordings import Recording, recording
+from impc.model.riccati import solve_lqr
+from impc.model.weights import stage_weights
+from impc.studies.fit.memory import open_memory
+from impc.studies.fit.result import FitResult
+from impc.studies.fit.settings import FitSettings
+from impc.studies.fit.subject import FitProgress, fit_problem, fit_recordings, stages
+
+FEEDBACK = ["theta1", "theta2", "theta1_rate", "theta2_rate"]
+SEED = 4
+
+
+def cart(dt: float = 0.05) -> Plant:
+    """A cart on a falling track: position and speed, a force, a push."""
+    A, B = [[0.0, 1.0], [2.0, -0.3]], [[0.0, 0.0], [1.0, 1.0]]
+    system = control.c2d(
+        control.ss(A, B, [[1.0, 0.0]], 0, inputs=["force", "push"], outputs=["position"]), dt
+    )
+    return as_plant(system, ["force"])
+
+
+def cart_trials(count: int, noise: float, samples: int = 300) -> list[Recording]:
+    """Trials of a cart whose force stands at its limit of 1 for a part of the time."""
+    plant, rng = cart(), np.random.default_rng(SEED)
+    weights = stage_weights(np.diag([4.0, 1.0]), 1)
+    controller = mpc_controller(
+        plant, weights, box_bounds(plant, u_min=-1, u_max=1), 10, terminal_set=False
+    )
+    trials = []
+    for _ in range(count):
+        push = np.repeat(rng.choice([-0.6, 0.0, 0.6], samples // 10), 10)
+        run = simulate(controller, scenario(plant, rng.normal(0, 0.05, 2), disturbance=push))
+        clean = (run.x @ plant.C.T)[:samples]
+        size = noise * np.sqrt(np.mean(clean**2))
+        trials.append(recording(plant, clean + size * rng.standard_normal(clean.shape), push))
+    return trials
+
+
+@pytest.fixture(scope="module")
+def noisy() -> FitResult:
+    trials = noisy_recordings(6.0, SEED, 0.9)
+    settings = FitSettings(u_max=6.0, feedback_states=FEEDBACK, intent_draws=False)
+    return fit_recordings(fit_problem(seat().problem.plant, trials, settings), settings)
+
+
+def test_vaf_is_that_of_the_trajectories(noisy: FitResult) -> None:
+    plant = noisy.fitted.problem.plant
+    runs = noisy.inverse_mpc.runs
+    for index, trial in enumerate(noisy.given.recordings):
+        expected = vaf(trial.outputs, runs[index].x @ plant.C.T)
+        np.testing.assert_allclose(noisy.trials[index].vaf, expected)
+        np.testing.assert_allclose(noisy.inverse_mpc.trial_vaf[index], expected)
+    together = np.concatenate([run.x @ plant.C.T for run in runs])
+    recorded = np.concatenate([trial.outputs for trial in noisy.given.recordings])
+    np.testing.assert_allclose(noisy.inverse_mpc.vaf, vaf(recorded, together))
+
+
+def test_trials_left_out_are_predicted_to_the_ceiling(noisy: FitResult) -> None:
+    assert len(noisy.held_out) == 3
+    for item in noisy.held_out:
+        assert np.all(np.abs(item.vaf - 90) < 1.0)
+
+
+def test_the_preliminary_estimate_is_shown_beside_the_others(noisy: FitResult) -> None:
+    names = [item.name for item in noisy.methods]
+    assert names == [
+        "preliminary",
+        "feedback_gain",
+        "inverse_lqr_gain",
+        "inverse_lqr_output",
+        "clipped_lqr",
+        "inverse_mpc",
+    ]
+    first = noisy.methods[0]
+    assert first.K is not None
+    assert np.all(first.K[0, 4:] == 0)
+    assert np.all(first.vaf < noisy.inverse_mpc.vaf - 5)
+
+
+def test_every_reading_has_the_gain_and_the_angle_is_theirs(noisy: FitResult) -> None:
+    plant, K = noisy.fitted.problem.plant, noisy.fitted.solution.K
+    first = noisy.intent.reported
+    for reading in noisy.intent.readings:
+        np.testing.assert_allclose(
+            solve_lqr(plant, reading.weights).K, K, atol=1e-6 * float(np.max(np.abs(K)))
+        )
+        values, vectors = np.linalg.eigh(reading.weights.Q)
+        np.testing.assert_allclose(values, reading.eigenvalues, rtol=1e-12)
+        cosine = abs(float(vectors[:, -1] @ first.dominant))
+        expected = np.degrees(np.arccos(min(1.0, cosine)))
+        assert reading.angle == pytest.approx(expected, abs=1e-3)
+        assert reading.condition >= first.condition * (1 - 1e-6)
+    assert noisy.intent.widest_angle > 10
+
+
+def test_intent_of_known_weights() -> None:
+    """The double integrator with Q = I: the least condition number is 1, whatever v is."""
+    plant = as_plant(control.ss([[1, 1], [0, 1]], [[0.5], [1]], np.eye(2), 0, True))
+    weights = stage_weights(np.diag([4.0, 1.0]), 1)
+    found = intent(
+        plant, np.array(solve_lqr(plant, weights).K), np.ones((1, 1, 1)), np.ones(2), weights
+    )
+    np.testing.assert_allclose(found.reported.eigenvalues, [1, 4], rtol=1e-5)
+    np.testing.assert_allclose(found.reported.dominant, [1, 0], atol=1e-4)
+    sentence = dominant_sentence(found.reported, plant, np.array([1.0, 3.0]))
+    assert sentence.startswith("The dominant cost is 4 (+1.00 x[0])^2, 80 % of the trace")
+
+
+def test_change_of_coordinates_keeps_the_regulator() -> None:
+    plant = cart()
+    T = np.array([[2.0, 1.0], [0.0, 3.0]])
+    moved = change_coordinates(plant, T, np.array([[5.0]]))
+    Q = np.diag([3.0, 1.0])
+    gain = solve_lqr(plant, stage_weights(Q, 2)).K
+    other = solve_lqr(moved, stage_weights(T.T @ Q @ T, 2 * 25)).K
+    np.testing.assert_allclose(5 * other @ np.linalg.inv(T), gain, atol=1e-10)
+
+
+def test_preliminary_gain_without_noise_finds_gains_of_its_own_form() -> None:
+    plant, rng = cart(), np.random.default_rng(SEED)
+    K = np.array([[3.0, 1.5]])
+    push = np.repeat(rng.choice([-1.0, 0.0, 1.0], 40), 10)
+    x = np.zeros((401, 2))
+    for k in range(400):
+        x[k + 1] = (plant.A - plant.B @ K) @ x[k] + plant.E[:, 0] * push[k]
+    trial = recording(plant, (x @ plant.C.T)[:400], push)
+    problem = fit_problem(plant, [trial], FitSettings())
+    np.testing.assert_allclose(preliminary_gain(problem, plant.states).K, K, rtol=1e-6)
+    with pytest.raises(InputError, match="feedback_states"):
+        preliminary_gain(problem, ["speed"])
+
+
+@pytest.fixture
+def small() -> tuple[InverseProblem, FitSettings]:
+    settings = FitSettings(horizon=10, u_max=1.0)
+    return fit_problem(cart(), cart_trials(3, 0.2), settings), settings
+
+
+def test_a_plant_of_ones_own_with_one_output(small: tuple[InverseProblem, FitSettings]) -> None:
+    heard: list[str] = []
+    result = fit_recordings(*small, FitProgress(heard.append))
+    assert len(heard) == stages(small[0], small[1])
+    # Noise of 20 % leaves 1 / 1.04 to explain.
+    assert np.all(np.abs(result.inverse_mpc.vaf - 100 / 1.04) < 1.5)
+    assert result.identifiability.rank == 2
+    single = replace(small[0], recordings=small[0].recordings[:1])
+    assert fit_recordings(single, small[1]).held_out == ()
+
+
+def test_an_interrupted_fit_goes_on(
+    small: tuple[InverseProblem, FitSettings], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = fit_recordings(*small)
+    memory = open_memory(tmp_path / "out", *small)
+
+    def interrupt(stage: str) -> None:
+        if stage == "feedback_gain":
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fit_recordings(*small, FitProgress(interrupt, memory.controller))
+    again = open_memory(tmp_path / "out", *small)
+    assert "fit" in again.stages
+
+    done = set(again.stages)
+    computed: list[int] = []
+
+    def counting(problem: InverseProblem) -> object:
+        computed.append(len(problem.recordings))
+        return fit_controller(problem)
+
+    monkeypatch.setattr("impc.studies.fit.memory.fit_controller", counting)
+    result = fit_recordings(*small, FitProgress(lambda _: None, again.controller))
+    assert len(computed) == 4 - len(done)
+    np.testing.assert_array_equal(result.fitted.weights.Q, whole.fitted.weights.Q)
+    for one, other in zip(result.held_out, whole.held_out, strict=True):
+        np.testing.assert_array_equal(one.vaf, other.vaf)
+    again.forget()
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_a_memory_of_another_fit_is_not_used(
+    small: tuple[InverseProblem, FitSettings], tmp_path: Path
+) -> None:
+    problem, settings = small
+    open_memory(tmp_path, problem, settings).controller("fit", problem)
+    assert list(open_memory(tmp_path, problem, settings).stages) == ["fit"]
+    assert open_memory(tmp_path, problem, replace(settings, settle=2.0)).stages == {}
+    other = replace(problem, recordings=problem.recordings[:2])
+    assert open_memory(tmp_path, other, settings).stages == {}
+    path = tmp_path / "fit-in-progress" / "fit.json"
+    whole = path.read_text()
+    for text in ("", "{", "[]", json.dumps({"digest": 3}), whole.replace("1", "2", 1)):
+        path.write_text(text)
+        assert open_memory(tmp_path, problem, settings).stages == {}
+
+
+def test_a_remembered_controller_is_the_same(
+    small: tuple[InverseProblem, FitSettings], tmp_path: Path
+) -> None:
+    problem, settings = small
+    found = fit_controller(problem)
+    open_memory(tmp_path, problem, settings).controller("fit", problem)
+    again = open_memory(tmp_path, problem, settings).controller("fit", problem)
+    np.testing.assert_array_equal(again.solution.K, found.solution.K)
+    np.testing.assert_array_equal(again.free.K, found.free.K)
+    for one, other in zip(again.problem.recordings, found.problem.recordings, strict=True):
+        np.testing.assert_array_equal(one.x0, other.x0)
+
+
+def test_what_cannot_be_fitted_is_said() -> None:
+    plant = cart()
+    with pytest.raises(DataError, match="there are none"):
+        fit_problem(plant, [], FitSettings())
+    with pytest.raises(DataError, match="zero in every trial"):
+        fit_problem(plant, [recording(plant, np.zeros(100))], FitSettings())
+    with pytest.raises(DataError, match="the shortest has 15 samples"):
+        fit_problem(plant, [*cart_trials(1, 0.1, 150), _short()], FitSettings())
+
+
+def _short() -> Recording:
+    trial = cart_trials(1, 0.1, 150)[0]
+    return replace(trial, outputs=trial.outputs[:15], disturbance=trial.disturbance[:15])
+
+
+def test_a_release_without_disturbance_is_fitted() -> None:
+    """Nothing but the initial states, which are unknown, moves these trials."""
+    plant = cart()
+    weights = stage_weights(np.diag([4.0, 1.0]), 1)
+    bounds = box_bounds(plant, u_min=-1, u_max=1)
+    controller = mpc_controller(plant, weights, bounds, 10, terminal_set=False)
+    trials = []
+    for x0 in ([0.4, 0.0], [-0.2, 0.3], [0.3, 0.1]):
+        run = simulate(controller, scenario(plant, x0, 100))
+        trials.append(recording(plant, (run.x @ plant.C.T)[:100]))
+    settings = FitSettings(horizon=10, u_max=1.0)
+    fitted = fit_controller(fit_problem(plant, trials, settings))
+    np.testing.assert_allclose(fitted.solution.K, controller.K, rtol=1e-6)
+    np.testing.assert_allclose(fitted.problem.recordings[1].x0, [-0.2, 0.3], atol=1e-7)
+
+
+def test_a_recording_in_which_nothing_moves_is_said() -> None:
+    plant = cart()
+    rng = np.random.default_rng(SEED)
+    outputs = 1e-3 * rng.standard_normal(200)
+    outputs[0] = 0.0
+    with pytest.raises(SolverError, match="nothing drives them"):
+        fit_controller(fit_problem(plant, [recording(plant, outputs)], FitSettings(u_max=1.0)))

@@ -1,0 +1,158 @@
+"""`impc simulate reliability-study` and `impc reliability`, from files to files."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from impc.cli.main import main
+from impc.files.plant_sources import make_plant, plant_source
+from impc.files.reading import read_recordings
+from impc.studies.cohort.study import read_study
+from impc.studies.reliability.findings import QUOTED, band_of
+from impc.studies.reliability.icc import icc
+
+
+def run(*arguments: str) -> Result:
+    return CliRunner().invoke(main, list(arguments))
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Five subjects, two visits, two trials; the conditions are three."""
+    folder = tmp_path_factory.mktemp("reliability")
+    done = run(
+        "simulate", "reliability-study", "--out", str(folder), "--subjects", "5", "--visits", "2",
+        "--trials", "2",
+    )  # fmt: skip
+    assert done.exit_code == 0, done.stderr
+    return folder
+
+
+@pytest.fixture(scope="module")
+def analysed(study: Path) -> tuple[Result, Path]:
+    out = study / "out"
+    done = run("reliability", str(study / "study.toml"), "--out", str(out))
+    assert done.exit_code == 0, done.stderr
+    return done, out
+
+
+def test_files(study: Path, analysed: tuple[Result, Path]) -> None:
+    assert len(list(study.rglob("sub-*_motion.csv"))) == 5 * 2 * 3 * 2
+    names = {path.name for path in analysed[1].iterdir()}
+    assert {"report.html", "result.json", "cmc.csv", "icc-rms.csv", "spectra.pdf"} <= names
+
+
+def test_icc_is_that_of_the_recordings(study: Path, analysed: tuple[Result, Path]) -> None:
+    """RMS of every trial from the files, without the command."""
+    found = json.loads((analysed[1] / "result.json").read_text())
+    read = read_study(study / "study.toml")
+    plant = make_plant(plant_source("plants:seated_balance_for", {}), ("perturbation",))
+    table = np.full((5, 2), np.nan)
+    for unit in read.units:
+        if unit.condition == "EC":
+            trials = read_recordings(unit.files, read.configuration, plant)
+            scores = [np.sqrt(np.mean(item.outputs[:, 0] ** 2)) for item in trials]
+            table[int(unit.subject) - 1, int(unit.visit) - 1] = np.mean(scores)
+    expected = icc(table, "A,k", method="generalised")
+    told = found["icc"]["rms.theta1"]["EC"]
+    assert told["form"] == "A,k"
+    for key in ("value", "low", "high"):
+        assert told[key] == pytest.approx(getattr(expected, key))
+    # The error of a single visit, not of the mean over visits that ICC(A,k) is of.
+    complete = table[np.all(np.isfinite(table), axis=1)]
+    within = np.sqrt(np.mean(np.var(complete, axis=1, ddof=1)))
+    assert told["sem"] == pytest.approx(within)
+    assert told["mdc"] > 1.96 * np.sqrt(2) * within
+    assert set(found["cmc"]) == {"within", "between"}
+    assert 0 <= found["anova"]["rms.theta1"]["EO"]["p"] <= 1
+
+
+def test_the_page_marks_findings_and_quotes_the_dissertation(
+    analysed: tuple[Result, Path],
+) -> None:
+    page = (analysed[1] / "report.html").read_text()
+    assert page.count("ound:</strong>") == 3
+    assert "Quoted from the dissertation, of its own subjects and not of these" in page
+    assert not re.search("https?:", page)
+    quoted = (analysed[1] / "dissertation.csv").read_text()
+    for conditions in QUOTED.values():
+        for lower, upper in conditions.values():
+            assert f"{lower},{upper}" in quoted
+
+
+def copy(study: Path, folder: Path) -> Path:
+    shutil.copytree(study, folder, ignore=shutil.ignore_patterns("out"))
+    return folder
+
+
+def remove(folder: Path, pattern: str) -> None:
+    for path in folder.rglob(pattern):
+        path.unlink()
+
+
+@pytest.mark.usefixtures("blank_figures")
+def test_one_visit_is_a_sentence(study: Path, tmp_path: Path) -> None:
+    folder = copy(study, tmp_path / "s")
+    remove(folder, "*_ses-2_*")
+    done = run("reliability", str(folder / "study.toml"), "--out", str(tmp_path / "o"))
+    assert done.exit_code == 0, done.stderr
+    assert "of 1 occasion" in (tmp_path / "o" / "icc-rms.csv").read_text()
+
+
+@pytest.mark.usefixtures("blank_figures")
+def test_one_subject_is_a_sentence(study: Path, tmp_path: Path) -> None:
+    folder = copy(study, tmp_path / "s")
+    for number in range(2, 6):
+        remove(folder, f"sub-{number:02d}_*")
+    done = run("reliability", str(folder / "study.toml"), "--out", str(tmp_path / "o"))
+    assert done.exit_code == 0, done.stderr
+    assert "complete for 1 subject" in (tmp_path / "o" / "icc-rms.csv").read_text()
+
+
+@pytest.mark.usefixtures("blank_figures")
+def test_unequal_cells_are_said(study: Path, tmp_path: Path) -> None:
+    """One subject lacks a visit, another a trial: left out of the one, cut alike in the other."""
+    folder = copy(study, tmp_path / "s")
+    remove(folder, "sub-02_ses-2_task-EO_*")
+    remove(folder, "sub-03_ses-1_task-EC_run-2_*")
+    done = run("reliability", str(folder / "study.toml"), "--out", str(tmp_path / "o"))
+    assert done.exit_code == 0, done.stderr
+    table = (tmp_path / "o" / "icc-rms.csv").read_text()
+    assert "4 subjects; 1 subjects lack a visit and are left out" in table
+    assert "give two or more subjects, visits and trials" in table
+
+
+@pytest.mark.usefixtures("blank_figures")
+def test_a_condition_without_trials(study: Path, tmp_path: Path) -> None:
+    """A condition that one visit lacks for everybody: no number, and why."""
+    folder = copy(study, tmp_path / "s")
+    remove(folder, "*_ses-2_task-VIB_*")
+    done = run("reliability", str(folder / "study.toml"), "--out", str(tmp_path / "o"))
+    assert done.exit_code == 0, done.stderr
+    found = json.loads((tmp_path / "o" / "result.json").read_text())
+    assert set(found["icc"]["rms.theta1"]) == {"EO", "EC"}
+
+
+def test_an_empty_passband_is_one_line(study: Path, tmp_path: Path) -> None:
+    folder = copy(study, tmp_path / "s")
+    for path in folder.rglob("*.csv"):
+        lines = path.read_text().splitlines()
+        rows = [line.rsplit(",", 1)[0] + ",0.0" for line in lines[1:]]
+        path.write_text("\n".join([lines[0], *rows]) + "\n")
+    done = run("reliability", str(folder / "study.toml"), "--out", str(tmp_path / "o"))
+    assert done.exit_code == 2
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert not (tmp_path / "o").exists()
+
+
+def test_bands() -> None:
+    """Cicchetti's limits."""
+    words = [band_of(value) for value in (-0.2, 0.39, 0.4, 0.6, 0.75, 1.0, float("nan"))]
+    assert words == ["poor", "poor", "fair", "good", "excellent", "excellent", "not defined"]

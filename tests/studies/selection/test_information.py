@@ -1,0 +1,199 @@
+"""Sensitivities, information, rank and subsets against differences, recursion and brute force."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+import plants
+from impc.errors import DataError, InputError
+from impc.studies.selection.estimation import estimate, free_indices, multi_start
+from impc.studies.selection.fisher import (
+    common_scaling,
+    fisher_information,
+    null_directions,
+    unseen_scalings,
+)
+from impc.studies.selection.linear import discretised, kronecker_sensitivity
+from impc.studies.selection.model import normalised, parametric_model, physical, sensitivity
+from impc.studies.selection.modern import (
+    best_collinear,
+    collinearity,
+    fixed_bias,
+    pivoted_order,
+    profile_interval,
+    subset_by_svd,
+)
+from impc.studies.selection.subsets import exhaustive, largest_subsets, subset_variances
+from tests.studies.selection.heads import NAMES_FIM, head_model, head_trials
+
+SEED = 1
+MODEL = head_model()
+NOMINAL = np.array(MODEL.typical)
+TRIALS = head_trials(MODEL, NOMINAL, 0.8226, SEED)
+FOUND = fisher_information(MODEL, NOMINAL, TRIALS)
+
+
+def test_sensitivities_against_differences() -> None:
+    """Central differences of 1e-4 in normalised units: 1e-6 of the largest."""
+    given = TRIALS[0].input
+    _, exact = sensitivity(MODEL, NOMINAL, given)
+    t = normalised(MODEL, NOMINAL)
+    for index in range(MODEL.size):
+        ends = []
+        for sign in (1, -1):
+            moved = t.copy()
+            moved[index] += sign * 1e-4
+            ends.append(MODEL.simulate(physical(MODEL, moved), given))
+        difference = (ends[0] - ends[1]) / 2e-4
+        scale = np.max(np.abs(exact[..., index])) + 1e-6 * np.max(np.abs(exact))
+        assert np.max(np.abs(difference - exact[..., index])) <= 1e-6 * scale
+
+
+def test_sensitivities_against_the_kronecker_recursion() -> None:
+    """(A.3): 1e-8."""
+    given = TRIALS[0].input
+    _, exact = sensitivity(MODEL, NOMINAL, given)
+    sampled = discretised(plants.head_neck_matrices(), NOMINAL, 1 / 60)
+    recursion = kronecker_sensitivity(sampled, given) * MODEL.gain
+    np.testing.assert_allclose(recursion, exact, atol=1e-8 * np.max(np.abs(exact)))
+
+
+def test_information_is_its_sum() -> None:
+    """(A.2) and (A.6), sample by sample."""
+    total = np.zeros((12, 12))
+    squares = 0.0
+    for trial in TRIALS:
+        outputs, derivative = sensitivity(MODEL, NOMINAL, trial.input)
+        squares += float(np.sum((trial.outputs - outputs) ** 2))
+        for row in derivative[:, 0]:
+            total += np.outer(row, row)
+    samples = sum(trial.outputs.size for trial in TRIALS)
+    np.testing.assert_allclose(FOUND.F, total / (squares / (samples - 12)), rtol=1e-9)
+
+
+def test_rank_and_what_is_not_seen() -> None:
+    """Eight directions; scaling the five torque gains together is unseen, and named."""
+    assert FOUND.rank == 8
+    gains = ("Kvis", "Kvcr", "Kccr", "B", "K")
+    assert unseen_scalings(MODEL, FOUND) == (gains,)
+    moved = NOMINAL.copy()
+    moved[[MODEL.names.index(name) for name in gains]] *= 1.3
+    before, after = (MODEL.simulate(theta, TRIALS[0].input) for theta in (NOMINAL, moved))
+    assert 1 - np.sum((after - before) ** 2) / np.sum(before**2) > 0.9999999
+    assert common_scaling(MODEL, FOUND, ("Kvis",)) > 100
+    told = null_directions(MODEL, FOUND)
+    assert len(told) == 4
+    assert any({"Kvis", "Kvcr", "Kccr"} <= set(item.shares) for item in told)
+
+
+@pytest.mark.parametrize("bound", [0.05, 0.25, 0.95])
+def test_growing_sets_is_exhaustive_search(bound: float) -> None:
+    assert largest_subsets([FOUND.F], bound) == exhaustive([FOUND.F], bound)
+
+
+def test_the_dissertation_s_subset_is_feasible_at_the_first_bound() -> None:
+    found = largest_subsets([FOUND.F], 0.05)
+    assert found.size == 5
+    assert free_indices(MODEL, NAMES_FIM) in found.subsets
+
+
+def test_variances_are_those_of_the_inverse() -> None:
+    rng = np.random.default_rng(SEED)
+    root = rng.standard_normal((30, 6))
+    others = rng.standard_normal((30, 6))
+    F, G = root.T @ root, others.T @ others
+    subsets = list(itertools.combinations(range(6), 3))
+    expected = [
+        max(np.max(np.diag(np.linalg.inv(item[np.ix_(s, s)]))) for item in (F, G)) for s in subsets
+    ]
+    np.testing.assert_allclose(subset_variances([F, G], subsets), expected)
+    singular = np.ones((3, 3))
+    assert np.isinf(subset_variances([singular], [(0, 1)])[0])
+
+
+def test_monotone_in_the_bound_and_many_parameters() -> None:
+    """Twenty-six parameters, of which exhaustive search would try 67 million subsets."""
+    rng = np.random.default_rng(SEED)
+    root = rng.standard_normal((40, 26)) * np.geomspace(1, 1e-2, 26)
+    sizes = [largest_subsets([root.T @ root], bound).size for bound in (0.1, 1.0, 3.0)]
+    assert sizes == sorted(sizes)
+    assert 2 <= sizes[0] < sizes[-1]
+    with pytest.raises(InputError, match="largest_subsets"):
+        exhaustive([root.T @ root], 1.0)
+
+
+def test_estimates_find_the_truth() -> None:
+    """Seed 1: five parameters inside four Cramér-Rao deviations, VAF as the noise leaves it."""
+    free = free_indices(MODEL, NAMES_FIM)
+    start = NOMINAL.copy()
+    start[list(free)] *= 1.2
+    found = estimate(MODEL, TRIALS, free, start)
+    assert found.vaf[0] == pytest.approx(82.26, abs=1.0)
+    part = np.asarray(FOUND.F)[np.ix_(free, free)]
+    deviation = np.sqrt(np.diag(np.linalg.inv(part)))
+    error = (normalised(MODEL, np.array(found.theta)) - normalised(MODEL, NOMINAL))[list(free)]
+    assert np.all(np.abs(error) < 4 * deviation)
+    several = multi_start(MODEL, TRIALS, free, 3, SEED)
+    assert several[0].misfit == pytest.approx(found.misfit, rel=1e-6)
+
+
+def test_other_selectors() -> None:
+    assert len(set(pivoted_order(FOUND))) == 12
+    assert len(subset_by_svd(FOUND, 5)) == 5
+    free = free_indices(MODEL, NAMES_FIM)
+    gamma = collinearity(FOUND, free)
+    columns = np.concatenate([sensitivity(MODEL, NOMINAL, item.input)[1][:, 0] for item in TRIALS])[
+        :, list(free)
+    ]
+    scaled = columns / np.linalg.norm(columns, axis=0)
+    assert gamma == pytest.approx(1 / np.linalg.svd(scaled, compute_uv=False)[-1], rel=1e-6)
+    assert best_collinear(FOUND, 3)[1] <= collinearity(FOUND, free[:3])
+
+
+def test_profile_agrees_with_cramer_rao() -> None:
+    free = free_indices(MODEL, ("tau",))
+    found = estimate(MODEL, TRIALS, free, NOMINAL)
+    low, high = profile_interval(MODEL, TRIALS, found, free[0])
+    deviation = MODEL.gain[3] / np.sqrt(FOUND.F[3, 3])
+    assert (high - low) / 2 == pytest.approx(1.96 * deviation, rel=0.1)
+
+
+def test_bias_from_fixed_parameters() -> None:
+    """The inertia-like scaling: Kvcr fixed 10 % of its half range higher moves Kvis up with it."""
+    free = free_indices(MODEL, ("Kvis", "Kccr", "tau"))
+    fit = estimate(MODEL, TRIALS, free, NOMINAL)
+    told = {item.name: item for item in fixed_bias(MODEL, TRIALS, fit)}
+    assert set(told) == set(MODEL.names) - {"Kvis", "Kccr", "tau"}
+    assert np.sign(told["Kvcr"].shift[0]) == np.sign(told["Kvcr"].moved)
+
+
+def test_any_function_is_a_model() -> None:
+    """Exponential decay by a plain function: the information of its closed form."""
+    time = np.linspace(0, 4, 50)[:, None]
+    model = parametric_model(
+        ["a", "k"], [0.1, 0.1], [5, 3], [2.0, 1.0], lambda p, t: p[0] * np.exp(-p[1] * t)
+    )
+    theta = np.array([2.0, 1.0])
+    from impc.studies.selection.model import Trial  # noqa: PLC0415
+
+    found = fisher_information(model, theta, [Trial(time, model.simulate(theta, time))], 0.01)
+    decay = np.exp(-time[:, 0])
+    J = np.column_stack([decay, -2 * time[:, 0] * decay]) * model.gain
+    np.testing.assert_allclose(found.F, J.T @ J / 0.01, rtol=1e-5)
+
+
+def test_models_are_checked() -> None:
+    def one(p: np.ndarray, u: np.ndarray) -> np.ndarray:
+        return np.asarray(u * p[0])
+
+    with pytest.raises(InputError, match="lies outside"):
+        parametric_model(["a"], [0], [1], [2], one)
+    with pytest.raises(InputError, match="low < high"):
+        parametric_model(["a"], [1], [1], [1], one)
+    with pytest.raises(InputError, match="is not one"):
+        free_indices(MODEL, ["mass"])
+    with pytest.raises(DataError, match="there are none"):
+        estimate(MODEL, [], (0,), NOMINAL)

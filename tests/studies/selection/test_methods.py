@@ -1,0 +1,234 @@
+"""Bootstrap, LASSO, key parameters, and the commands, with a model from another field too."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from impc.assess.resampling import block_residuals
+from impc.cli.main import main
+from impc.studies.selection.bootstrap import bootstrap_subset, draw_single
+from impc.studies.selection.estimation import estimate, free_indices
+from impc.studies.selection.fisher import fisher_information
+from impc.studies.selection.key_parameters import key_parameters
+from impc.studies.selection.lasso import proximal_lasso, table_c1
+from impc.studies.selection.model import ParametricModel, Trial, normalised, parametric_model
+from impc.studies.selection.queue import in_turn
+from impc.studies.selection.settings import SelectSettings
+from tests.studies.selection.dosing import blood_model
+from tests.studies.selection.heads import head_model
+
+SEED = 2
+MODEL = head_model()
+
+
+def run(*arguments: str) -> Result:
+    return CliRunner().invoke(main, list(arguments))
+
+
+def line_model() -> ParametricModel:
+    """y = a u1 + b u2 + c u3: least squares and LASSO have textbook answers."""
+
+    def simulate(p: np.ndarray, u: np.ndarray) -> np.ndarray:
+        return np.asarray(u @ p)[:, None]
+
+    return parametric_model(["a", "b", "c"], [-5] * 3, [5] * 3, [0.0, 0.0, 0.0], simulate)
+
+
+def line_trial(noise: float) -> Trial:
+    rng = np.random.default_rng(SEED)
+    u = rng.standard_normal((400, 3))
+    return Trial(u, (u @ [2.0, 0.0, -1.0])[:, None] + noise * rng.standard_normal((400, 1)))
+
+
+def test_bootstrap_of_a_line_is_its_covariance() -> None:
+    """Widths against 3.92 deviations of ordinary least squares, 400 replicates: 15 %."""
+    model, trial = line_model(), line_trial(0.5)
+    fit = estimate(model, [trial], (0, 1, 2), np.zeros(3))
+    found = bootstrap_subset(model, [trial], fit, 400, SEED)
+    expected = 3.92 * 0.5 * np.sqrt(np.diag(np.linalg.inv(trial.input.T @ trial.input)))
+    np.testing.assert_allclose(found.width, expected, rtol=0.15)
+    again = bootstrap_subset(model, [trial], fit, 3, SEED)
+    np.testing.assert_array_equal(again.drawn, found.drawn[:3])
+    assert np.all((found.low < found.value) & (found.value < found.high))
+
+
+def test_blocks_widen_intervals_of_coloured_residuals() -> None:
+    model, trial = line_model(), line_trial(0.0)
+    rng = np.random.default_rng(SEED)
+    slow = np.repeat(rng.standard_normal(40), 10)[:, None]
+    drive = np.repeat(rng.standard_normal((40, 3)), 10, axis=0)
+    trial = Trial(drive, (drive @ [2.0, 0.0, -1.0])[:, None] + 0.5 * slow)
+    fit = estimate(model, [trial], (0, 1, 2), np.zeros(3))
+    single = bootstrap_subset(model, [trial], fit, 200, SEED, draw_single).width
+    blocks = bootstrap_subset(model, [trial], fit, 200, SEED, block_residuals).width
+    assert np.all(blocks > 1.5 * single)
+
+
+def test_lasso_of_a_line_is_soft_thresholding() -> None:
+    """With an orthonormal design (C.5) is a soft threshold; zero means exactly typical."""
+    model = line_model()
+    u, _ = np.linalg.qr(np.random.default_rng(SEED).standard_normal((300, 3)))
+    u *= np.sqrt(300)
+    trial = Trial(u, (u @ [2.0, 0.1, -1.0])[:, None])
+    weight = 5 * 0.5  # in normalised units: half of the range is 5
+    t, _ = proximal_lasso(model, [trial], weight)
+    expected = np.sign([2, 0.1, -1]) * np.maximum(np.abs([2, 0.1, -1]) - 0.5 / 2, 0) / 5
+    np.testing.assert_allclose(t, expected, atol=1e-8)
+    assert t[1] == normalised(model, np.array(model.typical))[1]
+
+
+def test_nelder_mead_finds_the_same_objective() -> None:
+    """Table C.1's search on the line: what moved beyond 0.005 is what the proximal solver moves."""
+    model, trial = line_model(), line_trial(0.1)
+    found = table_c1(model, [trial], 2, solves=6)
+    t, objective = proximal_lasso(model, [trial], found.weight)
+    assert found.objective == pytest.approx(objective, rel=1e-3)
+    assert found.selected == tuple(np.flatnonzero(np.abs(t) > 0.005))
+
+
+def test_key_parameters_of_a_line() -> None:
+    """Six subjects, two visits: a and c differ between subjects, b is noise; a, c are reliable."""
+    rng = np.random.default_rng(SEED)
+    base = line_model()
+    model = parametric_model(
+        ["a", "b", "c"], [-5] * 3, [5] * 3, [0, 0, 0], base.simulate, pathways=["x", "x", "y"]
+    )
+    recorded = {}
+    for subject in range(6):
+        own = np.array([rng.normal(0, 1), 0.0, rng.normal(0, 1)])
+        for visit in ("1", "2"):
+            u = rng.standard_normal((60, 3))
+            theta = own + np.array([0, rng.normal(0, 0.3), 0])
+            y = (u @ theta)[:, None] + 0.2 * rng.standard_normal((60, 1))
+            recorded[str(subject), visit] = [Trial(u, y)]
+    found = key_parameters(
+        model, recorded, SelectSettings(), in_turn(model), bound=0.5, least_vaf=10.0
+    )
+    assert found.selection.size == 3
+    assert found.chosen == ()
+    pairs = {item.subset: item for item in found.candidates}
+    assert pairs[0, 1, 2].diversity == 2
+    assert pairs[0, 1, 2].reliability < 0.75
+
+
+@pytest.mark.slow
+def test_widths_of_table_4_3() -> None:
+    """Ten subjects about the FIM column, each with a VAF of its own: docs/selection.md."""
+    from experiments.selection_claims import bootstrap_widths  # noqa: PLC0415
+
+    widths = bootstrap_widths(0.2, 0.6, 60)
+    inside = [abs(item.mean - item.quoted) <= item.deviation for item in widths]
+    assert sum(inside) >= 4
+
+
+def test_head_tracking_from_files_to_files(tmp_path: Path) -> None:
+    made = run("simulate", "head-tracking", "--out", str(tmp_path), "--subjects", "1",
+               "--trials", "1", "--duration", "8")  # fmt: skip
+    assert made.exit_code == 0, made.stderr
+    study = tmp_path / "study.toml"
+    study.write_text(study.read_text().replace("replicates = 200", "replicates = 20\nstarts = 1"))
+    done = run("select", str(study), "--out", str(tmp_path / "out"), "--workers", "1")
+    assert done.exit_code == 0, done.stderr
+    found = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert set(found["selected"]) == {"fim", "lasso", "nelder_mead"}
+    assert {"common", "intervals", "vaf", "seconds", "rank"} <= set(found)
+    (scalings,) = found["unseen_scalings"].values()
+    assert ["Kvis", "Kvcr", "Kccr", "B", "K"] in scalings
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "Scaling Kvis, Kvcr, Kccr, B, K together" in page
+
+
+MINE = ("--model", "tests.studies.selection.dosing:blood_model")
+
+
+def blood_study(folder: Path, subjects: int, visits: int) -> Path:
+    """Subjects with doses every eight hours for two days."""
+    told, rng = blood_model(), np.random.default_rng(SEED)
+    dose = np.zeros((192, 1))
+    dose[::32] = 400.0
+    for subject in range(subjects):
+        own = np.array([1.0, 0.1, 30.0]) * np.exp(0.3 * rng.standard_normal(3))
+        for visit in range(visits):
+            theta = own * np.exp(0.02 * rng.standard_normal(3))
+            level = told["simulate"](theta, dose)
+            noisy = level + 0.03 * np.std(level) * rng.standard_normal(level.shape)
+            rows = np.column_stack([np.arange(192) * 0.25, dose, noisy])
+            np.savetxt(
+                folder / f"p{subject + 1}_v{visit + 1}.csv", rows, delimiter=",",
+                header="time,dose,level", comments="",
+            )  # fmt: skip
+    (folder / "study.toml").write_text(
+        """\
+[study]
+model = "tests.studies.selection.dosing:blood_model"
+recordings = "p{subject}_v{visit}.csv"
+[recording]
+time = "time"
+[signals.dose]
+column = "dose"
+unit = "dimensionless"
+[signals.concentration]
+column = "level"
+unit = "dimensionless"
+[select]
+bound = 0.05
+size = 2
+replicates = 40
+"""
+    )
+    return folder / "study.toml"
+
+
+def test_a_model_from_another_field(tmp_path: Path) -> None:
+    study = blood_study(tmp_path, 5, 2)
+    done = run("select", str(study), *MINE, "--out", str(tmp_path / "select"), "--workers", "1")
+    assert done.exit_code == 0, done.stderr
+    assert "information: ka, ke, V" in done.stdout
+    done = run(
+        "key-parameters", str(study), *MINE, "--out", str(tmp_path / "key"), "--workers", "1"
+    )
+    assert done.exit_code == 0, done.stderr
+    found = json.loads((tmp_path / "key" / "result.json").read_text())
+    assert found["chosen"] == ["ka", "ke", "V"]
+    assert found["candidates"][0]["diversity"] == 3
+
+
+def test_faults_are_one_line(tmp_path: Path) -> None:
+    study = blood_study(tmp_path, 1, 1)
+    text = study.read_text()
+    for old, new, match in (
+        ('model = "tests.studies.selection.dosing:blood_model"', "", "study.model"),
+        ("dosing:blood_model", "dosing:nothing", "nothing"),
+        ("bound = 0.05", "bond = 0.05", "is not a setting"),
+        ("replicates = 40", "draw = 'x'", "single or block"),
+        ("replicates = 40", "replicates = 0", "[select] replicates"),
+        ("replicates = 40", "replicates = 9223372036854775807", "[select] replicates"),
+        ("replicates = 40", "starts = 0", "[select] starts"),
+        ("replicates = 40", "seed = -1", "[select] seed"),
+        ("replicates = 40", "bounds = []", "[select] bounds"),
+        ("replicates = 40", "bounds = [nan]", "[select] bound"),
+        ("bound = 0.05", "bound = -1.0", "[select] bound"),
+        (
+            "tests.studies.selection.dosing:blood_model",
+            "os:system",
+            "no function of a module of yours",
+        ),
+    ):
+        study.write_text(text.replace(old, new))
+        done = run("select", str(study), "--allow-model", "--out", str(tmp_path / "out"))
+        assert done.exit_code == 2, done.stdout
+        assert match in done.stderr
+        assert len(done.stderr.strip().splitlines()) == 1
+        assert not (tmp_path / "out").exists()
+
+
+def test_fisher_of_the_line() -> None:
+    trial = line_trial(0.5)
+    found = fisher_information(line_model(), np.array([2.0, 0, -1]), [trial], 0.25)
+    np.testing.assert_allclose(found.F, 25 * trial.input.T @ trial.input / 0.25, rtol=1e-6)
+    assert free_indices(line_model(), ["b"]) == (1,)

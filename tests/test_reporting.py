@@ -1,0 +1,221 @@
+"""What a run leaves behind: figures, page, result.json, and files whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+
+from impc.errors import OutputError
+from impc.model.plant import Plant, as_plant
+from impc.model.riccati import solve_lqr
+from impc.model.weights import stage_weights
+from impc.reporting.provenance import Provenance, example_provenance
+from impc.reporting.style import journal_style
+from impc.reporting.writer import require_writable, write_files
+from impc.studies.example.cases import CASES, CaseResult, run_case
+from impc.studies.example.figures import example_figures
+from impc.studies.example.page import render_page
+from impc.studies.example.result import result_json
+from impc.studies.example.table import (
+    METHODS,
+    determined_sentences,
+    significant,
+    table_rows,
+    text_table,
+)
+from plants import yalmip_example
+
+
+@pytest.fixture(scope="module")
+def provenance() -> Provenance:
+    return example_provenance("plants:yalmip_example", as_plant(yalmip_example()))
+
+
+@pytest.fixture(scope="module")
+def case_a(provenance: Provenance) -> CaseResult:
+    return run_case(provenance.plant, "A")
+
+
+@pytest.fixture(scope="module")
+def figures(case_a: CaseResult) -> dict[str, bytes]:
+    return example_figures(case_a)
+
+
+@pytest.fixture(scope="module")
+def page(case_a: CaseResult, figures: dict[str, bytes], provenance: Provenance) -> str:
+    return render_page([case_a], figures, provenance)
+
+
+def snapshot(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+# The table
+
+
+def test_the_table_has_the_truth_and_every_method_in_order(case_a: CaseResult) -> None:
+    rows = table_rows(case_a)
+    assert [row.name for row in rows] == list(METHODS)
+    assert rows[0].weights == rows[-1].weights == "1.000 0.000 1.000 / 1"
+    by_name = {row.name: row for row in rows}
+    assert by_name["inverse_lqr_lmi"].weights == "infeasible"
+    assert by_name["feedback_gain"].kept == "no"
+    assert by_name["inverse_mpc"].kept == "yes"
+    assert "-0.000" not in text_table(case_a)
+
+
+def test_sentences_say_what_was_determined_and_what_was_chosen(case_a: CaseResult) -> None:
+    first, *others = determined_sentences(case_a.identifiability)
+    assert "determined 2 of the 3 free directions" in first
+    assert "condition number chose 1" in first
+    assert len(others) == 2
+
+
+@pytest.mark.parametrize(
+    ("value", "text"), [(10.0, "10"), (9.99999999999, "10"), (0.23329, "0.233"), (2e-16, "2e-16")]
+)
+def test_significant(value: float, text: str) -> None:
+    assert significant(value) == text
+
+
+# result.json
+
+
+def test_result_json_holds_the_numbers_of_an_independent_computation(
+    case_a: CaseResult, provenance: Provenance
+) -> None:
+    content = json.loads(result_json([case_a], provenance))
+    case = content["cases"]["A"]
+    assert tuple(case["x0"]) == CASES["A"]
+    A, B = np.array(content["plant"]["A"]), np.array(content["plant"]["B"])
+    x, u = np.array(case["truth"]["x"]), np.array(case["truth"]["u"])
+    assert x.shape == (21, 2)
+    assert u.shape == (20, 1)
+    np.testing.assert_allclose(x[1:], x[:-1] @ A.T + u @ B.T, atol=1e-12)
+    for name, method in case["methods"].items():
+        if method.get("feasible") is False:
+            assert not {"Q", "R", "K", "x", "state_misfit", "residual"} & set(method)
+            continue
+        run = np.array(method["x"])
+        assert method["max_abs_u"] == pytest.approx(np.max(np.abs(method["u"])))
+        if name != "truth":
+            assert method["state_misfit"] == pytest.approx(np.linalg.norm(run - x), abs=1e-12)
+            assert method["simulations"] >= 0
+        if "Q" in method:
+            check_weights(provenance.plant, method)
+
+
+def check_weights(plant: Plant, method: dict[str, Any]) -> None:
+    Q, R = np.array(method["Q"]), np.array(method["R"])
+    np.testing.assert_allclose(solve_lqr(plant, stage_weights(Q, R)).K, method["K"], atol=1e-8)
+    if "residual" in method:
+        distance = np.hypot(np.linalg.norm(Q - np.eye(2)), R[0, 0] - 1)
+        assert method["residual"] == pytest.approx(distance, abs=1e-12)
+
+
+# Figures
+
+
+def test_every_figure_comes_as_png_and_pdf(figures: dict[str, bytes]) -> None:
+    stems = ["figure-3.2", "figure-3.3", "figure-3.4", "terminal-set", "comparison"]
+    assert sorted(figures) == sorted(f"{s}-case-A.{kind}" for s in stems for kind in ("png", "pdf"))
+    for name, content in figures.items():
+        assert content.startswith(b"\x89PNG" if name.endswith("png") else b"%PDF")
+
+
+def test_the_same_case_gives_the_same_bytes(case_a: CaseResult, figures: dict[str, bytes]) -> None:
+    assert example_figures(case_a) == figures
+
+
+def test_the_style_ends_with_its_block() -> None:
+    before = dict(mpl.rcParams)
+    with journal_style():
+        assert dict(mpl.rcParams) != before
+    assert dict(mpl.rcParams) == before
+
+
+# The page
+
+
+def test_the_page_needs_nothing_else(page: str) -> None:
+    text = re.sub(r"data:image/png;base64,[^\"]*", "", page)
+    assert not re.search(r"https?:|//[a-z]|<script|<link|@import|url\(", text)
+    assert all(source.startswith("data:image/png") for source in re.findall(r'src="([^"]*)', page))
+    anchors = re.findall(r'href="#([^"]*)', page)
+    assert anchors
+    assert all(f'id="{anchor}"' in page for anchor in anchors)
+    assert page.count("<img") == page.count('alt="') == 4
+
+
+def test_the_page_says_what_a_reader_must_know(page: str, case_a: CaseResult) -> None:
+    assert "are lost" in page
+    assert "determined 2 of the 3 free directions" in page
+    for row in table_rows(case_a):
+        assert f"<code>{row.name}</code>" in page
+        assert METHODS[row.name].label in page
+    assert "casadi" in page
+    assert "condition weight" in page
+
+
+def test_the_page_escapes_what_it_is_given(
+    case_a: CaseResult, figures: dict[str, bytes], provenance: Provenance
+) -> None:
+    evil = "<script>alert(1)</script>"
+    named = {key.replace("case-A", f"case-{evil}"): value for key, value in figures.items()}
+    text = render_page(
+        [replace(case_a, name=evil, branch=evil)], named, replace(provenance, plant_name=evil)
+    )
+    assert "<script" not in text
+    assert text.count("&lt;script&gt;") >= 3
+
+
+# Writing
+
+
+def test_files_are_written_and_written_over(tmp_path: Path) -> None:
+    folder = tmp_path / "deep" / "er"
+    written = write_files(folder, {"a": b"1", "b": b"2"})
+    assert written == (folder / "a", folder / "b")
+    (folder / "mine").write_bytes(b"kept")
+    write_files(folder, {"b": b"3"})
+    assert snapshot(tmp_path) == {"deep/er/a": b"1", "deep/er/b": b"3", "deep/er/mine": b"kept"}
+    assert os.listdir(tmp_path / "deep") == ["er"]
+
+
+@pytest.mark.parametrize("below", [".", "below", "far/below"])
+def test_a_file_in_the_way_is_told_before_and_after_the_work(tmp_path: Path, below: str) -> None:
+    (tmp_path / "file").write_bytes(b"mine")
+    for attempt in (require_writable, lambda folder: write_files(folder, {"a": b"1"})):
+        with pytest.raises(OutputError, match="is a file") as error:
+            attempt(tmp_path / "file" / below)
+        assert "\n" not in str(error.value)
+    assert snapshot(tmp_path) == {"file": b"mine"}
+
+
+def test_a_failure_half_way_puts_everything_back(tmp_path: Path) -> None:
+    write_files(tmp_path, {"a": b"old"})
+    (tmp_path / "c").mkdir()  # a folder where a file should go
+    with pytest.raises(OutputError, match="cannot be written"):
+        write_files(tmp_path, {"a": b"new", "b": b"new", "c": b"new"})
+    assert snapshot(tmp_path) == {"a": b"old"}
+    assert sorted(os.listdir(tmp_path)) == ["a", "c"]
+
+
+def test_an_interruption_leaves_no_new_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "replace", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        write_files(tmp_path / "new" / "folder", {"a": b"1"})
+    assert os.listdir(tmp_path) == []
