@@ -23,12 +23,12 @@ from impc.arrays import Array
 from impc.assess.covariance import gain_covariance
 from impc.assess.long_run_covariance import residual_noise, white_noise
 from impc.control.closed_loop import require_complete, scenario, simulate
-from impc.control.controller import Controller, mpc_controller
+from impc.control.controller import Controller
 from impc.inverse.gain_search import fit_gain
-from impc.model.bounds import box_bounds
-from impc.model.plant import Plant, as_plant
-from impc.model.recordings import Recording, recording
-from impc.model.weights import stage_weights
+from impc.model.bounds import Bounds
+from impc.model.plant import Plant
+from impc.model.recordings import Recording
+from impc.model.weights import Weights
 from impc.studies.fit.settings import FitSettings
 from impc.studies.fit.subject import fit_problem
 
@@ -44,15 +44,15 @@ def cart(dt: float = 0.05) -> Plant:
     """Position and speed on a falling track: a force commands, a push disturbs."""
     A, B = [[0.0, 1.0], [0.5, -0.3]], [[0.0, 0.0], [1.0, 1.0]]
     system = control.ss(A, B, [[1.0, 0.0]], 0, inputs=["force", "push"], outputs=["position"])
-    return as_plant(control.c2d(system, dt), ["force"])
+    return Plant(control.c2d(system, dt), ["force"])
 
 
 def true_controller() -> Controller:
     """Q = diag(4, 1), R = 1."""
     plant = cart()
-    bounds = box_bounds(plant, u_min=-1, u_max=1)
-    weights = stage_weights(np.diag([4.0, 1.0]), 1)
-    return mpc_controller(plant, weights, bounds, _HORIZON, terminal_set=False)
+    bounds = Bounds(plant, u_min=-1, u_max=1)
+    weights = Weights(np.diag([4.0, 1.0]), 1)
+    return Controller(plant, weights, bounds, _HORIZON, terminal_set=False)
 
 
 def noisy_trial(seed: int, root: float) -> Recording:
@@ -65,7 +65,7 @@ def noisy_trial(seed: int, root: float) -> Recording:
     white = rng.standard_normal((_SAMPLES + 500, 1))
     noise = scipy.signal.lfilter([np.sqrt(1 - root**2)], [1.0, -root], white, axis=0)[500:]
     size = _NOISE * np.sqrt(np.mean(clean**2))
-    return recording(controller.plant, clean + size * noise, push)
+    return Recording(controller.plant, clean + size * noise, push)
 
 
 def covered(seed: int, root: float) -> Array:

@@ -17,7 +17,7 @@ import argparse
 import functools
 import json
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -33,14 +33,15 @@ from impc.assess.bounded_weights import linear_range, weights_set
 from impc.assess.covariance import gain_covariance
 from impc.assess.input_limits import with_limit
 from impc.assess.vaf import centred_vaf
+from impc.checking import replace
 from impc.control.closed_loop import simulate
 from impc.inverse.noisy_fit import FittedController, fit_controller
-from impc.inverse.problem import InverseProblem, controller_for, scenarios
+from impc.inverse.problem import Problem, controller_for, scenarios
 from impc.inverse.residuals import misfit_or_reason
 from impc.inverse.solution_set import gain_fibre
-from impc.model.plant import Plant, as_plant
+from impc.model.plant import Plant
 from impc.model.plant_family import plant_family
-from impc.model.recordings import recording
+from impc.model.recordings import Recording
 from impc.reporting.rendering import plain
 from impc.reporting.writer import write_files
 from impc.studies.fit.settings import FitSettings
@@ -121,11 +122,11 @@ class ConditionResult:
     target: list[float]
 
 
-def condition_problem(condition: Condition) -> InverseProblem:
+def condition_problem(condition: Condition) -> Problem:
     """The inverse problem of a condition: the error starts as recorded, the hand at rest."""
 
     def make(values: Array) -> Plant:
-        return as_plant(cursor_plant(float(values[0]), float(values[1])), ["command"])
+        return Plant(cursor_plant(float(values[0]), float(values[1])), ["command"])
 
     family = plant_family(make, ["delay", "lag"], _NOMINAL)
     plant = make(np.array(_NOMINAL))
@@ -133,7 +134,7 @@ def condition_problem(condition: Condition) -> InverseProblem:
     for target, response in zip(condition.target, condition.response, strict=True):
         error = response - target
         increments = np.append(np.diff(target), 0.0) * RATE
-        trials.append(recording(plant, error, increments, [error[0], *np.zeros(plant.n - 1)]))
+        trials.append(Recording(plant, error, increments, [error[0], *np.zeros(plant.n - 1)]))
     problem = fit_problem(plant, trials, FitSettings(), family)
     return replace(problem, unknown_start=False)
 
@@ -252,9 +253,7 @@ def _parameters(fitted: FittedController) -> tuple[float, float]:
     return float(delay), float(lag)
 
 
-def _cursor(
-    fitted: FittedController, problem: InverseProblem, condition: Condition, index: int
-) -> Array:
+def _cursor(fitted: FittedController, problem: Problem, condition: Condition, index: int) -> Array:
     """Cursor of one trial, simulated from its target."""
     one = replace(fitted.problem, recordings=(problem.recordings[index],))
     known = replace(one, family=None, logarithms=frozen([]))

@@ -13,14 +13,14 @@ import scipy.optimize
 
 import plants
 from experiments.benchmarks.workloads import seat
-from impc.model.plant import as_plant
+from impc.model.plant import Plant
 
 __all__ = ["least_radius"]
 
 
 def least_radius(seed: int, reach: float = 10.0) -> tuple[float, list[float]]:
     """Least spectral radius found, and the four gains that have it."""
-    plant = as_plant(plants.seated_balance_plant(), ["command"])
+    plant = Plant(plants.seated_balance_plant(), ["command"])
     truth = np.abs(np.array(seat(1, 1.0).controller.K)[0, :4])
 
     def radius(scaled: np.ndarray[tuple[int], np.dtype[np.float64]]) -> float:

@@ -15,7 +15,7 @@ import argparse
 import itertools
 import json
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,11 +24,12 @@ from tqdm import tqdm
 
 from experiments.benchmarks.workloads import seat
 from impc.assess.vaf import vaf
+from impc.checking import replace
 from impc.control.closed_loop import simulate
 from impc.inverse.methods import METHODS, estimate_all
 from impc.inverse.problem import controller_for
 from impc.inverse.solution_set import natural_coordinates
-from impc.model.recordings import recording
+from impc.model.recordings import Recording
 from impc.reporting.rendering import plain
 from impc.reporting.style import (
     BLUE,
@@ -52,7 +53,7 @@ if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.control.closed_loop import Scenario
     from impc.inverse.methods import Estimate
-    from impc.inverse.problem import InverseProblem
+    from impc.inverse.problem import Problem
 
 __all__ = ["Cell", "Outcome", "study_cell"]
 
@@ -116,7 +117,7 @@ def study_cell(cell: Cell) -> dict[str, Outcome]:
     share = (100 - cell.ceiling) / cell.ceiling
     size = np.sqrt(share * np.mean(clean.outputs**2, axis=0))
     noisy = clean.outputs + size * rng.standard_normal(clean.outputs.shape)
-    trial = recording(plant, noisy, clean.disturbance)
+    trial = Recording(plant, noisy, clean.disturbance)
     problem = fit_problem(plant, [trial], FitSettings(u_max=cell.limit))
     truth = np.array(work.controller.K)
     judged = replace(work.problem, recordings=(unseen,))
@@ -127,7 +128,7 @@ def study_cell(cell: Cell) -> dict[str, Outcome]:
 
 
 def _judge(
-    name: str, estimate: Estimate, unseen: InverseProblem, drive: Scenario, truth: Array
+    name: str, estimate: Estimate, unseen: Problem, drive: Scenario, truth: Array
 ) -> Outcome:
     if estimate.K is None or estimate.S is None:
         return Outcome(None, None, False, estimate.seconds, estimate.reason)

@@ -11,7 +11,7 @@ plant, all with the true weights.
 from __future__ import annotations
 
 import argparse
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,11 +19,12 @@ from tqdm import tqdm
 
 from experiments.benchmarks.workloads import seat
 from impc.arrays import Array
+from impc.checking import replace
 from impc.control.casadi_controller import build_mpc, solve_mpc
 from impc.control.closed_loop import Scenario, scenario, simulate
 from impc.control.controller import Controller
 from impc.control.nonlinear_controller import build_nonlinear_mpc, simulate_nonlinear
-from impc.model.bounds import box_bounds
+from impc.model.bounds import Bounds
 from plants.integration import runge_kutta_step
 from plants.seated_balance import nonlinear_dynamics
 
@@ -60,7 +61,7 @@ def compare_at(amplitude: float, seconds: float = 10.0) -> Comparison:
     share = amplitude / _TORQUE
     limit = _LIMIT * share
     plant = work.controller.plant
-    bounds = box_bounds(plant, u_min=-limit, u_max=limit)
+    bounds = Bounds(plant, u_min=-limit, u_max=limit)
     controller = replace(work.controller, bounds=bounds)
     step = runge_kutta_step(nonlinear_dynamics(), plant.dt, 2)
     torque = work.drives[0].disturbance * share

@@ -15,10 +15,10 @@ import numpy as np
 
 import plants
 from impc.arrays import Array
-from impc.control.controller import Controller, mpc_controller
-from impc.model.bounds import box_bounds
-from impc.model.plant import as_plant
-from impc.model.weights import stage_weights
+from impc.control.controller import Controller
+from impc.model.bounds import Bounds
+from impc.model.plant import Plant
+from impc.model.weights import Weights
 from impc.studies.protocols import critical_stiffness, torque_amplitude
 from impc.studies.simulated_people import simulate_subject
 
@@ -46,12 +46,12 @@ def subject_peak(stiffness: float, torque: Array, seed: int) -> float:
 
 @cache
 def _controller() -> Controller:
-    plant = as_plant(plants.seated_balance_for(k_r=_LEARNT), ["command"])
+    plant = Plant(plants.seated_balance_for(k_r=_LEARNT), ["command"])
     v = np.array([0.70, 0.65, 0.22, 0.20]) / np.linalg.norm([0.70, 0.65, 0.22, 0.20])
     Q = 1e-2 * np.eye(plant.n)
     Q[:4, :4] = 6e5 * np.outer(v, v) + np.diag([2e4, 2e4, 500, 500])
-    bounds = box_bounds(plant, u_min=-_LIMIT, u_max=_LIMIT)
-    return mpc_controller(plant, stage_weights(Q, 1), bounds, 20, terminal_set=False)
+    bounds = Bounds(plant, u_min=-_LIMIT, u_max=_LIMIT)
+    return Controller(plant, Weights(Q, 1), bounds, 20, terminal_set=False)
 
 
 def main() -> None:

@@ -26,12 +26,12 @@ from tqdm import tqdm
 
 from impc.assess.printed_gain import gain_estimate
 from impc.control.closed_loop import require_complete, scenario, simulate
-from impc.control.controller import Controller, mpc_controller
+from impc.control.controller import Controller
 from impc.inverse.noisy_fit import fit_controller
-from impc.model.bounds import box_bounds
-from impc.model.plant import Plant, as_plant
-from impc.model.recordings import Recording, recording
-from impc.model.weights import stage_weights
+from impc.model.bounds import Bounds
+from impc.model.plant import Plant
+from impc.model.recordings import Recording
+from impc.model.weights import Weights
 from impc.studies.fit.settings import FitSettings
 from impc.studies.fit.subject import fit_problem
 
@@ -97,16 +97,16 @@ def carts(count: int, dt: float = 0.1) -> Plant:
         inputs=[*forces, *(f"push{i + 1}" for i in range(count))],
         outputs=[f"position{i + 1}" for i in range(count)],
     )
-    return as_plant(control.c2d(system, dt), forces)
+    return Plant(control.c2d(system, dt), forces)
 
 
 def regulator(plant: Plant) -> Controller:
     """Prices of 4, 5, ... on positions and 1 on speeds; R is 1 on, .3 beside the diagonal."""
     m = plant.m
     Q = np.diag(np.concatenate([4.0 + np.arange(m), np.ones(plant.n - m)]))
-    weights = stage_weights(Q, 0.7 * np.eye(m) + 0.3)
-    bounds = box_bounds(plant, u_min=-1, u_max=1)
-    return mpc_controller(plant, weights, bounds, _HORIZON, terminal_set=False)
+    weights = Weights(Q, 0.7 * np.eye(m) + 0.3)
+    bounds = Bounds(plant, u_min=-1, u_max=1)
+    return Controller(plant, weights, bounds, _HORIZON, terminal_set=False)
 
 
 def noisy_recording(controller: Controller, seed: int, vaf: float, root: float) -> Recording:
@@ -127,7 +127,7 @@ def with_noise(
     white = rng.standard_normal((samples + _BEFORE, clean.shape[1]))
     noise = scipy.signal.lfilter([np.sqrt(1 - root**2)], [1.0, -root], white, axis=0)[_BEFORE:]
     size = np.sqrt((100 - vaf) / vaf * np.mean(clean**2, axis=0))
-    return recording(plant, clean + size * noise, push)
+    return Recording(plant, clean + size * noise, push)
 
 
 def random_recording(seed: int, inputs: int, vaf: float) -> tuple[Controller, Recording]:
@@ -143,7 +143,7 @@ def random_recording(seed: int, inputs: int, vaf: float) -> tuple[Controller, Re
     B, E = rng.standard_normal((n, inputs)), rng.standard_normal((n, pushes))
     C = rng.standard_normal((outputs, n))
     system = control.ss(A, np.hstack([B, E]), C, 0, 0.1)
-    plant = as_plant(system, system.input_labels[:inputs])
+    plant = Plant(system, system.input_labels[:inputs])
     L = rng.standard_normal((n, n))
     Q = L @ L.T + 0.1 * np.eye(n)
     L = rng.standard_normal((inputs, inputs))
@@ -152,8 +152,8 @@ def random_recording(seed: int, inputs: int, vaf: float) -> tuple[Controller, Re
     drive = scenario(plant, np.zeros(n), disturbance=push)
 
     def controller(limit: Array) -> Controller:
-        bounds = box_bounds(plant, u_min=-limit, u_max=limit)
-        return mpc_controller(plant, stage_weights(Q, R), bounds, 6, terminal_set=False)
+        bounds = Bounds(plant, u_min=-limit, u_max=limit)
+        return Controller(plant, Weights(Q, R), bounds, 6, terminal_set=False)
 
     unlimited = np.abs(simulate(controller(np.full(inputs, 1e6)), drive).u)
     truth = controller(np.quantile(unlimited, 0.95, axis=0))

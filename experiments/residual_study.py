@@ -27,12 +27,12 @@ from tqdm import tqdm
 import plants
 from impc.arrays import Array
 from impc.assess.diagnostics import ResidualDiagnostics, residual_diagnostics
-from impc.control.controller import mpc_controller
+from impc.control.controller import Controller
 from impc.inverse.noisy_fit import FittedController, fit_controller
-from impc.model.bounds import box_bounds
-from impc.model.plant import Plant, as_plant
-from impc.model.recordings import Recording, recording
-from impc.model.weights import Weights, stage_weights
+from impc.model.bounds import Bounds
+from impc.model.plant import Plant
+from impc.model.recordings import Recording
+from impc.model.weights import Weights
 from impc.studies.fit.settings import FitSettings
 from impc.studies.fit.subject import fit_problem
 from impc.studies.simulated_people import simulate_subject
@@ -64,10 +64,10 @@ SUBJECTS = {
 
 def fitted_subject(kind: Kind, seed: int, order: int, horizon: int) -> FittedController:
     """Simulate and fit a subject; `order` is that of the delay's approximant."""
-    plant = as_plant(plants.seated_balance_for(sample_time=0.01, delay_order=order), ["command"])
+    plant = Plant(plants.seated_balance_for(sample_time=0.01, delay_order=order), ["command"])
     weights = _weights(plant)
-    bounds = box_bounds(plant, u_min=-_LIMIT, u_max=_LIMIT)
-    controller = mpc_controller(plant, weights, bounds, horizon, terminal_set=False)
+    bounds = Bounds(plant, u_min=-_LIMIT, u_max=_LIMIT)
+    controller = Controller(plant, weights, bounds, horizon, terminal_set=False)
     step = _linear_step(plant) if kind.linear else _nonlinear_step(order)
     rng = np.random.default_rng([seed, 1])
     trials: list[Recording] = []
@@ -77,7 +77,7 @@ def fitted_subject(kind: Kind, seed: int, order: int, horizon: int) -> FittedCon
             controller, step, torque, rate=100.0, motor=kind.motor, largest=0.5, seed=child
         )
         noise = np.radians(kind.sensor) * _noise(kind.root, run.outputs.shape, rng)
-        trials.append(recording(plant, run.outputs + noise, run.disturbance))
+        trials.append(Recording(plant, run.outputs + noise, run.disturbance))
     settings = FitSettings(horizon=horizon, u_max=_LIMIT)
     return fit_controller(fit_problem(plant, trials, settings), weights)
 
@@ -94,7 +94,7 @@ def _weights(plant: Plant) -> Weights:
     v /= np.linalg.norm(v)
     Q = 1e-2 * np.eye(plant.n)
     Q[:4, :4] = 6e5 * np.outer(v, v) + np.diag([2e4, 2e4, 500, 500])
-    return stage_weights(Q, 1)
+    return Weights(Q, 1)
 
 
 def _linear_step(plant: Plant) -> Any:

@@ -21,13 +21,12 @@ from tqdm import tqdm
 from experiments.benchmarks.workloads import seat
 from impc.assess.printed_gain import gain_estimate
 from impc.inverse.noisy_fit import fit_controller
-from impc.model.recordings import recording
+from impc.model.recordings import Recording
 from impc.studies.fit.settings import FitSettings
 from impc.studies.fit.subject import fit_problem
 
 if TYPE_CHECKING:
     from impc.arrays import Array
-    from impc.model.recordings import Recording
 
 __all__ = ["Subject", "noisy_recordings", "simulated_subject"]
 
@@ -59,7 +58,7 @@ def noisy_recordings(limit: float, seed: int, ceiling: float) -> tuple[Recording
     for trial in work.problem.recordings:
         size = np.sqrt((1 - ceiling) / ceiling * np.mean(trial.outputs**2, axis=0))
         noisy = trial.outputs + size * rng.standard_normal(trial.outputs.shape)
-        trials.append(recording(work.problem.plant, noisy, trial.disturbance))
+        trials.append(Recording(work.problem.plant, noisy, trial.disturbance))
     return tuple(trials)
 
 

@@ -7,7 +7,7 @@ type, pandas' series and frames, numpy's scalars. The samples that a masked arra
 NaN, whatever stands below the mask.
 
     @checked(gain="m n", horizon=1)
-    def gain_controller(plant: Plant, gain: ArrayLike, ..., horizon: int) -> Controller: ...
+    def Controller.from_gain(plant: Plant, gain: ArrayLike, ..., horizon: int) -> Controller: ...
 
 A rule is a shape in the sizes of the plant (n states, m inputs, d disturbances, p outputs; ``*``
 any; ``~`` before it lets infinite and missing entries in), or the least value of a number, or
@@ -37,10 +37,11 @@ if TYPE_CHECKING:
     Kind = Callable[[str, Any], Any]
     Rule = str | float | tuple[float, float]
 
-__all__ = ["Value", "checked"]
+__all__ = ["Value", "checked", "replace"]
 
 P = ParamSpec("P")
 R = TypeVar("R")
+_V = TypeVar("_V")
 
 _SIZES = {"n": "states", "m": "inputs", "d": "disturbances", "p": "outputs"}
 # No array of the package can have more entries, and no count (samples, evaluations) means more.
@@ -80,7 +81,8 @@ def _checked(function: Callable[P, R], rules: dict[str, Rule]) -> Callable[P, R]
     kinds: dict[str, Kind] = {}
     names: list[str] = []  # of those that can be given by position
     for name, parameter in inspect.signature(function).parameters.items():
-        if parameter.kind not in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
+        bound = name in ("self", "cls")
+        if not bound and parameter.kind not in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
             kinds[name] = _kind(str(parameter.annotation))
         if parameter.kind is parameter.POSITIONAL_OR_KEYWORD:
             names.append(name)
@@ -107,11 +109,18 @@ def _checked(function: Callable[P, R], rules: dict[str, Rule]) -> Callable[P, R]
 class Value(Frozen):
     """Base of frozen dataclasses: fields are checked by the same table, arrays made read-only.
 
-    So whenever one is made, by its constructor or by `dataclasses.replace`; copies and what comes
-    out of a pickle were checked, and stay read-only too. `_rules` are the rules of the fields.
+    So whenever one is made, by its constructor or by `replace`; copies and what comes out of a
+    pickle were checked, and stay read-only too. `_rules` are the rules of the fields. A class whose
+    constructor takes other things than its fields ends it with `_fill`.
     """
 
     _rules: ClassVar[Mapping[str, Rule]] = {}
+
+    def _fill(self, **fields: Any) -> None:
+        """Take the fields, all of them, and check them."""
+        for name, value in fields.items():
+            object.__setattr__(self, name, value)
+        Value.__post_init__(self)
 
     def __post_init__(self) -> None:
         sizes: dict[str, int] = {}
@@ -125,6 +134,33 @@ class Value(Frozen):
             found = _sealed(found)
             if found is not value:
                 object.__setattr__(self, name, found)
+
+
+def replace(value: _V, **changes: Any) -> _V:
+    """Return a dataclass with other fields, checked as when it was made.
+
+    `dataclasses.replace` would call the constructor, which in a `Value` may take other things.
+
+    Parameters
+    ----------
+    value : dataclass
+    **changes : object
+        Fields by name.
+
+    Raises
+    ------
+    ImpcError
+        When a field cannot have that value.
+    """
+    if not isinstance(value, Value):
+        return dataclasses.replace(value, **changes)  # type: ignore[type-var]
+    fields = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}  # type: ignore[arg-type]
+    unknown = sorted(changes.keys() - fields.keys())
+    if unknown:
+        raise TypeError(f"{type(value).__name__} has no field {', '.join(unknown)}")
+    made = object.__new__(type(value))
+    made._fill(**fields | changes)
+    return made
 
 
 def _require_sizes(name: str, value: Any, sizes: dict[str, int]) -> None:
@@ -294,18 +330,18 @@ def _described(value: object) -> str:
 
 # Who makes a value, for the remedy; and where its class is.
 _VALUES = {
-    "Plant": ("impc.model.plant", "make it with as_plant"),
-    "Bounds": ("impc.model.bounds", "make it with box_bounds"),
+    "Plant": ("impc.model.plant", "make it with Plant(system)"),
+    "Bounds": ("impc.model.bounds", "make it with Bounds(plant, ...)"),
     "BoundRows": ("impc.model.bounds", "make it with bound_rows"),
-    "Weights": ("impc.model.weights", "make it with stage_weights"),
-    "Recording": ("impc.model.recordings", "make it with recording"),
+    "Weights": ("impc.model.weights", "make it with Weights(Q, R)"),
+    "Recording": ("impc.model.recordings", "make it with Recording(plant, ...)"),
     "Label": ("impc.model.recordings", "make it with Label"),
-    "Controller": ("impc.control.controller", "make it with mpc_controller or gain_controller"),
+    "Controller": ("impc.control.controller", "make it with Controller(plant, ...)"),
     "TerminalSet": ("impc.control.terminal_set", "make it with maximal_invariant_set"),
     "Scenario": ("impc.control.closed_loop", "make it with scenario"),
     "Simulation": ("impc.control.closed_loop", "make it with simulate"),
     "Directions": ("impc.control.constraint_rows", "make it with directions"),
-    "InverseProblem": ("impc.inverse.problem", "make it with inverse_problem"),
+    "Problem": ("impc.inverse.problem", "make it with Problem(plant, ...)"),
     "PlantFamily": ("impc.model.plant_family", "make it with plant_family"),
     "PlantSource": ("impc.files.plant_sources", "make it with plant_source"),
     "LqrSolution": ("impc.model.riccati", "make it with solve_lqr"),

@@ -5,7 +5,7 @@ Body: `plants.anthropometry`, after de Leva 1996. Plant: `plants.seated_balance`
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import fields
 from typing import Any
 
 import casadi as ca
@@ -16,6 +16,9 @@ from plants.seated_balance import nonlinear_dynamics, seated_balance_plant
 from plants.seated_parameters import SeatedBalanceParameters
 
 __all__ = ["seated_balance_for", "seated_balance_step_for", "seated_parameters_for"]
+
+
+from impc.checking import replace
 
 
 def seated_parameters_for(

@@ -11,16 +11,13 @@ import pytest
 from hypothesis import settings
 from matplotlib.figure import Figure
 
-from impc.model.bounds import box_bounds
-from impc.model.plant import as_plant
+from impc.model.bounds import Bounds
+from impc.model.plant import Plant
 from tests.labelled_axes import require_labels
 from tests.support import SEARCH
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-
-    from impc.model.bounds import Bounds
-    from impc.model.plant import Plant
 
 
 # The same examples on every machine and no clock; `make search` draws new ones.
@@ -57,10 +54,10 @@ def blank_figures(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def example_plant() -> Plant:
     """The example of section 3.4: unstable, two states, one input."""
-    return as_plant(control.ss([[2, -1], [1, 0.2]], [[1], [0]], np.eye(2), 0, True))
+    return Plant(control.ss([[2, -1], [1, 0.2]], [[1], [0]], np.eye(2), 0, True))
 
 
 @pytest.fixture
 def example_bounds(example_plant: Plant) -> Bounds:
     """|u| <= 1."""
-    return box_bounds(example_plant, u_min=-1, u_max=1)
+    return Bounds(example_plant, u_min=-1, u_max=1)

@@ -8,21 +8,14 @@ from typing import Any
 import numpy as np
 from scipy.optimize import linprog
 
-from impc.control.closed_loop import (
-    Scenario,
-    Simulation,
-    Status,
-    prepare_loop,
-    scenario,
-    simulate,
-)
+from impc.control.closed_loop import Scenario, Simulation, Status, prepare_loop, scenario, simulate
 from impc.control.compiled_loop import solve_dual
 from impc.control.constraint_rows import build_rows, directions
-from impc.control.controller import Controller, mpc_controller
+from impc.control.controller import Controller
 from impc.control.saturated import solve_saturated
 from impc.errors import SolverError
-from impc.model.bounds import bound_rows, box_bounds
-from impc.model.weights import Weights, stage_weights
+from impc.model.bounds import Bounds, bound_rows
+from impc.model.weights import Weights
 from tests.exact_mpc import ExactProgram, exact
 from tests.support import random_plant, random_weights
 
@@ -46,15 +39,15 @@ def hard_case(seed: int, largest: int = 60) -> HardCase:
     horizon = int(rng.integers(1, largest + 1))
     plant = random_plant(rng, n, m, rng.uniform(0.7, 2.0))
     price = 10 ** rng.uniform(-2, 2)
-    weights = stage_weights(random_weights(rng, n), price * random_weights(rng, m))
+    weights = Weights(random_weights(rng, n), price * random_weights(rng, m))
     x_max = rng.uniform(1, 4) if rng.random() < 0.4 else np.inf
     low, high = -rng.uniform(0.3, 3, size=m), rng.uniform(0.3, 3, size=m)
-    bounds = box_bounds(plant, u_min=low, u_max=high, x_min=-x_max, x_max=x_max)
+    bounds = Bounds(plant, u_min=low, u_max=high, x_min=-x_max, x_max=x_max)
     with_set = bool(rng.random() < 0.5)
     try:
-        controller = mpc_controller(plant, weights, bounds, horizon, terminal_set=with_set)
+        controller = Controller(plant, weights, bounds, horizon, terminal_set=with_set)
     except SolverError:  # a terminal set of too many steps: without one
-        controller = mpc_controller(plant, weights, bounds, horizon, terminal_set=False)
+        controller = Controller(plant, weights, bounds, horizon, terminal_set=False)
     direction = rng.normal(size=n)
     size = 10 ** rng.uniform(-1, 2)
     if rng.random() < 0.5:

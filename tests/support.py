@@ -11,12 +11,12 @@ import scipy.optimize
 from hypothesis import settings
 
 from impc.control.closed_loop import scenario, simulate
-from impc.control.controller import Controller, mpc_controller
-from impc.inverse.problem import InverseProblem, inverse_problem
-from impc.model.bounds import box_bounds
-from impc.model.plant import Plant, as_plant
-from impc.model.recordings import recording
-from impc.model.weights import Weights, stage_weights
+from impc.control.controller import Controller
+from impc.inverse.problem import Problem
+from impc.model.bounds import Bounds
+from impc.model.plant import Plant
+from impc.model.recordings import Recording
+from impc.model.weights import Weights
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -72,7 +72,7 @@ def random_plant(rng: np.random.Generator, n: int, m: int, radius: float, d: int
         True,
         inputs=[*names, *(f"d{i}" for i in range(d))],
     )
-    return as_plant(system, names)
+    return Plant(system, names)
 
 
 def random_weights(rng: np.random.Generator, size: int) -> np.ndarray:
@@ -89,18 +89,18 @@ def easier_seat(configuration: str) -> str:
 
 def saturated_problem(
     rng: np.random.Generator, n: int, m: int
-) -> tuple[Weights, Controller, InverseProblem]:
+) -> tuple[Weights, Controller, Problem]:
     """An exact recording of n states and m inputs, 2 to 30 % of which stand at their bounds."""
     while True:
         plant = random_plant(rng, n, m, rng.uniform(0.8, 1.1), d=1)
-        weights = stage_weights(random_weights(rng, n), random_weights(rng, m))
-        bounds = box_bounds(plant, u_min=-1, u_max=1)
-        controller = mpc_controller(plant, weights, bounds, 5, terminal_set=False)
+        weights = Weights(random_weights(rng, n), random_weights(rng, m))
+        bounds = Bounds(plant, u_min=-1, u_max=1)
+        controller = Controller(plant, weights, bounds, 5, terminal_set=False)
         push = rng.choice([-1.0, 0.0, 1.0], size=40).repeat(5)
         for size in 10 * 0.8 ** np.arange(40):
             run = simulate(controller, scenario(plant, np.zeros(n), disturbance=size * push))
             saturated = np.mean(np.abs(np.abs(run.u) - 1) < 1e-9)
             if run.complete and 0.02 < saturated < 0.3:
-                trial = recording(plant, run.x, np.append(size * push, 0))
-                problem = inverse_problem(plant, bounds, 5, (trial,), terminal_set=False)
+                trial = Recording(plant, run.x, np.append(size * push, 0))
+                problem = Problem(plant, bounds, 5, (trial,), terminal_set=False)
                 return weights, controller, problem

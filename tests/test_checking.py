@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import pickle
-from dataclasses import fields, replace
+from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
 import control
@@ -13,14 +13,14 @@ import pandas as pd
 import pytest
 
 from impc.arrays import Frozen, as_numbers
-from impc.checking import checked
+from impc.checking import checked, replace
 from impc.control.closed_loop import scenario, simulate
-from impc.control.controller import mpc_controller
+from impc.control.controller import Controller
 from impc.errors import DataError, ImpcError, InputError
-from impc.model.bounds import box_bounds
-from impc.model.plant import Plant, as_plant
-from impc.model.recordings import recording
-from impc.model.weights import Weights, stage_weights
+from impc.model.bounds import Bounds
+from impc.model.plant import Plant
+from impc.model.recordings import Recording
+from impc.model.weights import Weights
 from tests.wrong_arguments import calls, values, wrong_values
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 # Calls of more than half a second: numbers that mean something are left out.
 SLOW = ("infer_weights", "inverse_mpc_reduced", "starting_point", "fit_gain", "fit_controller")
-PLANT = as_plant(control.ss([[2, -1], [1, 0.2]], [[1], [0]], np.eye(2), 0, True))
+PLANT = Plant(control.ss([[2, -1], [1, 0.2]], [[1], [0]], np.eye(2), 0, True))
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # overflow of what is 1e308
@@ -70,19 +70,19 @@ def test_right_arguments_are_right() -> None:
 
 
 def test_an_error_names_its_argument() -> None:
-    box = box_bounds(PLANT, u_max=1)
-    pair = stage_weights(np.eye(2), 1)
+    box = Bounds(PLANT, u_max=1)
+    pair = Weights(np.eye(2), 1)
     for call, words in (
-        (lambda: mpc_controller(None, pair, box, 4), "plant: expected a Plant, got None; make it"),  # type: ignore[arg-type]
-        (lambda: mpc_controller(PLANT, box, box, 4), "weights: expected a Weights, got Bounds"),  # type: ignore[arg-type]
-        (lambda: mpc_controller(PLANT, pair, box, 4.0), "horizon: got 4.0; give a whole number"),  # type: ignore[arg-type]
-        (lambda: mpc_controller(PLANT, pair, box, 5001), "horizon: got 5001; give a whole number"),
-        (lambda: mpc_controller(PLANT, pair, box, 2**63), "horizon: is beyond 2147483647"),
-        (lambda: mpc_controller(PLANT, stage_weights(np.eye(3), 1), box, 4),
+        (lambda: Controller(None, pair, box, 4), "plant: expected a Plant, got None; make it"),  # type: ignore[arg-type]
+        (lambda: Controller(PLANT, box, box, 4), "weights: expected a Weights, got Bounds"),  # type: ignore[arg-type]
+        (lambda: Controller(PLANT, pair, box, 4.0), "horizon: got 4.0; give a whole number"),  # type: ignore[arg-type]
+        (lambda: Controller(PLANT, pair, box, 5001), "horizon: got 5001; give a whole number"),
+        (lambda: Controller(PLANT, pair, box, 2**63), "horizon: is beyond 2147483647"),
+        (lambda: Controller(PLANT, Weights(np.eye(3), 1), box, 4),
          "weights: has 3 states, what stands before it 2; give values of one plant"),
-        (lambda: stage_weights([[1, 2], [3]], 1), "Q: expected real numbers, got list"),
-        (lambda: stage_weights(np.eye(2) * 1j, 1), "Q: expected real numbers, got an array"),
-        (lambda: box_bounds(PLANT, u_max=["1"]), "u_max: expected real numbers, got an"),
+        (lambda: Weights([[1, 2], [3]], 1), "Q: expected real numbers, got list"),
+        (lambda: Weights(np.eye(2) * 1j, 1), "Q: expected real numbers, got an array"),
+        (lambda: Bounds(PLANT, u_max=["1"]), "u_max: expected real numbers, got an"),
     ):  # fmt: skip
         with pytest.raises(InputError) as caught:
             call()
@@ -91,16 +91,16 @@ def test_an_error_names_its_argument() -> None:
 
 def test_what_means_the_same_is_welcome() -> None:
     outputs = np.round(np.random.default_rng(0).normal(size=(20, 2)), 2).astype(np.float32)
-    expected = recording(PLANT, outputs.astype(float)).outputs
+    expected = Recording(PLANT, outputs.astype(float)).outputs
     frame = pd.DataFrame(outputs, columns=["x", "y"])
     for given in (outputs, outputs.tolist(), frame, np.ma.masked_array(outputs), tuple(outputs)):
-        np.testing.assert_array_equal(recording(PLANT, given).outputs, expected)
-    np.testing.assert_array_equal(recording(PLANT, frame.astype("Float32")).outputs, expected)
-    one = mpc_controller(PLANT, stage_weights(np.eye(2), 1), box_bounds(PLANT, u_max=[1]), 4)
-    other = mpc_controller(
+        np.testing.assert_array_equal(Recording(PLANT, given).outputs, expected)
+    np.testing.assert_array_equal(Recording(PLANT, frame.astype("Float32")).outputs, expected)
+    one = Controller(PLANT, Weights(np.eye(2), 1), Bounds(PLANT, u_max=[1]), 4)
+    other = Controller(
         PLANT,
-        stage_weights(pd.DataFrame(np.eye(2, dtype=int)), np.float32(1)),
-        box_bounds(PLANT, u_max=pd.Series([1], dtype="Int64")),
+        Weights(pd.DataFrame(np.eye(2, dtype=int)), np.float32(1)),
+        Bounds(PLANT, u_max=pd.Series([1], dtype="Int64")),
         np.int8(4),  # type: ignore[arg-type]
         terminal_set=np.bool_(True),  # type: ignore[arg-type]
     )
@@ -115,7 +115,7 @@ def test_masked_samples_are_missing_not_data() -> None:
     outputs[7, 1] = 1e6
     outputs[7, 1] = np.ma.masked
     with pytest.raises(DataError, match=r"1 of 40 entries are NaN or infinite.*\(7, 1\)"):
-        recording(PLANT, outputs)
+        Recording(PLANT, outputs)
     with pytest.raises(DataError, match="NaN or infinite"):
         scenario(PLANT, np.ma.masked_array([1.0, 2.0], mask=[False, True]), 10)
     np.testing.assert_array_equal(
@@ -158,7 +158,7 @@ def test_arrays_stay_read_only_in_copies_and_pickles(name: str) -> None:
 
 def test_a_value_made_by_hand_is_checked_and_not_the_callers() -> None:
     Q = np.eye(2)
-    made = Weights(Q, [[1]])  # type: ignore[arg-type]
+    made = Weights(Q, [[1]])
     Q[0, 0] = 5.0
     assert made.Q[0, 0] == 1.0
     assert made.R.dtype == np.float64

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import re
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +12,11 @@ import matplotlib as mpl
 import numpy as np
 import pytest
 
+from impc.checking import replace
 from impc.errors import OutputError
-from impc.model.plant import Plant, as_plant
+from impc.model.plant import Plant
 from impc.model.riccati import solve_lqr
-from impc.model.weights import stage_weights
+from impc.model.weights import Weights
 from impc.reporting.provenance import Provenance, example_provenance
 from impc.reporting.style import journal_style
 from impc.reporting.writer import require_writable, write_files
@@ -36,7 +36,7 @@ from plants import yalmip_example
 
 @pytest.fixture(scope="module")
 def provenance() -> Provenance:
-    return example_provenance("plants:yalmip_example", as_plant(yalmip_example()))
+    return example_provenance("plants:yalmip_example", Plant(yalmip_example()))
 
 
 @pytest.fixture(scope="module")
@@ -115,7 +115,7 @@ def test_result_json_holds_the_numbers_of_an_independent_computation(
 
 def check_weights(plant: Plant, method: dict[str, Any]) -> None:
     Q, R = np.array(method["Q"]), np.array(method["R"])
-    np.testing.assert_allclose(solve_lqr(plant, stage_weights(Q, R)).K, method["K"], atol=1e-8)
+    np.testing.assert_allclose(solve_lqr(plant, Weights(Q, R)).K, method["K"], atol=1e-8)
     if "residual" in method:
         distance = np.hypot(np.linalg.norm(Q - np.eye(2)), R[0, 0] - 1)
         assert method["residual"] == pytest.approx(distance, abs=1e-12)

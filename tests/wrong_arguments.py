@@ -14,6 +14,7 @@ import scipy.sparse
 from impc.assess import bounded_weights as weights_set
 from impc.assess import identified_directions as identifiability
 from impc.assess import vaf as agreement
+from impc.checking import replace
 from impc.control import casadi_controller as mpc
 from impc.control import closed_loop, controller, terminal_set
 from impc.files import plant_sources as plant_source
@@ -42,14 +43,14 @@ def values() -> dict[str, Any]:
     system = control.ss(
         [[1.1, 0.4], [0.0, 0.8]], [[0.2, 0.1, 0.3], [1, 0.5, 0]], np.eye(2), 0, True
     )
-    two = plant.as_plant(system, ["u[0]", "u[1]"])
-    box = bounds.box_bounds(two, u_min=-1, u_max=1)
-    pair = weights.stage_weights(np.diag([2.0, 1.0]), np.diag([1.0, 3.0]))
-    law = controller.mpc_controller(two, pair, box, 4)
+    two = plant.Plant(system, ["u[0]", "u[1]"])
+    box = bounds.Bounds(two, u_min=-1, u_max=1)
+    pair = weights.Weights(np.diag([2.0, 1.0]), np.diag([1.0, 3.0]))
+    law = controller.Controller(two, pair, box, 4)
     drive = closed_loop.scenario(two, [0.3, -0.2], disturbance=0.1 * np.sin(np.arange(30.0)))
     run = closed_loop.simulate(law, drive)
-    trial = recording.recording(two, run.x, np.append(drive.disturbance, [[0.0]], axis=0))
-    problem = inverse_problem.inverse_problem(two, box, 4, (trial,))
+    trial = recording.Recording(two, run.x, np.append(drive.disturbance, [[0.0]], axis=0))
+    problem = inverse_problem.Problem(two, box, 4, (trial,))
     solution = lqr.solve_lqr(two, pair)
     fibre = gain_fibre.gain_fibre(two, solution.K)
     return {
@@ -129,8 +130,13 @@ def wrong_values() -> dict[str, Any]:
     }
 
 
-def fields(kind: type) -> list[str]:
-    return [field.name for field in dataclasses.fields(kind)]
+def changed(value: Any) -> Call:
+    """A value with its own fields, as `replace` takes them."""
+
+    def change(**fields: Any) -> Any:
+        return replace(value, **fields)
+
+    return change, {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
 
 
 def calls() -> list[Call]:
@@ -143,21 +149,21 @@ def calls() -> list[Call]:
     about = {"plant": v["plant"], "gain": K}
     limits: dict[str, Any] = {"plant": v["plant"], "weights": v["weights"], "bounds": v["bounds"]}
     return [
-        (plant.as_plant, {"system": v["system"], "controls": ["u[0]", "u[1]"]}),
+        (plant.Plant, {"system": v["system"], "controls": ["u[0]", "u[1]"]}),
         (plant.change_coordinates, {"plant": v["plant"], "T": states, "G": states}),
         (
-            bounds.box_bounds,
+            bounds.Bounds,
             {"plant": v["plant"], "x_min": -size, "x_max": 9, "u_min": -1, "u_max": size},
         ),
         (bounds.bound_rows, {"bounds": v["bounds"], "plant": v["plant"]}),
-        (weights.stage_weights, {"Q": states, "R": states}),
+        (weights.Weights, {"Q": states, "R": states}),
         (weights.condition_number, {"weights": v["weights"]}),
         (weights.normalised, {"weights": v["weights"]}),
         (weights.residual, {"estimate": v["weights"], "truth": v["weights"]}),
         (weights.cholesky_parameters, {"weights": v["weights"]}),
         (weights.weights_from_parameters, {"parameters": np.ones(5), "n": 2, "m": 2}),
         (
-            recording.recording,
+            recording.Recording,
             {
                 "plant": v["plant"],
                 "outputs": trial.outputs,
@@ -185,11 +191,11 @@ def calls() -> list[Call]:
         (terminal_set.invariance_violation, {"terminal": v["terminal"]}),
         (terminal_set.maximality_violation, {"terminal": v["terminal"]}),
         (
-            controller.mpc_controller,
+            controller.Controller,
             {**limits, "horizon": 4, "terminal_set": True, "softening": 1e6},
         ),
         (
-            controller.gain_controller,
+            controller.Controller.from_gain,
             {
                 **about,
                 "bounds": v["bounds"],
@@ -211,7 +217,7 @@ def calls() -> list[Call]:
             {"controller": v["controller"], "simulation": v["simulation"]},
         ),
         (
-            inverse_problem.inverse_problem,
+            inverse_problem.Problem,
             {
                 "plant": v["plant"],
                 "bounds": v["bounds"],
@@ -224,7 +230,6 @@ def calls() -> list[Call]:
                 "family": v["family"],
             },
         ),
-        (inverse_problem.without_bounds, problem),
         (gain_fibre.gain_fibre, {**about, "metric": S}),
         (equivalent_weights.weights_margin, {"fibre": v["fibre"]}),
         (equivalent_weights.least_condition_weights, {"fibre": v["fibre"]}),
@@ -275,18 +280,12 @@ def calls() -> list[Call]:
         (plant_family.plant_family, {"make": len, "names": ["mass"], "nominal": [1.0]}),
         (plant_family.plant_at, {"family": v["family"], "logarithms": np.zeros(1)}),
         (units.si_unit, {"written": "deg"}),
-        (plant.Plant, {name: getattr(v["plant"], name) for name in fields(plant.Plant)}),
-        (bounds.Bounds, {name: getattr(v["bounds"], name) for name in fields(bounds.Bounds)}),
+        changed(v["plant"]),
+        changed(v["bounds"]),
         (weights.Weights, {"Q": states, "R": states}),
-        (recording.Recording, {name: getattr(trial, name) for name in fields(recording.Recording)}),
+        changed(trial),
         (recording.Label, {"subject": "a", "visit": "b", "condition": "c", "trial": "d"}),
         (closed_loop.Scenario, {"x0": size, "disturbance": np.zeros((9, 1))}),
-        (
-            controller.Controller,
-            {name: getattr(v["controller"], name) for name in fields(controller.Controller)},
-        ),
-        (
-            inverse_problem.InverseProblem,
-            {name: getattr(v["problem"], name) for name in fields(inverse_problem.InverseProblem)},
-        ),
+        changed(v["controller"]),
+        changed(v["problem"]),
     ]

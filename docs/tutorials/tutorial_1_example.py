@@ -21,16 +21,16 @@ show("example/comparison-case-A.png")
 # The same in Python, one step at a time. The plant is any discrete ``control.StateSpace``.
 import numpy as np
 
-from impc.model.bounds import box_bounds
+from impc.model.bounds import Bounds
 from impc.control.closed_loop import scenario, simulate
-from impc.control.controller import mpc_controller
-from impc.model.plant import as_plant
-from impc.model.weights import stage_weights
+from impc.control.controller import Controller
+from impc.model.plant import Plant
+from impc.model.weights import Weights
 from plants import yalmip_example
 
-plant = as_plant(yalmip_example())
-bounds = box_bounds(plant, u_min=-1, u_max=1)
-truth = mpc_controller(plant, stage_weights(np.eye(2), 1), bounds, horizon=3)
+plant = Plant(yalmip_example())
+bounds = Bounds(plant, u_min=-1, u_max=1)
+truth = Controller(plant, Weights(np.eye(2), 1), bounds, horizon=3)
 recorded = simulate(truth, scenario(plant, x0=[1, 3], steps=20))
 print("steps at the bound:", int(np.sum(np.abs(recorded.u) > 1 - 1e-9)))
 
@@ -39,10 +39,10 @@ print("steps at the bound:", int(np.sum(np.abs(recorded.u) > 1 - 1e-9)))
 # weights.
 from impc.assess.identified_directions import identifiability
 from impc.inverse.direct_and_reduced import infer_weights
-from impc.inverse.problem import inverse_problem
-from impc.model.recordings import recording
+from impc.inverse.problem import Problem
+from impc.model.recordings import Recording
 
-problem = inverse_problem(plant, bounds, 3, (recording(plant, recorded.x),))
+problem = Problem(plant, bounds, 3, (Recording(plant, recorded.x),))
 weights = infer_weights(problem).fit.weights
 print("Q =", np.round(weights.Q, 6).tolist(), " R =", np.round(weights.R, 6).tolist())
 

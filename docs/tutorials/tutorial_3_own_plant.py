@@ -49,16 +49,16 @@ from terminal import RESULTS
 sys.path.insert(0, str(RESULTS))
 from stick import stick
 
-from impc.model.bounds import box_bounds
+from impc.model.bounds import Bounds
 from impc.control.closed_loop import scenario, simulate
-from impc.control.controller import mpc_controller
-from impc.model.plant import as_plant
-from impc.model.weights import stage_weights
+from impc.control.controller import Controller
+from impc.model.plant import Plant
+from impc.model.weights import Weights
 
-plant = as_plant(stick(), controls=["acceleration"])
-bounds = box_bounds(plant, u_min=-3, u_max=3)
-person = mpc_controller(
-    plant, stage_weights(np.diag([40, 1, 10, 1]), 0.1), bounds, horizon=15, terminal_set=False
+plant = Plant(stick(), controls=["acceleration"])
+bounds = Bounds(plant, u_min=-3, u_max=3)
+person = Controller(
+    plant, Weights(np.diag([40, 1, 10, 1]), 0.1), bounds, horizon=15, terminal_set=False
 )
 rng = np.random.default_rng(1)
 for trial in (1, 2):

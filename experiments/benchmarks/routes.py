@@ -10,7 +10,7 @@ from experiments.benchmarks.table import Row
 from experiments.benchmarks.upper_level import Route, prox_linear, smooth_surrogate
 from experiments.benchmarks.workloads import example, seat
 from impc.inverse.direct_and_reduced import starting_point
-from impc.model.weights import stage_weights
+from impc.model.weights import Weights
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -23,7 +23,7 @@ def route_rows(_: int, __: Path) -> list[Row]:
     short, person = example(), seat()
     cases = {
         "W1 from the Table 3.1 start": (short, starting_point(short.problem).weights),
-        "W1 from diag(2, 0.2)": (short, stage_weights(np.diag([2.0, 0.2]), 1)),
+        "W1 from diag(2, 0.2)": (short, Weights(np.diag([2.0, 0.2]), 1)),
         "W2 from the Table 3.1 start": (person, starting_point(person.problem).weights),
     }
     rows = []

@@ -22,7 +22,7 @@ from impc.model.weights import cholesky_parameters, condition_number, weights_fr
 
 if TYPE_CHECKING:
     from impc.arrays import Array
-    from impc.inverse.problem import InverseProblem
+    from impc.inverse.problem import Problem
     from impc.model.weights import Weights
 
 __all__ = ["Route", "prox_linear", "smooth_surrogate"]
@@ -38,14 +38,14 @@ class Route:
     seconds: float
 
 
-def prox_linear(problem: InverseProblem, start: Weights) -> Route:
+def prox_linear(problem: Problem, start: Weights) -> Route:
     """The package's own route."""
     begin = time.perf_counter()
     fit = inverse_mpc(problem, start)
     return Route(fit.weights, fit.objective, fit.evaluations, time.perf_counter() - begin)
 
 
-def smooth_surrogate(problem: InverseProblem, start: Weights) -> Route:
+def smooth_surrogate(problem: Problem, start: Weights) -> Route:
     """L-BFGS with continuation on the surrogate of the module's text."""
     begin = time.perf_counter()
     plant = problem.plant
@@ -68,7 +68,7 @@ def smooth_surrogate(problem: InverseProblem, start: Weights) -> Route:
 
 
 def _surrogate(
-    parameters: Array, problem: InverseProblem, power: int, softness: float
+    parameters: Array, problem: Problem, power: int, softness: float
 ) -> tuple[float, Array]:
     plant = problem.plant
     n, m = plant.n, plant.m

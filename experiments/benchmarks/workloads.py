@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import control
 import numpy as np
 
 import plants
+from impc.checking import replace
 from impc.control.closed_loop import Scenario, require_complete, scenario, simulate
-from impc.control.controller import Controller, mpc_controller
-from impc.inverse.problem import InverseProblem, inverse_problem
-from impc.model.bounds import box_bounds
-from impc.model.plant import Plant, as_plant
-from impc.model.recordings import recording
-from impc.model.weights import Weights, stage_weights
+from impc.control.controller import Controller
+from impc.inverse.problem import Problem
+from impc.model.bounds import Bounds
+from impc.model.plant import Plant
+from impc.model.recordings import Recording
+from impc.model.weights import Weights
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -33,15 +34,15 @@ class Workload:
     weights: Weights
     controller: Controller
     drives: tuple[Scenario, ...]
-    problem: InverseProblem
+    problem: Problem
 
 
 def example() -> Workload:
     """W1: the example of section 3.4, case A."""
-    plant = as_plant(plants.yalmip_example())
-    bounds = box_bounds(plant, u_min=-1, u_max=1)
-    weights = stage_weights(np.eye(2), 1)
-    controller = mpc_controller(plant, weights, bounds, 3)
+    plant = Plant(plants.yalmip_example())
+    bounds = Bounds(plant, u_min=-1, u_max=1)
+    weights = Weights(np.eye(2), 1)
+    controller = Controller(plant, weights, bounds, 3)
     return _record(weights, controller, [scenario(plant, [1, 3], 20)], plant, terminal_set=True)
 
 
@@ -51,13 +52,13 @@ def seat(trials: int = 1, seconds: float = 30.0, limit: float = 6.0) -> Workload
     The weights are the "true" intent of the reference, without weight on delay and muscle states
     but 1e-2. Trials differ in the phase of the torque.
     """
-    plant = as_plant(plants.seated_balance_plant(), ["command"])
+    plant = Plant(plants.seated_balance_plant(), ["command"])
     v = _DIRECTION / np.linalg.norm(_DIRECTION)
     Q = 1e-2 * np.eye(plant.n)
     Q[:4, :4] = 6e5 * np.outer(v, v) + np.diag([2e4, 2e4, 500, 500])
-    weights = stage_weights(Q, 1)
-    bounds = box_bounds(plant, u_min=-limit, u_max=limit)
-    controller = mpc_controller(plant, weights, bounds, 20, terminal_set=False)
+    weights = Weights(Q, 1)
+    bounds = Bounds(plant, u_min=-limit, u_max=limit)
+    controller = Controller(plant, weights, bounds, 20, terminal_set=False)
     torques = [
         plants.ternary_torque(duration=seconds, rate=_RATE, seed=None if k == 0 else k)
         for k in range(trials)
@@ -89,15 +90,15 @@ def chain_of_masses(states: int, steps: int = 3000, seed: int = 0) -> Workload:
     B = np.zeros((states, 2))
     B[masses, 0] = B[-1, 1] = 1.0
     system = control.c2d(control.ss(A, B, np.eye(states), 0, inputs=["force", "push"]), 1 / _RATE)
-    plant = as_plant(system, ["force"])
-    weights = stage_weights(np.eye(states), 1e-2)
+    plant = Plant(system, ["force"])
+    weights = Weights(np.eye(states), 1e-2)
     push = np.random.default_rng(seed).choice([-1.0, 0.0, 1.0], size=steps // 25 + 1)
-    controller = mpc_controller(plant, weights, box_bounds(plant), 20, terminal_set=False)
+    controller = Controller(plant, weights, Bounds(plant), 20, terminal_set=False)
     drive = scenario(plant, np.zeros(states), disturbance=np.repeat(push, 25)[:steps])
     # A limit that about one sample in ten reaches.
     free = require_complete(controller, simulate(controller, drive))
     limit = float(np.quantile(np.abs(free.u), 0.9))
-    bounds = box_bounds(plant, u_min=-limit, u_max=limit)
+    bounds = Bounds(plant, u_min=-limit, u_max=limit)
     return _record(weights, replace(controller, bounds=bounds), [drive], plant, terminal_set=False)
 
 
@@ -113,8 +114,8 @@ def _record(
     for drive in drives:
         run = require_complete(controller, simulate(controller, drive))
         disturbance = np.vstack([drive.disturbance, np.zeros((1, plant.E.shape[1]))])
-        recordings.append(recording(plant, run.x @ plant.C.T, disturbance, x0=drive.x0))
-    problem = inverse_problem(
+        recordings.append(Recording(plant, run.x @ plant.C.T, disturbance, x0=drive.x0))
+    problem = Problem(
         plant,
         controller.bounds,
         controller.horizon,

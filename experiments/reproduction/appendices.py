@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,6 +10,7 @@ import numpy as np
 import plants
 from experiments.reproduction.entry import Entry, Verdict, agrees
 from experiments.selection_claims import FIM_SUBSET, mean_subject
+from impc.checking import replace
 from impc.studies.selection.estimation import estimate, free_indices
 from impc.studies.selection.fisher import fisher_information
 from impc.studies.selection.lasso import lasso_of_size

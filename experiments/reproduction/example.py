@@ -9,26 +9,23 @@ import numpy as np
 from experiments.reproduction.entry import Entry, Verdict, agrees, kind
 from impc.control.casadi_controller import build_mpc, simulate_mpc
 from impc.control.closed_loop import scenario, simulate
-from impc.control.controller import mpc_controller
+from impc.control.controller import Controller
 from impc.control.terminal_set import invariance_violation, maximal_invariant_set
 from impc.errors import InputError
 from impc.inverse.direct_and_reduced import infer_weights, inverse_mpc
-from impc.inverse.problem import inverse_problem
-from impc.model.bounds import box_bounds
-from impc.model.plant import as_plant
-from impc.model.recordings import recording
+from impc.inverse.problem import Problem
+from impc.model.bounds import Bounds
+from impc.model.plant import Plant
+from impc.model.recordings import Recording
 from impc.model.riccati import solve_lqr
-from impc.model.weights import cholesky_parameters, stage_weights, weights_from_parameters
+from impc.model.weights import Weights, cholesky_parameters, weights_from_parameters
 from impc.studies.example.cases import BOUND, CASES, HORIZON, STEPS
 from plants import yalmip_example
 
 if TYPE_CHECKING:
     from experiments.reproduction.evidence import Evidence
     from impc.arrays import Array
-    from impc.control.controller import Controller
     from impc.inverse.direct_and_reduced import Inference
-    from impc.model.bounds import Bounds
-    from impc.model.plant import Plant
 
 __all__ = ["STAND_IN", "controller_entries", "example_entries"]
 
@@ -41,11 +38,11 @@ _LOST_SYSTEM = "On the stand-in."
 
 def controller_entries() -> list[Entry]:
     """(3.1) to (3.7): computed on the stand-in plant of the example."""
-    plant = as_plant(yalmip_example())
-    bounds = box_bounds(plant, u_min=-BOUND, u_max=BOUND)
-    weights = stage_weights(np.eye(2), 1.0)
+    plant = Plant(yalmip_example())
+    bounds = Bounds(plant, u_min=-BOUND, u_max=BOUND)
+    weights = Weights(np.eye(2), 1.0)
     lqr = solve_lqr(plant, weights)
-    controller = mpc_controller(plant, weights, bounds, HORIZON)
+    controller = Controller(plant, weights, bounds, HORIZON)
     given = scenario(plant, x0=CASES["B"], steps=STEPS)
     ours = simulate(controller, given)
     gaps = {
@@ -56,11 +53,11 @@ def controller_entries() -> list[Entry]:
     gain_gap = float(np.max(np.abs(lqr.K - reference)))
     riccati_gap = float(np.max(np.abs(lqr.P - P)))
     terminal = maximal_invariant_set(plant, lqr.K, bounds)
-    scaled = mpc_controller(plant, stage_weights(7 * np.eye(2), 7.0), bounds, HORIZON)
+    scaled = Controller(plant, Weights(7 * np.eye(2), 7.0), bounds, HORIZON)
     ray = float(np.max(np.abs(simulate(scaled, given).u - ours.u)))
     direct = inverse_mpc(
-        inverse_problem(plant, bounds, HORIZON, (recording(plant, ours.x),)),
-        stage_weights(np.diag([2.0, 0.5]), 1.0),
+        Problem(plant, bounds, HORIZON, (Recording(plant, ours.x),)),
+        Weights(np.diag([2.0, 0.5]), 1.0),
     )
     off = float(np.max(np.abs(direct.weights.Q - np.eye(2))))
     whole = [_table_3_1(plant, bounds, controller, case) for case in ("A", "B")]
@@ -71,7 +68,7 @@ def controller_entries() -> list[Entry]:
             "MPC: least x_N'Px_N + sum of x'Qx + u'Ru over N steps, inside the bounds, x_N in X_f;"
             " the first input is applied.",
             (
-                "impc.control.controller:mpc_controller",
+                "impc.control.controller:Controller",
                 "impc.control.casadi_controller:solve_mpc",
                 "impc.control.closed_loop:simulate",
             ),
@@ -85,7 +82,7 @@ def controller_entries() -> list[Entry]:
             "(3.2)",
             "It is assumed that ... (the formula is lost; Q >= 0, R > 0, a stabilisable plant, and"
             " detectability fit the discussion).",
-            ("impc.model.weights:stage_weights", "impc.model.riccati:solve_lqr"),
+            ("impc.model.weights:Weights", "impc.model.riccati:solve_lqr"),
             f"Refused, in one line: {_refusal(np.diag([1.0, -1.0]), 1.0)}",
             Verdict.IN_KIND,
             "The formula is lost; the conditions are those under which (3.3) and (3.4) exist.",
@@ -324,12 +321,12 @@ def _dynamic_programming(A: Array, B: Array) -> tuple[Array, Array]:
 
 def _table_3_1(plant: Plant, bounds: Bounds, controller: Controller, case: str) -> Inference:
     states = simulate(controller, scenario(plant, x0=CASES[case], steps=STEPS)).x
-    return infer_weights(inverse_problem(plant, bounds, HORIZON, (recording(plant, states),)))
+    return infer_weights(Problem(plant, bounds, HORIZON, (Recording(plant, states),)))
 
 
 def _refusal(Q: Any, R: float) -> str:
     try:
-        stage_weights(Q, R)
+        Weights(Q, R)
     except InputError as error:
         return str(error)
     raise AssertionError("indefinite weights were accepted")

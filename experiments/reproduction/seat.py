@@ -11,7 +11,7 @@ import numpy as np
 from experiments.reproduction.entry import Entry, Verdict, agrees, drawing, kind
 from impc.assess.vaf import vaf
 from impc.inverse.inverse_lqr import inverse_lqr_lmi
-from impc.model.plant import as_plant
+from impc.model.plant import Plant
 from plants.actuation import delayed_muscle
 from plants.seated_balance import (
     SeatedBalanceParameters,
@@ -82,7 +82,7 @@ def _subject(fit: dict[str, Any], truth: dict[str, Any]) -> list[Entry]:
     both = list(fit["vaf"].values())
     start = fit["methods"]["feedback_gain"]
     A, B = np.array(fit["plant"]["A"]), np.array(fit["plant"]["B"])
-    plant = as_plant(control.ss(A, B, np.eye(len(A)), np.zeros(B.shape), fit["plant"]["dt"]))
+    plant = Plant(control.ss(A, B, np.eye(len(A)), np.zeros(B.shape), fit["plant"]["dt"]))
     lmi = inverse_lqr_lmi(plant, start["K"])
     return [
         Entry(

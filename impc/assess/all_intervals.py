@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from impc.assess.resampling import Replicate
     from impc.assess.weights_ranges import WeightsSummary
     from impc.inverse.noisy_fit import FittedController
-    from impc.inverse.problem import InverseProblem
+    from impc.inverse.problem import Problem
     from impc.model.weights import Weights
     from impc.studies.fit.settings import FitSettings
 
@@ -60,7 +60,7 @@ class Certainty:
     alternatives: tuple[Alternative, ...]
 
 
-def count_stages(problem: InverseProblem, settings: FitSettings) -> int:
+def count_stages(problem: Problem, settings: FitSettings) -> int:
     """Number of stages that `assess` reports, and one for the set of weights."""
     limited = int(np.any(np.isfinite(problem.bounds.u_max)))
     others = [length for length in settings.horizons if length != problem.horizon]
@@ -74,7 +74,7 @@ def count_stages(problem: InverseProblem, settings: FitSettings) -> int:
 
 
 def assess(
-    problem: InverseProblem,
+    problem: Problem,
     fitted: FittedController,
     estimate: GainEstimate,
     weights: tuple[WeightsSummary | None, str],
@@ -86,7 +86,7 @@ def assess(
 
     Parameters
     ----------
-    problem : InverseProblem
+    problem : Problem
         As it was posed.
     fitted : FittedController
         Its fit.

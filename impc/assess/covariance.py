@@ -32,7 +32,7 @@ from impc.inverse.solution_set import natural_coordinates
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from impc.inverse.problem import InverseProblem
+    from impc.inverse.problem import Problem
     from impc.inverse.residuals import Evaluation
 
 __all__ = ["DETERMINED", "FOREIGN", "TOLD", "GainCovariance", "gain_covariance"]
@@ -109,7 +109,7 @@ class GainCovariance(Frozen):
 
 
 def gain_covariance(
-    problem: InverseProblem,
+    problem: Problem,
     gain: Array,
     metric: Array,
     noise: Callable[[list[Array], int], ResidualNoise] = residual_noise,
@@ -120,7 +120,7 @@ def gain_covariance(
 
     Parameters
     ----------
-    problem : InverseProblem
+    problem : Problem
         At the initial states and the parameters that were found.
     gain, metric : Array
         K (m, n) and S (m, m) that were found.
@@ -172,7 +172,7 @@ def gain_covariance(
     )
 
 
-def _shifts(problem: InverseProblem, gain: Array, metric: Array, steps: Array) -> Array:
+def _shifts(problem: Problem, gain: Array, metric: Array, steps: Array) -> Array:
     """What steps of the gain (k, m, n), forth and back, do to the residual: (2 k, r).
 
     A step that cannot be simulated is halved, and what it does scaled by the square: the first
@@ -205,7 +205,7 @@ def _entries(back: Array, deviations: Array, spread: Array) -> tuple[Array, Arra
     return np.where(foreign < FOREIGN, by_itself, whole), foreign
 
 
-def _by_trial(problem: InverseProblem, rows: Array) -> list[Array]:
+def _by_trial(problem: Problem, rows: Array) -> list[Array]:
     """Rows of all trials as one (samples, p, ...) array a trial."""
     p, row, parts = len(problem.plant.outputs), 0, []
     for trial in problem.recordings:
@@ -215,7 +215,7 @@ def _by_trial(problem: InverseProblem, rows: Array) -> list[Array]:
     return parts
 
 
-def _nuisance(problem: InverseProblem, found: Evaluation) -> Array:
+def _nuisance(problem: Problem, found: Evaluation) -> Array:
     """Columns of what S is told, of initial states, trial by trial, then of parameters."""
     metric, sizes, _ = np.linalg.svd(found.dS.reshape(len(found.residual), -1), full_matrices=False)
     # Rounding leaves 1e-15 where S is not told: its scale, and inputs that are never at a bound.
@@ -240,7 +240,7 @@ def _orthogonal(columns: Array) -> Array:
 
 
 def _parameter_deviations(
-    problem: InverseProblem, on_gain: Array, nuisance: Array, colour: ResidualNoise
+    problem: Problem, on_gain: Array, nuisance: Array, colour: ResidualNoise
 ) -> Array:
     """Standard deviations of the logarithms, everything else being fitted too."""
     count = len(problem.logarithms)

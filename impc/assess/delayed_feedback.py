@@ -19,13 +19,12 @@ from impc.arrays import Array, BoolArray, Frozen, frozen
 from impc.errors import InputError, SolverError
 from impc.inverse.coordinates import start_unit
 from impc.inverse.diagonal_start import bryson_regulators
-from impc.inverse.problem import moved, without_bounds
 from impc.inverse.residuals import evaluate, misfit_or_reason
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from impc.inverse.problem import InverseProblem
+    from impc.inverse.problem import Problem
 
 __all__ = ["PreliminaryGain", "preliminary_gain"]
 
@@ -41,18 +40,18 @@ class PreliminaryGain(Frozen):
     ----------
     K : Array
         (m, n), zero outside the chosen states.
-    problem : InverseProblem
+    problem : Problem
         Without bounds, at the initial states and parameters found.
     misfit : float
         2-norm of the scaled residual.
     """
 
     K: Array
-    problem: InverseProblem
+    problem: Problem
     misfit: float
 
 
-def preliminary_gain(problem: InverseProblem, states: Sequence[str]) -> PreliminaryGain:
+def preliminary_gain(problem: Problem, states: Sequence[str]) -> PreliminaryGain:
     """Fit gains on some states, with initial states and physical parameters, without bounds.
 
     From the gains of Bryson's regulators on those states, at the scale at which they fit best.
@@ -64,7 +63,7 @@ def preliminary_gain(problem: InverseProblem, states: Sequence[str]) -> Prelimin
     SolverError
         When no gain of that form that stabilises the plant was found.
     """
-    loose = without_bounds(problem)
+    loose = problem.without_bounds()
     names = problem.plant.states
     unknown = [name for name in states if name not in names]
     if unknown or not states:
@@ -81,7 +80,7 @@ def preliminary_gain(problem: InverseProblem, states: Sequence[str]) -> Prelimin
     return PreliminaryGain(frozen(K), here, misfit)
 
 
-def _start(problem: InverseProblem, kept: BoolArray) -> Array:
+def _start(problem: Problem, kept: BoolArray) -> Array:
     """The best stabilising multiple of a Bryson regulator's gains on the kept states."""
     metric = np.eye(problem.plant.m)
     best: Array | None = None
@@ -104,7 +103,7 @@ def _start(problem: InverseProblem, kept: BoolArray) -> Array:
 class _Search:
     """Unknowns: kept entries of K over their start, initial states, logarithms of parameters."""
 
-    def __init__(self, problem: InverseProblem, kept: BoolArray, start: Array) -> None:
+    def __init__(self, problem: Problem, kept: BoolArray, start: Array) -> None:
         self.problem, self.gain = problem, start
         self.at_entry = np.flatnonzero(np.tile(kept, problem.plant.m))
         self.unit = start_unit(problem, start)
@@ -116,7 +115,7 @@ class _Search:
         size = np.abs(np.ravel(start)[self.at_entry])
         self.scale = np.maximum(size, 1e-3 * np.max(size))
 
-    def unpack(self, z: Array) -> tuple[Array, InverseProblem]:
+    def unpack(self, z: Array) -> tuple[Array, Problem]:
         entries, starts, logarithms = np.split(z, self.ends[:-1])
         gain = self.gain.copy()
         gain.ravel()[self.at_entry] += entries * self.scale
@@ -124,7 +123,7 @@ class _Search:
         if self.trials:
             x0 = x0 + starts.reshape(self.trials, self.n) @ self.unit.T
         here = self.problem.logarithms + _PARAMETER_UNIT * logarithms
-        return gain, moved(self.problem, x0, here)
+        return gain, self.problem.at(x0, here)
 
     def residual(self, z: Array) -> Array:
         gain, problem = self.unpack(z)

@@ -18,7 +18,7 @@ from impc.assess.residual_structure import ResidualStructure, residual_structure
 from impc.inverse.residuals import evaluate
 
 if TYPE_CHECKING:
-    from impc.inverse.problem import InverseProblem
+    from impc.inverse.problem import Problem
 
 __all__ = ["ResidualDiagnostics", "residual_diagnostics", "residual_warnings"]
 
@@ -37,14 +37,12 @@ class ResidualDiagnostics:
     structure: ResidualStructure | None
 
 
-def residual_diagnostics(
-    problem: InverseProblem, gain: Array, metric: Array
-) -> ResidualDiagnostics:
+def residual_diagnostics(problem: Problem, gain: Array, metric: Array) -> ResidualDiagnostics:
     """Run both tests.
 
     Parameters
     ----------
-    problem : InverseProblem
+    problem : Problem
         At the initial states and parameters of the fit.
     gain, metric : Array
         K (m, n) and S (m, m) of the fit.

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from impc.arrays import Array, Frozen, frozen
 from impc.assess.vaf import centred_vaf, vaf
+from impc.checking import replace
 from impc.control.closed_loop import simulate
 from impc.inverse.initial_states import with_fitted_starts
 from impc.inverse.problem import controller_for, scenarios
@@ -16,7 +17,7 @@ from impc.inverse.solution_set import natural_coordinates
 
 if TYPE_CHECKING:
     from impc.inverse.noisy_fit import FittedController
-    from impc.inverse.problem import InverseProblem
+    from impc.inverse.problem import Problem
 
 __all__ = ["HeldOut", "left_out_vaf", "predict"]
 
@@ -41,7 +42,7 @@ class HeldOut(Frozen):
 
 
 def predict(
-    problem: InverseProblem,
+    problem: Problem,
     controller: FittedController,
     fitted: FittedController,
     index: int,
@@ -51,7 +52,7 @@ def predict(
 
     Parameters
     ----------
-    problem : InverseProblem
+    problem : Problem
         With all trials.
     controller, fitted : FittedController
         Fitted to the others, and to all.
@@ -69,14 +70,12 @@ def predict(
     return HeldOut(each[0], each[1], change)
 
 
-def left_out_vaf(
-    alone: InverseProblem, gain: Array, metric: Array, settle: float
-) -> tuple[Array, Array]:
+def left_out_vaf(alone: Problem, gain: Array, metric: Array, settle: float) -> tuple[Array, Array]:
     """VAF of the one trial of a problem under a gain found without it.
 
     Parameters
     ----------
-    alone : InverseProblem
+    alone : Problem
         With that trial only.
     gain, metric : Array
         K (m, n) and S (m, m).

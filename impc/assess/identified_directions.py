@@ -26,7 +26,7 @@ from impc.model.weights import Weights, condition_number
 
 if TYPE_CHECKING:
     from impc.inverse.equivalent_weights import EquivalentWeights
-    from impc.inverse.problem import InverseProblem
+    from impc.inverse.problem import Problem
 
 __all__ = ["Identifiability", "OtherWeights", "identifiability"]
 
@@ -82,12 +82,12 @@ class Identifiability(Frozen):
 
 
 @checked
-def identifiability(problem: InverseProblem, weights: Weights) -> Identifiability:
+def identifiability(problem: Problem, weights: Weights) -> Identifiability:
     """Count what the recordings determine at the given weights.
 
     Parameters
     ----------
-    problem : InverseProblem
+    problem : Problem
     weights : Weights
         Positive definite; the result of a fit.
 
@@ -111,7 +111,7 @@ def identifiability(problem: InverseProblem, weights: Weights) -> Identifiabilit
     return Identifiability(frozen(values), free, rank, free - rank, _DETERMINED, others)
 
 
-def _explain(problem: InverseProblem, found: EquivalentWeights) -> OtherWeights:
+def _explain(problem: Problem, found: EquivalentWeights) -> OtherWeights:
     solution = solve_lqr(problem.plant, found.weights)
     controller = controller_for(problem, solution.K, solution.S)
     runs = [simulate(controller, drive) for drive in scenarios(problem)]

@@ -13,7 +13,7 @@ least L that D allows (docs/fitting.md).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,6 +22,7 @@ import scipy.stats
 
 from impc.arrays import Array, Frozen, frozen
 from impc.assess.long_run_covariance import residual_noise, spread_of_sum, white_noise
+from impc.checking import replace
 from impc.control.closed_loop import simulate, simulate_and_differentiate
 from impc.control.constraint_rows import directions
 from impc.errors import InputError, SolverError, WeightsError
@@ -29,14 +30,14 @@ from impc.inverse.gain_search import refine_gain
 from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.problem import controller_for, scenarios
 from impc.inverse.residuals import evaluate
-from impc.model.bounds import bound_rows, box_bounds
+from impc.model.bounds import Bounds, bound_rows
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from impc.inverse.gain_search import GainFit
     from impc.inverse.noisy_fit import FittedController
-    from impc.inverse.problem import InverseProblem
+    from impc.inverse.problem import Problem
 
 __all__ = ["LimitEstimate", "input_limit", "with_limit"]
 
@@ -80,7 +81,7 @@ class LimitEstimate(Frozen):
     distances: Array
 
 
-def with_limit(problem: InverseProblem, limit: float, control: int = 0) -> InverseProblem:
+def with_limit(problem: Problem, limit: float, control: int = 0) -> Problem:
     """The problem with |u_control| <= limit, or without that bound for an infinite limit.
 
     Parameters
@@ -93,7 +94,7 @@ def with_limit(problem: InverseProblem, limit: float, control: int = 0) -> Inver
     bounds = problem.bounds
     u_min, u_max = np.array(bounds.u_min), np.array(bounds.u_max)
     u_min[control], u_max[control] = -limit, limit
-    changed = box_bounds(
+    changed = Bounds(
         problem.plant, x_min=bounds.x_min, x_max=bounds.x_max, u_min=u_min, u_max=u_max
     )
     return replace(problem, bounds=changed)

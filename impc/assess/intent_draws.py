@@ -16,7 +16,7 @@ for all weights with the fitted gain and, of those drawn, in all but one at most
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,10 +24,11 @@ import scipy.linalg
 
 from impc.arrays import Array
 from impc.assess.bounded_weights import linear_maximum, linear_range, weights_set
+from impc.checking import replace
 from impc.errors import SolverError, WeightsError
 from impc.inverse.solution_set import gain_fibre
 from impc.model.riccati import gain_gradients, solve_lqr
-from impc.model.weights import stage_weights
+from impc.model.weights import Weights
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -37,7 +38,6 @@ if TYPE_CHECKING:
     from impc.assess.intent_statements import Statement
     from impc.model.plant import Plant
     from impc.model.riccati import LqrSolution
-    from impc.model.weights import Weights
 
 __all__ = [
     "DRAWS",
@@ -127,7 +127,7 @@ def drawn_gains(
     def solution(a: Array) -> LqrSolution:
         step = np.tensordot((mean + a) * spread, basis, 1)
         X = factor @ scipy.linalg.expm(step) @ factor.T
-        return solve_lqr(plant, stage_weights(X[:n, :n], X[n:, n:]))
+        return solve_lqr(plant, Weights(X[:n, :n], X[n:, n:]))
 
     def excess(a: Array) -> float:
         """Logarithm of the density over that of the linearised posterior, in which a ~ N(0, I)."""

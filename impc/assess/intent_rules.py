@@ -17,13 +17,10 @@ import numpy as np
 from impc.arrays import Array, Frozen, frozen
 from impc.assess.bounded_weights import nearest_diagonal, trace_range, weights_set
 from impc.errors import SolverError, WeightsError
-from impc.inverse.equivalent_weights import (
-    analytic_centre,
-    least_condition_weights,
-)
+from impc.inverse.equivalent_weights import analytic_centre, least_condition_weights
 from impc.inverse.solution_set import gain_fibre
 from impc.model.plant import change_coordinates
-from impc.model.weights import Weights, condition_number, normalised, stage_weights
+from impc.model.weights import Weights, condition_number, normalised
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -173,7 +170,7 @@ def _rules(
         scaled = gain_fibre(change_coordinates(plant, T), gain @ T, metrics)
         found = least_condition_weights(scaled).weights
         back = np.linalg.inv(T)
-        return [normalised(stage_weights(back.T @ found.Q @ back, found.R))]
+        return [normalised(Weights(back.T @ found.Q @ back, found.R))]
 
     return [
         (_PLANT_UNITS, lambda: [least_condition_weights(fibre).weights]),

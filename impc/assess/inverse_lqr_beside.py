@@ -15,13 +15,14 @@ from __future__ import annotations
 
 import functools
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from impc.arrays import Array, Frozen, frozen
 from impc.assess.judged import MethodFit, judge, without_gain
+from impc.checking import replace
 from impc.errors import SolverError, WeightsError
 from impc.inverse.direct_and_reduced import auxiliary_weights
 from impc.inverse.equivalent_weights import least_condition_weights
@@ -29,9 +30,8 @@ from impc.inverse.initial_states import with_fitted_starts
 from impc.inverse.inverse_lqr import inverse_lqr_lmi
 from impc.inverse.natural_search import in_plant_units, inverse_mpc_natural
 from impc.inverse.noisy_fit import free_gain, noise_of
-from impc.inverse.problem import without_bounds
 from impc.inverse.solution_set import gain_fibre, natural_coordinates
-from impc.model.bounds import box_bounds
+from impc.model.bounds import Bounds
 from impc.model.plant import change_coordinates
 from impc.model.riccati import is_stable, solve_lqr
 
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from impc.assess.delayed_feedback import PreliminaryGain
     from impc.inverse.gain_search import GainFit
     from impc.inverse.noisy_fit import FittedController
-    from impc.inverse.problem import InverseProblem
+    from impc.inverse.problem import Problem
     from impc.model.weights import Weights
 
 __all__ = ["compare_methods"]
@@ -64,11 +64,11 @@ def compare_methods(
         Computes the preliminary estimate.
     """
     known = _known(fitted.problem)
-    loose = without_bounds(known)
+    loose = known.without_bounds()
     begin, gain = fitted.weights, np.array(fitted.solution.K)
     results = []
 
-    def add(name: str, problem: InverseProblem, find: Callable[[], _Found]) -> _Found:
+    def add(name: str, problem: Problem, find: Callable[[], _Found]) -> _Found:
         started = time.perf_counter()
         try:
             found = find()
@@ -109,15 +109,15 @@ class _Found(Frozen):
     K: Array | None
     weights: Weights | None
     reason: str
-    problem: InverseProblem | None = None  # when it is not the common one
+    problem: Problem | None = None  # when it is not the common one
 
 
-def _known(problem: InverseProblem) -> InverseProblem:
+def _known(problem: Problem) -> Problem:
     """The problem with what was fitted taken as known."""
     return replace(problem, unknown_start=False, family=None, logarithms=frozen([]))
 
 
-def _gain_penalty(problem: InverseProblem, first: _Found, begin: Weights) -> _Found:
+def _gain_penalty(problem: Problem, first: _Found, begin: Weights) -> _Found:
     """Lines 2 to 7 of Table 3.1 in natural coordinates: the LMI, else the auxiliary problem."""
     if first.K is None:
         raise SolverError("gain", "none was found", "see the feedback gain")
@@ -136,14 +136,14 @@ def _gain_penalty(problem: InverseProblem, first: _Found, begin: Weights) -> _Fo
     return _Found(np.array(solve_lqr(plant, found).K), found, "")
 
 
-def _clipping(problem: InverseProblem) -> InverseProblem:
+def _clipping(problem: Problem) -> Problem:
     """A horizon of one sample without state bounds or terminal set: cut off, no foresight."""
-    limits = box_bounds(problem.plant, u_min=problem.bounds.u_min, u_max=problem.bounds.u_max)
+    limits = Bounds(problem.plant, u_min=problem.bounds.u_min, u_max=problem.bounds.u_max)
     return replace(problem, bounds=limits, horizon=1, terminal_set=False)
 
 
 def _judge(
-    name: str, fitted: FittedController, problem: InverseProblem, found: _Found, seconds: float
+    name: str, fitted: FittedController, problem: Problem, found: _Found, seconds: float
 ) -> MethodFit:
     """Simulate all recordings with the gain found, from initial states fitted for it."""
     if found.K is None:

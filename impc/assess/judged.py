@@ -16,7 +16,7 @@ from impc.control.closed_loop import Simulation, simulate
 from impc.inverse.problem import controller_for, scenarios
 
 if TYPE_CHECKING:
-    from impc.inverse.problem import InverseProblem
+    from impc.inverse.problem import Problem
     from impc.model.bounds import Bounds
     from impc.model.weights import Weights
 
@@ -72,7 +72,7 @@ class MethodFit(Frozen):
 
 def judge(
     name: str,
-    problem: InverseProblem,
+    problem: Problem,
     bounds: Bounds,
     gain: Array,
     metric: Array,
@@ -87,7 +87,7 @@ def judge(
     ----------
     name : str
         Of the method.
-    problem : InverseProblem
+    problem : Problem
         At the initial states to simulate from; its bounds are those that the controller knows.
     bounds : Bounds
         Those of the subject, which it may exceed.
@@ -122,7 +122,7 @@ def judge(
     )
 
 
-def without_gain(name: str, problem: InverseProblem, seconds: float, reason: str) -> MethodFit:
+def without_gain(name: str, problem: Problem, seconds: float, reason: str) -> MethodFit:
     """What is left to say of the method `name` that ended without a gain.
 
     Its `reason` and the time in s, `seconds`, are kept.
@@ -143,14 +143,14 @@ def without_gain(name: str, problem: InverseProblem, seconds: float, reason: str
     )
 
 
-def _trial_vaf(problem: InverseProblem, index: int, run: Simulation) -> Array:
+def _trial_vaf(problem: Problem, index: int, run: Simulation) -> Array:
     trial = problem.recordings[index]
     if not run.complete:
         return np.full(len(problem.plant.outputs), np.nan)
     return vaf(trial.outputs, run.x @ problem.plant.C.T)
 
 
-def _pooled_vaf(problem: InverseProblem, runs: tuple[Simulation, ...]) -> Array:
+def _pooled_vaf(problem: Problem, runs: tuple[Simulation, ...]) -> Array:
     if not all(run.complete for run in runs):
         return np.full(len(problem.plant.outputs), np.nan)
     recorded = np.concatenate([trial.outputs for trial in problem.recordings])

@@ -12,16 +12,16 @@ two models apart; above 10 the worse one has no support (Burnham and Anderson 20
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from impc.assess.held_out import left_out_vaf
 from impc.assess.long_run_covariance import residual_noise
+from impc.checking import replace
 from impc.errors import SolverError, WeightsError
 from impc.inverse.noisy_fit import fit_controller
-from impc.inverse.problem import without_bounds
 from impc.inverse.residuals import residual_only
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from impc.arrays import Array
     from impc.inverse.noisy_fit import FittedController
-    from impc.inverse.problem import InverseProblem
+    from impc.inverse.problem import Problem
 
 __all__ = ["Alternative", "fit_alternatives", "verdict"]
 
@@ -65,7 +65,7 @@ class Alternative:
 
 
 def fit_alternatives(
-    problem: InverseProblem,
+    problem: Problem,
     fitted: FittedController,
     horizons: Sequence[int],
     settle: float,
@@ -75,7 +75,7 @@ def fit_alternatives(
 
     Parameters
     ----------
-    problem : InverseProblem
+    problem : Problem
         As it was posed.
     fitted : FittedController
         Its fit, from whose weights the others start.
@@ -88,7 +88,7 @@ def fit_alternatives(
     """
     posed = [("as fitted", problem)]
     if np.any(np.isfinite(problem.bounds.u_max)):
-        posed.append(("no limit", without_bounds(problem)))
+        posed.append(("no limit", problem.without_bounds()))
     posed += [
         (f"horizon {length}", replace(problem, horizon=length))
         for length in horizons
@@ -121,7 +121,7 @@ def verdict(one: Alternative, other: Alternative) -> str:
 
 
 def _fit(
-    name: str, problem: InverseProblem, fitted: FittedController, settle: float, roots: Array
+    name: str, problem: Problem, fitted: FittedController, settle: float, roots: Array
 ) -> Alternative:
     try:
         found = fitted if name == "as fitted" else fit_controller(problem, fitted.weights)
@@ -133,19 +133,19 @@ def _fit(
     return Alternative(name, problem.horizon, found.misfit, aic, mean, "")
 
 
-def _trials(problem: InverseProblem) -> int:
+def _trials(problem: Problem) -> int:
     count = len(problem.recordings)
     return count if count > 1 else 0
 
 
-def _left_out(problem: InverseProblem, found: FittedController, index: int, settle: float) -> Array:
+def _left_out(problem: Problem, found: FittedController, index: int, settle: float) -> Array:
     others = problem.recordings[:index] + problem.recordings[index + 1 :]
     fit = fit_controller(replace(problem, recordings=others), found.weights)
     alone = replace(fit.problem, recordings=(problem.recordings[index],))
     return left_out_vaf(alone, np.array(fit.solution.K), np.array(fit.solution.S), settle)[0]
 
 
-def _residuals(found: FittedController, problem: InverseProblem) -> list[Array]:
+def _residuals(found: FittedController, problem: Problem) -> list[Array]:
     flat = residual_only(problem, found.solution.K, found.solution.S)
     ends = np.cumsum([trial.outputs.size for trial in problem.recordings])[:-1]
     parts = np.split(flat, ends)

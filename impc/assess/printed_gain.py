@@ -27,11 +27,10 @@ from impc.arrays import Array, frozen
 from impc.assess.covariance import GainCovariance, gain_covariance
 from impc.assess.long_run_covariance import white_noise
 from impc.inverse.coordinates import Coordinates
-from impc.inverse.problem import moved
 
 if TYPE_CHECKING:
     from impc.inverse.noisy_fit import FittedController
-    from impc.inverse.problem import InverseProblem
+    from impc.inverse.problem import Problem
 
 __all__ = ["GainEstimate", "gain_estimate"]
 
@@ -47,7 +46,7 @@ class GainEstimate:
 
     Attributes
     ----------
-    problem : InverseProblem
+    problem : Problem
         At the initial states and parameters found with this gain.
     K : Array
         (m, n); the weights' along what the recordings do not tell.
@@ -61,7 +60,7 @@ class GainEstimate:
         As if the residuals were white.
     """
 
-    problem: InverseProblem
+    problem: Problem
     K: Array
     S: Array
     misfit: float
@@ -112,7 +111,7 @@ def gain_estimate(fitted: FittedController) -> GainEstimate:
 class _Found:
     """A gain of the search, with its covariance to first order."""
 
-    problem: InverseProblem
+    problem: Problem
     K: Array
     S: Array
     misfit: float
@@ -151,7 +150,7 @@ def _round(here: _Found) -> _Found:
     )
     z = space.start + along @ found.x
     there = space.unpack(z)
-    problem = moved(here.problem, there.starts, there.logarithms)
+    problem = here.problem.at(there.starts, there.logarithms)
     misfit = float(np.linalg.norm(space.at(z).residual))
     covariance = gain_covariance(problem, there.K, there.S)
     return _Found(problem, there.K, there.S, misfit, covariance)

@@ -14,7 +14,7 @@ Replicate k draws from the k-th child of the seed: the same numbers in any order
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,6 +24,7 @@ from statsmodels.regression.linear_model import burg
 from impc.arrays import Array, Frozen, frozen
 from impc.assess.intervals import Interval, entry_names
 from impc.assess.printed_gain import gain_estimate
+from impc.checking import replace
 from impc.control.closed_loop import simulate
 from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.problem import controller_for, scenarios
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from impc.assess.printed_gain import GainEstimate
-    from impc.inverse.problem import InverseProblem
+    from impc.inverse.problem import Problem
     from impc.model.weights import Weights
 
 __all__ = [
@@ -70,7 +71,7 @@ class Replicate(Frozen):
 
 
 def replicate(
-    problem: InverseProblem,
+    problem: Problem,
     gain: Array,
     metric: Array,
     start: Weights,
@@ -82,7 +83,7 @@ def replicate(
 
     Parameters
     ----------
-    problem : InverseProblem
+    problem : Problem
         At the initial states and parameters of the estimate.
     gain, metric : Array
         K (m, n) and S (m, m) of the estimate: what is simulated.
@@ -210,7 +211,7 @@ def _autoregression(parts: list[Array]) -> Array:
     return np.asarray(chosen)
 
 
-def _split(problem: InverseProblem, gain: Array, metric: Array) -> tuple[list[Array], list[Array]]:
+def _split(problem: Problem, gain: Array, metric: Array) -> tuple[list[Array], list[Array]]:
     """Simulated outputs of every trial, and what is left of the recorded ones."""
     controller = controller_for(problem, gain, metric)
     runs = [simulate(controller, drive) for drive in scenarios(problem)]

@@ -24,7 +24,7 @@ import numpy as np
 from impc.arrays import Array
 
 if TYPE_CHECKING:
-    from impc.inverse.problem import InverseProblem
+    from impc.inverse.problem import Problem
     from impc.inverse.residuals import Evaluation
 
 __all__ = ["ResidualStructure", "residual_structure"]
@@ -67,13 +67,13 @@ class ResidualStructure:
 
 
 def residual_structure(
-    problem: InverseProblem, gain: Array, found: Evaluation, seed: int = 0
+    problem: Problem, gain: Array, found: Evaluation, seed: int = 0
 ) -> ResidualStructure | None:
     """Test both families.
 
     Parameters
     ----------
-    problem : InverseProblem
+    problem : Problem
         At the initial states and parameters of the fit.
     gain : Array
         K (m, n) of the fit.
@@ -112,7 +112,7 @@ def residual_structure(
     return ResidualStructure(linear, nonlinear, min(results, key=lambda r: (r[0], -r[1]))[1])
 
 
-def _linear(problem: InverseProblem) -> Array:
+def _linear(problem: Problem) -> Array:
     columns = np.concatenate([trial.disturbance for trial in problem.recordings])
     return np.asarray(columns[:, np.ptp(columns, axis=0) > 0])
 
@@ -125,7 +125,7 @@ def _nonlinear(outputs: Array) -> Array:
     return np.column_stack([*pairs, *triples])
 
 
-def _fitted(problem: InverseProblem, found: Evaluation) -> Array:
+def _fitted(problem: Problem, found: Evaluation) -> Array:
     """Derivatives with respect to all that was fitted, initial states trial by trial."""
     rows = len(found.residual)
     columns, row = [found.dK.reshape(rows, -1), found.dparameters], 0
@@ -137,7 +137,7 @@ def _fitted(problem: InverseProblem, found: Evaluation) -> Array:
     return np.hstack(columns)
 
 
-def _settling(problem: InverseProblem, gain: Array) -> int:
+def _settling(problem: Problem, gain: Array) -> int:
     """Samples in which the closed loop gives 19 of 20 parts of its answer to an impulse."""
     plant = problem.plant
     longest = min(trial.samples for trial in problem.recordings) // 4

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 import time
-from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING
 import click
 from tqdm import tqdm
 
+from impc.checking import replace
 from impc.cli.exit_status import ExitStatus
 from impc.cli.options import code_options, out_option, scheduler_options
 from impc.cli.plant import named_plant

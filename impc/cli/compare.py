@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 from tqdm import tqdm
 
+from impc.checking import replace
 from impc.cli.options import out_option, yes_option
 from impc.cli.output import print_files
 from impc.cli.plant import KNOWN

@@ -115,26 +115,26 @@ def _wanted(formats: str) -> tuple[str, ...]:
 
 
 def _controller(person: dict[str, Any], limit: float) -> Controller:
-    from impc.control.controller import mpc_controller  # noqa: PLC0415
+    from impc.control.controller import Controller  # noqa: PLC0415
     from impc.files.plant_sources import make_plant  # noqa: PLC0415
-    from impc.model.bounds import box_bounds  # noqa: PLC0415
+    from impc.model.bounds import Bounds  # noqa: PLC0415
 
     plant = make_plant(_source(_PLANT, person), ("perturbation",))
-    bounds = box_bounds(plant, u_min=-limit, u_max=limit)
-    return mpc_controller(plant, _weights(plant), bounds, _HORIZON, terminal_set=False)
+    bounds = Bounds(plant, u_min=-limit, u_max=limit)
+    return Controller(plant, _weights(plant), bounds, _HORIZON, terminal_set=False)
 
 
 def _weights(plant: Plant) -> Weights:
     """The intent: one direction of angles and rates, little else."""
     import numpy as np  # noqa: PLC0415
 
-    from impc.model.weights import stage_weights  # noqa: PLC0415
+    from impc.model.weights import Weights  # noqa: PLC0415
 
     v = np.array([0.70, 0.65, 0.22, 0.20])
     v /= np.linalg.norm(v)
     Q = 1e-2 * np.eye(plant.n)
     Q[:4, :4] = 6e5 * np.outer(v, v) + np.diag([2e4, 2e4, 500, 500])
-    return stage_weights(Q, 1)
+    return Weights(Q, 1)
 
 
 def _source(path: str, person: dict[str, Any]) -> PlantSource:

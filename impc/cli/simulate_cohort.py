@@ -110,12 +110,12 @@ def _visit(
     """All trials of a visit as files, and the gain behind them."""
     import numpy as np  # noqa: PLC0415
 
-    from impc.control.controller import mpc_controller  # noqa: PLC0415
+    from impc.control.controller import Controller  # noqa: PLC0415
     from impc.files.formats import encode_table  # noqa: PLC0415
     from impc.files.plant_sources import import_function, make_plant, plant_source  # noqa: PLC0415
     from impc.files.table import make_table  # noqa: PLC0415
-    from impc.model.bounds import box_bounds  # noqa: PLC0415
-    from impc.model.weights import stage_weights  # noqa: PLC0415
+    from impc.model.bounds import Bounds  # noqa: PLC0415
+    from impc.model.weights import Weights  # noqa: PLC0415
     from impc.studies.simulated_people import simulate_subject  # noqa: PLC0415
 
     plant = make_plant(plant_source(_PLANT, person), ("perturbation",))
@@ -124,8 +124,8 @@ def _visit(
     Q = 1e-2 * np.eye(plant.n)
     Q[:4, :4] = price * (6e5 * np.outer(v, v) + np.diag([2e4, 2e4, 500, 500]))
     limit = given["torque_limit"]
-    bounds = box_bounds(plant, u_min=-limit, u_max=limit)
-    controller = mpc_controller(plant, stage_weights(Q, 1), bounds, _HORIZON, terminal_set=False)
+    bounds = Bounds(plant, u_min=-limit, u_max=limit)
+    controller = Controller(plant, Weights(Q, 1), bounds, _HORIZON, terminal_set=False)
     step = plant_source(_STEP, person | {"sample_time": 1 / _RATE})
     make, torque = step.make(**step.arguments), import_function(_TORQUE)
     files = {}

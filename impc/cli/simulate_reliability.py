@@ -114,14 +114,14 @@ def _cell(
     from impc.files.formats import encode_table  # noqa: PLC0415
     from impc.files.table import make_table  # noqa: PLC0415
     from impc.model.riccati import solve_lqr  # noqa: PLC0415
-    from impc.model.weights import stage_weights  # noqa: PLC0415
+    from impc.model.weights import Weights  # noqa: PLC0415
 
     (price, sway), (factor, own, noise) = size, _CONDITIONS[condition]
     v = np.array([0.70, 0.65, 0.22, 0.20])
     v /= np.linalg.norm(v)
     Q = 1e-2 * np.eye(plant.n)
     Q[:4, :4] = factor * price * (6e5 * np.outer(v, v) + np.diag([2e4, 2e4, 500, 500]))
-    K = solve_lqr(plant, stage_weights(Q, 1)).K
+    K = solve_lqr(plant, Weights(Q, 1)).K
     files = []
     for _ in range(given["trials"]):
         here = own * sway * float(np.exp(_TRIAL * rng.standard_normal()))

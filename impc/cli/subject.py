@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from impc.files.inputs import Inputs
     from impc.files.plant_sources import PlantSource
-    from impc.inverse.problem import InverseProblem
+    from impc.inverse.problem import Problem
     from impc.studies.fit.settings import FitSettings
 
 __all__ = ["Subject", "read_subject"]
@@ -31,7 +31,7 @@ class Subject:
 
     Attributes
     ----------
-    problem : InverseProblem
+    problem : Problem
     settings : FitSettings
     source : PlantSource
         Of the plant.
@@ -39,7 +39,7 @@ class Subject:
         Digests of all files that went in.
     """
 
-    problem: InverseProblem
+    problem: Problem
     settings: FitSettings
     source: PlantSource
     inputs: Inputs

@@ -17,6 +17,7 @@ import numpy as np
 
 from impc.arrays import Array, finite_array, frozen, symmetric_matrix
 from impc.checking import Value, checked
+from impc.control.closed_loop import scenario, simulate
 from impc.control.terminal_set import maximal_invariant_set
 from impc.errors import InputError
 from impc.model.riccati import is_stable, solve_lqr
@@ -26,20 +27,37 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike
 
+    from impc.control.closed_loop import Simulation
     from impc.control.terminal_set import TerminalSet
     from impc.model.bounds import Bounds
     from impc.model.plant import Plant
     from impc.model.weights import Weights
 
-__all__ = ["LONGEST_HORIZON", "Controller", "gain_controller", "mpc_controller"]
+__all__ = ["LONGEST_HORIZON", "Controller"]
 
 #: Samples; the rows of a horizon take memory in its square, 0.4 GB of these for two bounds.
 LONGEST_HORIZON = 5000
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, init=False)
 class Controller(Value):
     """minimise sum_{k<N} v_k'S v_k  subject to the bounds, x_N in the terminal set.
+
+    The constructor takes stage weights: it is the controller (3.1) with terminal weight (3.4).
+    `from_gain` takes the gain itself.
+
+    Parameters
+    ----------
+    plant : Plant
+        Discrete, stabilisable.
+    weights : Weights
+    bounds : Bounds
+    horizon : int
+        N >= 1, in samples.
+    terminal_set : bool
+        Whether x_N must lie in the maximal invariant set of the regulator under the bounds.
+    softening : float, optional
+        See the attribute.
 
     Attributes
     ----------
@@ -59,6 +77,22 @@ class Controller(Value):
         E x <= b by s costs ``softening * U^2 * s / b`` with U the least finite input bound (1
         where there is none). The penalty is exact: while it is larger than the multipliers the
         answer is that of the hard problem whenever there is one. Input bounds are always hard.
+
+    Raises
+    ------
+    PlantError, WeightsError, InputError
+        When the plant is continuous, no stabilising Riccati solution exists, or the horizon is
+        not a positive whole number.
+
+    Examples
+    --------
+    >>> import control
+    >>> import impc
+    >>> plant = impc.Plant(control.ss([[2, -1], [1, 0.2]], [[1], [0]], [[1, 0], [0, 1]], 0, 1))
+    >>> bounds = impc.Bounds(plant, u_min=-1, u_max=1)
+    >>> truth = impc.Controller(plant, impc.Weights([[1, 0], [0, 1]], 1), bounds, horizon=3)
+    >>> truth.K.round(3)
+    array([[ 1.494, -0.881]])
     """
 
     _rules: ClassVar[Mapping[str, Any]] = {
@@ -75,6 +109,125 @@ class Controller(Value):
     terminal: TerminalSet | None
     softening: float | None
 
+    @checked(horizon=(1, LONGEST_HORIZON))
+    def __init__(
+        self,
+        plant: Plant,
+        weights: Weights,
+        bounds: Bounds,
+        horizon: int,
+        *,
+        terminal_set: bool = True,
+        softening: float | None = None,
+    ) -> None:
+        solution = solve_lqr(plant.require_discrete(), weights)
+        made = Controller.from_gain(
+            plant,
+            solution.K,
+            bounds,
+            horizon,
+            metric=solution.S,
+            terminal_set=terminal_set,
+            softening=softening,
+        )
+        self._fill(**vars(made))
+
+    @classmethod
+    @checked(gain="m n", metric="m m", horizon=(1, LONGEST_HORIZON))
+    def from_gain(
+        cls,
+        plant: Plant,
+        gain: ArrayLike,
+        bounds: Bounds,
+        horizon: int,
+        *,
+        metric: ArrayLike | None = None,
+        terminal_set: bool = True,
+        softening: float | None = None,
+        near: TerminalSet | None = None,
+    ) -> Controller:
+        """Controller that stays near u = -Kx; with a terminal set the gain must stabilise.
+
+        Parameters
+        ----------
+        plant : Plant
+            Discrete.
+        gain : array_like
+            K (m, n).
+        bounds : Bounds
+        horizon : int
+            N >= 1, in samples.
+        metric : array_like, optional
+            S (m, m), positive definite; the identity by default, which is no choice for one input.
+        terminal_set, softening
+            As in the constructor.
+        near : TerminalSet, optional
+            Set of a gain nearby: the same answer in less time, see `maximal_invariant_set`.
+
+        Raises
+        ------
+        InputError
+            When the gain does not stabilise the plant or the metric is not positive definite.
+        """
+        plant.require_discrete()
+        K = finite_array("gain", gain, (plant.m, plant.n))
+        if terminal_set and not is_stable(plant.A - plant.B @ K, discrete=True):
+            raise InputError(
+                "gain", "does not stabilise the plant", "give one with |eig(A - BK)| < 1"
+            )
+        S = np.eye(plant.m) if metric is None else symmetric_matrix("metric", metric, plant.m)
+        if np.linalg.eigvalsh(S)[0] <= 0:
+            raise InputError("metric", "is not positive definite", "give R + B'PB")
+        if softening is not None and not 0 < softening < np.inf:
+            raise InputError("softening", f"got {softening!r}", "give a positive number, or None")
+        made = object.__new__(cls)
+        made._fill(
+            plant=plant,
+            K=frozen(K),
+            S=frozen(S * (plant.m / np.trace(S))),
+            bounds=bounds,
+            horizon=horizon,
+            terminal=maximal_invariant_set(plant, K, bounds, near=near) if terminal_set else None,
+            softening=softening,
+        )
+        return made
+
+    @checked(steps=(1, 10_000_000), x0="n")
+    def simulate(
+        self, x0: ArrayLike, steps: int | None = None, disturbance: ArrayLike | None = None
+    ) -> Simulation:
+        """Simulate the plant under this controller.
+
+        Parameters
+        ----------
+        x0 : array_like
+            Initial state (n,).
+        steps : int, optional
+            Needed when there is no disturbance; otherwise its length is taken.
+        disturbance : array_like, optional
+            (steps, d), or (steps,) for a single disturbance.
+
+        Returns
+        -------
+        Simulation
+            With a status for each sample; `require_complete` turns a failure into an error.
+
+        Raises
+        ------
+        DataError
+            When something is not finite or of the wrong shape, or neither length is given.
+
+        Examples
+        --------
+        >>> import control
+        >>> import impc
+        >>> plant = impc.Plant(control.ss([[0.5]], [[1]], [[1]], 0, 1))
+        >>> law = impc.Controller(plant, impc.Weights(1, 1), impc.Bounds(plant, u_max=1), 3)
+        >>> law.simulate([1.0], steps=4).x.shape
+        (5, 1)
+        """
+        return simulate(self, scenario(self.plant, x0, steps, disturbance))
+
     @property
     def penalty(self) -> float:
         """Cost of a relative excess of 1, infinite when the rows are hard."""
@@ -84,90 +237,3 @@ class Controller(Value):
         finite = sides[np.isfinite(sides)]
         unit = float(finite.min()) if len(finite) else 1.0
         return self.softening * unit**2
-
-
-@checked(horizon=(1, LONGEST_HORIZON))
-def mpc_controller(
-    plant: Plant,
-    weights: Weights,
-    bounds: Bounds,
-    horizon: int,
-    *,
-    terminal_set: bool = True,
-    softening: float | None = None,
-) -> Controller:
-    """Controller (3.1) with terminal weight (3.4) from stage weights.
-
-    Parameters
-    ----------
-    plant : Plant
-        Discrete, stabilisable.
-    weights : Weights
-    bounds : Bounds
-    horizon : int
-        N >= 1, in samples.
-    terminal_set : bool
-        Whether x_N must lie in the maximal invariant set of the regulator under the bounds.
-    softening : float, optional
-        See `Controller`.
-
-    Raises
-    ------
-    PlantError, WeightsError, InputError
-        When the plant is continuous, no stabilising Riccati solution exists, or the horizon is
-        not a positive whole number.
-    """
-    solution = solve_lqr(plant.require_discrete(), weights)
-    return gain_controller(
-        plant,
-        solution.K,
-        bounds,
-        horizon,
-        metric=solution.S,
-        terminal_set=terminal_set,
-        softening=softening,
-    )
-
-
-@checked(gain="m n", metric="m m", horizon=(1, LONGEST_HORIZON))
-def gain_controller(
-    plant: Plant,
-    gain: ArrayLike,
-    bounds: Bounds,
-    horizon: int,
-    *,
-    metric: ArrayLike | None = None,
-    terminal_set: bool = True,
-    softening: float | None = None,
-    near: TerminalSet | None = None,
-) -> Controller:
-    """Controller that stays near u = -Kx; the gain must stabilise the plant.
-
-    Parameters
-    ----------
-    gain : array_like
-        K (m, n).
-    metric : array_like, optional
-        S (m, m), positive definite; the identity by default, which is no choice for one input.
-    near : TerminalSet, optional
-        Set of a gain nearby: the same answer in less time, see `maximal_invariant_set`.
-    bounds, horizon, terminal_set, softening
-        As in `mpc_controller`.
-
-    Raises
-    ------
-    InputError
-        When the gain does not stabilise the plant or the metric is not positive definite.
-    """
-    plant.require_discrete()
-    K = finite_array("gain", gain, (plant.m, plant.n))
-    if terminal_set and not is_stable(plant.A - plant.B @ K, discrete=True):
-        raise InputError("gain", "does not stabilise the plant", "give one with |eig(A - BK)| < 1")
-    S = np.eye(plant.m) if metric is None else symmetric_matrix("metric", metric, plant.m)
-    if np.linalg.eigvalsh(S)[0] <= 0:
-        raise InputError("metric", "is not positive definite", "give R + B'PB")
-    if softening is not None and not 0 < softening < np.inf:
-        raise InputError("softening", f"got {softening!r}", "give a positive number, or None")
-    terminal = maximal_invariant_set(plant, K, bounds, near=near) if terminal_set else None
-    scaled = S * (plant.m / np.trace(S))
-    return Controller(plant, frozen(K), frozen(scaled), bounds, horizon, terminal, softening)

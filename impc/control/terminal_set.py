@@ -237,7 +237,7 @@ def _check(plant: Plant, F: Array, bounds: Bounds, tolerance: float, max_steps: 
         raise InputError("gain", problem, "give the gain of a regulator, such as solve_lqr(...).K")
     if (bounds.x_min.size, bounds.u_min.size) != (plant.n, plant.m):
         problem = f"are for {bounds.x_min.size} states and {bounds.u_min.size} inputs"
-        raise BoundsError("bounds", problem, f"the plant has {plant.n} and {plant.m}: box_bounds")
+        raise BoundsError("bounds", problem, f"the plant has {plant.n} and {plant.m}: Bounds")
     if not 0 <= tolerance <= 1e-2 or max_steps < 1:
         problem = f"are {tolerance!r} and {max_steps!r}"
         raise InputError("tolerance, max_steps", problem, "give 0 to 0.01, and at least 1")

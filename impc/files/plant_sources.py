@@ -23,7 +23,7 @@ import numpy as np
 from impc.checking import checked
 from impc.errors import ImpcError, InputError, PlantError, one_line
 from impc.files.saved_plant import SAVED, read_matrices, state_space
-from impc.model.plant import Plant, as_plant
+from impc.model.plant import Plant
 from impc.model.plant_family import PlantFamily, plant_family
 
 if TYPE_CHECKING:
@@ -177,7 +177,7 @@ def make_plant(source: PlantSource, recorded: Sequence[str], **changed: float) -
             controls = [item for item in inputs if item not in recorded]
             if inputs and not controls:
                 raise PlantError(name, "all its inputs are recorded", "one must be the command")
-            return as_plant(system, controls or None)
+            return Plant(system, controls or None)
     except ImpcError:
         raise
     except np.exceptions.ComplexWarning:  # control.ss would drop the imaginary parts

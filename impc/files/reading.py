@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import difflib
 import os
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from impc.checking import replace
 from impc.errors import DataError, InputError
 from impc.files import checks, measurable
 from impc.files.alignment import misaligned
@@ -19,7 +19,7 @@ from impc.files.configuration import UNKNOWN_UNIT
 from impc.files.formats import read_table
 from impc.files.resampling import held_means, instants, resampled_samples, same_rate
 from impc.files.units import si_unit
-from impc.model.recordings import Label, recording
+from impc.model.recordings import Label, Recording
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from impc.files.table import Table
     from impc.files.units import Unit
     from impc.model.plant import Plant
-    from impc.model.recordings import Recording
 
 __all__ = ["read_recordings", "recording_of"]
 
@@ -115,7 +114,7 @@ def recording_of(table: Table, configuration: Configuration, plant: Plant) -> Re
             disturbance[:, index] = series[name]
             findings += _order(table.source, series, name, plant)
     outputs = np.column_stack([series[name] for name in plant.outputs])
-    return recording(
+    return Recording(
         plant, outputs, disturbance, np.zeros(plant.n), label=label, findings=tuple(findings)
     )
 

@@ -26,13 +26,13 @@ import scipy.linalg
 
 from impc.arrays import Array
 from impc.control.closed_loop import simulate
-from impc.inverse.problem import controller_for, moved, scenarios
+from impc.inverse.problem import controller_for, scenarios
 from impc.inverse.residuals import evaluate
 from impc.inverse.solution_set import floored_covariance, natural_coordinates
 
 if TYPE_CHECKING:
     from impc.control.terminal_set import TerminalSet
-    from impc.inverse.problem import InverseProblem
+    from impc.inverse.problem import Problem
     from impc.inverse.residuals import Evaluation
 
 __all__ = ["PARAMETER_UNIT", "Compressed", "Coordinates", "Point", "WithPrior", "start_unit"]
@@ -91,12 +91,12 @@ class Coordinates:
 
     Parameters
     ----------
-    problem : InverseProblem
+    problem : Problem
     gain, metric : Array
         K (m, n) and S (m, m) where the search begins.
     """
 
-    def __init__(self, problem: InverseProblem, gain: Array, metric: Array) -> None:
+    def __init__(self, problem: Problem, gain: Array, metric: Array) -> None:
         self.problem = problem
         plant = problem.plant
         self.m, self.n, self.trials = plant.m, plant.n, len(problem.recordings)
@@ -135,7 +135,7 @@ class Coordinates:
         key = z.tobytes()
         if self.last is None or self.last[0] != key:
             here = self.unpack(z)
-            problem = moved(self.problem, here.starts, here.logarithms)
+            problem = self.problem.at(here.starts, here.logarithms)
             evaluation = evaluate(problem, here.K, here.S, self.near)
             self.near = evaluation.terminal or self.near
             if evaluation.reason:
@@ -259,7 +259,7 @@ class WithPrior:
         return np.vstack([data, self.weight * np.eye(len(z))])
 
 
-def start_unit(problem: InverseProblem, gain: Array) -> Array:
+def start_unit(problem: Problem, gain: Array) -> Array:
     """Unit of initial states, (n, n), at a `gain` (m, n).
 
     They are thought of as any other state of their trials.

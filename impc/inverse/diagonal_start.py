@@ -13,23 +13,24 @@ about that start keeps those prices where they are that the recordings do not se
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.optimize
 
 from impc.arrays import Array, frozen
+from impc.checking import replace
 from impc.control.closed_loop import simulate
 from impc.errors import SolverError, WeightsError
 from impc.inverse.one_step import one_step
 from impc.inverse.problem import controller_for, scenarios
 from impc.inverse.residuals import Evaluation, evaluate, misfit_or_reason, unusable
 from impc.model.riccati import LqrSolution, gain_gradients, solve_lqr
-from impc.model.weights import Weights, stage_weights
+from impc.model.weights import Weights
 
 if TYPE_CHECKING:
-    from impc.inverse.problem import InverseProblem
+    from impc.inverse.problem import Problem
 
 __all__ = ["bryson_regulators", "bryson_weights", "diagonal_weights"]
 
@@ -45,7 +46,7 @@ _SMALL = 1e-2
 _TOLERANCE = 1e-3
 
 
-def bryson_weights(problem: InverseProblem) -> list[Weights]:
+def bryson_weights(problem: Problem) -> list[Weights]:
     """Weights that price each recorded output by its size (Bryson's rule), over a range of efforts.
 
     Q = C'diag(p/mean(y^2))C plus 1e-8 of its mean diagonal, R = rho I for rho from 1e-9 to 1e3,
@@ -59,10 +60,10 @@ def bryson_weights(problem: InverseProblem) -> list[Weights]:
     common = np.exp(np.mean(np.log(power[seen]))) if np.any(seen) else _NOTHING
     Q = plant.C.T @ np.diag(common / power) @ plant.C
     Q += 1e-8 * np.trace(Q) / plant.n * np.eye(plant.n)
-    return [stage_weights(Q, rho * np.eye(plant.m)) for rho in _PRICES]
+    return [Weights(Q, rho * np.eye(plant.m)) for rho in _PRICES]
 
 
-def bryson_regulators(problem: InverseProblem) -> list[tuple[Weights, LqrSolution]]:
+def bryson_regulators(problem: Problem) -> list[tuple[Weights, LqrSolution]]:
     """Those of `bryson_weights` that have a regulator to working precision, with it.
 
     Raises
@@ -82,7 +83,7 @@ def bryson_regulators(problem: InverseProblem) -> list[tuple[Weights, LqrSolutio
     return found
 
 
-def diagonal_weights(problem: InverseProblem, *, max_evaluations: int = 15) -> Weights:
+def diagonal_weights(problem: Problem, *, max_evaluations: int = 15) -> Weights:
     """Fit the prices of the states, at given initial states, plant and R = I.
 
     Where no regulator of `bryson_weights` can be simulated to the end, sample by sample
@@ -119,7 +120,7 @@ def diagonal_weights(problem: InverseProblem, *, max_evaluations: int = 15) -> W
     return search.weights(found.x)
 
 
-def _ranked(problem: InverseProblem) -> list[tuple[Weights, LqrSolution]]:
+def _ranked(problem: Problem) -> list[tuple[Weights, LqrSolution]]:
     """Those of `bryson_weights` that can be simulated, least misfit first."""
     candidates, reason = [], ""
     for weights, solution in bryson_regulators(problem):
@@ -135,7 +136,7 @@ def _ranked(problem: InverseProblem) -> list[tuple[Weights, LqrSolution]]:
     return [(weights, solution) for _, weights, solution in candidates]
 
 
-def _first_usable(problem: InverseProblem, ranked: list[tuple[Weights, LqrSolution]]) -> _Prices:
+def _first_usable(problem: Problem, ranked: list[tuple[Weights, LqrSolution]]) -> _Prices:
     """The search from the best weights whose diagonal has a regulator that can be simulated too.
 
     A price on each state is another regulator than that of Bryson's rule: beside a command that is
@@ -165,7 +166,7 @@ class _Evaluated:
 class _Prices:
     """The residual as a function of the logarithms of the prices; keeps the last evaluation."""
 
-    def __init__(self, problem: InverseProblem, weights: Weights, solution: LqrSolution) -> None:
+    def __init__(self, problem: Problem, weights: Weights, solution: LqrSolution) -> None:
         self.problem, self.solution = problem, solution
         controller = controller_for(problem, solution.K, solution.S)
         runs = [simulate(controller, drive) for drive in scenarios(problem)]
@@ -183,7 +184,7 @@ class _Prices:
         self.last: tuple[bytes, _Evaluated] | None = None
 
     def weights(self, z: Array) -> Weights:
-        return stage_weights(np.diag(np.exp(z) * self.unit), np.eye(self.problem.plant.m))
+        return Weights(np.diag(np.exp(z) * self.unit), np.eye(self.problem.plant.m))
 
     def at(self, z: Array) -> _Evaluated:
         key = z.tobytes()

@@ -7,25 +7,25 @@ weights of least condition number among all those with that gain are one semidef
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from impc.arrays import Array
-from impc.checking import checked
+from impc.checking import checked, replace
 from impc.control.closed_loop import simulate
-from impc.control.controller import mpc_controller
+from impc.control.controller import Controller
 from impc.inverse.diagonal_start import bryson_regulators
 from impc.inverse.explaining_weights import weights_behind
 from impc.inverse.gain_search import EXPLAINED, GainFit, fit_gain
 from impc.inverse.inverse_lqr import inverse_lqr_gradient, inverse_lqr_lmi
-from impc.inverse.problem import recorded_size, scenarios, typical_output, without_bounds
+from impc.inverse.problem import recorded_size, scenarios, typical_output
 from impc.inverse.proximal_search import ConditionedFit, Objective, Residual, conditioned_fit
 from impc.inverse.residuals import evaluate
 from impc.inverse.weights_search import search_weights
 from impc.model.riccati import solve_lqr
-from impc.model.weights import Weights, condition_number, normalised, stage_weights
+from impc.model.weights import Weights, condition_number, normalised
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from impc.inverse.equivalent_weights import EquivalentWeights
     from impc.inverse.explaining_weights import WeightsBehind
     from impc.inverse.inverse_lqr import InverseLqr
-    from impc.inverse.problem import InverseProblem
+    from impc.inverse.problem import Problem
     from impc.model.plant import Plant
     from impc.model.riccati import LqrSolution
 
@@ -161,12 +161,12 @@ class Inference:
 
 
 @checked(condition_weight=0)
-def infer_weights(problem: InverseProblem, *, condition_weight: float | None = None) -> Inference:
+def infer_weights(problem: Problem, *, condition_weight: float | None = None) -> Inference:
     """Table 3.1: from recordings to the weights of the constrained controller behind them.
 
     Parameters
     ----------
-    problem : InverseProblem
+    problem : Problem
     condition_weight : float, optional
         Of the direct form, see `inverse_mpc`.
 
@@ -190,7 +190,7 @@ def start_gains(start: Start, plant: Plant) -> list[tuple[Array, Array]]:
 
 
 @checked
-def starting_point(problem: InverseProblem) -> Start:
+def starting_point(problem: Problem) -> Start:
     """Lines 1 to 8 of Table 3.1: a feedback gain, and the weights of a regulator like it.
 
     Raises
@@ -199,7 +199,7 @@ def starting_point(problem: InverseProblem) -> Start:
         As `infer_weights`.
     """
     plant = problem.plant
-    gain = fit_gain(without_bounds(problem), attempts=1)
+    gain = fit_gain(problem.without_bounds(), attempts=1)
     lmi = inverse_lqr_lmi(plant, gain.K)
     if lmi.weights is not None:
         return Start(gain, lmi, None, None, lmi.weights)
@@ -211,7 +211,7 @@ def starting_point(problem: InverseProblem) -> Start:
 
 @checked(condition_weight=0, max_iterations=1)
 def inverse_mpc(
-    problem: InverseProblem,
+    problem: Problem,
     start: Weights,
     *,
     condition_weight: float | None = None,
@@ -255,13 +255,13 @@ def inverse_mpc(
     return _explaining(problem, found, weight)
 
 
-def _direct(problem: InverseProblem, fit: ConditionedFit) -> DirectFit:
+def _direct(problem: Problem, fit: ConditionedFit) -> DirectFit:
     explained = fit.misfit <= EXPLAINED * recorded_size(problem)
     values = {item.name: getattr(fit, item.name) for item in fields(ConditionedFit)}
     return DirectFit(**values, explained=explained)
 
 
-def _explaining(problem: InverseProblem, found: DirectFit, weight: float) -> DirectFit:
+def _explaining(problem: Problem, found: DirectFit, weight: float) -> DirectFit:
     """Weights of least condition number that explain the recordings, if any; else those given."""
     near = search_weights(problem, found.weights)
     start = np.array(near.solution.K), np.array(near.solution.S)
@@ -284,7 +284,7 @@ def _explaining(problem: InverseProblem, found: DirectFit, weight: float) -> Dir
 
 @checked(condition_weight=0)
 def inverse_mpc_reduced(
-    problem: InverseProblem,
+    problem: Problem,
     *starts: tuple[Array, Array],
     condition_weight: float | None = None,
 ) -> ReducedFit:
@@ -325,13 +325,13 @@ def inverse_mpc_reduced(
     return ReducedFit(first.gain, None, direct, False, first.reason, kept)
 
 
-def _with_gain(problem: InverseProblem, found: WeightsBehind) -> ReducedFit:
+def _with_gain(problem: Problem, found: WeightsBehind) -> ReducedFit:
     assert found.equivalent is not None  # its misfit is finite
     kept = all(run.complete for run in verify_hard(problem, found.equivalent.weights))
     return ReducedFit(found.gain, found.equivalent, None, found.explained, found.reason, kept)
 
 
-def _most_promising(problem: InverseProblem) -> Weights:
+def _most_promising(problem: Problem) -> Weights:
     """Of `bryson_weights` those with the least misfit, whether or not every sample is reached."""
 
     def distance(solution: LqrSolution) -> float:
@@ -373,7 +373,7 @@ def auxiliary_weights(
     def distance(solution: LqrSolution) -> Residual:
         return Residual((solution.K - gain).ravel(), dK, dS, usable=True)
 
-    begin = stage_weights(np.eye(plant.n), np.eye(plant.m)) if start is None else start
+    begin = Weights(np.eye(plant.n), np.eye(plant.m)) if start is None else start
     return conditioned_fit(
         plant, Objective(distance, 1.0, condition_weight, squared=False), _definite(begin)
     )
@@ -381,7 +381,7 @@ def auxiliary_weights(
 
 @checked(condition_weight=0)
 def output_penalty_weights(
-    problem: InverseProblem,
+    problem: Problem,
     start: Weights,
     *,
     condition_weight: float | None = None,
@@ -401,18 +401,18 @@ def output_penalty_weights(
         As `inverse_mpc`.
     """
     return inverse_mpc(
-        without_bounds(problem), start, condition_weight=condition_weight, explain=False
+        problem.without_bounds(), start, condition_weight=condition_weight, explain=False
     )
 
 
 @checked
-def verify_hard(problem: InverseProblem, weights: Weights) -> list[Simulation]:
+def verify_hard(problem: Problem, weights: Weights) -> list[Simulation]:
     """Simulate every recording with hard state bounds and terminal set.
 
     The search softens those rows; this says whether the controller found keeps them. Pass each
     result to `require_complete` to turn a failure into an error.
     """
-    controller = mpc_controller(
+    controller = Controller(
         problem.plant,
         weights,
         problem.bounds,
@@ -422,7 +422,7 @@ def verify_hard(problem: InverseProblem, weights: Weights) -> list[Simulation]:
     return [simulate(controller, drive) for drive in scenarios(problem)]
 
 
-def _closed_loop_residual(problem: InverseProblem) -> Callable[[LqrSolution], Residual]:
+def _closed_loop_residual(problem: Problem) -> Callable[[LqrSolution], Residual]:
     near: TerminalSet | None = None
 
     def residual(solution: LqrSolution) -> Residual:
@@ -443,4 +443,4 @@ def _definite(weights: Weights) -> Weights:
     for matrix in (weights.Q, weights.R):
         values, vectors = np.linalg.eigh(matrix)
         lifted.append((vectors * np.maximum(values, floor)) @ vectors.T)
-    return normalised(stage_weights(*lifted))
+    return normalised(Weights(*lifted))

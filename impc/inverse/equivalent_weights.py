@@ -19,7 +19,7 @@ from impc.errors import SolverError, WeightsError
 from impc.inverse.semidefinite import matrix_inequality, solve_semidefinite
 from impc.inverse.solution_set import GainFibre, gain_fibre, pair_blocks, split_blocks
 from impc.model.riccati import solve_lqr
-from impc.model.weights import Weights, condition_number, normalised, stage_weights
+from impc.model.weights import Weights, condition_number, normalised
 
 __all__ = [
     "EquivalentWeights",
@@ -315,7 +315,7 @@ def inverse_factor(fibre: GainFibre, weights: Weights) -> Array:
 
 
 def _member(fibre: GainFibre, found: Weights, status: str, gap: float | None) -> EquivalentWeights:
-    checked = normalised(stage_weights(found.Q, found.R))
+    checked = normalised(Weights(found.Q, found.R))
     solution = solve_lqr(fibre.plant, checked)
     size = max(float(np.linalg.norm(fibre.gain)), 1e-300)
     error = float(np.linalg.norm(solution.K - fibre.gain)) / size

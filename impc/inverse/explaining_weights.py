@@ -14,11 +14,12 @@ the last digit.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from impc.checking import replace
 from impc.errors import SolverError, WeightsError
 from impc.inverse.equivalent_weights import least_condition_weights
 from impc.inverse.gain_search import EXPLAINED, describe_gain
@@ -31,7 +32,7 @@ from impc.model.riccati import solve_lqr
 if TYPE_CHECKING:
     from impc.inverse.equivalent_weights import EquivalentWeights
     from impc.inverse.gain_search import GainFit
-    from impc.inverse.problem import InverseProblem
+    from impc.inverse.problem import Problem
     from impc.model.weights import Weights
 
 __all__ = ["WeightsBehind", "weights_behind", "weights_misfit"]
@@ -87,7 +88,7 @@ def weights_behind(fit: GainFit) -> WeightsBehind:
     return _with_gain(exact, refined.weights)
 
 
-def weights_misfit(problem: InverseProblem, weights: Weights) -> float:
+def weights_misfit(problem: Problem, weights: Weights) -> float:
     """2-norm of the residual of the constrained controller with these weights."""
     solution = solve_lqr(problem.plant, weights)
     return float(np.linalg.norm(residual_only(problem, solution.K, solution.S)))

@@ -7,7 +7,7 @@ nothing else (docs/theory.md, section 2).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,24 +15,23 @@ import scipy.linalg
 import scipy.optimize
 
 from impc.arrays import Array, Frozen, frozen
-from impc.checking import checked
+from impc.checking import checked, replace
 from impc.errors import DataError, SolverError, WeightsError
 from impc.inverse.coordinates import Coordinates
 from impc.inverse.diagonal_start import bryson_regulators
 from impc.inverse.one_step import follows_plant, one_step, regressed_gain
-from impc.inverse.problem import moved, recorded_size
+from impc.inverse.problem import recorded_size
 from impc.inverse.residuals import misfit_or_reason
 from impc.inverse.solution_set import natural_coordinates
 from impc.inverse.stationarity import inverse_kkt
 from impc.inverse.weights_search import search_weights
 from impc.model.riccati import is_stable, solve_lqr
-from impc.model.weights import stage_weights
+from impc.model.weights import Weights
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from impc.inverse.problem import InverseProblem
-    from impc.model.weights import Weights
+    from impc.inverse.problem import Problem
 
 __all__ = ["EXPLAINED", "GainFit", "bryson_starts", "describe_gain", "fit_gain", "refine_gain"]
 
@@ -60,7 +59,7 @@ class GainFit(Frozen):
         (m, n).
     S : Array
         Metric (m, m); the one it started from where the recordings do not determine it.
-    problem : InverseProblem
+    problem : Problem
         The problem at the initial states and the parameters found; the given one when these are
         known.
     misfit : float
@@ -84,7 +83,7 @@ class GainFit(Frozen):
 
     K: Array
     S: Array
-    problem: InverseProblem
+    problem: Problem
     misfit: float
     explained: bool
     stabilises: bool
@@ -101,7 +100,7 @@ class GainFit(Frozen):
 
 @checked(attempts=1, max_evaluations=1, spread=0)
 def fit_gain(
-    problem: InverseProblem,
+    problem: Problem,
     *starts: tuple[Array, Array],
     attempts: int = 3,
     regulators: bool = True,
@@ -118,7 +117,7 @@ def fit_gain(
 
     Parameters
     ----------
-    problem : InverseProblem
+    problem : Problem
     starts : pairs of Array
         Gains (m, n) and metrics (m, m) to start from.
     attempts : int
@@ -153,7 +152,7 @@ def fit_gain(
 
 
 def _by_single_steps(
-    problem: InverseProblem, starts: Sequence[tuple[Array, Array]], budget: int, spread: float
+    problem: Problem, starts: Sequence[tuple[Array, Array]], budget: int, spread: float
 ) -> GainFit | None:
     """A search from the gain that fits each step of the recordings by itself (`one_step`)."""
     steps = one_step(problem)
@@ -180,19 +179,19 @@ def _by_single_steps(
     return fit and replace(fit, evaluations=fit.evaluations + spent)
 
 
-def _round(problem: InverseProblem, gain: Array) -> Weights:
+def _round(problem: Problem, gain: Array) -> Weights:
     """The weights that are I in the natural coordinates of a gain (m, n)."""
     T, G = (np.linalg.inv(item) for item in natural_coordinates(problem.plant, gain))
-    return stage_weights(T.T @ T, G.T @ G)
+    return Weights(T.T @ T, G.T @ G)
 
 
-def _pair(problem: InverseProblem, weights: Weights) -> tuple[Array, Array]:
+def _pair(problem: Problem, weights: Weights) -> tuple[Array, Array]:
     solution = solve_lqr(problem.plant, weights)
     return np.array(solution.K), np.array(solution.S)
 
 
 def _weights_by_steps(
-    steps: InverseProblem, starts: list[Weights]
+    steps: Problem, starts: list[Weights]
 ) -> tuple[tuple[Array, Array] | None, int]:
     """Gain and metric of weights that explain each step, if a search finds any; evaluations."""
     spent, enough = 0, EXPLAINED * recorded_size(steps)
@@ -208,7 +207,7 @@ def _weights_by_steps(
 
 
 def _best_search(
-    problem: InverseProblem,
+    problem: Problem,
     starts: list[tuple[Array, Array]],
     attempts: int,
     budget: int,
@@ -231,7 +230,7 @@ def _best_search(
 
 
 def refine_gain(
-    problem: InverseProblem,
+    problem: Problem,
     gain: Array,
     metric: Array,
     *,
@@ -268,13 +267,13 @@ def describe_gain(fit: GainFit, gain: Array, metric: Array) -> GainFit:
     return replace(found, evaluations=fit.evaluations + 1, refused=fit.refused)
 
 
-def bryson_starts(problem: InverseProblem) -> list[tuple[Array, Array]]:
+def bryson_starts(problem: Problem) -> list[tuple[Array, Array]]:
     """Gains (m, n) and metrics (m, m) of the regulators of `bryson_weights`."""
     return [(np.array(item.K), np.array(item.S)) for _, item in bryson_regulators(problem)]
 
 
 def _rank(
-    problem: InverseProblem, starts: list[tuple[Array, Array]]
+    problem: Problem, starts: list[tuple[Array, Array]]
 ) -> tuple[list[tuple[Array, Array]], int, list[str]]:
     """The usable starts by their misfit, the evaluations spent, and why the others are not."""
     usable, refused = [], []
@@ -288,9 +287,7 @@ def _rank(
     return [(K, S) for _, K, S in usable], len(starts), refused
 
 
-def _search(
-    problem: InverseProblem, gain: Array, metric: Array, budget: int, spread: float
-) -> GainFit:
+def _search(problem: Problem, gain: Array, metric: Array, budget: int, spread: float) -> GainFit:
     """One search; with a finite spread in rounds, each with the noise that the last one left.
 
     While the misfit still falls by more than its square root, the fit is limited by the prior and
@@ -321,7 +318,7 @@ def _search(
 
 def _gain_fit(space: Coordinates, z: Array, evaluations: int) -> GainFit:
     found = space.unpack(z)
-    problem = moved(space.problem, found.starts, found.logarithms)
+    problem = space.problem.at(found.starts, found.logarithms)
     plant = problem.plant
     stabilises = is_stable(plant.A - plant.B @ found.K, discrete=True)
     misfit = float(np.linalg.norm(space.at(z).residual))

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.optimize
 
 from impc.arrays import Array, frozen
+from impc.checking import replace
 from impc.inverse.coordinates import start_unit
 from impc.inverse.residuals import evaluate
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from impc.inverse.problem import InverseProblem
+    from impc.inverse.problem import Problem
     from impc.inverse.residuals import Evaluation
 
 __all__ = ["with_fitted_starts"]
@@ -26,8 +26,8 @@ _ROUNDS = 2
 
 
 def with_fitted_starts(
-    problem: InverseProblem, gain: Array, metric: Array, samples: int | None = None
-) -> InverseProblem:
+    problem: Problem, gain: Array, metric: Array, samples: int | None = None
+) -> Problem:
     """Return the problem with each trial's x0 fitted to its first samples under a controller.
 
     From the given x0, by trust-region least squares. Where the samples leave x0 free it stays: it
@@ -50,7 +50,7 @@ def with_fitted_starts(
     return replace(problem, recordings=tuple(fitted))
 
 
-def _fit(problem: InverseProblem, gain: Array, metric: Array) -> Array:
+def _fit(problem: Problem, gain: Array, metric: Array) -> Array:
     unit = start_unit(problem, gain)
     (trial,) = problem.recordings
     n = problem.plant.n

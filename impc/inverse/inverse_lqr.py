@@ -19,7 +19,7 @@ from impc.errors import WeightsError
 from impc.inverse.cross_term import CrossTerm, inverse_lqr_cross_term
 from impc.inverse.equivalent_weights import gain_fibre, least_condition_weights, weights_margin
 from impc.model.riccati import gain_gradients, is_stable, solve_lqr
-from impc.model.weights import Weights, condition_number, normalised, stage_weights
+from impc.model.weights import Weights, condition_number, normalised
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -199,7 +199,7 @@ class _FactorSpace(Frozen):
         L, G = self.factors(parameters)
         Q, R = L @ L.T + self.lift * np.eye(len(L)), G @ G.T + self.lift * np.eye(len(G))
         try:
-            return solve_lqr(self.plant, stage_weights(Q, R))
+            return solve_lqr(self.plant, Weights(Q, R))
         except WeightsError:
             return None
 
@@ -216,11 +216,11 @@ class _FactorSpace(Frozen):
 
 def _default_start(plant: Plant, K: Array) -> Weights:
     if not is_stable(plant.A - plant.B @ K, discrete=plant.discrete):
-        return stage_weights(np.eye(plant.n), np.eye(plant.m))
+        return Weights(np.eye(plant.n), np.eye(plant.m))
     found = inverse_lqr_cross_term(plant, K)
     # Q is often singular there. A lift of 1e-4 would undo the start on the seat plant, where the
     # eigenvalues span 1e8: a gain error of 7 % after 300 evaluations, from this one 6e-6.
-    return stage_weights(_definite(found.Q, 1e-8 * float(np.linalg.norm(found.Q, 2))), found.R)
+    return Weights(_definite(found.Q, 1e-8 * float(np.linalg.norm(found.Q, 2))), found.R)
 
 
 def _definite(matrix: Array, least: float) -> Array:

@@ -17,12 +17,13 @@ again for its own gain before it is judged.
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from impc.arrays import Array, Frozen, frozen
+from impc.checking import replace
 from impc.errors import ImpcError, SolverError, WeightsError
 from impc.inverse.diagonal_start import diagonal_weights
 from impc.inverse.direct_and_reduced import auxiliary_weights
@@ -31,19 +32,17 @@ from impc.inverse.explaining_weights import weights_behind
 from impc.inverse.inverse_lqr import inverse_lqr_gradient, inverse_lqr_lmi
 from impc.inverse.natural_search import in_plant_units, inverse_mpc_natural
 from impc.inverse.noisy_fit import free_gain, noise_of
-from impc.inverse.problem import moved, without_bounds
 from impc.inverse.solution_set import gain_fibre, natural_coordinates
 from impc.inverse.stationarity import inverse_kkt
 from impc.model.plant import change_coordinates
 from impc.model.riccati import is_stable, solve_lqr
-from impc.model.weights import stage_weights
+from impc.model.weights import Weights
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from impc.inverse.problem import InverseProblem
+    from impc.inverse.problem import Problem
     from impc.model.plant import Plant
-    from impc.model.weights import Weights
 
 __all__ = ["METHODS", "Estimate", "decode_estimate", "encode_estimate", "estimate_all"]
 
@@ -93,14 +92,14 @@ class Estimate(Frozen):
 
 
 def estimate_all(
-    problem: InverseProblem,
+    problem: Problem,
     remember: Callable[[str, Callable[[], Estimate]], Estimate] = lambda _, compute: compute(),
 ) -> dict[str, Estimate]:
     """Run every method of the module's text.
 
     Parameters
     ----------
-    problem : InverseProblem
+    problem : Problem
     remember : callable
         (name, compute) -> the estimate: from memory, or computed now.
     """
@@ -109,15 +108,15 @@ def estimate_all(
     found = {"inverse_mpc_reduced": reduced}
     if reduced.K is None:
         return found
-    here = moved(problem, np.array(reduced.starts), np.array(reduced.logarithms))
+    here = problem.at(np.array(reduced.starts), np.array(reduced.logarithms))
     known = replace(here, unknown_start=False, family=None, logarithms=frozen([]))
-    feedback = remember("feedback_gain", lambda: _timed(begin, _feedback, without_bounds(known)))
+    feedback = remember("feedback_gain", lambda: _timed(begin, _feedback, known.without_bounds()))
     found["feedback_gain"] = feedback
     finders: dict[str, Callable[[], Weights]] = {
         "inverse_lqr_lmi": lambda: _lmi(*_natural(known.plant, feedback, begin)),
         "inverse_lqr_gradient": lambda: _gradient(*_natural(known.plant, feedback, begin)),
         "inverse_lqr_auxiliary": lambda: _auxiliary(*_natural(known.plant, feedback, begin)),
-        "inverse_lqr_output": lambda: _direct(without_bounds(known), begin, feedback),
+        "inverse_lqr_output": lambda: _direct(known.without_bounds(), begin, feedback),
         "inverse_kkt": lambda: inverse_kkt(known, begin.gain),
         "inverse_mpc_direct": lambda: _direct(known, begin, reduced),
     }
@@ -129,7 +128,7 @@ def estimate_all(
 class _Begin:
     """The best diagonal weights, computed when first asked for."""
 
-    def __init__(self, problem: InverseProblem) -> None:
+    def __init__(self, problem: Problem) -> None:
         self.problem = problem
         self.found: Weights | None = None
 
@@ -145,7 +144,7 @@ class _Begin:
 
 
 def _timed(
-    begin: _Begin, find: Callable[[_Begin, InverseProblem], Estimate], problem: InverseProblem
+    begin: _Begin, find: Callable[[_Begin, Problem], Estimate], problem: Problem
 ) -> Estimate:
     begin.weights  # noqa: B018 - the start is common to all methods and not in any one's time
     started = time.perf_counter()
@@ -169,7 +168,7 @@ def _weights(find: Callable[[], Weights], reduced: Estimate, plant: Plant) -> Es
     return replace(found, seconds=time.perf_counter() - started)
 
 
-def _reduced(begin: _Begin, problem: InverseProblem) -> Estimate:
+def _reduced(begin: _Begin, problem: Problem) -> Estimate:
     behind = weights_behind(free_gain(problem, begin.weights))
     free, reason = behind.gain, behind.reason
     weights = None if behind.equivalent is None else behind.equivalent.weights
@@ -179,13 +178,13 @@ def _reduced(begin: _Begin, problem: InverseProblem) -> Estimate:
     )
 
 
-def _feedback(begin: _Begin, loose: InverseProblem) -> Estimate:
+def _feedback(begin: _Begin, loose: Problem) -> Estimate:
     free = free_gain(loose, begin.weights)
     starts = frozen([trial.x0 for trial in loose.recordings])
     return Estimate(free.K, free.S, None, starts, loose.logarithms, noise_of(free), 0.0, "")
 
 
-def _nothing(problem: InverseProblem, reason: str) -> Estimate:
+def _nothing(problem: Problem, reason: str) -> Estimate:
     starts = frozen([trial.x0 for trial in problem.recordings])
     return Estimate(None, None, None, starts, problem.logarithms, np.nan, 0.0, reason)
 
@@ -224,7 +223,7 @@ def _auxiliary(natural: Plant, target: Array, start: Array, T: Array, G: Array) 
     return in_plant_units(auxiliary_weights(natural, target, centre).weights, T, G)
 
 
-def _direct(problem: InverseProblem, begin: _Begin, before: Estimate) -> Weights:
+def _direct(problem: Problem, begin: _Begin, before: Estimate) -> Weights:
     return inverse_mpc_natural(problem, begin.weights, before.noise).weights
 
 
@@ -249,7 +248,7 @@ def decode_estimate(kept: dict[str, Any]) -> Estimate:
     return Estimate(
         None if kept["K"] is None else frozen(kept["K"]),
         None if kept["S"] is None else frozen(kept["S"]),
-        None if kept["Q"] is None else stage_weights(kept["Q"], kept["R"]),
+        None if kept["Q"] is None else Weights(kept["Q"], kept["R"]),
         frozen(kept["starts"]),
         frozen(kept["logarithms"]),
         np.nan if kept["noise"] is None else kept["noise"],

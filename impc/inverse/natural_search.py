@@ -15,12 +15,12 @@ G are the natural coordinates of the start and stay.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from impc.arrays import Array, frozen
+from impc.checking import replace
 from impc.inverse.equivalent_weights import least_condition_weights
 from impc.inverse.proximal_search import Objective, Residual, conditioned_fit
 from impc.inverse.residuals import evaluate
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from impc.control.terminal_set import TerminalSet
-    from impc.inverse.problem import InverseProblem
+    from impc.inverse.problem import Problem
     from impc.inverse.proximal_search import ConditionedFit
     from impc.model.riccati import LqrSolution
 
@@ -49,7 +49,7 @@ _TOLERANCE = 1e-5
 
 
 def inverse_mpc_natural(
-    problem: InverseProblem,
+    problem: Problem,
     start: Weights,
     noise: float,
     *,
@@ -60,7 +60,7 @@ def inverse_mpc_natural(
 
     Parameters
     ----------
-    problem : InverseProblem
+    problem : Problem
     start : Weights
         Positive definite. Their gain and metric are kept, and the weights of least condition number
         with both, in natural coordinates, are where the search begins.
@@ -122,7 +122,7 @@ def in_plant_units(weights: Weights, T: Array, G: Array) -> Weights:
 
 
 def _residual(
-    problem: InverseProblem, T: Array, G: Array, noise: float
+    problem: Problem, T: Array, G: Array, noise: float
 ) -> Callable[[LqrSolution], Residual]:
     """Residual over noise of a regulator given in natural coordinates, u = -G K T^-1 x."""
     known = replace(problem, unknown_start=False, family=None, logarithms=frozen(np.zeros(0)))

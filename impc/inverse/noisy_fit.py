@@ -10,13 +10,13 @@ natural coordinates (`natural_fit`) takes the weights that fit best (docs/fittin
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from impc.arrays import Array, frozen
-from impc.checking import checked
+from impc.checking import checked, replace
 from impc.errors import SolverError, WeightsError
 from impc.inverse.diagonal_start import diagonal_weights
 from impc.inverse.direct_and_reduced import auxiliary_weights
@@ -32,7 +32,7 @@ from impc.model.plant import change_coordinates
 from impc.model.riccati import solve_lqr
 
 if TYPE_CHECKING:
-    from impc.inverse.problem import InverseProblem
+    from impc.inverse.problem import Problem
     from impc.inverse.proximal_search import ConditionedFit
     from impc.model.riccati import LqrSolution
     from impc.model.weights import Weights
@@ -52,7 +52,7 @@ class FittedController:
 
     Attributes
     ----------
-    problem : InverseProblem
+    problem : Problem
         At the initial states and parameters found.
     free : GainFit
         The best gain of any kind, under the same bounds.
@@ -71,7 +71,7 @@ class FittedController:
         `GainFit`.
     """
 
-    problem: InverseProblem
+    problem: Problem
     free: GainFit
     weights: Weights
     solution: LqrSolution
@@ -87,12 +87,12 @@ class FittedController:
 
 
 @checked
-def fit_controller(problem: InverseProblem, start: Weights | None = None) -> FittedController:
+def fit_controller(problem: Problem, start: Weights | None = None) -> FittedController:
     """Fit the weights of the constrained controller behind recordings.
 
     Parameters
     ----------
-    problem : InverseProblem
+    problem : Problem
     start : Weights, optional
         Where the search begins; by default the best diagonal ones.
 
@@ -140,7 +140,7 @@ def _again(free: GainFit, begin: Weights, found: ConditionedFit) -> ConditionedF
     return other if other.misfit < found.misfit else found
 
 
-def free_gain(problem: InverseProblem, begin: Weights) -> GainFit:
+def free_gain(problem: Problem, begin: Weights) -> GainFit:
     """The best gain of any kind near that of some weights, with what else the problem lacks."""
     solution = solve_lqr(problem.plant, begin)
     start = np.array(solution.K), np.array(solution.S)
@@ -153,7 +153,7 @@ def noise_of(free: GainFit) -> float:
 
 
 def _finish(
-    free: GainFit, problem: InverseProblem, weights: Weights, *, exact: bool, converged: bool
+    free: GainFit, problem: Problem, weights: Weights, *, exact: bool, converged: bool
 ) -> FittedController:
     solution = solve_lqr(problem.plant, weights)
     K, S = np.array(solution.K), np.array(solution.S)

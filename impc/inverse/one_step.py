@@ -13,17 +13,17 @@ recordings no search over trajectories explains, three in four are explained fro
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.optimize
 
 from impc.arrays import Array, frozen
+from impc.checking import replace
 from impc.inverse.smoothing import smoothed_trials
 
 if TYPE_CHECKING:
-    from impc.inverse.problem import InverseProblem
+    from impc.inverse.problem import Problem
 
 __all__ = ["follows_plant", "one_step", "regressed_gain"]
 
@@ -35,7 +35,7 @@ _FOLLOWS = 1e-6
 _AT_BOUND = 1e-6
 
 
-def one_step(problem: InverseProblem) -> InverseProblem:
+def one_step(problem: Problem) -> Problem:
     """Return the problem whose recordings are pairs of neighbouring samples, starts known.
 
     States are those of the outputs where these determine them, otherwise smoothed ones.
@@ -64,7 +64,7 @@ def one_step(problem: InverseProblem) -> InverseProblem:
     )
 
 
-def follows_plant(problem: InverseProblem) -> bool:
+def follows_plant(problem: Problem) -> bool:
     """Whether the outputs are states that the plant can follow exactly, by some inputs."""
     plant, states = problem.plant, _recorded_states(problem)
     if states is None:
@@ -78,7 +78,7 @@ def follows_plant(problem: InverseProblem) -> bool:
     return missed <= _FOLLOWS**2 * size
 
 
-def regressed_gain(problem: InverseProblem) -> Array | None:
+def regressed_gain(problem: Problem) -> Array | None:
     """The gain (m, n) of most samples: the commands' least sum of absolute values of u + K x.
 
     At a sample from which no bound is met within the horizon the command is -K x exactly; where
@@ -114,7 +114,7 @@ def _least_absolute(x: Array, u: Array) -> Array:
     return np.zeros(n) if found.x is None else np.asarray(found.x[:n])
 
 
-def _recorded_states(problem: InverseProblem) -> list[Array] | None:
+def _recorded_states(problem: Problem) -> list[Array] | None:
     C = problem.plant.C
     if C.shape[0] != C.shape[1] or np.linalg.matrix_rank(C) < len(C):
         return None

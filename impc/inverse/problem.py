@@ -10,47 +10,57 @@ at other values of these (docs/theory.md, section 6; docs/fitting.md).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from impc.arrays import Array, finite_array, frozen
-from impc.checking import Value, checked
+from impc.checking import Value, checked, replace
 from impc.control.closed_loop import Scenario
-from impc.control.controller import LONGEST_HORIZON, Controller, gain_controller
+from impc.control.controller import LONGEST_HORIZON, Controller
 from impc.errors import DataError, InputError
-from impc.model.bounds import box_bounds
+from impc.model.bounds import Bounds
 from impc.model.plant_family import plant_at
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import ArrayLike
 
     from impc.control.closed_loop import Simulation
     from impc.control.terminal_set import TerminalSet
-    from impc.model.bounds import Bounds
     from impc.model.plant import Plant
     from impc.model.plant_family import PlantFamily
     from impc.model.recordings import Recording
 
 __all__ = [
-    "InverseProblem",
+    "Problem",
     "controller_for",
-    "inverse_problem",
     "misfit",
-    "moved",
     "recorded_size",
     "scenarios",
     "typical_output",
-    "without_bounds",
 ]
 
 
-@dataclass(frozen=True)
-class InverseProblem(Value):
+@dataclass(frozen=True, init=False)
+class Problem(Value):
     """Find the controller that made the recordings.
+
+    Parameters
+    ----------
+    plant : Plant
+        That of the family's nominal values, when there is one.
+    bounds : Bounds
+    horizon : int
+        N, in samples.
+    recordings : sequence of Recording
+    terminal_set, softening, unknown_start, family
+        See the attributes.
+    output_scale : array_like, optional
+        (p,), positive; by default the root-mean-square of each output over all recordings, so
+        that no answer depends on units. An output that is zero throughout counts as the largest.
 
     Attributes
     ----------
@@ -72,6 +82,22 @@ class InverseProblem(Value):
         Plants among which the search goes on; None when the plant is known.
     logarithms : Array
         Logarithms of the family's parameters over their nominal values at which `plant` is (k,).
+
+    Raises
+    ------
+    PlantError, DataError, InputError
+        When the plant is continuous, there is no recording, or a scale is not positive.
+
+    Examples
+    --------
+    >>> import control
+    >>> import impc
+    >>> plant = impc.Plant(control.ss([[2, -1], [1, 0.2]], [[1], [0]], [[1, 0], [0, 1]], 0, 1))
+    >>> bounds = impc.Bounds(plant, u_min=-1, u_max=1)
+    >>> truth = impc.Controller(plant, impc.Weights([[1, 0], [0, 1]], 1), bounds, horizon=3)
+    >>> trial = impc.Recording(plant, truth.simulate([1, 3], steps=20).x)
+    >>> impc.Problem(plant, bounds, 3, [trial]).without_bounds().bounds.u_max
+    array([inf])
     """
 
     _rules: ClassVar[Mapping[str, Any]] = {
@@ -91,64 +117,77 @@ class InverseProblem(Value):
     family: PlantFamily | None
     logarithms: Array
 
+    @checked(horizon=(1, LONGEST_HORIZON), output_scale="p")
+    def __init__(
+        self,
+        plant: Plant,
+        bounds: Bounds,
+        horizon: int,
+        recordings: Sequence[Recording],
+        *,
+        terminal_set: bool = True,
+        softening: float = 1e6,
+        output_scale: ArrayLike | None = None,
+        unknown_start: bool = False,
+        family: PlantFamily | None = None,
+    ) -> None:
+        plant.require_discrete()
+        if not recordings:
+            raise DataError("recordings", "there are none", "give at least one trial")
+        given = _root_mean_square(recordings) if output_scale is None else output_scale
+        scale = finite_array("output_scale", given, (len(plant.outputs),))
+        if np.any(scale <= 0):
+            raise InputError("output_scale", f"got {scale.tolist()}", "give positive numbers")
+        self._fill(
+            plant=plant,
+            bounds=bounds,
+            horizon=horizon,
+            recordings=tuple(recordings),
+            terminal_set=terminal_set,
+            softening=softening,
+            output_scale=frozen(scale),
+            unknown_start=unknown_start,
+            family=family,
+            logarithms=frozen(np.zeros(0 if family is None else len(family.names))),
+        )
 
-@checked(horizon=(1, LONGEST_HORIZON), output_scale="p")
-def inverse_problem(
-    plant: Plant,
-    bounds: Bounds,
-    horizon: int,
-    recordings: tuple[Recording, ...],
-    *,
-    terminal_set: bool = True,
-    softening: float = 1e6,
-    output_scale: ArrayLike | None = None,
-    unknown_start: bool = False,
-    family: PlantFamily | None = None,
-) -> InverseProblem:
-    """Check and gather an inverse problem.
+    def without_bounds(self) -> Problem:
+        """Return the same problem for a plain feedback gain: no bounds, no terminal set."""
+        return replace(self, bounds=Bounds(self.plant), terminal_set=False)
 
-    Parameters
-    ----------
-    plant : Plant
-        That of the family's nominal values, when there is one.
-    bounds : Bounds
-    horizon : int
-        N, in samples.
-    recordings : tuple of Recording
-    terminal_set, softening, unknown_start, family
-        See `InverseProblem`.
-    output_scale : array_like, optional
-        (p,), positive; by default the root-mean-square of each output over all recordings, so
-        that no answer depends on units. An output that is zero throughout counts as the largest.
+    def known(self) -> Problem:
+        """Return the problem with its initial states and parameters taken as they stand."""
+        return replace(self, unknown_start=False, family=None, logarithms=frozen([]))
 
-    Raises
-    ------
-    PlantError, DataError, InputError
-        When the plant is continuous, there is no recording, or a scale is not positive.
-    """
-    plant.require_discrete()
-    if not recordings:
-        raise DataError("recordings", "there are none", "give at least one trial")
-    p = len(plant.outputs)
-    given = _root_mean_square(recordings) if output_scale is None else output_scale
-    scale = finite_array("output_scale", given, (p,))
-    if np.any(scale <= 0):
-        raise InputError("output_scale", f"got {scale.tolist()}", "give positive numbers")
-    return InverseProblem(
-        plant,
-        bounds,
-        horizon,
-        tuple(recordings),
-        terminal_set,
-        softening,
-        frozen(scale),
-        unknown_start,
-        family,
-        frozen(np.zeros(0 if family is None else len(family.names))),
-    )
+    def leaving_out(self, trial: int) -> Problem:
+        """Return the problem without one trial, counted from 0."""
+        return replace(self, recordings=self.recordings[:trial] + self.recordings[trial + 1 :])
+
+    def at(self, starts: Array, logarithms: Array) -> Problem:
+        """Return the problem at other initial states and other parameters.
+
+        Parameters
+        ----------
+        starts : Array
+            Initial states (trials, n).
+        logarithms : Array
+            Of the family's parameters over their nominal values (k,).
+        """
+        recordings = tuple(
+            replace(trial, x0=frozen(x0)) for trial, x0 in zip(self.recordings, starts, strict=True)
+        )
+        plant = self.plant
+        if self.family is not None and not np.array_equal(logarithms, self.logarithms):
+            plant = plant_at(self.family, logarithms)
+        return replace(self, plant=plant, recordings=recordings, logarithms=frozen(logarithms))
+
+    @property
+    def starts(self) -> Array:
+        """Initial states of the trials, (trials, n)."""
+        return frozen([trial.x0 for trial in self.recordings])
 
 
-def _root_mean_square(recordings: tuple[Recording, ...]) -> Array:
+def _root_mean_square(recordings: Sequence[Recording]) -> Array:
     outputs = np.concatenate([trial.outputs for trial in recordings])
     largest = np.max(np.abs(outputs), axis=0)
     unit = np.where(largest > 0, largest, 1.0)  # squares of 1e200 are none
@@ -156,33 +195,8 @@ def _root_mean_square(recordings: tuple[Recording, ...]) -> Array:
     return np.where(size > 0, size, np.max(size) or 1.0)
 
 
-def moved(problem: InverseProblem, starts: Array, logarithms: Array) -> InverseProblem:
-    """Return the problem at other initial states and other parameters.
-
-    Parameters
-    ----------
-    starts : Array
-        Initial states (trials, n).
-    logarithms : Array
-        Of the family's parameters over their nominal values (k,).
-    """
-    recordings = tuple(
-        replace(trial, x0=frozen(x0)) for trial, x0 in zip(problem.recordings, starts, strict=True)
-    )
-    plant = problem.plant
-    if problem.family is not None and not np.array_equal(logarithms, problem.logarithms):
-        plant = plant_at(problem.family, logarithms)
-    return replace(problem, plant=plant, recordings=recordings, logarithms=frozen(logarithms))
-
-
-@checked
-def without_bounds(problem: InverseProblem) -> InverseProblem:
-    """Return the same problem for a plain feedback gain: no bounds, no terminal set."""
-    return replace(problem, bounds=box_bounds(problem.plant), terminal_set=False)
-
-
 def controller_for(
-    problem: InverseProblem, gain: Array, metric: Array, near: TerminalSet | None = None
+    problem: Problem, gain: Array, metric: Array, near: TerminalSet | None = None
 ) -> Controller:
     """Return the controller of the problem with that `gain` (m, n) and `metric` (m, m).
 
@@ -191,9 +205,9 @@ def controller_for(
     Raises
     ------
     InputError, SolverError
-        As `gain_controller`.
+        As `Controller`.
     """
-    return gain_controller(
+    return Controller.from_gain(
         problem.plant,
         gain,
         problem.bounds,
@@ -205,24 +219,24 @@ def controller_for(
     )
 
 
-def scenarios(problem: InverseProblem) -> list[Scenario]:
+def scenarios(problem: Problem) -> list[Scenario]:
     """What drives each recording."""
     return [Scenario(trial.x0, trial.disturbance[:-1]) for trial in problem.recordings]
 
 
-def recorded_size(problem: InverseProblem) -> float:
+def recorded_size(problem: Problem) -> float:
     """2-norm of all recorded outputs, each divided by its scale."""
     parts = [(trial.outputs / problem.output_scale).ravel() for trial in problem.recordings]
     return float(np.linalg.norm(np.concatenate(parts)))
 
 
-def typical_output(problem: InverseProblem) -> float:
+def typical_output(problem: Problem) -> float:
     """Root-mean-square of all recorded outputs over their scales: 1 at the default scales."""
     count = sum(trial.outputs.size for trial in problem.recordings)
     return recorded_size(problem) / float(np.sqrt(count)) or 1.0
 
 
-def misfit(problem: InverseProblem, simulations: list[Simulation]) -> float:
+def misfit(problem: Problem, simulations: list[Simulation]) -> float:
     """2-norm of all simulated minus recorded outputs, each divided by its scale."""
     parts = [
         (run.x @ problem.plant.C.T - trial.outputs) / problem.output_scale

@@ -30,7 +30,7 @@ from impc.arrays import Array, Frozen, frozen
 from impc.errors import SolverError
 from impc.inverse.proximal_step import StepProgram, block_basis, solve_step
 from impc.model.riccati import gain_gradients, metric_gradients, solve_lqr
-from impc.model.weights import Weights, condition_number, normalised, stage_weights
+from impc.model.weights import Weights, condition_number, normalised
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -228,7 +228,7 @@ class _Point:
 
 def _point(plant: Plant, objective: Objective, weights: Weights) -> _Point:
     least = float(np.linalg.eigvalsh(weights.block)[0])
-    scaled = stage_weights(weights.Q / least, weights.R / least)
+    scaled = Weights(weights.Q / least, weights.R / least)
     solution = solve_lqr(plant, scaled)
     residual = objective.residual(solution)
     size = float(np.linalg.norm(residual.values))

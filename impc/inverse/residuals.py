@@ -24,7 +24,7 @@ from impc.model.riccati import is_stable
 if TYPE_CHECKING:
     from impc.control.controller import Controller
     from impc.control.terminal_set import TerminalSet
-    from impc.inverse.problem import InverseProblem
+    from impc.inverse.problem import Problem
     from impc.model.plant_family import PlantDifferential
     from impc.model.recordings import Recording
 
@@ -70,7 +70,7 @@ class Evaluation:
 
 
 def evaluate(
-    problem: InverseProblem, gain: Array, metric: Array, near: TerminalSet | None = None
+    problem: Problem, gain: Array, metric: Array, near: TerminalSet | None = None
 ) -> Evaluation:
     """Residual and exact derivatives at a `gain` (m, n) and a `metric` (m, m).
 
@@ -119,7 +119,7 @@ def evaluate(
     )
 
 
-def misfit_or_reason(problem: InverseProblem, gain: Array, metric: Array) -> tuple[float, str]:
+def misfit_or_reason(problem: Problem, gain: Array, metric: Array) -> tuple[float, str]:
     """2-norm of the residual and an empty string, or infinity and why there is none.
 
     At a `gain` (m, n) and a `metric` (m, m). A fifth of the time of `evaluate`, which also
@@ -138,7 +138,7 @@ def misfit_or_reason(problem: InverseProblem, gain: Array, metric: Array) -> tup
     return misfit(problem, runs), ""
 
 
-def residual_only(problem: InverseProblem, gain: Array, metric: Array) -> Array:
+def residual_only(problem: Problem, gain: Array, metric: Array) -> Array:
     """Residual without derivatives, for differences and comparisons.
 
     Parameters
@@ -180,7 +180,7 @@ class _Layout:
         return int(self.parameters.stop)
 
 
-def _layout(problem: InverseProblem) -> _Layout:
+def _layout(problem: Problem) -> _Layout:
     m, n = problem.plant.m, problem.plant.n
     sizes = (
         m * n,
@@ -192,7 +192,7 @@ def _layout(problem: InverseProblem) -> _Layout:
     return _Layout(*(slice(a, b) for a, b in itertools.pairwise(ends)))
 
 
-def _plant_differential(problem: InverseProblem) -> PlantDifferential | None:
+def _plant_differential(problem: Problem) -> PlantDifferential | None:
     if problem.family is None:
         return None
     return plant_differential(problem.family, problem.logarithms)
@@ -233,11 +233,11 @@ def _symmetric(columns: Array, m: int) -> Array:
     return dS
 
 
-def _scale(problem: InverseProblem, trial: Recording) -> float:
+def _scale(problem: Problem, trial: Recording) -> float:
     return float(np.sqrt(np.mean((trial.outputs / problem.output_scale) ** 2))) or 1.0
 
 
-def unusable(problem: InverseProblem, reason: str) -> Evaluation:
+def unusable(problem: Problem, reason: str) -> Evaluation:
     """A large finite residual with its reason, for a search to step back from."""
     m, n = problem.plant.m, problem.plant.n
     residual = np.concatenate(

@@ -21,7 +21,7 @@ from statsmodels.tsa.statespace.kalman_smoother import KalmanSmoother
 from impc.arrays import Array, Frozen, frozen
 
 if TYPE_CHECKING:
-    from impc.inverse.problem import InverseProblem
+    from impc.inverse.problem import Problem
     from impc.model.plant import Plant
     from impc.model.recordings import Recording
 
@@ -49,7 +49,7 @@ class Smoothed(Frozen):
     u: Array
 
 
-def smoothed_trials(problem: InverseProblem) -> tuple[Smoothed, ...]:
+def smoothed_trials(problem: Problem) -> tuple[Smoothed, ...]:
     """Estimate states and commands of every trial; bounds and controller play no part."""
 
     def cost(logarithm: float) -> float:
@@ -74,7 +74,7 @@ def smoothed_trials(problem: InverseProblem) -> tuple[Smoothed, ...]:
     return tuple(smoothed)
 
 
-def _model(problem: InverseProblem, trial: Recording, ratio: float) -> KalmanSmoother:
+def _model(problem: Problem, trial: Recording, ratio: float) -> KalmanSmoother:
     """The state-space model of the module's text with states (x, u), at r = 1."""
     plant, scale = problem.plant, np.asarray(problem.output_scale)
     n, m, p = plant.n, plant.m, len(plant.outputs)

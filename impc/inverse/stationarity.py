@@ -28,15 +28,14 @@ from impc.inverse.proximal_step import block_basis
 from impc.inverse.semidefinite import matrix_inequality, norm_bound, solve_semidefinite
 from impc.inverse.smoothing import smoothed_trials
 from impc.inverse.solution_set import natural_coordinates, split_blocks
-from impc.model.weights import normalised, stage_weights
+from impc.model.weights import Weights, normalised
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from impc.inverse.problem import InverseProblem
+    from impc.inverse.problem import Problem
     from impc.inverse.smoothing import Smoothed
     from impc.model.plant import Plant
-    from impc.model.weights import Weights
 
 __all__ = ["inverse_kkt", "stationarity_weights"]
 
@@ -47,12 +46,12 @@ _AT_BOUND = 1e-2
 _FLOOR, _RIDGE = 1e-6, 1e-6
 
 
-def inverse_kkt(problem: InverseProblem, gain: Array) -> Weights:
+def inverse_kkt(problem: Problem, gain: Array) -> Weights:
     """Weights of least stationarity residual on smoothed trajectories.
 
     Parameters
     ----------
-    problem : InverseProblem
+    problem : Problem
         Its horizon is the length of the stretches, its input bounds decide which rows count.
     gain : Array
         A stabilising gain (m, n), for the units in which the program is solved only.
@@ -117,7 +116,7 @@ def stationarity_weights(
     natural = np.tensordot(theta, units, 1)
     found = split_blocks(natural, n)
     Q, R = back.T @ found.Q @ back, forth.T @ found.R @ forth
-    return normalised(stage_weights((Q + Q.T) / 2, (R + R.T) / 2))
+    return normalised(Weights((Q + Q.T) / 2, (R + R.T) / 2))
 
 
 def _stretch(A: Array, B: Array, units: Array, x: Array, u: Array, free: BoolArray) -> Array:

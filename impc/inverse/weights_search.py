@@ -13,13 +13,14 @@ states and inputs, and what the recordings do not tell of the weights stays as i
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.linalg
 
 from impc.arrays import Array, frozen
+from impc.checking import replace
 from impc.errors import SolverError, WeightsError
 from impc.inverse.problem import recorded_size
 from impc.inverse.proximal_search import Residual, weight_jacobian
@@ -30,7 +31,7 @@ from impc.model.riccati import solve_lqr
 from impc.model.weights import normalised
 
 if TYPE_CHECKING:
-    from impc.inverse.problem import InverseProblem
+    from impc.inverse.problem import Problem
     from impc.model.riccati import LqrSolution
     from impc.model.weights import Weights
 
@@ -68,14 +69,12 @@ class WeightsSearch:
     evaluations: int
 
 
-def search_weights(
-    problem: InverseProblem, start: Weights, *, max_evaluations: int = 60
-) -> WeightsSearch:
+def search_weights(problem: Problem, start: Weights, *, max_evaluations: int = 60) -> WeightsSearch:
     """Fit the weights to the recordings, at given initial states and plant.
 
     Parameters
     ----------
-    problem : InverseProblem
+    problem : Problem
     start : Weights
         Positive definite.
     max_evaluations : int
@@ -118,7 +117,7 @@ class _Point:
     misfit: float
 
 
-def _point(problem: InverseProblem, weights: Weights) -> _Point:
+def _point(problem: Problem, weights: Weights) -> _Point:
     solution = solve_lqr(problem.plant, weights)
     found = evaluate(problem, solution.K, solution.S)
     residual = Residual(found.residual, found.dK, found.dS, usable=not found.reason)
@@ -151,7 +150,7 @@ def _shortest(values: Array, seen: Array, radius: float) -> Array:
     return np.asarray(values * seen / (values**2 + high))
 
 
-def _try(problem: InverseProblem, L: Array, step: Array) -> _Point | None:
+def _try(problem: Problem, L: Array, step: Array) -> _Point | None:
     moved = L @ np.asarray(scipy.linalg.expm(step)) @ L.T
     if np.linalg.cond(moved) > _SINGULAR:
         return None

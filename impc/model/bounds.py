@@ -24,12 +24,20 @@ if TYPE_CHECKING:
 
     from impc.model.plant import Plant
 
-__all__ = ["BoundRows", "Bounds", "bound_rows", "box_bounds"]
+__all__ = ["BoundRows", "Bounds", "bound_rows"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, init=False)
 class Bounds(Value):
-    """Lower and upper bounds, infinite where there is none.
+    """Lower and upper bounds on states and inputs; what is not given is infinite.
+
+    Parameters
+    ----------
+    plant : Plant
+        Gives the sizes and the names.
+    x_min, x_max, u_min, u_max : array_like, optional
+        A number for all signals, or one for each, (n,) and (m,), in their units. The origin is
+        the equilibrium that is regulated to, so it must lie strictly inside.
 
     Attributes
     ----------
@@ -37,6 +45,19 @@ class Bounds(Value):
         State bounds (n,), in the units of the states.
     u_min, u_max : Array
         Input bounds (m,), in the units of the inputs.
+
+    Raises
+    ------
+    BoundsError
+        When a bound is NaN, has the wrong length, crosses its counterpart, or excludes the origin.
+
+    Examples
+    --------
+    >>> import control
+    >>> import impc
+    >>> plant = impc.Plant(control.ss([[2, -1], [1, 0.2]], [[1], [0]], [[1, 0]], 0, 1))
+    >>> impc.Bounds(plant, u_min=-1, u_max=1).u_max
+    array([1.])
     """
 
     _rules: ClassVar[Mapping[str, Any]] = {
@@ -50,6 +71,24 @@ class Bounds(Value):
     x_max: Array
     u_min: Array
     u_max: Array
+
+    @checked
+    def __init__(
+        self,
+        plant: Plant,
+        *,
+        x_min: ArrayLike | None = None,
+        x_max: ArrayLike | None = None,
+        u_min: ArrayLike | None = None,
+        u_max: ArrayLike | None = None,
+    ) -> None:
+        lower_x = _side("x_min", x_min, plant.n, -np.inf)
+        upper_x = _side("x_max", x_max, plant.n, np.inf)
+        lower_u = _side("u_min", u_min, plant.m, -np.inf)
+        upper_u = _side("u_max", u_max, plant.m, np.inf)
+        _check_pair("x_min, x_max", plant.states, lower_x, upper_x)
+        _check_pair("u_min, u_max", plant.controls, lower_u, upper_u)
+        self._fill(x_min=lower_x, x_max=upper_x, u_min=lower_u, u_max=upper_u)
 
 
 @dataclass(frozen=True)
@@ -71,39 +110,6 @@ class BoundRows(Value):
     b: Array
     on_state: BoolArray
     names: tuple[str, ...]
-
-
-@checked
-def box_bounds(
-    plant: Plant,
-    *,
-    x_min: ArrayLike | None = None,
-    x_max: ArrayLike | None = None,
-    u_min: ArrayLike | None = None,
-    u_max: ArrayLike | None = None,
-) -> Bounds:
-    """Check the given bounds against the plant; what is not given is infinite.
-
-    Parameters
-    ----------
-    plant : Plant
-        Gives the sizes and the names.
-    x_min, x_max, u_min, u_max : array_like, optional
-        A number for all signals, or one for each, (n,) and (m,), in their units. The origin is
-        the equilibrium that is regulated to, so it must lie strictly inside.
-
-    Raises
-    ------
-    BoundsError
-        When a bound is NaN, has the wrong length, crosses its counterpart, or excludes the origin.
-    """
-    lower_x = _side("x_min", x_min, plant.n, -np.inf)
-    upper_x = _side("x_max", x_max, plant.n, np.inf)
-    lower_u = _side("u_min", u_min, plant.m, -np.inf)
-    upper_u = _side("u_max", u_max, plant.m, np.inf)
-    _check_pair("x_min, x_max", plant.states, lower_x, upper_x)
-    _check_pair("u_min, u_max", plant.controls, lower_u, upper_u)
-    return Bounds(frozen(lower_x), frozen(upper_x), frozen(lower_u), frozen(upper_u))
 
 
 @checked

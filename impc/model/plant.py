@@ -9,25 +9,33 @@ disturbances has an E with no columns. What the controller makes of it: docs/the
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import scipy.linalg
 
 from impc.arrays import Array, frozen
-from impc.checking import Value, checked
+from impc.checking import Value, checked, replace
 from impc.errors import PlantError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-__all__ = ["Plant", "as_plant", "change_coordinates"]
+__all__ = ["Plant", "change_coordinates"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, init=False)
 class Plant(Value):
-    """A linear plant with named signals.
+    """A linear plant with named signals, read from a `control.StateSpace`.
+
+    Parameters
+    ----------
+    system : control.StateSpace or Plant
+        Discrete (``dt`` positive, or True for one second) or continuous (``dt`` zero).
+    controls : sequence of str, optional
+        Names of the inputs that the controller commands; the others are disturbances. By default
+        every input is a control.
 
     Attributes
     ----------
@@ -37,6 +45,21 @@ class Plant(Value):
         Sample time in seconds; 0 for continuous time.
     states, controls, disturbances, outputs : tuple of str
         Names of the signals, in the order of the arrays.
+
+    Raises
+    ------
+    PlantError
+        When the matrices are missing or not finite, when an output depends directly on an input,
+        when a control is not among the inputs, or when (A, B) is not stabilisable.
+
+    Examples
+    --------
+    >>> import control
+    >>> import impc
+    >>> cart = control.ss([[0, 1], [0, 0]], [[0], [1]], [[1, 0]], 0)
+    >>> plant = impc.Plant(control.c2d(cart, 0.1))
+    >>> plant.n, plant.m, plant.dt
+    (2, 1, 0.1)
     """
 
     _rules: ClassVar[Mapping[str, Any]] = {
@@ -56,6 +79,33 @@ class Plant(Value):
     controls: tuple[str, ...]
     disturbances: tuple[str, ...]
     outputs: tuple[str, ...]
+
+    @checked
+    def __init__(self, system: Any, controls: Sequence[str] | None = None) -> None:
+        if isinstance(system, Plant):
+            self._fill(**vars(system))
+            return
+        matrices = _matrices(system)
+        names = tuple(system.input_labels)
+        chosen = names if controls is None else tuple(controls)
+        unknown = [name for name in chosen if name not in names]
+        if unknown or not chosen:
+            raise PlantError(
+                "controls", f"{unknown or 'none given'}: the inputs are {list(names)}", "name some"
+            )
+        rest = tuple(name for name in names if name not in chosen)
+        self._fill(
+            A=matrices["A"],
+            B=matrices["B"][:, [names.index(name) for name in chosen]],
+            E=matrices["B"][:, [names.index(name) for name in rest]],
+            C=matrices["C"],
+            dt=_sample_time(system.dt),
+            states=tuple(system.state_labels),
+            controls=chosen,
+            disturbances=rest,
+            outputs=tuple(system.output_labels),
+        )
+        _require_stabilisable(self)
 
     @property
     def n(self) -> int:
@@ -89,67 +139,6 @@ class Plant(Value):
         return self
 
 
-@checked
-def as_plant(system: Any, controls: Sequence[str] | None = None) -> Plant:
-    """Read the arrays and names from a `control.StateSpace`.
-
-    Parameters
-    ----------
-    system : control.StateSpace or Plant
-        Discrete (``dt`` positive, or True for one second) or continuous (``dt`` zero). A `Plant`
-        is returned as it is.
-    controls : sequence of str, optional
-        Names of the inputs that the controller commands; the others are disturbances. By default
-        every input is a control.
-
-    Returns
-    -------
-    Plant
-
-    Raises
-    ------
-    PlantError
-        When the matrices are missing or not finite, when an output depends directly on an input,
-        when a control is not among the inputs, or when (A, B) is not stabilisable.
-    """
-    if isinstance(system, Plant):
-        return system
-    if not all(hasattr(system, name) for name in ("A", "B", "C", "D", "dt", "input_labels")):
-        kind = type(system).__name__
-        raise PlantError("plant", f"expected a control.StateSpace, got {kind}", "use control.ss")
-    matrices = {name: np.asarray(getattr(system, name), dtype=float) for name in "ABCD"}
-    for name, matrix in matrices.items():
-        if not np.all(np.isfinite(matrix)):
-            raise PlantError(f"plant.{name}", "has NaN or infinite entries", "correct the model")
-    if matrices["A"].shape[0] == 0 or matrices["B"].shape[1] == 0:
-        raise PlantError("plant", "has no states or no inputs", "give at least one of each")
-    if np.any(matrices["D"]):
-        raise PlantError(
-            "plant.D", "is not zero", "delay the output by a sample or drop the feedthrough"
-        )
-    names = tuple(system.input_labels)
-    chosen = names if controls is None else tuple(controls)
-    unknown = [name for name in chosen if name not in names]
-    if unknown or not chosen:
-        raise PlantError(
-            "controls", f"{unknown or 'none given'}: the inputs are {list(names)}", "name some"
-        )
-    rest = tuple(name for name in names if name not in chosen)
-    plant = Plant(
-        A=frozen(matrices["A"]),
-        B=frozen(matrices["B"][:, [names.index(name) for name in chosen]]),
-        E=frozen(matrices["B"][:, [names.index(name) for name in rest]]),
-        C=frozen(matrices["C"]),
-        dt=_sample_time(system.dt),
-        states=tuple(system.state_labels),
-        controls=chosen,
-        disturbances=rest,
-        outputs=tuple(system.output_labels),
-    )
-    _require_stabilisable(plant)
-    return plant
-
-
 @checked(T="n n", G="m m")
 def change_coordinates(plant: Plant, T: Array, G: Array | None = None) -> Plant:
     """Return the plant in z = T^-1 x and v = G^-1 u, T (n, n) and G (m, m); names stay."""
@@ -162,6 +151,23 @@ def change_coordinates(plant: Plant, T: Array, G: Array | None = None) -> Plant:
         E=frozen(back @ plant.E),
         C=frozen(plant.C @ T),
     )
+
+
+def _matrices(system: Any) -> dict[str, Array]:
+    if not all(hasattr(system, name) for name in ("A", "B", "C", "D", "dt", "input_labels")):
+        kind = type(system).__name__
+        raise PlantError("plant", f"expected a control.StateSpace, got {kind}", "use control.ss")
+    matrices = {name: frozen(getattr(system, name)) for name in "ABCD"}
+    for name, matrix in matrices.items():
+        if not np.all(np.isfinite(matrix)):
+            raise PlantError(f"plant.{name}", "has NaN or infinite entries", "correct the model")
+    if matrices["A"].shape[0] == 0 or matrices["B"].shape[1] == 0:
+        raise PlantError("plant", "has no states or no inputs", "give at least one of each")
+    if np.any(matrices["D"]):
+        raise PlantError(
+            "plant.D", "is not zero", "delay the output by a sample or drop the feedthrough"
+        )
+    return matrices
 
 
 def _sample_time(dt: object) -> float:

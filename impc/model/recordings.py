@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from impc.model.plant import Plant
 
-__all__ = ["Label", "Recording", "recording"]
+__all__ = ["Label", "Recording"]
 
 
 @dataclass(frozen=True)
@@ -41,52 +41,9 @@ class Label(Value):
         return " ".join(part for part in parts if part)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, init=False)
 class Recording(Value):
-    """One trial.
-
-    Attributes
-    ----------
-    outputs : Array
-        (samples, p), in the units of the plant's outputs.
-    disturbance : Array
-        (samples, d); row k acts between samples k and k + 1, so that the last is not used.
-    x0 : Array
-        State at the first sample (n,): known, or where a fit of it starts.
-    label : Label
-    findings : tuple of str
-        What the checks of its file found and let pass, one sentence each.
-    """
-
-    _rules: ClassVar[Mapping[str, Any]] = {
-        "outputs": "* p",
-        "disturbance": "* d",
-        "x0": "n",
-    }
-
-    outputs: Array
-    disturbance: Array
-    x0: Array
-    label: Label = Label()
-    findings: tuple[str, ...] = ()
-
-    @property
-    def samples(self) -> int:
-        """Number of samples."""
-        return len(self.outputs)
-
-
-@checked
-def recording(
-    plant: Plant,
-    outputs: ArrayLike,
-    disturbance: ArrayLike | None = None,
-    x0: ArrayLike | None = None,
-    *,
-    label: Label | None = None,
-    findings: tuple[str, ...] = (),
-) -> Recording:
-    """Check a trial against the plant and freeze it.
+    """One recorded trial, checked against its plant.
 
     Parameters
     ----------
@@ -103,27 +60,76 @@ def recording(
     findings : tuple of str
         What the checks of the file found, for the report.
 
+    Attributes
+    ----------
+    outputs : Array
+        (samples, p), in the units of the plant's outputs.
+    disturbance : Array
+        (samples, d); row k acts between samples k and k + 1, so that the last is not used.
+    x0 : Array
+        State at the first sample (n,): known, or where a fit of it starts.
+    label : Label
+    findings : tuple of str
+        What the checks of its file found and let pass, one sentence each.
+
     Raises
     ------
     DataError
         When something is missing, not finite, or of the wrong shape.
+
+    Examples
+    --------
+    >>> import control
+    >>> import impc
+    >>> plant = impc.Plant(control.ss([[0.5]], [[1]], [[1]], 0, 1))
+    >>> impc.Recording(plant, [1.0, 0.4, 0.2]).samples
+    3
     """
-    y = finite_array("outputs", _columns(outputs), (None, len(plant.outputs)))
-    if len(y) < 2:
-        raise DataError("outputs", f"has {len(y)} samples", "give at least 2")
-    width = plant.E.shape[1]
-    d = np.zeros((len(y), width)) if disturbance is None else _columns(disturbance)
-    start = x0
-    if start is None:
-        full = plant.C.shape == (plant.n, plant.n) and np.array_equal(plant.C, np.eye(plant.n))
-        start = y[0] if full else np.zeros(plant.n)
-    return Recording(
-        frozen(y),
-        frozen(finite_array("disturbance", d, (len(y), width))),
-        frozen(finite_array("x0", start, (plant.n,))),
-        label or Label(),
-        findings,
-    )
+
+    _rules: ClassVar[Mapping[str, Any]] = {
+        "outputs": "* p",
+        "disturbance": "* d",
+        "x0": "n",
+    }
+
+    outputs: Array
+    disturbance: Array
+    x0: Array
+    label: Label
+    findings: tuple[str, ...]
+
+    @checked
+    def __init__(
+        self,
+        plant: Plant,
+        outputs: ArrayLike,
+        disturbance: ArrayLike | None = None,
+        x0: ArrayLike | None = None,
+        *,
+        label: Label | None = None,
+        findings: tuple[str, ...] = (),
+    ) -> None:
+        y = finite_array("outputs", _columns(outputs), (None, len(plant.outputs)))
+        if len(y) < 2:
+            raise DataError("outputs", f"has {len(y)} samples", "give at least 2")
+        width = plant.E.shape[1]
+        d = np.zeros((len(y), width)) if disturbance is None else _columns(disturbance)
+        start = x0
+        if start is None:
+            full = plant.C.shape == (plant.n, plant.n) and np.array_equal(plant.C, np.eye(plant.n))
+            start = y[0] if full else np.zeros(plant.n)
+        self._fill(
+            outputs=frozen(y),
+            disturbance=frozen(finite_array("disturbance", d, (len(y), width))),
+            x0=frozen(finite_array("x0", start, (plant.n,))),
+            label=label or Label(),
+            findings=findings,
+        )
+
+    @property
+    def samples(self) -> int:
+        """Number of samples."""
+        return len(self.outputs)
 
 
 def _columns(values: ArrayLike) -> ArrayLike:

@@ -13,7 +13,7 @@ import numpy as np
 import scipy.linalg
 
 from impc.arrays import Array, frozen, symmetric_matrix
-from impc.checking import Value, checked
+from impc.checking import Value, checked, replace
 from impc.errors import WeightsError
 
 if TYPE_CHECKING:
@@ -27,14 +27,18 @@ __all__ = [
     "condition_number",
     "normalised",
     "residual",
-    "stage_weights",
     "weights_from_parameters",
 ]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, init=False)
 class Weights(Value):
     """Stage weights of the cost  sum x'Qx + u'Ru.
+
+    Parameters
+    ----------
+    Q, R : array_like
+        Shapes (n, n) and (m, m); a number stands for a 1 x 1 matrix.
 
     Attributes
     ----------
@@ -42,6 +46,19 @@ class Weights(Value):
         State weight (n, n), symmetric, positive semidefinite.
     R : Array
         Input weight (m, m), symmetric, positive definite.
+
+    Raises
+    ------
+    DataError, InputError
+        When a matrix is not square, finite and symmetric.
+    WeightsError
+        When Q has an eigenvalue below -1e-9 of its largest, or R one that is not positive.
+
+    Examples
+    --------
+    >>> import impc
+    >>> impc.Weights([[1, 0], [0, 4]], 1).R
+    array([[1.]])
     """
 
     _rules: ClassVar[Mapping[str, Any]] = {
@@ -52,43 +69,28 @@ class Weights(Value):
     Q: Array
     R: Array
 
+    @checked
+    def __init__(self, Q: ArrayLike, R: ArrayLike) -> None:
+        q, r = symmetric_matrix("Q", Q), symmetric_matrix("R", R)
+        q_eigenvalues, r_eigenvalues = np.linalg.eigvalsh(q), np.linalg.eigvalsh(r)
+        if q_eigenvalues[0] < -1e-9 * max(q_eigenvalues[-1], 1e-300):
+            raise WeightsError(
+                "Q",
+                f"is not positive semidefinite: its least eigenvalue is {q_eigenvalues[0]:.4g}",
+                "give Q = LL'",
+            )
+        if r_eigenvalues[0] <= 0:
+            raise WeightsError(
+                "R",
+                f"is not positive definite: its least eigenvalue is {r_eigenvalues[0]:.4g}",
+                "every input needs a positive cost",
+            )
+        self._fill(Q=frozen(q), R=frozen(r))
+
     @property
     def block(self) -> Array:
         """The block-diagonal matrix blkdiag(Q, R), (n + m, n + m)."""
         return np.asarray(scipy.linalg.block_diag(self.Q, self.R))
-
-
-@checked
-def stage_weights(Q: ArrayLike, R: ArrayLike) -> Weights:
-    """Check and freeze a pair of weights.
-
-    Parameters
-    ----------
-    Q, R : array_like
-        Shapes (n, n) and (m, m); a number stands for a 1 x 1 matrix.
-
-    Raises
-    ------
-    DataError, InputError
-        When a matrix is not square, finite and symmetric.
-    WeightsError
-        When Q has an eigenvalue below -1e-9 of its largest, or R one that is not positive.
-    """
-    q, r = symmetric_matrix("Q", Q), symmetric_matrix("R", R)
-    q_eigenvalues, r_eigenvalues = np.linalg.eigvalsh(q), np.linalg.eigvalsh(r)
-    if q_eigenvalues[0] < -1e-9 * max(q_eigenvalues[-1], 1e-300):
-        raise WeightsError(
-            "Q",
-            f"is not positive semidefinite: its least eigenvalue is {q_eigenvalues[0]:.4g}",
-            "give Q = LL'",
-        )
-    if r_eigenvalues[0] <= 0:
-        raise WeightsError(
-            "R",
-            f"is not positive definite: its least eigenvalue is {r_eigenvalues[0]:.4g}",
-            "every input needs a positive cost",
-        )
-    return Weights(frozen(q), frozen(r))
 
 
 @checked
@@ -102,7 +104,7 @@ def condition_number(weights: Weights) -> float:
 def normalised(weights: Weights) -> Weights:
     """Return the same weights scaled to R[0, 0] = 1."""
     scale = float(weights.R[0, 0])
-    return Weights(frozen(weights.Q / scale), frozen(weights.R / scale))
+    return replace(weights, Q=weights.Q / scale, R=weights.R / scale)
 
 
 @checked

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from impc.inverse.problem import InverseProblem
+    from impc.inverse.problem import Problem
     from impc.studies.fit.settings import FitSettings
 
 __all__ = ["Effort", "fit_effort"]
@@ -46,7 +46,7 @@ class Effort:
     gigabytes: float
 
 
-def fit_effort(problem: InverseProblem, settings: FitSettings) -> Effort:
+def fit_effort(problem: Problem, settings: FitSettings) -> Effort:
     """What `impc.studies.fit.subject` will take; nothing of its size is made."""
     plant, trials = problem.plant, problem.recordings
     n, m = plant.n, plant.m

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from experiments.coverage import cart, noisy_trial, true_controller
 from impc.assess.other_models import Alternative, fit_alternatives, verdict
+from impc.checking import replace
 from impc.errors import InputError
 from impc.inverse.noisy_fit import fit_controller
 from impc.studies.fit.result import FitResult

@@ -16,11 +16,11 @@ from impc.assess.bounded_weights import (
 )
 from impc.assess.intent_statements import order_statements, sense_statements, widest_dominant_angle
 from impc.control.closed_loop import simulate
-from impc.control.controller import mpc_controller
+from impc.control.controller import Controller
 from impc.errors import InputError
 from impc.inverse.solution_set import gain_fibre, pair_blocks, split_blocks
 from impc.model.riccati import solve_lqr
-from impc.model.weights import condition_number, stage_weights
+from impc.model.weights import Weights, condition_number
 
 SEED = 2
 
@@ -64,9 +64,9 @@ def test_members_give_the_same_trajectories(make) -> None:  # type: ignore[no-un
     size = float(np.max(np.abs(truth.x @ plant.C.T)))
     for X in random_members(found, 5):
         weights = split_blocks(X, plant.n)
-        controller = mpc_controller(
+        controller = Controller(
             plant,
-            stage_weights(weights.Q, weights.R),
+            Weights(weights.Q, weights.R),
             work.controller.bounds,
             work.controller.horizon,
             terminal_set=work.controller.terminal is not None,
@@ -104,7 +104,7 @@ def test_ranges_of_several_inputs_are_never_passed() -> None:
         assert abs(ends.high - ends.high_bound) <= 1e-5 * width
         for weights in (ends.low_weights, ends.high_weights):
             assert condition_number(weights) <= found.limit * (1 + 1e-4)
-            K = solve_lqr(work.problem.plant, stage_weights(weights.Q, weights.R)).K
+            K = solve_lqr(work.problem.plant, Weights(weights.Q, weights.R)).K
             np.testing.assert_allclose(K, work.controller.K, atol=1e-6 * np.max(np.abs(K)))
 
 
@@ -151,7 +151,7 @@ def test_widest_angle_is_at_least_that_of_sampled_members() -> None:
     assert angle >= max(sampled) - 0.5
     reached = np.degrees(np.arccos(abs(float(centre @ dominant(weights.Q)))))
     assert reached == pytest.approx(angle, abs=1e-6)
-    assert condition_number(stage_weights(weights.Q, weights.R)) <= found.limit * (1 + 1e-6)
+    assert condition_number(Weights(weights.Q, weights.R)) <= found.limit * (1 + 1e-6)
 
 
 def test_a_ratio_must_leave_room() -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -20,7 +18,8 @@ from impc.arrays import Array, frozen
 from impc.assess.covariance import gain_covariance
 from impc.assess.long_run_covariance import ResidualNoise
 from impc.assess.printed_gain import gain_estimate
-from impc.inverse.problem import InverseProblem
+from impc.checking import replace
+from impc.inverse.problem import Problem
 from impc.inverse.residuals import residual_only
 from impc.studies.fit.settings import FitSettings
 from impc.studies.fit.subject import fit_problem
@@ -29,7 +28,7 @@ SETTINGS = FitSettings(horizon=8, u_max=1.0)
 STEP = 1e-6
 
 
-def differences(problem: InverseProblem, K: Array, S: Array) -> Array:
+def differences(problem: Problem, K: Array, S: Array) -> Array:
     """Derivative of the residual by central differences: K, S up to scale, x0; (r, q), to 1e-8."""
     (trial,) = problem.recordings
     m, n = K.shape

@@ -18,9 +18,9 @@ from impc.assess.bounded_weights import (
 )
 from impc.assess.eigenvalue_ranges import eigenvalue_ranges
 from impc.inverse.solution_set import gain_fibre
-from impc.model.plant import as_plant
+from impc.model.plant import Plant
 from impc.model.riccati import solve_lqr
-from impc.model.weights import condition_number, stage_weights
+from impc.model.weights import Weights, condition_number
 from tests.assess.test_bounded_weights import random_members, set_of
 
 
@@ -112,8 +112,8 @@ def test_nearest_diagonal_of_the_seat_is_proved() -> None:
 
 def test_ends_are_proved_without_an_analytic_centre() -> None:
     """A state that is gone in one step: its cost is free but for the limit."""
-    plant = as_plant(control.ss([[1.2, 0.5], [0.0, 0.0]], [[1.0], [0.3]], np.eye(2), 0, True))
-    K = solve_lqr(plant, stage_weights(np.diag([2.0, 1.0]), 1.0)).K
+    plant = Plant(control.ss([[1.2, 0.5], [0.0, 0.0]], [[1.0], [0.3]], np.eye(2), 0, True))
+    K = solve_lqr(plant, Weights(np.diag([2.0, 1.0]), 1.0)).K
     assert abs(np.linalg.det(plant.A - plant.B @ K)) < 1e-12
     found = weights_set(gain_fibre(plant, K))
     values = eigenvalues(found, random_members(found, 500))
@@ -128,5 +128,5 @@ def test_a_diagonal_member_is_found_where_there_is_one() -> None:
     found = set_of(example())
     end = nearest_diagonal(found, np.array([1.0, 3.0]))
     np.testing.assert_allclose(end.weights.Q, np.diag(np.diag(end.weights.Q)), atol=1e-6)
-    checked = stage_weights(end.weights.Q, end.weights.R)
+    checked = Weights(end.weights.Q, end.weights.R)
     assert condition_number(checked) <= found.limit

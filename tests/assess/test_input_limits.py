@@ -12,7 +12,7 @@ from impc.assess.input_limits import LimitEstimate, input_limit, with_limit
 from impc.control.closed_loop import scenario, simulate
 from impc.errors import InputError
 from impc.inverse.noisy_fit import FittedController, fit_controller
-from impc.model.recordings import Recording, recording
+from impc.model.recordings import Recording
 from impc.studies.fit.settings import FitSettings
 from impc.studies.fit.subject import fit_problem
 
@@ -31,7 +31,7 @@ def gentle_trial() -> Recording:
     assert np.max(np.abs(run.u)) < 0.8
     clean = (run.x @ controller.plant.C.T)[:1500]
     noise = rng.standard_normal(clean.shape)
-    return recording(controller.plant, clean + 0.2 * np.std(clean) * noise, push)
+    return Recording(controller.plant, clean + 0.2 * np.std(clean) * noise, push)
 
 
 @pytest.mark.parametrize("assumed", [None, 1.4])

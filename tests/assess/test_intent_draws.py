@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -12,6 +10,7 @@ from experiments.cursor_tracking import ConditionResult, price_ratio
 from impc.assess.covariance import GainCovariance, gain_covariance
 from impc.assess.intent_draws import drawn_gains
 from impc.assess.weights_ranges import summarise_weights
+from impc.checking import replace
 from impc.inverse.noisy_fit import FittedController, fit_controller
 from impc.model.riccati import solve_lqr
 from impc.studies.fit.result import FittedParameter

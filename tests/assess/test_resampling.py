@@ -27,8 +27,8 @@ from impc.assess.resampling import (
 from impc.errors import InputError
 from impc.inverse.noisy_fit import FittedController, fit_controller
 from impc.inverse.residuals import misfit_or_reason
-from impc.model.plant import as_plant
-from impc.model.recordings import recording
+from impc.model.plant import Plant
+from impc.model.recordings import Recording
 from impc.studies.fit.settings import FitSettings
 from impc.studies.fit.subject import fit_problem
 
@@ -116,9 +116,9 @@ def test_what_is_not_determined_has_no_end() -> None:
         np.vstack([np.hstack([base.B, base.E]), [0, 0]]),
     )
     system = control.ss(A, B, np.hstack([base.C, [[0]]]), 0, base.dt, inputs=["force", "push"])
-    plant = as_plant(system, ["force"])
+    plant = Plant(system, ["force"])
     trial = noisy_trial(SEED, 0.0)
-    again = recording(plant, trial.outputs, trial.disturbance)
+    again = Recording(plant, trial.outputs, trial.disturbance)
     problem = fit_problem(plant, [again], FitSettings(horizon=10, u_max=1.0))
     estimate = gain_estimate(fit_controller(problem))
     names = entry_names(plant)

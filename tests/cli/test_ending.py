@@ -70,7 +70,7 @@ def test_what_nobody_foresaw_is_one_line_with_its_place_and_a_log(
     assert done.stderr.count("\n") == 1
     assert says in done.stderr
     assert len(done.stderr) < 700
-    place = re.search(r"\(impc\.commands\.(?:example|ending), line \d+\)", done.stderr)
+    place = re.search(r"\(impc\.cli\.(?:example|ending), line \d+\)", done.stderr)
     assert place, done.stderr
     (log,) = tmp_path.iterdir()
     assert str(log) in done.stderr

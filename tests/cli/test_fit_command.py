@@ -6,13 +6,13 @@ import json
 import os
 import re
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
+from impc.checking import replace
 from impc.cli.main import main
 from impc.files.configuration import read_configuration
 from impc.files.plant_sources import make_plant, plant_source

@@ -8,7 +8,7 @@ import pytest
 
 from impc.control.casadi_controller import SOLVERS, build_mpc, simulate_mpc, solve_mpc
 from impc.control.closed_loop import Status, require_complete, scenario, simulate
-from impc.control.controller import gain_controller, mpc_controller
+from impc.control.controller import Controller
 from impc.errors import (
     BoundsError,
     DataError,
@@ -17,9 +17,9 @@ from impc.errors import (
     PlantError,
     WeightsError,
 )
-from impc.model.bounds import Bounds, bound_rows, box_bounds
-from impc.model.plant import Plant, as_plant
-from impc.model.weights import stage_weights
+from impc.model.bounds import Bounds, bound_rows
+from impc.model.plant import Plant
+from impc.model.weights import Weights
 from tests.independent_mpc import first_input
 from tests.support import random_plant, random_weights
 
@@ -34,8 +34,8 @@ def test_solvers_fast_path_and_independent_program_agree(seed: int) -> None:
     plant = random_plant(rng, n, m, 1.15 if seed % 4 < 2 else 0.9)
     Q, R = random_weights(rng, n), random_weights(rng, m)
     x_max = 6.0 if seed % 3 == 0 else np.inf
-    bounds = box_bounds(plant, u_min=-0.5, u_max=0.5, x_min=-x_max, x_max=x_max)
-    controller = mpc_controller(plant, stage_weights(Q, R), bounds, 5)
+    bounds = Bounds(plant, u_min=-0.5, u_max=0.5, x_min=-x_max, x_max=x_max)
+    controller = Controller(plant, Weights(Q, R), bounds, 5)
     # As far out as the program is feasible, so that bounds are active.
     for size in 30.0 * 0.8 ** np.arange(30):
         drive = scenario(plant, size * np.ones(n) / np.sqrt(n), STEPS)
@@ -61,13 +61,13 @@ def test_solvers_fast_path_and_independent_program_agree(seed: int) -> None:
 def test_soft_state_bounds_agree_with_the_fast_path(name: str) -> None:
     rng = np.random.default_rng(5)
     plant = random_plant(rng, 3, 1, 1.1, d=1)
-    weights = stage_weights(np.eye(3), 1)
-    bounds = box_bounds(plant, u_min=-1, u_max=1, x_min=-0.5, x_max=0.5)
-    soft = mpc_controller(plant, weights, bounds, 6, softening=1e3)
+    weights = Weights(np.eye(3), 1)
+    bounds = Bounds(plant, u_min=-1, u_max=1, x_min=-0.5, x_max=0.5)
+    soft = Controller(plant, weights, bounds, 6, softening=1e3)
     drive = scenario(plant, 0.2 * np.ones(3), disturbance=rng.normal(size=40) * 0.8)
     fast = simulate(soft, drive)
     assert Status.SOFTENED in fast.status
-    hard = mpc_controller(plant, weights, bounds, 6)
+    hard = Controller(plant, weights, bounds, 6)
     assert not simulate(hard, drive).complete
     slow = simulate_mpc(build_mpc(soft, name), drive)
     np.testing.assert_allclose(slow.x, fast.x, atol=1e-6)
@@ -76,11 +76,11 @@ def test_soft_state_bounds_agree_with_the_fast_path(name: str) -> None:
 def test_softening_changes_nothing_where_the_hard_program_is_feasible(
     example_plant: Plant,
 ) -> None:
-    bounds = box_bounds(example_plant, u_min=-1, u_max=1, x_min=-3.1, x_max=3.1)
-    weights = stage_weights(np.eye(2), 1)
+    bounds = Bounds(example_plant, u_min=-1, u_max=1, x_min=-3.1, x_max=3.1)
+    weights = Weights(np.eye(2), 1)
     drive = scenario(example_plant, [2, 3], STEPS)
-    hard = simulate(mpc_controller(example_plant, weights, bounds, 3), drive)
-    soft = simulate(mpc_controller(example_plant, weights, bounds, 3, softening=1e3), drive)
+    hard = simulate(Controller(example_plant, weights, bounds, 3), drive)
+    soft = simulate(Controller(example_plant, weights, bounds, 3, softening=1e3), drive)
     assert hard.complete
     np.testing.assert_allclose(soft.x, hard.x, atol=1e-12)
 
@@ -96,13 +96,13 @@ REFERENCE_INPUTS = {
 def test_example_inputs_are_those_of_the_reference(
     example_plant: Plant, example_bounds: Bounds, x0: tuple[int, int], inputs: list[float]
 ) -> None:
-    controller = mpc_controller(example_plant, stage_weights(np.eye(2), 1), example_bounds, 3)
+    controller = Controller(example_plant, Weights(np.eye(2), 1), example_bounds, 3)
     run = require_complete(controller, simulate(controller, scenario(example_plant, x0, 20)))
     np.testing.assert_allclose(run.u[: len(inputs), 0], inputs, atol=1e-4)
 
 
 def test_a_solver_says_what_happened(example_plant: Plant, example_bounds: Bounds) -> None:
-    controller = mpc_controller(example_plant, stage_weights(np.eye(2), 1), example_bounds, 3)
+    controller = Controller(example_plant, Weights(np.eye(2), 1), example_bounds, 3)
     for name in SOLVERS:
         mpc = build_mpc(controller, name)
         assert solve_mpc(mpc, [0.1, 0]).status is Status.FREE
@@ -117,13 +117,13 @@ def test_a_solver_says_what_happened(example_plant: Plant, example_bounds: Bound
 def test_an_infeasible_start_names_the_bound_and_the_step(
     example_plant: Plant, example_bounds: Bounds
 ) -> None:
-    controller = mpc_controller(example_plant, stage_weights(np.eye(2), 1), example_bounds, 3)
+    controller = Controller(example_plant, Weights(np.eye(2), 1), example_bounds, 3)
     run = simulate(controller, scenario(example_plant, [3, 1], 20))
     assert run.reached == 0
     with pytest.raises(InfeasibleError, match=r"^x0: no input sequence keeps the bound u\[0\]"):
         require_complete(controller, run)
-    boxed = box_bounds(example_plant, x_max=1)
-    outside = mpc_controller(example_plant, stage_weights(np.eye(2), 1), boxed, 3)
+    boxed = Bounds(example_plant, x_max=1)
+    outside = Controller(example_plant, Weights(np.eye(2), 1), boxed, 3)
     run = simulate(outside, scenario(example_plant, [3, 1], 20))
     with pytest.raises(InfeasibleError, match=r"keeps the bound x\[0\] <= 1 0 samples ahead"):
         require_complete(outside, run)
@@ -137,9 +137,9 @@ def test_the_loop_stays_feasible_from_every_feasible_start() -> None:
     feasible = 0
     for _ in range(25):
         plant = random_plant(rng, 3, 1, 1.1)
-        bounds = box_bounds(plant, u_min=-1, u_max=0.7, x_min=-2, x_max=3)
-        weights = stage_weights(random_weights(rng, 3), 1)
-        controller = mpc_controller(plant, weights, bounds, 4)
+        bounds = Bounds(plant, u_min=-1, u_max=0.7, x_min=-2, x_max=3)
+        weights = Weights(random_weights(rng, 3), 1)
+        controller = Controller(plant, weights, bounds, 4)
         run = simulate(controller, scenario(plant, rng.uniform(-2, 2, 3), 60))
         if run.reached == 0:
             continue
@@ -153,39 +153,39 @@ def test_the_loop_stays_feasible_from_every_feasible_start() -> None:
 
 
 def test_bad_input_names_the_argument(example_plant: Plant, example_bounds: Bounds) -> None:
-    weights = stage_weights(np.eye(2), 1)
+    weights = Weights(np.eye(2), 1)
     cases: list[tuple[type[Exception], str, object]] = [
         (InputError, "^solver: got 'gurobi'; choose one of", lambda: build_mpc(
-            mpc_controller(example_plant, weights, example_bounds, 3), "gurobi")),
-        (InputError, "^horizon: got 0; give a whole number", lambda: mpc_controller(
+            Controller(example_plant, weights, example_bounds, 3), "gurobi")),
+        (InputError, "^horizon: got 0; give a whole number", lambda: Controller(
             example_plant, weights, example_bounds, 0)),
-        (InputError, "^horizon: got 2.5", lambda: mpc_controller(
+        (InputError, "^horizon: got 2.5", lambda: Controller(
             example_plant, weights, example_bounds, 2.5)),  # type: ignore[arg-type]
-        (InputError, "^softening: got -1", lambda: mpc_controller(
+        (InputError, "^softening: got -1", lambda: Controller(
             example_plant, weights, example_bounds, 3, softening=-1)),
-        (InputError, "^gain: does not stabilise", lambda: gain_controller(
+        (InputError, "^gain: does not stabilise", lambda: Controller.from_gain(
             example_plant, [[0, 0]], example_bounds, 3)),
-        (DataError, "^gain: expected shape", lambda: gain_controller(
+        (DataError, "^gain: expected shape", lambda: Controller.from_gain(
             example_plant, [1, 1], example_bounds, 3)),
         (DataError, "^x0: 1 of 2 entries are NaN or infinite, the first at", lambda: scenario(
             example_plant, [np.nan, 1], 3)),
         (DataError, "^steps: got None", lambda: scenario(example_plant, [1, 1])),
-        (WeightsError, "^Q: is not positive semidefinite", lambda: stage_weights(-np.eye(2), 1)),
-        (WeightsError, "^R: is not positive definite", lambda: stage_weights(np.eye(2), 0)),
-        (InputError, "^Q: is not symmetric", lambda: stage_weights([[1, 2], [0, 1]], 1)),
-        (BoundsError, "cross for u", lambda: box_bounds(example_plant, u_min=1, u_max=-1)),
-        (BoundsError, "exclude the origin", lambda: box_bounds(example_plant, u_min=1, u_max=2)),
-        (BoundsError, "has NaN", lambda: box_bounds(example_plant, u_max=np.nan)),
-        (BoundsError, "^x_max: got", lambda: box_bounds(example_plant, x_max=[1, 2, 3])),
-        (PlantError, "not stabilisable", lambda: as_plant(
+        (WeightsError, "^Q: is not positive semidefinite", lambda: Weights(-np.eye(2), 1)),
+        (WeightsError, "^R: is not positive definite", lambda: Weights(np.eye(2), 0)),
+        (InputError, "^Q: is not symmetric", lambda: Weights([[1, 2], [0, 1]], 1)),
+        (BoundsError, "cross for u", lambda: Bounds(example_plant, u_min=1, u_max=-1)),
+        (BoundsError, "exclude the origin", lambda: Bounds(example_plant, u_min=1, u_max=2)),
+        (BoundsError, "has NaN", lambda: Bounds(example_plant, u_max=np.nan)),
+        (BoundsError, "^x_max: got", lambda: Bounds(example_plant, x_max=[1, 2, 3])),
+        (PlantError, "not stabilisable", lambda: Plant(
             control.ss(np.diag([2.0, 0.5]), [[0], [1]], np.eye(2), 0, True))),
-        (PlantError, "expected a control.StateSpace", lambda: as_plant(np.eye(2))),
-        (PlantError, "D: is not zero", lambda: as_plant(control.ss(0.5, 1, 1, 1, True))),
-        (PlantError, "NaN or infinite", lambda: as_plant(control.ss(np.nan, 1, 1, 0, True))),
-        (PlantError, "is continuous", lambda: mpc_controller(
-            as_plant(control.ss(-1, 1, 1, 0)), stage_weights(1, 1),
-            box_bounds(as_plant(control.ss(-1, 1, 1, 0))), 3)),
-        (PlantError, "controls: .*the inputs are", lambda: as_plant(
+        (PlantError, "expected a control.StateSpace", lambda: Plant(np.eye(2))),
+        (PlantError, "D: is not zero", lambda: Plant(control.ss(0.5, 1, 1, 1, True))),
+        (PlantError, "NaN or infinite", lambda: Plant(control.ss(np.nan, 1, 1, 0, True))),
+        (PlantError, "is continuous", lambda: Controller(
+            Plant(control.ss(-1, 1, 1, 0)), Weights(1, 1),
+            Bounds(Plant(control.ss(-1, 1, 1, 0))), 3)),
+        (PlantError, "controls: .*the inputs are", lambda: Plant(
             control.ss(0.5, 1, 1, 0, True), ["torque"])),
     ]  # fmt: skip
     for kind, message, call in cases:
@@ -195,6 +195,6 @@ def test_bad_input_names_the_argument(example_plant: Plant, example_bounds: Boun
 
 
 def test_only_finite_bounds_make_rows(example_plant: Plant) -> None:
-    rows = bound_rows(box_bounds(example_plant, u_max=2, x_min=[-1, -np.inf]), example_plant)
+    rows = bound_rows(Bounds(example_plant, u_max=2, x_min=[-1, -np.inf]), example_plant)
     assert rows.names == ("u[0] <= 2", "x[0] >= -1")
     np.testing.assert_array_equal(rows.b, [2, 1])

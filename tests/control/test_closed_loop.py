@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy.optimize import linprog
 
+from impc.checking import replace
 from impc.control.closed_loop import (
     Scenario,
     Simulation,
@@ -20,11 +20,11 @@ from impc.control.closed_loop import (
 )
 from impc.control.compiled_loop import CONVERGED, INCONSISTENT, solve_dual
 from impc.control.constraint_rows import Directions, directions
-from impc.control.controller import Controller, gain_controller, mpc_controller
+from impc.control.controller import Controller
 from impc.errors import SolverError
-from impc.model.bounds import Bounds, bound_rows, box_bounds
+from impc.model.bounds import Bounds, bound_rows
 from impc.model.plant import Plant
-from impc.model.weights import stage_weights
+from impc.model.weights import Weights
 from tests.support import random_plant, random_weights
 
 
@@ -58,7 +58,7 @@ def with_bound(controller: Controller, row: int, step: float) -> Controller:
     signal = int(np.argmax(np.abs(unit)))
     name = ("x" if rows.on_state[row] else "u") + ("_max" if unit[signal] > 0 else "_min")
     sides[name][signal] += unit[signal] * step
-    changed = replace(controller, bounds=Bounds(**sides))
+    changed = replace(controller, bounds=replace(controller.bounds, **sides))
     if controller.softening is None:
         return changed
     # The penalty is a number of its own, not one of the directions.
@@ -104,9 +104,9 @@ def problem(seed: int, softening: float | None) -> tuple[Controller, Scenario, S
     for attempt in range(10):
         rng = np.random.default_rng([seed, attempt])
         plant = random_plant(rng, n, m, 1.1, d=1)
-        weights = stage_weights(random_weights(rng, n), random_weights(rng, m))
-        bounds = box_bounds(plant, u_min=-0.4, u_max=0.5, x_min=-x_max, x_max=x_max)
-        controller = mpc_controller(plant, weights, bounds, 3, softening=softening)
+        weights = Weights(random_weights(rng, n), random_weights(rng, m))
+        bounds = Bounds(plant, u_min=-0.4, u_max=0.5, x_min=-x_max, x_max=x_max)
+        controller = Controller(plant, weights, bounds, 3, softening=softening)
         push = 0.05 * rng.normal(size=25)
         direction = rng.normal(size=n)
         for size in 5 * 0.9 ** np.arange(60):
@@ -129,7 +129,7 @@ def test_jacobian_equals_central_differences(seed: int, softening: float | None)
 def test_jacobian_of_the_example_equals_central_differences(
     example_plant: Plant, example_bounds: Bounds, x0: tuple[int, int]
 ) -> None:
-    controller = mpc_controller(example_plant, stage_weights(np.eye(2), 1), example_bounds, 3)
+    controller = Controller(example_plant, Weights(np.eye(2), 1), example_bounds, 3)
     check_jacobian(controller, scenario(example_plant, x0, 20))
 
 
@@ -166,10 +166,10 @@ def test_soft_rows_are_part_of_the_comparison() -> None:
 
 def test_active_terminal_rows_are_differentiated(example_plant: Plant) -> None:
     """A start at which the terminal set is active: the trajectory without it differs."""
-    bounds = box_bounds(example_plant, u_min=-1, u_max=1)
-    weights = stage_weights(np.eye(2), 1)
-    controller = mpc_controller(example_plant, weights, bounds, 2)
-    bare = mpc_controller(example_plant, weights, bounds, 2, terminal_set=False)
+    bounds = Bounds(example_plant, u_min=-1, u_max=1)
+    weights = Weights(np.eye(2), 1)
+    controller = Controller(example_plant, weights, bounds, 2)
+    bare = Controller(example_plant, weights, bounds, 2, terminal_set=False)
     for x0 in np.ndindex(40, 40):
         drive = scenario(example_plant, np.array(x0) / 10, 12)
         run, without = simulate(controller, drive), simulate(bare, drive)
@@ -185,10 +185,10 @@ def test_active_terminal_rows_are_differentiated(example_plant: Plant) -> None:
         up, down = (
             # The set is computed anew for the changed gain or bound.
             simulate(
-                gain_controller(
+                Controller.from_gain(
                     example_plant,
                     controller.K + sign * step * _unit(part, index),
-                    box_bounds(example_plant, u_min=-1, u_max=1 + sign * step * (part == "bounds")),
+                    Bounds(example_plant, u_min=-1, u_max=1 + sign * step * (part == "bounds")),
                     2,
                 ),
                 drive,
@@ -211,19 +211,17 @@ def test_weights_with_the_same_gain_give_the_same_trajectories(
 ) -> None:
     """The two Q of the reference that have the gain of Q = I, R = 1 to its printed digits."""
     drive = scenario(example_plant, [2, 3], 20)
-    true = simulate(
-        mpc_controller(example_plant, stage_weights(np.eye(2), 1), example_bounds, 3), drive
-    )
+    true = simulate(Controller(example_plant, Weights(np.eye(2), 1), example_bounds, 3), drive)
     for Q in ([[1.3, 0.06], [0.06, 0.712]], [[0.5, -0.1], [-0.1, 1.48]]):
-        controller = mpc_controller(example_plant, stage_weights(Q, 1), example_bounds, 3)
+        controller = Controller(example_plant, Weights(Q, 1), example_bounds, 3)
         np.testing.assert_allclose(simulate(controller, drive).x, true.x, atol=1e-12)
 
 
 def test_samples_at_a_change_of_the_active_set_are_counted(
     example_plant: Plant, example_bounds: Bounds
 ) -> None:
-    controller = mpc_controller(
-        example_plant, stage_weights(np.eye(2), 1), example_bounds, 3, terminal_set=False
+    controller = Controller(
+        example_plant, Weights(np.eye(2), 1), example_bounds, 3, terminal_set=False
     )
     x = np.array([1 / controller.K[0, 0], 0.0])  # u = -Kx is exactly at the bound
     run = simulate(controller, scenario(example_plant, x, 1))
@@ -232,10 +230,8 @@ def test_samples_at_a_change_of_the_active_set_are_counted(
 
 
 def test_a_diverging_loop_is_named(example_plant: Plant) -> None:
-    bounds = box_bounds(example_plant, u_min=-0.1, u_max=0.1)
-    controller = mpc_controller(
-        example_plant, stage_weights(np.eye(2), 1), bounds, 3, terminal_set=False
-    )
+    bounds = Bounds(example_plant, u_min=-0.1, u_max=0.1)
+    controller = Controller(example_plant, Weights(np.eye(2), 1), bounds, 3, terminal_set=False)
     run = simulate(controller, scenario(example_plant, [5, 5], 400))
     assert not run.complete
     assert np.all(np.isfinite(run.x))

@@ -5,13 +5,11 @@ The reference is `tests/exact_mpc.py`: the program in u from (Q, R, P), proved w
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import TYPE_CHECKING
-
 import control
 import numpy as np
 import pytest
 
+from impc.checking import replace
 from impc.control.closed_loop import (
     Scenario,
     Status,
@@ -22,26 +20,23 @@ from impc.control.closed_loop import (
     simulate,
 )
 from impc.control.constraint_rows import build_rows, directions
-from impc.control.controller import mpc_controller
+from impc.control.controller import Controller
 from impc.control.infeasibility import proves_infeasible
 from impc.errors import SolverError
-from impc.model.bounds import box_bounds
-from impc.model.plant import as_plant
-from impc.model.weights import stage_weights
+from impc.model.bounds import Bounds
+from impc.model.plant import Plant
+from impc.model.weights import Weights
 from tests.hard_plants import STEPS, HardCase, faults, hard_case
 from tests.support import random_plant, random_weights
-
-if TYPE_CHECKING:
-    from impc.model.plant import Plant
 
 
 def runaway(pole: float, horizon: int) -> HardCase:
     """Three states, two of them unstable, from which no plan comes near the gain."""
     A = [[pole, 1, 0], [0, pole, 0.5], [0, 0, 0.8]]
-    plant = as_plant(control.ss(A, [[0], [0.1], [1]], np.eye(3), 0, True))
-    weights = stage_weights(np.eye(3), 1)
-    bounds = box_bounds(plant, u_min=-1, u_max=1)
-    controller = mpc_controller(plant, weights, bounds, horizon, terminal_set=False)
+    plant = Plant(control.ss(A, [[0], [0.1], [1]], np.eye(3), 0, True))
+    weights = Weights(np.eye(3), 1)
+    bounds = Bounds(plant, u_min=-1, u_max=1)
+    controller = Controller(plant, weights, bounds, horizon, terminal_set=False)
     return HardCase(weights, controller, Scenario(np.ones(3), np.zeros((STEPS, 0))))
 
 
@@ -63,7 +58,7 @@ def test_a_plant_that_runs_away_is_driven_at_its_bound(
 def test_soft_rows_on_a_plant_that_runs_away_are_refused_by_name() -> None:
     """The recursion over the stages has no rows of states: nothing is applied that is not told."""
     case = runaway(2, 30)
-    bounds = box_bounds(case.controller.plant, u_min=-1, u_max=1, x_min=-1, x_max=1)
+    bounds = Bounds(case.controller.plant, u_min=-1, u_max=1, x_min=-1, x_max=1)
     controller = replace(case.controller, bounds=bounds, softening=50.0)
     run = simulate(controller, case.drive)
     assert run.status[run.reached] == Status.UNSOLVED
@@ -81,9 +76,9 @@ def test_both_ways_to_an_answer_agree_and_so_do_their_derivatives(seed: int) -> 
     rng = np.random.default_rng([15, seed])
     n, m = 2 + seed % 3, 1 + seed % 3
     plant = random_plant(rng, n, m, 1.1, d=1)
-    weights = stage_weights(random_weights(rng, n), random_weights(rng, m))
-    bounds = box_bounds(plant, u_min=-0.4, u_max=0.5)
-    controller = mpc_controller(plant, weights, bounds, 6, terminal_set=False)
+    weights = Weights(random_weights(rng, n), random_weights(rng, m))
+    bounds = Bounds(plant, u_min=-0.4, u_max=0.5)
+    controller = Controller(plant, weights, bounds, 6, terminal_set=False)
     given = {
         name: rng.normal(size=(*shape, 5))
         for name, shape in (("A", (n, n)), ("B", (n, m)), ("K", (m, n)), ("x0", (n,)))
@@ -108,8 +103,8 @@ def test_both_ways_to_an_answer_agree_and_so_do_their_derivatives(seed: int) -> 
 def test_nothing_proves_a_feasible_program_infeasible(example_plant: Plant) -> None:
     """Random multipliers, at starts from which a plan keeps every row."""
     rng = np.random.default_rng(16)
-    bounds = box_bounds(example_plant, u_min=-1, u_max=1, x_min=-3, x_max=3)
-    controller = mpc_controller(example_plant, stage_weights(np.eye(2), 1), bounds, 3)
+    bounds = Bounds(example_plant, u_min=-1, u_max=1, x_min=-3, x_max=3)
+    controller = Controller(example_plant, Weights(np.eye(2), 1), bounds, 3)
     rows = build_rows(controller)
     for x0 in ([0.0, 0.0], [1.0, 1.5], [-1.0, -1.5]):
         assert simulate(controller, scenario(example_plant, x0, 1)).complete

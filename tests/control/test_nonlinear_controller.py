@@ -8,11 +8,11 @@ import pytest
 
 from experiments.nonlinear_check import compare_at
 from impc.control.closed_loop import scenario, simulate
-from impc.control.controller import mpc_controller
+from impc.control.controller import Controller
 from impc.control.nonlinear_controller import build_nonlinear_mpc, simulate_nonlinear
-from impc.model.bounds import box_bounds
-from impc.model.plant import Plant, as_plant
-from impc.model.weights import stage_weights
+from impc.model.bounds import Bounds
+from impc.model.plant import Plant
+from impc.model.weights import Weights
 from plants import yalmip_example
 
 
@@ -24,11 +24,11 @@ def linear_step(plant: Plant) -> ca.Function:
 
 @pytest.mark.parametrize("x0", [[1.0, 3.0], [2.0, 3.0], [2.0, 1.0]])
 def test_on_a_linear_plant_it_is_the_linear_controller(x0: list[float]) -> None:
-    plant = as_plant(yalmip_example())
-    weights, bounds = stage_weights(np.eye(2), 1), box_bounds(plant, u_min=-1, u_max=1)
+    plant = Plant(yalmip_example())
+    weights, bounds = Weights(np.eye(2), 1), Bounds(plant, u_min=-1, u_max=1)
     mpc = build_nonlinear_mpc(linear_step(plant), plant, weights, bounds, 3)
     drive = scenario(plant, x0, 20)
-    controller = mpc_controller(plant, weights, bounds, 3, terminal_set=False)
+    controller = Controller(plant, weights, bounds, 3, terminal_set=False)
     found, expected = simulate_nonlinear(mpc, drive), simulate(controller, drive)
     assert found.complete
     np.testing.assert_allclose(found.u, expected.u, atol=2e-6)
@@ -43,8 +43,8 @@ def test_on_the_seat_they_part_as_the_square_of_the_angle() -> None:
 
 
 def test_a_loop_that_falls_ends_where_it_falls() -> None:
-    plant = as_plant(yalmip_example())
-    weights, bounds = stage_weights(np.eye(2), 1), box_bounds(plant, u_min=-0.01, u_max=0.01)
+    plant = Plant(yalmip_example())
+    weights, bounds = Weights(np.eye(2), 1), Bounds(plant, u_min=-0.01, u_max=0.01)
     mpc = build_nonlinear_mpc(linear_step(plant), plant, weights, bounds, 3)
     run = simulate_nonlinear(mpc, scenario(plant, [3.0, 3.0], 400))
     assert not run.complete
@@ -53,8 +53,8 @@ def test_a_loop_that_falls_ends_where_it_falls() -> None:
 
 
 def test_a_loop_that_falls_at_its_last_sample_is_not_complete() -> None:
-    plant = as_plant(yalmip_example())
-    weights, bounds = stage_weights(np.eye(2), 1), box_bounds(plant, u_min=-0.01, u_max=0.01)
+    plant = Plant(yalmip_example())
+    weights, bounds = Weights(np.eye(2), 1), Bounds(plant, u_min=-0.01, u_max=0.01)
     mpc = build_nonlinear_mpc(linear_step(plant), plant, weights, bounds, 3)
     falls = simulate_nonlinear(mpc, scenario(plant, [3.0, 3.0], 400)).reached
     cut = simulate_nonlinear(mpc, scenario(plant, [3.0, 3.0], falls + 1))

@@ -10,7 +10,7 @@ from impc.assess.identified_directions import identifiability
 from impc.control.casadi_controller import build_mpc, simulate_mpc
 from impc.control.closed_loop import Status, simulate, simulate_and_differentiate
 from impc.control.constraint_rows import directions
-from impc.control.controller import gain_controller
+from impc.control.controller import Controller
 from impc.inverse.direct_and_reduced import inverse_mpc_reduced, start_gains, starting_point
 from tests.independent_mpc import first_input
 
@@ -72,7 +72,7 @@ def _with_gain_entry(work: Workload, index: int, change: float) -> np.ndarray:
     K = np.array(work.controller.K)
     K[0, index] += change
     bounds, plant = work.controller.bounds, work.controller.plant
-    moved = gain_controller(plant, K, bounds, 20, terminal_set=False)
+    moved = Controller.from_gain(plant, K, bounds, 20, terminal_set=False)
     return np.array(simulate(moved, work.drives[0]).x)
 
 

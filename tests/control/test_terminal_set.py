@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pickle
 import sys
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import control
@@ -15,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
+from impc.checking import replace
 from impc.control.polygon import as_pytope, polygon
 from impc.control.terminal_set import (
     TerminalSet,
@@ -24,38 +24,37 @@ from impc.control.terminal_set import (
     maximality_violation,
 )
 from impc.errors import DataError, ImpcError, InputError, PlantError, SolverError
-from impc.model.bounds import bound_rows, box_bounds
-from impc.model.plant import Plant, as_plant
+from impc.model.bounds import Bounds, bound_rows
+from impc.model.plant import Plant
 from impc.model.riccati import solve_lqr
-from impc.model.weights import stage_weights
+from impc.model.weights import Weights
 from plants.seated_balance import seated_balance_plant
 from tests.support import draws
 
 if TYPE_CHECKING:
     from impc.arrays import Array
-    from impc.model.bounds import Bounds
 
 Case = tuple[Plant, Any, "Bounds"]
 
 
 def sampled(A: Any, B: Any, dt: float = 1.0) -> Plant:
     a, b = np.array(A, dtype=float), np.array(B, dtype=float)
-    return as_plant(control.ss(a, b, np.eye(len(a)), np.zeros(b.shape), dt))
+    return Plant(control.ss(a, b, np.eye(len(a)), np.zeros(b.shape), dt))
 
 
 def regulator(plant: Plant) -> Array:
-    return solve_lqr(plant, stage_weights(np.eye(plant.n), np.eye(plant.m))).K
+    return solve_lqr(plant, Weights(np.eye(plant.n), np.eye(plant.m))).K
 
 
 def example() -> Case:
     """Primary example: input bound only."""
     plant = sampled([[2, -1], [1, 0.2]], [[1], [0]])
-    return plant, regulator(plant), box_bounds(plant, u_min=-1, u_max=1)
+    return plant, regulator(plant), Bounds(plant, u_min=-1, u_max=1)
 
 
 def cannon(upper: float = 10.0) -> Case:
     plant = sampled([[1.1, 2], [0, 0.95]], [[0], [0.0787]])
-    bounds = box_bounds(plant, u_min=-1, u_max=1, x_min=-10, x_max=upper)
+    bounds = Bounds(plant, u_min=-1, u_max=1, x_min=-10, x_max=upper)
     return plant, regulator(plant), bounds
 
 
@@ -68,19 +67,19 @@ def slow_rotations() -> Case:
     ]
     T = np.random.default_rng(0).standard_normal((10, 10))
     plant = sampled(T @ scipy.linalg.block_diag(*turns) @ np.linalg.inv(T), np.ones((10, 1)))
-    return plant, np.zeros((1, 10)), box_bounds(plant, x_min=-1, x_max=1)
+    return plant, np.zeros((1, 10)), Bounds(plant, x_min=-1, x_max=1)
 
 
 def seat() -> Case:
     """Seated balance, ten states; bounds on the command, both angles and both rates."""
-    plant = as_plant(seated_balance_plant(), controls=["command"])
+    plant = Plant(seated_balance_plant(), controls=["command"])
     intent = np.array([0.70, 0.65, 0.22, 0.20])
     Q = 1e-2 * np.eye(10)
     Q[:4, :4] = 6e5 * np.outer(intent, intent) + np.diag([2e4, 2e4, 500, 500])
     limit = np.full(10, np.inf)
     limit[:4] = [np.deg2rad(12), np.deg2rad(15), 1.5, 1.5]
-    bounds = box_bounds(plant, u_min=-6, u_max=6, x_min=-limit, x_max=limit)
-    return plant, solve_lqr(plant, stage_weights(Q, 1.0)).K, bounds
+    bounds = Bounds(plant, u_min=-6, u_max=6, x_min=-limit, x_max=limit)
+    return plant, solve_lqr(plant, Weights(Q, 1.0)).K, bounds
 
 
 def plain_support(direction: Array, H: Array, h: Array) -> float:
@@ -124,7 +123,7 @@ def assert_certified(terminal: TerminalSet) -> None:
 def test_scalar_set_with_one_bound_is_an_interval() -> None:
     # F = -1/2, x <= 1: the next step asks -x/2 <= 1, the one after x/4 <= 1 which follows.
     plant = sampled([[0.5]], [[1.0]])
-    terminal = maximal_invariant_set(plant, [[1.0]], box_bounds(plant, x_max=1))
+    terminal = maximal_invariant_set(plant, [[1.0]], Bounds(plant, x_max=1))
     np.testing.assert_allclose(terminal.h[:, None] / terminal.H, [[1], [-2]], rtol=1e-12)
     assert terminal.determinedness == 1
     assert_certified(terminal)
@@ -132,19 +131,19 @@ def test_scalar_set_with_one_bound_is_an_interval() -> None:
 
 def test_the_tighter_of_two_bounds_stays_and_of_equal_ones_the_first() -> None:
     plant = sampled([[1.2]], [[1.0]])
-    tight = maximal_invariant_set(plant, [[0.9]], box_bounds(plant, u_min=-0.45, u_max=0.45))
+    tight = maximal_invariant_set(plant, [[0.9]], Bounds(plant, u_min=-0.45, u_max=0.45))
     both = maximal_invariant_set(
-        plant, [[0.9]], box_bounds(plant, u_min=-0.45, u_max=0.45, x_min=-1, x_max=1)
+        plant, [[0.9]], Bounds(plant, u_min=-0.45, u_max=0.45, x_min=-1, x_max=1)
     )
     assert pairs(both) == pairs(tight) == [(0, 0), (0, 1)]
-    equal = box_bounds(sampled([[0.5]], [[1.0]]), u_min=-1, u_max=1, x_min=-1, x_max=1)
+    equal = Bounds(sampled([[0.5]], [[1.0]]), u_min=-1, u_max=1, x_min=-1, x_max=1)
     assert pairs(maximal_invariant_set(plant, [[1.0]], equal)) == [(0, 0), (0, 1)]
 
 
 def test_deadbeat_double_integrator_has_the_parallelogram_of_two_steps() -> None:
     # K = (1, 3/2) gives F^2 = 0: |x1 + 3/2 x2| <= 1 and, a step later, |x1 + x2 / 2| <= 1.
     plant = sampled([[1, 1], [0, 1]], [[0.5], [1]])
-    terminal = maximal_invariant_set(plant, [[1, 1.5]], box_bounds(plant, u_min=-1, u_max=1))
+    terminal = maximal_invariant_set(plant, [[1, 1.5]], Bounds(plant, u_min=-1, u_max=1))
     corners = polygon(terminal)
     start = int(np.argmin(np.abs(corners - [1, 0]).sum(axis=1)))
     expected = [[1, 0], [-2, 2], [-1, 0], [2, -2]]
@@ -205,7 +204,7 @@ def cases(draw: st.DrawFn) -> Case:
         lower = -upper
     missing = rng.random(n) < draw(st.sampled_from([0.0, 0.5, 1.0]))
     upper[missing], lower[missing] = np.inf, -np.inf
-    bounds = box_bounds(plant, u_min=-1, u_max=1, x_min=lower, x_max=upper)
+    bounds = Bounds(plant, u_min=-1, u_max=1, x_min=lower, x_max=upper)
     return plant, regulator(plant), bounds
 
 
@@ -282,7 +281,7 @@ def test_units_of_the_states_do_not_matter() -> None:
     plant, K, bounds = cannon(upper=7.0)
     scale = np.array([1e-6, 1e6])
     other = replace(plant, A=plant.A * scale[:, None] / scale, B=plant.B * scale[:, None])
-    scaled = box_bounds(
+    scaled = Bounds(
         other, u_min=-1, u_max=1, x_min=bounds.x_min * scale, x_max=bounds.x_max * scale
     )
     first = maximal_invariant_set(plant, K, bounds)
@@ -296,24 +295,24 @@ def test_a_direction_that_no_bound_sees_is_free() -> None:
     loop = np.array([[0.9, 0.4, 0.0], [-0.4, 0.9, 0.0], [0.0, 0.0, 0.95]])
     plant = sampled(T @ loop @ np.linalg.inv(T), T @ [[1.0], [0.0], [0.0]])
     K = np.array([[0.5, 0.2, 0.0]]) @ np.linalg.inv(T)
-    terminal = maximal_invariant_set(plant, K, box_bounds(plant, u_min=-1, u_max=1))
+    terminal = maximal_invariant_set(plant, K, Bounds(plant, u_min=-1, u_max=1))
     assert len(terminal.h) > 2
     np.testing.assert_allclose(terminal.H @ T[:, 2], 0, atol=1e-12)
     assert contains(terminal, 1e4 * T[:, 2])
     assert_certified(terminal)
     plane = sampled([[0.9, 0.4], [-0.4, 0.9]], [[1.0], [0.0]])
-    same = maximal_invariant_set(plane, [[0.5, 0.2]], box_bounds(plane, u_min=-1, u_max=1))
+    same = maximal_invariant_set(plane, [[0.5, 0.2]], Bounds(plane, u_min=-1, u_max=1))
     assert pairs(same) == pairs(terminal)
 
 
 def test_no_bounds_no_rows() -> None:
     plant, K, _ = example()
-    terminal = maximal_invariant_set(plant, K, box_bounds(plant))
+    terminal = maximal_invariant_set(plant, K, Bounds(plant))
     assert terminal.H.shape == (0, 2)
     assert contains(terminal, [1e9, -1e9])
     assert invariance_violation(terminal) == maximality_violation(terminal) == 0
     still = sampled([[0.5]], [[1.0]])
-    unused = maximal_invariant_set(still, [[0.0]], box_bounds(still, u_min=-1, u_max=1))
+    unused = maximal_invariant_set(still, [[0.0]], Bounds(still, u_min=-1, u_max=1))
     assert unused.H.shape == (0, 1)
     with pytest.raises(InputError, match="whole space"):
         as_pytope(terminal)
@@ -367,7 +366,7 @@ def test_pytope_agrees_in_the_plane(case: Case) -> None:
 def test_pytope_takes_one_row_and_ten_states_without_corners() -> None:
     pytest.importorskip("pytope", reason="the extra polytope is not installed")
     plant = sampled([[0.5]], [[1.0]])
-    half_line = maximal_invariant_set(plant, [[0.0]], box_bounds(plant, x_max=1))
+    half_line = maximal_invariant_set(plant, [[0.0]], Bounds(plant, x_max=1))
     assert np.all(as_pytope(half_line).A == 1)
     assert not as_pytope(maximal_invariant_set(*seat())).in_V_rep
 
@@ -380,9 +379,9 @@ def test_pytope_absent_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_polygon_refuses_what_it_cannot_draw() -> None:
     plant = sampled(np.diag([0.5, 0.8]), [[1.0], [0.0]])
-    strip = maximal_invariant_set(plant, [[0.3, 0.0]], box_bounds(plant, u_min=-1, u_max=1))
-    cone = maximal_invariant_set(plant, [[0.0, 0.0]], box_bounds(plant, x_max=1))
-    none = maximal_invariant_set(plant, [[0.0, 0.0]], box_bounds(plant))
+    strip = maximal_invariant_set(plant, [[0.3, 0.0]], Bounds(plant, u_min=-1, u_max=1))
+    cone = maximal_invariant_set(plant, [[0.0, 0.0]], Bounds(plant, x_max=1))
+    none = maximal_invariant_set(plant, [[0.0, 0.0]], Bounds(plant))
     for terminal in (strip, cone, none):
         with pytest.raises(InputError, match="unbounded"):
             polygon(terminal)
@@ -408,9 +407,9 @@ def test_errors_say_what_is_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(SolverError, match="max_steps = 3"):
         maximal_invariant_set(*cannon(), max_steps=3)
     assert maximal_invariant_set(*cannon(), max_steps=4).determinedness == 4
-    continuous = as_plant(control.ss([[-1.0]], [[1.0]], [[1.0]], [[0.0]]))
+    continuous = Plant(control.ss([[-1.0]], [[1.0]], [[1.0]], [[0.0]]))
     with pytest.raises(PlantError, match="continuous"):
-        maximal_invariant_set(continuous, [[0.0]], box_bounds(continuous, u_max=1))
+        maximal_invariant_set(continuous, [[0.0]], Bounds(continuous, u_max=1))
     with pytest.raises(DataError, match="x: expected shape"):
         contains(maximal_invariant_set(plant, K, bounds), [1.0])
 

@@ -22,7 +22,7 @@ from impc.cli.consent import require_consent
 from impc.cli.main import main
 from impc.cli.plant import find_plant
 from impc.control.closed_loop import require_complete, scenario, simulate
-from impc.control.controller import mpc_controller
+from impc.control.controller import Controller
 from impc.errors import ImpcError
 from impc.files import apart
 from impc.files.alignment import misaligned
@@ -33,11 +33,11 @@ from impc.files.reading import read_recordings, recording_of
 from impc.files.sealed import Kept
 from impc.files.table import Table, make_table
 from impc.jit import keep_caches
-from impc.model.bounds import box_bounds
-from impc.model.plant import Plant, as_plant
-from impc.model.recordings import recording
+from impc.model.bounds import Bounds
+from impc.model.plant import Plant
+from impc.model.recordings import Recording
 from impc.model.riccati import solve_lqr
-from impc.model.weights import stage_weights
+from impc.model.weights import Weights
 from impc.reporting.writer import owned, require_writable, write_files
 from impc.studies.cohort import cluster
 from impc.studies.cohort.names import checked_name
@@ -81,7 +81,7 @@ def damaged(name: str) -> Callable[[Path], None]:
 
 
 def cart(growth: float = 1.1) -> Plant:
-    return as_plant(control.ss([[growth]], [[1]], [[1]], 0, 0.1))
+    return Plant(control.ss([[growth]], [[1]], [[1]], 0, 0.1))
 
 
 def command(*words: str) -> str:
@@ -91,7 +91,7 @@ def command(*words: str) -> str:
 
 
 def short_trial(_: Path) -> None:
-    trial = recording(cart(), np.ones((20, 1)))
+    trial = Recording(cart(), np.ones((20, 1)))
     fit_problem(cart(), [trial], FitSettings(settle=10))
 
 
@@ -102,9 +102,9 @@ def late_push(_: Path) -> str:
 
 
 def far_start(_: Path) -> None:
-    bounds = box_bounds(cart(), x_min=-1, x_max=1, u_min=-0.1, u_max=0.1)
-    weights = stage_weights(np.eye(1), 1)
-    controller = mpc_controller(cart(), weights, bounds, 3)
+    bounds = Bounds(cart(), x_min=-1, x_max=1, u_min=-0.1, u_max=0.1)
+    weights = Weights(np.eye(1), 1)
+    controller = Controller(cart(), weights, bounds, 3)
     require_complete(controller, simulate(controller, scenario(cart(), x0=[5], steps=3)))
 
 
@@ -112,9 +112,9 @@ def runaway(growth: float, **settings: float) -> None:
     """A start beyond what the input can stop."""
     plant = cart(growth)
     side = settings.pop("x_max", np.inf)
-    bounds = box_bounds(plant, u_min=-0.1, u_max=0.1, x_min=-side, x_max=side)
-    weights, softening = stage_weights(np.eye(1), 1), settings.get("softening")
-    controller = mpc_controller(plant, weights, bounds, 60, terminal_set=False, softening=softening)
+    bounds = Bounds(plant, u_min=-0.1, u_max=0.1, x_min=-side, x_max=side)
+    weights, softening = Weights(np.eye(1), 1), settings.get("softening")
+    controller = Controller(plant, weights, bounds, 60, terminal_set=False, softening=softening)
     require_complete(controller, simulate(controller, scenario(plant, x0=[5], steps=400)))
 
 
@@ -364,23 +364,23 @@ PROVOKED: dict[str, Callable[[Path], object]] = {
     "would need ... GB of memory, more than this machine has": large_request(0, 1e9),
     "this request: would take about ... hours; ...; or say --yes": large_request(1e9, 0),
     "impc: note: caches are kept in ...": caches_without_a_home,
-    "is continuous, a discrete one is needed": lambda _: as_plant(
+    "is continuous, a discrete one is needed": lambda _: Plant(
         control.ss([[-1]], [[1]], [[1]], 0)
     ).require_discrete(),
-    "plant.D: is not zero": lambda _: as_plant(control.ss([[0.5]], [[1]], [[1]], 1, 0.1)),
-    "is not stabilisable: no input reaches the mode ...": lambda _: as_plant(
+    "plant.D: is not zero": lambda _: Plant(control.ss([[0.5]], [[1]], [[1]], 1, 0.1)),
+    "is not stabilisable: no input reaches the mode ...": lambda _: Plant(
         control.ss([[2, 0], [0, 0.5]], [[0], [1]], np.eye(2), 0, 0.1)
     ),
     "all its inputs are recorded": everything_recorded,
     "have no stabilising Riccati solution (...)": lambda _: solve_lqr(
-        cart(1.0), stage_weights(np.zeros((1, 1)), 1)
+        cart(1.0), Weights(np.zeros((1, 1)), 1)
     ),
     "no input sequence keeps the bound ...": far_start,
     "the input could not be told in double precision": lambda _: runaway(
         2.0, x_max=1.0, softening=50.0
     ),
     "the state left every reasonable range": lambda _: runaway(1.1),
-    "exclude the origin for ...": lambda _: box_bounds(cart(), u_min=1, u_max=2),
+    "exclude the origin for ...": lambda _: Bounds(cart(), u_min=1, u_max=2),
     "exists already; give another name, or remove it": draft_over_a_file,
     "... is a file; give another folder": file_for_a_folder,
     "another run is writing to it": two_runs,

@@ -5,22 +5,23 @@ from __future__ import annotations
 import importlib
 import os
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import control
 import numpy as np
 import pytest
 
+from impc.checking import replace
 from impc.errors import DataError
 from impc.files.configuration import Configuration, RecordingTable, SignalTable
 from impc.files.digests import content_digest, digest, source_digest, versions
 from impc.files.sealed import Kept
-from impc.inverse.problem import inverse_problem
-from impc.model.bounds import box_bounds
-from impc.model.plant import as_plant
+from impc.inverse.problem import Problem
+from impc.model.bounds import Bounds
+from impc.model.plant import Plant
 from impc.model.plant_family import plant_family
-from impc.model.recordings import recording
+from impc.model.recordings import Recording
 from impc.studies.cohort.unit_digest import unit_digest
 from impc.studies.fit.memory import open_memory
 from impc.studies.fit.settings import FitSettings
@@ -157,24 +158,22 @@ def test_the_memory_of_a_fit_knows_all_of_its_problem(tmp_path: Path) -> None:
     def system(growth: float = 1.1, dt: float = 0.1) -> object:
         return control.ss([[growth]], [[1.0]], [[1.0]], 0, dt)
 
-    plant = as_plant(system())
-    trial = recording(plant, np.ones((20, 1)))
-    family = plant_family(lambda values: as_plant(system(values[0])), ["growth"], [1.1])
-    curved = plant_family(lambda values: as_plant(system(values[0] ** 2 / 1.1)), ["growth"], [1.1])
+    plant = Plant(system())
+    trial = Recording(plant, np.ones((20, 1)))
+    family = plant_family(lambda values: Plant(system(values[0])), ["growth"], [1.1])
+    curved = plant_family(lambda values: Plant(system(values[0] ** 2 / 1.1)), ["growth"], [1.1])
 
     def problem(**changed: object) -> object:
-        made = inverse_problem(
-            plant, box_bounds(plant, u_min=-1, u_max=1), 20, (trial,), family=family
-        )
-        return replace(made, **changed)  # type: ignore[arg-type]
+        made = Problem(plant, Bounds(plant, u_min=-1, u_max=1), 20, (trial,), family=family)
+        return replace(made, **changed)
 
-    moved = recording(plant, np.append(np.ones(19), 1 + 1e-12)[:, None])
-    slower = as_plant(system(dt=0.2))
+    moved = Recording(plant, np.append(np.ones(19), 1 + 1e-12)[:, None])
+    slower = Plant(system(dt=0.2))
     problems = [
         problem(), problem(horizon=5), problem(family=None), problem(family=curved),
         problem(recordings=(moved,)), problem(plant=slower), problem(terminal_set=False),
         problem(output_scale=np.array([2.0])),
-        problem(bounds=box_bounds(plant, u_min=-1, u_max=2)),
+        problem(bounds=Bounds(plant, u_min=-1, u_max=2)),
     ]  # fmt: skip
     found = [open_memory(tmp_path, item, FitSettings()).digest for item in problems]  # type: ignore[arg-type]
     found.append(open_memory(tmp_path, problems[0], FitSettings(), "fit", "x").digest)  # type: ignore[arg-type]

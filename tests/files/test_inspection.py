@@ -17,7 +17,7 @@ from impc.files.configuration import UNKNOWN_UNIT, read_configuration
 from impc.files.formats import write_table
 from impc.files.reading import read_recordings
 from impc.files.table import make_table
-from impc.model.plant import as_plant
+from impc.model.plant import Plant
 from plants import seated_balance_plant
 from tests.files.damaged import PLANT
 from tests.files.samples import csv_text, pushed_seat, settings
@@ -80,7 +80,7 @@ def test_from_a_file_never_seen_to_a_recording(tmp_path: Path) -> None:
     names = ["t", "theta1", "theta2", "torque"]
     path.write_text(csv_text(dict(zip(names, columns.values(), strict=True))))
     assert inspect(path, "--out", out, "--plant", PLANT).exit_code == 0
-    plant = as_plant(seated_balance_plant(), ["command"])
+    plant = Plant(seated_balance_plant(), ["command"])
     with pytest.raises(InputError, match="is still '\\?'"):
         read_recordings([path], read_configuration(out), plant)
     text = out.read_text(encoding="utf-8")

@@ -12,7 +12,7 @@ from impc.errors import InputError
 from impc.files.alignment import misaligned
 from impc.files.configuration import read_configuration
 from impc.files.reading import read_recordings
-from impc.model.plant import as_plant
+from impc.model.plant import Plant
 from impc.model.recordings import Label
 from plants import seated_balance_plant, ternary_torque
 from tests.files.samples import csv_text, pushed_seat, settings
@@ -22,13 +22,12 @@ if TYPE_CHECKING:
 
     from impc.arrays import Array
     from impc.files.configuration import Configuration
-    from impc.model.plant import Plant
     from impc.model.recordings import Recording
 
 
 @pytest.fixture(scope="module")
 def seat() -> Plant:
-    return as_plant(seated_balance_plant(), ["command"])
+    return Plant(seated_balance_plant(), ["command"])
 
 
 def configured(folder: Path, *changes: tuple[str, str]) -> Configuration:
@@ -174,7 +173,7 @@ def test_trials_of_unequal_length_in_the_order_given(tmp_path: Path, seat: Plant
 
 
 def test_a_plant_without_recorded_disturbance(tmp_path: Path) -> None:
-    plant = as_plant(seated_balance_plant(), ["command", "perturbation"])
+    plant = Plant(seated_balance_plant(), ["command", "perturbation"])
     push = '[signals.perturbation]\ncolumn = "push"\nunit = "Nm"\n'
     trial = read(tmp_path, plant, csv_text(seated()), (push, ""))
     assert trial.disturbance.shape == (3000, 0)

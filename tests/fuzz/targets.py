@@ -17,7 +17,7 @@ from impc.files.inspection import draft_configuration, summary
 from impc.files.plant_sources import make_plant, plant_source
 from impc.files.reading import recording_of
 from impc.files.table import make_table
-from impc.model.plant import as_plant
+from impc.model.plant import Plant
 from tests.files.samples import csv_text, hdf5_mat, pushed_seat, save_mat
 from tests.fuzz.mutation import EDGES, mutated_bytes, mutated_text
 
@@ -82,7 +82,7 @@ class Fuzzer:
             [[0.9, 0.1], [0, 0.8]], [[0, 0], [1, 1]], [[1, 0]], 0, 0.01,
             inputs=["command", "push"], outputs=["seat"],
         )  # fmt: skip
-        self.plant = as_plant(system, ["command"])
+        self.plant = Plant(system, ["command"])
         self.sound = _sound_files(folder)
         self.config = folder / "sound.toml"
         self.config.write_text(_TEXT)

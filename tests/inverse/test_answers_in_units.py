@@ -7,36 +7,36 @@ import numpy as np
 import pytest
 
 from impc.control.closed_loop import scenario, simulate
-from impc.control.controller import mpc_controller
+from impc.control.controller import Controller
 from impc.inverse.direct_and_reduced import infer_weights, inverse_mpc_reduced
 from impc.inverse.gain_search import fit_gain
 from impc.inverse.noisy_fit import fit_controller
-from impc.inverse.problem import InverseProblem, inverse_problem
-from impc.model.bounds import box_bounds
-from impc.model.plant import Plant, as_plant, change_coordinates
-from impc.model.recordings import recording
+from impc.inverse.problem import Problem
+from impc.model.bounds import Bounds
+from impc.model.plant import Plant, change_coordinates
+from impc.model.recordings import Recording
 from impc.model.riccati import solve_lqr
-from impc.model.weights import stage_weights
+from impc.model.weights import Weights
 from impc.studies.example.cases import CASES
 from tests.inverse.test_several_inputs import random_problem
 
 UNITS = [1e-12, 1e-5, 1e5, 1e12]
 
 
-def recorded(scale: float, name: str) -> InverseProblem:
+def recorded(scale: float, name: str) -> Problem:
     """The example with all numbers, bounds too, `scale` times as large."""
-    plant = as_plant(control.ss([[2, -1], [1, 0.2]], [[1], [0]], np.eye(2), 0, True))
-    bounds = box_bounds(plant, u_min=-scale, u_max=scale)
-    controller = mpc_controller(plant, stage_weights(np.eye(2), 1), bounds, 3)
+    plant = Plant(control.ss([[2, -1], [1, 0.2]], [[1], [0]], np.eye(2), 0, True))
+    bounds = Bounds(plant, u_min=-scale, u_max=scale)
+    controller = Controller(plant, Weights(np.eye(2), 1), bounds, 3)
     run = simulate(controller, scenario(plant, x0=scale * np.array(CASES[name]), steps=20))
-    return inverse_problem(plant, bounds, 3, (recording(plant, run.x),))
+    return Problem(plant, bounds, 3, (Recording(plant, run.x),))
 
 
 @pytest.mark.parametrize("name", ["A", "B"])
 def test_table_3_1_does_not_depend_on_a_common_unit(name: str) -> None:
     """With numbers 1e12 times as large it returned (1.19, -.79) for (1.494, -.881)."""
     plain = infer_weights(recorded(1.0, name))
-    truth = solve_lqr(plain.fit.solution.plant, stage_weights(np.eye(2), 1)).K
+    truth = solve_lqr(plain.fit.solution.plant, Weights(np.eye(2), 1)).K
     for scale in [1.0, *UNITS]:
         found = infer_weights(recorded(scale, name))
         assert found.fit.explained
@@ -49,9 +49,9 @@ def test_table_3_1_does_not_depend_on_a_common_unit(name: str) -> None:
 def test_two_inputs_do_not_depend_on_a_common_unit(scale: float) -> None:
     controller, problem = random_problem(2, 2)
     plant, (trial,) = problem.plant, problem.recordings
-    bounds = box_bounds(plant, u_min=-scale, u_max=scale)
-    scaled = recording(plant, scale * trial.outputs, scale * trial.disturbance)
-    other = inverse_problem(plant, bounds, 5, (scaled,), terminal_set=False)
+    bounds = Bounds(plant, u_min=-scale, u_max=scale)
+    scaled = Recording(plant, scale * trial.outputs, scale * trial.disturbance)
+    other = Problem(plant, bounds, 5, (scaled,), terminal_set=False)
     found = inverse_mpc_reduced(other)
     assert found.explained
     np.testing.assert_allclose(found.gain.K, controller.K, rtol=1e-9, atol=1e-10)
@@ -59,12 +59,12 @@ def test_two_inputs_do_not_depend_on_a_common_unit(scale: float) -> None:
     np.testing.assert_allclose(fit_controller(other).solution.K, controller.K, rtol=1e-8, atol=1e-9)
 
 
-def in_units(problem: InverseProblem, states: np.ndarray, inputs: np.ndarray) -> InverseProblem:
+def in_units(problem: Problem, states: np.ndarray, inputs: np.ndarray) -> Problem:
     """x = diag(states) z, u = diag(inputs) v."""
     T, G = np.diag(states), np.diag(inputs)
     moved: Plant = change_coordinates(problem.plant, T, G)
     outputs = problem.plant.C @ T
-    plant = as_plant(
+    plant = Plant(
         control.ss(
             moved.A,
             np.hstack([moved.B, moved.E]),
@@ -76,13 +76,13 @@ def in_units(problem: InverseProblem, states: np.ndarray, inputs: np.ndarray) ->
         [f"u{i}" for i in range(moved.m)],
     )
     (trial,) = problem.recordings
-    bounds = box_bounds(plant, u_min=-1 / inputs, u_max=1 / inputs)
+    bounds = Bounds(plant, u_min=-1 / inputs, u_max=1 / inputs)
     z = np.linalg.solve(outputs, trial.outputs.T).T
-    return inverse_problem(
+    return Problem(
         plant,
         bounds,
         problem.horizon,
-        (recording(plant, z, trial.disturbance),),
+        (Recording(plant, z, trial.disturbance),),
         terminal_set=False,
     )
 
@@ -102,5 +102,5 @@ def test_output_scale_is_the_size_of_each_output() -> None:
     size = np.sqrt(np.mean(problem.recordings[0].outputs ** 2, axis=0))
     np.testing.assert_allclose(problem.output_scale, size, rtol=1e-12)
     plant, outputs = problem.plant, np.array([[0.0, 3.0], [0.0, 4.0]])
-    silent = inverse_problem(plant, problem.bounds, 3, (recording(plant, outputs),))
+    silent = Problem(plant, problem.bounds, 3, (Recording(plant, outputs),))
     np.testing.assert_allclose(silent.output_scale, [np.sqrt(12.5)] * 2, rtol=1e-12)

@@ -7,7 +7,7 @@ import pytest
 
 from impc.assess.identified_directions import identifiability
 from impc.control.closed_loop import Status, require_complete, scenario, simulate
-from impc.control.controller import gain_controller, mpc_controller
+from impc.control.controller import Controller
 from impc.inverse.direct_and_reduced import (
     AUXILIARY_CONDITION_WEIGHT,
     CONDITION_WEIGHT,
@@ -22,32 +22,31 @@ from impc.inverse.direct_and_reduced import (
 )
 from impc.inverse.equivalent_weights import gain_fibre, least_condition_weights
 from impc.inverse.gain_search import fit_gain
-from impc.inverse.problem import InverseProblem, controller_for, inverse_problem, without_bounds
+from impc.inverse.problem import Problem, controller_for
 from impc.inverse.proximal_search import Residual, weight_jacobian
 from impc.inverse.proximal_step import block_basis
 from impc.inverse.residuals import evaluate, residual_only
-from impc.model.bounds import Bounds, box_bounds
+from impc.model.bounds import Bounds
 from impc.model.plant import Plant
-from impc.model.recordings import recording
+from impc.model.recordings import Recording
 from impc.model.riccati import solve_lqr
 from impc.model.weights import (
     Weights,
     cholesky_parameters,
     condition_number,
     residual,
-    stage_weights,
     weights_from_parameters,
 )
 from impc.studies.example.cases import CASES, run_case
 from tests.support import nelder_mead, random_plant, random_weights
 
-IDENTITY = stage_weights(np.eye(2), 1)
+IDENTITY = Weights(np.eye(2), 1)
 
 
-def example(plant: Plant, bounds: Bounds, case: str) -> InverseProblem:
-    controller = mpc_controller(plant, IDENTITY, bounds, 3)
+def example(plant: Plant, bounds: Bounds, case: str) -> Problem:
+    controller = Controller(plant, IDENTITY, bounds, 3)
     run = require_complete(controller, simulate(controller, scenario(plant, CASES[case], 20)))
-    return inverse_problem(plant, bounds, 3, (recording(plant, run.x),))
+    return Problem(plant, bounds, 3, (Recording(plant, run.x),))
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -118,7 +117,7 @@ def test_auxiliary_problem_reaches_what_a_derivative_free_search_reaches(
     assert found.objective == pytest.approx(best, rel=1e-9)
     # The reference's Q_0 (section 3, case A), from Nelder-Mead on its own scaling of the weights.
     assert best <= auxiliary_objective(
-        example_plant, gain, stage_weights([[0.1901, 0.0716], [0.0716, 0.2163]], 1)
+        example_plant, gain, Weights([[0.1901, 0.0716], [0.0716, 0.2163]], 1)
     )
     for seed in range(3):
         start = np.random.default_rng(seed).normal(size=3)
@@ -134,7 +133,7 @@ def test_output_penalty_reaches_what_a_derivative_free_search_reaches(
     example_plant: Plant, example_bounds: Bounds
 ) -> None:
     problem = example(example_plant, example_bounds, "A")
-    linear = without_bounds(problem)
+    linear = problem.without_bounds()
 
     def objective(weights: Weights) -> float:
         solution = solve_lqr(example_plant, weights)
@@ -156,8 +155,8 @@ def test_direct_form_tends_to_the_reduced_one_with_noise(
     clean = example(example_plant, example_bounds, "B")
     rng = np.random.default_rng(0)
     noisy = clean.recordings[0].outputs + 0.01 * rng.normal(size=(21, 2))
-    problem = inverse_problem(
-        example_plant, example_bounds, 3, (recording(example_plant, noisy, x0=[2, 3]),)
+    problem = Problem(
+        example_plant, example_bounds, 3, (Recording(example_plant, noisy, x0=[2, 3]),)
     )
     reduced = inverse_mpc_reduced(problem)
     assert reduced.equivalent is not None
@@ -173,10 +172,10 @@ def test_squared_misfit_trades_and_the_norm_does_not(
     example_plant: Plant, example_bounds: Bounds
 ) -> None:
     """With exact data and true weights away from the identity: docs/theory.md, section 6."""
-    true = stage_weights([[4.0, 0.5], [0.5, 1.0]], 2.0)
-    controller = mpc_controller(example_plant, true, example_bounds, 3)
+    true = Weights([[4.0, 0.5], [0.5, 1.0]], 2.0)
+    controller = Controller(example_plant, true, example_bounds, 3)
     run = require_complete(controller, simulate(controller, scenario(example_plant, [2, 3], 20)))
-    problem = inverse_problem(example_plant, example_bounds, 3, (recording(example_plant, run.x),))
+    problem = Problem(example_plant, example_bounds, 3, (Recording(example_plant, run.x),))
     reduced = inverse_mpc_reduced(problem)
     assert np.linalg.norm(reduced.gain.K - controller.K) < 1e-9
     assert condition_number(reduced.weights) <= condition_number(true) * (1 + 1e-7)
@@ -191,15 +190,15 @@ def test_squared_misfit_trades_and_the_norm_does_not(
 def test_two_inputs_recover_gain_and_metric_while_bounds_are_active() -> None:
     rng = np.random.default_rng(3)
     plant = random_plant(rng, 3, 2, 1.1)
-    true = stage_weights(random_weights(rng, 3), random_weights(rng, 2))
-    bounds = box_bounds(plant, u_min=-0.3, u_max=0.3)
-    controller = mpc_controller(plant, true, bounds, 4)
+    true = Weights(random_weights(rng, 3), random_weights(rng, 2))
+    bounds = Bounds(plant, u_min=-0.3, u_max=0.3)
+    controller = Controller(plant, true, bounds, 4)
     recordings = []
     for _ in range(40):
         run = simulate(controller, scenario(plant, rng.normal(size=3), 15))
         if run.complete and Status.ACTIVE in run.status:
-            recordings.append(recording(plant, run.x))
-    problem = inverse_problem(plant, bounds, 4, tuple(recordings))
+            recordings.append(Recording(plant, run.x))
+    problem = Problem(plant, bounds, 4, tuple(recordings))
     found = inverse_mpc_reduced(problem)
     np.testing.assert_allclose(found.gain.K, controller.K, atol=1e-6)
     assert found.gain.metric_determined
@@ -214,7 +213,7 @@ def test_two_inputs_recover_gain_and_metric_while_bounds_are_active() -> None:
     assert counts.rank == 3 * 2 + 2 - 1  # docs/theory.md, section 2: n m + m - 1
     # Without an active bound the metric stays in the dark: only the gain is determined.
     calm = simulate(controller, scenario(plant, [1e-3, 0, 0], 15))
-    quiet = inverse_problem(plant, bounds, 4, (recording(plant, calm.x),))
+    quiet = Problem(plant, bounds, 4, (Recording(plant, calm.x),))
     assert not fit_gain(quiet).metric_determined
 
 
@@ -224,14 +223,14 @@ def test_jacobian_in_the_weights_equals_central_differences(inputs: int) -> None
     rng = np.random.default_rng(inputs)
     plant = random_plant(rng, 3, inputs, 1.1)
     Q, R = random_weights(rng, 3), random_weights(rng, inputs)
-    bounds = box_bounds(plant, u_min=-0.3, u_max=0.4, x_min=-2, x_max=2)
-    controller = mpc_controller(plant, stage_weights(Q, R), bounds, 3)
+    bounds = Bounds(plant, u_min=-0.3, u_max=0.4, x_min=-2, x_max=2)
+    controller = Controller(plant, Weights(Q, R), bounds, 3)
     for size in 5 * 0.9 ** np.arange(60):
         run = simulate(controller, scenario(plant, size * np.ones(3), 15))
         if run.complete and Status.ACTIVE in run.status:
             break
-    problem = inverse_problem(plant, bounds, 3, (recording(plant, 0.9 * run.x, x0=run.x[0]),))
-    solution = solve_lqr(plant, stage_weights(Q, R))
+    problem = Problem(plant, bounds, 3, (Recording(plant, 0.9 * run.x, x0=run.x[0]),))
+    solution = solve_lqr(plant, Weights(Q, R))
     found = evaluate(problem, solution.K, solution.S)
     basis = block_basis(3, inputs)
     exact = weight_jacobian(
@@ -241,7 +240,7 @@ def test_jacobian_in_the_weights_equals_central_differences(inputs: int) -> None
         errors = []
         for step in (1e-5, 1e-6):
             sides = [
-                solve_lqr(plant, stage_weights(Q + s * member[:3, :3], R + s * member[3:, 3:]))
+                solve_lqr(plant, Weights(Q + s * member[:3, :3], R + s * member[3:, 3:]))
                 for s in (step, -step)
             ]
             up, down = (residual_only(problem, side.K, side.S) for side in sides)
@@ -256,11 +255,11 @@ def test_a_gain_no_weights_have_is_said_and_the_direct_form_continues(
 ) -> None:
     """A recording made by a gain that is not a regulator's."""
     gain = np.array([[1.21183, -0.71277]])
-    controller = gain_controller(example_plant, gain, example_bounds, 3)
+    controller = Controller.from_gain(example_plant, gain, example_bounds, 3)
     run = require_complete(
         controller, simulate(controller, scenario(example_plant, [0.5, 0.7], 20))
     )
-    problem = inverse_problem(example_plant, example_bounds, 3, (recording(example_plant, run.x),))
+    problem = Problem(example_plant, example_bounds, 3, (Recording(example_plant, run.x),))
     found = inverse_mpc_reduced(problem)
     np.testing.assert_allclose(found.gain.K, gain, atol=1e-7)
     assert found.equivalent is None
@@ -296,13 +295,13 @@ def test_a_recording_that_breaks_a_state_bound_is_fitted_softly_and_said_so(
     """A push beyond the bound: no hard controller passes it, the soft one explains it."""
     rng = np.random.default_rng(5)
     plant = random_plant(rng, 3, 1, 1.1, d=1)
-    bounds = box_bounds(plant, u_min=-1, u_max=1, x_min=-0.5, x_max=0.5)
-    true = mpc_controller(plant, stage_weights(np.eye(3), 1), bounds, 6, softening=1e6)
+    bounds = Bounds(plant, u_min=-1, u_max=1, x_min=-0.5, x_max=0.5)
+    true = Controller(plant, Weights(np.eye(3), 1), bounds, 6, softening=1e6)
     push = 0.8 * rng.normal(size=40)
     run = simulate(true, scenario(plant, 0.2 * np.ones(3), disturbance=push))
     assert Status.SOFTENED in run.status
-    trial = recording(plant, run.x, np.append(push, 0.0))
-    problem = inverse_problem(plant, bounds, 6, (trial,), softening=1e6)
+    trial = Recording(plant, run.x, np.append(push, 0.0))
+    problem = Problem(plant, bounds, 6, (trial,), softening=1e6)
     found = inverse_mpc_reduced(problem)
     assert not found.kept_hard
     np.testing.assert_allclose(found.gain.K, true.K, atol=1e-6)
@@ -314,11 +313,11 @@ def test_an_iterate_that_diverges_is_named_and_finite(
     """A gain that gives the bounded input too little to do, from a start that needs it."""
     problem = example(example_plant, example_bounds, "A")
     outputs = np.vstack([2.5 * problem.recordings[0].outputs, np.zeros((200, 2))])
-    far = inverse_problem(
+    far = Problem(
         example_plant,
         example_bounds,
         3,
-        (recording(example_plant, outputs),),
+        (Recording(example_plant, outputs),),
         terminal_set=False,
     )
     found = evaluate(far, np.array([[1.02, -0.72]]), np.eye(1))

@@ -19,16 +19,16 @@ from impc.inverse.equivalent_weights import (
     weights_margin,
 )
 from impc.inverse.solution_set import split_blocks
-from impc.model.plant import Plant, as_plant
+from impc.model.plant import Plant
 from impc.model.riccati import solve_lqr
-from impc.model.weights import Weights, condition_number, residual, stage_weights
+from impc.model.weights import Weights, condition_number, residual
 from tests.support import draws
 
-EXAMPLE = as_plant(control.ss([[2, -1], [1, 0.2]], [[1], [0]], np.eye(2), 0, 1.0))
-INTEGRATOR = as_plant(control.ss([[1, 1], [0, 1]], [[0.5], [1]], np.eye(2), 0, 1.0))
+EXAMPLE = Plant(control.ss([[2, -1], [1, 0.2]], [[1], [0]], np.eye(2), 0, 1.0))
+INTEGRATOR = Plant(control.ss([[1, 1], [0, 1]], [[0.5], [1]], np.eye(2), 0, 1.0))
 
 # Priess et al. 2015, the feasible example (T1), continuous.
-PRIESS = as_plant(
+PRIESS = Plant(
     control.ss(
         [[0, 1, 7, 9], [4, -8, -5, -3], [8, -7, 7, -6], [10, -5, -5, -5]],
         [[2, 2, 5, -9], [-1, 1, 5, -9], [-3, 9, -3, 1], [7, -4, 1, 6]],
@@ -48,20 +48,20 @@ PRIESS_GAIN = np.array(
 
 def random_case(seed: int, n: int, m: int, dt: float) -> tuple[Plant, Weights]:
     rng = np.random.default_rng(seed)
-    plant = as_plant(control.ss(rng.normal(size=(n, n)), rng.normal(size=(n, m)), np.eye(n), 0, dt))
+    plant = Plant(control.ss(rng.normal(size=(n, n)), rng.normal(size=(n, m)), np.eye(n), 0, dt))
     q, r = rng.normal(size=(n, n)), rng.normal(size=(m, m))
-    return plant, stage_weights(q @ q.T + 0.1 * np.eye(n), r @ r.T + 0.1 * np.eye(m))
+    return plant, Weights(q @ q.T + 0.1 * np.eye(n), r @ r.T + 0.1 * np.eye(m))
 
 
 def seat() -> tuple[Plant, Weights]:
     from plants.seated_balance import seated_balance_plant  # noqa: PLC0415  # CasADi, for two tests
 
-    plant = as_plant(seated_balance_plant(), controls=["command"])
+    plant = Plant(seated_balance_plant(), controls=["command"])
     direction = np.array([0.70, 0.65, 0.22, 0.20])
     direction /= np.linalg.norm(direction)
     Q = 1e-2 * np.eye(10)
     Q[:4, :4] = 6e5 * np.outer(direction, direction) + np.diag([2e4, 2e4, 500.0, 500.0])
-    return plant, stage_weights(Q, 1.0)
+    return plant, Weights(Q, 1.0)
 
 
 def rescaled(plant: Plant, states: Array) -> Plant:
@@ -70,7 +70,7 @@ def rescaled(plant: Plant, states: Array) -> Plant:
     system = control.ss(
         back @ plant.A @ states, back @ plant.B, plant.C @ states, 0, plant.dt, inputs=plant.m
     )
-    return as_plant(system)
+    return Plant(system)
 
 
 def test_published_example_has_the_least_condition_number_of_the_reference() -> None:
@@ -200,7 +200,7 @@ def test_margin_and_centre_do_not_depend_on_units_but_the_least_condition_does()
     plant, truth = seat()
     scale = np.diag(np.logspace(-3, 2, 10))
     other = rescaled(plant, scale)
-    moved = stage_weights(scale @ truth.Q @ scale, truth.R)
+    moved = Weights(scale @ truth.Q @ scale, truth.R)
     fibres = [gain_fibre(a, solve_lqr(a, w).K) for a, w in ((plant, truth), (other, moved))]
     first, second = (weights_margin(fibre).margin for fibre in fibres)
     assert second == pytest.approx(first, rel=1e-6)
@@ -214,10 +214,10 @@ def test_analytic_centre_with_two_inputs_does_not_depend_on_their_coordinates() 
     plant, truth = random_case(3, 4, 2, 1.0)
     gain = solve_lqr(plant, truth).K
     inputs = np.array([[1.0, 0.4], [0.0, 50.0]])
-    moved = as_plant(control.ss(plant.A, plant.B @ inputs, plant.C, 0, 1.0))
+    moved = Plant(control.ss(plant.A, plant.B @ inputs, plant.C, 0, 1.0))
     centre = analytic_centre(gain_fibre(plant, gain)).weights
     other = analytic_centre(gain_fibre(moved, np.linalg.solve(inputs, gain))).weights
-    expected = stage_weights(centre.Q, inputs.T @ centre.R @ inputs)
+    expected = Weights(centre.Q, inputs.T @ centre.R @ inputs)
     assert residual(expected, other) < 1e-6 * np.linalg.norm(other.block)
 
 
@@ -247,8 +247,8 @@ def test_a_gain_that_does_not_stabilise_is_refused() -> None:
     ],
 )
 def test_an_unbounded_fibre_has_a_least_condition_but_no_centre(A: object, B: object) -> None:
-    plant = as_plant(control.ss(A, B, np.eye(len(np.asarray(A))), 0, 1.0))
-    gain = solve_lqr(plant, stage_weights(np.eye(plant.n), 1.0)).K
+    plant = Plant(control.ss(A, B, np.eye(len(np.asarray(A))), 0, 1.0))
+    gain = solve_lqr(plant, Weights(np.eye(plant.n), 1.0)).K
     fibre = gain_fibre(plant, gain)
     assert least_condition_weights(fibre).condition == pytest.approx(1.0, abs=1e-9)
     with pytest.raises(WeightsError, match="no analytic centre"):
@@ -274,7 +274,7 @@ def test_others_are_unlike_and_a_single_member_has_none() -> None:
         assert residual(member.weights, found.weights) > 0.5
         assert member.gain_error < 1e-14
     assert residual(others[0].weights, others[1].weights) > 0.5
-    single = gain_fibre(as_plant(control.ss([[1.2]], [[1]], [[1]], 0, 1.0)), [[0.7]])
+    single = gain_fibre(Plant(control.ss([[1.2]], [[1]], [[1]], 0, 1.0)), [[0.7]])
     assert other_weights(single) == ()
     assert residual(analytic_centre(single).weights, least_condition_weights(single).weights) < 1e-9
 

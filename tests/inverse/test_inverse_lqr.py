@@ -16,17 +16,17 @@ from impc.inverse.inverse_lqr import (
     inverse_lqr_gradient,
     inverse_lqr_lmi,
 )
-from impc.model.plant import Plant, as_plant
+from impc.model.plant import Plant
 from impc.model.riccati import solve_lqr
-from impc.model.weights import condition_number, stage_weights
+from impc.model.weights import Weights, condition_number
 from tests.support import draws, extrapolated_slope
 
-EXAMPLE = as_plant(control.ss([[2, -1], [1, 0.2]], [[1], [0]], np.eye(2), 0, 1.0))
+EXAMPLE = Plant(control.ss([[2, -1], [1, 0.2]], [[1], [0]], np.eye(2), 0, 1.0))
 NO_WEIGHTS_GAIN = np.array([[1.21183, -0.71277]])
 GAIN = [[1.351294, -0.836590]]
 
 # Priess et al. 2015, the infeasible example (T2), continuous.
-PRIESS = as_plant(
+PRIESS = Plant(
     control.ss(
         [[100, 0, -1], [0, 0.1, 50], [0.333, 10, 0]],
         [[-1, 0, 10], [1, 1, 0], [0.1, -20, 4]],
@@ -112,7 +112,7 @@ def test_gradient_of_the_example_tends_to_a_singular_Q() -> None:
 
 
 def test_gradient_finds_a_gain_that_weights_have() -> None:
-    for start in (None, stage_weights(np.diag([5.0, 0.1]), 2.0)):
+    for start in (None, Weights(np.diag([5.0, 0.1]), 2.0)):
         found = inverse_lqr_gradient(EXAMPLE, GAIN, start)
         assert found.feasible
         assert found.gain_error < 1e-10
@@ -121,17 +121,17 @@ def test_gradient_finds_a_gain_that_weights_have() -> None:
 def test_gradient_starts_from_the_identity_for_a_gain_that_does_not_stabilise() -> None:
     found = inverse_lqr_gradient(EXAMPLE, [[0.5, -0.2]])
     assert found.weights is not None
-    identity = solve_lqr(EXAMPLE, stage_weights(np.eye(2), 1.0)).K
+    identity = solve_lqr(EXAMPLE, Weights(np.eye(2), 1.0)).K
     assert found.gain_error < np.linalg.norm(identity - [[0.5, -0.2]])
 
 
 def test_gradient_on_the_seat_plant_comes_near_a_gain_that_no_weights_have() -> None:
     from plants.seated_balance import seated_balance_plant  # noqa: PLC0415  # CasADi, for one test
 
-    plant = as_plant(seated_balance_plant(), controls=["command"])
+    plant = Plant(seated_balance_plant(), controls=["command"])
     Q = 1e-2 * np.eye(10)
     Q[:4, :4] = np.diag([3e5, 3e5, 3e4, 3e4])
-    exact = solve_lqr(plant, stage_weights(Q, 1.0)).K
+    exact = solve_lqr(plant, Weights(Q, 1.0)).K
     rng = np.random.default_rng(1)
     for gain, error in ((exact, 1e-9), (exact * (1 + 0.02 * rng.normal(size=(1, 10))), 1e-3)):
         found = inverse_lqr_gradient(plant, gain, max_evaluations=60)
@@ -164,8 +164,8 @@ def test_gradient_agrees_with_finite_differences(seed: int, n: int, m: int, dt: 
 def require_gradient(seed: int, n: int, m: int, dt: float) -> None:
     """The Jacobian of the gain against differences of gains, to 1e-6 of its largest entry."""
     rng = np.random.default_rng(seed)
-    plant = as_plant(control.ss(rng.normal(size=(n, n)), rng.normal(size=(n, m)), np.eye(n), 0, dt))
-    space = _FactorSpace.around(plant, stage_weights(np.eye(n), np.eye(m)), 1e-3)
+    plant = Plant(control.ss(rng.normal(size=(n, n)), rng.normal(size=(n, m)), np.eye(n), 0, dt))
+    space = _FactorSpace.around(plant, Weights(np.eye(n), np.eye(m)), 1e-3)
     at = space.start + 0.1 * rng.normal(size=space.start.shape)
 
     def gain(parameters: Array) -> Array:

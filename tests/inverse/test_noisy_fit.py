@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import scipy.signal
@@ -15,25 +13,26 @@ from impc.assess.covariance import gain_covariance
 from impc.assess.inverse_lqr_beside import compare_methods
 from impc.assess.long_run_covariance import ResidualNoise, residual_noise, spread_of_sum
 from impc.assess.printed_gain import gain_estimate
+from impc.checking import replace
 from impc.control.closed_loop import scenario, simulate
 from impc.inverse.coordinates import Coordinates
 from impc.inverse.diagonal_start import diagonal_weights
 from impc.inverse.initial_states import with_fitted_starts
 from impc.inverse.noisy_fit import FittedController, fit_controller
-from impc.inverse.problem import InverseProblem, moved
+from impc.inverse.problem import Problem
 from impc.inverse.residuals import evaluate
-from impc.model.plant import as_plant
+from impc.model.plant import Plant
 from impc.model.plant_family import plant_at, plant_differential, plant_family
-from impc.model.recordings import recording
+from impc.model.recordings import Recording
 from impc.model.riccati import solve_lqr
 from impc.studies.fit.settings import FitSettings
 from impc.studies.fit.subject import fit_problem
 
 
-def clean_problem(limit: float, trials: int = 3) -> tuple[Workload, InverseProblem]:
+def clean_problem(limit: float, trials: int = 3) -> tuple[Workload, Problem]:
     work = seat(trials, 30.0, limit)
     plant = work.problem.plant
-    recordings = [recording(plant, t.outputs, t.disturbance) for t in work.problem.recordings]
+    recordings = [Recording(plant, t.outputs, t.disturbance) for t in work.problem.recordings]
     return work, fit_problem(plant, recordings, FitSettings(u_max=limit))
 
 
@@ -105,7 +104,7 @@ def test_initial_states_are_found() -> None:
     x0 = x[500 + rng.integers(100)]
     drive = scenario(plant, x0, disturbance=work.drives[0].disturbance[500:1500])
     run = simulate(controller, drive)
-    trial = recording(plant, run.x @ plant.C.T, np.vstack([drive.disturbance, [[0.0]]]))
+    trial = Recording(plant, run.x @ plant.C.T, np.vstack([drive.disturbance, [[0.0]]]))
     problem = replace(work.problem, recordings=(trial,), unknown_start=True)
     K, S = np.array(controller.K), np.array(controller.S)
     (found,) = with_fitted_starts(problem, K, S).recordings
@@ -115,14 +114,14 @@ def test_initial_states_are_found() -> None:
     np.testing.assert_allclose(seen.x @ plant.C.T, trial.outputs, atol=1e-8)
 
 
-def seat_family() -> tuple[InverseProblem, Workload]:
+def seat_family() -> tuple[Problem, Workload]:
     """Unknown moment of inertia and muscle time constant, from nominal values 20 % off."""
     work, problem = clean_problem(6.0, 2)
     truth = plants.SeatedBalanceParameters()
 
     def make(values: np.ndarray[tuple[int, ...], np.dtype[np.float64]]):  # type: ignore[no-untyped-def]
         changed = replace(truth, J2=float(values[0]), tau_m=float(values[1]))
-        return as_plant(plants.seated_balance_plant(changed), ["command"])
+        return Plant(plants.seated_balance_plant(changed), ["command"])
 
     family = plant_family(make, ["J2", "tau_m"], [1.2 * truth.J2, 0.8 * truth.tau_m])
     start = plant_at(family, np.zeros(2))
@@ -187,7 +186,7 @@ def test_an_evaluation_knows_what_a_problem_lacks() -> None:
 def test_moved_changes_starts_and_plant() -> None:
     problem, _ = seat_family()
     starts = np.ones((2, 10))
-    there = moved(problem, starts, np.array([0.1, 0.0]))
+    there = problem.at(starts, np.array([0.1, 0.0]))
     assert [trial.x0.tolist() for trial in there.recordings] == starts.tolist()
     assert not np.array_equal(there.plant.A, problem.plant.A)
 

@@ -8,13 +8,13 @@ import pytest
 from impc.control.controller import Controller
 from impc.inverse.direct_and_reduced import inverse_mpc_reduced
 from impc.inverse.equivalent_weights import gain_fibre, least_condition_weights
-from impc.inverse.problem import InverseProblem
+from impc.inverse.problem import Problem
 from impc.model.riccati import solve_lqr
 from impc.model.weights import Weights, condition_number
 from tests.support import saturated_problem
 
 
-def random_problem(seed: int) -> tuple[Weights, Controller, InverseProblem]:
+def random_problem(seed: int) -> tuple[Weights, Controller, Problem]:
     """2 to 6 states, 1 or 2 inputs, one random disturbance, 2 to 30 % of the inputs saturated."""
     rng = np.random.default_rng([11, seed])
     return saturated_problem(rng, 2 + seed % 5, 1 + seed % 2)

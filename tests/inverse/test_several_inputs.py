@@ -2,27 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 
 from impc.assess.weights_ranges import summarise_weights
+from impc.checking import replace
 from impc.control.closed_loop import scenario, simulate
-from impc.control.controller import Controller, mpc_controller
+from impc.control.controller import Controller
 from impc.errors import ImpcError
 from impc.inverse.direct_and_reduced import infer_weights, inverse_mpc_reduced
 from impc.inverse.equivalent_weights import least_condition_weights, other_weights
 from impc.inverse.gain_search import fit_gain
 from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.one_step import regressed_gain
-from impc.inverse.problem import InverseProblem
+from impc.inverse.problem import Problem
 from impc.inverse.solution_set import gain_fibre, natural_coordinates
 from impc.inverse.weights_search import search_weights
-from impc.model.recordings import recording
+from impc.model.recordings import Recording
 from impc.model.riccati import solve_lqr
-from impc.model.weights import Weights, stage_weights
+from impc.model.weights import Weights
 from tests.support import saturated_problem
 
 if TYPE_CHECKING:
@@ -32,17 +32,17 @@ if TYPE_CHECKING:
 REPRODUCED = 1e-7
 
 
-def random_problem(seed: int, m: int) -> tuple[Controller, InverseProblem]:
+def random_problem(seed: int, m: int) -> tuple[Controller, Problem]:
     """2 to 6 states, m inputs, one random disturbance, 2 to 30 % of the inputs saturated."""
     rng = np.random.default_rng([14, m, seed])
     _, controller, problem = saturated_problem(rng, 2 + seed % 5, m)
     return controller, problem
 
 
-def missed(problem: InverseProblem, weights: Weights) -> float:
+def missed(problem: Problem, weights: Weights) -> float:
     """Simulated minus recorded outputs over the recorded ones: by the controller, from weights."""
     plant = problem.plant
-    controller = mpc_controller(
+    controller = Controller(
         plant, weights, problem.bounds, problem.horizon, terminal_set=problem.terminal_set
     )
     (trial,) = problem.recordings
@@ -52,19 +52,19 @@ def missed(problem: InverseProblem, weights: Weights) -> float:
     return float(np.linalg.norm(error) / np.linalg.norm(trial.outputs / scale))
 
 
-def by_fit(problem: InverseProblem) -> tuple[Weights, bool]:
+def by_fit(problem: Problem) -> tuple[Weights, bool]:
     found = fit_controller(problem)
     assert found.explained or not found.exact
     return found.weights, found.explained
 
 
-def by_reduced(problem: InverseProblem) -> tuple[Weights, bool]:
+def by_reduced(problem: Problem) -> tuple[Weights, bool]:
     found = inverse_mpc_reduced(problem)
     assert found.explained == (not found.reason)
     return found.weights, found.explained
 
 
-def by_direct(problem: InverseProblem) -> tuple[Weights, bool]:
+def by_direct(problem: Problem) -> tuple[Weights, bool]:
     found = infer_weights(problem).fit
     return found.weights, found.explained
 
@@ -73,7 +73,7 @@ PATHS = {"fit": by_fit, "reduced": by_reduced, "direct": by_direct}
 
 
 def outcomes(
-    path: Callable[[InverseProblem], tuple[Weights, bool]], m: int, seeds: range
+    path: Callable[[Problem], tuple[Weights, bool]], m: int, seeds: range
 ) -> dict[int, str]:
     """Per problem that is not reproduced: "said so", or how far a silent answer missed."""
     found = {}
@@ -183,7 +183,7 @@ def test_weights_at_the_edge_of_those_that_a_program_finds() -> None:
     """Their margin is below 1e-9: known members are found again, none is made up without one."""
     _, problem = random_problem(2, 2)
     plant = problem.plant
-    thin = stage_weights(np.diag([1e-11, 1.0, 1.0, 1.0]), np.eye(2))
+    thin = Weights(np.diag([1e-11, 1.0, 1.0, 1.0]), np.eye(2))
     solution = solve_lqr(plant, thin)
     fibre = gain_fibre(plant, solution.K, solution.S)
     found = least_condition_weights(fibre, thin)
@@ -196,7 +196,7 @@ def test_a_noisy_fit_stays_where_it_ended() -> None:
     (trial,) = clean.recordings
     scale = np.asarray(clean.output_scale)
     noise = 0.15 * scale * np.random.default_rng(1).standard_normal(trial.outputs.shape)
-    noisy = recording(clean.plant, trial.outputs + noise, trial.disturbance, trial.x0)
+    noisy = Recording(clean.plant, trial.outputs + noise, trial.disturbance, trial.x0)
     problem = replace(clean, recordings=(noisy,))
     found = fit_controller(problem)
     again = fit_controller(problem, found.weights)

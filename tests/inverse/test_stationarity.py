@@ -13,7 +13,7 @@ from impc.errors import DataError
 from impc.inverse.smoothing import Smoothed, smoothed_trials
 from impc.inverse.stationarity import stationarity_weights
 from impc.model.riccati import solve_lqr
-from impc.model.weights import stage_weights
+from impc.model.weights import Weights
 from tests.support import random_plant, random_weights
 
 SEED = 6
@@ -23,7 +23,7 @@ def optimal_runs(seed: int, n: int, m: int) -> tuple[object, Array, list[Smoothe
     """Undisturbed regulators from random starts: every stretch is an optimal plan."""
     rng = np.random.default_rng(seed)
     plant = random_plant(rng, n, m, 1.1)
-    weights = stage_weights(random_weights(rng, n), random_weights(rng, m))
+    weights = Weights(random_weights(rng, n), random_weights(rng, m))
     K = np.array(solve_lqr(plant, weights).K)
     runs = []
     for _ in range(5):
@@ -59,7 +59,7 @@ def test_the_residual_is_that_of_the_stationarity_conditions() -> None:
         rows.append(run.u + adjoint[1:] @ B)
     objective = cvxpy.Minimize(cvxpy.sum_squares(cvxpy.vstack(rows)))
     cvxpy.Problem(objective, constraints).solve(solver=cvxpy.CLARABEL)
-    other = solve_lqr(plant, stage_weights(Q.value, 1)).K  # type: ignore[arg-type]
+    other = solve_lqr(plant, Weights(Q.value, 1)).K  # type: ignore[arg-type]
     ours = solve_lqr(plant, found).K  # type: ignore[arg-type]
     np.testing.assert_allclose(ours, other, atol=2e-3 * np.max(np.abs(K)))
 

@@ -8,7 +8,7 @@ import pytest
 import scipy.linalg
 
 from impc.errors import InputError, WeightsError
-from impc.model.plant import Plant, as_plant
+from impc.model.plant import Plant
 from impc.model.riccati import (
     gain_gradients,
     gain_plant_differential,
@@ -16,12 +16,12 @@ from impc.model.riccati import (
     metric_gradients,
     solve_lqr,
 )
-from impc.model.weights import stage_weights
+from impc.model.weights import Weights
 from tests.support import random_plant, random_weights
 
 
 def continuous_plant(rng: np.random.Generator) -> Plant:
-    return as_plant(control.ss(rng.normal(size=(3, 3)), rng.normal(size=(3, 2)), np.eye(3), 0))
+    return Plant(control.ss(rng.normal(size=(3, 3)), rng.normal(size=(3, 2)), np.eye(3), 0))
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -30,13 +30,13 @@ def test_gain_equals_that_of_python_control(seed: int) -> None:
     Q, R = random_weights(rng, 4), random_weights(rng, 2)
     plant = random_plant(rng, 4, 2, 1.2)
     K, P, _ = control.dlqr(plant.A, plant.B, Q, R)
-    found = solve_lqr(plant, stage_weights(Q, R))
+    found = solve_lqr(plant, Weights(Q, R))
     np.testing.assert_allclose(found.K, K, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(found.P, P, rtol=1e-9)
     smooth = continuous_plant(rng)
     Q, R = random_weights(rng, 3), random_weights(rng, 2)
     K, P, _ = control.lqr(smooth.A, smooth.B, Q, R)
-    found = solve_lqr(smooth, stage_weights(Q, R))
+    found = solve_lqr(smooth, Weights(Q, R))
     np.testing.assert_allclose(found.K, K, rtol=1e-8, atol=1e-9)
     np.testing.assert_allclose(found.P, P, rtol=1e-8, atol=1e-9)
 
@@ -45,7 +45,7 @@ def test_cost_of_any_inputs_is_distance_to_the_gain() -> None:
     """The identity of docs/theory.md, section 2, on random inputs."""
     rng = np.random.default_rng(1)
     plant = random_plant(rng, 3, 2, 1.3)
-    weights = stage_weights(random_weights(rng, 3), random_weights(rng, 2))
+    weights = Weights(random_weights(rng, 3), random_weights(rng, 2))
     found = solve_lqr(plant, weights)
     x = rng.normal(size=3)
     first = x @ found.P @ x
@@ -66,8 +66,8 @@ def test_gradients_equal_central_differences(seed: int, discrete: bool) -> None:
     Q, R = random_weights(rng, 3), random_weights(rng, 2)
     dQ, dR = (part + part.T for part in (rng.normal(size=(3, 3)), rng.normal(size=(2, 2))))
     step = 1e-5
-    up, down = (solve_lqr(plant, stage_weights(Q + s * dQ, R + s * dR)) for s in (step, -step))
-    here = solve_lqr(plant, stage_weights(Q, R))
+    up, down = (solve_lqr(plant, Weights(Q + s * dQ, R + s * dR)) for s in (step, -step))
+    here = solve_lqr(plant, Weights(Q, R))
     pairs = [(gain_gradients(here), up.K - down.K)]
     if discrete:
         pairs.append((metric_gradients(here), up.S - down.S))
@@ -81,14 +81,14 @@ def test_gradients_equal_central_differences(seed: int, discrete: bool) -> None:
 def test_plant_differential_equals_central_differences() -> None:
     rng = np.random.default_rng(7)
     plant = random_plant(rng, 4, 2, 1.1)
-    weights = stage_weights(random_weights(rng, 4), random_weights(rng, 2))
+    weights = Weights(random_weights(rng, 4), random_weights(rng, 2))
     dA, dB = rng.normal(size=(2, 4, 4)), rng.normal(size=(2, 4, 2))
     dK, dS = gain_plant_differential(solve_lqr(plant, weights), dA, dB)
     step = 1e-6
     for index in range(2):
         up, down = (
             solve_lqr(
-                as_plant(
+                Plant(
                     control.ss(plant.A + s * dA[index], plant.B + s * dB[index], np.eye(4), 0, True)
                 ),
                 weights,
@@ -113,11 +113,11 @@ def test_lyapunov_series_equals_scipy_up_to_slow_loops() -> None:
 
 
 def test_a_mode_without_weight_is_an_error() -> None:
-    plant = as_plant(control.ss(np.diag([1.0, 0.5]), [[1], [1]], np.eye(2), 0, True))
+    plant = Plant(control.ss(np.diag([1.0, 0.5]), [[1], [1]], np.eye(2), 0, True))
     with pytest.raises(WeightsError, match="weigh every mode"):
-        solve_lqr(plant, stage_weights(np.diag([0.0, 1.0]), 1))
+        solve_lqr(plant, Weights(np.diag([0.0, 1.0]), 1))
 
 
 def test_sizes_are_compared(example_plant: Plant) -> None:
     with pytest.raises(InputError, match="weights: has 3 states, what stands before it 2"):
-        solve_lqr(example_plant, stage_weights(np.eye(3), 1))
+        solve_lqr(example_plant, Weights(np.eye(3), 1))

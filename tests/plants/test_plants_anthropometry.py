@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
 import pytest
 
+from impc.checking import replace
 from plants import SeatedBalanceParameters, SeatLayout, from_anthropometry
 from plants.anthropometry import DE_LEVA
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import fields
 from typing import Any
 
 import casadi as ca
@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 
+from impc.checking import replace
 from plants import (
     SeatedBalanceLimits,
     SeatedBalanceParameters,

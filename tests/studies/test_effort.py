@@ -15,13 +15,13 @@ from impc.cli.consent import require_consent
 from impc.cli.main import main
 from impc.control.closed_loop import prepare_loop
 from impc.control.constraint_rows import directions
-from impc.control.controller import gain_controller
+from impc.control.controller import Controller
 from impc.errors import InputError
-from impc.inverse.problem import inverse_problem
-from impc.model.bounds import box_bounds
-from impc.model.recordings import recording
+from impc.inverse.problem import Problem
+from impc.model.bounds import Bounds
+from impc.model.recordings import Recording
 from impc.model.riccati import solve_lqr
-from impc.model.weights import stage_weights
+from impc.model.weights import Weights
 from impc.studies.effort import Effort, fit_effort
 from impc.studies.fit.settings import FitSettings
 from tests.support import random_plant
@@ -34,12 +34,12 @@ if TYPE_CHECKING:
 def test_memory_is_told_to_its_order_of_magnitude(n: int, m: int, horizon: int) -> None:
     """Against what building the rows and their derivatives takes, as numpy's allocator counts."""
     plant = random_plant(np.random.default_rng(5), n, m, 0.95)
-    bounds = box_bounds(plant, u_min=-1, u_max=1)
-    trial = recording(plant, np.ones((50, n)))
-    problem = inverse_problem(plant, bounds, horizon, (trial,), terminal_set=False)
+    bounds = Bounds(plant, u_min=-1, u_max=1)
+    trial = Recording(plant, np.ones((50, n)))
+    problem = Problem(plant, bounds, horizon, (trial,), terminal_set=False)
     told = fit_effort(problem, FitSettings(horizon=horizon)).gigabytes * 1e9
-    K = solve_lqr(plant, stage_weights(np.eye(n), np.eye(m))).K
-    controller = gain_controller(plant, K, bounds, horizon, terminal_set=False)
+    K = solve_lqr(plant, Weights(np.eye(n), np.eye(m))).K
+    controller = Controller.from_gain(plant, K, bounds, horizon, terminal_set=False)
     tracemalloc.start()
     try:
         prepare_loop(controller, directions(controller, n * m + m * m + n))
@@ -51,9 +51,9 @@ def test_memory_is_told_to_its_order_of_magnitude(n: int, m: int, horizon: int) 
 
 def test_time_grows_with_what_is_asked() -> None:
     plant = random_plant(np.random.default_rng(5), 4, 1, 0.95)
-    bounds = box_bounds(plant, u_min=-1, u_max=1)
-    trials = (recording(plant, np.ones((3000, 4))),) * 3
-    problem = inverse_problem(plant, bounds, 20, trials, terminal_set=False)
+    bounds = Bounds(plant, u_min=-1, u_max=1)
+    trials = (Recording(plant, np.ones((3000, 4))),) * 3
+    problem = Problem(plant, bounds, 20, trials, terminal_set=False)
     usual = fit_effort(problem, FitSettings(replicates=1000, profiles=["a"], horizons=[10])).seconds
     assert 60 < usual < 7200
     assert fit_effort(problem, FitSettings(replicates=10**6)).seconds > 7200

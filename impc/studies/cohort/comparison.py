@@ -11,13 +11,14 @@ Several measures are tested at once: beside each p stands Holm's, over the measu
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.stats
 from statsmodels.stats.multitest import multipletests
 
+from impc.checking import replace
 from impc.errors import DataError
 from impc.studies.reliability.icc import icc
 

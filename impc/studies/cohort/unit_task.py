@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 import os
 import time
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,14 +22,15 @@ from impc.assess.intent_rules import intent
 from impc.assess.judged import judge
 from impc.assess.printed_gain import gain_estimate
 from impc.assess.resampling import DRAWS, replicate
+from impc.checking import replace
 from impc.cli.plant import find_plant
 from impc.control.closed_loop import simulate
 from impc.errors import ImpcError
 from impc.files.plant_sources import make_plant, plant_family_of
 from impc.files.reading import read_recordings
 from impc.inverse.noisy_fit import fit_controller
-from impc.inverse.problem import controller_for, moved, scenarios
-from impc.model.weights import stage_weights
+from impc.inverse.problem import controller_for, scenarios
+from impc.model.weights import Weights
 from impc.reporting.rendering import plain
 from impc.studies.cohort.unit_digest import require_same_inputs, unit_digest
 from impc.studies.fit.settings import fit_settings
@@ -39,7 +40,7 @@ if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.files.configuration import Configuration
     from impc.inverse.noisy_fit import FittedController
-    from impc.inverse.problem import InverseProblem
+    from impc.inverse.problem import Problem
     from impc.studies.fit.settings import FitSettings
 
 __all__ = ["FitTask", "fit_unit", "replicate_unit"]
@@ -92,12 +93,12 @@ def replicate_unit(task: FitTask, fit: dict[str, Any], index: int) -> dict[str, 
     started = time.perf_counter()
     try:
         problem, settings = _problem(task)
-        here = moved(problem, np.array(fit["starts"]), np.array(fit["logarithms"]))
+        here = problem.at(np.array(fit["starts"]), np.array(fit["logarithms"]))
         found = replicate(
             here,
             np.array(fit["K"]),
             np.array(fit["S"]),
-            stage_weights(fit["Q"], fit["R"]),
+            Weights(fit["Q"], fit["R"]),
             index,
             settings.seed,
             DRAWS[settings.bootstrap],
@@ -115,7 +116,7 @@ def replicate_unit(task: FitTask, fit: dict[str, Any], index: int) -> dict[str, 
 
 
 @functools.lru_cache(maxsize=4)
-def _problem(task: FitTask) -> tuple[InverseProblem, FitSettings]:
+def _problem(task: FitTask) -> tuple[Problem, FitSettings]:
     settings = fit_settings(task.configuration.fit)
     source = find_plant(task.plant, task.arguments)
     # A worker on another machine, or one that has run for days, may have other files and code.
@@ -128,9 +129,7 @@ def _problem(task: FitTask) -> tuple[InverseProblem, FitSettings]:
     return fit_problem(plant, recordings, settings, family), settings
 
 
-def _described(
-    problem: InverseProblem, fitted: FittedController, settings: FitSettings
-) -> dict[str, Any]:
+def _described(problem: Problem, fitted: FittedController, settings: FitSettings) -> dict[str, Any]:
     known = replace(fitted.problem, unknown_start=False, family=None, logarithms=np.zeros(0))
     plant, K, S = known.plant, np.array(fitted.solution.K), np.array(fitted.solution.S)
     fit = judge("inverse_mpc", known, problem.bounds, K, S, weights=fitted.weights, seconds=0.0)
@@ -175,7 +174,7 @@ def _described(
     }
 
 
-def _held_out(problem: InverseProblem, fitted: FittedController, settings: FitSettings) -> Array:
+def _held_out(problem: Problem, fitted: FittedController, settings: FitSettings) -> Array:
     """Mean VAF over trials left out, %; NaN when they are not wanted or there is but one."""
     count = len(problem.recordings)
     if not settings.held_out or count < 2:
@@ -188,7 +187,7 @@ def _held_out(problem: InverseProblem, fitted: FittedController, settings: FitSe
     return np.asarray(np.mean(shares, axis=0))
 
 
-def _trajectory(known: InverseProblem, fitted: FittedController) -> dict[str, Any]:
+def _trajectory(known: Problem, fitted: FittedController) -> dict[str, Any]:
     """Recorded and simulated outputs of the first trial, a few hundred points."""
     one = replace(known, recordings=known.recordings[:1])
     controller = controller_for(one, np.array(fitted.solution.K), np.array(fitted.solution.S))

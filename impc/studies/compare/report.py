@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from matplotlib.figure import Figure
 
-    from impc.inverse.problem import InverseProblem
+    from impc.inverse.problem import Problem
     from impc.reporting.provenance import FitProvenance
     from impc.studies.compare.subject import MethodComparison
 
@@ -39,7 +39,7 @@ _SENTENCES = {
 
 
 def compare_files(
-    problem: InverseProblem, compared: Sequence[MethodComparison], provenance: FitProvenance
+    problem: Problem, compared: Sequence[MethodComparison], provenance: FitProvenance
 ) -> dict[str, bytes]:
     """Build all files; nothing is written."""
     with journal_style():
@@ -62,7 +62,7 @@ def compare_files(
     }
 
 
-def text_table(problem: InverseProblem, compared: Sequence[MethodComparison]) -> str:
+def text_table(problem: Problem, compared: Sequence[MethodComparison]) -> str:
     """The table for a terminal."""
     table = _methods(problem, compared)
     rows = [table.heads, *table.rows]
@@ -106,7 +106,7 @@ def _score(item: MethodComparison) -> np.ndarray[tuple[int, ...], np.dtype[np.fl
     return item.fit.vaf if np.any(np.isnan(held)) else held
 
 
-def _methods(problem: InverseProblem, compared: Sequence[MethodComparison]) -> TextTable:
+def _methods(problem: Problem, compared: Sequence[MethodComparison]) -> TextTable:
     outputs = problem.plant.outputs
     heads = ["method"]
     heads += [f"VAF {name} %" for name in outputs] + [f"left out {name} %" for name in outputs]
@@ -133,7 +133,7 @@ def _methods(problem: InverseProblem, compared: Sequence[MethodComparison]) -> T
     return TextTable(caption, tuple(heads), tuple(rows))
 
 
-def _weights(problem: InverseProblem, compared: Sequence[MethodComparison]) -> TextTable:
+def _weights(problem: Problem, compared: Sequence[MethodComparison]) -> TextTable:
     plant = problem.plant
     rows = []
     for item in compared:
@@ -157,7 +157,7 @@ def _weights(problem: InverseProblem, compared: Sequence[MethodComparison]) -> T
     )
 
 
-def _figure(problem: InverseProblem, compared: Sequence[MethodComparison]) -> Figure:
+def _figure(problem: Problem, compared: Sequence[MethodComparison]) -> Figure:
     shown = [item for item in compared if item.fit.K is not None][::-1]
     figure = new_figure(DOUBLE_COLUMN, 0.5 + 0.36 * max(len(shown), 2))
     left, right = figure.subplots(1, 2, sharey=True, width_ratios=(1.6, 1))
@@ -183,7 +183,7 @@ def _figure(problem: InverseProblem, compared: Sequence[MethodComparison]) -> Fi
     return figure
 
 
-def _csv(problem: InverseProblem, compared: Sequence[MethodComparison]) -> bytes:
+def _csv(problem: Problem, compared: Sequence[MethodComparison]) -> bytes:
     plant = problem.plant
     heads = [
         "method",
@@ -207,7 +207,7 @@ def _csv(problem: InverseProblem, compared: Sequence[MethodComparison]) -> bytes
 
 
 def _json(
-    problem: InverseProblem, compared: Sequence[MethodComparison], provenance: FitProvenance
+    problem: Problem, compared: Sequence[MethodComparison], provenance: FitProvenance
 ) -> bytes:
     plant = problem.plant
     methods: dict[str, Any] = {}

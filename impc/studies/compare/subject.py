@@ -5,7 +5,7 @@ docs/comparing.md says what each method is and where it breaks.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,16 +13,16 @@ import numpy as np
 from impc.arrays import Array, Frozen, frozen
 from impc.assess.held_out import left_out_vaf
 from impc.assess.judged import judge, without_gain
+from impc.checking import replace
 from impc.inverse.initial_states import with_fitted_starts
 from impc.inverse.methods import METHODS, estimate_all
-from impc.inverse.problem import moved, without_bounds
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from impc.assess.judged import MethodFit
     from impc.inverse.methods import Estimate
-    from impc.inverse.problem import InverseProblem
+    from impc.inverse.problem import Problem
 
 __all__ = ["MethodComparison", "bounds_of_method", "compare_recordings", "stages"]
 
@@ -52,13 +52,13 @@ def stages(trials: int) -> int:
     return len(METHODS) * (1 + (trials if trials > 1 else 0))
 
 
-def bounds_of_method(problem: InverseProblem, name: str) -> InverseProblem:
+def bounds_of_method(problem: Problem, name: str) -> Problem:
     """The problem with the bounds that the method `name` knows: inverse MPC alone has any."""
-    return problem if name.startswith("inverse_mpc") else without_bounds(problem)
+    return problem if name.startswith("inverse_mpc") else problem.without_bounds()
 
 
 def compare_recordings(
-    problem: InverseProblem,
+    problem: Problem,
     settle: float,
     remember: Callable[[str, Callable[[], Estimate]], Estimate] = lambda _, compute: compute(),
 ) -> tuple[MethodComparison, ...]:
@@ -66,7 +66,7 @@ def compare_recordings(
 
     Parameters
     ----------
-    problem : InverseProblem
+    problem : Problem
         Of `fit_problem`.
     settle : float
         Seconds at the start of a left-out trial that find its start and do not count.
@@ -97,11 +97,11 @@ def _within(
     return lambda name, compute: remember(f"{stage}/{name}", compute)
 
 
-def _judged(problem: InverseProblem, name: str, estimate: Estimate) -> MethodFit:
+def _judged(problem: Problem, name: str, estimate: Estimate) -> MethodFit:
     if estimate.K is None or estimate.S is None:
         return without_gain(name, problem, estimate.seconds, estimate.reason)
     K, S = np.array(estimate.K), np.array(estimate.S)
-    here = moved(problem, np.array(estimate.starts), np.array(estimate.logarithms))
+    here = problem.at(np.array(estimate.starts), np.array(estimate.logarithms))
     known = replace(here, family=None, logarithms=frozen([]), unknown_start=False)
     own = bounds_of_method(known, name)
     started = with_fitted_starts(own, K, S) if problem.unknown_start else own
@@ -118,7 +118,7 @@ def _judged(problem: InverseProblem, name: str, estimate: Estimate) -> MethodFit
 
 
 def _held_out(
-    problem: InverseProblem, name: str, estimates: list[Estimate | None], settle: float
+    problem: Problem, name: str, estimates: list[Estimate | None], settle: float
 ) -> Array:
     p = len(problem.plant.outputs)
     rows = np.full((len(estimates), p), np.nan)
@@ -127,7 +127,7 @@ def _held_out(
             continue
         trial = problem.recordings[index]
         one = replace(problem, recordings=(trial,))
-        here = moved(one, np.array([trial.x0]), np.array(estimate.logarithms))
+        here = one.at(np.array([trial.x0]), np.array(estimate.logarithms))
         alone = bounds_of_method(replace(here, family=None, logarithms=frozen([])), name)
         rows[index], _ = left_out_vaf(alone, np.array(estimate.K), np.array(estimate.S), settle)
     return frozen(rows)

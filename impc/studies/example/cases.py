@@ -16,7 +16,7 @@ import numpy as np
 from impc.arrays import Array, Frozen, frozen
 from impc.assess.identified_directions import Identifiability, identifiability
 from impc.control.closed_loop import Scenario, Simulation, require_complete, scenario, simulate
-from impc.control.controller import Controller, gain_controller, mpc_controller
+from impc.control.controller import Controller
 from impc.inverse.direct_and_reduced import (
     CONDITION_WEIGHT,
     auxiliary_weights,
@@ -26,11 +26,11 @@ from impc.inverse.direct_and_reduced import (
 )
 from impc.inverse.gain_search import fit_gain
 from impc.inverse.inverse_lqr import inverse_lqr_gradient, inverse_lqr_lmi
-from impc.inverse.problem import InverseProblem, inverse_problem, misfit, without_bounds
-from impc.model.bounds import box_bounds
-from impc.model.recordings import recording
+from impc.inverse.problem import Problem, misfit
+from impc.model.bounds import Bounds
+from impc.model.recordings import Recording
 from impc.model.riccati import solve_lqr
-from impc.model.weights import Weights, normalised, residual, stage_weights
+from impc.model.weights import Weights, normalised, residual
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -139,7 +139,7 @@ class CaseResult(Frozen):
 
 def true_weights(plant: Plant) -> Weights:
     """Return Q = I, R = 1, the weights that the methods are to find again, equation (3.9)."""
-    return stage_weights(np.eye(plant.n), np.eye(plant.m))
+    return Weights(np.eye(plant.n), np.eye(plant.m))
 
 
 def run_case(
@@ -161,17 +161,17 @@ def run_case(
     ImpcError
         When a method fails.
     """
-    bounds = box_bounds(plant, u_min=-BOUND, u_max=BOUND)
+    bounds = Bounds(plant, u_min=-BOUND, u_max=BOUND)
     truth_weights = true_weights(plant)
-    controller = mpc_controller(plant, truth_weights, bounds, HORIZON)
+    controller = Controller(plant, truth_weights, bounds, HORIZON)
     truth = require_complete(controller, simulate(controller, scenario(plant, CASES[name], STEPS)))
     # Scale and condition weights as the equations have them: the table is in the plant's own units.
-    problem = inverse_problem(
-        plant, bounds, HORIZON, (recording(plant, truth.x),), output_scale=np.ones(plant.n)
+    problem = Problem(
+        plant, bounds, HORIZON, (Recording(plant, truth.x),), output_scale=np.ones(plant.n)
     )
     runner = _Runner(problem, truth_weights, progress)
 
-    gain = runner.timed("feedback_gain", lambda: fit_gain(without_bounds(problem)))
+    gain = runner.timed("feedback_gain", lambda: fit_gain(problem.without_bounds()))
     runner.add_gain(gain.K, gain.evaluations)
     lmi = runner.timed("inverse_lqr_lmi", lambda: inverse_lqr_lmi(plant, gain.K))
     runner.add_regulator(lmi.weights, 0, feasible=lmi.weights is not None)
@@ -207,9 +207,7 @@ def run_case(
 class _Runner:
     """Times each method and judges its answer on the recording."""
 
-    def __init__(
-        self, problem: InverseProblem, truth: Weights, progress: Callable[[str], None]
-    ) -> None:
+    def __init__(self, problem: Problem, truth: Weights, progress: Callable[[str], None]) -> None:
         self.problem = problem
         self.truth = truth
         self.progress = progress
@@ -237,7 +235,7 @@ class _Runner:
 
     def add_constrained(self, weights: Weights, simulations: int) -> None:
         problem = self.problem
-        controller = mpc_controller(problem.plant, weights, problem.bounds, problem.horizon)
+        controller = Controller(problem.plant, weights, problem.bounds, problem.horizon)
         run = require_complete(controller, simulate(controller, self._drive()))
         self._add(controller.K, weights, run, simulations, None)
 
@@ -269,8 +267,8 @@ class _Runner:
 
     def _linear(self, gain: Array) -> Simulation:
         problem = self.problem
-        unlimited = without_bounds(problem).bounds
-        controller = gain_controller(
+        unlimited = problem.without_bounds().bounds
+        controller = Controller.from_gain(
             problem.plant, gain, unlimited, problem.horizon, terminal_set=False
         )
         return simulate(controller, self._drive())

@@ -6,28 +6,28 @@ what belongs to any other, or was damaged, is not used and is done again.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from impc.arrays import Array, frozen
 from impc.assess.resampling import Replicate
+from impc.checking import replace
 from impc.files.digests import digest, versions
 from impc.files.sealed import Kept
 from impc.inverse.gain_search import GainFit
 from impc.inverse.methods import decode_estimate, encode_estimate
 from impc.inverse.noisy_fit import FittedController, fit_controller
-from impc.inverse.problem import moved
 from impc.model.riccati import solve_lqr
-from impc.model.weights import stage_weights
+from impc.model.weights import Weights
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
     from impc.inverse.methods import Estimate
-    from impc.inverse.problem import InverseProblem
+    from impc.inverse.problem import Problem
     from impc.model.plant_family import PlantFamily
     from impc.studies.fit.settings import FitSettings
 
@@ -55,7 +55,7 @@ class FitMemory:
     digest: str
     stages: dict[str, Any] = field(default_factory=dict)
 
-    def controller(self, name: str, problem: InverseProblem) -> FittedController:
+    def controller(self, name: str, problem: Problem) -> FittedController:
         """The controller of the stage `name`, remembered or fitted now and then written down.
 
         Raises
@@ -124,7 +124,7 @@ class FitMemory:
 
 def open_memory(
     folder: Path,
-    problem: InverseProblem,
+    problem: Problem,
     settings: FitSettings,
     command: str = "fit",
     made_of: str = "",
@@ -135,7 +135,7 @@ def open_memory(
     ----------
     folder : Path
         Where the command writes.
-    problem : InverseProblem
+    problem : Problem
     settings : FitSettings
     command : str
         "fit" or "compare".
@@ -147,7 +147,7 @@ def open_memory(
     return FitMemory(files, known, files.recall_all(known))
 
 
-def _content(problem: InverseProblem) -> tuple[Any, ...]:
+def _content(problem: Problem) -> tuple[Any, ...]:
     """All of a problem that has a content: a family of plants is told by some of its plants."""
     family = problem.family
     if family is None:
@@ -186,17 +186,17 @@ def _encode(found: FittedController) -> dict[str, Any]:
     }
 
 
-def _nuisance(problem: InverseProblem) -> dict[str, Any]:
+def _nuisance(problem: Problem) -> dict[str, Any]:
     return {
         "starts": [trial.x0.tolist() for trial in problem.recordings],
         "logarithms": problem.logarithms.tolist(),
     }
 
 
-def _restore(problem: InverseProblem, kept: dict[str, Any]) -> FittedController:
+def _restore(problem: Problem, kept: dict[str, Any]) -> FittedController:
     free = kept["free"]
     here = _problem(problem, kept)
-    weights = stage_weights(kept["Q"], kept["R"])
+    weights = Weights(kept["Q"], kept["R"])
     return FittedController(
         here,
         GainFit(
@@ -220,6 +220,6 @@ def _restore(problem: InverseProblem, kept: dict[str, Any]) -> FittedController:
     )
 
 
-def _problem(problem: InverseProblem, kept: dict[str, Any]) -> InverseProblem:
+def _problem(problem: Problem, kept: dict[str, Any]) -> Problem:
     starts: Array = np.array(kept["starts"], dtype=np.float64)
-    return moved(problem, starts, np.array(kept["logarithms"], dtype=np.float64))
+    return problem.at(starts, np.array(kept["logarithms"], dtype=np.float64))

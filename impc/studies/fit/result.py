@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from impc.assess.printed_gain import GainEstimate
     from impc.assess.vaf import TrialAgreement
     from impc.inverse.noisy_fit import FittedController
-    from impc.inverse.problem import InverseProblem
+    from impc.inverse.problem import Problem
     from impc.studies.fit.settings import FitSettings
 
 __all__ = ["FitResult", "FittedParameter"]
@@ -63,7 +63,7 @@ class FitResult:
     Attributes
     ----------
     settings : FitSettings
-    given : InverseProblem
+    given : Problem
         The problem as it was posed: nominal plant, trials at rest.
     fitted : FittedController
         Weights and their gain; `fitted.problem` holds the initial states and the plant found.
@@ -91,7 +91,7 @@ class FitResult:
     """
 
     settings: FitSettings
-    given: InverseProblem
+    given: Problem
     fitted: FittedController
     estimate: GainEstimate
     parameters: tuple[FittedParameter, ...]

@@ -10,13 +10,12 @@ import numpy as np
 import scipy.signal
 
 from impc.errors import InputError, brief
-from impc.model.bounds import box_bounds
+from impc.model.bounds import Bounds
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from impc.arrays import Array
-    from impc.model.bounds import Bounds
     from impc.model.plant import Plant
     from impc.model.recordings import Recording
 
@@ -179,7 +178,7 @@ def fit_bounds(plant: Plant, settings: FitSettings, recordings: Sequence[Recordi
             "[fit] u_max", f"has {len(u_max)} numbers", f"give one, or {plant.m}, one an input"
         )
     u_min = None if u_max is None else -u_max
-    return box_bounds(plant, x_min=-x_max, x_max=x_max, u_min=u_min, u_max=u_max)
+    return Bounds(plant, x_min=-x_max, x_max=x_max, u_min=u_min, u_max=u_max)
 
 
 def _recorded_maximum(plant: Plant, name: str, word: str, recordings: Sequence[Recording]) -> float:

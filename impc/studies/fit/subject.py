@@ -11,7 +11,7 @@ import functools
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,11 +28,11 @@ from impc.assess.inverse_lqr_beside import compare_methods
 from impc.assess.printed_gain import gain_estimate
 from impc.assess.vaf import agreement
 from impc.assess.weights_ranges import weights_summary_or_reason
-from impc.checking import checked
+from impc.checking import checked, replace
 from impc.control.closed_loop import simulate
 from impc.errors import DataError, SolverError
 from impc.inverse.noisy_fit import FittedController, fit_controller
-from impc.inverse.problem import InverseProblem, controller_for, inverse_problem, scenarios
+from impc.inverse.problem import Problem, controller_for, scenarios
 from impc.studies.fit.result import FitResult, FittedParameter
 from impc.studies.fit.settings import FitSettings, fit_bounds
 
@@ -67,13 +67,13 @@ class FitProgress:
     """
 
     done: Callable[[str], None] = lambda _: None
-    controller: Callable[[str, InverseProblem], FittedController] = lambda _, problem: (
-        fit_controller(problem)
+    controller: Callable[[str, Problem], FittedController] = lambda _, problem: fit_controller(
+        problem
     )
     replicate: Callable[[str, Callable[[], Replicate]], Replicate] = lambda _, compute: compute()
 
 
-def stages(problem: InverseProblem, settings: FitSettings) -> int:
+def stages(problem: Problem, settings: FitSettings) -> int:
     """Number of stages that `fit_recordings` reports."""
     methods = 6 if settings.feedback_states else 5
     trials = len(problem.recordings)
@@ -87,7 +87,7 @@ def fit_problem(
     recordings: Sequence[Recording],
     settings: FitSettings,
     family: PlantFamily | None = None,
-) -> InverseProblem:
+) -> Problem:
     """Pose the inverse problem of a subject: outputs scaled by their size, starts unknown.
 
     Raises
@@ -110,7 +110,7 @@ def fit_problem(
             f"the shortest has {shortest} samples, {least} serve to find where it starts",
             "give longer ones, or lower [fit] settle",
         )
-    return inverse_problem(
+    return Problem(
         plant,
         fit_bounds(plant, settings, recordings),
         settings.horizon,
@@ -123,13 +123,13 @@ def fit_problem(
 
 
 def fit_recordings(
-    problem: InverseProblem, settings: FitSettings, progress: FitProgress | None = None
+    problem: Problem, settings: FitSettings, progress: FitProgress | None = None
 ) -> FitResult:
     """Fit a subject.
 
     Parameters
     ----------
-    problem : InverseProblem
+    problem : Problem
         Of `fit_problem`.
     settings : FitSettings
     progress : FitProgress, optional
@@ -192,9 +192,7 @@ def _first_guess(plant: Plant, trial: Recording) -> Recording:
     return replace(trial, x0=frozen(np.linalg.pinv(plant.C) @ trial.outputs[0]))
 
 
-def _preliminary(
-    problem: InverseProblem, settings: FitSettings
-) -> Callable[[], PreliminaryGain] | None:
+def _preliminary(problem: Problem, settings: FitSettings) -> Callable[[], PreliminaryGain] | None:
     if not settings.feedback_states:
         return None
     return functools.partial(preliminary_gain, problem, settings.feedback_states)
@@ -218,7 +216,7 @@ def _threads() -> Iterator[ThreadPoolExecutor]:
 
 
 def _left_out(
-    pool: ThreadPoolExecutor, problem: InverseProblem, settings: FitSettings, progress: FitProgress
+    pool: ThreadPoolExecutor, problem: Problem, settings: FitSettings, progress: FitProgress
 ) -> list[Future[FittedController]]:
     """Controllers fitted to all trials but one."""
     pending = []
@@ -250,7 +248,7 @@ def _parameters(estimate: GainEstimate) -> tuple[FittedParameter, ...]:
     )
 
 
-def _state_sizes(known: InverseProblem, fitted: FittedController) -> Array:
+def _state_sizes(known: Problem, fitted: FittedController) -> Array:
     """Root-mean-square of each state; states that never move count as the least that does."""
     controller = controller_for(known, np.array(fitted.solution.K), np.array(fitted.solution.S))
     x = np.concatenate([simulate(controller, drive).x for drive in scenarios(known)])
@@ -261,7 +259,7 @@ def _state_sizes(known: InverseProblem, fitted: FittedController) -> Array:
     return np.asarray(np.maximum(sizes, np.min(moving)))
 
 
-def _terminal_set_difference(problem: InverseProblem, fitted: FittedController) -> float:
+def _terminal_set_difference(problem: Problem, fitted: FittedController) -> float:
     K, S = np.array(fitted.solution.K), np.array(fitted.solution.S)
     pair = [
         [

@@ -22,7 +22,7 @@ import numpy as np
 from impc.errors import InputError
 from impc.files.plant_sources import import_function, users_code
 from impc.files.reading import read_recordings
-from impc.model.plant import as_plant
+from impc.model.plant import Plant
 from impc.studies.selection.linear import linear_functions
 from impc.studies.selection.model import ParametricModel, Trial, parametric_model
 
@@ -110,7 +110,7 @@ def read_trials(study: Study, source: ModelSource) -> dict[tuple[str, str], tupl
     d, p = len(source.inputs), len(source.outputs)
     names: dict[str, Any] = {"inputs": ["nothing", *source.inputs], "outputs": source.outputs}
     system = control.ss([[0.5]], np.ones((1, 1 + d)), np.ones((p, 1)), 0, 1 / source.rate, **names)
-    plant = as_plant(system, ["nothing"])
+    plant = Plant(system, ["nothing"])
     found: dict[tuple[str, str], tuple[Trial, ...]] = {}
     for unit in study.units:
         trials = read_recordings(unit.files, study.configuration, plant)

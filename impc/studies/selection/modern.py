@@ -11,7 +11,7 @@ bias           how far the free parameters move when a fixed one is elsewhere in
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,6 +20,7 @@ import scipy.optimize
 import scipy.stats
 
 from impc.arrays import Array, Frozen, frozen
+from impc.checking import replace
 from impc.studies.selection.estimation import estimate, residuals
 from impc.studies.selection.fisher import fisher_information
 from impc.studies.selection.model import normalised, physical

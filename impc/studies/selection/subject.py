@@ -12,11 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.assess.resampling import block_residuals
-from impc.studies.selection.bootstrap import (
-    BootstrapIntervals,
-    bootstrap_subset,
-    draw_single,
-)
+from impc.studies.selection.bootstrap import BootstrapIntervals, bootstrap_subset, draw_single
 from impc.studies.selection.estimation import Estimate, estimate, multi_start
 from impc.studies.selection.fisher import (
     Information,

@@ -9,10 +9,10 @@ import numpy as np
 
 from experiments.coverage import cart
 from impc.control.closed_loop import require_complete, scenario, simulate
-from impc.control.controller import mpc_controller
-from impc.model.bounds import box_bounds
-from impc.model.recordings import Recording, recording
-from impc.model.weights import stage_weights
+from impc.control.controller import Controller
+from impc.model.bounds import Bounds
+from impc.model.recordings import Recording
+from impc.model.weights import Weights
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -32,16 +32,16 @@ def cart_plant(drag: float = 0.3) -> Any:
 def subject_trial(seed: int, price: float = 4.0) -> Recording:
     """A trial of a subject with Q = diag(price, 1), with white noise of a fifth."""
     plant, rng = cart(), np.random.default_rng(seed)
-    bounds = box_bounds(plant, u_min=-1, u_max=1)
-    weights = stage_weights(np.diag([price, 1.0]), 1)
-    controller = mpc_controller(plant, weights, bounds, 10, terminal_set=False)
+    bounds = Bounds(plant, u_min=-1, u_max=1)
+    weights = Weights(np.diag([price, 1.0]), 1)
+    controller = Controller(plant, weights, bounds, 10, terminal_set=False)
     push = np.repeat(rng.choice([-0.8, 0.0, 0.8], _SAMPLES // 10), 10)
     run = require_complete(
         controller, simulate(controller, scenario(plant, np.zeros(2), disturbance=push))
     )
     clean = (run.x @ plant.C.T)[:_SAMPLES]
     noise = 0.2 * np.sqrt(np.mean(clean**2)) * rng.standard_normal(clean.shape)
-    return recording(plant, clean + noise, push)
+    return Recording(plant, clean + noise, push)
 
 
 def write_study(

@@ -9,14 +9,14 @@ import pytest
 
 import plants
 from impc.errors import ImpcError
-from impc.model.plant import Plant, as_plant
-from impc.model.recordings import recording
+from impc.model.plant import Plant
+from impc.model.recordings import Recording
 from impc.studies.fit.settings import FitSettings, fit_bounds, fit_settings
 
 
 @pytest.fixture(scope="module")
 def seat() -> Plant:
-    return as_plant(plants.seated_balance_plant(), ["command"])
+    return Plant(plants.seated_balance_plant(), ["command"])
 
 
 def test_defaults_and_values() -> None:
@@ -65,7 +65,7 @@ def test_bounds_from_the_data(seat: Plant) -> None:
     """A sinusoid of 0.1 rad at 1 Hz: its largest rate is 0.2 pi rad/s."""
     time = np.arange(3000) / 100
     angle = 0.1 * np.sin(2 * np.pi * time)
-    trial = recording(seat, np.column_stack([angle, -angle / 2]), np.zeros(3000))
+    trial = Recording(seat, np.column_stack([angle, -angle / 2]), np.zeros(3000))
     settings = FitSettings(
         u_max=5.0,
         margin=1.5,
@@ -91,13 +91,13 @@ def test_bounds_from_the_data(seat: Plant) -> None:
     ],
 )
 def test_bounds_that_cannot_be_set(seat: Plant, states: dict[str, Any], says: str) -> None:
-    trial = recording(seat, np.ones((100, 2)), np.zeros(100))
+    trial = Recording(seat, np.ones((100, 2)), np.zeros(100))
     with pytest.raises(ImpcError, match=says):
         fit_bounds(seat, FitSettings(bounded_states=states), [trial])
 
 
 def test_as_many_limits_as_inputs(seat: Plant) -> None:
-    trial = recording(seat, np.ones((300, 2)), np.zeros(300))
+    trial = Recording(seat, np.ones((300, 2)), np.zeros(300))
     for given in ([], [1.0, 2.0]):
         with pytest.raises(ImpcError, match=r"^\[fit\] u_max: has . numbers"):
             fit_bounds(seat, FitSettings(u_max=given), [trial])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import control
@@ -15,16 +14,17 @@ from experiments.simulated_subjects import noisy_recordings
 from impc.assess.delayed_feedback import preliminary_gain
 from impc.assess.intent_rules import dominant_sentence, intent
 from impc.assess.vaf import vaf
+from impc.checking import replace
 from impc.control.closed_loop import scenario, simulate
-from impc.control.controller import mpc_controller
+from impc.control.controller import Controller
 from impc.errors import DataError, InputError, SolverError
 from impc.inverse.noisy_fit import fit_controller
-from impc.inverse.problem import InverseProblem
-from impc.model.bounds import box_bounds
-from impc.model.plant import Plant, as_plant, change_coordinates
-from impc.model.recordings import Recording, recording
+from impc.inverse.problem import Problem
+from impc.model.bounds import Bounds
+from impc.model.plant import Plant, change_coordinates
+from impc.model.recordings import Recording
 from impc.model.riccati import solve_lqr
-from impc.model.weights import stage_weights
+from impc.model.weights import Weights
 from impc.studies.fit.memory import open_memory
 from impc.studies.fit.result import FitResult
 from impc.studies.fit.settings import FitSettings
@@ -40,15 +40,15 @@ def cart(dt: float = 0.05) -> Plant:
     system = control.c2d(
         control.ss(A, B, [[1.0, 0.0]], 0, inputs=["force", "push"], outputs=["position"]), dt
     )
-    return as_plant(system, ["force"])
+    return Plant(system, ["force"])
 
 
 def cart_trials(count: int, noise: float, samples: int = 300) -> list[Recording]:
     """Trials of a cart whose force stands at its limit of 1 for a part of the time."""
     plant, rng = cart(), np.random.default_rng(SEED)
-    weights = stage_weights(np.diag([4.0, 1.0]), 1)
-    controller = mpc_controller(
-        plant, weights, box_bounds(plant, u_min=-1, u_max=1), 10, terminal_set=False
+    weights = Weights(np.diag([4.0, 1.0]), 1)
+    controller = Controller(
+        plant, weights, Bounds(plant, u_min=-1, u_max=1), 10, terminal_set=False
     )
     trials = []
     for _ in range(count):
@@ -56,7 +56,7 @@ def cart_trials(count: int, noise: float, samples: int = 300) -> list[Recording]
         run = simulate(controller, scenario(plant, rng.normal(0, 0.05, 2), disturbance=push))
         clean = (run.x @ plant.C.T)[:samples]
         size = noise * np.sqrt(np.mean(clean**2))
-        trials.append(recording(plant, clean + size * rng.standard_normal(clean.shape), push))
+        trials.append(Recording(plant, clean + size * rng.standard_normal(clean.shape), push))
     return trials
 
 
@@ -119,8 +119,8 @@ def test_every_reading_has_the_gain_and_the_angle_is_theirs(noisy: FitResult) ->
 
 def test_intent_of_known_weights() -> None:
     """The double integrator with Q = I: the least condition number is 1, whatever v is."""
-    plant = as_plant(control.ss([[1, 1], [0, 1]], [[0.5], [1]], np.eye(2), 0, True))
-    weights = stage_weights(np.diag([4.0, 1.0]), 1)
+    plant = Plant(control.ss([[1, 1], [0, 1]], [[0.5], [1]], np.eye(2), 0, True))
+    weights = Weights(np.diag([4.0, 1.0]), 1)
     found = intent(
         plant, np.array(solve_lqr(plant, weights).K), np.ones((1, 1, 1)), np.ones(2), weights
     )
@@ -135,8 +135,8 @@ def test_change_of_coordinates_keeps_the_regulator() -> None:
     T = np.array([[2.0, 1.0], [0.0, 3.0]])
     moved = change_coordinates(plant, T, np.array([[5.0]]))
     Q = np.diag([3.0, 1.0])
-    gain = solve_lqr(plant, stage_weights(Q, 2)).K
-    other = solve_lqr(moved, stage_weights(T.T @ Q @ T, 2 * 25)).K
+    gain = solve_lqr(plant, Weights(Q, 2)).K
+    other = solve_lqr(moved, Weights(T.T @ Q @ T, 2 * 25)).K
     np.testing.assert_allclose(5 * other @ np.linalg.inv(T), gain, atol=1e-10)
 
 
@@ -147,7 +147,7 @@ def test_preliminary_gain_without_noise_finds_gains_of_its_own_form() -> None:
     x = np.zeros((401, 2))
     for k in range(400):
         x[k + 1] = (plant.A - plant.B @ K) @ x[k] + plant.E[:, 0] * push[k]
-    trial = recording(plant, (x @ plant.C.T)[:400], push)
+    trial = Recording(plant, (x @ plant.C.T)[:400], push)
     problem = fit_problem(plant, [trial], FitSettings())
     np.testing.assert_allclose(preliminary_gain(problem, plant.states).K, K, rtol=1e-6)
     with pytest.raises(InputError, match="feedback_states"):
@@ -155,12 +155,12 @@ def test_preliminary_gain_without_noise_finds_gains_of_its_own_form() -> None:
 
 
 @pytest.fixture
-def small() -> tuple[InverseProblem, FitSettings]:
+def small() -> tuple[Problem, FitSettings]:
     settings = FitSettings(horizon=10, u_max=1.0)
     return fit_problem(cart(), cart_trials(3, 0.2), settings), settings
 
 
-def test_a_plant_of_ones_own_with_one_output(small: tuple[InverseProblem, FitSettings]) -> None:
+def test_a_plant_of_ones_own_with_one_output(small: tuple[Problem, FitSettings]) -> None:
     heard: list[str] = []
     result = fit_recordings(*small, FitProgress(heard.append))
     assert len(heard) == stages(small[0], small[1])
@@ -172,7 +172,7 @@ def test_a_plant_of_ones_own_with_one_output(small: tuple[InverseProblem, FitSet
 
 
 def test_an_interrupted_fit_goes_on(
-    small: tuple[InverseProblem, FitSettings], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    small: tuple[Problem, FitSettings], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = fit_recordings(*small)
     memory = open_memory(tmp_path / "out", *small)
@@ -189,7 +189,7 @@ def test_an_interrupted_fit_goes_on(
     done = set(again.stages)
     computed: list[int] = []
 
-    def counting(problem: InverseProblem) -> object:
+    def counting(problem: Problem) -> object:
         computed.append(len(problem.recordings))
         return fit_controller(problem)
 
@@ -204,7 +204,7 @@ def test_an_interrupted_fit_goes_on(
 
 
 def test_a_memory_of_another_fit_is_not_used(
-    small: tuple[InverseProblem, FitSettings], tmp_path: Path
+    small: tuple[Problem, FitSettings], tmp_path: Path
 ) -> None:
     problem, settings = small
     open_memory(tmp_path, problem, settings).controller("fit", problem)
@@ -220,7 +220,7 @@ def test_a_memory_of_another_fit_is_not_used(
 
 
 def test_a_remembered_controller_is_the_same(
-    small: tuple[InverseProblem, FitSettings], tmp_path: Path
+    small: tuple[Problem, FitSettings], tmp_path: Path
 ) -> None:
     problem, settings = small
     found = fit_controller(problem)
@@ -237,7 +237,7 @@ def test_what_cannot_be_fitted_is_said() -> None:
     with pytest.raises(DataError, match="there are none"):
         fit_problem(plant, [], FitSettings())
     with pytest.raises(DataError, match="zero in every trial"):
-        fit_problem(plant, [recording(plant, np.zeros(100))], FitSettings())
+        fit_problem(plant, [Recording(plant, np.zeros(100))], FitSettings())
     with pytest.raises(DataError, match="the shortest has 15 samples"):
         fit_problem(plant, [*cart_trials(1, 0.1, 150), _short()], FitSettings())
 
@@ -250,13 +250,13 @@ def _short() -> Recording:
 def test_a_release_without_disturbance_is_fitted() -> None:
     """Nothing but the initial states, which are unknown, moves these trials."""
     plant = cart()
-    weights = stage_weights(np.diag([4.0, 1.0]), 1)
-    bounds = box_bounds(plant, u_min=-1, u_max=1)
-    controller = mpc_controller(plant, weights, bounds, 10, terminal_set=False)
+    weights = Weights(np.diag([4.0, 1.0]), 1)
+    bounds = Bounds(plant, u_min=-1, u_max=1)
+    controller = Controller(plant, weights, bounds, 10, terminal_set=False)
     trials = []
     for x0 in ([0.4, 0.0], [-0.2, 0.3], [0.3, 0.1]):
         run = simulate(controller, scenario(plant, x0, 100))
-        trials.append(recording(plant, (run.x @ plant.C.T)[:100]))
+        trials.append(Recording(plant, (run.x @ plant.C.T)[:100]))
     settings = FitSettings(horizon=10, u_max=1.0)
     fitted = fit_controller(fit_problem(plant, trials, settings))
     np.testing.assert_allclose(fitted.solution.K, controller.K, rtol=1e-6)
@@ -269,4 +269,4 @@ def test_a_recording_in_which_nothing_moves_is_said() -> None:
     outputs = 1e-3 * rng.standard_normal(200)
     outputs[0] = 0.0
     with pytest.raises(SolverError, match="nothing drives them"):
-        fit_controller(fit_problem(plant, [recording(plant, outputs)], FitSettings(u_max=1.0)))
+        fit_controller(fit_problem(plant, [Recording(plant, outputs)], FitSettings(u_max=1.0)))

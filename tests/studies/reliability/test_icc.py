@@ -6,13 +6,7 @@ import numpy as np
 import pytest
 
 from impc.errors import DataError, InputError
-from impc.studies.reliability.icc import (
-    FORMS,
-    Form,
-    icc,
-    mean_squares,
-    measurement_error,
-)
+from impc.studies.reliability.icc import FORMS, Form, icc, mean_squares, measurement_error
 
 #: Shrout and Fleiss, Psychological Bulletin 86 (1979) 420, table 2: six targets, four judges.
 SHROUT_FLEISS = np.array(
