@@ -7,10 +7,14 @@ import sys
 
 # `python -m` puts the working folder first: a numpy.py among recordings is not numpy. The folder
 # of a checkout is left, for the plants in it.
-if not (sys.flags.safe_path or os.path.exists(os.path.join(sys.path[0], "impc", "__main__.py"))):
+if __name__ == "__main__" and not (
+    sys.flags.safe_path or os.path.exists(os.path.join(sys.path[0], "impc", "__main__.py"))
+):
     del sys.path[0]
 
 from impc.cli.main import main
+
+__all__ = ["main"]
 
 if __name__ == "__main__":
     main()

@@ -144,13 +144,14 @@ def replace(value: _V, **changes: Any) -> _V:
     Parameters
     ----------
     value : dataclass
+        Any, frozen or not.
     **changes : object
         Fields by name.
 
     Raises
     ------
-    ImpcError
-        When a field cannot have that value.
+    TypeError
+        When it has no such field.
     """
     if not isinstance(value, Value):
         return dataclasses.replace(value, **changes)  # type: ignore[type-var]

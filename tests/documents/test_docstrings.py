@@ -54,21 +54,13 @@ ROOT = Path(__file__).parents[2]
 # Modules and packages without an equation to cite, by what they are about instead.
 PLUMBING = {
     "checks and exceptions": ("impc.arrays", "impc.checking", "impc.errors", "plants._checks"),
-    "the command line": ("impc.cli.main", "impc.cli"),
+    "the command line": ("impc.cli", "impc.__main__"),
     "files and what is in them": (
-        "impc.files.digests",
         "impc.files",
         "impc.studies.fit.memory",
-        "impc.files.inputs",
-        "impc.files.sealed",
         "impc.model.recordings",
     ),
-    "import paths": (
-        "impc.files.plant_sources",
-        "impc.files.saved_plant",
-        "impc.studies.selection.model_source",
-        "impc.files.user_code",
-    ),
+    "import paths": ("impc.studies.selection.model_source",),
     "queues and settings of a study": (
         "impc.studies.selection.queue",
         "impc.studies.selection.settings",
@@ -76,6 +68,9 @@ PLUMBING = {
     "a study from its folder to its pages": ("impc.studies.cohort",),
     "pages and figures": (
         "impc.reporting",
+        "impc.studies.compare.report",
+        "impc.studies.example",
+        "impc.studies.fit",
         "impc.studies.reliability.figures",
         "impc.studies.reliability.report",
     ),
@@ -175,7 +170,9 @@ def item_faults(value: Any, doc: NumpyDocString) -> Iterator[str]:
     made = "__init__" in vars(value) and not getattr(value, "_is_protocol", False)
     if inspect.isfunction(value) or (made and not fields):
         given = inspect.signature(value).parameters.values()
-        items = {each.name: str(each.annotation) for each in given if each.name != "self"}
+        items = {
+            each.name: str(each.annotation) for each in given if each.name not in ("self", "cls")
+        }
     told = {}
     for each in doc["Attributes" if fields else "Parameters"]:
         for name in each.name.split(","):
