@@ -169,7 +169,7 @@ def item_faults(value: Any, doc: NumpyDocString) -> Iterator[str]:
     items = {name: str(kind) for name, kind in fields.items() if not name.startswith("_")}
     made = "__init__" in vars(value) and not getattr(value, "_is_protocol", False)
     if inspect.isfunction(value) or (made and not fields):
-        given = inspect.signature(value).parameters.values()
+        given = list(inspect.signature(value).parameters.values())
         items = {
             each.name: str(each.annotation) for each in given if each.name not in ("self", "cls")
         }
