@@ -355,7 +355,7 @@ _VALUES = {
     "MpcSolver": ("impc.control.casadi_controller", "make it with build_mpc"),
     "FitSettings": ("impc.studies.fit.settings", "make it with FitSettings"),
     "FitProgress": ("impc.studies.fit.subject", "make it with FitProgress, or leave it out"),
-    "FittedController": ("impc.inverse.noisy_fit", "make it with fit_controller"),
+    "Estimate": ("impc.inverse.estimate", "make it with estimate(problem)"),
     "Rows": ("impc.control.constraint_rows", "make it with build_rows"),
 }
 _MADE_BY = {kind: remedy for kind, (_, remedy) in _VALUES.items()}

@@ -29,7 +29,7 @@ from impc.assess.long_run_covariance import white_noise
 from impc.inverse.coordinates import Coordinates
 
 if TYPE_CHECKING:
-    from impc.inverse.noisy_fit import FittedController
+    from impc.inverse.estimate import Estimate
     from impc.inverse.problem import Problem
 
 __all__ = ["GainEstimate", "gain_estimate"]
@@ -76,12 +76,12 @@ class GainEstimate:
         return np.asarray(family.nominal * np.exp(self.problem.logarithms))
 
 
-def gain_estimate(fitted: FittedController) -> GainEstimate:
+def gain_estimate(fitted: Estimate) -> GainEstimate:
     """Estimate the gain behind a fit, and how far it is determined.
 
     Parameters
     ----------
-    fitted : FittedController
+    fitted : Estimate
         The search begins at the gain of its weights.
 
     Raises
@@ -89,9 +89,9 @@ def gain_estimate(fitted: FittedController) -> GainEstimate:
     SolverError
         When the residual at that gain is not finite.
     """
-    K, S = np.array(fitted.solution.K), np.array(fitted.solution.S)
+    K, S = np.array(fitted.gain), np.array(fitted.metric)
     here = _Found(fitted.problem, K, S, fitted.misfit, gain_covariance(fitted.problem, K, S))
-    for _ in range(0 if fitted.exact else _ROUNDS):
+    for _ in range(0 if fitted.explained else _ROUNDS):
         before, here = here, _round(here)
         same = np.count_nonzero(here.linear.told) == np.count_nonzero(before.linear.told)
         if same and here.misfit > (1 - _SETTLED) * before.misfit:

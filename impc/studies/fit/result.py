@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from impc.assess.judged import MethodFit
     from impc.assess.printed_gain import GainEstimate
     from impc.assess.vaf import TrialAgreement
-    from impc.inverse.noisy_fit import FittedController
+    from impc.inverse.estimate import Estimate
     from impc.inverse.problem import Problem
     from impc.studies.fit.settings import FitSettings
 
@@ -65,7 +65,7 @@ class FitResult:
     settings : FitSettings
     given : Problem
         The problem as it was posed: nominal plant, trials at rest.
-    fitted : FittedController
+    fitted : Estimate
         Weights and their gain; `fitted.problem` holds the initial states and the plant found.
     estimate : GainEstimate
         The gain that the recordings tell, and how far: what is printed with intervals.
@@ -92,7 +92,7 @@ class FitResult:
 
     settings: FitSettings
     given: Problem
-    fitted: FittedController
+    fitted: Estimate
     estimate: GainEstimate
     parameters: tuple[FittedParameter, ...]
     intent: Intent
