@@ -51,15 +51,16 @@ def command(
     from impc.selection.key_report import key_files  # noqa: PLC0415
     from impc.selection.settings import select_settings  # noqa: PLC0415
 
-    study, source, recorded = read_model_study(study_file, model_name, allowed)
+    study, source, recorded, inputs = read_model_study(study_file, model_name, allowed)
     settings = select_settings(study.configuration.select)
     with study_runner(source, out, cluster, 2 * len(recorded)) as run:
         found = key_parameters(
             source.model, recorded, settings, run,
             bound=bound, least_vaf=vaf, least_reliability=icc,
         )  # fmt: skip
-    line = f"impc key-parameters {study_file.name} --bound {bound:g} --vaf {vaf:g} --icc {icc:g}"
-    written = write_files(out, key_files(source.model, found, line))
+    options = f"--model {source.name} --bound {bound:g} --vaf {vaf:g} --icc {icc:g}"
+    line = f"impc key-parameters {study_file.name} {options}"
+    written = write_files(out, key_files(source.model, found, line, inputs))
     kept_results(out).forget()
     names = source.model.names
     chosen = ", ".join(names[index] for index in found.chosen) or "none passes all filters"

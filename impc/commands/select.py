@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
     from impc.cohort.cluster import Cluster
     from impc.cohort.study import Study
+    from impc.inputs import Inputs
     from impc.kept import Kept
     from impc.selection.model import Trial
     from impc.selection.running import Runner
@@ -44,14 +45,13 @@ def command(
     from impc.selection.report import selection_files  # noqa: PLC0415
     from impc.selection.settings import select_settings  # noqa: PLC0415
 
-    study, source, recorded = read_model_study(study_file, model_name, allowed)
+    study, source, recorded, inputs = read_model_study(study_file, model_name, allowed)
     settings = select_settings(study.configuration.select)
     named = {" visit ".join(part for part in key if part): item for key, item in recorded.items()}
     with study_runner(source, out, cluster, 2 * len(named) + 1) as run:
         found = select_study(named, settings, run)
-    written = write_files(
-        out, selection_files(source.model, found, f"impc select {study_file.name}")
-    )
+    line = f"impc select {study_file.name} --model {source.name}"
+    written = write_files(out, selection_files(source.model, found, line, inputs))
     kept_results(out).forget()
     names = source.model.names
     click.echo(f"information: {', '.join(names[index] for index in found.free)}")
@@ -105,8 +105,8 @@ def study_runner(source: ModelSource, out: Path, cluster: Cluster, tasks: int) -
 
 def read_model_study(
     path: Path, given: str | None, allowed: bool
-) -> tuple[Study, ModelSource, dict[tuple[str, str], tuple[Trial, ...]]]:
-    """The study at `path`, its model and all recordings.
+) -> tuple[Study, ModelSource, dict[tuple[str, str], tuple[Trial, ...]], Inputs]:
+    """The study at `path`, its model, all recordings, and the digests of these.
 
     Parameters
     ----------
@@ -123,6 +123,7 @@ def read_model_study(
         When the file, the model or a recording cannot be used, or the model needs consent.
     """
     from impc.cohort.study import read_study  # noqa: PLC0415
+    from impc.inputs import study_inputs  # noqa: PLC0415
     from impc.plant_source import import_function  # noqa: PLC0415
     from impc.selection.source import model_source, read_trials  # noqa: PLC0415
     from impc.user_code import consented_name, require_users_function  # noqa: PLC0415
@@ -132,4 +133,5 @@ def read_model_study(
     require_users_function(where, import_function(name))
     arguments: dict[str, Any] = dict(study.configuration.model)
     source = model_source(name, arguments)
-    return study, source, read_trials(study, source)
+    recorded = read_trials(study, source)
+    return study, source, recorded, study_inputs(study.units, path, "model", name, arguments)
