@@ -16,12 +16,13 @@ perturbation, so the test holds for noise of any colour (docs/fitting.md has how
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from impc.arrays import Array
+from impc.trial_span import trial_span
 
 if TYPE_CHECKING:
     from impc.evaluation import Evaluation
@@ -36,6 +37,8 @@ _LEVEL = 0.05
 # 20 % (12 and 8 subjects, docs/fitting.md).
 _LEAST_SHARE = 0.03
 _SHIFTS, _LAGS = 199, 8
+# Recorded numbers that are looked at: 100 000 take 0.5 GB.
+_MOST = 100_000
 # Residuals are not shifted by less than this share of a trial: nearby shifts keep a tie.
 _LEAST_SHIFT = 0.1
 # Of the fit's own rounding: below it there is nothing to test.
@@ -87,6 +90,7 @@ def residual_structure(
     ResidualStructure or None
         None when the fit leaves nothing but rounding or trials are too short.
     """
+    problem, found = _thinned(problem, found)
     p = len(problem.plant.outputs)
     lengths = [trial.samples for trial in problem.recordings]
     residual = found.residual.reshape(-1, p)
@@ -95,15 +99,16 @@ def residual_structure(
     if found.reason or min(lengths) < 20 * _LAGS or np.any(size <= _EXACT * np.std(recorded)):
         return None
     weights = np.tile(1 / size, len(residual))
-    basis = _orthonormal(_fitted(problem, found) * weights[:, None])
+    fitted = np.hstack([found.dK.reshape(len(weights), -1), found.dparameters])
+    rows = [trial.outputs.size for trial in problem.recordings]
+    basis = trial_span(found.dx0 * weights[:, None], rows, fitted * weights[:, None])
     told = np.ravel(residual / size)
     shifted = _shifted(residual / size, lengths, np.random.default_rng(seed))
     simulated = residual + recorded
     span = _settling(problem, gain)
     results = []
     for columns in (_linear(problem), _nonlinear(simulated / np.std(simulated, axis=0))):
-        rows = np.kron(_delayed(columns, lengths, span), np.eye(p))
-        seen = _orthonormal(rows - basis @ (basis.T @ rows))
+        seen = _orthonormal(basis.without(np.kron(_delayed(columns, lengths, span), np.eye(p))))
         share = float(np.sum((seen.T @ told) ** 2) / (told @ told))
         null = np.sum((seen.T @ shifted) ** 2, axis=0) / np.sum(shifted**2, axis=0)
         probability = (1 + int(np.count_nonzero(null >= share))) / (1 + _SHIFTS)
@@ -125,16 +130,22 @@ def _nonlinear(outputs: Array) -> Array:
     return np.column_stack([*pairs, *triples])
 
 
-def _fitted(problem: InverseProblem, found: Evaluation) -> Array:
-    """Derivatives with respect to all that was fitted, initial states trial by trial."""
-    rows = len(found.residual)
-    columns, row = [found.dK.reshape(rows, -1), found.dparameters], 0
-    for trial in problem.recordings:
-        block = np.zeros_like(found.dx0)
-        block[row : row + trial.outputs.size] = found.dx0[row : row + trial.outputs.size]
-        row += trial.outputs.size
-        columns.append(block)
-    return np.hstack(columns)
+def _thinned(problem: InverseProblem, found: Evaluation) -> tuple[InverseProblem, Evaluation]:
+    """Every k-th trial of many, so that arrays of 199 shifts and of 112 delayed columns are small.
+
+    Nothing is lost that matters: of so many samples any part above `_LEAST_SHARE` is found.
+    """
+    sizes = [trial.outputs.size for trial in problem.recordings]
+    every = -(-sum(sizes) // _MOST)
+    if every == 1:
+        return problem, found
+    chosen = np.arange(len(sizes)) % every == 0
+    rows = np.repeat(chosen, sizes)
+    trials = tuple(itertools.compress(problem.recordings, chosen))
+    parts = {
+        name: getattr(found, name)[rows] for name in ("residual", "dK", "dS", "dx0", "dparameters")
+    }
+    return replace(problem, recordings=trials), replace(found, **parts)
 
 
 def _settling(problem: InverseProblem, gain: Array) -> int:

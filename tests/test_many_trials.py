@@ -1,13 +1,33 @@
-"""Hundreds of trials: the page draws those that are explained least, and names how many."""
+"""Hundreds of trials: memory grows with their number; the page draws those explained least."""
 
 from __future__ import annotations
 
+import tracemalloc
+from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pytest
 
+import impc.many_trials
+import impc.residual_structure
+from experiments.coverage import cart
+from impc.bounds import box_bounds
+from impc.closed_loop import scenario, simulate
+from impc.controller import gain_controller
+from impc.evaluation import evaluate
+from impc.gain import refine_gain
+from impc.gain_covariance import gain_covariance
+from impc.inverse_problem import InverseProblem, inverse_problem
+from impc.recording import recording
 from impc.report.fit_figures import shown_trials
+from impc.residual_structure import residual_structure
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+GAIN = np.array([[1.6, 1.4]])
 
 
 def of_trials(explained: list[float]) -> Any:
@@ -24,3 +44,71 @@ def test_of_500_those_that_are_explained_least() -> None:
     assert shown == sorted(shown)
     assert len(shown) == 24
     assert max(explained[index] for index in shown) == np.sort(explained)[23]
+
+
+def starts_unknown(trials: int) -> InverseProblem:
+    """Short trials of a cart from starts that nobody knows, with noise."""
+    plant, rng = cart(), np.random.default_rng(1)
+    bounds = box_bounds(plant, u_min=-1, u_max=1)
+    controller = gain_controller(plant, GAIN, bounds, 5, terminal_set=False)
+    recordings = []
+    for _ in range(trials):
+        push = np.repeat(rng.choice([-0.8, 0.0, 0.8], 6), 10)
+        begin = scenario(plant, 0.1 * rng.standard_normal(2), disturbance=push)
+        outputs = (simulate(controller, begin).x @ plant.C.T)[:60]
+        recordings.append(recording(plant, outputs + 0.02 * rng.standard_normal((60, 1)), push))
+    return inverse_problem(
+        plant, bounds, 5, tuple(recordings), terminal_set=False, unknown_start=True
+    )
+
+
+def peak_of(work: Callable[[], object]) -> int:
+    """Most that numpy holds meanwhile, bytes."""
+    tracemalloc.start()
+    try:
+        work()
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+WORK = {
+    "search": lambda problem: refine_gain(problem, GAIN, np.eye(1), max_evaluations=3, spread=0.5),
+    "covariance": lambda problem: gain_covariance(problem, GAIN, np.eye(1)),
+    "structure": lambda problem: residual_structure(
+        problem, GAIN, evaluate(problem, GAIN, np.eye(1))
+    ),
+}
+
+
+@pytest.mark.parametrize("name", WORK)
+def test_memory_grows_as_the_trials_do(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Thrice the trials: 3 times the memory; nine times when each had columns beside all others."""
+    monkeypatch.setattr(impc.residual_structure, "_LAGS", 2)
+    monkeypatch.setattr(impc.residual_structure, "_SHIFTS", 3)
+    few, many = (starts_unknown(count) for count in (150, 450))
+    WORK[name](few)  # what is compiled and kept once does not count
+    assert peak_of(lambda: WORK[name](many)) < 4.5 * peak_of(lambda: WORK[name](few))
+
+
+def test_many_trials_are_fitted_as_few_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Eliminated trial by trial, and with all columns side by side: the same gain and starts."""
+    problem = starts_unknown(120)
+    found = refine_gain(problem, GAIN, np.eye(1), spread=0.5)
+    monkeypatch.setattr(impc.many_trials, "_MANY", 10**9)
+    beside = refine_gain(problem, GAIN, np.eye(1), spread=0.5)
+    # Both searches end where the misfit falls by less than 1e-8 of it.
+    assert found.misfit == pytest.approx(beside.misfit, rel=1e-7)
+    np.testing.assert_allclose(found.K, beside.K, rtol=1e-3)
+    np.testing.assert_allclose(found.singular_values, beside.singular_values, rtol=1e-3)
+
+
+def test_of_very_many_samples_some_trials_are_tested(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = starts_unknown(9)
+    found = evaluate(problem, GAIN, np.eye(1))
+    monkeypatch.setattr(impc.residual_structure, "_LAGS", 2)
+    monkeypatch.setattr(impc.residual_structure, "_MOST", 200)
+    some = replace(problem, recordings=problem.recordings[::3])
+    expected = residual_structure(some, GAIN, evaluate(some, GAIN, np.eye(1)))
+    assert expected is not None
+    assert residual_structure(problem, GAIN, found) == expected

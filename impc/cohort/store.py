@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from impc.errors import OutputError
+from impc.files.writing import require_ordinary
 from impc.kept import Kept
 from impc.report.write import owned, write_files
 
@@ -117,6 +118,7 @@ class Store:
             When that cannot be done.
         """
         try:
+            require_ordinary(self.folder / "cohort.log")
             with (self.folder / "cohort.log").open("a", encoding="utf-8") as stream:
                 stream.write(line + "\n")
         except OSError as error:

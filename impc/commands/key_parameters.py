@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from impc.commands.numbers import Number
-from impc.commands.options import code_options, out_option, scheduler_options
+from impc.commands.options import code_options, out_option, scheduler_options, yes_option
 from impc.commands.output import print_files
 from impc.commands.select import kept_results, read_model_study, study_runner
 
@@ -31,6 +31,7 @@ __all__ = ["command"]
 @click.option("--vaf", type=Number(), default=69.0, help="Least mean VAF, %.")
 @click.option("--icc", type=Number(), default=0.75, help="Least ICC(A,k).")
 @scheduler_options
+@yes_option
 def command(
     study_file: Path,
     model_name: str | None,
@@ -40,20 +41,25 @@ def command(
     vaf: float,
     icc: float,
     cluster: Cluster,
+    yes: bool,
 ) -> None:
     """Key parameters of a study of several subjects and visits.
 
     The study file is that of `impc select`. It may be stopped at any time: the same command goes on
     from there.
     """
+    from impc.commands.consent import FEWER_STARTS, require_consent  # noqa: PLC0415
     from impc.report.write import write_files  # noqa: PLC0415
+    from impc.selection.effort import key_evaluations, selection_effort  # noqa: PLC0415
     from impc.selection.key_parameters import key_parameters  # noqa: PLC0415
     from impc.selection.key_report import key_files  # noqa: PLC0415
     from impc.selection.settings import select_settings  # noqa: PLC0415
 
     study, source, recorded, inputs = read_model_study(study_file, model_name, allowed)
     settings = select_settings(study.configuration.select)
-    with study_runner(source, out, cluster, 2 * len(recorded)) as run:
+    effort = selection_effort(source.model, recorded.values(), key_evaluations(settings))
+    with study_runner(source, out, cluster, 2 * len(recorded)) as (run, threads):
+        require_consent(effort.shared(len(recorded), threads), yes, FEWER_STARTS)
         found = key_parameters(
             source.model, recorded, settings, run,
             bound=bound, least_vaf=vaf, least_reliability=icc,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from tqdm import tqdm
 
-from impc.commands.options import code_options, out_option, scheduler_options
+from impc.commands.options import code_options, out_option, scheduler_options, yes_option
 from impc.commands.output import print_files
 
 if TYPE_CHECKING:
@@ -32,23 +32,29 @@ __all__ = ["command", "kept_results", "read_model_study", "study_runner"]
 @code_options("model")
 @out_option("select", "report.html, result.json, tables and figure")
 @scheduler_options
+@yes_option
 def command(
-    study_file: Path, model_name: str | None, allowed: bool, out: Path, cluster: Cluster
+    study_file: Path, model_name: str | None, allowed: bool, out: Path, cluster: Cluster, yes: bool
 ) -> None:
     """Sensitive parameters of a simulation model (chapter 4), subject by subject and in common.
 
     [study] model names the model by import path, [model] its arguments, [select] the settings. It
     may be stopped at any time: the same command goes on from there.
     """
+    from impc.commands.consent import FEWER_STARTS, require_consent  # noqa: PLC0415
     from impc.report.write import write_files  # noqa: PLC0415
     from impc.selection.analysis import select_study  # noqa: PLC0415
+    from impc.selection.effort import select_evaluations, selection_effort  # noqa: PLC0415
     from impc.selection.report import selection_files  # noqa: PLC0415
     from impc.selection.settings import select_settings  # noqa: PLC0415
 
     study, source, recorded, inputs = read_model_study(study_file, model_name, allowed)
     settings = select_settings(study.configuration.select)
     named = {" visit ".join(part for part in key if part): item for key, item in recorded.items()}
-    with study_runner(source, out, cluster, 2 * len(named) + 1) as run:
+    evaluations = select_evaluations(settings, len(named))
+    effort = selection_effort(source.model, named.values(), evaluations)
+    with study_runner(source, out, cluster, 2 * len(named) + 1) as (run, threads):
+        require_consent(effort.shared(len(named), threads), yes, FEWER_STARTS)
         found = select_study(named, settings, run)
     line = f"impc select {study_file.name} --model {source.name}"
     written = write_files(out, selection_files(source.model, found, line, inputs))
@@ -67,8 +73,10 @@ def kept_results(out: Path) -> Kept:
 
 
 @contextmanager
-def study_runner(source: ModelSource, out: Path, cluster: Cluster, tasks: int) -> Iterator[Runner]:
-    """Workers with a progress bar; a message about what is kept when it is interrupted.
+def study_runner(
+    source: ModelSource, out: Path, cluster: Cluster, tasks: int
+) -> Iterator[tuple[Runner, int]]:
+    """Workers with a progress bar, and how many; a message of what is kept when interrupted.
 
     Parameters
     ----------
@@ -96,7 +104,7 @@ def study_runner(source: ModelSource, out: Path, cluster: Cluster, tasks: int) -
 
         try:
             with connected(cluster) as workers:
-                yield on_workers(workers, source, kept, done)
+                yield on_workers(workers, source, kept, done), workers.threads
         except KeyboardInterrupt:
             raise KeyboardInterrupt(
                 f"{bar.n} of {tasks} tasks are kept in {kept.folder}; the same command goes on"

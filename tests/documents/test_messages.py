@@ -46,6 +46,7 @@ from impc.plant import Plant, as_plant
 from impc.plant_source import PlantSource, make_plant, plant_source
 from impc.recording import recording
 from impc.report.write import owned, require_writable, write_files
+from impc.selection.subsets import largest_subsets
 from impc.weights import stage_weights
 from tests.documents.blocks import PAGES
 from tests.files.damaged import DAMAGED, PLANT
@@ -299,6 +300,10 @@ def caches_without_a_home(folder: Path) -> str:
         return f"impc: note: {keep_caches()}"
 
 
+def too_many_subsets(_: Path) -> None:
+    largest_subsets([np.eye(40)], 2.0)
+
+
 def large_request(seconds: float, gigabytes: float) -> Callable[[Path], object]:
     return lambda _: require_consent(Effort(seconds, gigabytes), given=False)
 
@@ -362,6 +367,7 @@ PROVOKED: dict[str, Callable[[Path], object]] = {
     "names ... twice; name each once": of_fit({"free": ["mass", "mass"]}),
     "is a ... that no result can keep": lambda _: find_plant("cursor", {"sample_time": 2**64}),
     "would need ... GB of memory, more than this machine has": large_request(0, 1e9),
+    "more than ... subsets keep a variance of ...": too_many_subsets,
     "this request: would take about ... hours; ...; or say --yes": large_request(1e9, 0),
     "impc: note: caches are kept in ...": caches_without_a_home,
     "is continuous, a discrete one is needed": lambda _: as_plant(
