@@ -1,7 +1,7 @@
 """What a selection will take, told before it is begun: evaluations of the model, seconds, memory.
 
 The model is the user's: what one evaluation takes is measured. How many there will be is told from
-the settings, to a factor of three on a model of the head and one of a drug (tests/test_effort.py).
+the settings, to its order of magnitude: a fit takes from 7 to 200 (tests/test_effort.py).
 """
 
 from __future__ import annotations
@@ -24,8 +24,9 @@ __all__ = ["key_evaluations", "select_evaluations", "selection_effort"]
 
 # Evaluations with derivatives of a fit from a start far off, of one from its neighbourhood, of a
 # LASSO with its refit, of Table C.1 (of the outputs alone: a few thousand a solve), and of a
-# profile, which fits again at each of its points: counted on the drug 7, 5, 74 and 180.
-_FIT, _REFIT, _LASSO, _TABLE, _PROFILE = 15, 5, 100, 4000, 180
+# profile, which fits again at each of its points. Counted on the drug: 7, 5, 74 and 180; on the
+# head, whose twelve parameters are hardly told: 200, 17, 23.
+_FIT, _REFIT, _LASSO, _TABLE, _PROFILE = 30, 9, 100, 4000, 180
 # Arrays of the size of the derivative that a fit holds, and fits at a time in a bootstrap.
 _COPIES, _THREADS = 6, 2
 
