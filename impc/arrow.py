@@ -54,7 +54,7 @@ class Prior:
     Attributes
     ----------
     u, v : Array
-        The middle.
+        The middle, (a,) and (trials, n).
     shared : Array
         Weight of each entry of u (a,); 0 for none.
     own : float
@@ -69,7 +69,15 @@ class Prior:
 
 @dataclass(frozen=True)
 class Tolerances:
-    """When a search ends: `ftol`, `xtol`, `gtol` and `max_nfev` of scipy's `least_squares`."""
+    """When a search ends.
+
+    Attributes
+    ----------
+    ftol, xtol, gtol : float
+        Of scipy's `least_squares`: share of the misfit, share of the step, largest slope.
+    max_nfev : int
+        Calls at most.
+    """
 
     ftol: float
     xtol: float
@@ -80,7 +88,7 @@ class Tolerances:
 def arrow_least_squares(
     rows: Callable[[Array, Array], ArrowRows], prior: Prior, u: Array, v: Array, ends: Tolerances
 ) -> tuple[Array, Array, int]:
-    """Search from u (a,) and v (trials, n); where it ends, and the number of calls of `rows`.
+    """Search for u and v.
 
     Parameters
     ----------
@@ -88,8 +96,15 @@ def arrow_least_squares(
         (u, v) -> residual and derivative.
     prior : Prior
     u, v : Array
-        Where the search begins.
+        Where the search begins, (a,) and (trials, n).
     ends : Tolerances
+
+    Returns
+    -------
+    u, v : Array
+        Where it ends, (a,) and (trials, n).
+    spent : int
+        Calls of `rows`.
     """
     here = _Here.at(rows, prior, u, v)
     radius, alpha, spent = _norm(u, v) or 1.0, 0.0, 1
@@ -259,12 +274,17 @@ def _ratio(gained: float, promised: float) -> float:
 
 
 def triangular_rows(columns: list[Array]) -> Array:
-    """R of a QR factorisation of `columns`, arrays of (r, ...) side by side, block by block.
+    """R (w, w) of a QR factorisation of `columns`, arrays (r, k) side by side, block by block.
 
     Norms and inner products of its columns are those of the given ones.
 
     Blocks of a few thousand rows stay in the processor's cache: a recording ten times as long
     takes ten times the time, not fifteen.
+
+    Returns
+    -------
+    Array
+        (w, w), w columns in all; of fewer rows where there are fewer.
     """
     width = sum(part.shape[1] for part in columns)
     triangle = np.zeros((0, width))

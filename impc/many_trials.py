@@ -1,4 +1,7 @@
-"""The search of `Coordinates` over many trials: initial states are eliminated trial by trial."""
+"""The search of `Coordinates` over many trials: initial states are eliminated trial by trial.
+
+Time and memory then grow as the number of trials does (docs/speed.md).
+"""
 
 from __future__ import annotations
 
@@ -28,19 +31,26 @@ def has_many_trials(space: Coordinates) -> bool:
 def search_many(
     space: Coordinates, z: Array, along: Array, weights: tuple[Array, float], ends: Tolerances
 ) -> tuple[Array, int]:
-    """Least squares from z (q,), with a prior about the start; where it ends, and evaluations.
+    """Least squares with a prior about the start.
 
     Parameters
     ----------
     space : Coordinates
         Of a problem with unknown initial states.
     z : Array
-        Where the search begins.
+        Where the search begins (q,).
     along : Array
         Columns along which gain, metric and parameters may move (g, a), orthonormal.
     weights : tuple of Array and float
         Of the prior: along each of these columns (a,), and of all initial states.
     ends : Tolerances
+
+    Returns
+    -------
+    z : Array
+        Where it ends (q,).
+    spent : int
+        Evaluations.
     """
     first, last = int(space.ends[1]), int(space.ends[2])
     shape = space.trials, space.n

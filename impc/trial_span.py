@@ -1,7 +1,7 @@
 """What initial states, trial by trial, and other columns can explain of a residual.
 
 Columns of initial states are zero outside of their trial. Side by side they would take the square
-of the number of trials: 8 GB for 500 of 500 samples.
+of the number of trials: 8 GB for 500 of 500 samples (docs/speed.md).
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class TrialSpan:
     Attributes
     ----------
     own : tuple of Array
-        Of each trial (rows of the trial, at most n), zero in the rows of the others.
+        Of each trial (rows, k), k at most n; zero in the rows of the others.
     shared : Array
         Of the rest (r, c), orthogonal to those.
     """
@@ -43,7 +43,7 @@ class TrialSpan:
         return sum(basis.shape[1] for basis in self.own) + int(self.shared.shape[1])
 
     def without(self, columns: Array) -> Array:
-        """What the basis does not explain of `columns` (r, k)."""
+        """What the basis does not explain of `columns` (r, k), of that shape."""
         left = _without(self.own, columns)
         return np.asarray(left - self.shared @ (self.shared.T @ left))
 

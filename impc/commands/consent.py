@@ -16,8 +16,9 @@ __all__ = ["FEWER", "FEWER_STARTS", "require_consent"]
 _SECONDS, _GIGABYTES = 7200.0, 4.0
 
 
-#: What to do about a large request of a fit, and of a selection of parameters.
+#: What to do about a large request of a fit.
 FEWER = "lower horizon, replicates or profiles in [fit], or shorten the trials"
+#: What to do about one of a selection of parameters.
 FEWER_STARTS = "lower replicates or starts in [select], or shorten the trials"
 
 

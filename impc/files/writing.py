@@ -15,12 +15,12 @@ __all__ = ["flush_folder", "require_ordinary", "write_whole"]
 
 
 def require_ordinary(path: Path) -> None:
-    """Refuse a pipe or a device in the place of a file: to open it may wait for ever.
+    """Refuse a pipe or a device at `path`, in the place of a file: to open it may wait for ever.
 
     Raises
     ------
     OSError
-        When something is at `path` that is no ordinary file.
+        When something is there that is no ordinary file.
     """
     if path.exists() and not path.is_file():
         raise OSError(errno.EINVAL, "no ordinary file")

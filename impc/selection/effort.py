@@ -1,7 +1,7 @@
 """What a selection will take, told before it is begun: evaluations of the model, seconds, memory.
 
 The model is the user's: what one evaluation takes is measured. How many there will be is told from
-the settings, to its order of magnitude: a fit takes from 7 to 200 (tests/test_effort.py).
+the settings, to its order of magnitude: a fit takes from 7 to 200 (docs/speed.md).
 """
 
 from __future__ import annotations
