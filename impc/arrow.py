@@ -12,7 +12,7 @@ trials. The search is the trust region of scipy's `least_squares` (Moré 1978; B
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.linalg
@@ -235,15 +235,16 @@ class _Factor:
 
     def solved(self) -> tuple[Array, Array, float, float]:
         """The step, its norm, and how fast the norm falls with alpha."""
-        du = -np.linalg.solve(self.last, self.last_side)
+        du: Array = np.asarray(-np.linalg.solve(self.last, self.last_side), dtype=np.float64)
         side = self.own_side + self.beside @ du
-        dv = -np.linalg.solve(self.own, side[..., None])[..., 0]
+        step = -np.linalg.solve(self.own, side[..., None])[..., 0]
+        dv: Array = np.asarray(step, dtype=np.float64)
         size = _norm(du, dv)
         if size == 0:
             return du, dv, size, 1.0
-        back_v = np.linalg.solve(np.swapaxes(self.own, 1, 2), dv[..., None])[..., 0]
+        back_v: Any = np.linalg.solve(np.swapaxes(self.own, 1, 2), dv[..., None])[..., 0]
         rest = du - np.einsum("tna,tn->a", self.beside, back_v)
-        back_u = np.linalg.solve(self.last.T, rest)
+        back_u: Any = np.linalg.solve(self.last.T, rest)
         return du, dv, size, _norm(back_u, back_v) ** 2 / size
 
 
@@ -253,11 +254,11 @@ def _factor(here: _Here, alpha: float) -> _Factor:
     table = np.concatenate([here.rows.own, here.rows.shared, here.rows.residual[..., None]], axis=2)
     damped = np.zeros((trials, max(n, n + a + 1 - table.shape[1]), n + a + 1))
     damped[:, :n, :n] = root * np.eye(n)
-    upper = np.linalg.qr(np.concatenate([table, damped], axis=1), mode="r")
+    upper: Any = np.linalg.qr(np.concatenate([table, damped], axis=1), mode="r")
     below = [upper[:, n:, n:].reshape(-1, a + 1)]
     below.append(np.hstack([np.diag(here.prior.shared), here.pull[:, None]]))
     below.append(np.hstack([root * np.eye(a), np.zeros((a, 1))]))
-    last = np.linalg.qr(np.concatenate(below), mode="r")
+    last: Any = np.linalg.qr(np.concatenate(below), mode="r")
     return _Factor(
         upper[:, :n, :n], upper[:, :n, n : n + a], upper[:, :n, -1], last[:a, :a], last[:a, -1]
     )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import scipy.optimize
@@ -58,7 +60,7 @@ def test_the_search_is_that_of_scipy(seed: int, weight: float) -> None:
     rows, u, v = curved(seed), rng.standard_normal(SHARED), rng.standard_normal((TRIALS, OWN))
     prior = Prior(u, v, np.full(SHARED, weight), weight)
     residual, derivative = dense(rows, prior)
-    ends = {"ftol": 1e-12, "xtol": 1e-12, "gtol": 1e-13}
+    ends: dict[str, Any] = {"ftol": 1e-12, "xtol": 1e-12, "gtol": 1e-13}
     expected = scipy.optimize.least_squares(
         residual, np.concatenate([u, v.ravel()]), jac=derivative, max_nfev=200, **ends
     )
