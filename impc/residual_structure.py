@@ -100,15 +100,16 @@ def residual_structure(
         return None
     weights = np.tile(1 / size, len(residual))
     fitted = np.hstack([found.dK.reshape(len(weights), -1), found.dparameters])
-    rows = [trial.outputs.size for trial in problem.recordings]
-    basis = trial_span(found.dx0 * weights[:, None], rows, fitted * weights[:, None])
+    sizes = [trial.outputs.size for trial in problem.recordings]
+    basis = trial_span(found.dx0 * weights[:, None], sizes, fitted * weights[:, None])
     told = np.ravel(residual / size)
     shifted = _shifted(residual / size, lengths, np.random.default_rng(seed))
     simulated = residual + recorded
     span = _settling(problem, gain)
     results = []
     for columns in (_linear(problem), _nonlinear(simulated / np.std(simulated, axis=0))):
-        seen = _orthonormal(basis.without(np.kron(_delayed(columns, lengths, span), np.eye(p))))
+        rows: Array = np.kron(_delayed(columns, lengths, span), np.eye(p)).astype(np.float64)
+        seen = _orthonormal(basis.without(rows))
         share = float(np.sum((seen.T @ told) ** 2) / (told @ told))
         null = np.sum((seen.T @ shifted) ** 2, axis=0) / np.sum(shifted**2, axis=0)
         probability = (1 + int(np.count_nonzero(null >= share))) / (1 + _SHIFTS)
