@@ -28,12 +28,14 @@ from impc.arrays import Array, BoolArray, Frozen, frozen
 from impc.assess.long_run_covariance import ResidualNoise, residual_noise, spread_of_sum
 from impc.inverse.residuals import evaluate, misfit_or_reason, residual_only
 from impc.inverse.solution_set import natural_coordinates
+from impc.inverse.trial_span import trial_span
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from impc.inverse.problem import Problem
     from impc.inverse.residuals import Evaluation
+    from impc.inverse.trial_span import TrialSpan
 
 __all__ = ["DETERMINED", "FOREIGN", "TOLD", "GainCovariance", "gain_covariance"]
 
@@ -137,16 +139,14 @@ def gain_covariance(
     found = evaluate(problem, gain, metric)
     in_units = np.kron(G, np.linalg.inv(T).T)
     on_gain = found.dK.reshape(-1, m * n) @ in_units
-    nuisance = _nuisance(problem, found)
+    metric_columns = _told_metric(found)
     # What the rest can explain is taken out of the gain's columns; the gain's
     # block of the inverse of H is that of what is left.
-    left = _orthogonal(nuisance)
-    seen = on_gain - left @ (left.T @ on_gain)
+    rest = _span(problem, found, metric_columns, found.dparameters)
+    seen = rest.without(on_gain)
     _, values, directions = np.linalg.svd(seen, full_matrices=False)
     usable = values > DETERMINED * values[0]
-    colour = noise(
-        _by_trial(problem, found.residual), left.shape[1] + int(np.count_nonzero(usable))
-    )
+    colour = noise(_by_trial(problem, found.residual), rest.rank + int(np.count_nonzero(usable)))
     along = seen @ directions[usable].T / values[usable] ** 2
     spread = spread_of_sum(colour, _by_trial(problem, along))
     deviations = np.full(m * n, np.inf)
@@ -167,7 +167,7 @@ def gain_covariance(
         frozen(deviations),
         frozen(entries.reshape(m, n)),
         frozen(foreign.reshape(m, n)),
-        frozen(_parameter_deviations(problem, on_gain, nuisance, colour)),
+        frozen(_parameter_deviations(problem, found, [on_gain, metric_columns], colour)),
         colour,
     )
 
@@ -215,40 +215,28 @@ def _by_trial(problem: Problem, rows: Array) -> list[Array]:
     return parts
 
 
-def _nuisance(problem: Problem, found: Evaluation) -> Array:
-    """Columns of what S is told, of initial states, trial by trial, then of parameters."""
+def _told_metric(found: Evaluation) -> Array:
+    """Columns of what S is told (r, k)."""
     metric, sizes, _ = np.linalg.svd(found.dS.reshape(len(found.residual), -1), full_matrices=False)
     # Rounding leaves 1e-15 where S is not told: its scale, and inputs that are never at a bound.
-    columns, row = [metric[:, sizes > _ROUNDING * np.max(sizes)]], 0
-    for trial in problem.recordings:
-        mine = slice(row, row + trial.outputs.size)
-        row = mine.stop
-        block = np.zeros_like(found.dx0)
-        block[mine] = found.dx0[mine]
-        columns.append(block)
-    return np.hstack([*columns, found.dparameters])
+    return np.asarray(metric[:, sizes > _ROUNDING * np.max(sizes)])
 
 
-def _orthogonal(columns: Array) -> Array:
-    """Orthonormal basis of what the columns reach, to 1e-10 of the largest in each one's scale."""
-    size = np.linalg.norm(columns, axis=0)
-    scaled = columns[:, size > 0] / size[size > 0]
-    if scaled.shape[1] == 0:
-        return np.zeros((len(columns), 0))
-    left, values, _ = np.linalg.svd(scaled, full_matrices=False)
-    return np.asarray(left[:, values > _ROUNDING * values[0]])
+def _span(problem: Problem, found: Evaluation, *shared: Array) -> TrialSpan:
+    """What initial states and the columns `shared` can explain."""
+    sizes = [trial.outputs.size for trial in problem.recordings]
+    return trial_span(found.dx0, sizes, np.hstack(shared))
 
 
 def _parameter_deviations(
-    problem: Problem, on_gain: Array, nuisance: Array, colour: ResidualNoise
+    problem: Problem, found: Evaluation, others: list[Array], colour: ResidualNoise
 ) -> Array:
     """Standard deviations of the logarithms, everything else being fitted too."""
     count = len(problem.logarithms)
     if count == 0:
         return np.zeros(0)
-    own = nuisance[:, -count:]
-    left = _orthogonal(np.hstack([on_gain, nuisance[:, :-count]]))
-    seen = own - left @ (left.T @ own)
+    own = found.dparameters
+    seen = _span(problem, found, *others).without(own)
     _, values, directions = np.linalg.svd(seen, full_matrices=False)
     if values[-1] <= DETERMINED * np.linalg.norm(own, 2):
         return np.full(count, np.inf)

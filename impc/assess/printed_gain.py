@@ -26,7 +26,9 @@ import scipy.optimize
 from impc.arrays import Array, frozen
 from impc.assess.covariance import GainCovariance, gain_covariance
 from impc.assess.long_run_covariance import white_noise
+from impc.inverse.arrow import Tolerances
 from impc.inverse.coordinates import Coordinates
+from impc.inverse.many_trials import has_many_trials, search_many
 
 if TYPE_CHECKING:
     from impc.inverse.estimate import Estimate
@@ -126,11 +128,27 @@ def _round(here: _Found) -> _Found:
     """
     space = Coordinates(here.problem, here.K, here.S)
     told = here.linear.directions[here.linear.told]
-    rest = int(space.ends[-1] - space.ends[0])
-    # The search has the same natural coordinates as the directions: both are those of this gain.
-    along = scipy.linalg.block_diag(told.T, np.eye(rest))
     samples = sum(trial.outputs.size for trial in here.problem.recordings)
     noise = float(np.linalg.norm(space.at(space.start).residual)) / np.sqrt(samples)
+    z = _least_squares(space, told, noise)
+    there = space.unpack(z)
+    problem = here.problem.at(there.starts, there.logarithms)
+    misfit = float(np.linalg.norm(space.at(z).residual))
+    covariance = gain_covariance(problem, there.K, there.S)
+    return _Found(problem, there.K, there.S, misfit, covariance)
+
+
+def _least_squares(space: Coordinates, told: Array, noise: float) -> Array:
+    """Where the search ends that moves the gain along the rows of `told` only."""
+    # It has the same natural coordinates as the directions: both are those of this gain.
+    if has_many_trials(space):
+        beside = int(space.ends[1] - space.ends[0] + space.ends[3] - space.ends[2])
+        along = scipy.linalg.block_diag(told.T, np.eye(beside))
+        weights = np.concatenate([np.zeros(len(told)), np.full(beside, noise)]), noise
+        ends = Tolerances(1e-8, 1e-12, 1e-15, _EVALUATIONS)
+        return search_many(space, space.start, along, weights, ends)[0]
+    rest = int(space.ends[-1] - space.ends[0])
+    along = scipy.linalg.block_diag(told.T, np.eye(rest))
     prior = np.hstack([np.zeros((rest, len(told))), noise * np.eye(rest)])
 
     def residual(step: Array) -> Array:
@@ -148,9 +166,4 @@ def _round(here: _Found) -> _Found:
         gtol=1e-15,
         max_nfev=_EVALUATIONS,
     )
-    z = space.start + along @ found.x
-    there = space.unpack(z)
-    problem = here.problem.at(there.starts, there.logarithms)
-    misfit = float(np.linalg.norm(space.at(z).residual))
-    covariance = gain_covariance(problem, there.K, there.S)
-    return _Found(problem, there.K, there.S, misfit, covariance)
+    return np.asarray(space.start + along @ found.x)

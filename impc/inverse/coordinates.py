@@ -19,13 +19,14 @@ thirds of itself.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.linalg
 
 from impc.arrays import Array
 from impc.control.closed_loop import simulate
+from impc.inverse.arrow import ArrowRows, triangular_rows
 from impc.inverse.problem import controller_for, scenarios
 from impc.inverse.residuals import evaluate
 from impc.inverse.solution_set import floored_covariance, natural_coordinates
@@ -37,10 +38,11 @@ if TYPE_CHECKING:
 
 __all__ = ["PARAMETER_UNIT", "Compressed", "Coordinates", "Point", "WithPrior", "start_unit"]
 
-_BLOCK = 4096
 #: A parameter's coordinate counts thirds of itself.
 PARAMETER_UNIT = 1 / 3
 _START_FLOOR = 1e-8
+# Columns below that, of the largest, are rounding.
+_EXPLAINED = 1e-12
 
 
 @dataclass(frozen=True)
@@ -74,14 +76,30 @@ class Compressed:
 
     Attributes
     ----------
-    residual : Array
-        (r,).
-    jacobian : Array
-        With respect to the q coordinates (r, q).
+    rows : ArrowRows
+        Gain, metric and parameters are shared, initial states the trial's own.
+    split : int
+        How many of the shared columns stand before those of initial states; the rest after.
     """
 
-    residual: Array
-    jacobian: Array
+    rows: ArrowRows
+    split: int
+
+    @property
+    def residual(self) -> Array:
+        """(r,)."""
+        return np.ravel(self.rows.residual)
+
+    @cached_property
+    def jacobian(self) -> Array:
+        """With respect to the q coordinates (r, q)."""
+        shared, own = self.rows.shared, self.rows.own
+        trials, height, n = own.shape
+        starts = np.zeros((trials, height, trials, n))
+        starts[np.arange(trials), :, np.arange(trials)] = own
+        flat = shared.reshape(trials * height, -1)
+        middle = starts.reshape(trials * height, -1)
+        return np.hstack([flat[:, : self.split], middle, flat[:, self.split :]])
 
 
 class Coordinates:
@@ -156,13 +174,18 @@ class Coordinates:
             (r, g), g coordinates of gain and metric: orthogonal to the columns of initial states
             and parameters.
         """
-        jacobian = self.at(z).jacobian
-        kept, nuisance = jacobian[:, : self.ends[1]], jacobian[:, self.ends[1] :]
+        rows = self.at(z).rows
+        left, values, _ = np.linalg.svd(rows.own, full_matrices=False)
+        largest = np.max(values, initial=0.0)
+        basis = left * (values > _EXPLAINED * largest)[:, None, :]
+        shared = rows.shared - basis @ (np.swapaxes(basis, 1, 2) @ rows.shared)
+        kept, nuisance = np.split(shared.reshape(-1, shared.shape[2]), [int(self.ends[1])], axis=1)
         if nuisance.shape[1] == 0:
             return kept
-        left, values, _ = np.linalg.svd(nuisance, full_matrices=False)
-        left = left[:, values > 1e-12 * values[0]]
-        return np.asarray(kept - left @ (left.T @ kept))
+        size = np.sqrt(np.sum(rows.shared[..., int(self.ends[1]) :] ** 2, axis=(0, 1)))
+        rest, values, _ = np.linalg.svd(nuisance, full_matrices=False)
+        rest = rest[:, values > _EXPLAINED * max(largest, np.max(size))]
+        return np.asarray(kept - rest @ (rest.T @ kept))
 
     def _pack(self, gain: Array) -> Array:
         shapes = np.diff(np.concatenate([[0], self.ends]))
@@ -192,30 +215,24 @@ class Coordinates:
         parts = [found.dK.reshape(-1, self.m * self.n) @ self._gain_chain()]
         if self.m > 1:
             parts.append(found.dS.reshape(-1, self.m**2) @ self._metric_chain(z))
-        width = int(self.ends[-1])
         rows, row = [], 0
         sizes = [trial.outputs.size for trial in self.problem.recordings]
         if not self.problem.unknown_start:  # no column belongs to one trial: all are one block
             sizes = [sum(sizes)]
-        for index, size in enumerate(sizes):
+        for size in sizes:
             mine = slice(row, row + size)
             row = mine.stop
             blocks = [part[mine] for part in parts]
             blocks += [found.dx0[mine] @ self.start_unit] if found.dx0.shape[1] else []
             blocks += [found.dparameters[mine] * PARAMETER_UNIT, found.residual[mine, None]]
-            triangle = _triangle(blocks)
-            placed = np.zeros((len(triangle), width + 1))
-            placed[:, self._columns(index)] = triangle
-            rows.append(placed)
-        table = np.vstack(rows)
-        return Compressed(table[:, -1], table[:, :-1])
-
-    def _columns(self, trial: int) -> Array:
-        """Where the columns of one trial stand among all."""
-        shared = np.arange(self.ends[1])
-        mine = np.arange(self.n) + self.ends[1] + trial * self.n
-        own = mine if self.problem.unknown_start else mine[:0]
-        return np.concatenate([shared, own, np.arange(self.ends[2], self.ends[3] + 1)])
+            triangle = triangular_rows(blocks)
+            full = np.zeros((triangle.shape[1], triangle.shape[1]))
+            full[: len(triangle)] = triangle
+            rows.append(full)
+        table, split = np.stack(rows), int(self.ends[1])
+        own = slice(split, split + found.dx0.shape[1])
+        shared = np.delete(table[..., :-1], own, axis=2)
+        return Compressed(ArrowRows(table[..., -1], shared, table[..., own]), split)
 
     def _gain_chain(self) -> Array:
         return np.asarray(np.kron(self.G, np.linalg.inv(self.T).T), dtype=np.float64)
@@ -279,18 +296,3 @@ def start_unit(problem: Problem, gain: Array) -> Array:
     natural = float(np.linalg.norm(plant.C @ T / problem.output_scale[:, None]))
     size = float(np.sqrt(np.sum(np.mean(scaled**2, axis=0))))
     return size / natural * T if size > 0 and natural > 0 else T
-
-
-def _triangle(columns: list[Array]) -> Array:
-    """R of a QR factorisation of the columns side by side, block by block.
-
-    Blocks of a few thousand rows stay in the processor's cache: a recording ten times as long
-    takes ten times the time, not fifteen.
-    """
-    width = sum(part.shape[1] for part in columns)
-    triangle = np.zeros((0, width))
-    for first in range(0, len(columns[0]), _BLOCK):
-        block = np.hstack([part[first : first + _BLOCK] for part in columns])
-        (upper,) = scipy.linalg.qr(np.vstack([triangle, block]), mode="r", check_finite=False)
-        triangle = np.asarray(upper[:width], dtype=np.float64)
-    return triangle

@@ -17,8 +17,10 @@ import scipy.optimize
 from impc.arrays import Array, Frozen, frozen
 from impc.checking import checked, replace
 from impc.errors import DataError, SolverError, WeightsError
+from impc.inverse.arrow import Tolerances
 from impc.inverse.coordinates import Coordinates
 from impc.inverse.diagonal_start import bryson_regulators
+from impc.inverse.many_trials import has_many_trials, search_many
 from impc.inverse.one_step import follows_plant, one_step, regressed_gain
 from impc.inverse.problem import recorded_size
 from impc.inverse.residuals import misfit_or_reason
@@ -299,21 +301,29 @@ def _search(problem: Problem, gain: Array, metric: Array, budget: int, spread: f
     misfit = float(np.linalg.norm(space.at(z).residual))
     for _ in range(_ROUNDS):
         noise = 0.0 if np.isinf(spread) else misfit / np.sqrt(samples)
-        target = space.with_prior(noise / spread)
-        found = scipy.optimize.least_squares(
-            target.residual,
-            z,
-            jac=target.derivative,
-            ftol=1e-12 if noise == 0 else _NOISY_TOLERANCE,
-            xtol=1e-12,
-            gtol=1e-15,
-            max_nfev=max(budget - spent, 1),
-        )
-        z, spent = found.x, spent + int(found.nfev)
+        ftol = 1e-12 if noise == 0 else _NOISY_TOLERANCE
+        z, more = _step_down(space, z, noise / spread, ftol, max(budget - spent, 1))
+        spent += more
         before, misfit = misfit, float(np.linalg.norm(space.at(z).residual))
         if noise == 0 or misfit > (1 - _SETTLED) * before or spent >= budget:
             break
     return _gain_fit(space, z, spent)
+
+
+def _step_down(
+    space: Coordinates, z: Array, weight: float, ftol: float, budget: int
+) -> tuple[Array, int]:
+    """Least squares from z with a prior of that weight about the start; evaluations."""
+    if has_many_trials(space):
+        size = len(z) - space.trials * space.n
+        weights = np.full(size, weight), weight
+        return search_many(space, z, np.eye(size), weights, Tolerances(ftol, 1e-12, 1e-15, budget))
+    target = space.with_prior(weight)
+    found = scipy.optimize.least_squares(
+        target.residual, z, jac=target.derivative, ftol=ftol, xtol=1e-12, gtol=1e-15,
+        max_nfev=budget,
+    )  # fmt: skip
+    return found.x, int(found.nfev)
 
 
 def _gain_fit(space: Coordinates, z: Array, evaluations: int) -> GainFit:

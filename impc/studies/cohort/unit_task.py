@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from impc.inverse.problem import Problem
     from impc.studies.fit.settings import FitSettings
 
-__all__ = ["FitTask", "fit_unit", "replicate_unit"]
+__all__ = ["FitTask", "fit_unit", "replicate_unit", "unit_problem"]
 
 # Points of a trajectory that are kept for pictures.
 _SHOWN = 600
@@ -75,7 +75,7 @@ def fit_unit(task: FitTask) -> dict[str, Any]:
     """Fit a unit; {"reason": ...} when it cannot be fitted."""
     started = time.perf_counter()
     try:
-        problem, settings = _problem(task)
+        problem, settings = unit_problem(task)
         fitted = fit_controller(problem)
         content = _described(problem, fitted, settings)
     except ImpcError as error:
@@ -90,7 +90,7 @@ def replicate_unit(task: FitTask, fit: dict[str, Any], index: int) -> dict[str, 
     """One bootstrap replicate of a fitted unit, by its number `index`; `fit` is its content."""
     started = time.perf_counter()
     try:
-        problem, settings = _problem(task)
+        problem, settings = unit_problem(task)
         here = problem.at(np.array(fit["starts"]), np.array(fit["logarithms"]))
         found = replicate(
             here,
@@ -114,7 +114,14 @@ def replicate_unit(task: FitTask, fit: dict[str, Any], index: int) -> dict[str, 
 
 
 @functools.lru_cache(maxsize=4)
-def _problem(task: FitTask) -> tuple[Problem, FitSettings]:
+def unit_problem(task: FitTask) -> tuple[Problem, FitSettings]:
+    """The recordings of a unit as an inverse problem, read once for all that is done with it.
+
+    Raises
+    ------
+    ImpcError
+        When a recording, the plant or the settings cannot be used, or are not those of the `task`.
+    """
     settings = fit_settings(task.configuration.fit)
     source = find_plant(task.plant, task.arguments)
     # A worker on another machine, or one that has run for days, may have other files and code.
