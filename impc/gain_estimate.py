@@ -39,6 +39,8 @@ __all__ = ["GainEstimate", "gain_estimate"]
 _ROUNDS = 4
 _SETTLED = 1e-4
 _EVALUATIONS = 40
+# Steps that move the gain by less than this along what is not told leave it there.
+_SAME = 1e-10
 
 
 @dataclass(frozen=True)
@@ -126,13 +128,13 @@ def _round(here: _Found) -> _Found:
     an interval, and some of it nothing determines.
     """
     space = Coordinates(here.problem, here.K, here.S)
-    told = here.linear.directions[here.linear.told]
-    rest = int(space.ends[-1] - space.ends[0])
+    changes, _ = space.changes(space.unpack(space.start), space.start)
     # The search has the same natural coordinates as the directions: both are those of this gain.
-    along = scipy.linalg.block_diag(told.T, np.eye(rest))
+    moves = space.natural(changes).reshape(len(changes), -1).T
+    along = scipy.linalg.null_space(here.linear.directions[~here.linear.told] @ moves, _SAME)
     samples = sum(trial.outputs.size for trial in here.problem.recordings)
     noise = float(np.linalg.norm(space.at(space.start).residual)) / np.sqrt(samples)
-    prior = np.hstack([np.zeros((rest, len(told))), noise * np.eye(rest)])
+    prior = noise * along[space.ends[0] :]
 
     def residual(step: Array) -> Array:
         return np.concatenate([space.at(space.start + along @ step).residual, prior @ step])
@@ -142,7 +144,7 @@ def _round(here: _Found) -> _Found:
 
     found = scipy.optimize.least_squares(
         residual,
-        np.zeros(len(told) + rest),
+        np.zeros(along.shape[1]),
         jac=derivative,
         ftol=1e-8,
         xtol=1e-12,

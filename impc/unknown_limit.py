@@ -225,10 +225,9 @@ class _Search:
         known = [(key, fit) for key, fit in self.tried.items() if fit is not None]
         near = sorted(known, key=lambda item: abs(min(item[0], 1e9) - min(limit, 1e9)))
         solution = self.fitted.solution
-        starts = [(np.array(fit.K), fit.problem) for _, fit in near[:1]]
-        starts.append((np.array(solution.K), self.fitted.problem))
-        metric = np.array(solution.S)
-        for K, problem in starts:
+        starts = [(np.array(fit.K), np.array(fit.S), fit.problem) for _, fit in near[:1]]
+        starts.append((np.array(solution.K), np.array(solution.S), self.fitted.problem))
+        for K, metric, problem in starts:
             try:
                 return refine_gain(
                     with_limit(problem, limit, self.control),

@@ -14,7 +14,7 @@ the last digit.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,11 +22,10 @@ import numpy as np
 from impc.equivalent_weights import least_condition_weights
 from impc.errors import SolverError, WeightsError
 from impc.evaluation import residual_only
-from impc.gain import EXPLAINED, describe_gain
+from impc.gain import EXPLAINED
 from impc.gain_fibre import gain_fibre
 from impc.inverse_problem import recorded_size
 from impc.lqr import solve_lqr
-from impc.weights_search import search_weights
 
 if TYPE_CHECKING:
     from impc.equivalent_weights import EquivalentWeights
@@ -74,60 +73,18 @@ def weights_behind(fit: GainFit) -> WeightsBehind:
     SolverError
         When the plant under the fitted gain cannot be simulated.
     """
-    found = _with_gain(fit)
-    if found.explained or len(fit.S) == 1 or not fit.explained:
-        return found
-    start = _near(fit)
-    if start is None:
-        return found
-    refined = search_weights(fit.problem, start)
-    exact = describe_gain(fit, refined.solution.K, refined.solution.S)
-    if not exact.explained:
-        return found
-    return _with_gain(exact, refined.weights)
+    problem = fit.problem
+    try:
+        equivalent = least_condition_weights(gain_fibre(problem.plant, fit.K, fit.metrics))
+    except (WeightsError, SolverError) as error:
+        return WeightsBehind(fit, None, np.inf, explained=False, reason=str(error))
+    misfit, size = weights_misfit(problem, equivalent.weights), recorded_size(problem)
+    explained = misfit <= EXPLAINED * size
+    reason = "" if explained else f"the weights miss the recordings by {misfit / size:.2g} of them"
+    return WeightsBehind(fit, equivalent, misfit, explained, reason)
 
 
 def weights_misfit(problem: InverseProblem, weights: Weights) -> float:
     """2-norm of the residual of the constrained controller with these weights."""
     solution = solve_lqr(problem.plant, weights)
     return float(np.linalg.norm(residual_only(problem, solution.K, solution.S)))
-
-
-def _with_gain(fit: GainFit, member: Weights | None = None) -> WeightsBehind:
-    """The best of: metric in the span of those that are not told apart, or exactly the fitted."""
-    best = WeightsBehind(fit, None, np.inf, explained=False, reason="")
-    spans = [fit.metrics] if len(fit.metrics) == 1 else [fit.metrics, fit.metrics[:1]]
-    for metrics in spans:
-        try:
-            equivalent = least_condition_weights(
-                gain_fibre(fit.problem.plant, fit.K, metrics), member
-            )
-        except (WeightsError, SolverError) as error:
-            best = best if best.reason else replace(best, reason=str(error))
-            continue
-        misfit = weights_misfit(fit.problem, equivalent.weights)
-        if misfit < best.misfit:
-            best = _judged(fit, equivalent, misfit)
-        if best.explained:
-            break
-    return best
-
-
-def _judged(fit: GainFit, equivalent: EquivalentWeights, misfit: float) -> WeightsBehind:
-    size = recorded_size(fit.problem)
-    explained = misfit <= EXPLAINED * size
-    reason = "" if explained else f"the weights miss the recordings by {misfit / size:.2g} of them"
-    return WeightsBehind(fit, equivalent, misfit, explained, reason)
-
-
-def _near(fit: GainFit) -> Weights | None:
-    """Weights whose gain and metric come near the fitted ones, or None."""
-    plant, found = fit.problem.plant, []
-    for rank in _RANKS:
-        for metrics in (fit.metrics, None):
-            try:
-                weights = least_condition_weights(gain_fibre(plant, fit.K, metrics, rank)).weights
-                found.append((weights_misfit(fit.problem, weights), weights))
-            except (WeightsError, SolverError):  # none at this rank; another may have
-                continue
-    return min(found, key=lambda item: item[0])[1] if found else None
