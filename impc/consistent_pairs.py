@@ -31,15 +31,11 @@ if TYPE_CHECKING:
 __all__ = [
     "ConsistentGains",
     "consistent_gains",
-    "consistent_metrics",
     "consistent_pair",
     "metric_changes",
     "scaled_changes",
 ]
 
-# Condition number from which eigenvectors tell no metric: two eigenvalues are the same but for
-# rounding, and more metrics are consistent than those of the rows.
-_DEFECTIVE = 1e6
 # Of the largest singular value: changes of the metric that move it less far from consistency.
 _ALONE = 1e-8
 
@@ -112,34 +108,13 @@ def consistent_gains(plant: Plant, metric: Array, T: Array, G: Array) -> Consist
 
 
 def consistent_pair(plant: Plant, gain: Array, metric: Array) -> tuple[Array, Array]:
-    """The pair of some F and S near a gain (m, n) that stabilises and a metric (m, m).
-
-    The metric moves to one with which the gain is consistent, if there is any, and what is then
-    wrong is taken out of the gain.
-    """
+    """The metric (m, m), with the gain consistent with it next to one (m, n) that stabilises."""
     if plant.m == 1:
         return gain, metric
-    rows = consistent_metrics(plant, gain)
-    if rows is not None:
-        vectors = np.linalg.inv(rows)
-        metric = rows.T * np.diag(vectors.T @ metric @ vectors) @ rows
     T, G = natural_coordinates(plant, gain)
     basis = np.linalg.solve(G, consistent_gains(plant, metric, T, G).gains @ T)
     along = np.tensordot(np.tensordot(basis, np.linalg.solve(G, gain @ T), 2), basis, 1)
-    return np.asarray(G @ along @ np.linalg.inv(T)), np.asarray(metric)
-
-
-def consistent_metrics(plant: Plant, gain: Array) -> Array | None:
-    """Rows w_i (m, m) of the metrics with which a gain is consistent: sum of s_i w_i'w_i, s > 0.
-
-    They are the left eigenvectors of K A^-1 B = S^-1 B'PB, a product of symmetric matrices, one of
-    them positive definite: so its eigenvalues are real. None where they are not, or too close.
-    """
-    through = np.linalg.lstsq(plant.A.T, gain.T)[0].T @ plant.B
-    values, vectors = np.linalg.eig(through)
-    if np.iscomplexobj(values) or np.linalg.cond(vectors) > _DEFECTIVE:
-        return None
-    return np.asarray(np.linalg.inv(vectors))
+    return np.asarray(G @ along @ np.linalg.inv(T)), metric
 
 
 def metric_changes(

@@ -11,9 +11,10 @@ need not be symmetric and is not fooled by curvature. It ends nowhere if the mis
 recordings do not determine the number. The input limit has a module of its own, `unknown_limit`.
 docs/fitting.md says how often the interval covers the truth.
 
-A parameter's logarithm is affine in the coordinates z of the search (`Coordinates`), an entry of K in
-those of the gain while the metric stands. With a' the number's derivative at the start, the search
-goes on in the null space of a', and each point is brought back to the number along one direction.
+A parameter's logarithm is affine in the coordinates z of the search (`Coordinates`), an entry of K
+in those of the gain while the metric stands. With a' the number's derivative at the start, the
+search goes on in the null space of a', and each point is brought back to the number along one
+direction.
 """
 
 from __future__ import annotations

@@ -5,22 +5,23 @@ From a sample at which no bound is met within the horizon the plan is v = 0, so 
     x_{k+1} - A x_k - E d_k  =  -B K x_k
 
 exactly. Such samples come in runs: each run of n tells B K, and how many others follow it shows
-whether it was one. The metrics with which that K is consistent are those of m positive factors
-(`consistent_pairs`), so that S is a search over m - 1 numbers about a loop that is stable. On exact
-recordings of random plants with two and three inputs searches over all of (K, S) end in local
-minima where this does not (docs/fitting.md). With noise there is no such run, and no start from
-here.
+whether it was one. The pairs (K, S) with that B K that weights have (`consistent_pairs`) are a
+family of m - 1 numbers, of a few more when the inputs outnumber the states, about a loop that is
+stable. On exact recordings of random plants with two and three inputs, searches over all of (K, S)
+end in local minima where a search over the family does not (docs/fitting.md). With noise there is no
+such run, and no start from here.
 """
 
 from __future__ import annotations
 
+import itertools
 from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.optimize
 
 from impc.arrays import Array
-from impc.consistent_pairs import consistent_metrics, consistent_pair, scaled_changes
+from impc.consistent_pairs import scaled_changes
 from impc.evaluation import evaluate, unusable
 from impc.inverse_problem import recorded_size
 from impc.lqr import is_stable
@@ -43,9 +44,16 @@ _AT_BOUND = 1e-6
 _TELLS = 1e6
 # Laws that are tried: of 200 random problems the first was the true one in 191, the second in 6.
 _LAWS = 3
-# Misfit, of the recorded outputs, at which no other metric is tried; logarithms of the metric's
-# factors are looked for this far about their start; evaluations of such a search.
-_ENOUGH, _FAR, _BUDGET = 1e-9, 10.0, 30
+# Misfit, of the recorded outputs, at which no other metric is tried; how far about their start
+# coordinates (logarithms, in part) are looked for; evaluations of a search, which a valley of one
+# problem in a hundred needs.
+_ENOUGH, _FAR, _BUDGET = 1e-9, 10.0, 300
+# Random metrics that are tried after the given ones (seven were needed at most), and their least
+# eigenvalue in that of the first.
+_RANDOM, _FLOOR = 15, 0.1
+# Condition number from which eigenvectors tell no metric: two eigenvalues are the same but for
+# rounding.
+_DEFECTIVE = 1e6
 # Condition number of a metric from which a Cholesky factor is rounding.
 _SINGULAR = 1e12
 
@@ -56,21 +64,26 @@ def quiet_pairs(problem: InverseProblem, metrics: Sequence[Array]) -> list[tuple
     Parameters
     ----------
     metrics : sequence of Array
-        Where each search for a metric begins; tried in order until one explains the recordings.
+        Where a search for a metric begins, one at least; random ones about the first follow. They
+        are tried until one explains the recordings, and then it is the only answer.
     """
     plant, found = problem.plant, []
-    for law in quiet_feedback(problem):
-        for metric in metrics:
-            root = np.linalg.inv(np.linalg.cholesky(metric)).T  # S^-1 = root root'
-            # Of the gains with this B K, if there are several, the least in the metric.
-            gain = np.asarray(root @ np.linalg.pinv(plant.B @ root) @ law)
-            if not is_stable(plant.A - plant.B @ gain, discrete=True):
-                continue
-            search = _MetricSearch(problem, *consistent_pair(plant, gain, metric))
-            found.append((search.gain, search.best()))
-            if search.explains:
-                return found[-1:]
+    laws = [W for W in quiet_feedback(problem) if is_stable(plant.A - W, discrete=True)]
+    for metric, law in itertools.product([*metrics, *_about(metrics[0])], laws):
+        pair = _Pairs(problem, law, metric).search()
+        if pair is None:
+            continue
+        found.append(pair[:2])
+        if pair[2]:
+            return found[-1:]
     return found
+
+
+def _about(metric: Array) -> list[Array]:
+    """Metrics (m, m) of all shapes, whatever the units of the inputs: the same at every call."""
+    rng, root = np.random.default_rng(0), np.linalg.cholesky(metric)
+    factors = root @ rng.standard_normal((_RANDOM, *metric.shape))
+    return list(factors @ np.swapaxes(factors, 1, 2) + _FLOOR * metric)
 
 
 def quiet_feedback(problem: InverseProblem) -> list[Array]:
@@ -117,55 +130,101 @@ def _free_samples(problem: InverseProblem) -> tuple[Array, Array]:
     return x[inside], moved[inside]
 
 
-class _MetricSearch:
-    """Least squares over the factors of the metrics with which a gain is consistent."""
+class _Pairs:
+    """All consistent pairs with a given feedback B K = W, about a first metric.
 
-    def __init__(self, problem: InverseProblem, gain: Array, metric: Array) -> None:
-        self.problem, self.gain, self.metric = problem, gain, metric
-        self.rows = consistent_metrics(problem.plant, gain)
+    With r the rank of B, B V1 of full column rank and B V2 = 0, they are
+
+        K = (V1 + V2 Y) (B V1)^+ W,    S = sum_i exp(s_i) w_i'w_i + D C C'D',   D = V2 - V1 Y',
+
+    w_i being the left eigenvectors of (B V1)^+ W A^-1 B V1, which is the inverse of a positive
+    definite matrix times a symmetric one. V2, Y and C, a Cholesky factor with the logarithm of its
+    diagonal, are there with more inputs than states only.
+    """
+
+    def __init__(self, problem: InverseProblem, law: Array, metric: Array) -> None:
+        self.problem, plant = problem, problem.plant
+        rank = int(np.linalg.matrix_rank(plant.B))
+        V = np.linalg.svd(plant.B)[2].T
+        self.V1, self.V2 = V[:, :rank], V[:, rank:]
+        self.feedback = np.linalg.pinv(plant.B @ self.V1) @ law
+        through = np.linalg.lstsq(plant.A.T, self.feedback.T)[0].T @ plant.B @ self.V1
+        values, vectors = np.linalg.eig(through)
+        self.usable = not np.iscomplexobj(values) and np.linalg.cond(vectors) < _DEFECTIVE
         self.last: tuple[bytes, Evaluation] | None = None
-        self.explains = False
+        if self.usable:
+            self.rows = np.linalg.inv(vectors)
+            self.start = self._coordinates(metric, vectors)
 
-    def best(self) -> Array:
-        """The metric (m, m) found; the given one where there is nothing to search."""
-        if self.rows is None:
-            return self.metric
-        vectors = np.linalg.inv(self.rows)
-        start = np.log(np.diag(vectors.T @ self.metric @ vectors))
-        if self._at(start).reason:
-            return self.metric
+    def search(self) -> tuple[Array, Array, bool] | None:
+        """Least squares: K, S and whether they explain the recordings; None without a start."""
+        if not self.usable or self._at(self.start).reason:
+            return None
         found = scipy.optimize.least_squares(
-            lambda logs: self._at(logs).residual,
-            start,
+            lambda z: self._at(z).residual,
+            self.start,
             jac=self._derivative,
-            bounds=(start - _FAR, start + _FAR),
+            bounds=(self.start - _FAR, self.start + _FAR),
             xtol=1e-12,
             gtol=1e-15,
             max_nfev=_BUDGET,
         )
         misfit = float(np.linalg.norm(self._at(found.x).residual))
-        self.explains = misfit <= _ENOUGH * recorded_size(self.problem)
-        return self._metric(found.x)
+        return *self._pair(found.x), misfit <= _ENOUGH * recorded_size(self.problem)
 
-    def _metric(self, logs: Array) -> Array:
-        return np.asarray(self.rows.T * np.exp(logs) @ self.rows)
+    def _coordinates(self, metric: Array, vectors: Array) -> Array:
+        """Those of a pair near a metric: exactly its own where that is consistent."""
+        inverse = np.linalg.inv(metric)
+        inner = np.linalg.inv(self.V1.T @ inverse @ self.V1)
+        logs = np.log(np.diag(vectors.T @ inner @ vectors))
+        Y = self.V2.T @ inverse @ self.V1 @ inner
+        C = np.linalg.cholesky(self.V2.T @ metric @ self.V2) if self.V2.size else self.V2.T[:, :0]
+        np.fill_diagonal(C, np.log(np.diag(C)))
+        return np.concatenate([logs, Y.ravel(), C[np.tril_indices(len(C))]])
 
-    def _at(self, logs: Array) -> Evaluation:
-        key = logs.tobytes()
+    def _parts(self, z: Array) -> tuple[Array, Array, Array]:
+        """exp(s), Y and C."""
+        extra, rank = self.V2.shape[1], self.V1.shape[1]
+        logs, flat, entries = np.split(z, [rank, rank + extra * rank])
+        C = np.zeros((extra, extra))
+        C[np.tril_indices(extra)] = entries
+        np.fill_diagonal(C, np.exp(np.diag(C)))
+        return np.exp(logs), flat.reshape(extra, rank), C
+
+    def _pair(self, z: Array) -> tuple[Array, Array]:
+        factors, Y, C = self._parts(z)
+        W, D = self.rows @ self.V1.T, self.V2 - self.V1 @ Y.T
+        return (self.V1 + self.V2 @ Y) @ self.feedback, W.T * factors @ W + D @ C @ C.T @ D.T
+
+    def _at(self, z: Array) -> Evaluation:
+        key = z.tobytes()
         if self.last is None or self.last[0] != key:
-            metric = self._metric(logs)
+            gain, metric = self._pair(z)
             if np.linalg.cond(metric) > _SINGULAR:
                 found = unusable(self.problem, "the metric is singular to working precision")
             else:
-                found = evaluate(self.problem, self.gain, metric)
+                found = evaluate(self.problem, gain, metric)
             self.last = key, found
         return self.last[1]
 
-    def _derivative(self, logs: Array) -> Array:
-        metric = self._metric(logs)
-        changes = np.exp(logs)[:, None, None] * self.rows[:, :, None] * self.rows[:, None, :]
-        dS = scaled_changes(metric, changes).reshape(len(logs), -1)
-        return np.asarray(self._at(logs).dS.reshape(-1, metric.size) @ dS.T)
+    def _derivative(self, z: Array) -> Array:
+        factors, Y, C = self._parts(z)
+        W, D = self.rows @ self.V1.T, self.V2 - self.V1 @ Y.T
+        none = np.zeros((len(self.V1), self.problem.plant.n))
+        changes = [(none, x * np.outer(w, w)) for x, w in zip(factors, W, strict=True)]
+        for row, column in np.ndindex(Y.shape):
+            dK = np.outer(self.V2[:, row], self.feedback[column])
+            half = -np.outer(self.V1[:, column], (C @ C.T @ D.T)[row])
+            changes.append((dK, half + half.T))
+        for row, column in zip(*np.tril_indices(len(C)), strict=True):
+            unit = C[row, row] if row == column else 1.0
+            half = unit * np.outer(D[:, row], (D @ C)[:, column])
+            changes.append((none, half + half.T))
+        dS = scaled_changes(self._pair(z)[1], np.array([change for _, change in changes]))
+        dK = np.array([change for change, _ in changes])
+        found, count = self._at(z), len(z)
+        on_gain = found.dK.reshape(len(found.residual), -1) @ dK.reshape(count, -1).T
+        return np.asarray(on_gain + found.dS.reshape(len(on_gain), -1) @ dS.reshape(count, -1).T)
 
 
 def follows_plant(problem: InverseProblem) -> bool:
