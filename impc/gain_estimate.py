@@ -26,7 +26,6 @@ import scipy.optimize
 from impc.arrays import Array, frozen
 from impc.gain_coordinates import Coordinates
 from impc.gain_covariance import GainCovariance, gain_covariance
-from impc.inverse_problem import moved
 from impc.residual_noise import white_noise
 
 if TYPE_CHECKING:
@@ -153,7 +152,6 @@ def _round(here: _Found) -> _Found:
     )
     z = space.start + along @ found.x
     there = space.unpack(z)
-    problem = moved(here.problem, there.starts, there.logarithms)
     misfit = float(np.linalg.norm(space.at(z).residual))
-    covariance = gain_covariance(problem, there.K, there.S)
-    return _Found(problem, there.K, there.S, misfit, covariance)
+    covariance = gain_covariance(there.problem, there.K, there.S)
+    return _Found(there.problem, there.K, there.S, misfit, covariance)

@@ -8,8 +8,8 @@ exactly. Such samples come in runs: each run of n tells B K, and how many others
 whether it was one. The pairs (K, S) with that B K that weights have (`consistent_pairs`) are a
 family of m - 1 numbers, of a few more when the inputs outnumber the states, about a loop that is
 stable. On exact recordings of random plants with two and three inputs, searches over all of (K, S)
-end in local minima where a search over the family does not (docs/fitting.md). With noise there is no
-such run, and no start from here.
+end in local minima where a search over the family does not (docs/fitting.md). With noise there is
+no such run, and no start from here.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ _LAWS = 3
 # coordinates (logarithms, in part) are looked for; evaluations of a search, which a valley of one
 # problem in a hundred needs.
 _ENOUGH, _FAR, _BUDGET = 1e-9, 10.0, 300
-# Random metrics that are tried after the given ones (seven were needed at most), and their least
-# eigenvalue in that of the first.
+# Random metrics that are tried after the given ones (seven were needed at most), and what they have
+# of the identity.
 _RANDOM, _FLOOR = 15, 0.1
 # Condition number from which eigenvectors tell no metric: two eigenvalues are the same but for
 # rounding.
@@ -64,12 +64,14 @@ def quiet_pairs(problem: InverseProblem, metrics: Sequence[Array]) -> list[tuple
     Parameters
     ----------
     metrics : sequence of Array
-        Where a search for a metric begins, one at least; random ones about the first follow. They
-        are tried until one explains the recordings, and then it is the only answer.
+        Where a search for a metric begins; random ones follow. They are tried until one explains
+        the recordings, and then it is the only answer.
     """
     plant, found = problem.plant, []
     laws = [W for W in quiet_feedback(problem) if is_stable(plant.A - W, discrete=True)]
-    for metric, law in itertools.product([*metrics, *_about(metrics[0])], laws):
+    if not laws:
+        return []
+    for metric, law in itertools.product([*metrics, *_random_metrics(problem)], laws):
         pair = _Pairs(problem, law, metric).search()
         if pair is None:
             continue
@@ -79,11 +81,13 @@ def quiet_pairs(problem: InverseProblem, metrics: Sequence[Array]) -> list[tuple
     return found
 
 
-def _about(metric: Array) -> list[Array]:
-    """Metrics (m, m) of all shapes, whatever the units of the inputs: the same at every call."""
-    rng, root = np.random.default_rng(0), np.linalg.cholesky(metric)
-    factors = root @ rng.standard_normal((_RANDOM, *metric.shape))
-    return list(factors @ np.swapaxes(factors, 1, 2) + _FLOOR * metric)
+def _random_metrics(problem: InverseProblem) -> list[Array]:
+    """Metrics (m, m) of all shapes, in units of the recorded commands: the same at every call."""
+    _, moved = _free_samples(problem)
+    size = np.sqrt(np.mean((moved @ np.linalg.pinv(problem.plant.B).T) ** 2, axis=0))
+    unit = np.diag(1 / np.where(size > 0, size, 1.0))
+    factors = unit @ np.random.default_rng(0).standard_normal((_RANDOM, *unit.shape))
+    return list(factors @ np.swapaxes(factors, 1, 2) + _FLOOR * unit**2)
 
 
 def quiet_feedback(problem: InverseProblem) -> list[Array]:

@@ -12,21 +12,26 @@ from impc.closed_loop import scenario, simulate
 from impc.controller import Controller, mpc_controller
 from impc.equivalent_weights import least_condition_weights, other_weights
 from impc.errors import ImpcError
+from impc.evaluation import evaluate
 from impc.fitted_controller import fit_controller
 from impc.gain import fit_gain
+from impc.gain_coordinates import Coordinates
+from impc.gain_estimate import gain_estimate
 from impc.gain_fibre import gain_fibre, natural_coordinates
 from impc.inverse_mpc import infer_weights, inverse_mpc_reduced
 from impc.inverse_problem import InverseProblem
 from impc.lqr import solve_lqr
-from impc.one_step import regressed_gain
+from impc.quiet_samples import quiet_feedback
 from impc.recording import recording
 from impc.weights import Weights, stage_weights
 from impc.weights_search import search_weights
 from impc.weights_summary import summarise_weights
-from tests.support import saturated_problem
+from tests.support import extrapolated_slope, saturated_problem
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+    from impc.plant import Plant
 
 # What is asked of reported weights, of the recorded outputs.
 REPRODUCED = 1e-7
@@ -122,13 +127,15 @@ def test_ninety_nine_in_a_hundred_are_reproduced_and_no_miss_is_silent(path: str
 
 @pytest.mark.parametrize(("m", "seed"), [(2, 3), (3, 2)])
 def test_metric_is_kept_along_what_is_told_of_it(m: int, seed: int) -> None:
-    """Some of S is not told: weights that share what is told behave alike, others do not."""
+    """The recording alone leaves more than one S; consistency with K tells the rest of it."""
     controller, problem = random_problem(seed, m)
     plant = problem.plant
     fit = fit_gain(problem, (np.array(controller.K), np.array(controller.S)), attempts=1)
     assert fit.explained
-    assert not fit.metric_determined
-    assert 1 < len(fit.metrics) < m * (m + 1) // 2
+    assert fit.metric_determined
+    seen = evaluate(problem, fit.K, fit.S).dS.reshape(-1, m * m)
+    values = np.linalg.svd(seen, compute_uv=False)
+    assert np.count_nonzero(values > 1e-12 * values[0]) < m * (m + 1) // 2 - 1
     kept = gain_fibre(plant, controller.K, fit.metrics)
     for weights in (least_condition_weights(kept).weights, other_weights(kept, 1)[0].weights):
         assert missed(problem, weights) < 1e-6
@@ -172,11 +179,53 @@ def test_search_for_weights_ends_at_weights_that_explain() -> None:
     assert missed(problem, found.weights) < 1e-9
 
 
-def test_gain_of_most_samples_is_the_gain() -> None:
-    controller, problem = random_problem(4, 2)
-    found = regressed_gain(problem)
-    assert found is not None
-    np.testing.assert_allclose(found, controller.K, rtol=1e-8, atol=1e-9)
+@pytest.mark.parametrize(("m", "seed"), [(2, 4), (2, 12), (3, 5)])
+def test_unbounded_samples_tell_the_feedback(m: int, seed: int) -> None:
+    """Also where they are a third of all (2, 12), or the inputs outnumber the states (3, 5)."""
+    controller, problem = random_problem(seed, m)
+    truth = problem.plant.B @ controller.K
+    laws = quiet_feedback(problem)
+    assert min(np.max(np.abs(law - truth)) for law in laws) < 1e-7 * np.max(np.abs(truth))
+
+
+def asymmetry(plant: Plant, gain: np.ndarray, metric: np.ndarray) -> float:
+    """Of S K A^-1 B, against its size: it is B'PB where the pair is that of weights."""
+    product = metric @ gain @ np.linalg.solve(plant.A, plant.B)
+    return float(np.linalg.norm(product - product.T) / np.linalg.norm(product))
+
+
+@pytest.mark.parametrize(("m", "seed"), [(2, 1), (2, 4), (3, 0), (3, 4)])
+def test_search_moves_among_pairs_that_weights_have(m: int, seed: int) -> None:
+    """Everywhere, n m + m - 1 numbers, and at the truth the recording tells them all."""
+    controller, problem = random_problem(seed, m)
+    n, S = problem.plant.n, np.array(controller.S)
+    space = Coordinates(problem, np.array(controller.K), S)
+    here = space.unpack(space.start)
+    np.testing.assert_allclose(here.K, controller.K, atol=1e-11)
+    np.testing.assert_allclose(here.S / np.trace(here.S), S / np.trace(S), atol=1e-12)
+    values = np.linalg.svd(space.at(space.start).jacobian, compute_uv=False)
+    assert len(space.start) == np.count_nonzero(values > 1e-8 * values[0]) == n * m + m - 1
+    rng = np.random.default_rng(seed)
+    for _ in range(5):
+        there = space.unpack(space.start + 0.3 * rng.standard_normal(len(space.start)))
+        assert asymmetry(problem.plant, there.K, there.S) < 1e-11
+
+
+@pytest.mark.parametrize(("m", "seed"), [(2, 1), (3, 4)])
+def test_coordinates_know_how_gain_and_metric_change(m: int, seed: int) -> None:
+    controller, problem = random_problem(seed, m)
+    space = Coordinates(problem, np.array(controller.K), np.array(controller.S))
+    z = space.start + 0.1 * np.random.default_rng(seed).standard_normal(len(space.start))
+    dK, dS = space.changes(space.unpack(z), z)
+
+    def point(offset: float, index: int) -> np.ndarray:
+        moved = space.unpack(z + offset * np.eye(len(z))[index])
+        return np.concatenate([moved.K.ravel(), m * moved.S.ravel() / np.trace(moved.S)])
+
+    for index in range(len(z)):
+        expected = extrapolated_slope(lambda offset, index=index: point(offset, index))
+        found = np.concatenate([dK[index].ravel(), dS[index].ravel()])
+        np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-8)
 
 
 def test_weights_at_the_edge_of_those_that_a_program_finds() -> None:
@@ -208,3 +257,6 @@ def test_a_noisy_fit_stays_where_it_ended() -> None:
     assert found.converged
     assert not found.explained
     assert moved < 0.1 * error
+    # Whatever noise does, both gains are consistent with their metrics.
+    for one in (found.free, found.solution, gain_estimate(found)):
+        assert asymmetry(clean.plant, np.array(one.K), np.array(one.S)) < 1e-10
