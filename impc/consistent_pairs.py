@@ -108,7 +108,18 @@ def consistent_gains(plant: Plant, metric: Array, T: Array, G: Array) -> Consist
 
 
 def consistent_pair(plant: Plant, gain: Array, metric: Array) -> tuple[Array, Array]:
-    """The metric (m, m), with the gain consistent with it next to one (m, n) that stabilises."""
+    """Return the gain that is consistent with a metric next to one that stabilises, and the metric.
+
+    Parameters
+    ----------
+    gain, metric : Array
+        K (m, n) and S (m, m).
+
+    Returns
+    -------
+    gain, metric : Array
+        (m, n) and (m, m).
+    """
     if plant.m == 1:
         return gain, metric
     T, G = natural_coordinates(plant, gain)
@@ -149,9 +160,19 @@ def metric_changes(
 
 
 def scaled_changes(metric: Array, changes: Array) -> Array:
-    """Changes (k, m, m) of a metric (m, m) as those of the metric scaled to a mean diagonal of 1.
+    """Changes of a metric as those of the metric scaled to a mean diagonal of 1.
 
     That is how the controller scales it before it is differentiated (`Evaluation.dS`).
+
+    Parameters
+    ----------
+    metric, changes : Array
+        (m, m) and (k, m, m).
+
+    Returns
+    -------
+    Array
+        (k, m, m).
     """
     trace = np.trace(metric)
     shares = np.trace(changes, axis1=1, axis2=2)[:, None, None] / trace

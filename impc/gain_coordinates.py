@@ -168,7 +168,7 @@ class Coordinates:
         return np.concatenate([along, np.eye(self.m)[self.tril][1:], nuisance])
 
     def natural(self, gains: Array) -> Array:
-        """G^-1 K T of gains (..., m, n)."""
+        """G^-1 K T, (..., m, n), of gains (..., m, n)."""
         return np.asarray(np.linalg.solve(self.G, gains @ self.T))
 
     def _factor(self, entries: Array) -> Array:
@@ -181,7 +181,7 @@ class Coordinates:
         return np.asarray(factor @ factor.T)
 
     def changes(self, here: Point, z: Array) -> tuple[Array, Array]:
-        """Change of K (q, m, n), and of S scaled to trace m (q, m, m), with each coordinate."""
+        """Change of K (q, m, n), and of S scaled to trace m (q, m, m), with each of z (q,)."""
         along, factor, _, _ = np.split(z, self.ends[:-1])
         lower, metric = self._factor(factor), []
         for row, column in list(zip(*self.tril, strict=True))[1:]:
@@ -193,10 +193,11 @@ class Coordinates:
         products[: self.ends[0]] += self.gains.products(here.problem.plant)
         family = here.problem.family
         if family is not None and self.m > 1:
-            change = plant_differential(family, here.problem.logarithms)
-            drift = self.gains.drift(here.problem.plant, along, change)
+            differential = plant_differential(family, here.problem.logarithms)
+            drift = self.gains.drift(here.problem.plant, along, differential)
             products[self.ends[2] :] += PARAMETER_UNIT * drift
-        return np.linalg.solve(here.S, products), scaled_changes(here.S, dS)
+        dK = np.asarray(np.linalg.solve(here.S, products), dtype=np.float64)
+        return dK, scaled_changes(here.S, dS)
 
     def _compress(self, found: Evaluation, dK: Array, dS: Array) -> Compressed:
         """Factor derivative and residual together, trial by trial, then apply the chain rule."""

@@ -64,8 +64,13 @@ def quiet_pairs(problem: InverseProblem, metrics: Sequence[Array]) -> list[tuple
     Parameters
     ----------
     metrics : sequence of Array
-        Where a search for a metric begins; random ones follow. They are tried until one explains
+        (m, m) each: where a search for a metric begins; random ones follow. They are tried until one explains
         the recordings, and then it is the only answer.
+
+    Returns
+    -------
+    list of tuple
+        Pairs K (m, n) and S (m, m).
     """
     plant, found = problem.plant, []
     laws = [W for W in quiet_feedback(problem) if is_stable(plant.A - W, discrete=True)]
@@ -165,7 +170,7 @@ class _Pairs:
         if not self.usable or self._at(self.start).reason:
             return None
         found = scipy.optimize.least_squares(
-            lambda z: self._at(z).residual,
+            self._residual,
             self.start,
             jac=self._derivative,
             bounds=(self.start - _FAR, self.start + _FAR),
@@ -210,6 +215,9 @@ class _Pairs:
                 found = evaluate(self.problem, gain, metric)
             self.last = key, found
         return self.last[1]
+
+    def _residual(self, z: Array) -> Array:
+        return self._at(z).residual
 
     def _derivative(self, z: Array) -> Array:
         factors, Y, C = self._parts(z)

@@ -5,11 +5,8 @@ See docs/theory.md, section 6, and docs/fitting.md for several inputs.
     all weights with the gain and, along what is told of it, the metric  ->  least condition number
                                                                          ->  simulated and compared
 
-With one input the weights of the program reproduce the recordings as the gain does. With several
-the fitted pair (K, S) is that of weights only up to the fit's own error, and a program that is
-given such a pair has no members or far ones. So weights that miss the recordings are refined
-(`search_weights`), and the program is run again from the pair that they make, which has members to
-the last digit.
+The fitted pair (K, S) is consistent (`consistent_pairs`), so that it has weights to the last digit
+wherever positive definite ones exist.
 """
 
 from __future__ import annotations

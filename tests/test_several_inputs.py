@@ -218,12 +218,13 @@ def test_coordinates_know_how_gain_and_metric_change(m: int, seed: int) -> None:
     z = space.start + 0.1 * np.random.default_rng(seed).standard_normal(len(space.start))
     dK, dS = space.changes(space.unpack(z), z)
 
-    def point(offset: float, index: int) -> np.ndarray:
-        moved = space.unpack(z + offset * np.eye(len(z))[index])
-        return np.concatenate([moved.K.ravel(), m * moved.S.ravel() / np.trace(moved.S)])
+    for index, unit in enumerate(np.eye(len(z))):
 
-    for index in range(len(z)):
-        expected = extrapolated_slope(lambda offset, index=index: point(offset, index))
+        def point(offset: float, unit: np.ndarray = unit) -> np.ndarray:
+            moved = space.unpack(z + offset * unit)
+            return np.concatenate([moved.K.ravel(), m * moved.S.ravel() / np.trace(moved.S)])
+
+        expected = extrapolated_slope(point)
         found = np.concatenate([dK[index].ravel(), dS[index].ravel()])
         np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-8)
 
