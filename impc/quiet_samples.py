@@ -64,13 +64,13 @@ def quiet_pairs(problem: InverseProblem, metrics: Sequence[Array]) -> list[tuple
     Parameters
     ----------
     metrics : sequence of Array
-        (m, m) each: where a search for a metric begins; random ones follow. They are tried until one explains
-        the recordings, and then it is the only answer.
+        (m, m) each: where a search for a metric begins; random ones follow. They are tried until
+        one explains the recordings, and then it is the only answer.
 
     Returns
     -------
     list of tuple
-        Pairs K (m, n) and S (m, m).
+        (K, S), (m, n) and (m, m) each.
     """
     plant, found = problem.plant, []
     laws = [W for W in quiet_feedback(problem) if is_stable(plant.A - W, discrete=True)]
