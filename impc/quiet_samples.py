@@ -69,7 +69,7 @@ def quiet_pairs(problem: InverseProblem, metrics: Sequence[Array]) -> list[tuple
 
     Returns
     -------
-    list of tuple
+    list of (Array, Array)
         (K, S), (m, n) and (m, m) each.
     """
     plant, found = problem.plant, []
