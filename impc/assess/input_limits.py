@@ -223,10 +223,10 @@ class _Search:
         """From the nearest fit that holds, or from the given one."""
         known = [(key, fit) for key, fit in self.tried.items() if fit is not None]
         near = sorted(known, key=lambda item: abs(min(item[0], 1e9) - min(limit, 1e9)))
-        starts = [(np.array(fit.K), fit.problem) for _, fit in near[:1]]
-        starts.append((np.array(self.fitted.gain), self.fitted.problem))
-        metric = np.array(self.fitted.metric)
-        for K, problem in starts:
+        starts = [(np.array(fit.K), np.array(fit.S), fit.problem) for _, fit in near[:1]]
+        own = np.array(self.fitted.gain), np.array(self.fitted.metric)
+        starts.append((*own, self.fitted.problem))
+        for K, metric, problem in starts:
             try:
                 return refine_gain(
                     with_limit(problem, limit, self.control),

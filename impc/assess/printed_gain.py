@@ -40,6 +40,8 @@ __all__ = ["GainEstimate", "gain_estimate"]
 _ROUNDS = 4
 _SETTLED = 1e-4
 _EVALUATIONS = 40
+# Steps that move the gain by less than this along what is not told leave it there.
+_SAME = 1e-10
 
 
 @dataclass(frozen=True)
@@ -127,29 +129,31 @@ def _round(here: _Found) -> _Found:
     an interval, and some of it nothing determines.
     """
     space = Coordinates(here.problem, here.K, here.S)
-    told = here.linear.directions[here.linear.told]
     samples = sum(trial.outputs.size for trial in here.problem.recordings)
     noise = float(np.linalg.norm(space.at(space.start).residual)) / np.sqrt(samples)
-    z = _least_squares(space, told, noise)
+    z = _least_squares(space, here.linear, noise)
     there = space.unpack(z)
-    problem = here.problem.at(there.starts, there.logarithms)
     misfit = float(np.linalg.norm(space.at(z).residual))
-    covariance = gain_covariance(problem, there.K, there.S)
-    return _Found(problem, there.K, there.S, misfit, covariance)
+    covariance = gain_covariance(there.problem, there.K, there.S)
+    return _Found(there.problem, there.K, there.S, misfit, covariance)
 
 
-def _least_squares(space: Coordinates, told: Array, noise: float) -> Array:
-    """Where the search ends that moves the gain along the rows of `told` only."""
-    # It has the same natural coordinates as the directions: both are those of this gain.
-    if has_many_trials(space):
+def _least_squares(space: Coordinates, linear: GainCovariance, noise: float) -> Array:
+    """Where the search ends that moves the gain along the told directions only.
+
+    The search has the same natural coordinates as the directions: both are those of this gain.
+    """
+    if has_many_trials(space) and space.m == 1:  # one input: no other coordinate moves the gain
+        told = linear.directions[linear.told]
         beside = int(space.ends[1] - space.ends[0] + space.ends[3] - space.ends[2])
-        along = scipy.linalg.block_diag(told.T, np.eye(beside))
+        shared = scipy.linalg.block_diag(told.T, np.eye(beside))
         weights = np.concatenate([np.zeros(len(told)), np.full(beside, noise)]), noise
         ends = Tolerances(1e-8, 1e-12, 1e-15, _EVALUATIONS)
-        return search_many(space, space.start, along, weights, ends)[0]
-    rest = int(space.ends[-1] - space.ends[0])
-    along = scipy.linalg.block_diag(told.T, np.eye(rest))
-    prior = np.hstack([np.zeros((rest, len(told))), noise * np.eye(rest)])
+        return search_many(space, space.start, shared, weights, ends)[0]
+    changes, _ = space.changes(space.unpack(space.start), space.start)
+    moves = space.natural(changes).reshape(len(changes), -1).T
+    along = scipy.linalg.null_space(linear.directions[~linear.told] @ moves, _SAME)
+    prior = noise * along[space.ends[0] :]
 
     def residual(step: Array) -> Array:
         return np.concatenate([space.at(space.start + along @ step).residual, prior @ step])
@@ -159,7 +163,7 @@ def _least_squares(space: Coordinates, told: Array, noise: float) -> Array:
 
     found = scipy.optimize.least_squares(
         residual,
-        np.zeros(len(told) + rest),
+        np.zeros(along.shape[1]),
         jac=derivative,
         ftol=1e-8,
         xtol=1e-12,
