@@ -184,7 +184,7 @@ def gain_covariance(
 def _seen(on_metric: Array, metric: Array, changes: Array) -> Array:
     """Derivative (r, k) of the residual along changes (k, m, m) of a metric (m, m)."""
     scaled = scaled_changes(metric, changes)
-    return np.asarray(on_metric @ scaled.reshape(len(scaled), -1).T)
+    return np.asarray(on_metric @ scaled.reshape(len(scaled), metric.size).T)
 
 
 def _shifts(problem: Problem, gain: Array, metric: Array, steps: Array, metrics: Array) -> Array:

@@ -147,6 +147,8 @@ def metric_changes(
         The least change (m n, m, m) of S, in natural coordinates, for a step of one in each entry
         of G^-1 K T; and a basis (k, m, m) of its changes for the same gain, S itself among them.
     """
+    if plant.m == 1:  # S is its own scale, and every gain goes with it
+        return np.zeros((plant.n, 1, 1)), metric[None]
     units, back = block_basis(plant.m, 0), np.linalg.inv(G)
     steps = np.eye(gain.size).reshape(-1, *gain.shape)
     by_metric = _beside(plant, T, G, units @ back @ gain @ T)

@@ -225,13 +225,15 @@ def other_weights(
         As `least_condition_weights`.
     """
     centre = least_condition_weights(fibre)
-    ends = _ends(fibre, centre.weights, condition_ratio * centre.condition)
-    chosen = [fibre.to_natural(centre.weights)]
+    ends, frame = _ends(fibre, centre.weights, condition_ratio * centre.condition)
+    chosen = [np.eye(len(frame))]
     while ends and len(chosen) <= count:
         nearest = [min(_distance(end, item) for item in chosen) for end in ends]
         chosen.append(ends.pop(int(np.argmax(nearest))))
     status = f"{condition_ratio:g} times the least condition number"
-    return tuple(_member(fibre, fibre.from_natural(X), status, None) for X in chosen[1:])
+    return tuple(
+        _member(fibre, fibre.from_natural(frame @ X @ frame.T), status, None) for X in chosen[1:]
+    )
 
 
 def _interior(fibre: GainFibre, member: Weights | None = None) -> Weights:
@@ -280,8 +282,12 @@ def _centred_program(fibre: GainFibre, centre: Weights) -> tuple[Weights, float,
     return member, largest * found.bound, found.status
 
 
-def _ends(fibre: GainFibre, centre: Weights, limit: float) -> list[Array]:
-    """Ends of the rays, in natural coordinates; bisection, for the condition is quasiconvex."""
+def _ends(fibre: GainFibre, centre: Weights, limit: float) -> tuple[list[Array], Array]:
+    """Ends X of the rays as seen from the centre, and the frame L: L X L' in natural coordinates.
+
+    By bisection, for the condition is quasiconvex. Seen from the centre, which is I there, they are
+    definite to the last digit; in other coordinates the condition numbers multiply.
+    """
     inverse = inverse_factor(fibre, centre)
     back = np.linalg.inv(inverse)
     seen = (inverse @ pair_blocks(fibre.Q, fibre.R) @ inverse.T).reshape(fibre.dimension, -1)
@@ -297,7 +303,7 @@ def _ends(fibre: GainFibre, centre: Weights, limit: float) -> list[Array]:
         inside = values[:, -1] <= limit * values[:, 0]
         low, high = np.where(inside, middle, low), np.where(inside, high, middle)
     natural = scipy.linalg.block_diag(fibre.T, fibre.G).T @ back
-    return list(natural @ (np.eye(len(back)) + low[:, None, None] * rays) @ natural.T)
+    return list(np.eye(len(back)) + low[:, None, None] * rays), natural
 
 
 def _distance(X: Array, Y: Array) -> float:
