@@ -126,13 +126,26 @@ class Configuration(msgspec.Struct, frozen=True):
 
 
 def read_configuration(path: Path, *more: str) -> Configuration:
-    """Read the configuration at `path`; `more` names tables that it may have besides.
+    r"""Read the configuration at `path`; `more` names tables that it may have besides.
 
     Raises
     ------
     InputError
         When the file cannot be read, is no TOML, or has a key or value that cannot be: the message
         names it by its TOML path.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import impc
+    >>> text = '[recording]\nrate = 100\n[signals.angle]\ncolumn = "tilt"\nunit = "deg"\n'
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder, "lab.toml")
+    ...     _ = path.write_text(text)
+    ...     found = impc.read_configuration(path)
+    >>> found.recording.rate, found.signals["angle"].unit
+    (100.0, 'deg')
     """
     source = str(path)
     content = _parsed(source, path)

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from impc.files.table import Table
 
 __all__ = [
-    "LARGEST",
     "SUFFIXES",
     "encode_table",
     "read_table",
@@ -49,7 +48,7 @@ _SIGNATURES = {
 
 
 def read_table(path: Path, largest: int = LARGEST) -> Table:
-    """Read the columns of a recording.
+    r"""Read the columns of a recording.
 
     Parameters
     ----------
@@ -63,6 +62,18 @@ def read_table(path: Path, largest: int = LARGEST) -> Table:
     DataError
         When the file is missing, empty, too large, damaged, not what its ending says, or holds no
         column of numbers.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import impc
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder, "lab.csv")
+    ...     _ = path.write_text("t;tilt\n0,00;0,5\n0,01;0,6\n")
+    ...     found = impc.read_table(path)
+    >>> {name: column.tolist() for name, column in found.columns.items()}
+    {'t': [0.0, 0.01], 'tilt': [0.5, 0.6]}
     """
     source = str(path)
     read = _reader(source, _suffix(path, DataError), _head(path, largest))
@@ -86,6 +97,18 @@ def write_table(path: Path, table: Table) -> None:
     OutputError
         When the ending is not known, the format cannot hold the table, or the file cannot be
         written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import impc
+    >>> table = impc.make_table("simulated", {"t": [0, 0.01], "tilt": [0.5, 0.6]}, {"tilt": "deg"})
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder, "trial.mat")
+    ...     impc.write_table(path, table)
+    ...     impc.read_table(path).columns["tilt"].tolist()
+    [0.5, 0.6]
     """
     suffix = _suffix(path, OutputError)
     _write(path, _ENCODERS[suffix](table))

@@ -23,10 +23,9 @@ from impc.assess.judged import judge
 from impc.assess.printed_gain import gain_estimate
 from impc.assess.resampling import DRAWS, replicate
 from impc.checking import replace
-from impc.cli.plant import find_plant
 from impc.control.closed_loop import simulate
 from impc.errors import ImpcError
-from impc.files.plant_sources import make_plant, plant_family_of
+from impc.files.plant_sources import make_plant, plant_family_of, plant_source
 from impc.files.reading import read_recordings
 from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.problem import controller_for, scenarios
@@ -118,7 +117,7 @@ def replicate_unit(task: FitTask, fit: dict[str, Any], index: int) -> dict[str, 
 @functools.lru_cache(maxsize=4)
 def _problem(task: FitTask) -> tuple[Problem, FitSettings]:
     settings = fit_settings(task.configuration.fit)
-    source = find_plant(task.plant, task.arguments)
+    source = plant_source(task.plant, task.arguments)
     # A worker on another machine, or one that has run for days, may have other files and code.
     here = unit_digest(task.files, source.name, task.arguments, task.configuration)
     require_same_inputs(here, task.digest)

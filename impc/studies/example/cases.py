@@ -18,6 +18,7 @@ from impc.assess.identified_directions import Identifiability, identifiability
 from impc.control.closed_loop import Scenario, Simulation, require_complete, scenario, simulate
 from impc.control.controller import Controller
 from impc.inverse.direct_and_reduced import (
+    AUXILIARY_CONDITION_WEIGHT,
     CONDITION_WEIGHT,
     auxiliary_weights,
     inverse_mpc,
@@ -30,7 +31,7 @@ from impc.inverse.problem import Problem, misfit
 from impc.model.bounds import Bounds
 from impc.model.recordings import Recording
 from impc.model.riccati import solve_lqr
-from impc.model.weights import Weights, normalised, residual
+from impc.model.weights import Weights, normalised, weight_error
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -41,6 +42,8 @@ __all__ = [
     "BOUND",
     "CASES",
     "HORIZON",
+    "LOST",
+    "SETTINGS",
     "STEPS",
     "CaseResult",
     "MethodResult",
@@ -58,6 +61,20 @@ HORIZON = 3
 STEPS = 20
 #: Largest magnitude of the input.
 BOUND = 1.0
+#: The numbers of the example, as its page and result.json name them.
+SETTINGS: dict[str, float] = {
+    "horizon": HORIZON,
+    "steps": STEPS,
+    "input_bound": BOUND,
+    "condition_weight": CONDITION_WEIGHT,
+    "auxiliary_condition_weight": AUXILIARY_CONDITION_WEIGHT,
+}
+#: What the page of the example says of the dissertation's own plant.
+LOST = (
+    "The dissertation's own plant (3.8), initial state and input bound are lost. "
+    "This plant stands in for them: it shows everything that the dissertation says of its own, "
+    "but its numbers are not the dissertation's."
+)
 
 
 @dataclass(frozen=True)
@@ -257,7 +274,7 @@ class _Runner:
                 state_misfit=None if run is None else misfit(self.problem, [run]),
                 max_abs_u=largest,
                 bound_kept=None if largest is None else largest <= BOUND * (1 + 1e-9),
-                residual=None if weights is None else residual(weights, self.truth),
+                residual=None if weights is None else weight_error(weights, self.truth),
                 seconds=self.seconds,
                 simulations=simulations,
                 feasible=feasible,

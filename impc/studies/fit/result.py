@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from impc.assess.intent_rules import Intent
     from impc.assess.judged import MethodFit
     from impc.assess.printed_gain import GainEstimate
-    from impc.assess.vaf import TrialAgreement
+    from impc.assess.variance_accounted_for import TrialAgreement
     from impc.inverse.noisy_fit import FittedController
     from impc.inverse.problem import Problem
     from impc.studies.fit.settings import FitSettings
