@@ -64,6 +64,8 @@ if TYPE_CHECKING:
     from impc.studies.fit.subject import fit_problem as fit_problem
     from impc.studies.fit.subject import fit_recordings as fit_recordings
 
+    __version__: str
+
 _NAMES = {
     "assess.identified_directions": "Identifiability identifiability",
     "assess.variance_accounted_for": "vaf whiteness",
@@ -98,17 +100,18 @@ _MODULES = {name: module for module, names in _NAMES.items() for name in names.s
 __all__ = sorted(_MODULES)  # noqa: PLE0605 - a list of the names of the table above
 
 
-def __getattr__(name: str) -> object:
-    """Load a public name from its module, once (PEP 562)."""
-    if name == "__version__":
-        found: object = import_module("importlib.metadata").version("impc")
-    elif name in _MODULES:
-        found = getattr(import_module(f"impc.{_MODULES[name]}"), name)
-    else:
-        raise AttributeError(f"module 'impc' has no attribute {name!r}")
-    globals()[name] = found
-    return found
+if not TYPE_CHECKING:  # a type checker that sees it takes any name for one of ours
 
+    def __getattr__(name: str) -> object:
+        """Load a public name from its module, once (PEP 562)."""
+        if name == "__version__":
+            found = import_module("importlib.metadata").version("impc")
+        elif name in _MODULES:
+            found = getattr(import_module(f"impc.{_MODULES[name]}"), name)
+        else:
+            raise AttributeError(f"module 'impc' has no attribute {name!r}")
+        globals()[name] = found
+        return found
 
-def __dir__() -> list[str]:
-    return [*__all__, "__version__"]
+    def __dir__() -> list[str]:
+        return [*__all__, "__version__"]

@@ -277,7 +277,7 @@ def calls() -> list[Call]:
         (agreement.saturated_share, {"u": v["simulation"].u, "u_min": -size, "u_max": size}),
         (plant_source.plant_source, {"name": "plants:yalmip_example", "arguments": {}}),
         (plant_source.make_plant, {"source": v["source"], "recorded": ["d"]}),
-        (plant_family.plant_family, {"make": len, "names": ["mass"], "nominal": [1.0]}),
+        (plant_family.PlantFamily, {"make": len, "names": ["mass"], "nominal": [1.0]}),
         (plant_family.plant_at, {"family": v["family"], "logarithms": np.zeros(1)}),
         (units.si_unit, {"written": "deg"}),
         changed(v["plant"]),
