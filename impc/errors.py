@@ -167,8 +167,7 @@ class OutputError(ImpcError):
     Examples
     --------
     >>> import impc
-    >>> from pathlib import Path
-    >>> impc.write_table(Path("trial.docx"), impc.make_table("simulated", {"angle": [0.1, 0.2]}))
+    >>> impc.write_table("trial.docx", impc.make_table("simulated", {"angle": [0.1, 0.2]}))
     Traceback (most recent call last):
         ...
     impc.errors.OutputError: trial.docx: has the ending '.docx', and not .csv, ...

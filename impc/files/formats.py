@@ -68,12 +68,12 @@ _SIGNATURES = {
 }
 
 
-def read_table(path: Path, largest: int = LARGEST) -> Table:
+def read_table(path: Path | str, largest: int = LARGEST) -> Table:
     r"""Read the columns of a recording.
 
     Parameters
     ----------
-    path : Path
+    path : Path or str
         With one of the endings in `FORMATS`.
     largest : int
         Bytes above which a file is refused before it is read.
@@ -96,7 +96,7 @@ def read_table(path: Path, largest: int = LARGEST) -> Table:
     >>> {name: column.tolist() for name, column in found.columns.items()}
     {'t': [0.0, 0.01], 'tilt': [0.5, 0.6]}
     """
-    source = str(path)
+    source, path = str(path), Path(path)
     suffix = _suffix(path, DataError)
     head, form = _head(path, largest), FORMATS[suffix]
     _require(source, form.begins(head), suffix, head)
@@ -112,7 +112,7 @@ def read_table(path: Path, largest: int = LARGEST) -> Table:
         raise damaged(source, error) from None
 
 
-def write_table(path: Path, table: Table) -> None:
+def write_table(path: Path | str, table: Table) -> None:
     """Write a table in the format of the `path`, whole or not at all; .mat is written as v5.
 
     Raises
@@ -124,15 +124,14 @@ def write_table(path: Path, table: Table) -> None:
     Examples
     --------
     >>> import tempfile
-    >>> from pathlib import Path
     >>> import impc
     >>> table = impc.make_table("simulated", {"t": [0, 0.01], "tilt": [0.5, 0.6]}, {"tilt": "deg"})
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     path = Path(folder, "trial.mat")
-    ...     impc.write_table(path, table)
-    ...     impc.read_table(path).columns["tilt"].tolist()
+    ...     impc.write_table(f"{folder}/trial.mat", table)
+    ...     impc.read_table(f"{folder}/trial.mat").columns["tilt"].tolist()
     [0.5, 0.6]
     """
+    path = Path(path)
     suffix = _suffix(path, OutputError)
     _write(path, FORMATS[suffix].encode(table))
 
