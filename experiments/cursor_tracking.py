@@ -35,7 +35,8 @@ from impc.assess.input_limits import with_limit
 from impc.assess.variance_accounted_for import centred_vaf
 from impc.checking import replace
 from impc.control.closed_loop import simulate
-from impc.inverse.noisy_fit import FittedController, fit_controller
+from impc.inverse.estimate import Estimate
+from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.problem import Problem, controller_for, scenarios
 from impc.inverse.residuals import misfit_or_reason
 from impc.inverse.solution_set import gain_fibre
@@ -165,8 +166,9 @@ def resampled(condition: Condition, count: int, seed: int = 0) -> tuple[list[flo
         drawn = rng.integers(len(problem.recordings), size=len(problem.recordings))
         trials = tuple(problem.recordings[trial] for trial in drawn)
         fitted = fit_controller(replace(problem, recordings=trials))
-        prices.append(float(fitted.weights.Q[0, 0] / fitted.weights.R[0, 0]))
-        gains.append(float(fitted.solution.K[0, 0]))
+        weights = fitted.stage_weights
+        prices.append(float(weights.Q[0, 0] / weights.R[0, 0]))
+        gains.append(float(fitted.gain[0, 0]))
     return prices, gains
 
 
@@ -181,10 +183,9 @@ def fit_condition(
         _vaf(condition.response[k], _cursor(fitted, problem, condition, k)) for k in range(count)
     ]
     outside = [left_out_vaf(condition, index) for index in range(count)]
-    solution = fitted.solution
-    covariance = gain_covariance(fitted.problem, np.array(solution.K), np.array(solution.S))
+    covariance = gain_covariance(fitted.problem, np.array(fitted.gain), np.array(fitted.metric))
     plant = fitted.problem.plant
-    found = weights_set(gain_fibre(plant, solution.K), _RATIO)
+    found = weights_set(gain_fibre(plant, fitted.gain), _RATIO)
     of_error = np.zeros((plant.n + 1, plant.n + 1))
     of_error[0, 0] = 1.0
     price = linear_range(found, of_error)
@@ -203,7 +204,7 @@ def fit_condition(
         [item[0] for item in outside],
         [item[1] for item in outside],
         [_ceiling(condition, index) for index in range(count)],
-        solution.K[0, :2].tolist(),
+        fitted.gain[0, :2].tolist(),
         int(np.count_nonzero(np.array(covariance.deviations) < 1)),
         float(found.least.weights.Q[0, 0]),
         price.low,
@@ -224,14 +225,14 @@ def _ceiling(condition: Condition, index: int) -> float:
     return _vaf(condition.response[index], follow(condition.target[index], response))
 
 
-def _limit(fitted: FittedController) -> str:
+def _limit(fitted: Estimate) -> str:
     """What a bound on the command would change, everything else held.
 
     From the largest command of the fit downwards: the least bound that costs less than 1 % of the
     misfit, and whether any bound lowers it by as much.
     """
     known = replace(fitted.problem, family=None, logarithms=frozen([]))
-    K, S = np.array(fitted.solution.K), np.array(fitted.solution.S)
+    K, S = np.array(fitted.gain), np.array(fitted.metric)
     controller = controller_for(known, K, S)
     peak = max(float(np.max(np.abs(simulate(controller, d).u))) for d in scenarios(known))
     free, _ = misfit_or_reason(known, K, S)
@@ -246,18 +247,18 @@ def _limit(fitted: FittedController) -> str:
     return f"peak {peak:.0f}; {told}; bounds above {least:.0f} fit as well"
 
 
-def _parameters(fitted: FittedController) -> tuple[float, float]:
+def _parameters(fitted: Estimate) -> tuple[float, float]:
     family = fitted.problem.family
     assert family is not None
     delay, lag = family.nominal * np.exp(fitted.problem.logarithms)
     return float(delay), float(lag)
 
 
-def _cursor(fitted: FittedController, problem: Problem, condition: Condition, index: int) -> Array:
+def _cursor(fitted: Estimate, problem: Problem, condition: Condition, index: int) -> Array:
     """Cursor of one trial, simulated from its target."""
     one = replace(fitted.problem, recordings=(problem.recordings[index],))
     known = replace(one, family=None, logarithms=frozen([]))
-    controller = controller_for(known, np.array(fitted.solution.K), np.array(fitted.solution.S))
+    controller = controller_for(known, np.array(fitted.gain), np.array(fitted.metric))
     run = simulate(controller, scenarios(known)[0])
     return np.asarray(run.x[:, 0] + condition.target[index])
 

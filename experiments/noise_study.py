@@ -26,7 +26,7 @@ from experiments.benchmarks.workloads import seat
 from impc.assess.variance_accounted_for import vaf
 from impc.checking import replace
 from impc.control.closed_loop import simulate
-from impc.inverse.methods import METHODS, estimate_all
+from impc.inverse.methods import METHODS, NaturalUnits, estimate_all
 from impc.inverse.problem import controller_for
 from impc.inverse.solution_set import natural_coordinates
 from impc.model.recordings import Recording
@@ -42,8 +42,7 @@ from impc.reporting.style import (
     render,
 )
 from impc.reporting.writer import write_files
-from impc.studies.compare.subject import bounds_of_method
-from impc.studies.fit.sentences import METHOD_LABELS
+from impc.studies.compare.subject import COMPARED
 from impc.studies.fit.settings import FitSettings
 from impc.studies.fit.subject import fit_problem
 
@@ -52,7 +51,7 @@ if TYPE_CHECKING:
 
     from impc.arrays import Array
     from impc.control.closed_loop import Scenario
-    from impc.inverse.methods import Estimate
+    from impc.inverse.estimate import Estimate
     from impc.inverse.problem import Problem
 
 __all__ = ["Cell", "Outcome", "study_cell"]
@@ -68,7 +67,7 @@ _MARKS = {
     "inverse_lqr_lmi": (BLUE, "x", "--"),
     "inverse_kkt": (GREEN, "v", "-."),
     "inverse_mpc_reduced": (VERMILLION, "P", "-"),
-    "inverse_mpc_direct": (VERMILLION, "o", "-"),
+    "inverse_mpc": (VERMILLION, "o", "-"),
 }
 
 
@@ -122,20 +121,20 @@ def study_cell(cell: Cell) -> dict[str, Outcome]:
     truth = np.array(work.controller.K)
     judged = replace(work.problem, recordings=(unseen,))
     return {
-        name: _judge(name, estimate, judged, work.drives[1], truth)
-        for name, estimate in estimate_all(problem).items()
+        name: _judge(estimate, judged, work.drives[1], truth)
+        for name, estimate in estimate_all(NaturalUnits(problem), COMPARED).items()
     }
 
 
-def _judge(
-    name: str, estimate: Estimate, unseen: Problem, drive: Scenario, truth: Array
-) -> Outcome:
-    if estimate.K is None or estimate.S is None:
+def _judge(estimate: Estimate, unseen: Problem, drive: Scenario, truth: Array) -> Outcome:
+    if estimate.K is None:
         return Outcome(None, None, False, estimate.seconds, estimate.reason)
     K, plant = np.array(estimate.K), unseen.plant
     T, _ = natural_coordinates(plant, truth)
     error = float(np.linalg.norm((K - truth) @ T) / np.linalg.norm(truth @ T))
-    run = simulate(controller_for(bounds_of_method(unseen, name), K, np.array(estimate.S)), drive)
+    run = simulate(
+        controller_for(METHODS[estimate.method].sees(unseen), K, np.array(estimate.S)), drive
+    )
     share = None
     if run.complete:
         share = float(np.mean(vaf(unseen.recordings[0].outputs, run.x @ plant.C.T)))
@@ -191,13 +190,13 @@ def _table(found: dict[str, dict[str, Outcome]], seeds: int) -> str:
             f"\nlimit {limit:g} Nm: VAF % of an unseen trial without noise (error of the gain)",
             f"{'noise leaves':<38}" + "".join(f"{ceiling:>15.2f} %" for ceiling in _CEILINGS),
         ]
-        for name in METHODS:
+        for name in COMPARED:
             cells = []
             for ceiling in _CEILINGS:
                 share, error, count = _median(found, limit, ceiling, seeds, name)
                 text = f"{share:.2f} ({error:.2g})" if count else "none"
                 cells.append(f"{text:>17}")
-            lines.append(f"{METHOD_LABELS[name]:<38}{''.join(cells)}")
+            lines.append(f"{METHODS[name].label:<38}{''.join(cells)}")
     return "\n".join(lines)
 
 
@@ -206,7 +205,7 @@ def _figure(found: dict[str, dict[str, Outcome]], seeds: int) -> Figure:
     axes = figure.subplots(1, len(_LIMITS), sharey=True)
     noise = [100 - ceiling for ceiling in _CEILINGS]
     for position, (ax, limit) in enumerate(zip(axes, _LIMITS, strict=True)):
-        for name in METHODS:
+        for name in COMPARED:
             color, marker, line = _MARKS[name]
             missed = [100 - _median(found, limit, ceiling, seeds, name)[0] for ceiling in _CEILINGS]
             ax.loglog(
@@ -216,7 +215,7 @@ def _figure(found: dict[str, dict[str, Outcome]], seeds: int) -> Figure:
                 marker=marker,
                 linestyle=line,
                 markerfacecolor="white",
-                label=METHOD_LABELS[name],
+                label=METHODS[name].label,
             )
         ax.set_title(f"({'ABC'[position]}) limit {limit:g} Nm", loc="left")
         ax.set_xlabel("noise (% of the variance)")

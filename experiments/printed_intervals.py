@@ -37,7 +37,7 @@ from impc.studies.fit.subject import fit_problem
 
 if TYPE_CHECKING:
     from impc.arrays import Array
-    from impc.inverse.noisy_fit import FittedController
+    from impc.inverse.estimate import Estimate
 
 __all__ = [
     "Scores",
@@ -161,7 +161,7 @@ def random_recording(seed: int, inputs: int, vaf: float) -> tuple[Controller, Re
     return truth, with_noise(truth, push, noise, vaf, 0.0)
 
 
-def fit(controller: Controller, trial: Recording) -> FittedController:
+def fit(controller: Controller, trial: Recording) -> Estimate:
     """Fit a recording as `impc fit` does, under the true limit."""
     settings = FitSettings(horizon=controller.horizon, u_max=list(controller.bounds.u_max))
     return fit_controller(fit_problem(controller.plant, [trial], settings))

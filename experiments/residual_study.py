@@ -28,7 +28,8 @@ import plants
 from impc.arrays import Array
 from impc.assess.diagnostics import ResidualDiagnostics, residual_diagnostics
 from impc.control.controller import Controller
-from impc.inverse.noisy_fit import FittedController, fit_controller
+from impc.inverse.estimate import Estimate
+from impc.inverse.noisy_fit import fit_controller
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.recordings import Recording
@@ -62,7 +63,7 @@ SUBJECTS = {
 }
 
 
-def fitted_subject(kind: Kind, seed: int, order: int, horizon: int) -> FittedController:
+def fitted_subject(kind: Kind, seed: int, order: int, horizon: int) -> Estimate:
     """Simulate and fit a subject; `order` is that of the delay's approximant."""
     plant = Plant(plants.seated_balance_for(sample_time=0.01, delay_order=order), ["command"])
     weights = _weights(plant)
@@ -85,8 +86,7 @@ def fitted_subject(kind: Kind, seed: int, order: int, horizon: int) -> FittedCon
 def diagnosed(seed: int, name: str, order: int = 5, horizon: int = 20) -> ResidualDiagnostics:
     """Both tests on one subject."""
     fitted = fitted_subject(SUBJECTS[name], seed, order, horizon)
-    solution = fitted.solution
-    return residual_diagnostics(fitted.problem, np.array(solution.K), np.array(solution.S))
+    return residual_diagnostics(fitted.problem, np.array(fitted.gain), np.array(fitted.metric))
 
 
 def _weights(plant: Plant) -> Weights:

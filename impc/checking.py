@@ -32,7 +32,7 @@ from impc.arrays import Frozen, as_numbers, require_finite, with_shape
 from impc.errors import DataError, InputError, brief
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Hashable, Mapping
+    from collections.abc import Callable, Container, Hashable, Mapping
 
     Kind = Callable[[str, Any], Any]
     Rule = str | float | tuple[float, float]
@@ -120,12 +120,20 @@ class Value(Frozen):
         """Take the fields, all of them, and check them."""
         for name, value in fields.items():
             object.__setattr__(self, name, value)
-        Value.__post_init__(self)
+        self._check(fields)
 
     def __post_init__(self) -> None:
+        self._check({field.name for field in dataclasses.fields(self)})  # type: ignore[arg-type]
+
+    def _check(self, changed: Container[str]) -> None:
+        """Check the changed fields, the others having been checked when they were given."""
         sizes: dict[str, int] = {}
         for name, kind in _field_kinds(cast("Hashable", type(self))):
             value = getattr(self, name)
+            if name not in changed:
+                _require_sizes(name, value, sizes)
+                _take_sizes(value, self._rules.get(name), sizes)
+                continue
             found = kind(name, value)
             _require_sizes(name, found, sizes)
             rule = self._rules.get(name)
@@ -155,12 +163,14 @@ def replace(value: _V, **changes: Any) -> _V:
     """
     if not isinstance(value, Value):
         return dataclasses.replace(value, **changes)  # type: ignore[type-var]
-    fields = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}  # type: ignore[arg-type]
+    fields = vars(value)
     unknown = sorted(changes.keys() - fields.keys())
     if unknown:
         raise TypeError(f"{type(value).__name__} has no field {', '.join(unknown)}")
     made = object.__new__(type(value))
-    made._fill(**fields | changes)
+    for name, given in (fields | changes).items():
+        object.__setattr__(made, name, given)
+    made._check(changes)
     return made
 
 
@@ -190,6 +200,13 @@ def _sizes_of(value: Any) -> dict[str, int]:
                 pairs = zip(rule.lstrip("~").split(), shape.shape, strict=False)
                 sizes |= {symbol: size for symbol, size in pairs if symbol in _SIZES}
     return sizes
+
+
+def _take_sizes(value: Any, rule: Rule | None, sizes: dict[str, int]) -> None:
+    if isinstance(rule, str) and isinstance(value, np.ndarray):
+        for symbol, size in zip(rule.lstrip("~").split(), value.shape, strict=True):
+            if symbol in _SIZES:
+                sizes.setdefault(symbol, size)
 
 
 def _ruled(name: str, value: Any, rule: Rule, sizes: dict[str, int]) -> Any:
@@ -355,7 +372,7 @@ _VALUES = {
     "MpcSolver": ("impc.control.casadi_controller", "make it with build_mpc"),
     "FitSettings": ("impc.studies.fit.settings", "make it with FitSettings"),
     "FitProgress": ("impc.studies.fit.subject", "make it with FitProgress, or leave it out"),
-    "FittedController": ("impc.inverse.noisy_fit", "make it with fit_controller"),
+    "Estimate": ("impc.inverse.estimate", "make it with estimate(problem)"),
     "Rows": ("impc.control.constraint_rows", "make it with build_rows"),
 }
 _MADE_BY = {kind: remedy for kind, (_, remedy) in _VALUES.items()}

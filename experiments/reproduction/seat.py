@@ -88,7 +88,7 @@ def _subject(fit: dict[str, Any], truth: dict[str, Any]) -> list[Entry]:
         Entry(
             "(3.19)",
             "Parameters estimated beside the gains: inertias, lengths, delay, muscle constant.",
-            ("impc.assess.delayed_feedback:preliminary_gain", "impc.model.plant_family"),
+            ("impc.inverse.delayed_feedback:preliminary_gain", "impc.model.plant_family"),
             "Any parameter of a plant function may be freed ([fit] free); in this fit none is.",
             Verdict.LOST,
             "The estimates are lost.",
@@ -96,7 +96,7 @@ def _subject(fit: dict[str, Any], truth: dict[str, Any]) -> list[Entry]:
         Entry(
             "(3.20)",
             "K = [K4, 0]: feedback of angles and rates only, estimated first.",
-            ("impc.assess.delayed_feedback:preliminary_gain",),
+            ("impc.inverse.delayed_feedback:preliminary_gain",),
             "[fit] feedback_states does it. It stabilises the seat; with a delay of 80 ms the"
             " gains of the other six states are not zero for any weights we know of.",
             Verdict.IN_KIND,
@@ -109,7 +109,7 @@ def _subject(fit: dict[str, Any], truth: dict[str, Any]) -> list[Entry]:
                 "impc.inverse.direct_and_reduced:auxiliary_weights",
                 "impc.inverse.inverse_lqr:inverse_lqr_gradient",
             ),
-            f"From the unbounded estimate: VAF {_both(fit, 'inverse_lqr_gain')} % where that"
+            f"From the unbounded estimate: VAF {_both(fit, 'inverse_lqr')} % where that"
             f" estimate itself has {_both(fit, 'feedback_gain')} %.",
             Verdict.LOST,
             "The numbers are lost.",

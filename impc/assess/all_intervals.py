@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from impc.assess.printed_gain import GainEstimate
     from impc.assess.resampling import Replicate
     from impc.assess.weights_ranges import WeightsSummary
-    from impc.inverse.noisy_fit import FittedController
+    from impc.inverse.estimate import Estimate
     from impc.inverse.problem import Problem
     from impc.model.weights import Weights
 
@@ -106,7 +106,7 @@ def count_stages(problem: Problem, settings: Asked) -> int:
 
 def assess(
     problem: Problem,
-    fitted: FittedController,
+    fitted: Estimate,
     estimate: GainEstimate,
     weights: tuple[WeightsSummary | None, str],
     settings: Asked,
@@ -119,7 +119,7 @@ def assess(
     ----------
     problem : Problem
         As it was posed.
-    fitted : FittedController
+    fitted : Estimate
         Its fit.
     estimate : GainEstimate
         Of `gain_estimate`.
@@ -153,7 +153,7 @@ def assess(
     alternatives: tuple[Alternative, ...] = ()
     if settings.horizons:
         alternatives = fit_alternatives(problem, fitted, settings.horizons, settings.settle, done)
-    intervals += _bootstrap(fitted.weights, estimate, settings, done, remember)
+    intervals += _bootstrap(fitted.stage_weights, estimate, settings, done, remember)
     return Certainty(tuple(intervals), *weights, tuple(limits), alternatives)
 
 

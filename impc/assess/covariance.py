@@ -10,7 +10,9 @@ the middle as `residual_noise` estimates it from the residuals. With white noise
 Cramér-Rao bound.
 
 Beside the gain everything else that was fitted is unknown: initial states, physical parameters
-and, for several inputs, the metric S. The prior of a search (`fit_gain`) is left out: the result
+and, for several inputs, the metric S. Gain and metric move within the pairs that weights have
+(`consistent_pairs`): a step of the gain takes the metric along, and what is left for the metric
+alone is m - 1 numbers. The prior of a search (`fit_gain`) is left out: the result
 says what the recordings determine, and in a direction that they hardly do it is wide.
 
 To first order a direction that is not told has no part in those that are; to second order it has,
@@ -19,6 +21,7 @@ and it may be wrong by as much as a gain can be. `curvature` adds that (docs/fit
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -26,14 +29,17 @@ import numpy as np
 
 from impc.arrays import Array, BoolArray, Frozen, frozen
 from impc.assess.long_run_covariance import ResidualNoise, residual_noise, spread_of_sum
+from impc.inverse.consistent_pairs import metric_changes, scaled_changes
 from impc.inverse.residuals import evaluate, misfit_or_reason, residual_only
 from impc.inverse.solution_set import natural_coordinates
+from impc.inverse.trial_span import trial_span
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from impc.inverse.problem import Problem
     from impc.inverse.residuals import Evaluation
+    from impc.inverse.trial_span import TrialSpan
 
 __all__ = ["DETERMINED", "FOREIGN", "TOLD", "GainCovariance", "gain_covariance"]
 
@@ -137,16 +143,17 @@ def gain_covariance(
     found = evaluate(problem, gain, metric)
     in_units = np.kron(G, np.linalg.inv(T).T)
     on_gain = found.dK.reshape(-1, m * n) @ in_units
-    nuisance = _nuisance(problem, found)
+    with_gain, alone = metric_changes(problem.plant, gain, metric, T, G)
+    on_metric = found.dS.reshape(len(on_gain), -1)
+    on_gain = on_gain + _seen(on_metric, metric, with_gain)
+    metric_columns = _told_metric(_seen(on_metric, metric, alone))
     # What the rest can explain is taken out of the gain's columns; the gain's
     # block of the inverse of H is that of what is left.
-    left = _orthogonal(nuisance)
-    seen = on_gain - left @ (left.T @ on_gain)
+    rest = _span(problem, found, metric_columns, found.dparameters)
+    seen = rest.without(on_gain)
     _, values, directions = np.linalg.svd(seen, full_matrices=False)
     usable = values > DETERMINED * values[0]
-    colour = noise(
-        _by_trial(problem, found.residual), left.shape[1] + int(np.count_nonzero(usable))
-    )
+    colour = noise(_by_trial(problem, found.residual), rest.rank + int(np.count_nonzero(usable)))
     along = seen @ directions[usable].T / values[usable] ** 2
     spread = spread_of_sum(colour, _by_trial(problem, along))
     deviations = np.full(m * n, np.inf)
@@ -154,8 +161,10 @@ def gain_covariance(
     if curvature:
         told = np.flatnonzero(deviations < TOLD)
         reach = np.minimum(deviations, 1.0)[:, None] * directions
-        steps = (reach[deviations >= TOLD] @ in_units.T).reshape(-1, m, n)
-        shifts = _shifts(problem, gain, metric, steps) @ along[:, told]
+        untold = reach[deviations >= TOLD]
+        steps = (untold @ in_units.T).reshape(-1, m, n)
+        metrics = np.tensordot(untold, with_gain, 1)
+        shifts = _shifts(problem, gain, metric, steps, metrics) @ along[:, told]
         spread[np.ix_(told, told)] += shifts.T @ shifts / 2
         deviations[usable] = np.sqrt(np.maximum(np.diag(spread), 0.0))
     entries, foreign = _entries(in_units @ directions.T, deviations, spread)
@@ -167,23 +176,31 @@ def gain_covariance(
         frozen(deviations),
         frozen(entries.reshape(m, n)),
         frozen(foreign.reshape(m, n)),
-        frozen(_parameter_deviations(problem, on_gain, nuisance, colour)),
+        frozen(_parameter_deviations(problem, found, [on_gain, metric_columns], colour)),
         colour,
     )
 
 
-def _shifts(problem: Problem, gain: Array, metric: Array, steps: Array) -> Array:
-    """What steps of the gain (k, m, n), forth and back, do to the residual: (2 k, r).
+def _seen(on_metric: Array, metric: Array, changes: Array) -> Array:
+    """Derivative (r, k) of the residual along changes (k, m, m) of a metric (m, m)."""
+    scaled = scaled_changes(metric, changes)
+    return np.asarray(on_metric @ scaled.reshape(len(scaled), -1).T)
+
+
+def _shifts(problem: Problem, gain: Array, metric: Array, steps: Array, metrics: Array) -> Array:
+    """What steps of gain (k, m, n) and metric (k, m, m), forth and back, do to the residual.
+
+    (2 k, r), one row a step and sign.
 
     A step that cannot be simulated is halved, and what it does scaled by the square: the first
     order of a step that is not told has no part in those that are.
     """
     here, shifts = residual_only(problem, gain, metric), []
-    for step in (sign * step for step in steps for sign in (1.0, -1.0)):
+    for index, sign in itertools.product(range(len(steps)), (1.0, -1.0)):
         for share in _STEPS:
-            there = gain + share * step
-            if not misfit_or_reason(problem, there, metric)[1]:
-                shifts.append((residual_only(problem, there, metric) - here) / share**2)
+            there = gain + sign * share * steps[index], metric + sign * share * metrics[index]
+            if not misfit_or_reason(problem, *there)[1]:
+                shifts.append((residual_only(problem, *there) - here) / share**2)
                 break
     return np.array(shifts).reshape(-1, len(here))
 
@@ -215,40 +232,28 @@ def _by_trial(problem: Problem, rows: Array) -> list[Array]:
     return parts
 
 
-def _nuisance(problem: Problem, found: Evaluation) -> Array:
-    """Columns of what S is told, of initial states, trial by trial, then of parameters."""
-    metric, sizes, _ = np.linalg.svd(found.dS.reshape(len(found.residual), -1), full_matrices=False)
+def _told_metric(alone: Array) -> Array:
+    """Columns of what is told of S `alone` (r, k)."""
+    metric, sizes, _ = np.linalg.svd(alone, full_matrices=False)
     # Rounding leaves 1e-15 where S is not told: its scale, and inputs that are never at a bound.
-    columns, row = [metric[:, sizes > _ROUNDING * np.max(sizes)]], 0
-    for trial in problem.recordings:
-        mine = slice(row, row + trial.outputs.size)
-        row = mine.stop
-        block = np.zeros_like(found.dx0)
-        block[mine] = found.dx0[mine]
-        columns.append(block)
-    return np.hstack([*columns, found.dparameters])
+    return np.asarray(metric[:, sizes > _ROUNDING * np.max(sizes)])
 
 
-def _orthogonal(columns: Array) -> Array:
-    """Orthonormal basis of what the columns reach, to 1e-10 of the largest in each one's scale."""
-    size = np.linalg.norm(columns, axis=0)
-    scaled = columns[:, size > 0] / size[size > 0]
-    if scaled.shape[1] == 0:
-        return np.zeros((len(columns), 0))
-    left, values, _ = np.linalg.svd(scaled, full_matrices=False)
-    return np.asarray(left[:, values > _ROUNDING * values[0]])
+def _span(problem: Problem, found: Evaluation, *shared: Array) -> TrialSpan:
+    """What initial states and the columns `shared` can explain."""
+    sizes = [trial.outputs.size for trial in problem.recordings]
+    return trial_span(found.dx0, sizes, np.hstack(shared))
 
 
 def _parameter_deviations(
-    problem: Problem, on_gain: Array, nuisance: Array, colour: ResidualNoise
+    problem: Problem, found: Evaluation, others: list[Array], colour: ResidualNoise
 ) -> Array:
     """Standard deviations of the logarithms, everything else being fitted too."""
     count = len(problem.logarithms)
     if count == 0:
         return np.zeros(0)
-    own = nuisance[:, -count:]
-    left = _orthogonal(np.hstack([on_gain, nuisance[:, :-count]]))
-    seen = own - left @ (left.T @ own)
+    own = found.dparameters
+    seen = _span(problem, found, *others).without(own)
     _, values, directions = np.linalg.svd(seen, full_matrices=False)
     if values[-1] <= DETERMINED * np.linalg.norm(own, 2):
         return np.full(count, np.inf)

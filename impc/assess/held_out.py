@@ -16,8 +16,9 @@ from impc.inverse.problem import controller_for, scenarios
 from impc.inverse.solution_set import natural_coordinates
 
 if TYPE_CHECKING:
-    from impc.inverse.noisy_fit import FittedController
+    from impc.inverse.estimate import Estimate
     from impc.inverse.problem import Problem
+    from impc.model.recordings import Recording
 
 __all__ = ["HeldOut", "left_out_vaf", "predict"]
 
@@ -42,55 +43,48 @@ class HeldOut(Frozen):
 
 
 def predict(
-    problem: Problem,
-    controller: FittedController,
-    fitted: FittedController,
-    index: int,
-    settle: float,
+    problem: Problem, other: Estimate, fitted: Estimate, index: int, settle: float
 ) -> HeldOut:
-    """Simulate a trial that the controller has not seen.
+    """Simulate a trial that a controller has not seen.
 
     Parameters
     ----------
     problem : Problem
         With all trials.
-    controller, fitted : FittedController
-        Fitted to the others, and to all.
+    other, fitted : Estimate
+        Of the other trials, and of all.
     index : int
         Of the trial.
     settle : float
         Seconds that serve to find where it starts, and do not count.
     """
-    K, S = np.array(controller.solution.K), np.array(controller.solution.S)
-    alone = replace(controller.problem, recordings=(problem.recordings[index],))
-    each = left_out_vaf(alone, K, S, settle)
-    full = np.array(fitted.solution.K)
-    T, _ = natural_coordinates(fitted.problem.plant, full)
-    change = float(np.linalg.norm((K - full) @ T) / np.linalg.norm(full @ T))
-    return HeldOut(each[0], each[1], change)
+    each = left_out_vaf(other, problem.recordings[index], settle)
+    T, _ = natural_coordinates(fitted.problem.plant, np.array(fitted.gain))
+    change = np.linalg.norm((other.gain - fitted.gain) @ T) / np.linalg.norm(fitted.gain @ T)
+    return HeldOut(each[0], each[1], float(change))
 
 
-def left_out_vaf(alone: Problem, gain: Array, metric: Array, settle: float) -> tuple[Array, Array]:
-    """VAF of the one trial of a problem under a gain found without it.
+def left_out_vaf(other: Estimate, trial: Recording, settle: float) -> tuple[Array, Array]:
+    """VAF of a trial under the controller that was found without it.
 
     Parameters
     ----------
-    alone : Problem
-        With that trial only.
-    gain, metric : Array
-        K (m, n) and S (m, m).
+    other : Estimate
+        Of the other trials.
+    trial : Recording
     settle : float
         Time at the start that does not count, s; an unknown initial state is fitted to it.
 
     Returns
     -------
     vaf, centred : Array
-        `agreement.vaf` and `agreement.centred_vaf`, % (p,); NaN when the loop ends early.
+        `vaf` and `centred_vaf`, % (p,); NaN when the loop ends early.
     """
-    trial = alone.recordings[0]
+    gain, metric = np.array(other.gain), np.array(other.metric)
+    alone = replace(other.problem.known(), recordings=(trial,))
     first = round(settle / alone.plant.dt)
     started = alone
-    if alone.unknown_start:
+    if other.problem.unknown_start:
         started = with_fitted_starts(alone, gain, metric, max(first, alone.plant.n))
     run = simulate(controller_for(started, gain, metric), scenarios(started)[0])
     recorded, simulated = trial.outputs[first:], (run.x @ started.plant.C.T)[first:]

@@ -35,8 +35,8 @@ from impc.model.bounds import Bounds, bound_rows
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from impc.inverse.estimate import Estimate
     from impc.inverse.gain_search import GainFit
-    from impc.inverse.noisy_fit import FittedController
     from impc.inverse.problem import Problem
 
 __all__ = ["LimitEstimate", "input_limit", "with_limit"]
@@ -100,14 +100,12 @@ def with_limit(problem: Problem, limit: float, control: int = 0) -> Problem:
     return replace(problem, bounds=changed)
 
 
-def input_limit(
-    fitted: FittedController, control: int = 0, *, level: float = 0.95
-) -> LimitEstimate:
+def input_limit(fitted: Estimate, control: int = 0, *, level: float = 0.95) -> LimitEstimate:
     """Fit the symmetric limit of one input; the others keep theirs.
 
     Parameters
     ----------
-    fitted : FittedController
+    fitted : Estimate
         From any limit, or none: its gain is where the searches start.
     control : int
         Index of the input.
@@ -161,7 +159,7 @@ def input_limit(
     )
 
 
-def _searched(fitted: FittedController, control: int) -> tuple[_Search, GainFit]:
+def _searched(fitted: Estimate, control: int) -> tuple[_Search, GainFit]:
     """The best limit, and the search that found it.
 
     The first round goes over a grid below the largest command that the best regulator without a
@@ -184,7 +182,7 @@ def _searched(fitted: FittedController, control: int) -> tuple[_Search, GainFit]
 class _Search:
     """Fits at limits, remembered: each starts from the nearest one before it."""
 
-    def __init__(self, fitted: FittedController, control: int) -> None:
+    def __init__(self, fitted: Estimate, control: int) -> None:
         self.fitted, self.control = fitted, control
         self.samples = sum(trial.outputs.size for trial in fitted.problem.recordings)
         self.tried: dict[float, GainFit | None] = {}
@@ -225,11 +223,10 @@ class _Search:
         """From the nearest fit that holds, or from the given one."""
         known = [(key, fit) for key, fit in self.tried.items() if fit is not None]
         near = sorted(known, key=lambda item: abs(min(item[0], 1e9) - min(limit, 1e9)))
-        solution = self.fitted.solution
-        starts = [(np.array(fit.K), fit.problem) for _, fit in near[:1]]
-        starts.append((np.array(solution.K), self.fitted.problem))
-        metric = np.array(solution.S)
-        for K, problem in starts:
+        starts = [(np.array(fit.K), np.array(fit.S), fit.problem) for _, fit in near[:1]]
+        own = np.array(self.fitted.gain), np.array(self.fitted.metric)
+        starts.append((*own, self.fitted.problem))
+        for K, metric, problem in starts:
             try:
                 return refine_gain(
                     with_limit(problem, limit, self.control),
@@ -243,9 +240,9 @@ class _Search:
         return None
 
 
-def _typical_peak(fitted: FittedController, control: int) -> float:
+def _typical_peak(fitted: Estimate, control: int) -> float:
     """What the command of the weights' regulator exceeds at one sample in two hundred."""
-    K, S = np.array(fitted.solution.K), np.array(fitted.solution.S)
+    K, S = np.array(fitted.gain), np.array(fitted.metric)
     controller = controller_for(fitted.problem, K, S)
     runs = [simulate(controller, drive) for drive in scenarios(fitted.problem)]
     command = np.concatenate([np.abs(run.u[:, control]) for run in runs])

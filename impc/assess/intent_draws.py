@@ -54,6 +54,8 @@ DRAWS = 39
 _DECADE = np.log(10.0)
 # Steps of the sampler between two draws that are used.
 _STEPS = 6
+# Share of P that the last doubling may add: the next would add its square.
+_ENOUGH = 1e-9
 # Natural units of the gain: an exact recording is no sharper than rounding and search leave it.
 _SHARPEST = 1e-6
 
@@ -124,16 +126,15 @@ def drawn_gains(
     wrong = covariance.along(centre.K - gain) / deviations
     mean = -spread * values * (left.T @ wrong)[: len(values)]
 
-    def solution(a: Array) -> LqrSolution:
+    def weights_at(a: Array) -> tuple[Array, Array]:
         step = np.tensordot((mean + a) * spread, basis, 1)
         X = factor @ scipy.linalg.expm(step) @ factor.T
-        return solve_lqr(plant, Weights(X[:n, :n], X[n:, n:]))
+        return X[:n, :n], X[n:, n:]
 
     def excess(a: Array) -> float:
         """Logarithm of the density over that of the linearised posterior, in which a ~ N(0, I)."""
-        try:
-            K = solution(a).K
-        except (WeightsError, SolverError):
+        K = _gain(plant, *weights_at(a))
+        if K is None:
             return -np.inf
         off, far = covariance.along(K - gain) / deviations, (mean + a) * spread / _DECADE
         return float(a @ a - off @ off - far @ far) / 2
@@ -143,7 +144,7 @@ def drawn_gains(
     for _ in range(count):
         for _ in range(_STEPS):
             a = _slice(a, excess, rng)
-        drawn.append(solution(a))
+        drawn.append(solve_lqr(plant, Weights(*weights_at(a))))
     return tuple(drawn)
 
 
@@ -247,6 +248,26 @@ def _holds(item: Statement, found: WeightsSet | None, sizes: Array) -> bool:
         return linear_maximum(found, sign * direction).value < 0
     except SolverError:
         return False
+
+
+def _gain(plant: Plant, Q: Array, R: Array) -> Array | None:
+    """K (m, n) to eight digits, by doubling (Chu et al. 2004); None where it does not converge.
+
+    The sampler asks for three thousand gains, in a fifth of the time of `solve_lqr`; those that it
+    returns are solved for to the last digit.
+    """
+    A, G, P = plant.A, plant.B @ np.linalg.solve(R, plant.B.T), Q
+    for _ in range(60):
+        right = np.linalg.solve(np.eye(plant.n) + G @ P, np.hstack([A, G]))
+        more = A.T @ P @ right[:, : plant.n]
+        A, G, P = A @ right[:, : plant.n], G + A @ right[:, plant.n :] @ A.T, P + more
+        size = float(np.max(np.abs(P)))
+        if not np.isfinite(size):
+            return None
+        if np.max(np.abs(more)) <= _ENOUGH * size:
+            S = R + plant.B.T @ P @ plant.B
+            return np.asarray(np.linalg.solve(S, plant.B.T @ P @ plant.A))
+    return None
 
 
 def _slice(a: Array, excess: Callable[[Array], float], rng: np.random.Generator) -> Array:

@@ -13,14 +13,14 @@ import numpy as np
 from impc.arrays import Array, Frozen, frozen
 from impc.assess.variance_accounted_for import vaf
 from impc.control.closed_loop import Simulation, simulate
-from impc.inverse.problem import controller_for, scenarios
+from impc.inverse.problem import scenarios
 
 if TYPE_CHECKING:
+    from impc.inverse.estimate import Estimate
     from impc.inverse.problem import Problem
     from impc.model.bounds import Bounds
-    from impc.model.weights import Weights
 
-__all__ = ["MethodFit", "judge", "without_gain"]
+__all__ = ["MethodFit", "judge"]
 
 
 @dataclass(frozen=True)
@@ -29,11 +29,8 @@ class MethodFit(Frozen):
 
     Attributes
     ----------
-    name : str
-        Of the method.
-    K : Array or None
-        (m, n); None when the method ended without one.
-    weights : Weights or None
+    estimate : Estimate
+        What it found.
     runs : tuple of Simulation
         One a trial; empty without a gain.
     vaf : Array
@@ -46,100 +43,73 @@ class MethodFit(Frozen):
         Share of the samples at which an input bound is exceeded, by more than 1e-6 of it.
     fell : tuple of float or None
         For each trial the time in s at which the loop left every reasonable range.
-    seconds : float
-        Time that the method took, s.
-    reason : str
-        Why there is no gain; empty otherwise.
     """
 
-    name: str
-    K: Array | None
-    weights: Weights | None
+    estimate: Estimate
     runs: tuple[Simulation, ...]
     vaf: Array
     trial_vaf: Array
     largest_input: Array
     exceeded: float
     fell: tuple[float | None, ...]
-    seconds: float
-    reason: str
+
+    @property
+    def name(self) -> str:
+        """Of the method."""
+        return self.estimate.method
 
     @property
     def keeps_bounds(self) -> bool:
         """Whether there is a gain and it never exceeds an input bound."""
-        return self.K is not None and self.exceeded == 0
+        return self.estimate.K is not None and self.exceeded == 0
 
 
-def judge(
-    name: str,
-    problem: Problem,
-    bounds: Bounds,
-    gain: Array,
-    metric: Array,
-    *,
-    weights: Weights | None,
-    seconds: float,
-    reason: str = "",
-) -> MethodFit:
-    """Simulate all recordings of a problem with a gain.
+def judge(estimate: Estimate, bounds: Bounds) -> MethodFit:
+    """Simulate all recordings with what a method found.
 
     Parameters
     ----------
-    name : str
-        Of the method.
-    problem : Problem
-        At the initial states to simulate from; its bounds are those that the controller knows.
+    estimate : Estimate
+        Its problem has the bounds that its controller knows.
     bounds : Bounds
         Those of the subject, which it may exceed.
-    gain, metric : Array
-        (m, n), (m, m).
-    weights, seconds, reason
-        Kept in the result; the time in s.
 
     Raises
     ------
     InputError, SolverError
         As `controller_for`.
     """
-    controller = controller_for(problem, gain, metric)
+    problem = estimate.problem
+    if estimate.K is None:
+        return _without_gain(estimate)
+    controller = estimate.controller()
     runs = tuple(simulate(controller, drive) for drive in scenarios(problem))
     commands = np.concatenate([run.u for run in runs])
     beyond = (commands > bounds.u_max + 1e-6 * np.abs(bounds.u_max)) | (
         commands < bounds.u_min - 1e-6 * np.abs(bounds.u_min)
     )
     return MethodFit(
-        name,
-        frozen(gain),
-        weights,
+        estimate,
         runs,
         frozen(_pooled_vaf(problem, runs)),
         frozen([_trial_vaf(problem, index, run) for index, run in enumerate(runs)]),
         frozen(np.max(np.abs(commands), axis=0)),
         float(np.mean(np.any(beyond, axis=1))),
         tuple(None if run.complete else run.reached * problem.plant.dt for run in runs),
-        seconds,
-        reason,
     )
 
 
-def without_gain(name: str, problem: Problem, seconds: float, reason: str) -> MethodFit:
-    """What is left to say of the method `name` that ended without a gain.
-
-    Its `reason` and the time in s, `seconds`, are kept.
-    """
-    p, m, count = len(problem.plant.outputs), problem.plant.m, len(problem.recordings)
+def _without_gain(estimate: Estimate) -> MethodFit:
+    plant, count = estimate.problem.plant, len(estimate.problem.recordings)
+    p = len(plant.outputs)
     return MethodFit(
-        name,
-        None,
-        None,
+        estimate,
         (),
         frozen(np.full(p, np.nan)),
         frozen(np.full((count, p), np.nan)),
-        frozen(np.full(m, np.nan)),
+        frozen(np.full(plant.m, np.nan)),
         0.0,
         (None,) * count,
-        seconds,
-        reason,
     )
 
 

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from impc.arrays import Array
-    from impc.inverse.noisy_fit import FittedController
+    from impc.inverse.estimate import Estimate
     from impc.inverse.problem import Problem
 
 __all__ = ["Alternative", "fit_alternatives", "verdict"]
@@ -66,7 +66,7 @@ class Alternative:
 
 def fit_alternatives(
     problem: Problem,
-    fitted: FittedController,
+    fitted: Estimate,
     horizons: Sequence[int],
     settle: float,
     progress: Callable[[str], None] = lambda _: None,
@@ -77,7 +77,7 @@ def fit_alternatives(
     ----------
     problem : Problem
         As it was posed.
-    fitted : FittedController
+    fitted : Estimate
         Its fit, from whose weights the others start.
     horizons : sequence of int
         In samples; that of the problem is passed over.
@@ -120,9 +120,7 @@ def verdict(one: Alternative, other: Alternative) -> str:
     )
 
 
-def _fit(
-    name: str, problem: Problem, fitted: FittedController, settle: float, roots: Array
-) -> Alternative:
+def _fit(name: str, problem: Problem, fitted: Estimate, settle: float, roots: Array) -> Alternative:
     try:
         found = fitted if name == "as fitted" else fit_controller(problem, fitted.weights)
         held = [_left_out(problem, found, index, settle) for index in range(_trials(problem))]
@@ -138,15 +136,13 @@ def _trials(problem: Problem) -> int:
     return count if count > 1 else 0
 
 
-def _left_out(problem: Problem, found: FittedController, index: int, settle: float) -> Array:
-    others = problem.recordings[:index] + problem.recordings[index + 1 :]
-    fit = fit_controller(replace(problem, recordings=others), found.weights)
-    alone = replace(fit.problem, recordings=(problem.recordings[index],))
-    return left_out_vaf(alone, np.array(fit.solution.K), np.array(fit.solution.S), settle)[0]
+def _left_out(problem: Problem, found: Estimate, index: int, settle: float) -> Array:
+    fit = fit_controller(problem.leaving_out(index), found.weights)
+    return left_out_vaf(fit, problem.recordings[index], settle)[0]
 
 
-def _residuals(found: FittedController, problem: Problem) -> list[Array]:
-    flat = residual_only(problem, found.solution.K, found.solution.S)
+def _residuals(found: Estimate, problem: Problem) -> list[Array]:
+    flat = residual_only(problem, found.gain, found.metric)
     ends = np.cumsum([trial.outputs.size for trial in problem.recordings])[:-1]
     parts = np.split(flat, ends)
     return [

@@ -26,10 +26,12 @@ import scipy.optimize
 from impc.arrays import Array, frozen
 from impc.assess.covariance import GainCovariance, gain_covariance
 from impc.assess.long_run_covariance import white_noise
+from impc.inverse.arrow import Tolerances
 from impc.inverse.coordinates import Coordinates
+from impc.inverse.many_trials import has_many_trials, search_many
 
 if TYPE_CHECKING:
-    from impc.inverse.noisy_fit import FittedController
+    from impc.inverse.estimate import Estimate
     from impc.inverse.problem import Problem
 
 __all__ = ["GainEstimate", "gain_estimate"]
@@ -38,6 +40,8 @@ __all__ = ["GainEstimate", "gain_estimate"]
 _ROUNDS = 4
 _SETTLED = 1e-4
 _EVALUATIONS = 40
+# Steps that move the gain by less than this along what is not told leave it there.
+_SAME = 1e-10
 
 
 @dataclass(frozen=True)
@@ -76,12 +80,12 @@ class GainEstimate:
         return np.asarray(family.nominal * np.exp(self.problem.logarithms))
 
 
-def gain_estimate(fitted: FittedController) -> GainEstimate:
+def gain_estimate(fitted: Estimate) -> GainEstimate:
     """Estimate the gain behind a fit, and how far it is determined.
 
     Parameters
     ----------
-    fitted : FittedController
+    fitted : Estimate
         The search begins at the gain of its weights.
 
     Raises
@@ -89,9 +93,9 @@ def gain_estimate(fitted: FittedController) -> GainEstimate:
     SolverError
         When the residual at that gain is not finite.
     """
-    K, S = np.array(fitted.solution.K), np.array(fitted.solution.S)
+    K, S = np.array(fitted.gain), np.array(fitted.metric)
     here = _Found(fitted.problem, K, S, fitted.misfit, gain_covariance(fitted.problem, K, S))
-    for _ in range(0 if fitted.exact else _ROUNDS):
+    for _ in range(0 if fitted.explained else _ROUNDS):
         before, here = here, _round(here)
         same = np.count_nonzero(here.linear.told) == np.count_nonzero(before.linear.told)
         if same and here.misfit > (1 - _SETTLED) * before.misfit:
@@ -125,13 +129,31 @@ def _round(here: _Found) -> _Found:
     an interval, and some of it nothing determines.
     """
     space = Coordinates(here.problem, here.K, here.S)
-    told = here.linear.directions[here.linear.told]
-    rest = int(space.ends[-1] - space.ends[0])
-    # The search has the same natural coordinates as the directions: both are those of this gain.
-    along = scipy.linalg.block_diag(told.T, np.eye(rest))
     samples = sum(trial.outputs.size for trial in here.problem.recordings)
     noise = float(np.linalg.norm(space.at(space.start).residual)) / np.sqrt(samples)
-    prior = np.hstack([np.zeros((rest, len(told))), noise * np.eye(rest)])
+    z = _least_squares(space, here.linear, noise)
+    there = space.unpack(z)
+    misfit = float(np.linalg.norm(space.at(z).residual))
+    covariance = gain_covariance(there.problem, there.K, there.S)
+    return _Found(there.problem, there.K, there.S, misfit, covariance)
+
+
+def _least_squares(space: Coordinates, linear: GainCovariance, noise: float) -> Array:
+    """Where the search ends that moves the gain along the told directions only.
+
+    The search has the same natural coordinates as the directions: both are those of this gain.
+    """
+    if has_many_trials(space) and space.m == 1:  # one input: no other coordinate moves the gain
+        told = linear.directions[linear.told]
+        beside = int(space.ends[1] - space.ends[0] + space.ends[3] - space.ends[2])
+        shared = scipy.linalg.block_diag(told.T, np.eye(beside))
+        weights = np.concatenate([np.zeros(len(told)), np.full(beside, noise)]), noise
+        ends = Tolerances(1e-8, 1e-12, 1e-15, _EVALUATIONS)
+        return search_many(space, space.start, shared, weights, ends)[0]
+    changes, _ = space.changes(space.unpack(space.start), space.start)
+    moves = space.natural(changes).reshape(len(changes), -1).T
+    along = scipy.linalg.null_space(linear.directions[~linear.told] @ moves, _SAME)
+    prior = noise * along[space.ends[0] :]
 
     def residual(step: Array) -> Array:
         return np.concatenate([space.at(space.start + along @ step).residual, prior @ step])
@@ -141,16 +163,11 @@ def _round(here: _Found) -> _Found:
 
     found = scipy.optimize.least_squares(
         residual,
-        np.zeros(len(told) + rest),
+        np.zeros(along.shape[1]),
         jac=derivative,
         ftol=1e-8,
         xtol=1e-12,
         gtol=1e-15,
         max_nfev=_EVALUATIONS,
     )
-    z = space.start + along @ found.x
-    there = space.unpack(z)
-    problem = here.problem.at(there.starts, there.logarithms)
-    misfit = float(np.linalg.norm(space.at(z).residual))
-    covariance = gain_covariance(problem, there.K, there.S)
-    return _Found(problem, there.K, there.S, misfit, covariance)
+    return np.asarray(space.start + along @ found.x)

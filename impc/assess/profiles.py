@@ -11,8 +11,10 @@ need not be symmetric and is not fooled by curvature. It ends nowhere if the mis
 recordings do not determine the number. The input limit has a module of its own, `unknown_limit`.
 docs/fitting.md says how often the interval covers the truth.
 
-All of these numbers are affine in the coordinates z of the search (`Coordinates`), c + a'z,
-parameters in their logarithm; the search with a'z held goes on in the null space of a'.
+A parameter's logarithm is affine in the coordinates z of the search (`Coordinates`), an entry of K
+in those of the gain while the metric stands. With a' the number's derivative at the start, the
+search goes on in the null space of a', and each point is brought back to the number along one
+direction.
 """
 
 from __future__ import annotations
@@ -99,8 +101,15 @@ class _Search:
     def __init__(self, estimate: GainEstimate, name: str) -> None:
         problem = estimate.problem
         self.space = Coordinates(problem, np.array(estimate.K), np.array(estimate.S))
-        self.direction, self.number = _functional(estimate, self.space, name)
-        self.null = scipy.linalg.null_space(self.direction[None])
+        self.held, self.number = _functional(estimate, self.space, name)
+        _, direction = self.held(self.space.start)
+        self.null = scipy.linalg.null_space(direction[None])
+        # Along the gain, or the parameter, alone: there the number is affine.
+        own = (
+            slice(0, self.space.ends[0]) if np.any(direction[: self.space.ends[0]]) else slice(None)
+        )
+        self.unit = np.zeros_like(direction)
+        self.unit[own] = direction[own] / float(direction[own] @ direction[own])
         self.samples = sum(trial.outputs.size for trial in problem.recordings)
         misfit = float(np.linalg.norm(self.space.at(self.space.start).residual))
         self.noise = max(misfit, 1e-12) / np.sqrt(self.samples)
@@ -117,21 +126,29 @@ class _Search:
                 start = self.null.T @ (self.tried[near][1] - self.space.start)
             else:
                 start = np.zeros(self.null.shape[1])
-            unit = self.direction / float(self.direction @ self.direction)
-            base = self.space.start + offset * unit
 
             def residual(w: Array) -> Array:
-                return self.target.residual(base + self.null @ w)
+                return self.target.residual(self._at(offset, w)[0])
 
             def derivative(w: Array) -> Array:
-                return np.asarray(self.target.derivative(base + self.null @ w) @ self.null)
+                z, along = self._at(offset, w)
+                return np.asarray(self.target.derivative(z) @ along)
 
             found = scipy.optimize.least_squares(
                 residual, start, jac=derivative, ftol=1e-8, max_nfev=40
             )
-            z = base + self.null @ found.x
+            z, _ = self._at(offset, found.x)
             self.tried[offset] = (float(np.sum(self.space.at(z).residual ** 2)), z)
         return self.tried[offset][0]
+
+    def _at(self, offset: float, w: Array) -> tuple[Array, Array]:
+        """The point with the number at the offset, and its derivative with respect to w."""
+        z = self.space.start + offset * self.unit + self.null @ w
+        value, slope = self.held(z)
+        here = float(slope @ self.unit)
+        z = z + (offset - value) / here * self.unit
+        _, slope = self.held(z)
+        return z, self.null - np.outer(self.unit, slope @ self.null) / float(slope @ self.unit)
 
     def best_offset(self) -> float:
         return min(self.tried, key=lambda offset: self.tried[offset][0])
@@ -185,22 +202,31 @@ class _Search:
 
 def _functional(
     estimate: GainEstimate, space: Coordinates, name: str
-) -> tuple[Array, Callable[[float], float]]:
-    """Row a of the number in z, and the number at an offset of a'z."""
+) -> tuple[Callable[[Array], tuple[float, Array]], Callable[[float], float]]:
+    """The offset of the number at z with its derivative, and the number at an offset."""
     entries = entry_names(estimate.problem.plant)
-    row = np.zeros(int(space.ends[-1]))
     if name in entries:
-        index = entries.index(name)
-        control, state = divmod(index, space.n)
-        row[: space.ends[0]] = np.kron(space.G[control], np.linalg.inv(space.T)[:, state])
+        control, state = divmod(entries.index(name), space.n)
         value = float(estimate.K[control, state])
-        return row, lambda offset: value + offset
+
+        def entry(z: Array) -> tuple[float, Array]:
+            here = space.unpack(z)
+            return float(here.K[control, state]) - value, space.changes(here, z)[0][
+                :, control, state
+            ]
+
+        return entry, lambda offset: value + offset
     family = estimate.problem.family
     if family is not None and name in family.names:
         index = family.names.index(name)
+        row = np.zeros(int(space.ends[-1]))
         row[int(space.ends[2]) + index] = PARAMETER_UNIT
         value = float(estimate.parameters[index])
-        return row, lambda offset: float(value * np.exp(offset)) if offset < 700 else np.inf
+
+        def parameter(z: Array) -> tuple[float, Array]:
+            return float(row @ (z - space.start)), row
+
+        return parameter, lambda offset: float(value * np.exp(offset)) if offset < 700 else np.inf
     known = [*entries, *(family.names if family is not None else ())]
     raise InputError(f"profile of {name}", "there is no such number", f"known: {', '.join(known)}")
 

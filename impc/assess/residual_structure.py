@@ -22,6 +22,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.arrays import Array
+from impc.checking import replace
+from impc.inverse.trial_span import trial_span
 
 if TYPE_CHECKING:
     from impc.inverse.problem import Problem
@@ -36,6 +38,8 @@ _LEVEL = 0.05
 # 20 % (12 and 8 subjects, docs/fitting.md).
 _LEAST_SHARE = 0.03
 _SHIFTS, _LAGS = 199, 8
+# Recorded numbers that are looked at: 100 000 take 0.5 GB.
+_MOST = 100_000
 # Residuals are not shifted by less than this share of a trial: nearby shifts keep a tie.
 _LEAST_SHIFT = 0.1
 # Of the fit's own rounding: below it there is nothing to test.
@@ -87,6 +91,7 @@ def residual_structure(
     ResidualStructure or None
         None when the fit leaves nothing but rounding or trials are too short.
     """
+    problem, found = _thinned(problem, found)
     p = len(problem.plant.outputs)
     lengths = [trial.samples for trial in problem.recordings]
     residual = found.residual.reshape(-1, p)
@@ -95,15 +100,17 @@ def residual_structure(
     if found.reason or min(lengths) < 20 * _LAGS or np.any(size <= _EXACT * np.std(recorded)):
         return None
     weights = np.tile(1 / size, len(residual))
-    basis = _orthonormal(_fitted(problem, found) * weights[:, None])
+    fitted = np.hstack([found.dK.reshape(len(weights), -1), found.dparameters])
+    sizes = [trial.outputs.size for trial in problem.recordings]
+    basis = trial_span(found.dx0 * weights[:, None], sizes, fitted * weights[:, None])
     told = np.ravel(residual / size)
     shifted = _shifted(residual / size, lengths, np.random.default_rng(seed))
     simulated = residual + recorded
     span = _settling(problem, gain)
     results = []
     for columns in (_linear(problem), _nonlinear(simulated / np.std(simulated, axis=0))):
-        rows = np.kron(_delayed(columns, lengths, span), np.eye(p))
-        seen = _orthonormal(rows - basis @ (basis.T @ rows))
+        rows: Array = np.kron(_delayed(columns, lengths, span), np.eye(p)).astype(np.float64)
+        seen = _orthonormal(basis.without(rows))
         share = float(np.sum((seen.T @ told) ** 2) / (told @ told))
         null = np.sum((seen.T @ shifted) ** 2, axis=0) / np.sum(shifted**2, axis=0)
         probability = (1 + int(np.count_nonzero(null >= share))) / (1 + _SHIFTS)
@@ -125,16 +132,22 @@ def _nonlinear(outputs: Array) -> Array:
     return np.column_stack([*pairs, *triples])
 
 
-def _fitted(problem: Problem, found: Evaluation) -> Array:
-    """Derivatives with respect to all that was fitted, initial states trial by trial."""
-    rows = len(found.residual)
-    columns, row = [found.dK.reshape(rows, -1), found.dparameters], 0
-    for trial in problem.recordings:
-        block = np.zeros_like(found.dx0)
-        block[row : row + trial.outputs.size] = found.dx0[row : row + trial.outputs.size]
-        row += trial.outputs.size
-        columns.append(block)
-    return np.hstack(columns)
+def _thinned(problem: Problem, found: Evaluation) -> tuple[Problem, Evaluation]:
+    """Every k-th trial of many, so that arrays of 199 shifts and of 112 delayed columns are small.
+
+    Nothing is lost that matters: of so many samples any part above `_LEAST_SHARE` is found.
+    """
+    sizes = [trial.outputs.size for trial in problem.recordings]
+    every = -(-sum(sizes) // _MOST)
+    if every == 1:
+        return problem, found
+    chosen = np.arange(len(sizes)) % every == 0
+    rows = np.repeat(chosen, sizes)
+    trials = tuple(itertools.compress(problem.recordings, chosen))
+    parts = {
+        name: getattr(found, name)[rows] for name in ("residual", "dK", "dS", "dx0", "dparameters")
+    }
+    return replace(problem, recordings=trials), replace(found, **parts)
 
 
 def _settling(problem: Problem, gain: Array) -> int:

@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from impc.checking import replace
 from impc.cli.exit_status import ExitStatus
-from impc.cli.options import code_options, out_option, scheduler_options
+from impc.cli.options import code_options, out_option, scheduler_options, yes_option
 from impc.cli.plant import named_plant
 
 if TYPE_CHECKING:
@@ -31,6 +31,7 @@ __all__ = ["command"]
 @code_options("plant")
 @out_option("cohort", "results, tables and report; the same folder again goes on")
 @scheduler_options
+@yes_option
 @click.pass_context
 def command(
     context: click.Context,
@@ -39,6 +40,7 @@ def command(
     allowed: bool,
     out: Path,
     cluster: Cluster,
+    yes: bool,
 ) -> None:
     """Fit every subject, visit and condition of a study, with bootstrap replicates.
 
@@ -63,7 +65,7 @@ def command(
     store = Store(out, {name: task.digest for name, task in tasks.items()})
     for unit, reason in unreadable.items():
         store.keep_failure(unit, None, reason)
-    failures = _run(study, tasks, store, cluster)
+    failures = _run(study, tasks, store, cluster, yes)
     failures.units |= unreadable
     write_report(study, store, failures, f"impc cohort {study_file.name}")
     for line in failures.lines:
@@ -74,9 +76,13 @@ def command(
         context.exit(ExitStatus.PARTIAL)
 
 
-def _run(study: Study, tasks: dict[str, FitTask], store: Store, cluster: Cluster) -> Failures:
+def _run(
+    study: Study, tasks: dict[str, FitTask], store: Store, cluster: Cluster, yes: bool
+) -> Failures:
     """Do what is left, with a bar, and a message about what is kept when it is interrupted."""
+    from impc.cli.consent import require_consent  # noqa: PLC0415
     from impc.studies.cohort.cluster import connected  # noqa: PLC0415
+    from impc.studies.cohort.effort import study_effort  # noqa: PLC0415
     from impc.studies.cohort.engine import Progress, run_study, work_left  # noqa: PLC0415
 
     done, total = work_left(study, store)
@@ -99,6 +105,13 @@ def _run(study: Study, tasks: dict[str, FitTask], store: Store, cluster: Cluster
 
         try:
             with connected(cluster) as workers:
+                if done < total:
+                    one, units = study_effort(tasks)
+                    left = units * (total - done) / total
+                    effort = one.shared(left, workers.threads)
+                    if cluster.scheduler:  # memory is not this machine's
+                        effort = replace(effort, gigabytes=0.0)
+                    require_consent(effort, yes)
                 failures = run_study(study, tasks, store, workers, Progress(told, log))
         except KeyboardInterrupt:
             finished, _ = work_left(study, store)

@@ -17,7 +17,7 @@ from impc.cli.plant import KNOWN
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from impc.inverse.methods import Estimate
+    from impc.inverse.estimate import Estimate
 
 __all__ = ["command"]
 

@@ -10,13 +10,19 @@ import click
 if TYPE_CHECKING:
     from impc.studies.effort import Effort
 
-__all__ = ["require_consent"]
+__all__ = ["FEWER", "FEWER_STARTS", "require_consent"]
 
 # What is begun without a question: two hours, and what a machine of 8 GB has to spare.
 _SECONDS, _GIGABYTES = 7200.0, 4.0
 
 
-def require_consent(effort: Effort, given: bool) -> None:
+#: What to do about a large request of a fit.
+FEWER = "lower horizon, replicates or profiles in [fit], or shorten the trials"
+#: What to do about one of a selection of parameters.
+FEWER_STARTS = "lower replicates or starts in [select], or shorten the trials"
+
+
+def require_consent(effort: Effort, given: bool, lower: str = FEWER) -> None:
     """Ask before a large request is begun, unless consent is `given` by --yes.
 
     Parameters
@@ -25,6 +31,8 @@ def require_consent(effort: Effort, given: bool) -> None:
         What the request would take.
     given : bool
         Whether --yes is.
+    lower : str
+        What would make it smaller.
 
     Raises
     ------
@@ -35,7 +43,6 @@ def require_consent(effort: Effort, given: bool) -> None:
 
     from impc.errors import InputError  # noqa: PLC0415
 
-    lower = "lower horizon, replicates or profiles in [fit], or shorten the trials"
     needs = f"would need {effort.gigabytes:.3g} GB of memory"
     if effort.gigabytes > psutil.virtual_memory().total / 1e9:
         raise InputError("this request", f"{needs}, more than this machine has", lower)

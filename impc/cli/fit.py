@@ -73,7 +73,7 @@ def command(files: tuple[Path, ...], plant_name: str, config: Path, out: Path, y
 
         try:
             result = fit_recordings(
-                problem, settings, FitProgress(done, memory.controller, memory.replicate)
+                problem, settings, FitProgress(done, memory.estimate, memory.replicate)
             )
         except KeyboardInterrupt:
             raise KeyboardInterrupt(memory.kept()) from None

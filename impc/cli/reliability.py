@@ -9,13 +9,17 @@ from typing import TYPE_CHECKING
 import click
 from tqdm import tqdm
 
+from impc.checking import replace
 from impc.cli.options import code_options, out_option
 from impc.cli.output import print_files
 from impc.cli.plant import named_plant
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from impc.files.configuration import Configuration
     from impc.files.plant_sources import PlantSource
-    from impc.studies.cohort.study import Study
+    from impc.studies.cohort.study import Unit
     from impc.studies.reliability.analysis import Trials
 
 __all__ = ["command"]
@@ -36,6 +40,7 @@ def command(study_file: Path, plant_name: str | None, allowed: bool, out: Path, 
 
     The study file is that of `impc cohort`.
     """
+    from impc.files.inputs import study_inputs  # noqa: PLC0415
     from impc.reporting.writer import write_files  # noqa: PLC0415
     from impc.studies.cohort.study import read_study  # noqa: PLC0415
     from impc.studies.reliability.analysis import analyse  # noqa: PLC0415
@@ -43,10 +48,13 @@ def command(study_file: Path, plant_name: str | None, allowed: bool, out: Path, 
     from impc.studies.reliability.report import reliability_files  # noqa: PLC0415
 
     study = read_study(study_file)
-    trials = _trials(study, named_plant(study_file, study, plant_name, allowed), last)
+    source = named_plant(study_file, study, plant_name, allowed)
+    units = [replace(unit, files=unit.files[-last:]) for unit in study.units]
+    trials = _trials(units, study.configuration, source)
+    inputs = study_inputs(units, study_file, "plant", source.name, source.arguments)
     result = analyse(trials)
-    files = reliability_files(trials, result, f"impc reliability {study_file.name} --last {last}")
-    written = write_files(out, files)
+    line = f"impc reliability {study_file.name} --plant {source.name} --last {last}"
+    written = write_files(out, reliability_files(trials, result, line, inputs))
     for item in findings(result):
         click.echo(f"{'found' if item.found else 'not found'}: {item.statement} ({item.numbers})")
     for line in result.notes:
@@ -54,15 +62,15 @@ def command(study_file: Path, plant_name: str | None, allowed: bool, out: Path, 
     print_files(out, written)
 
 
-def _trials(study: Study, source: PlantSource, last: int) -> Trials:
+def _trials(units: Sequence[Unit], configuration: Configuration, source: PlantSource) -> Trials:
     from impc.files.plant_sources import make_plant  # noqa: PLC0415
     from impc.files.reading import read_recordings  # noqa: PLC0415
     from impc.studies.reliability.analysis import Trials  # noqa: PLC0415
 
     cells = {}
-    recorded = tuple(study.configuration.signals)
+    recorded = tuple(configuration.signals)
     plant = make_plant(source, recorded)
-    for unit in tqdm(study.units, unit="visit", file=sys.stderr, disable=None, leave=False):
-        found = read_recordings(unit.files[-last:], study.configuration, plant)
+    for unit in tqdm(units, unit="visit", file=sys.stderr, disable=None, leave=False):
+        found = read_recordings(unit.files, configuration, plant)
         cells[unit.subject, unit.visit, unit.condition] = found
     return Trials(tuple(plant.outputs), 1 / plant.dt, cells)

@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING, Any
 import click
 from tqdm import tqdm
 
-from impc.cli.options import code_options, out_option, scheduler_options
+from impc.cli.options import code_options, out_option, scheduler_options, yes_option
 from impc.cli.output import print_files
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from impc.files.inputs import Inputs
     from impc.files.sealed import Kept
     from impc.studies.cohort.cluster import Cluster
     from impc.studies.cohort.study import Study
@@ -31,27 +32,32 @@ __all__ = ["command", "kept_results", "read_model_study", "study_runner"]
 @code_options("model")
 @out_option("select", "report.html, result.json, tables and figure")
 @scheduler_options
+@yes_option
 def command(
-    study_file: Path, model_name: str | None, allowed: bool, out: Path, cluster: Cluster
+    study_file: Path, model_name: str | None, allowed: bool, out: Path, cluster: Cluster, yes: bool
 ) -> None:
     """Sensitive parameters of a simulation model (chapter 4), subject by subject and in common.
 
     [study] model names the model by import path, [model] its arguments, [select] the settings. It
     may be stopped at any time: the same command goes on from there.
     """
+    from impc.cli.consent import FEWER_STARTS, require_consent  # noqa: PLC0415
     from impc.reporting.writer import write_files  # noqa: PLC0415
     from impc.studies.selection.analysis import select_study  # noqa: PLC0415
+    from impc.studies.selection.effort import select_evaluations, selection_effort  # noqa: PLC0415
     from impc.studies.selection.report import selection_files  # noqa: PLC0415
     from impc.studies.selection.settings import select_settings  # noqa: PLC0415
 
-    study, source, recorded = read_model_study(study_file, model_name, allowed)
+    study, source, recorded, inputs = read_model_study(study_file, model_name, allowed)
     settings = select_settings(study.configuration.select)
     named = {" visit ".join(part for part in key if part): item for key, item in recorded.items()}
-    with study_runner(source, out, cluster, 2 * len(named) + 1) as run:
+    evaluations = select_evaluations(settings, len(named))
+    effort = selection_effort(source.model, named.values(), evaluations)
+    with study_runner(source, out, cluster, 2 * len(named) + 1) as (run, threads):
+        require_consent(effort.shared(len(named), threads), yes, FEWER_STARTS)
         found = select_study(named, settings, run)
-    written = write_files(
-        out, selection_files(source.model, found, f"impc select {study_file.name}")
-    )
+    line = f"impc select {study_file.name} --model {source.name}"
+    written = write_files(out, selection_files(source.model, found, line, inputs))
     kept_results(out).forget()
     names = source.model.names
     click.echo(f"information: {', '.join(names[index] for index in found.free)}")
@@ -67,8 +73,10 @@ def kept_results(out: Path) -> Kept:
 
 
 @contextmanager
-def study_runner(source: ModelSource, out: Path, cluster: Cluster, tasks: int) -> Iterator[Runner]:
-    """Workers with a progress bar; a message about what is kept when it is interrupted.
+def study_runner(
+    source: ModelSource, out: Path, cluster: Cluster, tasks: int
+) -> Iterator[tuple[Runner, int]]:
+    """Workers with a progress bar, and how many; a message of what is kept when interrupted.
 
     Parameters
     ----------
@@ -96,7 +104,7 @@ def study_runner(source: ModelSource, out: Path, cluster: Cluster, tasks: int) -
 
         try:
             with connected(cluster) as workers:
-                yield on_workers(workers, source, kept, done)
+                yield on_workers(workers, source, kept, done), workers.threads
         except KeyboardInterrupt:
             raise KeyboardInterrupt(
                 f"{bar.n} of {tasks} tasks are kept in {kept.folder}; the same command goes on"
@@ -105,8 +113,8 @@ def study_runner(source: ModelSource, out: Path, cluster: Cluster, tasks: int) -
 
 def read_model_study(
     path: Path, given: str | None, allowed: bool
-) -> tuple[Study, ModelSource, dict[tuple[str, str], tuple[Trial, ...]]]:
-    """The study at `path`, its model and all recordings.
+) -> tuple[Study, ModelSource, dict[tuple[str, str], tuple[Trial, ...]], Inputs]:
+    """The study at `path`, its model, all recordings, and the digests of these.
 
     Parameters
     ----------
@@ -122,6 +130,7 @@ def read_model_study(
     InputError, DataError
         When the file, the model or a recording cannot be used, or the model needs consent.
     """
+    from impc.files.inputs import study_inputs  # noqa: PLC0415
     from impc.files.plant_sources import import_function  # noqa: PLC0415
     from impc.files.user_code import consented_name, require_users_function  # noqa: PLC0415
     from impc.studies.cohort.study import read_study  # noqa: PLC0415
@@ -132,4 +141,5 @@ def read_model_study(
     require_users_function(where, import_function(name))
     arguments: dict[str, Any] = dict(study.configuration.model)
     source = model_source(name, arguments)
-    return study, source, read_trials(study, source)
+    recorded = read_trials(study, source)
+    return study, source, recorded, study_inputs(study.units, path, "model", name, arguments)

@@ -69,5 +69,5 @@ def read_subject(files: Sequence[Path], plant_name: str, config: Path) -> Subjec
     plant = make_plant(source, recorded)
     family = plant_family_of(source, recorded, settings.free)
     recordings = read_recordings(files, configuration, plant)
-    inputs = gather_inputs(files, config, source)
+    inputs = gather_inputs(files, config, source.name, source.arguments)
     return Subject(fit_problem(plant, recordings, settings, family), settings, source, inputs)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 from impc.files.digests import content_digest, digest, source_digest, versions
 
@@ -11,9 +11,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
-    from impc.files.plant_sources import PlantSource
 
-__all__ = ["Inputs", "gather_inputs"]
+__all__ = ["Inputs", "Recorded", "gather_inputs", "study_inputs"]
 
 
 @dataclass(frozen=True)
@@ -22,20 +21,23 @@ class Inputs:
 
     Attributes
     ----------
-    recordings : tuple of str
-        Of each file, in the order given.
+    recordings : tuple of str, or mapping of str to tuple of str
+        Of each file, in the order given; of a study, by the name of the unit.
     configuration : str
-        Of the configuration file.
-    plant : str
-        Of the plant's code or file, and its arguments.
+        Of the configuration or the study file.
+    code : str
+        Of the plant's or model's code or file, and its arguments.
     versions : str
         Of Python, of the packages that compute, and of this package's source.
+    kind : str
+        What the code is: "plant" or "model".
     """
 
-    recordings: tuple[str, ...]
+    recordings: tuple[str, ...] | Mapping[str, tuple[str, ...]]
     configuration: str
-    plant: str
+    code: str
     versions: str
+    kind: str = "plant"
 
     @property
     def digest(self) -> str:
@@ -45,15 +47,17 @@ class Inputs:
     def plain(self) -> Mapping[str, Any]:
         """As result.json has them."""
         return {
-            "recordings": list(self.recordings),
+            "recordings": self.recordings,
             "configuration": self.configuration,
-            "plant": self.plant,
+            self.kind: self.code,
             "versions": self.versions,
             "all": self.digest,
         }
 
 
-def gather_inputs(files: Sequence[Path], configuration: Path, source: PlantSource) -> Inputs:
+def gather_inputs(
+    files: Sequence[Path], configuration: Path, name: str, arguments: Mapping[str, Any]
+) -> Inputs:
     """Digests of recordings, configuration and plant as they are now.
 
     Parameters
@@ -62,7 +66,9 @@ def gather_inputs(files: Sequence[Path], configuration: Path, source: PlantSourc
         The recordings.
     configuration : Path
         Its file.
-    source : PlantSource
+    name : str
+        Import path, imported already, or file of the plant.
+    arguments : mapping
         Of the plant.
 
     Raises
@@ -70,9 +76,52 @@ def gather_inputs(files: Sequence[Path], configuration: Path, source: PlantSourc
     DataError
         When a file cannot be read.
     """
+    recordings = tuple(content_digest(path) for path in files)
     return Inputs(
-        tuple(content_digest(path) for path in files),
-        content_digest(configuration),
-        digest(source_digest(source.name, source.arguments), dict(source.arguments)),
-        digest(versions()),
+        recordings, content_digest(configuration), _code(name, arguments), digest(versions())
     )
+
+
+class Recorded(Protocol):
+    """What is read here of a unit of a study."""
+
+    @property
+    def name(self) -> str:
+        """Of the unit."""
+
+    @property
+    def files(self) -> Sequence[Path]:
+        """Its recordings."""
+
+
+def study_inputs(
+    units: Sequence[Recorded], study: Path, kind: str, name: str, arguments: Mapping[str, Any]
+) -> Inputs:
+    """Digests of the recordings of a study, of its file and of its plant or model as they are now.
+
+    Parameters
+    ----------
+    units : sequence of Recorded
+        With the recordings that are used.
+    study : Path
+        The study file.
+    kind : str
+        "plant" or "model".
+    name : str
+        Import path, imported already, or file.
+    arguments : mapping
+        Of the plant or model.
+
+    Raises
+    ------
+    DataError
+        When a file cannot be read.
+    """
+    recordings = {unit.name: tuple(content_digest(path) for path in unit.files) for unit in units}
+    return Inputs(
+        recordings, content_digest(study), _code(name, arguments), digest(versions()), kind
+    )
+
+
+def _code(name: str, arguments: Mapping[str, Any]) -> str:
+    return digest(source_digest(name, arguments), dict(arguments))

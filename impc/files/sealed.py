@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from impc.errors import InputError, OutputError
-from impc.files.writing import write_whole
+from impc.files.writing import require_ordinary, write_whole
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -55,6 +55,7 @@ class Kept:
         """
         path = self.path(name)
         try:
+            require_ordinary(path)
             found = _unsealed(path.read_bytes())
         except FileNotFoundError:
             return None
@@ -92,7 +93,11 @@ class Kept:
     def recall_all(self, digest: str) -> dict[str, Any]:
         """All that runs with that `digest` kept, name -> content, oldest first."""
         found = {}
-        files = [path for path in self.folder.rglob("*.json") if os.access(path, os.R_OK)]
+        files = [
+            path
+            for path in self.folder.rglob("*.json")
+            if path.is_file() and os.access(path, os.R_OK)
+        ]
         for path in sorted(files, key=lambda path: (path.stat().st_mtime_ns, path.name)):
             one = _unsealed(path.read_bytes())
             if one is not None and one["digest"] == digest and self.path(one["name"]) == path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from typing import TYPE_CHECKING
 
@@ -10,7 +11,19 @@ from impc.errors import OutputError
 if TYPE_CHECKING:
     from pathlib import Path
 
-__all__ = ["flush_folder", "write_whole"]
+__all__ = ["flush_folder", "require_ordinary", "write_whole"]
+
+
+def require_ordinary(path: Path) -> None:
+    """Refuse a pipe or a device at `path`, in the place of a file: to open it may wait for ever.
+
+    Raises
+    ------
+    OSError
+        When something is there that is no ordinary file.
+    """
+    if path.exists() and not path.is_file():
+        raise OSError(errno.EINVAL, "no ordinary file")
 
 
 def write_whole(path: Path, content: bytes) -> None:

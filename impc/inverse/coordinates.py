@@ -19,16 +19,19 @@ thirds of itself.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.linalg
 
 from impc.arrays import Array
 from impc.control.closed_loop import simulate
+from impc.inverse.arrow import ArrowRows, triangular_rows
+from impc.inverse.consistent_pairs import consistent_gains, scaled_changes
 from impc.inverse.problem import controller_for, scenarios
 from impc.inverse.residuals import evaluate
 from impc.inverse.solution_set import floored_covariance, natural_coordinates
+from impc.model.plant_family import plant_differential
 
 if TYPE_CHECKING:
     from impc.control.terminal_set import TerminalSet
@@ -37,10 +40,11 @@ if TYPE_CHECKING:
 
 __all__ = ["PARAMETER_UNIT", "Compressed", "Coordinates", "Point", "WithPrior", "start_unit"]
 
-_BLOCK = 4096
 #: A parameter's coordinate counts thirds of itself.
 PARAMETER_UNIT = 1 / 3
 _START_FLOOR = 1e-8
+# Columns below that, of the largest, are rounding.
+_EXPLAINED = 1e-12
 
 
 @dataclass(frozen=True)
@@ -53,16 +57,13 @@ class Point:
         Gain (m, n).
     S : Array
         Metric (m, m).
-    starts : Array
-        Initial states (trials, n).
-    logarithms : Array
-        Of the parameters over their nominal values (k,).
+    problem : Problem
+        At the initial states and the parameters.
     """
 
     K: Array
     S: Array
-    starts: Array
-    logarithms: Array
+    problem: Problem
 
 
 @dataclass(frozen=True)
@@ -74,14 +75,30 @@ class Compressed:
 
     Attributes
     ----------
-    residual : Array
-        (r,).
-    jacobian : Array
-        With respect to the q coordinates (r, q).
+    rows : ArrowRows
+        Gain, metric and parameters are shared, initial states the trial's own.
+    split : int
+        How many of the shared columns stand before those of initial states; the rest after.
     """
 
-    residual: Array
-    jacobian: Array
+    rows: ArrowRows
+    split: int
+
+    @property
+    def residual(self) -> Array:
+        """(r,)."""
+        return np.ravel(self.rows.residual)
+
+    @cached_property
+    def jacobian(self) -> Array:
+        """With respect to the q coordinates (r, q)."""
+        shared, own = self.rows.shared, self.rows.own
+        trials, height, n = own.shape
+        starts = np.zeros((trials, height, trials, n))
+        starts[np.arange(trials), :, np.arange(trials)] = own
+        flat = shared.reshape(trials * height, -1)
+        middle = starts.reshape(trials * height, -1)
+        return np.hstack([flat[:, : self.split], middle, flat[:, self.split :]])
 
 
 class Coordinates:
@@ -103,12 +120,13 @@ class Coordinates:
         self.T, self.G = natural_coordinates(plant, gain)
         self.start_unit = start_unit(problem, gain)
         self.first = np.linalg.cholesky(metric * (plant.m / np.trace(metric)))
+        self.gains = consistent_gains(plant, self.first @ self.first.T, self.T, self.G)
         self.tril = np.tril_indices(self.m)
         self.refused: list[str] = []
         self.last: tuple[bytes, Compressed] | None = None
         self.near: TerminalSet | None = None
         sizes = (
-            self.m * self.n,
+            len(self.gains.gains),
             len(self.tril[0]) - 1,
             self.trials * self.n if problem.unknown_start else 0,
             len(problem.logarithms),
@@ -118,29 +136,26 @@ class Coordinates:
 
     def unpack(self, z: Array) -> Point:
         """The values at z (q,)."""
-        flat, factor, starts, parameters = np.split(z, self.ends[:-1])
+        along, factor, starts, parameters = np.split(z, self.ends[:-1])
         given = np.array([trial.x0 for trial in self.problem.recordings])
         if len(starts):
             given = given + starts.reshape(self.trials, self.n) @ self.start_unit.T
-        gain = self.G @ np.linalg.solve(self.T.T, flat.reshape(self.m, self.n).T).T
-        return Point(
-            np.asarray(gain, dtype=np.float64),
-            self._metric(factor),
-            given,
-            self.problem.logarithms + PARAMETER_UNIT * parameters,
-        )
+        problem = self.problem.at(given, self.problem.logarithms + PARAMETER_UNIT * parameters)
+        product = np.tensordot(along, self.gains.products(problem.plant), 1)
+        metric = self._metric(factor)
+        gain = np.linalg.solve(metric, product)
+        return Point(np.asarray(gain, dtype=np.float64), metric, problem)
 
     def at(self, z: Array) -> Compressed:
         """Residual and derivative at z (q,)."""
         key = z.tobytes()
         if self.last is None or self.last[0] != key:
             here = self.unpack(z)
-            problem = self.problem.at(here.starts, here.logarithms)
-            evaluation = evaluate(problem, here.K, here.S, self.near)
+            evaluation = evaluate(here.problem, here.K, here.S, self.near)
             self.near = evaluation.terminal or self.near
             if evaluation.reason:
                 self.refused.append(evaluation.reason)
-            self.last = (key, self._compress(evaluation, z))
+            self.last = (key, self._compress(evaluation, *self.changes(here, z)))
         return self.last[1]
 
     def with_prior(self, weight: float) -> WithPrior:
@@ -156,19 +171,28 @@ class Coordinates:
             (r, g), g coordinates of gain and metric: orthogonal to the columns of initial states
             and parameters.
         """
-        jacobian = self.at(z).jacobian
-        kept, nuisance = jacobian[:, : self.ends[1]], jacobian[:, self.ends[1] :]
+        rows = self.at(z).rows
+        left, values, _ = np.linalg.svd(rows.own, full_matrices=False)
+        largest = np.max(values, initial=0.0)
+        basis = left * (values > _EXPLAINED * largest)[:, None, :]
+        shared = rows.shared - basis @ (np.swapaxes(basis, 1, 2) @ rows.shared)
+        kept, nuisance = np.split(shared.reshape(-1, shared.shape[2]), [int(self.ends[1])], axis=1)
         if nuisance.shape[1] == 0:
             return kept
-        left, values, _ = np.linalg.svd(nuisance, full_matrices=False)
-        left = left[:, values > 1e-12 * values[0]]
-        return np.asarray(kept - left @ (left.T @ kept))
+        size = np.sqrt(np.sum(rows.shared[..., int(self.ends[1]) :] ** 2, axis=(0, 1)))
+        rest, values, _ = np.linalg.svd(nuisance, full_matrices=False)
+        rest = rest[:, values > _EXPLAINED * max(largest, np.max(size))]
+        return np.asarray(kept - rest @ (rest.T @ kept))
 
     def _pack(self, gain: Array) -> Array:
         shapes = np.diff(np.concatenate([[0], self.ends]))
         nuisance = np.zeros(int(shapes[2] + shapes[3]))
-        natural = np.linalg.solve(self.G, gain @ self.T)
-        return np.concatenate([natural.ravel(), np.eye(self.m)[self.tril][1:], nuisance])
+        along = np.tensordot(self.natural(self.gains.gains), self.natural(gain), 2)
+        return np.concatenate([along, np.eye(self.m)[self.tril][1:], nuisance])
+
+    def natural(self, gains: Array) -> Array:
+        """G^-1 K T, (..., m, n), of gains (..., m, n)."""
+        return np.asarray(np.linalg.solve(self.G, gains @ self.T))
 
     def _factor(self, entries: Array) -> Array:
         factor = np.zeros((self.m, self.m))
@@ -179,55 +203,49 @@ class Coordinates:
         factor = self._factor(entries)
         return np.asarray(factor @ factor.T)
 
-    def metric_changes(self, z: Array) -> Array:
-        """Change of the metric with each entry of its factor, at z (q,): (k, m, m)."""
-        factor, changes = self._factor(z[self.ends[0] : self.ends[1]]), []
+    def changes(self, here: Point, z: Array) -> tuple[Array, Array]:
+        """Change of K (q, m, n), and of S scaled to trace m (q, m, m), with each of z (q,)."""
+        along, factor, _, _ = np.split(z, self.ends[:-1])
+        lower, metric = self._factor(factor), []
         for row, column in list(zip(*self.tril, strict=True))[1:]:
-            change = np.outer(self.first[:, row], factor[:, column])
-            changes.append(change + change.T)
-        return np.array(changes).reshape(-1, self.m, self.m)
+            change = np.outer(self.first[:, row], lower[:, column])
+            metric.append(change + change.T)
+        dS = np.zeros((len(z), self.m, self.m))
+        dS[self.ends[0] : self.ends[1]] = np.array(metric).reshape(-1, self.m, self.m)
+        products = -dS @ here.K
+        products[: self.ends[0]] += self.gains.products(here.problem.plant)
+        family = here.problem.family
+        if family is not None and self.m > 1:
+            differential = plant_differential(family, here.problem.logarithms)
+            drift = self.gains.drift(here.problem.plant, along, differential)
+            products[self.ends[2] :] += PARAMETER_UNIT * drift
+        dK = np.asarray(np.linalg.solve(here.S, products), dtype=np.float64)
+        return dK, scaled_changes(here.S, dS)
 
-    def _compress(self, found: Evaluation, z: Array) -> Compressed:
+    def _compress(self, found: Evaluation, dK: Array, dS: Array) -> Compressed:
         """Factor derivative and residual together, trial by trial, then apply the chain rule."""
-        parts = [found.dK.reshape(-1, self.m * self.n) @ self._gain_chain()]
+        along = found.dK.reshape(-1, self.m * self.n) @ dK.reshape(len(dK), -1).T
         if self.m > 1:
-            parts.append(found.dS.reshape(-1, self.m**2) @ self._metric_chain(z))
-        width = int(self.ends[-1])
+            along += found.dS.reshape(-1, self.m**2) @ dS.reshape(len(dS), -1).T
         rows, row = [], 0
         sizes = [trial.outputs.size for trial in self.problem.recordings]
         if not self.problem.unknown_start:  # no column belongs to one trial: all are one block
             sizes = [sum(sizes)]
-        for index, size in enumerate(sizes):
+        for size in sizes:
             mine = slice(row, row + size)
             row = mine.stop
-            blocks = [part[mine] for part in parts]
+            blocks = [along[mine, : self.ends[1]]]
             blocks += [found.dx0[mine] @ self.start_unit] if found.dx0.shape[1] else []
-            blocks += [found.dparameters[mine] * PARAMETER_UNIT, found.residual[mine, None]]
-            triangle = _triangle(blocks)
-            placed = np.zeros((len(triangle), width + 1))
-            placed[:, self._columns(index)] = triangle
-            rows.append(placed)
-        table = np.vstack(rows)
-        return Compressed(table[:, -1], table[:, :-1])
-
-    def _columns(self, trial: int) -> Array:
-        """Where the columns of one trial stand among all."""
-        shared = np.arange(self.ends[1])
-        mine = np.arange(self.n) + self.ends[1] + trial * self.n
-        own = mine if self.problem.unknown_start else mine[:0]
-        return np.concatenate([shared, own, np.arange(self.ends[2], self.ends[3] + 1)])
-
-    def _gain_chain(self) -> Array:
-        return np.asarray(np.kron(self.G, np.linalg.inv(self.T).T), dtype=np.float64)
-
-    def _metric_chain(self, z: Array) -> Array:
-        """Derivative of the scaled metric with respect to the entries of its factor: (m m, k)."""
-        metric = self._metric(z[self.ends[0] : self.ends[1]])
-        # The controller scales the metric to a mean diagonal of 1.
-        scale, trace = self.m / np.trace(metric), np.trace(metric)
-        changes = self.metric_changes(z)
-        flat = [scale * (change - metric * np.trace(change) / trace).ravel() for change in changes]
-        return np.column_stack(flat)
+            parameters = found.dparameters[mine] * PARAMETER_UNIT + along[mine, self.ends[2] :]
+            blocks += [parameters, found.residual[mine, None]]
+            triangle = triangular_rows(blocks)
+            full = np.zeros((triangle.shape[1], triangle.shape[1]))
+            full[: len(triangle)] = triangle
+            rows.append(full)
+        table, split = np.stack(rows), int(self.ends[1])
+        own = slice(split, split + found.dx0.shape[1])
+        shared = np.delete(table[..., :-1], own, axis=2)
+        return Compressed(ArrowRows(table[..., -1], shared, table[..., own]), split)
 
 
 @dataclass(frozen=True)
@@ -279,18 +297,3 @@ def start_unit(problem: Problem, gain: Array) -> Array:
     natural = float(np.linalg.norm(plant.C @ T / problem.output_scale[:, None]))
     size = float(np.sqrt(np.sum(np.mean(scaled**2, axis=0))))
     return size / natural * T if size > 0 and natural > 0 else T
-
-
-def _triangle(columns: list[Array]) -> Array:
-    """R of a QR factorisation of the columns side by side, block by block.
-
-    Blocks of a few thousand rows stay in the processor's cache: a recording ten times as long
-    takes ten times the time, not fifteen.
-    """
-    width = sum(part.shape[1] for part in columns)
-    triangle = np.zeros((0, width))
-    for first in range(0, len(columns[0]), _BLOCK):
-        block = np.hstack([part[first : first + _BLOCK] for part in columns])
-        (upper,) = scipy.linalg.qr(np.vstack([triangle, block]), mode="r", check_finite=False)
-        triangle = np.asarray(upper[:width], dtype=np.float64)
-    return triangle

@@ -23,7 +23,6 @@ from impc.inverse.inverse_lqr import inverse_lqr_gradient, inverse_lqr_lmi
 from impc.inverse.problem import recorded_size, scenarios, typical_output
 from impc.inverse.proximal_search import ConditionedFit, Objective, Residual, conditioned_fit
 from impc.inverse.residuals import evaluate
-from impc.inverse.weights_search import search_weights
 from impc.model.riccati import solve_lqr
 from impc.model.weights import Weights, condition_number, normalised
 
@@ -198,7 +197,7 @@ def start_gains(start: Start, plant: Plant) -> list[tuple[Array, Array]]:
         passed.append(start.gradient.weights)
     solutions = [solve_lqr(plant, weights) for weights in passed]
     pairs = [(np.array(item.K), np.array(item.S)) for item in solutions]
-    return [(np.array(start.gain.K), pairs[0][1]), *pairs]
+    return [(np.array(start.gain.K), np.array(start.gain.S)), *pairs]
 
 
 @checked
@@ -288,8 +287,7 @@ def _direct(problem: Problem, fit: ConditionedFit) -> DirectFit:
 
 def _explaining(problem: Problem, found: DirectFit, weight: float) -> DirectFit:
     """Weights of least condition number that explain the recordings, if any; else those given."""
-    near = search_weights(problem, found.weights)
-    start = np.array(near.solution.K), np.array(near.solution.S)
+    start = np.array(found.solution.K), np.array(found.solution.S)
     behind = weights_behind(fit_gain(problem, start, attempts=1, regulators=False))
     if not behind.explained or behind.equivalent is None:
         return found
@@ -301,7 +299,7 @@ def _explaining(problem: Problem, found: DirectFit, weight: float) -> DirectFit:
         misfit=behind.misfit,
         condition=condition,
         objective=behind.misfit + weight * condition,
-        evaluations=found.evaluations + near.evaluations + behind.gain.evaluations,
+        evaluations=found.evaluations + behind.gain.evaluations,
         converged=True,
         explained=True,
     )
@@ -353,8 +351,8 @@ def inverse_mpc_reduced(
         max_iterations=_DETOUR,
         explain=False,
     )
-    end = search_weights(problem, direct.weights).solution
-    second = weights_behind(fit_gain(problem, (np.array(end.K), np.array(end.S)), attempts=1))
+    end = np.array(direct.solution.K), np.array(direct.solution.S)
+    second = weights_behind(fit_gain(problem, end, attempts=1))
     best = min(first, second, key=lambda item: item.misfit)
     if best.misfit <= direct.misfit:
         return _with_gain(problem, best)

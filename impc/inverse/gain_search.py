@@ -16,17 +16,17 @@ import scipy.optimize
 
 from impc.arrays import Array, Frozen, frozen
 from impc.checking import checked, replace
-from impc.errors import DataError, SolverError, WeightsError
+from impc.errors import SolverError
+from impc.inverse.arrow import Tolerances
+from impc.inverse.consistent_pairs import consistent_pair
 from impc.inverse.coordinates import Coordinates
 from impc.inverse.diagonal_start import bryson_regulators
-from impc.inverse.one_step import follows_plant, one_step, regressed_gain
+from impc.inverse.many_trials import has_many_trials, search_many
+from impc.inverse.one_step import one_step
 from impc.inverse.problem import recorded_size
+from impc.inverse.quiet_samples import quiet_pairs
 from impc.inverse.residuals import misfit_or_reason
-from impc.inverse.solution_set import natural_coordinates
-from impc.inverse.stationarity import inverse_kkt
-from impc.inverse.weights_search import search_weights
-from impc.model.riccati import is_stable, solve_lqr
-from impc.model.weights import Weights
+from impc.model.riccati import is_stable
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -39,11 +39,13 @@ __all__ = ["EXPLAINED", "GainFit", "bryson_starts", "describe_gain", "fit_gain",
 EXPLAINED = 1e-9
 # A direction of the metric whose singular value is below this, of the largest, is not told.
 _TOLD = 1e-8
+# Changes of the metric that move the gain by less than this, in natural coordinates, leave it.
+_ALONE = 1e-8
 _ROUNDS = 8
 # Searches step by step: of 20 random problems that needed them the fourth helped one.
 _STEP_ATTEMPTS = 4
-# Evaluations of a search for weights step by step: its valleys took up to 200.
-_LONGEST = 300
+# Searches that the gain of unbounded samples adds: their metrics are still guesses.
+_QUIET_ATTEMPTS = 4
 # A round of a noisy search ends when the misfit falls by less than 1e-6 of itself; the rounds end
 # when one lowers it by less than 1e-3: the noise is then known to that.
 _NOISY_TOLERANCE, _SETTLED = 1e-6, 1e-3
@@ -72,8 +74,8 @@ class GainFit(Frozen):
         Of the residual's derivative with respect to K and S in natural coordinates, after initial
         states and parameters have taken what they can (g,); largest first.
     metrics : Array
-        Basis of the metrics that the recordings do not tell from S, S first (k, m, m): along the
-        others, after K has taken what it can, the singular value is above 1e-8 of the largest.
+        Basis of the metrics with which K is consistent and which the recordings do not tell from S,
+        S first (k, m, m): along the others the singular value is above 1e-8 of the largest.
         All that follows from the gain asks for weights with a metric in their span (`gain_fibre`).
     evaluations : int
         Simulations with derivatives.
@@ -139,11 +141,13 @@ def fit_gain(
         When the recordings cannot be simulated from any start.
     """
     given = [*starts, *(bryson_starts(problem) if regulators else [])]
+    if problem.plant.m > 1:
+        metrics = [S for _, S in [*starts, *bryson_starts(problem)[::3]]]
+        quiet = quiet_pairs(problem, metrics)
+        given, attempts = [*given, *quiet], attempts + len(quiet[:_QUIET_ATTEMPTS])
     found, reason = _best_search(problem, given, attempts, max_evaluations, spread)
-    if found is None or (not found.explained and problem.plant.m > 1 and follows_plant(problem)):
-        again = _by_single_steps(problem, starts, max_evaluations, spread)
-        if found is None or (again is not None and _preference(again) < _preference(found)):
-            found = again
+    if found is None:
+        found = _by_single_steps(problem, starts, max_evaluations, spread)
     if found is None:
         raise SolverError(
             "gain", f"no start can be simulated: {reason}", "give a start of your own"
@@ -156,54 +160,14 @@ def _by_single_steps(
 ) -> GainFit | None:
     """A search from the gain that fits each step of the recordings by itself (`one_step`)."""
     steps = one_step(problem)
-    regulators = [weights for weights, _ in bryson_regulators(problem)[::3]]
-    pairs = [_pair(problem, weights) for weights in regulators]
-    try:
-        regulators.append(inverse_kkt(problem, pairs[0][0]))
-        pairs.append(_pair(problem, regulators[-1]))
-    except (WeightsError, SolverError, DataError):  # one start less
-        pass
-    given = [*starts, *pairs]
-    gain = regressed_gain(problem)
-    if gain is not None:
-        given += [(gain, S) for _, S in given]
-    near, _ = _best_search(steps, given, _STEP_ATTEMPTS, 2 * budget, np.inf)
+    near, _ = _best_search(
+        steps, [*starts, *bryson_starts(problem)[::3]], _STEP_ATTEMPTS, 2 * budget, np.inf
+    )
     if near is None:
         return None
-    end, spent = (np.array(near.K), np.array(near.S)), near.evaluations
-    if not near.explained:
-        found, more = _weights_by_steps(steps, [_round(problem, pairs[1][0]), *regulators[::-1]])
-        spent += more
-        end = found if found is not None else end
+    end = np.array(near.K), np.array(near.S)
     fit, _ = _best_search(problem, [end], 1, 2 * budget, spread)
-    return fit and replace(fit, evaluations=fit.evaluations + spent)
-
-
-def _round(problem: Problem, gain: Array) -> Weights:
-    """The weights that are I in the natural coordinates of a gain (m, n)."""
-    T, G = (np.linalg.inv(item) for item in natural_coordinates(problem.plant, gain))
-    return Weights(T.T @ T, G.T @ G)
-
-
-def _pair(problem: Problem, weights: Weights) -> tuple[Array, Array]:
-    solution = solve_lqr(problem.plant, weights)
-    return np.array(solution.K), np.array(solution.S)
-
-
-def _weights_by_steps(
-    steps: Problem, starts: list[Weights]
-) -> tuple[tuple[Array, Array] | None, int]:
-    """Gain and metric of weights that explain each step, if a search finds any; evaluations."""
-    spent, enough = 0, EXPLAINED * recorded_size(steps)
-    for weights in starts:
-        try:
-            found = search_weights(steps, weights, max_evaluations=_LONGEST)
-        except (WeightsError, SolverError):  # one start less
-            continue
-        spent += found.evaluations
-        if found.misfit <= enough:
-            return (np.array(found.solution.K), np.array(found.solution.S)), spent
-    return None, spent
+    return fit and replace(fit, evaluations=fit.evaluations + near.evaluations)
 
 
 def _best_search(
@@ -254,6 +218,7 @@ def refine_gain(
     SolverError
         When the recordings cannot be simulated from there.
     """
+    gain, metric = _consistent(problem, gain, metric)
     _, reason = misfit_or_reason(problem, gain, metric)
     if reason:
         raise SolverError("gain", f"the start cannot be simulated: {reason}", "start elsewhere")
@@ -277,7 +242,7 @@ def _rank(
 ) -> tuple[list[tuple[Array, Array]], int, list[str]]:
     """The usable starts by their misfit, the evaluations spent, and why the others are not."""
     usable, refused = [], []
-    for K, S in starts:
+    for K, S in (_consistent(problem, *pair) for pair in starts):
         size, reason = misfit_or_reason(problem, K, S)
         if reason:
             refused.append(reason)
@@ -285,6 +250,12 @@ def _rank(
             usable.append((size, K, S))
     usable.sort(key=lambda item: item[0])
     return [(K, S) for _, K, S in usable], len(starts), refused
+
+
+def _consistent(problem: Problem, gain: Array, metric: Array) -> tuple[Array, Array]:
+    if not is_stable(problem.plant.A - problem.plant.B @ gain, discrete=True):
+        return gain, metric
+    return consistent_pair(problem.plant, gain, metric)
 
 
 def _search(problem: Problem, gain: Array, metric: Array, budget: int, spread: float) -> GainFit:
@@ -299,26 +270,34 @@ def _search(problem: Problem, gain: Array, metric: Array, budget: int, spread: f
     misfit = float(np.linalg.norm(space.at(z).residual))
     for _ in range(_ROUNDS):
         noise = 0.0 if np.isinf(spread) else misfit / np.sqrt(samples)
-        target = space.with_prior(noise / spread)
-        found = scipy.optimize.least_squares(
-            target.residual,
-            z,
-            jac=target.derivative,
-            ftol=1e-12 if noise == 0 else _NOISY_TOLERANCE,
-            xtol=1e-12,
-            gtol=1e-15,
-            max_nfev=max(budget - spent, 1),
-        )
-        z, spent = found.x, spent + int(found.nfev)
+        ftol = 1e-12 if noise == 0 else _NOISY_TOLERANCE
+        z, more = _step_down(space, z, noise / spread, ftol, max(budget - spent, 1))
+        spent += more
         before, misfit = misfit, float(np.linalg.norm(space.at(z).residual))
         if noise == 0 or misfit > (1 - _SETTLED) * before or spent >= budget:
             break
     return _gain_fit(space, z, spent)
 
 
+def _step_down(
+    space: Coordinates, z: Array, weight: float, ftol: float, budget: int
+) -> tuple[Array, int]:
+    """Least squares from z with a prior of that weight about the start; evaluations."""
+    if has_many_trials(space):
+        size = len(z) - space.trials * space.n
+        weights = np.full(size, weight), weight
+        return search_many(space, z, np.eye(size), weights, Tolerances(ftol, 1e-12, 1e-15, budget))
+    target = space.with_prior(weight)
+    found = scipy.optimize.least_squares(
+        target.residual, z, jac=target.derivative, ftol=ftol, xtol=1e-12, gtol=1e-15,
+        max_nfev=budget,
+    )  # fmt: skip
+    return found.x, int(found.nfev)
+
+
 def _gain_fit(space: Coordinates, z: Array, evaluations: int) -> GainFit:
     found = space.unpack(z)
-    problem = space.problem.at(found.starts, found.logarithms)
+    problem = found.problem
     plant = problem.plant
     stabilises = is_stable(plant.A - plant.B @ found.K, discrete=True)
     misfit = float(np.linalg.norm(space.at(z).residual))
@@ -338,21 +317,15 @@ def _gain_fit(space: Coordinates, z: Array, evaluations: int) -> GainFit:
 
 
 def _metrics(space: Coordinates, z: Array, jacobian: Array) -> Array:
-    """S, and the directions of it along which the residual does not change but by K's doing."""
-    S = space.unpack(z).S
-    size = space.m * space.n
-    basis, values, _ = np.linalg.svd(jacobian[:, :size], full_matrices=False)
-    basis = basis[:, values > _TOLD * values[0]]
-    rest = jacobian[:, size:] - basis @ (basis.T @ jacobian[:, size:])
-    told = _told_directions(rest, float(np.linalg.norm(jacobian, 2)))
-    free = scipy.linalg.null_space(told, rcond=0.5) if len(told) else np.eye(rest.shape[1])
-    return frozen(np.concatenate([S[None], np.tensordot(free.T, space.metric_changes(z), 1)]))
-
-
-def _told_directions(rest: Array, largest: float) -> Array:
-    """Orthonormal rows (t, k)."""
-    _, values, directions = np.linalg.svd(rest, full_matrices=False)
-    return np.asarray(directions[values > _TOLD * largest])
+    """S, and the directions along which it moves alone, unseen, within the consistent pairs."""
+    here = space.unpack(z)
+    dK, dS = (change[: jacobian.shape[1]] for change in space.changes(here, z))
+    natural = space.natural(dK).reshape(len(dK), -1).T
+    alone = scipy.linalg.null_space(natural, rcond=_ALONE)
+    _, values, rows = np.linalg.svd(jacobian @ alone)
+    told = np.count_nonzero(values > _TOLD * float(np.linalg.norm(jacobian, 2)))
+    untold = np.tensordot(rows[told:] @ alone.T, dS, 1)
+    return frozen(np.concatenate([here.S[None], untold]))
 
 
 def _preference(found: GainFit) -> tuple[bool, float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,13 +11,12 @@ import scipy.optimize
 from impc.arrays import Array, frozen
 from impc.checking import replace
 from impc.inverse.coordinates import start_unit
-from impc.inverse.residuals import evaluate
+from impc.inverse.residuals import start_residual
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from impc.inverse.problem import Problem
-    from impc.inverse.residuals import Evaluation
 
 __all__ = ["with_fitted_starts"]
 
@@ -53,34 +53,39 @@ def with_fitted_starts(
 def _fit(problem: Problem, gain: Array, metric: Array) -> Array:
     unit = start_unit(problem, gain)
     (trial,) = problem.recordings
-    n = problem.plant.n
+    simulated = start_residual(problem, gain, metric)
 
-    def at(z: Array) -> Evaluation:
-        moved = replace(trial, x0=frozen(trial.x0 + unit @ z))
-        return evaluate(replace(problem, recordings=(moved,)), gain, metric)
+    @functools.lru_cache(maxsize=1)  # the search asks for residual and derivative one by one
+    def seen(z: tuple[float, ...]) -> tuple[Array, Array]:
+        residual, slope = simulated(trial.x0 + unit @ np.array(z))
+        return residual, slope @ unit
 
-    z: Array = np.zeros(n)
+    z: Array = np.zeros(problem.plant.n)
     for _ in range(_ROUNDS):
-        z = _round(at, unit, z)
+        z = _round(lambda z: seen(tuple(z)), z)
     return np.asarray(trial.x0 + unit @ z)
 
 
-def _round(at: Callable[[Array], Evaluation], unit: Array, z: Array) -> Array:
+def _round(at: Callable[[Array], tuple[Array, Array]], z: Array) -> Array:
     """One fit from z, with the noise that is left there."""
-    n = len(z)
-    here = at(z)
-    columns = here.dx0 @ unit
+    here, columns = at(z)
     # What no x0 explains is noise: to first order, the residual beside the derivative's columns.
-    left = here.residual - columns @ np.linalg.lstsq(columns, here.residual)[0]
+    left = here - columns @ np.linalg.lstsq(columns, here)[0]
     noise = float(np.linalg.norm(left)) / np.sqrt(len(left))
 
     def residual(z: Array) -> Array:
-        return np.concatenate([at(z).residual, noise * z])
+        return np.concatenate([at(z)[0], noise * z])
 
     def derivative(z: Array) -> Array:
-        return np.vstack([at(z).dx0 @ unit, noise * np.eye(n)])
+        return np.vstack([at(z)[1], noise * np.eye(len(z))])
 
     found = scipy.optimize.least_squares(
-        residual, z, jac=derivative, ftol=1e-10, xtol=1e-12, gtol=1e-15, max_nfev=_EVALUATIONS
+        residual,
+        z,
+        jac=derivative,
+        ftol=1e-10,
+        xtol=1e-12,
+        gtol=1e-15,
+        max_nfev=_EVALUATIONS,
     )
     return np.asarray(found.x)

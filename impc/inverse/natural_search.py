@@ -21,6 +21,7 @@ import numpy as np
 
 from impc.arrays import Array, frozen
 from impc.checking import replace
+from impc.inverse.arrow import triangular_rows
 from impc.inverse.equivalent_weights import least_condition_weights
 from impc.inverse.proximal_search import Objective, Residual, conditioned_fit
 from impc.inverse.residuals import evaluate
@@ -134,10 +135,15 @@ def _residual(
         metric = v.T @ solution.S @ v
         found = evaluate(known, G @ solution.K @ z, metric, near)
         near = found.terminal or near
-        dS = v @ found.dS @ v.T * _scale_ratio(metric, solution.S)
-        dK = np.asarray(G.T @ found.dK @ z.T)
-        usable = not found.reason
-        return Residual(found.residual / noise, dK / noise, dS / noise, usable=usable)
+        # As many rows as columns: a search uses norms and inner products only.
+        m, n = known.plant.m, known.plant.n
+        table = triangular_rows(
+            [found.dK.reshape(-1, m * n), found.dS.reshape(-1, m * m), found.residual[:, None]]
+        )
+        table = table / noise
+        dK = np.asarray(G.T @ table[:, : m * n].reshape(-1, m, n) @ z.T)
+        dS = v @ table[:, m * n : -1].reshape(-1, m, m) @ v.T * _scale_ratio(metric, solution.S)
+        return Residual(table[:, -1], dK, dS, usable=not found.reason)
 
     return residual
 

@@ -10,17 +10,17 @@ natural coordinates (`natural_fit`) takes the weights that fit best (docs/fittin
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.arrays import Array, frozen
+from impc.arrays import frozen
 from impc.checking import checked, replace
 from impc.errors import SolverError, WeightsError
 from impc.inverse.diagonal_start import diagonal_weights
 from impc.inverse.direct_and_reduced import auxiliary_weights
 from impc.inverse.equivalent_weights import least_condition_weights
+from impc.inverse.estimate import Estimate, Status
 from impc.inverse.explaining_weights import weights_behind
 from impc.inverse.gain_search import EXPLAINED, GainFit, describe_gain, fit_gain
 from impc.inverse.initial_states import with_fitted_starts
@@ -34,10 +34,9 @@ from impc.model.riccati import solve_lqr
 if TYPE_CHECKING:
     from impc.inverse.problem import Problem
     from impc.inverse.proximal_search import ConditionedFit
-    from impc.model.riccati import LqrSolution
     from impc.model.weights import Weights
 
-__all__ = ["FittedController", "fit_controller", "free_gain", "noise_of"]
+__all__ = ["fit_controller", "free_gain", "noise_of"]
 
 # Of the natural coordinates of the gain, see `fit_gain`: no optimal gain is far beyond 1.
 _SPREAD = 1.0
@@ -46,48 +45,8 @@ _SPREAD = 1.0
 _POOR = 1.05
 
 
-@dataclass(frozen=True)
-class FittedController:
-    """Weights whose constrained controller explains recordings, and the gain that needs no weights.
-
-    Attributes
-    ----------
-    problem : Problem
-        At the initial states and parameters found.
-    free : GainFit
-        The best gain of any kind, under the same bounds.
-    weights : Weights
-        Scaled to R[0, 0] = 1.
-    solution : LqrSolution
-        Their regulator.
-    misfit : float
-        2-norm of the residual with these weights.
-    exact : bool
-        Whether the weights have the free gain, and reproduce the recordings to 1e-9 of them.
-    converged : bool
-        Whether the search for the weights ended.
-    metrics : Array
-        Basis of the metrics that the recordings do not tell from that of the weights (k, m, m), see
-        `GainFit`.
-    """
-
-    problem: Problem
-    free: GainFit
-    weights: Weights
-    solution: LqrSolution
-    misfit: float
-    exact: bool
-    converged: bool
-    metrics: Array
-
-    @property
-    def explained(self) -> bool:
-        """Whether these weights, simulated, reproduce the recordings to 1e-9 of them."""
-        return self.misfit <= EXPLAINED * recorded_size(self.problem)
-
-
 @checked
-def fit_controller(problem: Problem, start: Weights | None = None) -> FittedController:
+def fit_controller(problem: Problem, start: Weights | None = None) -> Estimate:
     """Fit the weights of the constrained controller behind recordings.
 
     Parameters
@@ -95,6 +54,11 @@ def fit_controller(problem: Problem, start: Weights | None = None) -> FittedCont
     problem : Problem
     start : Weights, optional
         Where the search begins; by default the best diagonal ones.
+
+    Returns
+    -------
+    Estimate
+        Of the method "inverse_mpc".
 
     Raises
     ------
@@ -107,7 +71,7 @@ def fit_controller(problem: Problem, start: Weights | None = None) -> FittedCont
         behind = weights_behind(free)
         if behind.explained and behind.equivalent is not None:
             return _finish(
-                behind.gain, free.problem, behind.equivalent.weights, exact=True, converged=True
+                behind.gain, free.problem, behind.equivalent.weights, evaluations=0, converged=True
             )
     found = inverse_mpc_natural(free.problem, begin, noise_of(free))
     if found.misfit < free.misfit:  # the free gain stands in a local minimum
@@ -118,7 +82,9 @@ def fit_controller(problem: Problem, start: Weights | None = None) -> FittedCont
     settled = free.problem
     if problem.unknown_start:
         settled = with_fitted_starts(free.problem, found.solution.K, found.solution.S)
-    return _finish(free, settled, found.weights, exact=False, converged=found.converged)
+    return _finish(
+        free, settled, found.weights, evaluations=found.evaluations, converged=found.converged
+    )
 
 
 def _again(free: GainFit, begin: Weights, found: ConditionedFit) -> ConditionedFit:
@@ -153,12 +119,27 @@ def noise_of(free: GainFit) -> float:
 
 
 def _finish(
-    free: GainFit, problem: Problem, weights: Weights, *, exact: bool, converged: bool
-) -> FittedController:
+    free: GainFit, problem: Problem, weights: Weights, *, evaluations: int, converged: bool
+) -> Estimate:
     solution = solve_lqr(problem.plant, weights)
     K, S = np.array(solution.K), np.array(solution.S)
     metrics = frozen(S[None])
     if problem.plant.m > 1:
         metrics = describe_gain(replace(free, problem=problem), K, S).metrics
     misfit = float(np.linalg.norm(residual_only(problem, K, S)))
-    return FittedController(problem, free, weights, solution, misfit, exact, converged, metrics)
+    explained = misfit <= EXPLAINED * recorded_size(problem)
+    status = Status.SETTLED if converged else Status.STOPPED
+    return Estimate(
+        method="inverse_mpc",
+        problem=problem,
+        K=solution.K,
+        S=solution.S,
+        weights=weights,
+        metrics=metrics,
+        misfit=misfit,
+        noise=noise_of(free),
+        status=Status.EXPLAINED if explained else status,
+        reason="",
+        evaluations=free.evaluations + evaluations,
+        seconds=0.0,
+    )

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.arrays import Array
-from impc.control.closed_loop import Status, prepare_loop, run_loop, simulate
+from impc.arrays import Array, frozen
+from impc.control.closed_loop import Scenario, Status, prepare_loop, run_loop, simulate
 from impc.control.constraint_rows import Directions, directions
 from impc.errors import ImpcError
 from impc.inverse.problem import controller_for, misfit, scenarios
@@ -22,13 +22,25 @@ from impc.model.plant_family import plant_differential
 from impc.model.riccati import is_stable
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from impc.control.closed_loop import Simulation
     from impc.control.controller import Controller
     from impc.control.terminal_set import TerminalSet
     from impc.inverse.problem import Problem
     from impc.model.plant_family import PlantDifferential
     from impc.model.recordings import Recording
 
-__all__ = ["Evaluation", "evaluate", "misfit_or_reason", "residual_only", "unusable"]
+    StartResidual = Callable[[Array], tuple[Array, Array]]
+
+__all__ = [
+    "Evaluation",
+    "evaluate",
+    "misfit_or_reason",
+    "residual_only",
+    "start_residual",
+    "unusable",
+]
 
 # What a sample that a trial controller does not reach counts for, in root-mean-square outputs.
 _NOT_REACHED = 1e3
@@ -95,12 +107,10 @@ def evaluate(
     residuals, derivatives, reason, weakly_active = [], [], "", 0
     for trial, drive in zip(problem.recordings, scenarios(problem), strict=True):
         run, sensitivity = run_loop(prepared, drive)
-        difference = (run.x @ plant.C.T - trial.outputs) / problem.output_scale
         weakly_active += run.weakly_active
         if not run.complete:
-            difference[run.reached + 1 :] = _NOT_REACHED * _scale(problem, trial)
             reason = f"sample {run.reached}: {Status(int(run.status[run.reached])).sentence}"
-        residuals.append(difference.ravel())
+        residuals.append(_difference(problem, trial, run).ravel())
         derivative = weighting @ sensitivity.x
         if differential is not None:
             seen = np.tensordot(run.x, differential.C, ((1,), (1,)))  # dC x: (samples, p, k)
@@ -117,6 +127,38 @@ def evaluate(
         weakly_active,
         controller.terminal,
     )
+
+
+def start_residual(problem: Problem, gain: Array, metric: Array) -> StartResidual:
+    """Residual of the only trial of a problem as a function of its initial state.
+
+    Parameters
+    ----------
+    gain, metric : Array
+        K (m, n) and S (m, m), which stay: rows and their derivatives are built once.
+
+    Returns
+    -------
+    callable
+        x0 (n,) -> residual (r,) and its derivative (r, n).
+
+    Raises
+    ------
+    InputError, SolverError
+        As `controller_for`.
+    """
+    controller = controller_for(problem, gain, metric)
+    n = problem.plant.n
+    prepared = prepare_loop(controller, directions(controller, n, x0=np.eye(n)))
+    (trial,) = problem.recordings
+    weighting = problem.plant.C / problem.output_scale[:, None]
+
+    def at(x0: Array) -> tuple[Array, Array]:
+        run, sensitivity = run_loop(prepared, Scenario(frozen(x0), trial.disturbance[:-1]))
+        difference = _difference(problem, trial, run)
+        return difference.ravel(), (weighting @ sensitivity.x).reshape(-1, n)
+
+    return at
 
 
 def misfit_or_reason(problem: Problem, gain: Array, metric: Array) -> tuple[float, str]:
@@ -231,6 +273,14 @@ def _symmetric(columns: Array, m: int) -> Array:
         dS[:, rows, places] = columns * np.where(rows == places, 1.0, 0.5)
         dS[:, places, rows] = dS[:, rows, places]
     return dS
+
+
+def _difference(problem: Problem, trial: Recording, run: Simulation) -> Array:
+    """Simulated minus recorded outputs over their scales (samples, p), large where not reached."""
+    difference = (run.x @ problem.plant.C.T - trial.outputs) / problem.output_scale
+    if not run.complete:
+        difference[run.reached + 1 :] = _NOT_REACHED * _scale(problem, trial)
+    return np.asarray(difference)
 
 
 def _scale(problem: Problem, trial: Recording) -> float:

@@ -12,6 +12,7 @@ except ImportError:  # Windows
     import msvcrt
 
 from impc.errors import OutputError
+from impc.files.writing import require_ordinary
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -46,6 +47,7 @@ def locked(folder: Path) -> Iterator[None]:
 def _opened(path: Path) -> IO[bytes]:
     while True:
         try:
+            require_ordinary(path)
             stream = path.open("ab")
         except OSError as error:
             raise OutputError(

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from impc.errors import OutputError
-from impc.files.writing import write_whole
+from impc.files.writing import require_ordinary, write_whole
 from impc.reporting.lock import locked
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ class _Run:
 
     folder: Path
     command: str
-    before: frozenset[str]
+    before: Mapping[str, str]
     written: dict[str, str] = field(default_factory=dict)
 
     def begin(self, new: dict[str, bytes]) -> None:
@@ -75,8 +75,11 @@ class _Run:
 
     def finish(self) -> None:
         """Remove what the last run wrote and this one did not."""
-        for name in self.before - set(self.written):
-            (self.folder / name).unlink(missing_ok=True)
+        for name in self.before.keys() - self.written.keys():
+            # What somebody has changed since, or a damaged list names by mistake, is not ours.
+            if not _has(self.folder / name, self.before[name]):
+                continue
+            (self.folder / name).unlink()
             for parent in Path(name).parents[:-1]:
                 _remove_if_empty(self.folder / parent)
         lines = [self.command, *(json.dumps(item) for item in self.written.items())]
@@ -138,8 +141,8 @@ def _unlist(folder: Path, before: set[str]) -> None:
         (folder / _LIST).unlink()
 
 
-def _listed(folder: Path, command: str) -> frozenset[str]:
-    """Names of what a run of the `command` wrote to the folder before.
+def _listed(folder: Path, command: str) -> dict[str, str]:
+    """What a run of the `command` wrote to the folder before: SHA-256 by name.
 
     Raises
     ------
@@ -147,6 +150,7 @@ def _listed(folder: Path, command: str) -> frozenset[str]:
         When the results in the folder are of another command, or have no list.
     """
     try:
+        require_ordinary(folder / _LIST)
         owner, *lines = (folder / _LIST).read_text(encoding="utf-8").split("\n")
     except FileNotFoundError:
         telling = [name for name in _TELLING if (folder / name).exists()]
@@ -154,22 +158,30 @@ def _listed(folder: Path, command: str) -> frozenset[str]:
             raise OutputError(
                 f"folder {folder}", f"holds {telling[0]} of another version or of your own", _REMEDY
             ) from None
-        return frozenset()
+        return {}
     except (OSError, ValueError):
         raise OutputError(f"folder {folder}", f"its list {_LIST} is damaged", _REMEDY) from None
     if owner != command:
         raise OutputError(f"folder {folder}", f"holds results of impc {owner}", _REMEDY)
-    return frozenset(name for line in lines if (name := _name(line)) is not None)
+    return dict(item for line in lines if (item := _item(line)) is not None)
 
 
-def _name(line: str) -> str | None:
-    """A name of the list; None for a line that a killed run left half, and for no safe name."""
+def _has(path: Path, seal: str) -> bool:
+    """Whether the content of a file has that SHA-256."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest() == seal
+
+
+def _item(line: str) -> tuple[str, str] | None:
+    """A line of the list; None for one that a killed run left half, and for no safe name."""
     try:
-        name, _ = json.loads(line)
+        name, seal = json.loads(line)
     except (ValueError, TypeError, RecursionError):
         return None
     inside = isinstance(name, str) and not Path(name).is_absolute() and ".." not in Path(name).parts
-    return name if inside else None
+    return (name, str(seal)) if inside else None
 
 
 def _remove_if_empty(folder: Path) -> None:

@@ -45,6 +45,11 @@ class Effort:
     seconds: float
     gigabytes: float
 
+    def shared(self, parts: float, threads: int) -> Effort:
+        """Of so many such `parts`, as many at a time as there are `threads`."""
+        at_once = min(float(threads), parts)
+        return Effort(self.seconds * parts / max(at_once, 1.0), self.gigabytes * at_once)
+
 
 def fit_effort(problem: Problem, settings: FitSettings) -> Effort:
     """What `impc.studies.fit.subject` will take; nothing of its size is made."""

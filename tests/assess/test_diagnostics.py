@@ -111,7 +111,7 @@ def test_noise_knows_nothing_of_the_perturbation(root: float) -> None:
     """One recording of the cart, fitted: neither test speaks, seed 5."""
     problem = fit_problem(cart(), [noisy_trial(5, root)], FitSettings(horizon=10, u_max=1.0))
     fitted = fit_controller(problem)
-    found = residual_diagnostics(fitted.problem, fitted.solution.K, fitted.solution.S)
+    found = residual_diagnostics(fitted.problem, fitted.gain, fitted.metric)
     assert found.structure is not None
     assert not found.structure.found
     assert residual_warnings(found, ("position",), 0.1) == ()
@@ -125,8 +125,8 @@ def test_false_alarms_of_structure(colour: float, most: float) -> None:
     """
     problem = fit_problem(cart(), [noisy_trial(0, 0.0)], FitSettings(horizon=10, u_max=1.0))
     fitted = fit_controller(problem)
-    problem, K = fitted.problem, np.array(fitted.solution.K)
-    clean = evaluate(problem, K, np.array(fitted.solution.S))
+    problem, K = fitted.problem, np.array(fitted.gain)
+    clean = evaluate(problem, K, np.array(fitted.metric))
     columns = np.hstack([clean.dK.reshape(len(clean.residual), -1), clean.dx0])
     basis = np.linalg.qr(columns)[0]
     alarms = 0

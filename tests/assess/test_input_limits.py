@@ -11,7 +11,8 @@ from experiments.simulated_subjects import noisy_recordings
 from impc.assess.input_limits import LimitEstimate, input_limit, with_limit
 from impc.control.closed_loop import scenario, simulate
 from impc.errors import InputError
-from impc.inverse.noisy_fit import FittedController, fit_controller
+from impc.inverse.estimate import Estimate
+from impc.inverse.noisy_fit import fit_controller
 from impc.model.recordings import Recording
 from impc.studies.fit.settings import FitSettings
 from impc.studies.fit.subject import fit_problem
@@ -19,7 +20,7 @@ from impc.studies.fit.subject import fit_problem
 SEED = 3
 
 
-def fitted_cart(trial: Recording, limit: float | None) -> FittedController:
+def fitted_cart(trial: Recording, limit: float | None) -> Estimate:
     return fit_controller(fit_problem(cart(), [trial], FitSettings(horizon=10, u_max=limit)))
 
 

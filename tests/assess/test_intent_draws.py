@@ -11,7 +11,8 @@ from impc.assess.covariance import GainCovariance, gain_covariance
 from impc.assess.intent_draws import drawn_gains
 from impc.assess.weights_ranges import summarise_weights
 from impc.checking import replace
-from impc.inverse.noisy_fit import FittedController, fit_controller
+from impc.inverse.estimate import Estimate
+from impc.inverse.noisy_fit import fit_controller
 from impc.model.riccati import solve_lqr
 from impc.studies.fit.result import FittedParameter
 from impc.studies.fit.settings import FitSettings
@@ -22,42 +23,44 @@ SIZES = np.array([1.0, 1.0])
 
 
 @pytest.fixture(scope="module")
-def fitted() -> tuple[FittedController, GainCovariance]:
+def fitted() -> tuple[Estimate, GainCovariance]:
     settings = FitSettings(horizon=10, u_max=1.0)
     found = fit_controller(fit_problem(cart(), [noisy_trial(3, 0.0)], settings))
-    K, S = np.array(found.solution.K), np.array(found.solution.S)
+    K, S = np.array(found.gain), np.array(found.metric)
     return found, gain_covariance(found.problem, K, S)
 
 
 def test_drawn_gains_spread_as_their_covariance(
-    fitted: tuple[FittedController, GainCovariance],
+    fitted: tuple[Estimate, GainCovariance],
 ) -> None:
     """300 gains: centre to 0.2 deviations, deviations along both directions to 15 %."""
     found, covariance = fitted
-    drawn = drawn_gains(cart(), found.weights, found.solution.K, covariance, 300)
-    off = np.array([covariance.along(one.K - found.solution.K) for one in drawn])
+    drawn = drawn_gains(cart(), found.stage_weights, found.gain, covariance, 300)
+    off = np.array([covariance.along(one.K - found.gain) for one in drawn])
     scaled = off / covariance.deviations
     np.testing.assert_allclose(np.std(scaled, axis=0), 1.0, atol=0.15)
     assert np.all(np.abs(np.mean(scaled, axis=0)) < 0.2)
     for one in drawn[:5]:
         np.testing.assert_allclose(solve_lqr(cart(), one.weights).K, one.K)
-    again = drawn_gains(cart(), found.weights, found.solution.K, covariance, 2)
+    again = drawn_gains(cart(), found.stage_weights, found.gain, covariance, 2)
     np.testing.assert_array_equal(again[1].K, drawn[1].K)
 
 
 def test_a_statement_is_made_only_when_other_gains_agree(
-    fitted: tuple[FittedController, GainCovariance],
+    fitted: tuple[Estimate, GainCovariance],
 ) -> None:
     """The same gain and the same weights: told to its deviations, and all but unknown."""
     found, covariance = fitted
-    K, metrics = np.array(found.solution.K), np.array(found.metrics)
+    K, metrics = np.array(found.gain), np.array(found.metrics)
     bare = summarise_weights(cart(), K, metrics, SIZES)
     held = [item for item in bare.statements if item.holds is not None]
     assert held, "at the fitted gain a price is above the other"
     assert not any(item.made for item in bare.statements), "nothing was tried"
     outcomes = {}
     for name, deviations in (("told", covariance.deviations), ("unknown", np.full(2, np.inf))):
-        draws = drawn_gains(cart(), found.weights, K, replace(covariance, deviations=deviations))
+        draws = drawn_gains(
+            cart(), found.stage_weights, K, replace(covariance, deviations=deviations)
+        )
         outcomes[name] = summarise_weights(cart(), K, metrics, SIZES, draws=draws)
         assert [item.holds for item in outcomes[name].statements] == [
             item.holds for item in bare.statements

@@ -25,7 +25,8 @@ from impc.assess.resampling import (
     replicate,
 )
 from impc.errors import InputError
-from impc.inverse.noisy_fit import FittedController, fit_controller
+from impc.inverse.estimate import Estimate
+from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.residuals import misfit_or_reason
 from impc.model.plant import Plant
 from impc.model.recordings import Recording
@@ -36,7 +37,7 @@ SEED = 4
 
 
 @pytest.fixture(scope="module", params=[0.0, 0.9], ids=["white", "coloured"])
-def fitted(request: pytest.FixtureRequest) -> FittedController:
+def fitted(request: pytest.FixtureRequest) -> Estimate:
     trial = noisy_trial(SEED, request.param)
     return fit_controller(fit_problem(cart(), [trial], FitSettings(horizon=10, u_max=1.0)))
 
@@ -47,17 +48,17 @@ def first_order(root: float, samples: int, seed: int) -> Array:
     return np.asarray(scipy.signal.lfilter([1.0], [1.0, -root], white, axis=0)[500:])
 
 
-def drawn(fitted: FittedController, index: int, seed: int, draw: Draw) -> Replicate:
+def drawn(fitted: Estimate, index: int, seed: int, draw: Draw) -> Replicate:
     at = gain_estimate(fitted)
     K, S = np.array(at.K), np.array(at.S)
-    return replicate(at.problem, K, S, fitted.weights, index, seed, draw)
+    return replicate(at.problem, K, S, fitted.stage_weights, index, seed, draw)
 
 
 def width(found: tuple[Interval, ...]) -> Array:
     return np.array([item.high - item.low for item in found])
 
 
-def test_bootstrap_agrees_with_the_sandwich(fitted: FittedController) -> None:
+def test_bootstrap_agrees_with_the_sandwich(fitted: Estimate) -> None:
     """30 replicates, seed 4: widths within a third of the sandwich's, for both ways to draw."""
     estimate = gain_estimate(fitted)
     sandwich = width(covariance_intervals(estimate, estimate.covariance, "sandwich"))
@@ -67,7 +68,7 @@ def test_bootstrap_agrees_with_the_sandwich(fitted: FittedController) -> None:
         assert np.all(np.abs(np.log(ratio)) < np.log(1.5)), ratio
 
 
-def test_profile_agrees_with_the_sandwich(fitted: FittedController) -> None:
+def test_profile_agrees_with_the_sandwich(fitted: Estimate) -> None:
     """Nearly quadratic, so nearly the same ends."""
     estimate = gain_estimate(fitted)
     for item in covariance_intervals(estimate, estimate.covariance, "sandwich"):
@@ -86,7 +87,7 @@ def test_plain_intervals_are_narrower_with_coloured_noise() -> None:
     assert np.all(sandwich > 2 * plain)
 
 
-def test_profile_against_brute_force(fitted: FittedController) -> None:
+def test_profile_against_brute_force(fitted: Estimate) -> None:
     """D at one value against a dense search over the only other entry, initial state refitted."""
     problem = dataclasses.replace(fitted.problem, unknown_start=False)
     known = gain_estimate(dataclasses.replace(fitted, problem=problem))
@@ -127,12 +128,12 @@ def test_what_is_not_determined_has_no_end() -> None:
     assert estimate.covariance.told_entries.tolist() == [[True, True, False]]
 
 
-def test_an_unknown_name_is_told(fitted: FittedController) -> None:
+def test_an_unknown_name_is_told(fitted: Estimate) -> None:
     with pytest.raises(InputError, match=r"known: K\.force"):
         profile_likelihood(gain_estimate(fitted), "mass")
 
 
-def test_a_replicate_depends_on_seed_and_number_only(fitted: FittedController) -> None:
+def test_a_replicate_depends_on_seed_and_number_only(fitted: Estimate) -> None:
     alone = drawn(fitted, 3, SEED, block_residuals)
     among = [drawn(fitted, index, SEED, block_residuals) for index in range(5)][3]
     np.testing.assert_array_equal(alone.K, among.K)

@@ -102,7 +102,7 @@ def test_result_json_is_the_fit(fitted: tuple[Result, Path], subject: Path) -> N
     recordings = read_recordings(files, configuration, plant)
     settings = replace(fit_settings(configuration.fit), held_out=False, intent_draws=False)
     result = fit_recordings(fit_problem(plant, recordings, settings), settings)
-    np.testing.assert_allclose(found["K"], result.fitted.solution.K, rtol=1e-6)
+    np.testing.assert_allclose(found["K"], result.fitted.gain, rtol=1e-6)
     assert found["horizon"] == 20
     assert found["bounds"]["u_max"] == [6.0]
     assert found["bounds"]["x_max"] == [None] * 10

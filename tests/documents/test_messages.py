@@ -47,6 +47,7 @@ from impc.studies.cohort.study import read_study
 from impc.studies.effort import Effort
 from impc.studies.fit.settings import FitSettings, fit_settings
 from impc.studies.fit.subject import fit_problem
+from impc.studies.selection.subsets import largest_subsets
 from tests.documents.blocks import PAGES
 from tests.files.damaged import DAMAGED, PLANT
 from tests.files.samples import hdf5_mat, pushed_seat, settings
@@ -299,6 +300,10 @@ def caches_without_a_home(folder: Path) -> str:
         return f"impc: note: {keep_caches()}"
 
 
+def too_many_subsets(_: Path) -> None:
+    largest_subsets([np.eye(40)], 2.0)
+
+
 def large_request(seconds: float, gigabytes: float) -> Callable[[Path], object]:
     return lambda _: require_consent(Effort(seconds, gigabytes), given=False)
 
@@ -362,6 +367,7 @@ PROVOKED: dict[str, Callable[[Path], object]] = {
     "names ... twice; name each once": of_fit({"free": ["mass", "mass"]}),
     "is a ... that no result can keep": lambda _: find_plant("cursor", {"sample_time": 2**64}),
     "would need ... GB of memory, more than this machine has": large_request(0, 1e9),
+    "more than ... subsets keep a variance of ...": too_many_subsets,
     "this request: would take about ... hours; ...; or say --yes": large_request(1e9, 0),
     "impc: note: caches are kept in ...": caches_without_a_home,
     "is continuous, a discrete one is needed": lambda _: Plant(

@@ -16,7 +16,7 @@ def test_a_cell_with_saturation() -> None:
     """At 4.5 Nm and 1 % noise inverse MPC wins by more than a point over all without bounds."""
     found = study_cell(Cell(4.5, 99.0, 0))
     assert list(found) == list(METHODS)
-    ours = found["inverse_mpc_direct"].vaf
+    ours = found["inverse_mpc"].vaf
     assert ours is not None
     assert ours > 99.9
     for name in ("feedback_gain", "inverse_lqr_output", "inverse_kkt"):

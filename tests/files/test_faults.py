@@ -18,6 +18,8 @@ import pytest
 from impc.errors import OutputError
 from impc.files.sealed import Kept
 from impc.reporting.writer import owned, write_files
+from impc.studies.cohort.figures import memory_figure
+from impc.studies.cohort.store import Store
 
 OLD = {"report.html": b"old", "figure_9.png": b"old", "sub/old.csv": b"old"}
 NEW = {"report.html": b"new", "result.json": b"new", "sub/new.csv": b"new"}
@@ -127,3 +129,92 @@ def test_a_kill_at_each_rename(tmp_path: Path) -> None:
         kills += 1
     assert kills >= 6
     assert told >= 3
+
+
+MINE = {"notes.txt": b"mine", "sub/ole.csv": b"mine"}  # one bit from a name of the old run
+
+
+@pytest.mark.parametrize("name", [".impc", "fit-in-progress/fit.json"])
+def test_a_flipped_byte_in_what_a_folder_keeps(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Anywhere: the run is refused in one line, or its files are those of an undisturbed one."""
+    monkeypatch.setattr(os, "fsync", lambda _: None)  # thousands of them take minutes
+    refused = right = 0
+    folder = _interrupted(tmp_path / "0")
+    whole = (folder / name).read_bytes()
+    for place in range(0, len(whole), 4):
+        folder = _interrupted(tmp_path / f"{place + 1}")
+        changed = bytearray(whole)
+        changed[place] ^= 1 << (place % 3)
+        (folder / name).write_bytes(changed)
+        said = ""
+        try:
+            work(folder, NEW)
+        except OutputError as error:
+            said, refused = str(error), refused + 1
+        else:
+            right += 1
+            assert shown(folder).items() >= (NEW | MINE).items()
+        assert "\n" not in said
+        assert shown(folder).items() >= MINE.items()
+    assert right >= 20
+    assert refused >= 3 or name != ".impc"
+
+
+def _interrupted(folder: Path) -> Path:
+    """A folder with the files of a run, what another one had done, and files of somebody's own."""
+    work(folder, OLD)
+    with owned(folder, "fit"):
+        Kept(folder / "fit-in-progress").keep("fit", "digest", STAGES["fit"])
+    for name, content in MINE.items():
+        (folder / name).write_bytes(content)
+    return folder
+
+
+@pytest.mark.skipif(os.name != "posix", reason="pipes with a name")
+@pytest.mark.parametrize("name", [".impc", ".impc-lock", "fit-in-progress/fit.json"])
+def test_a_pipe_in_the_place_of_a_file_is_not_waited_for(name: str, tmp_path: Path) -> None:
+    """In a process of its own: who opens it waits for ever."""
+    folder = _interrupted(tmp_path)
+    (folder / name).unlink(missing_ok=True)
+    os.mkfifo(folder / name)
+    done = subprocess.run(
+        [sys.executable, "-c", PIPED, str(folder)], check=False, capture_output=True, text=True,
+        cwd=Path(__file__).parents[2], timeout=120,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "\n" not in done.stdout
+    assert shown(folder).items() >= MINE.items()
+    if not done.stdout:
+        assert shown(folder).items() >= NEW.items()
+
+
+PIPED = """
+import sys
+from pathlib import Path
+from impc.errors import OutputError
+from tests.files.test_faults import NEW, work
+try:
+    work(Path(sys.argv[1]), NEW)
+except OutputError as error:
+    print(error, end="")
+"""
+
+
+def test_a_log_of_a_cohort_that_is_damaged_is_no_fault(tmp_path: Path) -> None:
+    """It is read again for the figure of memory: no byte of it ends a command."""
+    line = b"sub-1: fit in 0.10 s; memory of worker 300 MB, of client 200 MB\n"
+    log = tmp_path / "cohort.log"
+    for place in range(len(line)):
+        changed = bytearray(line * 2)
+        changed[place] ^= 0x80
+        log.write_bytes(changed)
+        assert memory_figure(log) is not None
+    log.write_bytes(line.replace(b"300", b"9" * 400))
+    assert memory_figure(log) is None
+    log.unlink()
+    os.mkfifo(log)
+    assert memory_figure(log) is None
+    with pytest.raises(OutputError, match="no ordinary file"):
+        Store(tmp_path).log("run")

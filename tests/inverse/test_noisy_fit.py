@@ -10,15 +10,17 @@ import plants
 from experiments.benchmarks.workloads import Workload, seat
 from experiments.simulated_subjects import simulated_subject
 from impc.assess.covariance import gain_covariance
-from impc.assess.inverse_lqr_beside import compare_methods
+from impc.assess.judged import judge
 from impc.assess.long_run_covariance import ResidualNoise, residual_noise, spread_of_sum
 from impc.assess.printed_gain import gain_estimate
 from impc.checking import replace
 from impc.control.closed_loop import scenario, simulate
 from impc.inverse.coordinates import Coordinates
 from impc.inverse.diagonal_start import diagonal_weights
+from impc.inverse.estimate import Estimate
 from impc.inverse.initial_states import with_fitted_starts
-from impc.inverse.noisy_fit import FittedController, fit_controller
+from impc.inverse.methods import NaturalUnits, estimate_all
+from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.problem import Problem
 from impc.inverse.residuals import evaluate
 from impc.model.plant import Plant
@@ -27,6 +29,8 @@ from impc.model.recordings import Recording
 from impc.model.riccati import solve_lqr
 from impc.studies.fit.settings import FitSettings
 from impc.studies.fit.subject import fit_problem
+
+OURS = "inverse_mpc"
 
 
 def clean_problem(limit: float, trials: int = 3) -> tuple[Workload, Problem]:
@@ -37,36 +41,40 @@ def clean_problem(limit: float, trials: int = 3) -> tuple[Workload, Problem]:
 
 
 @pytest.fixture(scope="module", params=[70.0, 6.0, 4.5], ids="{}Nm".format)
-def clean(request: pytest.FixtureRequest) -> tuple[Workload, FittedController]:
+def clean(request: pytest.FixtureRequest) -> tuple[Workload, Estimate]:
     work, problem = clean_problem(request.param)
     return work, fit_controller(problem)
 
 
 def test_without_noise_all_that_is_determined_comes_out(
-    clean: tuple[Workload, FittedController],
+    clean: tuple[Workload, Estimate],
 ) -> None:
     """VAF above 99.999 %, and the gain to 1e-5 along every determined direction."""
     work, fitted = clean
     samples = sum(trial.outputs.size for trial in work.problem.recordings)
-    assert fitted.exact
+    assert fitted.explained
     assert 1 - fitted.misfit**2 / samples > 0.99999
     covariance = gain_estimate(fitted).covariance
     determined = covariance.singular_values > 1e-6 * covariance.singular_values[0]
     truth = np.array(work.controller.K)
-    error = covariance.along(fitted.solution.K - truth)
+    error = covariance.along(fitted.gain - truth)
     size = np.linalg.norm(truth @ covariance.T)
     assert np.count_nonzero(determined) >= 9
     assert np.max(np.abs(error[determined])) <= 1e-5 * size
 
 
-def test_inverse_mpc_against_inverse_lqr(clean: tuple[Workload, FittedController]) -> None:
+def test_inverse_mpc_against_inverse_lqr(clean: tuple[Workload, Estimate]) -> None:
     """It wins and keeps the limit where the subject saturates, and equals where none is active."""
     work, fitted = clean
-    methods = {item.name: item for item in compare_methods(fitted)}
+    ground = NaturalUnits(fitted.problem, lambda name, make: fitted if name == OURS else make())
+    names = ("feedback_gain", "inverse_lqr", "inverse_lqr_output", "clipped_lqr", OURS)
+    bounds = fitted.problem.bounds
+    found = estimate_all(ground, names)
+    methods = {name: judge(item, bounds) for name, item in found.items()}
     mpc = methods["inverse_mpc"]
     limit = float(work.controller.bounds.u_max[0])
     assert mpc.keeps_bounds
-    for name in ("feedback_gain", "inverse_lqr_gain", "inverse_lqr_output"):
+    for name in ("feedback_gain", "inverse_lqr", "inverse_lqr_output"):
         if limit == 70.0:
             np.testing.assert_allclose(methods[name].vaf, mpc.vaf, atol=1e-6)
         else:
@@ -238,8 +246,7 @@ def test_standard_deviations_of_a_linear_model_are_those_of_theory() -> None:
     )
     here = replace(problem, recordings=(replace(trial, outputs=noisy),))
     K = np.array(work.controller.K)
-    fit = fit_controller(problem).free
-    covariance = gain_covariance(here, K, np.array(fit.S))
+    covariance = gain_covariance(here, K, np.array(fit_controller(problem).metric))
     found = evaluate(here, K, np.eye(1))
     J = np.hstack([found.dK.reshape(len(found.residual), -1), found.dx0])
     scale = np.linalg.norm(J, axis=0)

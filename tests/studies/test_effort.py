@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import tracemalloc
 from typing import TYPE_CHECKING
 
@@ -10,7 +11,10 @@ import psutil
 import pytest
 from click.testing import CliRunner
 
+import impc.cli.consent
+import impc.studies.cohort.engine
 import impc.studies.fit.subject
+from impc.checking import replace
 from impc.cli.consent import require_consent
 from impc.cli.main import main
 from impc.control.closed_loop import prepare_loop
@@ -24,10 +28,23 @@ from impc.model.riccati import solve_lqr
 from impc.model.weights import Weights
 from impc.studies.effort import Effort, fit_effort
 from impc.studies.fit.settings import FitSettings
+from impc.studies.selection.analysis import select_study
+from impc.studies.selection.effort import key_evaluations, select_evaluations, selection_effort
+from impc.studies.selection.key_parameters import key_parameters
+from impc.studies.selection.model import ParametricModel, Trial, sensitivity
+from impc.studies.selection.model_source import model_source
+from impc.studies.selection.queue import in_turn
+from impc.studies.selection.settings import SelectSettings
+from tests.files.test_inputs import here
+from tests.studies.cohort.carts import write_study
+from tests.studies.selection.heads import head_model, head_trials
+from tests.studies.selection.test_methods import blood_study
 from tests.support import random_plant
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from impc.arrays import Array, IntArray
 
 
 @pytest.mark.parametrize(("n", "m", "horizon"), [(2, 1, 300), (4, 2, 100), (8, 1, 150)])
@@ -96,3 +113,93 @@ def test_a_request_for_hours_or_memory_ends_at_once(
     assert done.stderr.startswith("impc: error: this request: would ")
     assert done.stderr.count("\n") == 1
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("which", ["drug", pytest.param("head", marks=pytest.mark.slow)])
+def test_evaluations_of_a_selection_are_told_to_their_order_of_magnitude(which: str) -> None:
+    """Counted: calls of the Jacobian. A fit of the drug takes 7, one of the head 200."""
+    if which == "drug":
+        model, trials = drug()
+    else:
+        model = head_model()
+        trials = tuple(head_trials(model, np.array(model.typical), 0.8, 3, count=1))
+    calls = 0
+    plain = replace(model, jacobian=None)
+
+    def counted(theta: Array, given: Array, free: IntArray) -> tuple[Array, Array]:
+        nonlocal calls
+        calls += 1
+        if model.jacobian is not None:
+            return model.jacobian(theta, given, free)
+        outputs, derivative = sensitivity(plain, theta, given, free)
+        return outputs, derivative / model.gain[free]
+
+    watched = replace(model, jacobian=counted)
+    settings = SelectSettings(replicates=20, starts=2, least=1)
+    select_study({"1": trials}, settings, in_turn(watched))
+    assert 1 / 10 < select_evaluations(settings, 1) / calls < 10
+    calls = 0
+    cells = {("1", "1"): trials, ("1", "2"): trials}
+    found = key_parameters(watched, cells, settings, in_turn(watched), bound=0.5)
+    told = key_evaluations(settings, len(found.candidates))
+    assert 1 / 10 < told / (calls / 2) < 10
+
+
+def drug() -> tuple[ParametricModel, tuple[Trial, ...]]:
+    model = model_source("tests.studies.selection.dosing:blood_model", {}).model
+    dose = np.zeros((192, 1))
+    dose[::32] = 400.0
+    level = model.simulate(np.array([1.2, 0.08, 25.0]), dose)
+    noise = 0.03 * np.std(level) * np.random.default_rng(0).standard_normal(level.shape)
+    return model, (Trial(dose, level + noise),)
+
+
+def test_memory_of_a_selection_grows_with_recordings_and_workers() -> None:
+    model, trials = drug()
+    one = selection_effort(model, [trials], 1)
+    # 192 samples of one output, three parameters, six arrays, two threads.
+    assert one.gigabytes == pytest.approx(8e-9 * 192 * 3 * 12)
+    assert selection_effort(model, [trials * 5, trials], 1).gigabytes == 5 * one.gigabytes
+    assert Effort(10, 1).shared(6, 2) == Effort(30, 2)
+    assert Effort(10, 1).shared(1, 8) == Effort(10, 1)
+
+
+def test_a_cohort_for_days_ends_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Six subjects: refused as one request, begun with --yes, and not asked for when it is done."""
+    here(monkeypatch)
+    study = write_study(tmp_path, 1, replicates=100_000)
+    for number in range(2, 7):
+        shutil.copytree(tmp_path / "sub-01", tmp_path / f"sub-{number:02d}")
+    people = [f"{number:02d},a,0.3" for number in range(1, 7)]
+    (tmp_path / "people.csv").write_text("\n".join(["subject,group,drag", *people]) + "\n")
+    words = ["cohort", str(study), "--allow-plant", "--out", str(tmp_path / "out")]
+    done = CliRunner().invoke(main, words)
+    assert done.exit_code == 2, done.output
+    assert "this request: would take about" in done.stderr
+    assert not (tmp_path / "out").exists()
+
+    def begun(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(impc.studies.cohort.engine, "run_study", begun)
+    done = CliRunner().invoke(main, [*words, "--yes"])
+    assert done.exit_code == 130, done.output
+
+
+@pytest.mark.parametrize("command", ["select", "key-parameters"])
+def test_a_selection_asks_too(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its time is measured: here the limit is moved, so that no clock decides."""
+    done = here(monkeypatch, stop=0)
+    study = blood_study(tmp_path, 1, 2)
+    words = [command, str(study), "--allow-model", "--out", str(tmp_path / "out")]
+    monkeypatch.setattr(impc.cli.consent, "_SECONDS", 0.0)
+    refused = CliRunner().invoke(main, words)
+    assert refused.exit_code == 2, refused.output
+    assert "lower replicates or starts in [select]" in refused.stderr
+    assert not (tmp_path / "out").exists()
+    assert CliRunner().invoke(main, [*words, "--yes"]).exit_code == 130
+    monkeypatch.setattr(impc.cli.consent, "_SECONDS", 7200.0)
+    assert CliRunner().invoke(main, words).exit_code == 130
+    assert done == []

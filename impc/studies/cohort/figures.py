@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from impc.files.writing import require_ordinary
 from impc.reporting.style import BLUE, DOUBLE_COLUMN, INK, STATE_MARKS, VERMILLION, new_figure
 
 if TYPE_CHECKING:
@@ -20,7 +21,7 @@ __all__ = ["group_figure", "memory_figure", "subject_figure"]
 
 _COLUMNS = 3
 _SOFT = "#8C8C8C"
-_LINE = re.compile(r"memory of worker (\d+) MB, of client (\d+) MB")
+_LINE = re.compile(r"memory of worker (\d{1,7}) MB, of client (\d{1,7}) MB")
 
 
 def group_figure(units: pd.DataFrame, measures: Sequence[str]) -> Figure:
@@ -56,7 +57,8 @@ def group_figure(units: pd.DataFrame, measures: Sequence[str]) -> Figure:
 def memory_figure(log: Path) -> Figure | None:
     """Memory of workers and client over the tasks of a log; None when it has none."""
     try:
-        found = _LINE.findall(log.read_text(encoding="utf-8"))
+        require_ordinary(log)
+        found = _LINE.findall(log.read_text(encoding="utf-8", errors="replace"))
     except OSError:
         return None
     if not found:

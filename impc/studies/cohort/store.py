@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from impc.errors import OutputError
 from impc.files.sealed import Kept
+from impc.files.writing import require_ordinary
 from impc.reporting.writer import owned, write_files
 
 if TYPE_CHECKING:
@@ -117,6 +118,7 @@ class Store:
             When that cannot be done.
         """
         try:
+            require_ordinary(self.folder / "cohort.log")
             with (self.folder / "cohort.log").open("a", encoding="utf-8") as stream:
                 stream.write(line + "\n")
         except OSError as error:

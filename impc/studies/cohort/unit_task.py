@@ -22,27 +22,25 @@ from impc.assess.intent_rules import intent
 from impc.assess.judged import judge
 from impc.assess.printed_gain import gain_estimate
 from impc.assess.resampling import DRAWS, replicate
-from impc.checking import replace
-from impc.control.closed_loop import simulate
 from impc.errors import ImpcError
 from impc.files.plant_sources import make_plant, plant_family_of, plant_source
 from impc.files.reading import read_recordings
 from impc.inverse.noisy_fit import fit_controller
-from impc.inverse.problem import controller_for, scenarios
 from impc.model.weights import Weights
 from impc.reporting.rendering import plain
 from impc.studies.cohort.unit_digest import require_same_inputs, unit_digest
 from impc.studies.fit.settings import fit_settings
-from impc.studies.fit.subject import fit_problem
+from impc.studies.fit.subject import fit_problem, state_sizes
 
 if TYPE_CHECKING:
     from impc.arrays import Array
+    from impc.assess.judged import MethodFit
     from impc.files.configuration import Configuration
-    from impc.inverse.noisy_fit import FittedController
+    from impc.inverse.estimate import Estimate
     from impc.inverse.problem import Problem
     from impc.studies.fit.settings import FitSettings
 
-__all__ = ["FitTask", "fit_unit", "replicate_unit"]
+__all__ = ["FitTask", "fit_unit", "replicate_unit", "unit_problem"]
 
 # Points of a trajectory that are kept for pictures.
 _SHOWN = 600
@@ -76,7 +74,7 @@ def fit_unit(task: FitTask) -> dict[str, Any]:
     """Fit a unit; {"reason": ...} when it cannot be fitted."""
     started = time.perf_counter()
     try:
-        problem, settings = _problem(task)
+        problem, settings = unit_problem(task)
         fitted = fit_controller(problem)
         content = _described(problem, fitted, settings)
     except ImpcError as error:
@@ -91,7 +89,7 @@ def replicate_unit(task: FitTask, fit: dict[str, Any], index: int) -> dict[str, 
     """One bootstrap replicate of a fitted unit, by its number `index`; `fit` is its content."""
     started = time.perf_counter()
     try:
-        problem, settings = _problem(task)
+        problem, settings = unit_problem(task)
         here = problem.at(np.array(fit["starts"]), np.array(fit["logarithms"]))
         found = replicate(
             here,
@@ -115,7 +113,14 @@ def replicate_unit(task: FitTask, fit: dict[str, Any], index: int) -> dict[str, 
 
 
 @functools.lru_cache(maxsize=4)
-def _problem(task: FitTask) -> tuple[Problem, FitSettings]:
+def unit_problem(task: FitTask) -> tuple[Problem, FitSettings]:
+    """The recordings of a unit as an inverse problem, read once for all that is done with it.
+
+    Raises
+    ------
+    ImpcError
+        When a recording, the plant or the settings cannot be used, or are not those of the `task`.
+    """
     settings = fit_settings(task.configuration.fit)
     source = plant_source(task.plant, task.arguments)
     # A worker on another machine, or one that has run for days, may have other files and code.
@@ -128,15 +133,12 @@ def _problem(task: FitTask) -> tuple[Problem, FitSettings]:
     return fit_problem(plant, recordings, settings, family), settings
 
 
-def _described(problem: Problem, fitted: FittedController, settings: FitSettings) -> dict[str, Any]:
-    known = replace(fitted.problem, unknown_start=False, family=None, logarithms=np.zeros(0))
-    plant, K, S = known.plant, np.array(fitted.solution.K), np.array(fitted.solution.S)
-    fit = judge("inverse_mpc", known, problem.bounds, K, S, weights=fitted.weights, seconds=0.0)
+def _described(problem: Problem, fitted: Estimate, settings: FitSettings) -> dict[str, Any]:
+    plant, K, weights = fitted.problem.plant, np.array(fitted.gain), fitted.stage_weights
+    fit = judge(fitted, problem.bounds)
     estimate = gain_estimate(fitted)
-    sizes = np.sqrt(np.mean(np.concatenate([run.x for run in fit.runs]) ** 2, axis=0))
-    moving = sizes[sizes > 0]
-    sizes = np.maximum(sizes, np.min(moving) if len(moving) else 1.0)
-    readings = intent(plant, K, np.array(fitted.metrics), sizes, fitted.weights)
+    sizes = state_sizes(fit.runs)
+    readings = intent(plant, K, np.array(fitted.metrics), sizes, weights)
     family = estimate.problem.family
     names = () if family is None else family.names
     limit = np.minimum(np.abs(problem.bounds.u_max), np.abs(problem.bounds.u_min))
@@ -152,10 +154,10 @@ def _described(problem: Problem, fitted: FittedController, settings: FitSettings
         "K_deviation": estimate.covariance.entries,
         "K_told": estimate.covariance.told_entries,
         "K_of_weights": K,
-        "Q": fitted.weights.Q,
-        "R": fitted.weights.R,
+        "Q": weights.Q,
+        "R": weights.R,
         "misfit": fitted.misfit,
-        "exact": fitted.exact,
+        "exact": fitted.explained,
         "converged": fitted.converged,
         "vaf": dict(zip(plant.outputs, fit.vaf, strict=True)),
         "held_out_vaf": dict(zip(plant.outputs, _held_out(problem, fitted, settings), strict=True)),
@@ -169,34 +171,31 @@ def _described(problem: Problem, fitted: FittedController, settings: FitSettings
         "starts": [trial.x0 for trial in estimate.problem.recordings],
         "logarithms": estimate.problem.logarithms,
         "findings": [trial.findings for trial in problem.recordings],
-        "trajectory": _trajectory(known, fitted),
+        "trajectory": _trajectory(fit),
     }
 
 
-def _held_out(problem: Problem, fitted: FittedController, settings: FitSettings) -> Array:
+def _held_out(problem: Problem, fitted: Estimate, settings: FitSettings) -> Array:
     """Mean VAF over trials left out, %; NaN when they are not wanted or there is but one."""
     count = len(problem.recordings)
     if not settings.held_out or count < 2:
         return np.full(len(problem.plant.outputs), np.nan)
     shares = []
     for index in range(count):
-        others = problem.recordings[:index] + problem.recordings[index + 1 :]
-        other = fit_controller(replace(problem, recordings=others))
+        other = fit_controller(problem.leaving_out(index), fitted.stage_weights)
         shares.append(predict(problem, other, fitted, index, settings.settle).vaf)
     return np.asarray(np.mean(shares, axis=0))
 
 
-def _trajectory(known: Problem, fitted: FittedController) -> dict[str, Any]:
+def _trajectory(fit: MethodFit) -> dict[str, Any]:
     """Recorded and simulated outputs of the first trial, a few hundred points."""
-    one = replace(known, recordings=known.recordings[:1])
-    controller = controller_for(one, np.array(fitted.solution.K), np.array(fitted.solution.S))
-    run = simulate(controller, scenarios(one)[0])
-    trial = one.recordings[0]
+    problem = fit.estimate.problem
+    trial, run = problem.recordings[0], fit.runs[0]
     step = max(1, trial.samples // _SHOWN)
     return {
-        "dt": known.plant.dt * step,
+        "dt": problem.plant.dt * step,
         "recorded": trial.outputs[::step],
-        "simulated": (run.x @ known.plant.C.T)[::step],
+        "simulated": (run.x @ problem.plant.C.T)[::step],
     }
 
 

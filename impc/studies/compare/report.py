@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from impc.inverse.methods import METHODS
 from impc.reporting.csv_text import csv_bytes
 from impc.reporting.rendering import TextTable, embedded, number, plain, render_template
 from impc.reporting.style import BLUE, DOUBLE_COLUMN, INK, journal_style, new_figure, render
-from impc.studies.fit.sentences import METHOD_LABELS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -22,20 +22,6 @@ if TYPE_CHECKING:
     from impc.studies.compare.subject import MethodComparison
 
 __all__ = ["compare_files", "text_table"]
-
-_SENTENCES = {
-    "feedback_gain": "Any gain whose loop, without bounds, fits the outputs. It has no weights.",
-    "inverse_lqr_lmi": "Weights with exactly that gain, by a semidefinite program; a gain fitted "
-    "to noise has none as a rule.",
-    "inverse_lqr_gradient": "Weights whose regulator's gain is nearest to that gain, in natural "
-    "coordinates.",
-    "inverse_lqr_auxiliary": "The same with a price on the condition number.",
-    "inverse_lqr_output": "Weights whose regulator, without bounds, fits the outputs best.",
-    "inverse_kkt": "Weights that make the smoothed states and commands look like optimal plans. "
-    "No simulation; what disturbs the subject is taken for planned.",
-    "inverse_mpc_reduced": "Any gain, under the bounds; weights where that gain has any.",
-    "inverse_mpc_direct": "Weights whose constrained controller fits the outputs best.",
-}
 
 
 def compare_files(
@@ -51,7 +37,7 @@ def compare_files(
         methods=_methods(problem, compared),
         weights=_weights(problem, compared),
         source=embedded(pictures["png"]),
-        sentences=[(METHOD_LABELS[item.name], _SENTENCES[item.name]) for item in compared],
+        sentences=[(METHODS[item.name].label, METHODS[item.name].sentence) for item in compared],
         provenance=provenance,
     )
     return {
@@ -90,13 +76,15 @@ def _findings(compared: Sequence[MethodComparison]) -> list[str]:
         best = ranked[0]
         where = "trials that it has not seen" if held else "the trials that it was fitted to"
         lines.append(
-            f"Best on {where}: {METHOD_LABELS[best.name]}, {np.mean(_score(best)):.2f} % on "
+            f"Best on {where}: {METHODS[best.name].label}, {np.mean(_score(best)):.2f} % on "
             "average over the outputs."
         )
-    keeping = [METHOD_LABELS[item.name] for item in usable if item.fit.keeps_bounds]
+    keeping = [METHODS[item.name].label for item in usable if item.fit.keeps_bounds]
     lines.append(f"Keep the subject's bounds: {', '.join(keeping) or 'none'}.")
     lines += [
-        f"{METHOD_LABELS[item.name]}: {item.fit.reason}." for item in compared if item.fit.reason
+        f"{METHODS[item.name].label}: {item.fit.estimate.reason}."
+        for item in compared
+        if item.fit.estimate.reason
     ]
     return lines
 
@@ -117,13 +105,13 @@ def _methods(problem: Problem, compared: Sequence[MethodComparison]) -> TextTabl
         fallen = [time for time in fit.fell if time is not None]
         rows.append(
             (
-                METHOD_LABELS[item.name],
+                METHODS[item.name].label,
                 *(number(float(value), 5) for value in (*fit.vaf, *_held(item))),
                 ", ".join(number(float(value)) for value in fit.largest_input),
-                "-" if fit.K is None else f"{100 * fit.exceeded:.1f}",
+                "-" if fit.estimate.K is None else f"{100 * fit.exceeded:.1f}",
                 f"{min(fallen):.1f} s" if fallen else "",
-                "none" if fit.weights is None else "yes",
-                f"{fit.seconds:.2f}",
+                "none" if fit.estimate.weights is None else "yes",
+                f"{fit.estimate.seconds:.2f}",
             )
         )
     caption = (
@@ -137,13 +125,13 @@ def _weights(problem: Problem, compared: Sequence[MethodComparison]) -> TextTabl
     plant = problem.plant
     rows = []
     for item in compared:
-        given = item.fit.weights
+        given = item.fit.estimate.weights
         if given is None:
             continue
         eigenvalues = np.linalg.eigvalsh(given.block)
         rows.append(
             (
-                METHOD_LABELS[item.name],
+                METHODS[item.name].label,
                 *(number(float(value)) for value in np.diag(given.Q)),
                 number(float(eigenvalues[-1] / eigenvalues[0])),
             )
@@ -158,7 +146,7 @@ def _weights(problem: Problem, compared: Sequence[MethodComparison]) -> TextTabl
 
 
 def _figure(problem: Problem, compared: Sequence[MethodComparison]) -> Figure:
-    shown = [item for item in compared if item.fit.K is not None][::-1]
+    shown = [item for item in compared if item.fit.estimate.K is not None][::-1]
     figure = new_figure(DOUBLE_COLUMN, 0.5 + 0.36 * max(len(shown), 2))
     left, right = figure.subplots(1, 2, sharey=True, width_ratios=(1.6, 1))
     rows = np.arange(len(shown))
@@ -168,7 +156,7 @@ def _figure(problem: Problem, compared: Sequence[MethodComparison]) -> Figure:
     left.barh(
         rows - 0.2, outside, 0.38, color="white", edgecolor=INK, linewidth=0.8, label="left out"
     )
-    left.set_yticks(rows, [METHOD_LABELS[item.name] for item in shown])
+    left.set_yticks(rows, [METHODS[item.name].label for item in shown])
     left.set_xlim(0, 100)
     left.set_xlabel("VAF, mean over outputs (%)")
     left.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
@@ -198,8 +186,8 @@ def _csv(problem: Problem, compared: Sequence[MethodComparison]) -> bytes:
         (
             item.name,
             *map(float, (*item.fit.vaf, *_held(item), *item.fit.largest_input, item.fit.exceeded)),
-            item.fit.seconds,
-            item.fit.reason,
+            item.fit.estimate.seconds,
+            item.fit.estimate.reason,
         )
         for item in compared
     ]
@@ -214,9 +202,9 @@ def _json(
     for item in compared:
         fit = item.fit
         methods[item.name] = {
-            "K": fit.K,
-            "Q": None if fit.weights is None else fit.weights.Q,
-            "R": None if fit.weights is None else fit.weights.R,
+            "K": fit.estimate.K,
+            "Q": None if fit.estimate.weights is None else fit.estimate.weights.Q,
+            "R": None if fit.estimate.weights is None else fit.estimate.weights.R,
             "vaf": dict(zip(plant.outputs, fit.vaf, strict=True)),
             "held_out_vaf": dict(zip(plant.outputs, _held(item), strict=True)),
             "trial_vaf": fit.trial_vaf,
@@ -224,8 +212,8 @@ def _json(
             "largest_input": fit.largest_input,
             "share_beyond_bound": fit.exceeded,
             "fell": fit.fell,
-            "seconds": fit.seconds,
-            "reason": fit.reason,
+            "seconds": fit.estimate.seconds,
+            "reason": fit.estimate.reason,
         }
     content = {
         "methods": methods,

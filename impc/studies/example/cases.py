@@ -7,7 +7,6 @@ method is in tests/.
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
 
@@ -15,32 +14,26 @@ import numpy as np
 
 from impc.arrays import Array, Frozen, frozen
 from impc.assess.identified_directions import Identifiability, identifiability
-from impc.control.closed_loop import Scenario, Simulation, require_complete, scenario, simulate
+from impc.assess.judged import judge
+from impc.control.closed_loop import Simulation, require_complete, scenario, simulate
 from impc.control.controller import Controller
-from impc.inverse.direct_and_reduced import (
-    AUXILIARY_CONDITION_WEIGHT,
-    CONDITION_WEIGHT,
-    auxiliary_weights,
-    inverse_mpc,
-    inverse_mpc_reduced,
-    output_penalty_weights,
-)
-from impc.inverse.gain_search import fit_gain
-from impc.inverse.inverse_lqr import inverse_lqr_gradient, inverse_lqr_lmi
+from impc.inverse.direct_and_reduced import AUXILIARY_CONDITION_WEIGHT, CONDITION_WEIGHT
+from impc.inverse.methods import METHODS, PlantUnits
 from impc.inverse.problem import Problem, misfit
 from impc.model.bounds import Bounds
 from impc.model.recordings import Recording
-from impc.model.riccati import solve_lqr
-from impc.model.weights import Weights, normalised, weight_error
+from impc.model.weights import Weights, weight_error
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from impc.assess.judged import MethodFit
     from impc.model.plant import Plant
 
 __all__ = [
     "BOUND",
     "CASES",
+    "EXAMPLE",
     "HORIZON",
     "LOST",
     "SETTINGS",
@@ -55,6 +48,16 @@ _T = TypeVar("_T")
 
 #: Initial states by name.
 CASES: dict[str, tuple[float, float]] = {"A": (1.0, 3.0), "B": (2.0, 3.0), "C": (2.0, 1.0)}
+#: The methods, in the order of the table.
+EXAMPLE = (
+    "feedback_gain",
+    "inverse_lqr_lmi",
+    "inverse_lqr_gradient",
+    "inverse_lqr_auxiliary",
+    "inverse_lqr_output",
+    "inverse_mpc",
+    "inverse_mpc_reduced",
+)
 #: N of the controller, in samples.
 HORIZON = 3
 #: Samples of a recording.
@@ -186,109 +189,39 @@ def run_case(
     problem = Problem(
         plant, bounds, HORIZON, (Recording(plant, truth.x),), output_scale=np.ones(plant.n)
     )
-    runner = _Runner(problem, truth_weights, progress)
-
-    gain = runner.timed("feedback_gain", lambda: fit_gain(problem.without_bounds()))
-    runner.add_gain(gain.K, gain.evaluations)
-    lmi = runner.timed("inverse_lqr_lmi", lambda: inverse_lqr_lmi(plant, gain.K))
-    runner.add_regulator(lmi.weights, 0, feasible=lmi.weights is not None)
-    gradient = runner.timed("inverse_lqr_gradient", lambda: inverse_lqr_gradient(plant, gain.K))
-    runner.add_regulator(gradient.weights, 0)
-    auxiliary = runner.timed(
-        "inverse_lqr_auxiliary", lambda: auxiliary_weights(plant, gain.K, gradient.weights)
-    )
-    runner.add_regulator(auxiliary.weights, 0)
-    start = auxiliary.weights if lmi.weights is None else lmi.weights
-    output = runner.timed(
-        "inverse_lqr_output",
-        lambda: output_penalty_weights(problem, start, condition_weight=CONDITION_WEIGHT),
-    )
-    runner.add_regulator(output.weights, output.evaluations)
-    direct = runner.timed(
-        "inverse_mpc", lambda: inverse_mpc(problem, start, condition_weight=CONDITION_WEIGHT)
-    )
-    runner.add_constrained(direct.weights, direct.evaluations)
-    reduced = runner.timed("inverse_mpc_reduced", lambda: inverse_mpc_reduced(problem))
-    runner.add_constrained(reduced.weights, reduced.gain.evaluations)
+    ground = PlantUnits(problem)
+    results = []
+    for method in EXAMPLE:
+        found = METHODS[method].estimate(ground)
+        results.append(_result(judge(found, bounds), truth_weights))
+        progress(method)
+    branch = "gradient" if ground.lmi.weights is None else "LMI"
+    direct = next(item for item in results if item.name == "inverse_mpc")
+    assert direct.weights is not None  # it raises where there are none
     return CaseResult(
         name,
         frozen(CASES[name]),
         controller,
         truth,
-        "gradient" if lmi.weights is None else "LMI",
-        tuple(runner.results),
+        branch,
+        tuple(results),
         identifiability(problem, direct.weights),
     )
 
 
-class _Runner:
-    """Times each method and judges its answer on the recording."""
-
-    def __init__(self, problem: Problem, truth: Weights, progress: Callable[[str], None]) -> None:
-        self.problem = problem
-        self.truth = truth
-        self.progress = progress
-        self.results: list[MethodResult] = []
-        self.name = ""
-        self.seconds = 0.0
-
-    def timed(self, name: str, call: Callable[[], _T]) -> _T:
-        begin = time.perf_counter()
-        answer = call()
-        self.name, self.seconds = name, time.perf_counter() - begin
-        return answer
-
-    def add_gain(self, gain: Array, simulations: int) -> None:
-        self._add(gain, None, self._linear(gain), simulations, None)
-
-    def add_regulator(
-        self, weights: Weights | None, simulations: int, feasible: bool | None = None
-    ) -> None:
-        if weights is None:
-            self._add(None, None, None, simulations, feasible)
-            return
-        gain = solve_lqr(self.problem.plant, weights).K
-        self._add(gain, weights, self._linear(gain), simulations, feasible)
-
-    def add_constrained(self, weights: Weights, simulations: int) -> None:
-        problem = self.problem
-        controller = Controller(problem.plant, weights, problem.bounds, problem.horizon)
-        run = require_complete(controller, simulate(controller, self._drive()))
-        self._add(controller.K, weights, run, simulations, None)
-
-    def _add(
-        self,
-        gain: Array | None,
-        weights: Weights | None,
-        run: Simulation | None,
-        simulations: int,
-        feasible: bool | None,
-    ) -> None:
-        largest = None if run is None else float(np.max(np.abs(run.u)))
-        self.results.append(
-            MethodResult(
-                name=self.name,
-                weights=None if weights is None else normalised(weights),
-                K=gain,
-                simulation=run,
-                state_misfit=None if run is None else misfit(self.problem, [run]),
-                max_abs_u=largest,
-                bound_kept=None if largest is None else largest <= BOUND * (1 + 1e-9),
-                residual=None if weights is None else weight_error(weights, self.truth),
-                seconds=self.seconds,
-                simulations=simulations,
-                feasible=feasible,
-            )
-        )
-        self.progress(self.name)
-
-    def _linear(self, gain: Array) -> Simulation:
-        problem = self.problem
-        unlimited = problem.without_bounds().bounds
-        controller = Controller.from_gain(
-            problem.plant, gain, unlimited, problem.horizon, terminal_set=False
-        )
-        return simulate(controller, self._drive())
-
-    def _drive(self) -> Scenario:
-        return scenario(self.problem.plant, self.problem.recordings[0].x0, STEPS)
+def _result(fit: MethodFit, truth: Weights) -> MethodResult:
+    found = fit.estimate
+    largest = float(fit.largest_input[0]) if fit.runs else None
+    return MethodResult(
+        name=fit.name,
+        weights=found.weights,
+        K=found.K,
+        simulation=fit.runs[0] if fit.runs else None,
+        state_misfit=misfit(found.problem, list(fit.runs)) if fit.runs else None,
+        max_abs_u=largest,
+        bound_kept=None if largest is None else largest <= BOUND * (1 + 1e-9),
+        residual=None if found.weights is None else weight_error(found.weights, truth),
+        seconds=found.seconds,
+        simulations=found.evaluations,
+        feasible=found.weights is not None if fit.name == "inverse_lqr_lmi" else None,
+    )

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from impc.inverse.methods import METHODS as REGISTRY
 from impc.model.weights import normalised
-from impc.studies.example.cases import true_weights
+from impc.studies.example.cases import EXAMPLE, true_weights
 
 if TYPE_CHECKING:
     from impc.arrays import Array
@@ -48,35 +49,7 @@ class MethodText:
 #: The true controller and the methods in words, by their names.
 METHODS: dict[str, MethodText] = {
     "truth": MethodText("true controller", "The MPC that made the recording."),
-    "feedback_gain": MethodText(
-        "feedback gain",
-        "The fixed gain K of u = -Kx that fits the recorded states best. It knows no bounds.",
-    ),
-    "inverse_lqr_lmi": MethodText(
-        "inverse LQR, LMI",
-        "Weights whose optimal gain is exactly that K, of least condition number. "
-        "There may be none: then the program is infeasible.",
-    ),
-    "inverse_lqr_gradient": MethodText(
-        "inverse LQR, gradient", "Weights whose optimal gain comes nearest to that K."
-    ),
-    "inverse_lqr_auxiliary": MethodText(
-        "inverse LQR, auxiliary (3.7)",
-        "The same, with a price on the condition number that keeps the weights away from singular.",
-    ),
-    "inverse_lqr_output": MethodText(
-        "inverse LQR, outputs (3.16)",
-        "Weights whose optimal gain fits the recorded states themselves. It knows no bounds.",
-    ),
-    "inverse_mpc": MethodText(
-        "inverse MPC, direct (3.6)",
-        "Weights whose controller, with its bounds, fits the recorded states.",
-    ),
-    "inverse_mpc_reduced": MethodText(
-        "inverse MPC, reduced",
-        "First the gain of the bounded controller that fits the recorded states, then the weights "
-        "of least condition number that have this gain.",
-    ),
+    **{name: MethodText(REGISTRY[name].label, REGISTRY[name].sentence) for name in EXAMPLE},
 }
 
 #: Heads of the table.

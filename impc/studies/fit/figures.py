@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from impc.inverse.methods import METHODS
 from impc.reporting.style import (
     BLUE,
     DOUBLE_COLUMN,
@@ -17,7 +18,7 @@ from impc.reporting.style import (
     new_figure,
     render,
 )
-from impc.studies.fit.sentences import METHOD_LABELS, trial_name
+from impc.studies.fit.sentences import trial_name
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -256,7 +257,7 @@ def _methods(result: FitResult) -> Figure:
         run = method.runs[index]
         output = factor * (run.x @ plant.C.T)[window, 0]
         above.plot(
-            time, output, color=color, linestyle=line, linewidth=1.1, label=METHOD_LABELS[name]
+            time, output, color=color, linestyle=line, linewidth=1.1, label=METHODS[name].label
         )
         below.plot(time, run.u[window, 0], color=color, linestyle=line, linewidth=1.0)
     for limit in (result.given.bounds.u_min[0], result.given.bounds.u_max[0]):

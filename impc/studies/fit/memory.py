@@ -6,6 +6,7 @@ what belongs to any other, or was damaged, is not used and is done again.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -16,17 +17,13 @@ from impc.assess.resampling import Replicate
 from impc.checking import replace
 from impc.files.digests import digest, versions
 from impc.files.sealed import Kept
-from impc.inverse.gain_search import GainFit
-from impc.inverse.methods import decode_estimate, encode_estimate
-from impc.inverse.noisy_fit import FittedController, fit_controller
-from impc.model.riccati import solve_lqr
-from impc.model.weights import Weights
+from impc.inverse.estimate import Estimate, decode_estimate, encode_estimate
+from impc.inverse.methods import METHODS, Method
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from impc.inverse.methods import Estimate
     from impc.inverse.problem import Problem
     from impc.model.plant_family import PlantFamily
     from impc.studies.fit.settings import FitSettings
@@ -35,6 +32,8 @@ __all__ = ["FitMemory", "open_memory"]
 
 # Where a family of plants is looked at: two families may agree at their nominal values.
 _FACTORS = (0.9, 1.1)
+# Stages of a fit, and of a comparison.
+_LEFT_OUT = re.compile(r"without (?:trial )?(\d+)")
 
 
 @dataclass(frozen=True)
@@ -43,6 +42,8 @@ class FitMemory:
 
     Attributes
     ----------
+    problem : Problem
+        As it was posed.
     files : Kept
         One a stage; the folder is made when the first stage is done.
     digest : str
@@ -51,25 +52,10 @@ class FitMemory:
         Name of stage -> what `_encode` keeps of it.
     """
 
+    problem: Problem
     files: Kept
     digest: str
     stages: dict[str, Any] = field(default_factory=dict)
-
-    def controller(self, name: str, problem: Problem) -> FittedController:
-        """The controller of the stage `name`, remembered or fitted now and then written down.
-
-        Raises
-        ------
-        WeightsError, SolverError
-            As `fit_controller`.
-        OutputError
-            When the file cannot be written.
-        """
-        if name in self.stages:
-            return _restore(problem, self.stages[name])
-        found = fit_controller(problem)
-        self._keep(name, _encode(found))
-        return found
 
     def estimate(self, name: str, compute: Callable[[], Estimate]) -> Estimate:
         """The estimate of the stage `name`, remembered or computed now and then written down.
@@ -80,7 +66,8 @@ class FitMemory:
             When the file cannot be written.
         """
         if name in self.stages:
-            return decode_estimate(self.stages[name])
+            kept = self.stages[name]
+            return decode_estimate(_seen(self.problem, name, METHODS[kept["method"]]), kept)
         found = compute()
         self._keep(name, encode_estimate(found))
         return found
@@ -144,7 +131,7 @@ def open_memory(
     """
     files = Kept(folder / f"{command}-in-progress")
     known = digest(_content(problem), settings, made_of, versions())
-    return FitMemory(files, known, files.recall_all(known))
+    return FitMemory(problem, files, known, files.recall_all(known))
 
 
 def _content(problem: Problem) -> tuple[Any, ...]:
@@ -161,65 +148,8 @@ def _probes(family: PlantFamily) -> list[Array]:
     return [family.nominal * row for row in np.concatenate(changes)]
 
 
-def _encode(found: FittedController) -> dict[str, Any]:
-    free = found.free
-    return {
-        "Q": found.weights.Q.tolist(),
-        "R": found.weights.R.tolist(),
-        "misfit": found.misfit,
-        "exact": found.exact,
-        "converged": found.converged,
-        "metrics": found.metrics.tolist(),
-        **_nuisance(found.problem),
-        "free": {
-            "K": free.K.tolist(),
-            "S": free.S.tolist(),
-            "misfit": free.misfit,
-            "explained": free.explained,
-            "stabilises": free.stabilises,
-            "singular_values": free.singular_values.tolist(),
-            "metrics": free.metrics.tolist(),
-            "evaluations": free.evaluations,
-            "refused": list(free.refused),
-            **_nuisance(free.problem),
-        },
-    }
-
-
-def _nuisance(problem: Problem) -> dict[str, Any]:
-    return {
-        "starts": [trial.x0.tolist() for trial in problem.recordings],
-        "logarithms": problem.logarithms.tolist(),
-    }
-
-
-def _restore(problem: Problem, kept: dict[str, Any]) -> FittedController:
-    free = kept["free"]
-    here = _problem(problem, kept)
-    weights = Weights(kept["Q"], kept["R"])
-    return FittedController(
-        here,
-        GainFit(
-            frozen(free["K"]),
-            frozen(free["S"]),
-            _problem(problem, free),
-            free["misfit"],
-            free["explained"],
-            free["stabilises"],
-            frozen(free["singular_values"]),
-            frozen(free["metrics"]),
-            free["evaluations"],
-            tuple(free["refused"]),
-        ),
-        weights,
-        solve_lqr(here.plant, weights),
-        kept["misfit"],
-        kept["exact"],
-        kept["converged"],
-        frozen(kept["metrics"]),
-    )
-
-
-def _problem(problem: Problem, kept: dict[str, Any]) -> Problem:
-    starts: Array = np.array(kept["starts"], dtype=np.float64)
-    return problem.at(starts, np.array(kept["logarithms"], dtype=np.float64))
+def _seen(problem: Problem, stage: str, method: Method) -> Problem:
+    """The problem of a stage as its method sees it."""
+    left_out = _LEFT_OUT.match(stage)
+    posed = problem.leaving_out(int(left_out[1]) - 1) if left_out else problem
+    return posed if method.name == "inverse_mpc" else method.sees(posed.known())

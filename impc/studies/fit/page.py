@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.assess.covariance import TOLD
+from impc.inverse.methods import METHODS
 from impc.reporting.rendering import TextTable, embedded, number, render_template
 from impc.studies.fit.figures import shown_trials
 from impc.studies.fit.sentences import (
-    METHOD_LABELS,
     direction_name,
     findings,
     method_note,
@@ -79,7 +79,7 @@ def fit_page(result: FitResult, figures: Mapping[str, bytes], provenance: FitPro
             for index, trial in enumerate(result.given.recordings)
         ],
         terminal_set=_terminal_set(result),
-        converged=result.fitted.converged or result.fitted.exact,
+        converged=result.fitted.converged or result.fitted.explained,
         settings=asdict(result.settings),
         provenance=provenance,
         plant=plant,
@@ -120,11 +120,11 @@ def _methods(result: FitResult) -> TextTable:
     heads = ("method", *(f"VAF {name} %" for name in outputs), "largest input", "", "seconds")
     rows = tuple(
         (
-            METHOD_LABELS[item.name],
+            METHODS[item.name].label,
             *(number(value, 5) for value in item.vaf),
             ", ".join(number(value) for value in item.largest_input),
             method_note(result, item),
-            f"{item.seconds:.2f}",
+            f"{item.estimate.seconds:.2f}",
         )
         for item in result.methods
     )

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from impc.assess.judged import MethodFit
     from impc.assess.printed_gain import GainEstimate
     from impc.assess.variance_accounted_for import TrialAgreement
-    from impc.inverse.noisy_fit import FittedController
+    from impc.inverse.estimate import Estimate
     from impc.inverse.problem import Problem
     from impc.studies.fit.settings import FitSettings
 
@@ -65,7 +65,7 @@ class FitResult:
     settings : FitSettings
     given : Problem
         The problem as it was posed: nominal plant, trials at rest.
-    fitted : FittedController
+    fitted : Estimate
         Weights and their gain; `fitted.problem` holds the initial states and the plant found.
     estimate : GainEstimate
         The gain that the recordings tell, and how far: what is printed with intervals.
@@ -80,7 +80,7 @@ class FitResult:
     held_out : tuple of HeldOut
         One a trial; empty for a single trial or when not asked for.
     methods : tuple of MethodFit
-        Those of `impc.assess.inverse_lqr_beside` in their order; the last is inverse MPC.
+        Those of `impc.inverse.methods` that a fit asks for; the last is inverse MPC.
     diagnostics : ResidualDiagnostics
         What the residuals say against the fit.
     terminal_set_difference : float
@@ -92,7 +92,7 @@ class FitResult:
 
     settings: FitSettings
     given: Problem
-    fitted: FittedController
+    fitted: Estimate
     estimate: GainEstimate
     parameters: tuple[FittedParameter, ...]
     intent: Intent

@@ -45,9 +45,9 @@ def fit_json(result: FitResult, provenance: FitProvenance) -> bytes:
 
 
 def _controller(result: FitResult) -> dict[str, Any]:
-    plant, solution = result.fitted.problem.plant, result.fitted.solution
+    plant, fitted = result.fitted.problem.plant, result.fitted
     weights = result.intent.reported.weights
-    scale = weights.R[0, 0] / result.fitted.weights.R[0, 0]
+    scale = weights.R[0, 0] / fitted.stage_weights.R[0, 0]
     bounds = result.given.bounds
     held = np.array([item.vaf for item in result.held_out])
     return {
@@ -60,8 +60,8 @@ def _controller(result: FitResult) -> dict[str, Any]:
         "controls": plant.controls,
         "outputs": plant.outputs,
         "disturbances": plant.disturbances,
-        "K": solution.K,
-        "S": solution.S * scale,
+        "K": fitted.gain,
+        "S": fitted.metric * scale,
         "Q": weights.Q,
         "R": weights.R,
         "P": result.reported_P,
@@ -116,16 +116,16 @@ def _found(result: FitResult) -> dict[str, Any]:
         "trials": [_trial(result, index) for index in range(len(result.trials))],
         "methods": {
             item.name: {
-                "K": item.K,
-                "Q": None if item.weights is None else item.weights.Q,
-                "R": None if item.weights is None else item.weights.R,
+                "K": item.estimate.K,
+                "Q": None if item.estimate.weights is None else item.estimate.weights.Q,
+                "R": None if item.estimate.weights is None else item.estimate.weights.R,
                 "vaf": dict(zip(plant.outputs, item.vaf, strict=True)),
                 "trial_vaf": item.trial_vaf,
                 "largest_input": item.largest_input,
                 "keeps_bounds": item.keeps_bounds,
                 "fell": item.fell,
-                "seconds": item.seconds,
-                "reason": item.reason,
+                "seconds": item.estimate.seconds,
+                "reason": item.estimate.reason,
             }
             for item in result.methods
         },

@@ -14,23 +14,8 @@ if TYPE_CHECKING:
     from impc.assess.judged import MethodFit
     from impc.studies.fit.result import FitResult
 
-__all__ = ["METHOD_LABELS", "direction_name", "findings", "method_note", "trial_name"]
+__all__ = ["direction_name", "findings", "method_note", "trial_name"]
 
-#: Methods in words, by their names.
-METHOD_LABELS = {
-    "preliminary": "preliminary gains and parameters (3.19)",
-    "feedback_gain": "feedback gain, no bounds (3.12)",
-    "inverse_lqr_gain": "inverse LQR, gain penalty (3.7)",
-    "inverse_lqr_output": "inverse LQR, output penalty (3.16)",
-    "inverse_lqr_lmi": "inverse LQR, LMI",
-    "inverse_lqr_gradient": "inverse LQR, gradient",
-    "inverse_lqr_auxiliary": "inverse LQR, gain penalty (3.7)",
-    "inverse_kkt": "inverse KKT",
-    "clipped_lqr": "LQR of inverse MPC, clipped",
-    "inverse_mpc_reduced": "inverse MPC, reduced",
-    "inverse_mpc_direct": "inverse MPC, direct (3.6)",
-    "inverse_mpc": "inverse MPC",
-}
 # Parts of a direction below this are not named.
 _NAMED = 0.15
 
@@ -57,8 +42,8 @@ def trial_name(result: FitResult, index: int) -> str:
 
 def method_note(result: FitResult, method: MethodFit) -> str:
     """Why a method is no explanation, in a few words; empty when it may be one."""
-    if method.K is None:
-        return method.reason
+    if method.estimate.K is None:
+        return method.estimate.reason
     fell = [
         f"{trial_name(result, index)} at {time:.1f} s"
         for index, time in enumerate(method.fell)
@@ -111,7 +96,7 @@ def _against_inverse_lqr(result: FitResult) -> list[str]:
     methods = {item.name: item for item in result.methods}
     other, own = methods["inverse_lqr_output"], result.inverse_mpc
     lines = []
-    if other.K is not None and not np.any(np.isnan(other.vaf)):
+    if other.estimate.K is not None and not np.any(np.isnan(other.vaf)):
         gain = float(np.mean(own.vaf - other.vaf))
         kept = "keeps the bound too" if other.keeps_bounds else "exceeds the bound"
         sign = "more" if gain >= 0 else "less"

@@ -18,20 +18,21 @@ import numpy as np
 
 from impc.arrays import Array, frozen
 from impc.assess.all_intervals import assess, count_stages
-from impc.assess.delayed_feedback import PreliminaryGain, preliminary_gain
 from impc.assess.diagnostics import residual_diagnostics
 from impc.assess.held_out import predict
 from impc.assess.identified_directions import identifiability
 from impc.assess.intent_draws import drawn_gains
 from impc.assess.intent_rules import intent
-from impc.assess.inverse_lqr_beside import compare_methods
+from impc.assess.judged import judge
 from impc.assess.printed_gain import gain_estimate
 from impc.assess.variance_accounted_for import agreement
 from impc.assess.weights_ranges import weights_summary_or_reason
 from impc.checking import checked, replace
 from impc.control.closed_loop import simulate
 from impc.errors import DataError, SolverError
-from impc.inverse.noisy_fit import FittedController, fit_controller
+from impc.inverse.estimate import Estimate
+from impc.inverse.methods import NaturalUnits, Remember, compute, estimate_all
+from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.problem import Problem, controller_for, scenarios
 from impc.studies.fit.result import FitResult, FittedParameter
 from impc.studies.fit.settings import FitSettings, fit_bounds
@@ -39,16 +40,20 @@ from impc.studies.fit.settings import FitSettings, fit_bounds
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
+    from impc.assess.judged import MethodFit
     from impc.assess.printed_gain import GainEstimate
     from impc.assess.resampling import Replicate
+    from impc.control.closed_loop import Simulation
     from impc.model.plant import Plant
     from impc.model.plant_family import PlantFamily
     from impc.model.recordings import Recording
     from impc.model.riccati import LqrSolution
 
-__all__ = ["FitProgress", "fit_problem", "fit_recordings", "stages"]
+__all__ = ["BESIDE", "FitProgress", "fit_problem", "fit_recordings", "stages", "state_sizes"]
 
 _THREADS = 2
+# Shown beside inverse MPC, which comes last.
+BESIDE = ("feedback_gain", "inverse_lqr", "inverse_lqr_output", "clipped_lqr")
 
 
 @dataclass(frozen=True)
@@ -59,26 +64,28 @@ class FitProgress:
     ----------
     done : callable
         Told the name of each stage when it is done.
-    controller : callable
-        (name of stage, its problem) -> the controller fitted to it, from memory when it is there
+    estimate : callable
+        (name of stage, compute) -> the estimate, from memory when it is there
         (`impc.studies.fit.memory`). By default every one is computed.
     replicate : callable
         (name of stage, compute) -> a bootstrap replicate, in the same way.
     """
 
     done: Callable[[str], None] = lambda _: None
-    controller: Callable[[str, Problem], FittedController] = lambda _, problem: fit_controller(
-        problem
-    )
+    estimate: Remember = compute
     replicate: Callable[[str, Callable[[], Replicate]], Replicate] = lambda _, compute: compute()
 
 
 def stages(problem: Problem, settings: FitSettings) -> int:
     """Number of stages that `fit_recordings` reports."""
-    methods = 6 if settings.feedback_states else 5
     trials = len(problem.recordings)
     left_out = trials if _leaves_out(trials, settings) else 0
-    return 1 + methods + left_out + count_stages(problem, settings)
+    return 1 + len(_beside(settings)) + left_out + count_stages(problem, settings)
+
+
+def _beside(settings: FitSettings) -> tuple[str, ...]:
+    """Methods that are shown beside inverse MPC, in the order of the table."""
+    return ("preliminary", *BESIDE) if settings.feedback_states else BESIDE
 
 
 @checked
@@ -169,19 +176,23 @@ def fit_recordings(
     """
     progress = progress or FitProgress()
     started = time.perf_counter()
-    fitted = progress.controller("fit", problem)
+    ground = NaturalUnits(problem, progress.estimate, settings.feedback_states)
+    fitted = ground.fitted
     progress.done("inverse MPC")
     estimate = gain_estimate(fitted)
-    known = replace(fitted.problem, unknown_start=False, family=None, logarithms=frozen([]))
-    plant, K, metrics = known.plant, np.array(fitted.solution.K), np.array(fitted.metrics)
-    sizes = _state_sizes(known, fitted)
+    known, weights = ground.known, fitted.stage_weights
+    plant, K, metrics = known.plant, np.array(fitted.gain), np.array(fitted.metrics)
+    methods = [judge(fitted, problem.bounds)]
+    sizes = state_sizes(methods[0].runs)
     with _threads() as pool:
-        others = _left_out(pool, problem, settings, progress)
+        others = _left_out(pool, ground, settings)
         draws: tuple[LqrSolution, ...] = ()
         if settings.intent_draws:
-            draws = drawn_gains(plant, fitted.weights, estimate.K, estimate.covariance)
+            draws = drawn_gains(plant, weights, estimate.K, estimate.covariance)
         whole_set = pool.submit(weights_summary_or_reason, plant, K, metrics, sizes, draws)
-        methods = compare_methods(fitted, progress.done, _preliminary(problem, settings))
+        for name in _beside(settings)[::-1]:
+            methods.insert(0, judge(estimate_all(ground, [name])[name], problem.bounds))
+            progress.done(name)
         held_out = []
         for index, other in enumerate(others):
             held_out.append(predict(problem, other.result(), fitted, index, settings.settle))
@@ -198,17 +209,17 @@ def fit_recordings(
         fitted,
         estimate,
         _parameters(estimate),
-        intent(plant, K, metrics, sizes, fitted.weights),
-        identifiability(known, fitted.weights),
+        intent(plant, K, metrics, sizes, weights),
+        identifiability(known, weights),
         certainty,
         tuple(
             agreement(plant, trial, run, np.array(bounds.u_min), np.array(bounds.u_max))
             for trial, run in zip(known.recordings, runs, strict=True)
         ),
         tuple(held_out),
-        methods,
-        residual_diagnostics(fitted.problem, K, np.array(fitted.solution.S)),
-        _terminal_set_difference(known, fitted),
+        tuple(methods),
+        residual_diagnostics(fitted.problem, K, np.array(fitted.metric)),
+        _terminal_set_difference(methods[-1]),
         time.perf_counter() - started,
     )
 
@@ -218,12 +229,6 @@ def _first_guess(plant: Plant, trial: Recording) -> Recording:
     if np.any(trial.disturbance) or np.any(trial.x0):
         return trial
     return replace(trial, x0=frozen(np.linalg.pinv(plant.C) @ trial.outputs[0]))
-
-
-def _preliminary(problem: Problem, settings: FitSettings) -> Callable[[], PreliminaryGain] | None:
-    if not settings.feedback_states:
-        return None
-    return functools.partial(preliminary_gain, problem, settings.feedback_states)
 
 
 def _leaves_out(trials: int, settings: FitSettings) -> bool:
@@ -244,15 +249,15 @@ def _threads() -> Iterator[ThreadPoolExecutor]:
 
 
 def _left_out(
-    pool: ThreadPoolExecutor, problem: Problem, settings: FitSettings, progress: FitProgress
-) -> list[Future[FittedController]]:
-    """Controllers fitted to all trials but one."""
+    pool: ThreadPoolExecutor, ground: NaturalUnits, settings: FitSettings
+) -> list[Future[Estimate]]:
+    """Controllers fitted to all trials but one, each from the weights that fit all."""
+    problem, start = ground.problem, ground.fitted.stage_weights
     pending = []
     for index in range(len(problem.recordings)):
         if _leaves_out(len(problem.recordings), settings):
-            others = problem.recordings[:index] + problem.recordings[index + 1 :]
-            part = replace(problem, recordings=others)
-            pending.append(pool.submit(progress.controller, _without(index), part))
+            fit = functools.partial(fit_controller, problem.leaving_out(index), start)
+            pending.append(pool.submit(ground.remember, _without(index), fit))
     return pending
 
 
@@ -276,26 +281,29 @@ def _parameters(estimate: GainEstimate) -> tuple[FittedParameter, ...]:
     )
 
 
-def _state_sizes(known: Problem, fitted: FittedController) -> Array:
-    """Root-mean-square of each state; states that never move count as the least that does."""
-    controller = controller_for(known, np.array(fitted.solution.K), np.array(fitted.solution.S))
-    x = np.concatenate([simulate(controller, drive).x for drive in scenarios(known)])
-    sizes = np.sqrt(np.mean(x**2, axis=0))
+def state_sizes(runs: tuple[Simulation, ...]) -> Array:
+    """Root-mean-square of each state (n,); states that never move count as the least that does.
+
+    Of simulated `runs`.
+
+    Raises
+    ------
+    SolverError
+        When no state moves.
+    """
+    sizes = np.sqrt(np.mean(np.concatenate([run.x for run in runs]) ** 2, axis=0))
     moving = sizes[sizes > 0]
     if len(moving) == 0:
         raise SolverError("simulation", "no state moves", "check the disturbance's column")
     return np.asarray(np.maximum(sizes, np.min(moving)))
 
 
-def _terminal_set_difference(problem: Problem, fitted: FittedController) -> float:
-    K, S = np.array(fitted.solution.K), np.array(fitted.solution.S)
-    pair = [
-        [
-            simulate(controller_for(replace(problem, terminal_set=with_set), K, S), drive)
-            for drive in scenarios(problem)
-        ]
-        for with_set in (False, True)
-    ]
+def _terminal_set_difference(fitted: MethodFit) -> float:
+    """Largest change of a scaled output where the terminal set is added, or taken away."""
+    found = fitted.estimate
+    problem = replace(found.problem, terminal_set=not found.problem.terminal_set)
+    controller = controller_for(problem, found.gain, found.metric)
+    pair = [fitted.runs, [simulate(controller, drive) for drive in scenarios(problem)]]
     if not all(run.complete for runs in pair for run in runs):
         return float("nan")
     return max(

@@ -41,7 +41,7 @@ _NO_ENDS = "not determined"
 def intervals_table(result: FitResult) -> TextTable:
     """Intervals of every number, a column for each method, beside the gain of the weights."""
     certainty, plant = result.certainty, result.fitted.problem.plant
-    of_weights = dict(zip(entry_names(plant), np.ravel(result.fitted.solution.K), strict=True))
+    of_weights = dict(zip(entry_names(plant), np.ravel(result.fitted.gain), strict=True))
     methods = [key for key in _METHODS if any(item.method == key for item in certainty.intervals)]
     found = {(item.name, item.method): item for item in certainty.intervals}
     names = list(dict.fromkeys(item.name for item in certainty.intervals))

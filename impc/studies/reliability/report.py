@@ -16,13 +16,16 @@ from impc.studies.reliability.tables import reliability_tables
 
 if TYPE_CHECKING:
     from impc.arrays import Array
+    from impc.files.inputs import Inputs
     from impc.studies.reliability.analysis import Reliability, Trials
 
 __all__ = ["reliability_files"]
 
 
-def reliability_files(trials: Trials, result: Reliability, command: str) -> dict[str, bytes]:
-    """Build all files; nothing is written. The page ends with the `command` that made it."""
+def reliability_files(
+    trials: Trials, result: Reliability, command: str, inputs: Inputs
+) -> dict[str, bytes]:
+    """Build all files; nothing is written. They name the `command` and its `inputs`."""
     figures = reliability_figures(trials, result)
     tables = reliability_tables(result)
     pictures = {
@@ -45,13 +48,13 @@ def reliability_files(trials: Trials, result: Reliability, command: str) -> dict
     )
     return {
         "report.html": page.encode(),
-        "result.json": _json(result, command),
+        "result.json": _json(result, command, inputs),
         **{f"{name}.csv": csv_bytes(table.heads, table.rows) for name, table in tables.items()},
         **figures,
     }
 
 
-def _json(result: Reliability, command: str) -> bytes:
+def _json(result: Reliability, command: str, inputs: Inputs) -> bytes:
     found: dict[str, dict[str, Any]] = {"icc": {}, "anova": {}, "components": {}}
     for item in result.measures:
         name = f"{item.measure}.{item.output}"
@@ -79,6 +82,7 @@ def _json(result: Reliability, command: str) -> bytes:
         "findings": [asdict(item) for item in findings(result)],
         "notes": result.notes,
         "command": command,
+        "sha256": inputs.plain(),
     }
     return (json.dumps(plain(content), indent=1, allow_nan=False) + "\n").encode()
 

@@ -16,14 +16,17 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from impc.arrays import Array
+    from impc.files.inputs import Inputs
     from impc.studies.selection.key_parameters import KeyParameters
     from impc.studies.selection.model import ParametricModel
 
 __all__ = ["key_files"]
 
 
-def key_files(model: ParametricModel, found: KeyParameters, command: str) -> dict[str, bytes]:
-    """Build all files of `impc key-parameters`; they name the `command`; nothing is written."""
+def key_files(
+    model: ParametricModel, found: KeyParameters, command: str, inputs: Inputs
+) -> dict[str, bytes]:
+    """Build all files of `impc key-parameters`; they name `command` and `inputs`, all as bytes."""
     rows = tuple(
         (
             names_of(model, item.subset),
@@ -89,6 +92,7 @@ def key_files(model: ParametricModel, found: KeyParameters, command: str) -> dic
             for item in found.candidates
         ],
         "command": command,
+        "sha256": inputs.plain(),
     }
     return {
         "report.html": page.encode(),

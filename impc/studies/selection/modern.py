@@ -11,6 +11,7 @@ bias           how far the free parameters move when a fixed one is elsewhere in
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -45,6 +46,9 @@ __all__ = [
     "subset_by_svd",
     "with_doubled_ranges",
 ]
+
+# Subsets whose collinearity is looked at.
+_MOST = 200_000
 
 
 @dataclass(frozen=True)
@@ -90,7 +94,12 @@ def collinearity(found: Information, subset: Sequence[int]) -> float:
 
 
 def best_collinear(found: Information, count: int) -> tuple[tuple[int, ...], float]:
-    """The subset of `count` parameters with the least collinearity, and its index."""
+    """The subset of `count` parameters with the least collinearity, and its index.
+
+    None, and NaN, where there are more than 200 000 of that size: a minute's work.
+    """
+    if math.comb(len(found.F), count) > _MOST:
+        return (), float("nan")
     subsets = itertools.combinations(range(len(found.F)), count)
     index, best = min((collinearity(found, subset), subset) for subset in subsets)
     return best, index

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
     from matplotlib.figure import Figure
 
+    from impc.files.inputs import Inputs
     from impc.studies.selection.analysis import StudySelection
     from impc.studies.selection.model import ParametricModel
 
@@ -24,9 +25,9 @@ __all__ = ["names_of", "selection_files", "selection_table", "table_csv"]
 
 
 def selection_files(
-    model: ParametricModel, found: StudySelection, command: str
+    model: ParametricModel, found: StudySelection, command: str, inputs: Inputs
 ) -> dict[str, bytes]:
-    """Build all files of `impc select`; they name the `command`; nothing is written."""
+    """Build all files of `impc select`; they name the `command` and `inputs`; none is written."""
     tables = {
         "identifiability": _rank_table(model, found),
         "sweep": _sweep_table(model, found),
@@ -50,7 +51,7 @@ def selection_files(
     )
     return {
         "report.html": page.encode(),
-        "result.json": _json(model, found, command),
+        "result.json": _json(model, found, command, inputs),
         **{f"{name}.csv": table_csv(table) for name, table in tables.items()},
         **{f"intervals.{kind}": content for kind, content in pictures.items()},
     }
@@ -220,7 +221,7 @@ def _interval_figure(model: ParametricModel, found: StudySelection) -> Figure:
     return figure
 
 
-def _json(model: ParametricModel, found: StudySelection, command: str) -> bytes:
+def _json(model: ParametricModel, found: StudySelection, command: str, inputs: Inputs) -> bytes:
     def names(subset: Sequence[int]) -> list[str]:
         return [model.names[index] for index in subset]
 
@@ -268,6 +269,7 @@ def _json(model: ParametricModel, found: StudySelection, command: str) -> bytes:
             for item in found.worst_case
         ],
         "command": command,
+        "sha256": inputs.plain(),
     }
     return (json.dumps(plain(content), indent=1, allow_nan=False) + "\n").encode()
 

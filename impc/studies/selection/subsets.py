@@ -20,13 +20,15 @@ import numpy as np
 from impc.errors import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from impc.arrays import Array
 
 __all__ = ["Selection", "exhaustive", "largest_subsets", "subset_variances", "sweep"]
 
 _EPS = float(np.finfo(np.float64).eps)
+# Subsets of one size that are looked at, and at a time: a minute, and 0.1 GB for ten parameters.
+_MOST, _AT_ONCE = 1_000_000, 50_000
 
 
 @dataclass(frozen=True)
@@ -92,7 +94,8 @@ def largest_subsets(informations: Sequence[Array], bound: float, least: int = 2)
     Raises
     ------
     InputError
-        When there is no information or the bound is not positive.
+        When there is no information, the bound is not positive, or so many subsets keep it that
+        they cannot all be looked at.
     """
     if not informations or not bound > 0:
         raise InputError("selection", "needs an information and a positive bound", "give both")
@@ -102,21 +105,28 @@ def largest_subsets(informations: Sequence[Array], bound: float, least: int = 2)
     best = kept
     while kept:
         best = kept
-        known = {subset for subset, _ in kept}
-        grown = [
-            (*subset, index)
-            for subset, _ in kept
-            for index in range(subset[-1] + 1, count)
-            if all(
-                (*subset[:place], *subset[place + 1 :], index) in known
-                for place in range(len(subset))
-            )
-        ]
+        known = [subset for subset, _ in kept]
+        grown = list(itertools.islice(_grown(known, count), _MOST + 1))
+        if len(grown) > _MOST:
+            raise InputError(
+                "selection", f"more than {_MOST} subsets keep a variance of {bound:g}",
+                "lower bound and bounds in [select]",
+            )  # fmt: skip
         kept = _feasible(informations, grown, bound) if grown else []
     if not best or len(best[0][0]) < least:
         return Selection(bound, (), ())
     ordered = sorted(best, key=lambda item: item[1])
     return Selection(bound, tuple(item[0] for item in ordered), tuple(item[1] for item in ordered))
+
+
+def _grown(known: Sequence[tuple[int, ...]], count: int) -> Iterator[tuple[int, ...]]:
+    """Subsets of one parameter more, each of whose parts is among the known ones."""
+    among = set(known)
+    for subset in known:
+        for index in range(subset[-1] + 1, count):
+            parts = ((*subset[:place], *subset[place + 1 :], index) for place in range(len(subset)))
+            if all(part in among for part in parts):
+                yield (*subset, index)
 
 
 def exhaustive(informations: Sequence[Array], bound: float, least: int = 2) -> Selection:
@@ -163,7 +173,8 @@ def sweep(
 def _feasible(
     informations: Sequence[Array], subsets: Sequence[tuple[int, ...]], bound: float
 ) -> list[tuple[tuple[int, ...], float]]:
-    variances = subset_variances(informations, subsets)
+    parts = [subsets[at : at + _AT_ONCE] for at in range(0, len(subsets), _AT_ONCE)]
+    variances = np.concatenate([subset_variances(informations, part) for part in parts])
     return [
         (subset, float(value))
         for subset, value in zip(subsets, variances, strict=True)

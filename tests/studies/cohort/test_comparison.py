@@ -83,7 +83,7 @@ def cohort_p(seed: int, difference: float, subjects: int = 10) -> float:
         price = 4.0 * (difference if group == "b" else 1.0) * np.exp(0.2 * rng.standard_normal())
         trial = subject_trial(int(rng.integers(2**31)), float(price))
         fitted = fit_controller(fit_problem(cart(), [trial], SETTINGS))
-        rows.append((str(number), "1", "", group, fitted.solution.K[0, 0]))
+        rows.append((str(number), "1", "", group, fitted.gain[0, 0]))
     units = pd.DataFrame(rows, columns=["subject", "visit", "condition", "group", "K.force.x"])
     (found,) = compare_cohort(units)
     return found.p

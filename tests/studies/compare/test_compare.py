@@ -14,8 +14,13 @@ from click.testing import CliRunner
 from experiments.coverage import cart, noisy_trial, true_controller
 from impc.arrays import Array
 from impc.cli.main import main
-from impc.inverse.methods import METHODS, Estimate, decode_estimate, encode_estimate
-from impc.studies.compare.subject import MethodComparison, compare_recordings, stages
+from impc.inverse.estimate import Estimate, decode_estimate, encode_estimate
+from impc.studies.compare.subject import (
+    COMPARED,
+    MethodComparison,
+    compare_recordings,
+    stages,
+)
 from impc.studies.fit.memory import open_memory
 from impc.studies.fit.settings import FitSettings
 from impc.studies.fit.subject import fit_problem
@@ -35,29 +40,29 @@ def compared() -> dict[str, MethodComparison]:
 
     found = compare_recordings(problem, 1.0, remember)
     assert len(heard) == stages(2)
-    assert [item.name for item in found] == list(METHODS)
+    assert [item.name for item in found] == list(COMPARED)
     return {item.name: item for item in found}
 
 
 def gain_error(item: MethodComparison) -> float:
     truth = true_controller().K
-    assert item.fit.K is not None
-    return float(np.linalg.norm(item.fit.K - truth) / np.linalg.norm(truth))
+    assert item.fit.estimate.K is not None
+    return float(np.linalg.norm(item.fit.estimate.K - truth) / np.linalg.norm(truth))
 
 
 def test_inverse_mpc_finds_the_gain_and_keeps_the_limit(
     compared: dict[str, MethodComparison],
 ) -> None:
-    for name in ("inverse_mpc_direct", "inverse_mpc_reduced"):
+    for name in ("inverse_mpc", "inverse_mpc_reduced"):
         assert gain_error(compared[name]) < 0.05
         assert compared[name].fit.keeps_bounds
     feedback = compared["feedback_gain"]
-    assert gain_error(feedback) > 2 * gain_error(compared["inverse_mpc_direct"])
+    assert gain_error(feedback) > 2 * gain_error(compared["inverse_mpc"])
     assert not feedback.fit.keeps_bounds
 
 
 def test_left_out_trials(compared: dict[str, MethodComparison]) -> None:
-    ours = compared["inverse_mpc_direct"]
+    ours = compared["inverse_mpc"]
     assert ours.held_out.shape == (2, 1)
     # Noise of 20 % leaves 1 / 1.04 to explain.
     assert np.all(np.abs(ours.held_out - 100 / 1.04) < 1.5)
@@ -81,12 +86,15 @@ def test_estimates_go_through_json(compared: dict[str, MethodComparison]) -> Non
 
     compare_recordings(problem, 1.0, remember)
     for estimate in kept.values():
-        again = decode_estimate(json.loads(json.dumps(encode_estimate(estimate))))
+        seen = problem if estimate.method == "inverse_mpc" else estimate.problem
+        again = decode_estimate(seen, json.loads(json.dumps(encode_estimate(estimate))))
         assert again.reason == estimate.reason
         if estimate.K is None:
             assert again.K is None
         else:
             np.testing.assert_array_equal(again.K, estimate.K)
+            np.testing.assert_array_equal(again.problem.starts, estimate.problem.starts)
+            assert again.status is estimate.status
 
 
 def test_an_interrupted_comparison_goes_on(tmp_path: Path) -> None:
@@ -141,7 +149,7 @@ def test_the_command(tmp_path: Path) -> None:
     pictures = {"comparison.png", "comparison.pdf"}
     assert names == {"report.html", "result.json", "comparison.csv", ".impc", *pictures}
     found = json.loads((out / "result.json").read_text())["methods"]
-    assert list(found) == list(METHODS)
+    assert list(found) == list(COMPARED)
     with (out / "comparison.csv").open() as stream:
         rows = list(csv.DictReader(stream))
     for row in rows:

@@ -11,13 +11,14 @@ import pytest
 
 from experiments.benchmarks.workloads import seat
 from experiments.simulated_subjects import noisy_recordings
-from impc.assess.delayed_feedback import preliminary_gain
 from impc.assess.intent_rules import dominant_sentence, intent
 from impc.assess.variance_accounted_for import vaf
 from impc.checking import replace
 from impc.control.closed_loop import scenario, simulate
 from impc.control.controller import Controller
 from impc.errors import DataError, InputError, SolverError
+from impc.inverse.delayed_feedback import preliminary_gain
+from impc.inverse.estimate import Estimate
 from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.problem import Problem
 from impc.model.bounds import Bounds
@@ -90,19 +91,19 @@ def test_the_preliminary_estimate_is_shown_beside_the_others(noisy: FitResult) -
     assert names == [
         "preliminary",
         "feedback_gain",
-        "inverse_lqr_gain",
+        "inverse_lqr",
         "inverse_lqr_output",
         "clipped_lqr",
         "inverse_mpc",
     ]
     first = noisy.methods[0]
-    assert first.K is not None
-    assert np.all(first.K[0, 4:] == 0)
+    assert first.estimate.K is not None
+    assert np.all(first.estimate.K[0, 4:] == 0)
     assert np.all(first.vaf < noisy.inverse_mpc.vaf - 5)
 
 
 def test_every_reading_has_the_gain_and_the_angle_is_theirs(noisy: FitResult) -> None:
-    plant, K = noisy.fitted.problem.plant, noisy.fitted.solution.K
+    plant, K = noisy.fitted.problem.plant, noisy.fitted.gain
     first = noisy.intent.reported
     for reading in noisy.intent.readings:
         np.testing.assert_allclose(
@@ -182,21 +183,23 @@ def test_an_interrupted_fit_goes_on(
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        fit_recordings(*small, FitProgress(interrupt, memory.controller))
+        fit_recordings(*small, FitProgress(interrupt, memory.estimate))
     again = open_memory(tmp_path / "out", *small)
-    assert "fit" in again.stages
+    assert "inverse_mpc" in again.stages
 
     done = set(again.stages)
     computed: list[int] = []
 
-    def counting(problem: Problem) -> object:
+    def counting(problem: Problem, start: Weights | None = None) -> object:
         computed.append(len(problem.recordings))
-        return fit_controller(problem)
+        return fit_controller(problem, start)
 
-    monkeypatch.setattr("impc.studies.fit.memory.fit_controller", counting)
-    result = fit_recordings(*small, FitProgress(lambda _: None, again.controller))
-    assert len(computed) == 4 - len(done)
-    np.testing.assert_array_equal(result.fitted.weights.Q, whole.fitted.weights.Q)
+    for module in ("impc.studies.fit.subject", "impc.inverse.methods"):
+        monkeypatch.setattr(f"{module}.fit_controller", counting)
+    result = fit_recordings(*small, FitProgress(lambda _: None, again.estimate))
+    fits = {"inverse_mpc", *(f"without trial {number}" for number in (1, 2, 3))}
+    assert len(computed) == len(fits - done)
+    np.testing.assert_array_equal(result.fitted.stage_weights.Q, whole.fitted.stage_weights.Q)
     for one, other in zip(result.held_out, whole.held_out, strict=True):
         np.testing.assert_array_equal(one.vaf, other.vaf)
     again.forget()
@@ -207,16 +210,21 @@ def test_a_memory_of_another_fit_is_not_used(
     small: tuple[Problem, FitSettings], tmp_path: Path
 ) -> None:
     problem, settings = small
-    open_memory(tmp_path, problem, settings).controller("fit", problem)
-    assert list(open_memory(tmp_path, problem, settings).stages) == ["fit"]
+    found = fit_controller(problem)
+    open_memory(tmp_path, problem, settings).estimate("inverse_mpc", lambda: found)
+    assert list(open_memory(tmp_path, problem, settings).stages) == ["inverse_mpc"]
     assert open_memory(tmp_path, problem, replace(settings, settle=2.0)).stages == {}
     other = replace(problem, recordings=problem.recordings[:2])
     assert open_memory(tmp_path, other, settings).stages == {}
-    path = tmp_path / "fit-in-progress" / "fit.json"
+    path = tmp_path / "fit-in-progress" / "inverse_mpc.json"
     whole = path.read_text()
     for text in ("", "{", "[]", json.dumps({"digest": 3}), whole.replace("1", "2", 1)):
         path.write_text(text)
         assert open_memory(tmp_path, problem, settings).stages == {}
+
+
+def unwanted() -> Estimate:
+    raise AssertionError("computed again")
 
 
 def test_a_remembered_controller_is_the_same(
@@ -224,10 +232,10 @@ def test_a_remembered_controller_is_the_same(
 ) -> None:
     problem, settings = small
     found = fit_controller(problem)
-    open_memory(tmp_path, problem, settings).controller("fit", problem)
-    again = open_memory(tmp_path, problem, settings).controller("fit", problem)
-    np.testing.assert_array_equal(again.solution.K, found.solution.K)
-    np.testing.assert_array_equal(again.free.K, found.free.K)
+    open_memory(tmp_path, problem, settings).estimate("inverse_mpc", lambda: found)
+    again = open_memory(tmp_path, problem, settings).estimate("inverse_mpc", unwanted)
+    np.testing.assert_array_equal(again.gain, found.gain)
+    assert (again.misfit, again.noise, again.status) == (found.misfit, found.noise, found.status)
     for one, other in zip(again.problem.recordings, found.problem.recordings, strict=True):
         np.testing.assert_array_equal(one.x0, other.x0)
 
@@ -259,7 +267,7 @@ def test_a_release_without_disturbance_is_fitted() -> None:
         trials.append(Recording(plant, (run.x @ plant.C.T)[:100]))
     settings = FitSettings(horizon=10, u_max=1.0)
     fitted = fit_controller(fit_problem(plant, trials, settings))
-    np.testing.assert_allclose(fitted.solution.K, controller.K, rtol=1e-6)
+    np.testing.assert_allclose(fitted.gain, controller.K, rtol=1e-6)
     np.testing.assert_allclose(fitted.problem.recordings[1].x0, [-0.2, 0.3], atol=1e-7)
 
 

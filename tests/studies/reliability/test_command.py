@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 import shutil
@@ -72,6 +73,28 @@ def test_icc_is_that_of_the_recordings(study: Path, analysed: tuple[Result, Path
     assert told["mdc"] > 1.96 * np.sqrt(2) * within
     assert set(found["cmc"]) == {"within", "between"}
     assert 0 <= found["anova"]["rms.theta1"]["EO"]["p"] <= 1
+
+
+def test_a_result_names_the_recordings_that_count(study: Path, tmp_path: Path) -> None:
+    """With --last 1 the second of two trials; a byte in its middle makes another result."""
+    folder = copy(study, tmp_path / "s")
+    found = {}
+    for name in ("before", "after"):
+        out = tmp_path / name
+        done = run("reliability", str(folder / "study.toml"), "--last", "1", "--out", str(out))
+        assert done.exit_code == 0, done.stderr
+        found[name] = json.loads((out / "result.json").read_text())["sha256"]
+        (path,) = folder.rglob("sub-01_ses-1_task-EC_run-2_*.csv")
+        whole = hashlib.sha256(path.read_bytes()).hexdigest()
+        if name == "before":
+            assert found[name]["recordings"]["sub-01_ses-1_task-EC"] == [whole]
+            content = path.read_bytes()
+            place = content.index(b".", len(content) // 2) + 1
+            digit = b"3" if content[place : place + 1] != b"3" else b"4"
+            path.write_bytes(content[:place] + digit + content[place + 1 :])
+    same = ("configuration", "plant", "versions")
+    assert all(found["before"][key] == found["after"][key] for key in same)
+    assert found["before"]["all"] != found["after"]["all"]
 
 
 def test_the_page_marks_findings_and_quotes_the_dissertation(

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import itertools
+import tracemalloc
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+import impc.studies.selection.subsets
 import plants
 from impc.errors import DataError, InputError
 from impc.studies.selection.estimation import estimate, free_indices, multi_start
@@ -197,3 +200,19 @@ def test_models_are_checked() -> None:
         free_indices(MODEL, ["mass"])
     with pytest.raises(DataError, match="there are none"):
         estimate(MODEL, [], (0,), NOMINAL)
+
+
+def test_subsets_beyond_number_are_refused_and_not_begun(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of forty parameters that are all told: a million subsets of five, and more of six."""
+    monkeypatch.setattr(impc.studies.selection.subsets, "_MOST", 2000)
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError, match="more than 2000 subsets keep a variance of 2"):
+            largest_subsets([np.eye(40)], 2.0)
+        assert tracemalloc.get_traced_memory()[1] < 20e6
+    finally:
+        tracemalloc.stop()
+    few = np.diag([1.0] * 4 + [0.1] * 36)
+    assert largest_subsets([few], 2.0).subsets == ((0, 1, 2, 3),)
+    found = SimpleNamespace(F=np.eye(40))
+    assert best_collinear(found, 10)[0] == ()  # type: ignore[arg-type]

@@ -1,0 +1,192 @@
+"""What a method found: the one type for every method, from a feedback gain to inverse MPC.
+
+The unknowns are those of docs/theory.md, section 6; what one more function says of an estimate
+(intervals, intent, agreement with trials left out) is in `impc.assess`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from impc.arrays import Array, Frozen, frozen
+from impc.control.controller import Controller
+from impc.errors import SolverError, WeightsError
+from impc.inverse.problem import controller_for
+from impc.model.weights import Weights
+
+if TYPE_CHECKING:
+    from impc.inverse.problem import Problem
+
+__all__ = ["Estimate", "Status", "decode_estimate", "encode_estimate"]
+
+
+class Status(Enum):
+    """How a method ended."""
+
+    EXPLAINED = "explained"
+    SETTLED = "settled"
+    STOPPED = "stopped"
+    GAIN_ONLY = "gain only"
+    NONE = "none"
+
+    @property
+    def sentence(self) -> str:
+        """The same as a sentence."""
+        return _SENTENCES[self]
+
+
+_SENTENCES = {
+    Status.EXPLAINED: "The weights reproduce the recordings to 1e-9 of them.",
+    Status.SETTLED: "The search ended; what it leaves of the recordings counts as noise.",
+    Status.STOPPED: "The search was stopped before it ended: the answer may be wrong.",
+    Status.GAIN_ONLY: "A gain was found, and no weights that have it.",
+    Status.NONE: "The method ended without a gain.",
+}
+
+
+@dataclass(frozen=True)
+class Estimate(Frozen):
+    """A controller that a method found behind recordings.
+
+    Attributes
+    ----------
+    method : str
+        A name of `impc.inverse.methods.METHODS`.
+    problem : Problem
+        As the method saw it (a method of inverse LQR knows no bounds), at the initial states and
+        physical parameters that belong to the answer.
+    K, S : Array or None
+        Gain (m, n) and metric (m, m); None when the method ended without them.
+    weights : Weights or None
+        Scaled to R[0, 0] = 1; None where the method seeks or finds none.
+    metrics : Array
+        Basis of the metrics that the recordings do not tell from S (k, m, m), see `GainFit`.
+    misfit : float
+        2-norm of the output residual, each output over its scale; NaN without a gain.
+    noise : float
+        The part of it that no weights are asked to explain: that of the best gain of any kind.
+    status : Status
+    reason : str
+        Why there is no gain or no weights, in the words of whatever failed; empty otherwise.
+    evaluations : int
+        Simulations with derivatives.
+    seconds : float
+        Time of the method, given what it starts from, s.
+    """
+
+    method: str
+    problem: Problem
+    K: Array | None
+    S: Array | None
+    weights: Weights | None
+    metrics: Array
+    misfit: float
+    noise: float
+    status: Status
+    reason: str
+    evaluations: int
+    seconds: float
+
+    @property
+    def gain(self) -> Array:
+        """K (m, n).
+
+        Raises
+        ------
+        SolverError
+            When the method ended without one.
+        """
+        return self._found(self.K)
+
+    @property
+    def metric(self) -> Array:
+        """S (m, m).
+
+        Raises
+        ------
+        SolverError
+            When the method ended without one.
+        """
+        return self._found(self.S)
+
+    @property
+    def stage_weights(self) -> Weights:
+        """The weights.
+
+        Raises
+        ------
+        WeightsError
+            When the method has found none.
+        """
+        if self.weights is None:
+            raise WeightsError(self.method, f"found no weights: {self.reason}", "see its reason")
+        return self.weights
+
+    @property
+    def explained(self) -> bool:
+        """Whether the weights, simulated, reproduce the recordings to 1e-9 of them."""
+        return self.status is Status.EXPLAINED
+
+    @property
+    def converged(self) -> bool:
+        """Whether the search ended by itself."""
+        return self.status in (Status.EXPLAINED, Status.SETTLED)
+
+    def controller(self) -> Controller:
+        """Return the constrained controller that was found.
+
+        Raises
+        ------
+        SolverError
+            When the method ended without a gain.
+        """
+        return controller_for(self.problem, self.gain, self.metric)
+
+    def _found(self, matrix: Array | None) -> Array:
+        if matrix is None:
+            raise SolverError(self.method, f"found no gain: {self.reason}", "try another method")
+        return matrix
+
+
+def encode_estimate(estimate: Estimate) -> dict[str, Any]:
+    """Values that JSON keeps to the last digit; the problem itself is not among them."""
+    given = estimate.weights
+    return {
+        "method": estimate.method,
+        "starts": estimate.problem.starts.tolist(),
+        "logarithms": estimate.problem.logarithms.tolist(),
+        "K": None if estimate.K is None else estimate.K.tolist(),
+        "S": None if estimate.S is None else estimate.S.tolist(),
+        "Q": None if given is None else given.Q.tolist(),
+        "R": None if given is None else given.R.tolist(),
+        "metrics": estimate.metrics.tolist(),
+        "misfit": None if np.isnan(estimate.misfit) else estimate.misfit,
+        "noise": None if np.isnan(estimate.noise) else estimate.noise,
+        "status": estimate.status.value,
+        "reason": estimate.reason,
+        "evaluations": estimate.evaluations,
+        "seconds": estimate.seconds,
+    }
+
+
+def decode_estimate(seen: Problem, kept: dict[str, Any]) -> Estimate:
+    """Inverse of `encode_estimate`; the problem is as the method has `seen` it."""
+    m = seen.plant.m
+    return Estimate(
+        kept["method"],
+        seen.at(np.array(kept["starts"]), np.array(kept["logarithms"], dtype=np.float64)),
+        None if kept["K"] is None else frozen(kept["K"]),
+        None if kept["S"] is None else frozen(kept["S"]),
+        None if kept["Q"] is None else Weights(kept["Q"], kept["R"]),
+        frozen(np.reshape(kept["metrics"], (-1, m, m))),
+        np.nan if kept["misfit"] is None else kept["misfit"],
+        np.nan if kept["noise"] is None else kept["noise"],
+        Status(kept["status"]),
+        kept["reason"],
+        kept["evaluations"],
+        kept["seconds"],
+    )

@@ -1,0 +1,76 @@
+"""What a selection will take, told before it is begun: evaluations of the model, seconds, memory.
+
+The model is the user's: what one evaluation takes is measured. How many there will be is told from
+the settings, to its order of magnitude: a fit takes from 7 to 200 (docs/speed.md).
+"""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.studies.effort import Effort
+from impc.studies.selection.model import sensitivity
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from impc.studies.selection.model import ParametricModel, Trial
+    from impc.studies.selection.settings import SelectSettings
+
+__all__ = ["key_evaluations", "select_evaluations", "selection_effort"]
+
+# Evaluations with derivatives of a fit from a start far off, of one from its neighbourhood, of a
+# LASSO with its refit, of Table C.1 (of the outputs alone: a few thousand a solve), and of a
+# profile, which fits again at each of its points. Counted on the drug: 7, 5, 74 and 180; on the
+# head, whose twelve parameters are hardly told: 200, 17, 23.
+_FIT, _REFIT, _LASSO, _TABLE, _PROFILE = 30, 9, 100, 4000, 180
+# Arrays of the size of the derivative that a fit holds, and fits at a time in a bootstrap.
+_COPIES, _THREADS = 6, 2
+
+
+def select_evaluations(settings: SelectSettings, subjects: int) -> int:
+    """Of the model with its derivative, for one of so many `subjects` of `impc select`.
+
+    Profiles are taken of the first subject only.
+    """
+    table = _TABLE if settings.nelder_mead else 0
+    each = _FIT * settings.starts + _REFIT * settings.replicates + _LASSO + table
+    return each + _PROFILE * settings.size // subjects
+
+
+def key_evaluations(settings: SelectSettings, most: int = 20) -> int:
+    """Of the model with its derivative, for one subject and visit of `impc key-parameters`.
+
+    Parameters
+    ----------
+    settings : SelectSettings
+    most : int
+        Subsets that are fitted alone.
+    """
+    return _FIT * (settings.starts + most)
+
+
+def selection_effort(
+    model: ParametricModel, recorded: Iterable[Sequence[Trial]], evaluations: int
+) -> Effort:
+    """What one subject takes, on average; the model is called once.
+
+    Parameters
+    ----------
+    model : ParametricModel
+    recorded : iterable of sequences of Trial
+        Trials of each subject.
+    evaluations : int
+        Of the model with its derivative over all trials of a subject.
+    """
+    subjects = [tuple(trials) for trials in recorded]
+    samples = [sum(len(trial.input) for trial in trials) for trials in subjects]
+    first = subjects[0][0]
+    begun = time.perf_counter()
+    outputs, _ = sensitivity(model, np.array(model.typical), first.input)
+    one = (time.perf_counter() - begun) / len(first.input)
+    numbers = max(samples) * outputs.shape[1] * model.size * _COPIES * _THREADS
+    return Effort(one * float(np.mean(samples)) * evaluations, 8e-9 * numbers)

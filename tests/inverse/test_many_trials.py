@@ -1,0 +1,112 @@
+"""Hundreds of trials: memory grows with their number; the page draws those explained least."""
+
+from __future__ import annotations
+
+import tracemalloc
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+import impc.assess.residual_structure
+import impc.inverse.many_trials
+from experiments.coverage import cart
+from impc.assess.covariance import gain_covariance
+from impc.assess.residual_structure import residual_structure
+from impc.checking import replace
+from impc.control.closed_loop import scenario, simulate
+from impc.control.controller import Controller
+from impc.inverse.gain_search import refine_gain
+from impc.inverse.problem import Problem
+from impc.inverse.residuals import evaluate
+from impc.model.bounds import Bounds
+from impc.model.recordings import Recording
+from impc.studies.fit.figures import shown_trials
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+GAIN = np.array([[1.6, 1.4]])
+
+
+def of_trials(explained: list[float]) -> Any:
+    return SimpleNamespace(trials=[SimpleNamespace(vaf=np.array([v, v])) for v in explained])
+
+
+def test_few_trials_are_all_drawn() -> None:
+    assert shown_trials(of_trials([90.0, 20.0, 50.0])) == [0, 1, 2]
+
+
+def test_of_500_those_that_are_explained_least() -> None:
+    explained = np.random.default_rng(0).uniform(0, 100, 500).tolist()
+    shown = shown_trials(of_trials(explained))
+    assert shown == sorted(shown)
+    assert len(shown) == 24
+    assert max(explained[index] for index in shown) == np.sort(explained)[23]
+
+
+def starts_unknown(trials: int) -> Problem:
+    """Short trials of a cart from starts that nobody knows, with noise."""
+    plant, rng = cart(), np.random.default_rng(1)
+    bounds = Bounds(plant, u_min=-1, u_max=1)
+    controller = Controller.from_gain(plant, GAIN, bounds, 5, terminal_set=False)
+    recordings = []
+    for _ in range(trials):
+        push = np.repeat(rng.choice([-0.8, 0.0, 0.8], 6), 10)
+        begin = scenario(plant, 0.1 * rng.standard_normal(2), disturbance=push)
+        outputs = (simulate(controller, begin).x @ plant.C.T)[:60]
+        recordings.append(Recording(plant, outputs + 0.02 * rng.standard_normal((60, 1)), push))
+    return Problem(plant, bounds, 5, tuple(recordings), terminal_set=False, unknown_start=True)
+
+
+def peak_of(work: Callable[[], object]) -> int:
+    """Most that numpy holds meanwhile, bytes."""
+    tracemalloc.start()
+    try:
+        work()
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+WORK: dict[str, Callable[[Problem], object]] = {
+    "search": lambda problem: refine_gain(problem, GAIN, np.eye(1), max_evaluations=3, spread=0.5),
+    "covariance": lambda problem: gain_covariance(problem, GAIN, np.eye(1)),
+    "structure": lambda problem: residual_structure(
+        problem, GAIN, evaluate(problem, GAIN, np.eye(1))
+    ),
+}
+
+
+@pytest.mark.parametrize("name", WORK)
+def test_memory_grows_as_the_trials_do(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Thrice the trials: 3 times the memory; nine times when each had columns beside all others."""
+    monkeypatch.setattr(impc.assess.residual_structure, "_LAGS", 2)
+    monkeypatch.setattr(impc.assess.residual_structure, "_SHIFTS", 3)
+    few, many = (starts_unknown(count) for count in (150, 450))
+    WORK[name](few)  # what is compiled and kept once does not count
+    assert peak_of(lambda: WORK[name](many)) < 4.5 * peak_of(lambda: WORK[name](few))
+
+
+def test_many_trials_are_fitted_as_few_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Eliminated trial by trial, and with all columns side by side: the same gain and starts."""
+    problem = starts_unknown(12)
+    beside = refine_gain(problem, GAIN, np.eye(1), spread=0.5)
+    monkeypatch.setattr(impc.inverse.many_trials, "_MANY", 0)
+    found = refine_gain(problem, GAIN, np.eye(1), spread=0.5)
+    # Both searches end where the misfit falls by less than 1e-8 of it.
+    assert found.misfit == pytest.approx(beside.misfit, rel=1e-7)
+    np.testing.assert_allclose(found.K, beside.K, rtol=1e-3)
+    np.testing.assert_allclose(found.singular_values, beside.singular_values, rtol=1e-3)
+
+
+def test_of_very_many_samples_some_trials_are_tested(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = starts_unknown(9)
+    found = evaluate(problem, GAIN, np.eye(1))
+    monkeypatch.setattr(impc.assess.residual_structure, "_LAGS", 2)
+    monkeypatch.setattr(impc.assess.residual_structure, "_MOST", 200)
+    some = replace(problem, recordings=problem.recordings[::3])
+    expected = residual_structure(some, GAIN, evaluate(some, GAIN, np.eye(1)))
+    assert expected is not None
+    assert residual_structure(problem, GAIN, found) == expected
