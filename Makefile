@@ -5,7 +5,7 @@
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
-.PHONY: help env demo test check docs reproduce wheel slow coverage search numerics bench fuzz lock clean
+.PHONY: help env demo test check docs architecture reproduce wheel slow coverage search numerics bench fuzz lock clean
 
 PYTHON ?= python3
 # Not to be set from outside: the environment is made with `venv --clear`.
@@ -44,6 +44,7 @@ help:
 	@echo 'make search   new examples for the tests by hypothesis, from a seed that is printed'
 	@echo 'make numerics the numerical tests on other processors and dependencies (an hour; needs uv)'
 	@echo 'make docs    build the site in docs/_build/html; warnings are errors, tutorials run (minutes)'
+	@echo 'make architecture  draw docs/images/rooms.svg from the imports of the code'
 	@echo 'make reproduce  write docs/reproduction: the dissertation, line by line (half an hour)'
 	@echo 'make wheel   build a wheel, install it in an empty environment, run impc example there'
 	@echo 'make bench   the benchmarks:                     python -m experiments.benchmarks'
@@ -68,6 +69,9 @@ check: env
 docs: env
 	OPENBLAS_NUM_THREADS=1 $(PY) -m sphinx -W --keep-going -E -b html -q docs docs/_build/html
 	@echo 'docs/_build/html/index.html'
+
+architecture: env
+	$(PY) -m docs.rooms
 
 reproduce: env
 	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.reproduction

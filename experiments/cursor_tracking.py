@@ -32,7 +32,7 @@ from impc.arrays import Array, frozen
 from impc.assess.bounded_weights import linear_range, weights_set
 from impc.assess.covariance import gain_covariance
 from impc.assess.input_limits import with_limit
-from impc.assess.vaf import centred_vaf
+from impc.assess.variance_accounted_for import centred_vaf
 from impc.checking import replace
 from impc.control.closed_loop import simulate
 from impc.inverse.estimate import Estimate
@@ -41,7 +41,7 @@ from impc.inverse.problem import Problem, controller_for, scenarios
 from impc.inverse.residuals import misfit_or_reason
 from impc.inverse.solution_set import gain_fibre
 from impc.model.plant import Plant
-from impc.model.plant_family import plant_family
+from impc.model.plant_family import PlantFamily
 from impc.model.recordings import Recording
 from impc.reporting.rendering import plain
 from impc.reporting.writer import write_files
@@ -129,7 +129,7 @@ def condition_problem(condition: Condition) -> Problem:
     def make(values: Array) -> Plant:
         return Plant(cursor_plant(float(values[0]), float(values[1])), ["command"])
 
-    family = plant_family(make, ["delay", "lag"], _NOMINAL)
+    family = PlantFamily(make, ["delay", "lag"], _NOMINAL)
     plant = make(np.array(_NOMINAL))
     trials = []
     for target, response in zip(condition.target, condition.response, strict=True):

@@ -23,7 +23,7 @@ import numpy as np
 from tqdm import tqdm
 
 from experiments.benchmarks.workloads import seat
-from impc.assess.vaf import vaf
+from impc.assess.variance_accounted_for import vaf
 from impc.checking import replace
 from impc.control.closed_loop import simulate
 from impc.inverse.methods import METHODS, NaturalUnits, estimate_all

@@ -1,1 +1,117 @@
-"""Inverse model predictive control: the weights behind a recorded closed loop."""
+"""Inverse model predictive control: the weights behind a recorded closed loop.
+
+What most users import is here, and docs/api.md lists it by subject. A name is loaded from its
+module when it is first used: `import impc` itself loads no other library.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from impc.assess.identified_directions import Identifiability as Identifiability
+    from impc.assess.identified_directions import identifiability as identifiability
+    from impc.assess.variance_accounted_for import vaf as vaf
+    from impc.assess.variance_accounted_for import whiteness as whiteness
+    from impc.control.closed_loop import Scenario as Scenario
+    from impc.control.closed_loop import Simulation as Simulation
+    from impc.control.closed_loop import Status as Status
+    from impc.control.closed_loop import require_complete as require_complete
+    from impc.control.closed_loop import scenario as scenario
+    from impc.control.closed_loop import simulate_and_differentiate as simulate_and_differentiate
+    from impc.control.constraint_rows import directions as directions
+    from impc.control.controller import Controller as Controller
+    from impc.control.terminal_set import TerminalSet as TerminalSet
+    from impc.control.terminal_set import maximal_invariant_set as maximal_invariant_set
+    from impc.errors import BoundsError as BoundsError
+    from impc.errors import DataError as DataError
+    from impc.errors import ImpcError as ImpcError
+    from impc.errors import InfeasibleError as InfeasibleError
+    from impc.errors import InputError as InputError
+    from impc.errors import OutputError as OutputError
+    from impc.errors import PlantError as PlantError
+    from impc.errors import SolverError as SolverError
+    from impc.errors import WeightsError as WeightsError
+    from impc.files.configuration import read_configuration as read_configuration
+    from impc.files.formats import read_table as read_table
+    from impc.files.formats import write_table as write_table
+    from impc.files.reading import read_recordings as read_recordings
+    from impc.files.table import make_table as make_table
+    from impc.inverse.cross_term import inverse_lqr_cross_term as inverse_lqr_cross_term
+    from impc.inverse.direct_and_reduced import infer_weights as infer_weights
+    from impc.inverse.direct_and_reduced import inverse_mpc as inverse_mpc
+    from impc.inverse.direct_and_reduced import inverse_mpc_reduced as inverse_mpc_reduced
+    from impc.inverse.equivalent_weights import least_condition_weights as least_condition_weights
+    from impc.inverse.equivalent_weights import other_weights as other_weights
+    from impc.inverse.inverse_lqr import inverse_lqr_gradient as inverse_lqr_gradient
+    from impc.inverse.inverse_lqr import inverse_lqr_lmi as inverse_lqr_lmi
+    from impc.inverse.problem import Problem as Problem
+    from impc.inverse.solution_set import gain_fibre as gain_fibre
+    from impc.model.bounds import Bounds as Bounds
+    from impc.model.plant import Plant as Plant
+    from impc.model.plant_family import PlantFamily as PlantFamily
+    from impc.model.recordings import Label as Label
+    from impc.model.recordings import Recording as Recording
+    from impc.model.riccati import LqrSolution as LqrSolution
+    from impc.model.riccati import gain_gradients as gain_gradients
+    from impc.model.riccati import solve_lqr as solve_lqr
+    from impc.model.weights import Weights as Weights
+    from impc.model.weights import condition_number as condition_number
+    from impc.model.weights import normalised as normalised
+    from impc.model.weights import weight_error as weight_error
+    from impc.studies.fit.settings import FitSettings as FitSettings
+    from impc.studies.fit.subject import fit_problem as fit_problem
+    from impc.studies.fit.subject import fit_recordings as fit_recordings
+
+    __version__: str
+
+_NAMES = {
+    "assess.identified_directions": "Identifiability identifiability",
+    "assess.variance_accounted_for": "vaf whiteness",
+    "control.closed_loop": "Scenario Simulation Status require_complete scenario"
+    " simulate_and_differentiate",
+    "control.constraint_rows": "directions",
+    "control.controller": "Controller",
+    "control.terminal_set": "TerminalSet maximal_invariant_set",
+    "errors": "BoundsError DataError ImpcError InfeasibleError InputError OutputError PlantError"
+    " SolverError WeightsError",
+    "files.configuration": "read_configuration",
+    "files.formats": "read_table write_table",
+    "files.reading": "read_recordings",
+    "files.table": "make_table",
+    "inverse.cross_term": "inverse_lqr_cross_term",
+    "inverse.direct_and_reduced": "infer_weights inverse_mpc inverse_mpc_reduced",
+    "inverse.equivalent_weights": "least_condition_weights other_weights",
+    "inverse.inverse_lqr": "inverse_lqr_gradient inverse_lqr_lmi",
+    "inverse.problem": "Problem",
+    "inverse.solution_set": "gain_fibre",
+    "model.bounds": "Bounds",
+    "model.plant": "Plant",
+    "model.plant_family": "PlantFamily",
+    "model.recordings": "Label Recording",
+    "model.riccati": "LqrSolution gain_gradients solve_lqr",
+    "model.weights": "Weights condition_number normalised weight_error",
+    "studies.fit.settings": "FitSettings",
+    "studies.fit.subject": "fit_problem fit_recordings",
+}
+_MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
+
+__all__ = sorted(_MODULES)  # noqa: PLE0605 - a list of the names of the table above
+
+
+if not TYPE_CHECKING:  # a type checker that sees it takes any name for one of ours
+
+    def __getattr__(name: str) -> object:
+        """Load a public name from its module, once (PEP 562)."""
+        if name == "__version__":
+            found = import_module("importlib.metadata").version("impc")
+        elif name in _MODULES:
+            found = getattr(import_module(f"impc.{_MODULES[name]}"), name)
+        else:
+            raise AttributeError(f"module 'impc' has no attribute {name!r}")
+        globals()[name] = found
+        return found
+
+    def __dir__() -> list[str]:
+        return [*__all__, "__version__"]

@@ -38,6 +38,15 @@ class ImpcError(Exception):
         What was expected and what was given instead.
     remedy : str
         What to do about it.
+
+    Examples
+    --------
+    >>> import impc
+    >>> try:
+    ...     impc.Weights([[1, 0], [0, 1]], -1)
+    ... except impc.ImpcError as error:
+    ...     print(error.subject, "|", error.remedy)
+    R | every input needs a positive cost
     """
 
     def __init__(self, subject: str, problem: str, remedy: str) -> None:
@@ -52,35 +61,117 @@ class ImpcError(Exception):
 
 
 class InputError(ImpcError, ValueError):
-    """An argument that cannot be used as it is."""
+    """An argument that cannot be used as it is.
+
+    Examples
+    --------
+    >>> import impc
+    >>> impc.Weights([[1, 2], [3, 4]], 1)
+    Traceback (most recent call last):
+        ...
+    impc.errors.InputError: Q: is not symmetric; give (M + M')/2
+    """
 
 
 class PlantError(InputError):
-    """A plant that is not discrete, not stabilisable, or of the wrong size."""
+    """A plant that is not discrete, not stabilisable, or of the wrong size.
+
+    Examples
+    --------
+    >>> import control
+    >>> import impc
+    >>> impc.Plant(control.ss([[2]], [[0]], [[1]], 0, 1))
+    Traceback (most recent call last):
+        ...
+    impc.errors.PlantError: plant: is not stabilisable: no input reaches the mode 2+0j; ...
+    """
 
 
 class WeightsError(InputError):
-    """Weights that are not definite enough, or that no gain or no weights can match."""
+    """Weights that are not definite enough, or that no gain or no weights can match.
+
+    Examples
+    --------
+    >>> import impc
+    >>> impc.Weights([[1, 0], [0, 1]], -1)
+    Traceback (most recent call last):
+        ...
+    impc.errors.WeightsError: R: is not positive definite: its least eigenvalue is -1; ...
+    """
 
 
 class BoundsError(InputError):
-    """Bounds that cross, or that exclude the equilibrium."""
+    """Bounds that cross, or that exclude the equilibrium.
+
+    Examples
+    --------
+    >>> import impc
+    >>> from plants import yalmip_example
+    >>> impc.Bounds(impc.Plant(yalmip_example()), u_max=-1)
+    Traceback (most recent call last):
+        ...
+    impc.errors.BoundsError: u_min, u_max: exclude the origin for u: [-inf, -1]; ...
+    """
 
 
 class DataError(InputError):
-    """Recorded data that are missing, not finite, or of the wrong shape."""
+    """Recorded data that are missing, not finite, or of the wrong shape.
+
+    Examples
+    --------
+    >>> import impc
+    >>> from plants import yalmip_example
+    >>> impc.Recording(impc.Plant(yalmip_example()), [[1, 3]])
+    Traceback (most recent call last):
+        ...
+    impc.errors.DataError: outputs: has 1 samples; give at least 2
+    """
 
 
 class InfeasibleError(ImpcError):
-    """A state from which no input sequence keeps the bounds."""
+    """A state from which no input sequence keeps the bounds.
+
+    Examples
+    --------
+    >>> import impc
+    >>> from plants import yalmip_example
+    >>> plant = impc.Plant(yalmip_example())
+    >>> bounds = impc.Bounds(plant, u_min=-1, u_max=1)
+    >>> law = impc.Controller(plant, impc.Weights([[1, 0], [0, 1]], 1), bounds, horizon=3)
+    >>> impc.require_complete(law, law.simulate([9, 3], steps=20))
+    Traceback (most recent call last):
+        ...
+    impc.errors.InfeasibleError: x0: no input sequence keeps the bound u <= 1 ...
+    """
 
 
 class SolverError(ImpcError):
-    """A numerical method that ended without an answer."""
+    """A numerical method that ended without an answer.
+
+    Examples
+    --------
+    >>> import impc
+    >>> from plants import yalmip_example
+    >>> plant = impc.Plant(yalmip_example())
+    >>> law = impc.Controller.from_gain(plant, [[0, 0]], impc.Bounds(plant), 3, terminal_set=False)
+    >>> impc.require_complete(law, law.simulate([1, 3], steps=200))
+    Traceback (most recent call last):
+        ...
+    impc.errors.SolverError: sample ...: the state left every reasonable range; ...
+    """
 
 
 class OutputError(ImpcError):
-    """A result that could not be written."""
+    """A result that could not be written.
+
+    Examples
+    --------
+    >>> import impc
+    >>> impc.write_table("trial.docx", impc.make_table("simulated", {"angle": [0.1, 0.2]}))
+    Traceback (most recent call last):
+        ...
+    impc.errors.OutputError: trial.docx: has the ending '.docx', and not .csv, ...
+    """
 
 
 def one_line(text: object, longest: int = _LONGEST) -> str:

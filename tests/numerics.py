@@ -25,7 +25,7 @@ FILES = (
     "tests/studies/reliability/test_tests.py",
     "tests/studies/selection/test_information.py",
     "tests/studies/selection/test_methods.py",
-    "tests/assess/test_vaf.py",
+    "tests/assess/test_variance_accounted_for.py",
     "tests/control/test_closed_loop.py",
     "tests/assess/test_eigenvalue_ranges.py",
     "tests/inverse/test_equivalent_weights.py",

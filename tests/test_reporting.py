@@ -20,7 +20,7 @@ from impc.model.weights import Weights
 from impc.reporting.provenance import Provenance, example_provenance
 from impc.reporting.style import journal_style
 from impc.reporting.writer import require_writable, write_files
-from impc.studies.example.cases import CASES, CaseResult, run_case
+from impc.studies.example.cases import CASES, SETTINGS, CaseResult, run_case
 from impc.studies.example.figures import example_figures
 from impc.studies.example.page import render_page
 from impc.studies.example.result import result_json
@@ -36,7 +36,7 @@ from plants import yalmip_example
 
 @pytest.fixture(scope="module")
 def provenance() -> Provenance:
-    return example_provenance("plants:yalmip_example", Plant(yalmip_example()))
+    return example_provenance("plants:yalmip_example", Plant(yalmip_example()), SETTINGS)
 
 
 @pytest.fixture(scope="module")

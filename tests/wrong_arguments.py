@@ -13,7 +13,7 @@ import scipy.sparse
 
 from impc.assess import bounded_weights as weights_set
 from impc.assess import identified_directions as identifiability
-from impc.assess import vaf as agreement
+from impc.assess import variance_accounted_for as agreement
 from impc.checking import replace
 from impc.control import casadi_controller as mpc
 from impc.control import closed_loop, controller, terminal_set
@@ -68,7 +68,7 @@ def values() -> dict[str, Any]:
         "set": weights_set.weights_set(fibre),
         "mpc": mpc.build_mpc(law),
         "terminal": law.terminal,
-        "family": plant_family.plant_family(lambda _: two, ["mass"], [1.0]),
+        "family": plant_family.PlantFamily(lambda _: two, ["mass"], [1.0]),
         "source": plant_source.plant_source("plants:yalmip_example", {}),
     }
 
@@ -159,7 +159,7 @@ def calls() -> list[Call]:
         (weights.Weights, {"Q": states, "R": states}),
         (weights.condition_number, {"weights": v["weights"]}),
         (weights.normalised, {"weights": v["weights"]}),
-        (weights.residual, {"estimate": v["weights"], "truth": v["weights"]}),
+        (weights.weight_error, {"estimate": v["weights"], "truth": v["weights"]}),
         (weights.cholesky_parameters, {"weights": v["weights"]}),
         (weights.weights_from_parameters, {"parameters": np.ones(5), "n": 2, "m": 2}),
         (
@@ -277,7 +277,7 @@ def calls() -> list[Call]:
         (agreement.saturated_share, {"u": v["simulation"].u, "u_min": -size, "u_max": size}),
         (plant_source.plant_source, {"name": "plants:yalmip_example", "arguments": {}}),
         (plant_source.make_plant, {"source": v["source"], "recorded": ["d"]}),
-        (plant_family.plant_family, {"make": len, "names": ["mass"], "nominal": [1.0]}),
+        (plant_family.PlantFamily, {"make": len, "names": ["mass"], "nominal": [1.0]}),
         (plant_family.plant_at, {"family": v["family"], "logarithms": np.zeros(1)}),
         (units.si_unit, {"written": "deg"}),
         changed(v["plant"]),

@@ -21,33 +21,24 @@ show("example/comparison-case-A.png")
 # The same in Python, one step at a time. The plant is any discrete ``control.StateSpace``.
 import numpy as np
 
-from impc.model.bounds import Bounds
-from impc.control.closed_loop import scenario, simulate
-from impc.control.controller import Controller
-from impc.model.plant import Plant
-from impc.model.weights import Weights
+import impc
 from plants import yalmip_example
 
-plant = Plant(yalmip_example())
-bounds = Bounds(plant, u_min=-1, u_max=1)
-truth = Controller(plant, Weights(np.eye(2), 1), bounds, horizon=3)
-recorded = simulate(truth, scenario(plant, x0=[1, 3], steps=20))
+plant = impc.Plant(yalmip_example())
+bounds = impc.Bounds(plant, u_min=-1, u_max=1)
+truth = impc.Controller(plant, impc.Weights(np.eye(2), 1), bounds, horizon=3)
+recorded = truth.simulate(x0=[1, 3], steps=20)
 print("steps at the bound:", int(np.sum(np.abs(recorded.u) > 1 - 1e-9)))
 
 # %%
 # Inverse MPC: a start from inverse LQR (Table 3.1 of the dissertation), then the search over
 # weights.
-from impc.assess.identified_directions import identifiability
-from impc.inverse.direct_and_reduced import infer_weights
-from impc.inverse.problem import Problem
-from impc.model.recordings import Recording
-
-problem = Problem(plant, bounds, 3, (Recording(plant, recorded.x),))
-weights = infer_weights(problem).fit.weights
+problem = impc.Problem(plant, bounds, 3, [impc.Recording(plant, recorded.x)])
+weights = impc.infer_weights(problem).fit.weights
 print("Q =", np.round(weights.Q, 6).tolist(), " R =", np.round(weights.R, 6).tolist())
 
 # %%
 # And what of that came from the recording. The gain did; that Q is the identity is the choice of
 # the least condition number among all weights with this gain, see :doc:`/equivalent-weights`.
-told = identifiability(problem, weights)
+told = impc.identifiability(problem, weights)
 print(f"determined: {told.rank} of {told.free} directions; chosen: {told.chosen}")

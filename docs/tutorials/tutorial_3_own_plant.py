@@ -49,21 +49,16 @@ from terminal import RESULTS
 sys.path.insert(0, str(RESULTS))
 from stick import stick
 
-from impc.model.bounds import Bounds
-from impc.control.closed_loop import scenario, simulate
-from impc.control.controller import Controller
-from impc.model.plant import Plant
-from impc.model.weights import Weights
+import impc
 
-plant = Plant(stick(), controls=["acceleration"])
-bounds = Bounds(plant, u_min=-3, u_max=3)
-person = Controller(
-    plant, Weights(np.diag([40, 1, 10, 1]), 0.1), bounds, horizon=15, terminal_set=False
-)
+plant = impc.Plant(stick(), controls=["acceleration"])
+bounds = impc.Bounds(plant, u_min=-3, u_max=3)
+weights = impc.Weights(np.diag([40, 1, 10, 1]), 0.1)
+person = impc.Controller(plant, weights, bounds, horizon=15, terminal_set=False)
 rng = np.random.default_rng(1)
 for trial in (1, 2):
     push = np.repeat(rng.choice([-1.5, 0, 1.5], size=60), 10)
-    moved = simulate(person, scenario(plant, x0=np.zeros(4), disturbance=push[:, None]))
+    moved = person.simulate(x0=np.zeros(4), disturbance=push)
     angle = np.degrees(moved.x[:-1, 0]) + 0.05 * rng.standard_normal(len(push))
     hand = 100 * moved.x[:-1, 2] + 0.05 * rng.standard_normal(len(push))
     rows = np.column_stack([np.arange(len(push)) * 0.02, angle, hand, push])

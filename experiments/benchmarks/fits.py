@@ -18,7 +18,7 @@ from impc.inverse.direct_and_reduced import (
     start_gains,
     starting_point,
 )
-from impc.model.weights import residual
+from impc.model.weights import weight_error
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -95,7 +95,7 @@ def _example(runs: int) -> list[Row]:
     work = example()
     start = starting_point(work.problem).weights
     for found in (inverse_mpc(work.problem, start), inverse_mpc_reduced(work.problem)):
-        if residual(found.weights, work.weights) > 1e-6:
+        if weight_error(found.weights, work.weights) > 1e-6:
             raise AssertionError("W1 missed the true weights")
     timings = side_by_side(
         {
@@ -108,7 +108,7 @@ def _example(runs: int) -> list[Row]:
 
     def script() -> None:
         weights, _ = cvxpy_nelder_mead(work, start, CONDITION_WEIGHT, _NELDER_MEAD_BUDGET)
-        reached.append(residual(weights, work.weights))
+        reached.append(weight_error(weights, work.weights))
 
     slow = side_by_side({"direct": lambda: inverse_mpc(work.problem, start), "script": script}, 1)
     return [

@@ -194,7 +194,7 @@ def example_entries(evidence: Evidence) -> list[Entry]:
         Entry(
             "(3.10)",
             "Residual between estimated and true matrices.",
-            ("impc.model.weights:residual",),
+            ("impc.model.weights:weight_error",),
             "; ".join(f"{name} {value:.2g}" for name, value in residuals.items()) + ".",
             Verdict.IN_KIND,
             "Which norm is lost; here that of Frobenius of blkdiag(Q, R).",

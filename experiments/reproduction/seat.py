@@ -9,7 +9,7 @@ import control
 import numpy as np
 
 from experiments.reproduction.entry import Entry, Verdict, agrees, drawing, kind
-from impc.assess.vaf import vaf
+from impc.assess.variance_accounted_for import vaf
 from impc.inverse.inverse_lqr import inverse_lqr_lmi
 from impc.model.plant import Plant
 from plants.actuation import delayed_muscle
@@ -135,7 +135,10 @@ def _subject(fit: dict[str, Any], truth: dict[str, Any]) -> list[Entry]:
         Entry(
             "(3.24)",
             "VAF = (1 - sum (y - yhat)^2 / sum y^2) 100 %.",
-            ("impc.assess.vaf:vaf", "impc.assess.vaf:centred_vaf"),
+            (
+                "impc.assess.variance_accounted_for:vaf",
+                "impc.assess.variance_accounted_for:centred_vaf",
+            ),
             f"A simulation 10 % too small has {_ten_per_cent():.2f} % (99 by hand).",
             agrees(abs(_ten_per_cent() - 99) < 1e-9),
         ),

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from impc.assess.profiles import profile_likelihood
 from impc.assess.resampling import DRAWS, bootstrap_intervals, replicate
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from impc.assess.input_limits import LimitEstimate
     from impc.assess.other_models import Alternative
@@ -30,9 +30,40 @@ if TYPE_CHECKING:
     from impc.inverse.estimate import Estimate
     from impc.inverse.problem import Problem
     from impc.model.weights import Weights
-    from impc.studies.fit.settings import FitSettings
 
-__all__ = ["Certainty", "assess", "count_stages"]
+__all__ = ["Asked", "Certainty", "assess", "count_stages"]
+
+
+class Asked(Protocol):
+    """What of all this is wanted: the part of a fit's settings that is read here."""
+
+    @property
+    def replicates(self) -> int:
+        """Number of bootstrap replicates; 0 for none."""
+
+    @property
+    def bootstrap(self) -> str:
+        """How residuals are drawn: a key of `DRAWS`."""
+
+    @property
+    def seed(self) -> int:
+        """Of the bootstrap."""
+
+    @property
+    def profiles(self) -> Sequence[str]:
+        """Names of the numbers whose profile likelihood is wanted."""
+
+    @property
+    def unknown_limit(self) -> bool:
+        """Whether the limit of each input is estimated too."""
+
+    @property
+    def horizons(self) -> Sequence[int]:
+        """Other horizons to compare with, in samples."""
+
+    @property
+    def settle(self) -> float:
+        """Time at the start of a trial that does not count, s."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +91,7 @@ class Certainty:
     alternatives: tuple[Alternative, ...]
 
 
-def count_stages(problem: Problem, settings: FitSettings) -> int:
+def count_stages(problem: Problem, settings: Asked) -> int:
     """Number of stages that `assess` reports, and one for the set of weights."""
     limited = int(np.any(np.isfinite(problem.bounds.u_max)))
     others = [length for length in settings.horizons if length != problem.horizon]
@@ -78,7 +109,7 @@ def assess(
     fitted: Estimate,
     estimate: GainEstimate,
     weights: tuple[WeightsSummary | None, str],
-    settings: FitSettings,
+    settings: Asked,
     done: Callable[[str], None],
     remember: Callable[[str, Callable[[], Replicate]], Replicate],
 ) -> Certainty:
@@ -94,7 +125,7 @@ def assess(
         Of `gain_estimate`.
     weights : tuple
         Of `weights_summary_or_reason`.
-    settings : FitSettings
+    settings : Asked
     done : callable
         Told each stage.
     remember : callable
@@ -133,7 +164,7 @@ def _limit_interval(found: LimitEstimate, control: str) -> Interval:
 def _bootstrap(
     weights: Weights,
     estimate: GainEstimate,
-    settings: FitSettings,
+    settings: Asked,
     done: Callable[[str], None],
     remember: Callable[[str, Callable[[], Replicate]], Replicate],
 ) -> tuple[Interval, ...]:

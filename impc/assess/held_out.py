@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.arrays import Array, Frozen, frozen
-from impc.assess.vaf import centred_vaf, vaf
+from impc.assess.variance_accounted_for import centred_vaf, vaf
 from impc.checking import replace
 from impc.control.closed_loop import simulate
 from impc.inverse.initial_states import with_fitted_starts

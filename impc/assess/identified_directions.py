@@ -16,11 +16,12 @@ import numpy as np
 from impc.arrays import Array, Frozen, frozen
 from impc.checking import checked
 from impc.control.closed_loop import simulate
-from impc.inverse.equivalent_weights import gain_fibre, other_weights
+from impc.inverse.equivalent_weights import other_weights
 from impc.inverse.problem import controller_for, misfit, scenarios
 from impc.inverse.proximal_search import Residual, weight_jacobian
 from impc.inverse.proximal_step import block_basis
 from impc.inverse.residuals import evaluate
+from impc.inverse.solution_set import gain_fibre
 from impc.model.riccati import solve_lqr
 from impc.model.weights import Weights, condition_number
 
@@ -71,6 +72,18 @@ class Identifiability(Frozen):
         That share of the largest.
     others : tuple of OtherWeights
         Other weights that explain the recordings equally well.
+
+    Examples
+    --------
+    >>> import impc
+    >>> from plants import yalmip_example
+    >>> plant = impc.Plant(yalmip_example())
+    >>> bounds, weights = impc.Bounds(plant, u_min=-1, u_max=1), impc.Weights([[1, 0], [0, 1]], 1)
+    >>> truth = impc.Controller(plant, weights, bounds, horizon=3)
+    >>> trial = impc.Recording(plant, truth.simulate([1, 3], steps=20).x)
+    >>> told = impc.identifiability(impc.Problem(plant, bounds, 3, [trial]), weights)
+    >>> isinstance(told, impc.Identifiability), len(told.singular_values), len(told.others)
+    (True, 4, 2)
     """
 
     singular_values: Array
@@ -95,6 +108,18 @@ def identifiability(problem: Problem, weights: Weights) -> Identifiability:
     ------
     WeightsError
         When the weights have no stabilising Riccati solution.
+
+    Examples
+    --------
+    >>> import impc
+    >>> from plants import yalmip_example
+    >>> plant = impc.Plant(yalmip_example())
+    >>> bounds, weights = impc.Bounds(plant, u_min=-1, u_max=1), impc.Weights([[1, 0], [0, 1]], 1)
+    >>> truth = impc.Controller(plant, weights, bounds, horizon=3)
+    >>> trial = impc.Recording(plant, truth.simulate([1, 3], steps=20).x)
+    >>> told = impc.identifiability(impc.Problem(plant, bounds, 3, [trial]), weights)
+    >>> told.free, told.rank, told.chosen
+    (3, 2, 1)
     """
     plant = problem.plant
     solution = solve_lqr(plant, weights)

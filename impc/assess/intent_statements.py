@@ -140,6 +140,8 @@ def widest_dominant_angle(found: WeightsSet, sizes: Array) -> tuple[float, Weigh
     Wolfe (the derivative of an eigenvector is linear in Q, so a step is one program).
     """
     n = found.fibre.plant.n
+    if n == 1:  # one state has one direction
+        return 0.0, found.least.weights
     D = np.diag(np.asarray(sizes, dtype=np.float64))
     centre = _dominant(D @ found.least.weights.Q @ D)
     largest = np.argsort(-np.diag(D @ found.least.weights.Q @ D))[:2]

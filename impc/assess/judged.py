@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.arrays import Array, Frozen, frozen
-from impc.assess.vaf import vaf
+from impc.assess.variance_accounted_for import vaf
 from impc.control.closed_loop import Simulation, simulate
 from impc.inverse.problem import scenarios
 

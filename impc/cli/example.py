@@ -40,15 +40,15 @@ def command(case: str, out: Path) -> None:
     everything its text says stands in for them.
     """
     # Imported here: the libraries take seconds to load, and --help and --version need none.
-    from impc.reporting.provenance import LOST, example_provenance  # noqa: PLC0415
+    from impc.reporting.provenance import example_provenance  # noqa: PLC0415
     from impc.reporting.writer import require_writable, write_files  # noqa: PLC0415
-    from impc.studies.example.cases import CASES  # noqa: PLC0415
+    from impc.studies.example.cases import CASES, LOST, SETTINGS  # noqa: PLC0415
     from impc.studies.example.report import example_files  # noqa: PLC0415
 
     require_writable(out)
     plant = load_plant(_EXAMPLE_PLANT)
     cases = _run(plant, tuple(CASES) if case == "all" else (case,))
-    files = example_files(cases, example_provenance(_EXAMPLE_PLANT, plant))
+    files = example_files(cases, example_provenance(_EXAMPLE_PLANT, plant, SETTINGS))
     written = write_files(out, files)
     click.echo(click.wrap_text(LOST, width=100))
     for result in cases:

@@ -62,6 +62,12 @@ class Status(IntEnum):
     exceeded. INFEASIBLE: it is proved that no input sequence keeps the bounds. UNSOLVED: which
     input is the answer, or whether there is one, could not be told in double precision. DIVERGED:
     the state left every reasonable range. NOT_REACHED: the simulation ended before.
+
+    Examples
+    --------
+    >>> import impc
+    >>> impc.Status.ACTIVE.sentence
+    'a bound is active'
     """
 
     FREE = 0
@@ -99,6 +105,14 @@ class Scenario(Value):
         Initial state (n,).
     disturbance : Array
         One row for each sample (steps, d).
+
+    Examples
+    --------
+    >>> import impc
+    >>> from plants import yalmip_example
+    >>> drive = impc.scenario(impc.Plant(yalmip_example()), x0=[1, 3], steps=20)
+    >>> isinstance(drive, impc.Scenario), drive.steps, drive.disturbance.shape
+    (True, 20, (20, 0))
     """
 
     _rules: ClassVar[Mapping[str, Any]] = {
@@ -131,6 +145,19 @@ class Simulation(Frozen):
         Number of samples at which the active set is about to change, to 1e-8 of the bound.
     failed_row : int
         Row of `Rows` that proved the last problem inconsistent, -1 when none did.
+
+    Examples
+    --------
+    >>> import impc
+    >>> from plants import yalmip_example
+    >>> plant = impc.Plant(yalmip_example())
+    >>> bounds = impc.Bounds(plant, u_min=-1, u_max=1)
+    >>> truth = impc.Controller(plant, impc.Weights([[1, 0], [0, 1]], 1), bounds, horizon=3)
+    >>> run = truth.simulate([1, 3], steps=20)
+    >>> run.x.shape, run.u.shape, run.complete
+    ((21, 2), (20, 1), True)
+    >>> float(abs(run.u).max().round(9))
+    1.0
     """
 
     x: Array
@@ -214,6 +241,13 @@ def scenario(
     ------
     DataError
         When something is not finite or of the wrong shape, or neither length is given.
+
+    Examples
+    --------
+    >>> import impc
+    >>> from plants import yalmip_example
+    >>> impc.scenario(impc.Plant(yalmip_example()), x0=[1, 3], steps=20).x0
+    array([1., 3.])
     """
     start = finite_array("x0", x0, (plant.n,))
     count = plant.E.shape[1]
@@ -245,7 +279,23 @@ def simulate(controller: Controller, given: Scenario) -> Simulation:
 def simulate_and_differentiate(
     controller: Controller, given: Scenario, along: Directions
 ) -> tuple[Simulation, Sensitivity]:
-    """Simulate and differentiate in one pass; see `simulate` and the module's text."""
+    """Simulate and differentiate in one pass; see `simulate` and the module's text.
+
+    Examples
+    --------
+    How the trajectory moves with the initial state: one direction for each of its entries.
+
+    >>> import impc
+    >>> import numpy as np
+    >>> from plants import yalmip_example
+    >>> plant = impc.Plant(yalmip_example())
+    >>> bounds = impc.Bounds(plant, u_min=-1, u_max=1)
+    >>> law = impc.Controller(plant, impc.Weights([[1, 0], [0, 1]], 1), bounds, horizon=3)
+    >>> along = impc.directions(law, 2, x0=np.eye(2))
+    >>> run, moved = impc.simulate_and_differentiate(law, impc.scenario(plant, [1, 3], 20), along)
+    >>> run.x.shape, moved.x.shape
+    ((21, 2), (21, 2, 2))
+    """
     return run_loop(prepare_loop(controller, along), given)
 
 
@@ -353,6 +403,20 @@ def require_complete(controller: Controller, simulation: Simulation) -> Simulati
         When a sample has no input that keeps the bounds: names the bound and the sample.
     SolverError
         When the loop diverged or the active-set method found no answer.
+
+    Examples
+    --------
+    >>> import impc
+    >>> from plants import yalmip_example
+    >>> plant = impc.Plant(yalmip_example())
+    >>> bounds = impc.Bounds(plant, u_min=-1, u_max=1)
+    >>> law = impc.Controller(plant, impc.Weights([[1, 0], [0, 1]], 1), bounds, horizon=3)
+    >>> impc.require_complete(law, law.simulate([1, 3], steps=20)).reached
+    20
+    >>> impc.require_complete(law, law.simulate([90, 3], steps=20))
+    Traceback (most recent call last):
+        ...
+    impc.errors.InfeasibleError: x0: no input sequence keeps the bound u <= 1 ...
     """
     if simulation.complete:
         return simulation

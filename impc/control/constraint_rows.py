@@ -124,6 +124,17 @@ def directions(controller: Controller, count: int, **given: Array) -> Directions
         Number of directions p.
     **given : Array
         Fields of `Directions` by name, in any layout that reshapes to theirs: K to (m, n, p).
+
+    Examples
+    --------
+    >>> import impc
+    >>> import numpy as np
+    >>> from plants import yalmip_example
+    >>> plant = impc.Plant(yalmip_example())
+    >>> bounds = impc.Bounds(plant, u_min=-1, u_max=1)
+    >>> law = impc.Controller(plant, impc.Weights([[1, 0], [0, 1]], 1), bounds, horizon=3)
+    >>> impc.directions(law, 2, K=np.eye(2)).K.shape
+    (1, 2, 2)
     """
     plant = controller.plant
     rows = bound_rows(controller.bounds, plant)

@@ -78,6 +78,16 @@ class TerminalSet(Value):
     bases : mapping of int to IntArray
         How the linear programs ended, for ``near=``: bases (c, q) by step, and at 0 those of the
         last pruning.
+
+    Examples
+    --------
+    >>> import impc
+    >>> from plants import yalmip_example
+    >>> plant = impc.Plant(yalmip_example())
+    >>> bounds = impc.Bounds(plant, u_min=-1, u_max=1)
+    >>> reached = impc.maximal_invariant_set(plant, [[1.5, -0.9]], bounds)
+    >>> [bool((reached.H @ x <= reached.h).all()) for x in ([0.1, 0.1], [9, 9])]
+    [True, False]
     """
 
     H: Array
@@ -141,6 +151,15 @@ def maximal_invariant_set(
         or a setting is out of range.
     SolverError
         When k* exceeds max_steps, or a linear program fails.
+
+    Examples
+    --------
+    >>> import impc
+    >>> from plants import yalmip_example
+    >>> plant = impc.Plant(yalmip_example())
+    >>> bounds = impc.Bounds(plant, u_min=-1, u_max=1)
+    >>> impc.maximal_invariant_set(plant, [[1.5, -0.9]], bounds).h.shape
+    (4,)
     """
     plant.require_discrete()
     K = finite_array("gain", gain, (plant.m, plant.n))

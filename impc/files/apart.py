@@ -23,7 +23,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-import impc
 from impc.errors import DataError, InputError
 from impc.files.table import Table
 
@@ -257,7 +256,7 @@ def _running() -> _Process:
         _current.clear()
     if not _current:
         popen = subprocess.Popen(
-            [sys.executable, "-P", "-c", _START, str(Path(impc.__path__[0]).parent)],
+            [sys.executable, "-P", "-c", _START, str(Path(__file__).parents[2])],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,

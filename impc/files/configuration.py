@@ -12,6 +12,7 @@ import math
 import re
 import tomllib
 import warnings
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import msgspec
@@ -22,7 +23,6 @@ from impc.files.units import si_unit
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
-    from pathlib import Path
 
 __all__ = [
     "UNKNOWN_UNIT",
@@ -125,17 +125,30 @@ class Configuration(msgspec.Struct, frozen=True):
     select: dict[str, Any] = {}
 
 
-def read_configuration(path: Path, *more: str) -> Configuration:
-    """Read the configuration at `path`; `more` names tables that it may have besides.
+def read_configuration(path: Path | str, *more: str) -> Configuration:
+    r"""Read the configuration at `path`; `more` names tables that it may have besides.
 
     Raises
     ------
     InputError
         When the file cannot be read, is no TOML, or has a key or value that cannot be: the message
         names it by its TOML path.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import impc
+    >>> text = '[recording]\nrate = 100\n[signals.angle]\ncolumn = "tilt"\nunit = "deg"\n'
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder, "lab.toml")
+    ...     _ = path.write_text(text)
+    ...     found = impc.read_configuration(path)
+    >>> found.recording.rate, found.signals["angle"].unit
+    (100.0, 'deg')
     """
     source = str(path)
-    content = _parsed(source, path)
+    content = _parsed(source, Path(path))
     known = (*_TABLES, *more)
     _require_known(source, "", content, known)
     tables = {name: content.get(name, {}) for name in (*_TABLES, *_STUDY)}

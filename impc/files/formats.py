@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import os
 import tempfile
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,16 +24,35 @@ if TYPE_CHECKING:
     from impc.files.table import Table
 
 __all__ = [
-    "LARGEST",
-    "SUFFIXES",
+    "FORMATS",
+    "Format",
     "encode_table",
     "read_table",
     "write_matlab73",
     "write_table",
 ]
 
-#: Endings of the formats that are read.
-SUFFIXES = (".csv", ".tsv", ".txt", ".mat", ".tdms", ".c3d")
+
+@dataclass(frozen=True)
+class Format:
+    """How files of one ending are recognised, read and written.
+
+    Attributes
+    ----------
+    read : callable
+        (path, most bytes that its arrays may take) -> table. Whatever it raises becomes one line.
+    encode : callable
+        Table -> the bytes of a file.
+    begins : callable
+        Whether the first kilobyte of a file is that of this format; by default, of any text: of
+        what does not begin as something else.
+    """
+
+    read: Callable[[Path, int], Table]
+    encode: Callable[[Table], bytes]
+    begins: Callable[[bytes], bool] = lambda head: not _what_it_is(head)
+
+
 # First bytes of what else may carry one of the endings, and what it is.
 _SIGNATURES = {
     b"PK\x03\x04": "a zip archive or an Excel workbook",
@@ -48,13 +68,13 @@ _SIGNATURES = {
 }
 
 
-def read_table(path: Path, largest: int = LARGEST) -> Table:
-    """Read the columns of a recording.
+def read_table(path: Path | str, largest: int = LARGEST) -> Table:
+    r"""Read the columns of a recording.
 
     Parameters
     ----------
-    path : Path
-        A .csv, .tsv, .txt, .mat, .tdms or .c3d file.
+    path : Path or str
+        With one of the endings in `FORMATS`.
     largest : int
         Bytes above which a file is refused before it is read.
 
@@ -63,11 +83,25 @@ def read_table(path: Path, largest: int = LARGEST) -> Table:
     DataError
         When the file is missing, empty, too large, damaged, not what its ending says, or holds no
         column of numbers.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import impc
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder, "lab.csv")
+    ...     _ = path.write_text("t;tilt\n0,00;0,5\n0,01;0,6\n")
+    ...     found = impc.read_table(path)
+    >>> {name: column.tolist() for name, column in found.columns.items()}
+    {'t': [0.0, 0.01], 'tilt': [0.5, 0.6]}
     """
-    source = str(path)
-    read = _reader(source, _suffix(path, DataError), _head(path, largest))
+    source, path = str(path), Path(path)
+    suffix = _suffix(path, DataError)
+    head, form = _head(path, largest), FORMATS[suffix]
+    _require(source, form.begins(head), suffix, head)
     try:
-        return read(path, largest)
+        return form.read(path, largest)
     except ImpcError:
         raise
     except MemoryError:
@@ -78,7 +112,7 @@ def read_table(path: Path, largest: int = LARGEST) -> Table:
         raise damaged(source, error) from None
 
 
-def write_table(path: Path, table: Table) -> None:
+def write_table(path: Path | str, table: Table) -> None:
     """Write a table in the format of the `path`, whole or not at all; .mat is written as v5.
 
     Raises
@@ -86,20 +120,31 @@ def write_table(path: Path, table: Table) -> None:
     OutputError
         When the ending is not known, the format cannot hold the table, or the file cannot be
         written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import impc
+    >>> table = impc.make_table("simulated", {"t": [0, 0.01], "tilt": [0.5, 0.6]}, {"tilt": "deg"})
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     impc.write_table(f"{folder}/trial.mat", table)
+    ...     impc.read_table(f"{folder}/trial.mat").columns["tilt"].tolist()
+    [0.5, 0.6]
     """
+    path = Path(path)
     suffix = _suffix(path, OutputError)
-    _write(path, _ENCODERS[suffix](table))
+    _write(path, FORMATS[suffix].encode(table))
 
 
 def encode_table(ending: str, table: Table) -> bytes:
-    """The bytes of a table in the format of an ending, one of `SUFFIXES`; .mat is v5.
+    """The bytes of a table in the format of an ending, a key of `FORMATS`; .mat is v5.
 
     Raises
     ------
     OutputError
         When the ending is not known or the format cannot hold the table.
     """
-    return _ENCODERS[_suffix(Path(f"table{ending}"), OutputError)](table)
+    return FORMATS[_suffix(Path(f"table{ending}"), OutputError)].encode(table)
 
 
 def write_matlab73(path: Path, table: Table) -> None:
@@ -113,20 +158,10 @@ def write_matlab73(path: Path, table: Table) -> None:
     _write(path, matlab73_bytes(table))
 
 
-_ENCODERS: dict[str, Callable[[Table], bytes]] = {
-    ".csv": lambda table: encode_delimited(table, ".csv"),
-    ".tsv": lambda table: encode_delimited(table, ".tsv"),
-    ".txt": lambda table: encode_delimited(table, ".txt"),
-    ".mat": encode_matlab,
-    ".tdms": encode_tdms,
-    ".c3d": encode_c3d,
-}
-
-
 def _suffix(path: Path, error: type[InputError | OutputError]) -> str:
     suffix = path.suffix.lower()
-    if suffix not in SUFFIXES:
-        known = ", ".join(SUFFIXES)
+    if suffix not in FORMATS:
+        known = ", ".join(FORMATS)
         remedy = "export it as one of these"
         raise error(str(path), f"has the ending {suffix!r}, and not {known}", remedy)
     return suffix
@@ -143,30 +178,28 @@ def _head(path: Path, largest: int) -> bytes:
         raise DataError(str(path), f"cannot be opened ({reason})", "check the path") from None
 
 
-def _reader(source: str, suffix: str, head: bytes) -> Callable[[Path, int], Table]:
-    """Who reads a file of this ending; the first bytes must agree with the ending."""
-    found = next((what for mark, what in _SIGNATURES.items() if head.startswith(mark)), "")
-    if suffix == ".mat":
-        return _matlab_reader(source, head, found)
-    if suffix == ".tdms":
-        _require(source, head.startswith(b"TDSm"), suffix, found)
-        return functools.partial(read_apart, "tdms")
-    if suffix == ".c3d":
-        _require(source, head[1:2] == b"\x50", suffix, found)
-        return functools.partial(read_apart, "c3d")
-    _require(source, not found, suffix, found)
-    return lambda path, _: read_delimited(path)
+def _what_it_is(head: bytes) -> str:
+    """What a file that begins like this is, as far as its first bytes say; empty if they do not."""
+    return next((what for mark, what in _SIGNATURES.items() if head.startswith(mark)), "")
 
 
-def _matlab_reader(source: str, head: bytes, found: str) -> Callable[[Path, int], Table]:
+def _require(source: str, agrees: bool, suffix: str, head: bytes) -> None:
+    if not agrees:
+        found = _what_it_is(head)
+        what = f"is {found}" if found else "does not begin as such a file"
+        raise DataError(source, f"ends in {suffix} and {what}", "export it again")
+
+
+def _read_matlab(path: Path, largest: int) -> Table:
     """v5 or v7.3: the version in the header and the HDF5 signature behind it must agree."""
+    source, head = str(path), _head(path, largest)
     hdf5 = HDF5_SIGNATURE in (head[:8], head[512:520])
     version = int.from_bytes(head[124:126], "big" if head[126:128] == b"MI" else "little") >> 8
     if hdf5 and (version == 2 or head.startswith(HDF5_SIGNATURE)):
-        return functools.partial(read_apart, "matlab73")
-    _require(source, head.startswith(b"MATLAB "), ".mat", found)
+        return read_apart("matlab73", path, largest)
+    _require(source, head.startswith(b"MATLAB "), ".mat", head)
     if version == 1 and not hdf5:
-        return functools.partial(read_apart, "matlab")
+        return read_apart("matlab", path, largest)
     inside, said = ("7.3", "5") if hdf5 else ("5", "7.3")
     if hdf5 or version == 2:
         problem = f"says that it is version {said} and holds version {inside} or damaged data"
@@ -174,10 +207,10 @@ def _matlab_reader(source: str, head: bytes, found: str) -> Callable[[Path, int]
     raise DataError(source, "is of no version that MATLAB writes", "save it again with '-v7'")
 
 
-def _require(source: str, agrees: bool, suffix: str, found: str) -> None:
-    if not agrees:
-        what = f"is {found}" if found else "does not begin as such a file"
-        raise DataError(source, f"ends in {suffix} and {what}", "export it again")
+def _delimited(ending: str) -> Format:
+    return Format(
+        lambda path, _: read_delimited(path), lambda table: encode_delimited(table, ending)
+    )
 
 
 def _write(path: Path, content: bytes) -> None:
@@ -189,3 +222,18 @@ def _write(path: Path, content: bytes) -> None:
     except OSError as error:
         reason = error.strerror or type(error).__name__
         raise OutputError(str(path), f"cannot be written ({reason})", "give another path") from None
+
+
+#: By ending: the formats that are read and written. A new one is a line here.
+FORMATS: dict[str, Format] = {
+    ".csv": _delimited(".csv"),
+    ".tsv": _delimited(".tsv"),
+    ".txt": _delimited(".txt"),
+    ".mat": Format(_read_matlab, encode_matlab, lambda _: True),
+    ".tdms": Format(
+        functools.partial(read_apart, "tdms"), encode_tdms, lambda head: head.startswith(b"TDSm")
+    ),
+    ".c3d": Format(
+        functools.partial(read_apart, "c3d"), encode_c3d, lambda head: head[1:2] == b"\x50"
+    ),
+}

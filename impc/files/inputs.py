@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 from impc.files.digests import content_digest, digest, source_digest, versions
 
@@ -11,9 +11,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
-    from impc.studies.cohort.study import Unit
 
-__all__ = ["Inputs", "gather_inputs", "study_inputs"]
+__all__ = ["Inputs", "Recorded", "gather_inputs", "study_inputs"]
 
 
 @dataclass(frozen=True)
@@ -83,14 +82,26 @@ def gather_inputs(
     )
 
 
+class Recorded(Protocol):
+    """What is read here of a unit of a study."""
+
+    @property
+    def name(self) -> str:
+        """Of the unit."""
+
+    @property
+    def files(self) -> Sequence[Path]:
+        """Its recordings."""
+
+
 def study_inputs(
-    units: Sequence[Unit], study: Path, kind: str, name: str, arguments: Mapping[str, Any]
+    units: Sequence[Recorded], study: Path, kind: str, name: str, arguments: Mapping[str, Any]
 ) -> Inputs:
     """Digests of the recordings of a study, of its file and of its plant or model as they are now.
 
     Parameters
     ----------
-    units : sequence of Unit
+    units : sequence of Recorded
         With the recordings that are used.
     study : Path
         The study file.

@@ -24,7 +24,7 @@ from impc.checking import checked
 from impc.errors import ImpcError, InputError, PlantError, one_line
 from impc.files.saved_plant import SAVED, read_matrices, state_space
 from impc.model.plant import Plant
-from impc.model.plant_family import PlantFamily, plant_family
+from impc.model.plant_family import PlantFamily
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -213,7 +213,7 @@ def plant_family_of(
         changed = {name: float(value) for name, value in zip(free, values, strict=True)}
         return make_plant(source, recorded, **changed)
 
-    return plant_family(make, free, nominal)
+    return PlantFamily(make, free, nominal)
 
 
 def _nominal(source: PlantSource, name: str) -> float:

@@ -40,7 +40,7 @@ _SAMPLES_A_STATE = 5
 def read_recordings(
     paths: Sequence[Path], configuration: Configuration, plant: Plant
 ) -> tuple[Recording, ...]:
-    """Read one trial from each file, in the order given.
+    r"""Read one trial from each file, in the order given.
 
     Parameters
     ----------
@@ -63,6 +63,23 @@ def read_recordings(
         When the configuration does not name the plant's signals, or a file is given twice.
     DataError
         When a file cannot be read or a check fails. Nothing is returned then.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import control
+    >>> import impc
+    >>> plant = impc.Plant(control.ss([[0.9]], [[1]], [[1]], 0, 0.01, outputs=["angle"]))
+    >>> text = '[recording]\nrate = 100\n[signals.angle]\ncolumn = "tilt"\nunit = "deg"\n'
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     file, settings = Path(folder, "trial.csv"), Path(folder, "lab.toml")
+    ...     _ = settings.write_text(text)
+    ...     table = impc.make_table("simulated", {"tilt": [90 * 0.9**k for k in range(20)]})
+    ...     impc.write_table(file, table)
+    ...     trials = impc.read_recordings([file], impc.read_configuration(settings), plant)
+    >>> trials[0].outputs[:2].round(4).tolist()
+    [[1.5708], [1.4137]]
     """
     plant.require_discrete()
     _require_names(configuration, plant)  # before files are read, which may take long

@@ -78,6 +78,13 @@ def make_table(
     ------
     DataError
         When no column of numbers is left.
+
+    Examples
+    --------
+    >>> import impc
+    >>> table = impc.make_table("simulated", {"t": [0, 0.01], "tilt": [0.5, 0.6]}, {"tilt": "deg"})
+    >>> table.samples, dict(table.units)
+    (2, {'tilt': 'deg'})
     """
     given, columns = columns, {shown(name, _LONGEST): value for name, value in columns.items()}
     if len(columns) < len(given):

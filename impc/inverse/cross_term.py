@@ -68,6 +68,17 @@ def inverse_lqr_cross_term(plant: Plant, gain: ArrayLike) -> CrossTerm:
         When A - BK is not stable: no quadratic cost has such a gain.
     SolverError
         When the semidefinite program ends without an answer.
+
+    Examples
+    --------
+    A gain that some weights have needs no cross term.
+
+    >>> import impc
+    >>> from plants import yalmip_example
+    >>> plant = impc.Plant(yalmip_example())
+    >>> gain = impc.solve_lqr(plant, impc.Weights([[1, 0], [0, 1]], 1)).K
+    >>> impc.inverse_lqr_cross_term(plant, gain).norm < 1e-6
+    True
     """
     n, m = plant.n, plant.m
     K = finite_array("gain", gain, (m, n))

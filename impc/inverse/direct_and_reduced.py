@@ -173,6 +173,18 @@ def infer_weights(problem: Problem, *, condition_weight: float | None = None) ->
     ------
     WeightsError, SolverError
         When no starting weights can be found, or the recordings cannot be simulated from them.
+
+    Examples
+    --------
+    >>> import impc
+    >>> from plants import yalmip_example
+    >>> plant = impc.Plant(yalmip_example())
+    >>> bounds, weights = impc.Bounds(plant, u_min=-1, u_max=1), impc.Weights([[1, 0], [0, 1]], 1)
+    >>> truth = impc.Controller(plant, weights, bounds, horizon=3)
+    >>> trial = impc.Recording(plant, truth.simulate([1, 3], steps=20).x)
+    >>> found = impc.infer_weights(impc.Problem(plant, bounds, 3, [trial])).fit
+    >>> found.explained, impc.weight_error(found.weights, weights) < 1e-6
+    (True, True)
     """
     start = starting_point(problem)
     return Inference(start, inverse_mpc(problem, start.weights, condition_weight=condition_weight))
@@ -242,6 +254,19 @@ def inverse_mpc(
     ------
     WeightsError, SolverError
         As `conditioned_fit`.
+
+    Examples
+    --------
+    >>> import impc
+    >>> from plants import yalmip_example
+    >>> plant = impc.Plant(yalmip_example())
+    >>> bounds, weights = impc.Bounds(plant, u_min=-1, u_max=1), impc.Weights([[1, 0], [0, 1]], 1)
+    >>> truth = impc.Controller(plant, weights, bounds, horizon=3)
+    >>> trial = impc.Recording(plant, truth.simulate([1, 3], steps=20).x)
+    >>> problem = impc.Problem(plant, bounds, 3, [trial])
+    >>> found = impc.inverse_mpc(problem, impc.Weights([[1, 0], [0, 2]], 3))
+    >>> found.explained, impc.weight_error(found.weights, weights) < 1e-6
+    (True, True)
     """
     weight = condition_weight
     if weight is None:
@@ -303,6 +328,18 @@ def inverse_mpc_reduced(
     ------
     SolverError
         When the recordings cannot be simulated from any start.
+
+    Examples
+    --------
+    >>> import impc
+    >>> from plants import yalmip_example
+    >>> plant = impc.Plant(yalmip_example())
+    >>> bounds = impc.Bounds(plant, u_min=-1, u_max=1)
+    >>> truth = impc.Controller(plant, impc.Weights([[1, 0], [0, 1]], 1), bounds, horizon=3)
+    >>> trial = impc.Recording(plant, truth.simulate([1, 3], steps=20).x)
+    >>> found = impc.inverse_mpc_reduced(impc.Problem(plant, bounds, 3, [trial]))
+    >>> found.explained, bool(abs(found.gain.K - truth.K).max() < 1e-6)
+    (True, True)
     """
     first = weights_behind(fit_gain(problem, *starts, attempts=2))
     if first.explained:

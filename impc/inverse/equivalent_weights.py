@@ -17,16 +17,14 @@ from impc.arrays import Array, Frozen
 from impc.checking import checked
 from impc.errors import SolverError, WeightsError
 from impc.inverse.semidefinite import matrix_inequality, solve_semidefinite
-from impc.inverse.solution_set import GainFibre, gain_fibre, pair_blocks, split_blocks
+from impc.inverse.solution_set import GainFibre, pair_blocks, split_blocks
 from impc.model.riccati import solve_lqr
 from impc.model.weights import Weights, condition_number, normalised
 
 __all__ = [
     "EquivalentWeights",
-    "GainFibre",
     "WeightsMargin",
     "analytic_centre",
-    "gain_fibre",
     "inverse_factor",
     "least_condition_weights",
     "other_weights",
@@ -143,6 +141,16 @@ def least_condition_weights(fibre: GainFibre, member: Weights | None = None) -> 
     SolverError
         When the dual bound stays more than 1e-4 below, or no member is definite to working
         precision in the units of the plant.
+
+    Examples
+    --------
+    >>> import impc
+    >>> from plants import yalmip_example
+    >>> plant = impc.Plant(yalmip_example())
+    >>> gain = impc.solve_lqr(plant, impc.Weights([[1, 0], [0, 1]], 1)).K
+    >>> found = impc.least_condition_weights(impc.gain_fibre(plant, gain))
+    >>> round(found.condition, 6), found.weights.Q.round(6).diagonal()
+    (1.0, array([1., 1.]))
     """
     best = _interior(fibre, member)
     least, gap, status = condition_number(best), 1.0, ""
@@ -223,6 +231,16 @@ def other_weights(
     ------
     WeightsError, SolverError
         As `least_condition_weights`.
+
+    Examples
+    --------
+    >>> import impc
+    >>> from plants import yalmip_example
+    >>> plant = impc.Plant(yalmip_example())
+    >>> gain = impc.solve_lqr(plant, impc.Weights([[1, 0], [0, 1]], 1)).K
+    >>> others = impc.other_weights(impc.gain_fibre(plant, gain), 2, condition_ratio=10)
+    >>> [(round(item.condition, 4), item.gain_error < 1e-9) for item in others]
+    [(10.0, True), (10.0, True)]
     """
     centre = least_condition_weights(fibre)
     ends, frame = _ends(fibre, centre.weights, condition_ratio * centre.condition)

@@ -16,8 +16,9 @@ import scipy.optimize
 from impc.arrays import Array, Frozen, finite_array, frozen
 from impc.checking import checked
 from impc.errors import WeightsError
-from impc.inverse.cross_term import CrossTerm, inverse_lqr_cross_term
-from impc.inverse.equivalent_weights import gain_fibre, least_condition_weights, weights_margin
+from impc.inverse.cross_term import inverse_lqr_cross_term
+from impc.inverse.equivalent_weights import least_condition_weights, weights_margin
+from impc.inverse.solution_set import gain_fibre
 from impc.model.riccati import gain_gradients, is_stable, solve_lqr
 from impc.model.weights import Weights, condition_number, normalised
 
@@ -28,9 +29,7 @@ if TYPE_CHECKING:
     from impc.model.riccati import LqrSolution
 
 __all__ = [
-    "CrossTerm",
     "InverseLqr",
-    "inverse_lqr_cross_term",
     "inverse_lqr_gradient",
     "inverse_lqr_lmi",
 ]
@@ -91,6 +90,16 @@ def inverse_lqr_lmi(plant: Plant, gain: ArrayLike) -> InverseLqr:
     ------
     SolverError
         When the semidefinite program ends without an answer.
+
+    Examples
+    --------
+    >>> import impc
+    >>> from plants import yalmip_example
+    >>> plant = impc.Plant(yalmip_example())
+    >>> gain = impc.solve_lqr(plant, impc.Weights([[1, 0], [0, 1]], 1)).K
+    >>> found = impc.inverse_lqr_lmi(plant, gain)
+    >>> found.feasible, round(found.condition, 6)
+    (True, 1.0)
     """
     K = finite_array("gain", gain, (plant.m, plant.n))
     if not is_stable(plant.A - plant.B @ K, discrete=plant.discrete):
@@ -136,6 +145,15 @@ def inverse_lqr_gradient(
     ------
     WeightsError
         When the start has no stabilising Riccati solution.
+
+    Examples
+    --------
+    >>> import impc
+    >>> from plants import yalmip_example
+    >>> plant = impc.Plant(yalmip_example())
+    >>> gain = impc.solve_lqr(plant, impc.Weights([[1, 0], [0, 1]], 1)).K
+    >>> impc.inverse_lqr_gradient(plant, gain).gain_error < 1e-6
+    True
     """
     K = finite_array("gain", gain, (plant.m, plant.n))
     space = _FactorSpace.around(plant, _default_start(plant, K) if start is None else start, floor)

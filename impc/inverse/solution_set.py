@@ -129,6 +129,17 @@ def gain_fibre(
         When the gain is not a finite (m, n) matrix, or a metric not a symmetric (m, m) one.
     WeightsError
         When A - BK is not stable: no weights have such a gain.
+
+    Examples
+    --------
+    Two states and one input: four numbers of (Q, R), of which a gain of two fixes two.
+
+    >>> import impc
+    >>> from plants import yalmip_example
+    >>> plant = impc.Plant(yalmip_example())
+    >>> gain = impc.solve_lqr(plant, impc.Weights([[1, 0], [0, 1]], 1)).K
+    >>> impc.gain_fibre(plant, gain).dimension
+    2
     """
     K = finite_array("gain", gain, (plant.m, plant.n))
     if not is_stable(plant.A - plant.B @ K, discrete=plant.discrete):

@@ -24,16 +24,25 @@ if TYPE_CHECKING:
 
     from impc.model.plant import Plant
 
-__all__ = ["PlantDifferential", "PlantFamily", "plant_at", "plant_differential", "plant_family"]
+__all__ = ["PlantDifferential", "PlantFamily", "plant_at", "plant_differential"]
 
 _STEP = 1e-3
 # Difference of the two central differences, relative to the derivative: h^2 for a smooth plant.
 _ROUGH = 1e-3
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, init=False)
 class PlantFamily(Frozen):
-    """A plant for every value of some parameters.
+    """A plant for every value of some physical parameters, which are searched with the gain.
+
+    Parameters
+    ----------
+    make : callable
+        Values of the parameters (k,), in their units -> plant.
+    names : sequence of str
+        Of the parameters.
+    nominal : sequence of float
+        Their values when nothing is known, in their units; positive.
 
     Attributes
     ----------
@@ -43,11 +52,44 @@ class PlantFamily(Frozen):
         (k,).
     nominal : Array
         Values about which they are searched (k,), positive.
+
+    Raises
+    ------
+    InputError
+        When a nominal value is not a positive number: give it in a unit in which it is.
+
+    Examples
+    --------
+    A mass (kg) that is pushed for a second at a time, between 60 and 90 kg as far as one knows.
+
+    >>> import control
+    >>> import impc
+    >>> def pushed(values):
+    ...     return impc.Plant(control.ss([[1.0]], [[1 / values[0]]], [[1.0]], 0, 1))
+    >>> family = impc.PlantFamily(pushed, ["mass"], [75.0])
+    >>> family.make([80.0]).B
+    array([[0.0125]])
     """
 
     make: Callable[[Array], Plant]
     names: tuple[str, ...]
     nominal: Array
+
+    @checked
+    def __init__(
+        self, make: Callable[[Array], Plant], names: Sequence[str], nominal: Sequence[float]
+    ) -> None:
+        if len(names) != len(nominal):
+            raise InputError(
+                "nominal", f"has {len(nominal)} values", f"give {len(names)}, one a name"
+            )
+        for name, value in zip(names, nominal, strict=True):
+            if not 0 < value < np.inf:
+                raise InputError(
+                    f"parameter {name}", f"nominal value {value:g}", "give a positive one"
+                )
+        for field, given in (("make", make), ("names", tuple(names)), ("nominal", frozen(nominal))):
+            object.__setattr__(self, field, given)
 
 
 class PlantDifferential(NamedTuple):
@@ -63,34 +105,6 @@ class PlantDifferential(NamedTuple):
     B: Array
     E: Array
     C: Array
-
-
-@checked
-def plant_family(
-    make: Callable[[Array], Plant], names: Sequence[str], nominal: Sequence[float]
-) -> PlantFamily:
-    """Check and freeze a family.
-
-    Parameters
-    ----------
-    make : callable
-        Values of the parameters (k,), in their units -> plant.
-    names : sequence of str
-        Of the parameters.
-    nominal : sequence of float
-        Their values when nothing is known, in their units; positive.
-
-    Raises
-    ------
-    InputError
-        When a nominal value is not a positive number: give it in a unit in which it is.
-    """
-    if len(names) != len(nominal):
-        raise InputError("nominal", f"has {len(nominal)} values", f"give {len(names)}, one a name")
-    for name, value in zip(names, nominal, strict=True):
-        if not 0 < value < np.inf:
-            raise InputError(f"parameter {name}", f"nominal value {value:g}", "give a positive one")
-    return PlantFamily(make, tuple(names), frozen(nominal))
 
 
 @checked(logarithms="*")

@@ -29,6 +29,13 @@ class Label(Value):
     ----------
     subject, visit, condition, trial : str
         Names, as the files or the study give them.
+
+    Examples
+    --------
+    >>> import impc
+    >>> label = impc.Label(subject="S01", condition="eyes closed", trial="2")
+    >>> str(label)
+    'S01 eyes closed 2'
     """
 
     subject: str = ""

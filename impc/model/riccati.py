@@ -55,6 +55,14 @@ class LqrSolution(Frozen):
         Metric (m, m) in which the constrained controller stays near the gain: R + B'PB.
     F : Array
         Closed loop A - BK, (n, n).
+
+    Examples
+    --------
+    >>> import impc
+    >>> from plants import yalmip_example
+    >>> found = impc.solve_lqr(impc.Plant(yalmip_example()), impc.Weights([[1, 0], [0, 1]], 1))
+    >>> isinstance(found, impc.LqrSolution), found.P.shape, found.S.shape
+    (True, (2, 2), (1, 1))
     """
 
     plant: Plant
@@ -99,6 +107,14 @@ def solve_lqr(plant: Plant, weights: Weights) -> LqrSolution:
     WeightsError
         When no stabilising solution exists: Q leaves a mode on or outside the stability limit
         without weight.
+
+    Examples
+    --------
+    >>> import impc
+    >>> from plants import yalmip_example
+    >>> found = impc.solve_lqr(impc.Plant(yalmip_example()), impc.Weights([[1, 0], [0, 1]], 1))
+    >>> found.K.round(4)
+    array([[ 1.4938, -0.8811]])
     """
     if weights.Q.shape != (plant.n, plant.n) or weights.R.shape != (plant.m, plant.m):
         raise InputError(
@@ -179,6 +195,15 @@ def gain_gradients(solution: LqrSolution) -> Gradients:
     -------
     Gradients
         Of shapes (m, n, n, n) and (m, n, m, m).
+
+    Examples
+    --------
+    >>> import impc
+    >>> from plants import yalmip_example
+    >>> found = impc.solve_lqr(impc.Plant(yalmip_example()), impc.Weights([[1, 0], [0, 1]], 1))
+    >>> slopes = impc.gain_gradients(found)
+    >>> slopes.Q.shape, slopes.R.shape
+    ((1, 2, 2, 2), (1, 2, 1, 1))
     """
     B, K, F, S = solution.plant.B, solution.K, solution.F, solution.S
     m, n = K.shape

@@ -26,7 +26,7 @@ __all__ = [
     "cholesky_parameters",
     "condition_number",
     "normalised",
-    "residual",
+    "weight_error",
     "weights_from_parameters",
 ]
 
@@ -95,21 +95,46 @@ class Weights(Value):
 
 @checked
 def condition_number(weights: Weights) -> float:
-    """Condition number of blkdiag(Q, R), the kappa of (3.5); infinite when Q is singular."""
+    """Condition number of blkdiag(Q, R), the kappa of (3.5); infinite when Q is singular.
+
+    Examples
+    --------
+    >>> import impc
+    >>> impc.condition_number(impc.Weights([[1, 0], [0, 4]], 2))
+    4.0
+    """
     eigenvalues = np.linalg.eigvalsh(weights.block)
     return float(eigenvalues[-1] / eigenvalues[0]) if eigenvalues[0] > 0 else float("inf")
 
 
 @checked
 def normalised(weights: Weights) -> Weights:
-    """Return the same weights scaled to R[0, 0] = 1."""
+    """Return the same weights scaled to R[0, 0] = 1.
+
+    Examples
+    --------
+    >>> import impc
+    >>> impc.normalised(impc.Weights([[1, 0], [0, 4]], 2)).Q
+    array([[0.5, 0. ],
+           [0. , 2. ]])
+    """
     scale = float(weights.R[0, 0])
     return replace(weights, Q=weights.Q / scale, R=weights.R / scale)
 
 
 @checked
-def residual(estimate: Weights, truth: Weights) -> float:
-    """Frobenius distance of blkdiag(Q, R) after scaling both to R[0, 0] = 1, equation (3.10)."""
+def weight_error(estimate: Weights, truth: Weights) -> float:
+    """Frobenius distance of blkdiag(Q, R) after scaling both to R[0, 0] = 1, equation (3.10).
+
+    Examples
+    --------
+    >>> import impc
+    >>> truth = impc.Weights([[1, 0], [0, 1]], 1)
+    >>> impc.weight_error(impc.Weights([[2, 0], [0, 2]], 2), truth)
+    0.0
+    >>> impc.weight_error(impc.Weights([[1, 0], [0, 4]], 1), truth)
+    3.0
+    """
     return float(np.linalg.norm(normalised(estimate).block - normalised(truth).block))
 
 

@@ -8,9 +8,6 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
-from impc.inverse.direct_and_reduced import AUXILIARY_CONDITION_WEIGHT, CONDITION_WEIGHT
-from impc.studies.example.cases import BOUND, HORIZON, STEPS
-
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
@@ -19,14 +16,8 @@ if TYPE_CHECKING:
     from impc.files.plant_sources import PlantSource
     from impc.model.plant import Plant
 
-__all__ = ["LOST", "FitProvenance", "Provenance", "example_provenance", "fit_provenance"]
+__all__ = ["FitProvenance", "Provenance", "example_provenance", "fit_provenance"]
 
-#: What the page of the example says of the dissertation's own plant.
-LOST = (
-    "The dissertation's own plant (3.8), initial state and input bound are lost. "
-    "This plant stands in for them: it shows everything that the dissertation says of its own, "
-    "but its numbers are not the dissertation's."
-)
 _PACKAGES = ("impc", "casadi", "clarabel", "control", "cvxpy", "numba", "numpy", "scipy")
 
 
@@ -85,19 +76,12 @@ class FitProvenance:
     inputs: Inputs
 
 
-def example_provenance(plant_name: str, plant: Plant) -> Provenance:
+def example_provenance(plant_name: str, plant: Plant, settings: Mapping[str, float]) -> Provenance:
     """Gather the provenance of a run of the example, now and with what is installed here.
 
-    `plant_name` is the import path of the plant.
+    `plant_name` is the import path of the plant, `settings` are the numbers of the example.
     """
-    settings: dict[str, float] = {
-        "horizon": HORIZON,
-        "steps": STEPS,
-        "input_bound": BOUND,
-        "condition_weight": CONDITION_WEIGHT,
-        "auxiliary_condition_weight": AUXILIARY_CONDITION_WEIGHT,
-    }
-    return Provenance(plant_name, plant, settings, _versions(), _now())
+    return Provenance(plant_name, plant, dict(settings), _versions(), _now())
 
 
 def fit_provenance(

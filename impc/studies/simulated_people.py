@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from impc.arrays import Array, Frozen, finite_array, frozen
-from impc.assess.vaf import saturated_share
+from impc.assess.variance_accounted_for import saturated_share
 from impc.control.closed_loop import Scenario, Status, prepare_loop, run_loop
 from impc.control.constraint_rows import directions
 from impc.errors import InputError

@@ -20,7 +20,7 @@ from impc.files.sealed import Kept
 from impc.inverse.problem import Problem
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
-from impc.model.plant_family import plant_family
+from impc.model.plant_family import PlantFamily
 from impc.model.recordings import Recording
 from impc.studies.cohort.unit_digest import unit_digest
 from impc.studies.fit.memory import open_memory
@@ -160,8 +160,8 @@ def test_the_memory_of_a_fit_knows_all_of_its_problem(tmp_path: Path) -> None:
 
     plant = Plant(system())
     trial = Recording(plant, np.ones((20, 1)))
-    family = plant_family(lambda values: Plant(system(values[0])), ["growth"], [1.1])
-    curved = plant_family(lambda values: Plant(system(values[0] ** 2 / 1.1)), ["growth"], [1.1])
+    family = PlantFamily(lambda values: Plant(system(values[0])), ["growth"], [1.1])
+    curved = PlantFamily(lambda values: Plant(system(values[0] ** 2 / 1.1)), ["growth"], [1.1])
 
     def problem(**changed: object) -> object:
         made = Problem(plant, Bounds(plant, u_min=-1, u_max=1), 20, (trial,), family=family)

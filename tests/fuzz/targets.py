@@ -12,7 +12,7 @@ import numpy as np
 
 from impc.errors import ImpcError
 from impc.files.configuration import read_configuration
-from impc.files.formats import SUFFIXES, read_table, write_matlab73, write_table
+from impc.files.formats import FORMATS, read_table, write_matlab73, write_table
 from impc.files.inspection import draft_configuration, summary
 from impc.files.plant_sources import make_plant, plant_source
 from impc.files.reading import recording_of
@@ -143,7 +143,7 @@ class Fuzzer:
 
 #: Who makes a case, by what it is.
 TARGETS: dict[str, Callable[[Fuzzer], tuple[Path, Callable[[], Any]]]] = {
-    **{suffix: methodcaller("file", suffix) for suffix in SUFFIXES},
+    **{suffix: methodcaller("file", suffix) for suffix in FORMATS},
     "configuration": Fuzzer.configuration,
     "plant": Fuzzer.saved_plant,
 }

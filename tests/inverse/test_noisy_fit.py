@@ -24,7 +24,7 @@ from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.problem import Problem
 from impc.inverse.residuals import evaluate
 from impc.model.plant import Plant
-from impc.model.plant_family import plant_at, plant_differential, plant_family
+from impc.model.plant_family import PlantFamily, plant_at, plant_differential
 from impc.model.recordings import Recording
 from impc.model.riccati import solve_lqr
 from impc.studies.fit.settings import FitSettings
@@ -131,7 +131,7 @@ def seat_family() -> tuple[Problem, Workload]:
         changed = replace(truth, J2=float(values[0]), tau_m=float(values[1]))
         return Plant(plants.seated_balance_plant(changed), ["command"])
 
-    family = plant_family(make, ["J2", "tau_m"], [1.2 * truth.J2, 0.8 * truth.tau_m])
+    family = PlantFamily(make, ["J2", "tau_m"], [1.2 * truth.J2, 0.8 * truth.tau_m])
     start = plant_at(family, np.zeros(2))
     return replace(problem, plant=start, family=family, logarithms=np.zeros(2)), work
 

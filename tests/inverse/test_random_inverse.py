@@ -7,8 +7,9 @@ import pytest
 
 from impc.control.controller import Controller
 from impc.inverse.direct_and_reduced import inverse_mpc_reduced
-from impc.inverse.equivalent_weights import gain_fibre, least_condition_weights
+from impc.inverse.equivalent_weights import least_condition_weights
 from impc.inverse.problem import Problem
+from impc.inverse.solution_set import gain_fibre
 from impc.model.riccati import solve_lqr
 from impc.model.weights import Weights, condition_number
 from tests.support import saturated_problem

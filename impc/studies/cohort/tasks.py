@@ -73,4 +73,4 @@ def _task(study: Study, unit: Unit, unused: set[str], source: PlantSource) -> Fi
     arguments: Mapping[str, Any] = dict(study.configuration.plant) | person
     files = tuple(str(file.resolve()) for file in unit.files)
     digest = unit_digest(files, source.name, arguments, study.configuration)
-    return FitTask(files, study.plant, dict(arguments), study.configuration, digest)
+    return FitTask(files, source.name, dict(arguments), study.configuration, digest)

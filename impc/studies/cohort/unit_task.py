@@ -22,9 +22,8 @@ from impc.assess.intent_rules import intent
 from impc.assess.judged import judge
 from impc.assess.printed_gain import gain_estimate
 from impc.assess.resampling import DRAWS, replicate
-from impc.cli.plant import find_plant
 from impc.errors import ImpcError
-from impc.files.plant_sources import make_plant, plant_family_of
+from impc.files.plant_sources import make_plant, plant_family_of, plant_source
 from impc.files.reading import read_recordings
 from impc.inverse.noisy_fit import fit_controller
 from impc.model.weights import Weights
@@ -123,7 +122,7 @@ def unit_problem(task: FitTask) -> tuple[Problem, FitSettings]:
         When a recording, the plant or the settings cannot be used, or are not those of the `task`.
     """
     settings = fit_settings(task.configuration.fit)
-    source = find_plant(task.plant, task.arguments)
+    source = plant_source(task.plant, task.arguments)
     # A worker on another machine, or one that has run for days, may have other files and code.
     here = unit_digest(task.files, source.name, task.arguments, task.configuration)
     require_same_inputs(here, task.digest)

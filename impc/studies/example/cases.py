@@ -17,11 +17,12 @@ from impc.assess.identified_directions import Identifiability, identifiability
 from impc.assess.judged import judge
 from impc.control.closed_loop import Simulation, require_complete, scenario, simulate
 from impc.control.controller import Controller
+from impc.inverse.direct_and_reduced import AUXILIARY_CONDITION_WEIGHT, CONDITION_WEIGHT
 from impc.inverse.methods import METHODS, PlantUnits
 from impc.inverse.problem import Problem, misfit
 from impc.model.bounds import Bounds
 from impc.model.recordings import Recording
-from impc.model.weights import Weights, residual
+from impc.model.weights import Weights, weight_error
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -34,6 +35,8 @@ __all__ = [
     "CASES",
     "EXAMPLE",
     "HORIZON",
+    "LOST",
+    "SETTINGS",
     "STEPS",
     "CaseResult",
     "MethodResult",
@@ -61,6 +64,20 @@ HORIZON = 3
 STEPS = 20
 #: Largest magnitude of the input.
 BOUND = 1.0
+#: The numbers of the example, as its page and result.json name them.
+SETTINGS: dict[str, float] = {
+    "horizon": HORIZON,
+    "steps": STEPS,
+    "input_bound": BOUND,
+    "condition_weight": CONDITION_WEIGHT,
+    "auxiliary_condition_weight": AUXILIARY_CONDITION_WEIGHT,
+}
+#: What the page of the example says of the dissertation's own plant.
+LOST = (
+    "The dissertation's own plant (3.8), initial state and input bound are lost. "
+    "This plant stands in for them: it shows everything that the dissertation says of its own, "
+    "but its numbers are not the dissertation's."
+)
 
 
 @dataclass(frozen=True)
@@ -203,7 +220,7 @@ def _result(fit: MethodFit, truth: Weights) -> MethodResult:
         state_misfit=misfit(found.problem, list(fit.runs)) if fit.runs else None,
         max_abs_u=largest,
         bound_kept=None if largest is None else largest <= BOUND * (1 + 1e-9),
-        residual=None if found.weights is None else residual(found.weights, truth),
+        residual=None if found.weights is None else weight_error(found.weights, truth),
         seconds=found.seconds,
         simulations=found.evaluations,
         feasible=found.weights is not None if fit.name == "inverse_lqr_lmi" else None,

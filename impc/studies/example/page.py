@@ -8,8 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from impc.reporting.provenance import LOST
 from impc.reporting.rendering import embedded, render_template
+from impc.studies.example.cases import LOST
 from impc.studies.example.figures import FIGURES
 from impc.studies.example.table import (
     METHODS,

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from impc.assess.intent_rules import Intent
     from impc.assess.judged import MethodFit
     from impc.assess.printed_gain import GainEstimate
-    from impc.assess.vaf import TrialAgreement
+    from impc.assess.variance_accounted_for import TrialAgreement
     from impc.inverse.estimate import Estimate
     from impc.inverse.problem import Problem
     from impc.studies.fit.settings import FitSettings
@@ -80,7 +80,7 @@ class FitResult:
     held_out : tuple of HeldOut
         One a trial; empty for a single trial or when not asked for.
     methods : tuple of MethodFit
-        Those of `impc.assess.inverse_lqr_beside` in their order; the last is inverse MPC.
+        Those of `impc.inverse.methods` that a fit asks for; the last is inverse MPC.
     diagnostics : ResidualDiagnostics
         What the residuals say against the fit.
     terminal_set_difference : float

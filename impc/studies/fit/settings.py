@@ -84,6 +84,13 @@ class FitSettings:
         Whether the limit of each input is estimated too.
     horizons : list of int
         Other horizons, in samples, to compare with; and the fit without limit beside them.
+
+    Examples
+    --------
+    >>> import impc
+    >>> settings = impc.FitSettings(horizon=10, u_max=1.2, held_out=False)
+    >>> settings.horizon, settings.margin
+    (10, 1.2)
     """
 
     horizon: int = 20

@@ -25,7 +25,7 @@ from impc.assess.intent_draws import drawn_gains
 from impc.assess.intent_rules import intent
 from impc.assess.judged import judge
 from impc.assess.printed_gain import gain_estimate
-from impc.assess.vaf import agreement
+from impc.assess.variance_accounted_for import agreement
 from impc.assess.weights_ranges import weights_summary_or_reason
 from impc.checking import checked, replace
 from impc.control.closed_loop import simulate
@@ -101,6 +101,17 @@ def fit_problem(
     ------
     DataError, InputError, BoundsError
         When there is no recording, an output is zero throughout, or a bound cannot be set.
+
+    Examples
+    --------
+    >>> import control
+    >>> import impc
+    >>> plant = impc.Plant(control.ss([[1.1]], [[1]], [[1]], 0, 1))
+    >>> law = impc.Controller(plant, impc.Weights(1, 1), impc.Bounds(plant), horizon=3)
+    >>> trial = impc.Recording(plant, law.simulate([1.0], steps=30).x)
+    >>> problem = impc.fit_problem(plant, [trial], impc.FitSettings(horizon=3, u_max=0.5))
+    >>> problem.unknown_start, problem.bounds.u_max
+    (True, array([0.5]))
     """
     if not recordings:
         raise DataError("recordings", "there are none", "give at least one trial")
@@ -145,6 +156,23 @@ def fit_recordings(
     ------
     WeightsError, SolverError
         When no regulator can be simulated on these recordings, or no weights are found.
+
+    Examples
+    --------
+    >>> import control
+    >>> import impc
+    >>> import numpy as np
+    >>> rng = np.random.default_rng(1)
+    >>> plant = impc.Plant(control.ss([[1.1]], [[1, 1]], [[1]], 0, 1, inputs=["u", "push"]), ["u"])
+    >>> bounds = impc.Bounds(plant, u_min=-1, u_max=1)
+    >>> law = impc.Controller(plant, impc.Weights(1, 1), bounds, horizon=3)
+    >>> push = rng.choice([-0.5, 0.0, 0.5], 60)
+    >>> states = law.simulate([0.0], disturbance=push).x[:-1]
+    >>> trial = impc.Recording(plant, states + 0.01 * rng.standard_normal(states.shape), push)
+    >>> settings = impc.FitSettings(horizon=3, u_max=1.0, intent_draws=False)
+    >>> found = impc.fit_recordings(impc.fit_problem(plant, [trial], settings), settings)
+    >>> bool(abs(found.estimate.K - law.K).max() < 0.1)
+    True
     """
     progress = progress or FitProgress()
     started = time.perf_counter()

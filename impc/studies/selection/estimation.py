@@ -13,7 +13,7 @@ import numpy as np
 import scipy.optimize
 
 from impc.arrays import Array, Frozen, IntArray, frozen
-from impc.assess.vaf import vaf
+from impc.assess.variance_accounted_for import vaf
 from impc.errors import DataError, InputError
 from impc.studies.selection.model import normalised, physical, sensitivity
 

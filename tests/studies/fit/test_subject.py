@@ -12,7 +12,7 @@ import pytest
 from experiments.benchmarks.workloads import seat
 from experiments.simulated_subjects import noisy_recordings
 from impc.assess.intent_rules import dominant_sentence, intent
-from impc.assess.vaf import vaf
+from impc.assess.variance_accounted_for import vaf
 from impc.checking import replace
 from impc.control.closed_loop import scenario, simulate
 from impc.control.controller import Controller
@@ -68,7 +68,7 @@ def noisy() -> FitResult:
     return fit_recordings(fit_problem(seat().problem.plant, trials, settings), settings)
 
 
-def test_vaf_is_that_of_the_trajectories(noisy: FitResult) -> None:
+def test_variance_accounted_for_is_that_of_the_trajectories(noisy: FitResult) -> None:
     plant = noisy.fitted.problem.plant
     runs = noisy.inverse_mpc.runs
     for index, trial in enumerate(noisy.given.recordings):

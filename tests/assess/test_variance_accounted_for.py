@@ -7,10 +7,10 @@ import pytest
 import scipy.signal
 import scipy.stats
 
-from impc.assess.vaf import centred_vaf, saturated_share, vaf, whiteness
+from impc.assess.variance_accounted_for import centred_vaf, saturated_share, vaf, whiteness
 
 
-def test_vaf_by_hand() -> None:
+def test_variance_accounted_for_by_hand() -> None:
     recorded = np.array([[3.0, 1.0], [4.0, 1.0]])
     simulated = np.array([[3.0, 0.0], [3.0, 1.0]])
     np.testing.assert_allclose(vaf(recorded, simulated), [100 * (1 - 1 / 25), 50.0])
@@ -18,7 +18,7 @@ def test_vaf_by_hand() -> None:
     np.testing.assert_allclose(centred_vaf(recorded, simulated), [0.0, np.nan])
 
 
-def test_vaf_of_an_output_that_is_zero_is_not_a_number() -> None:
+def test_variance_accounted_for_of_an_output_that_is_zero_is_not_a_number() -> None:
     assert np.isnan(vaf(np.zeros((5, 1)), np.ones((5, 1)))[0])
 
 

@@ -1,0 +1,104 @@
+"""`import impc`: its names, what it loads, and the example of each name."""
+
+from __future__ import annotations
+
+import ast
+import doctest
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import impc
+from tests.documents.blocks import ROOT
+
+FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
+HEAVY = {"casadi", "matplotlib", "numba", "numpy", "scipy"}
+
+
+def test_there_are_at_most_sixty_names_and_each_is_there() -> None:
+    assert len(impc.__all__) == len(set(impc.__all__)) <= 60
+    for name in impc.__all__:
+        assert getattr(impc, name).__name__ == name
+    assert {*impc.__all__, "__version__"} == set(dir(impc))
+    assert impc.__version__ in (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    with pytest.raises(AttributeError, match="module 'impc' has no attribute 'nothing'"):
+        impc.nothing  # type: ignore[attr-defined]  # noqa: B018
+
+
+def test_a_type_checker_sees_the_same_names_in_the_same_modules() -> None:
+    tree = ast.parse(Path(impc.__file__).read_text(encoding="utf-8"))
+    typed = {
+        (item.name, str(node.module).removeprefix("impc."), item.asname)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom) and str(node.module).startswith("impc.")
+        for item in node.names
+    }
+    assert typed == {(name, module, name) for name, module in impc._MODULES.items()}
+
+
+def loaded(*lines: str) -> set[str]:
+    """Names of the modules that a fresh Python has after some lines."""
+    code = "\n".join((*lines, "import json, sys", "print(json.dumps(sorted(sys.modules)))"))
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    return set(json.loads(done.stdout))
+
+
+def test_importing_it_loads_no_other_library() -> None:
+    bare, found = loaded(), loaded("import impc")
+    assert {name for name in found - bare if name.split(".")[0] != "impc"} <= {
+        name for name in found if name.split(".")[0] in sys.stdlib_module_names
+    }
+    assert found.isdisjoint(HEAVY)
+    assert {name for name in found if name.startswith("impc.")} == set()
+
+
+def test_a_name_loads_its_module_and_not_the_others() -> None:
+    found = loaded("import impc", "impc.Weights")
+    assert {"impc.model.weights", "numpy"} <= found
+    assert found.isdisjoint({"casadi", "numba", "impc.inverse.problem", "matplotlib"})
+
+
+@pytest.mark.parametrize("name", impc.__all__)
+def test_the_example_of_the_name_runs(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    thing: Any = getattr(impc, name)
+    assert re.search(r"^\s*Examples\n\s*-{8}\n", thing.__doc__, re.MULTILINE), "no Examples"
+    found = doctest.DocTestFinder(recurse=False).find(thing, name, globs={})
+    runner = doctest.DocTestRunner(optionflags=FLAGS)
+    told: list[str] = []
+    for test in found:
+        assert any(example.want for example in test.examples), "shows no result"
+        runner.run(test, out=told.append)
+    assert runner.summarize(verbose=False).attempted > 0
+    assert told == []
+
+
+def test_an_example_that_is_wrong_is_found() -> None:
+    def wrong() -> None:
+        """Add.
+
+        Examples
+        --------
+        >>> 1 + 1
+        3
+        """
+
+    found = doctest.DocTestFinder(recurse=False).find(wrong, "wrong", globs={})
+    runner = doctest.DocTestRunner(optionflags=FLAGS)
+    assert runner.run(found[0], out=lambda _: None).failed == 1
+
+
+def test_the_page_lists_every_name_once() -> None:
+    page = (ROOT / "docs/api.md").read_text(encoding="utf-8")
+    listed = re.findall(r"^\| `(\w+)` \|", page, flags=re.MULTILINE)
+    assert sorted(listed) == impc.__all__
+    assert "`impc.`" not in page
