@@ -138,8 +138,7 @@ def gain_covariance(
     in_units = np.kron(G, np.linalg.inv(T).T)
     on_gain = found.dK.reshape(-1, m * n) @ in_units
     nuisance = _nuisance(problem, found)
-    # What the rest can explain is taken out of the gain's columns; the gain's
-    # block of the inverse of H is that of what is left.
+    # The gain's block of the inverse of H: that of its columns less what the rest can explain.
     left = _orthogonal(nuisance)
     seen = on_gain - left @ (left.T @ on_gain)
     _, values, directions = np.linalg.svd(seen, full_matrices=False)
@@ -153,9 +152,8 @@ def gain_covariance(
     deviations[usable] = np.sqrt(np.maximum(np.diag(spread), 0.0))
     if curvature:
         told = np.flatnonzero(deviations < TOLD)
-        reach = np.minimum(deviations, 1.0)[:, None] * directions
-        steps = (reach[deviations >= TOLD] @ in_units.T).reshape(-1, m, n)
-        shifts = _shifts(problem, gain, metric, steps) @ along[:, told]
+        reach = (np.minimum(deviations, 1.0)[:, None] * directions)[deviations >= TOLD]
+        shifts = _shifts(problem, gain, metric, reach @ in_units.T) @ along[:, told]
         spread[np.ix_(told, told)] += shifts.T @ shifts / 2
         deviations[usable] = np.sqrt(np.maximum(np.diag(spread), 0.0))
     entries, foreign = _entries(in_units @ directions.T, deviations, spread)
@@ -173,13 +171,13 @@ def gain_covariance(
 
 
 def _shifts(problem: Problem, gain: Array, metric: Array, steps: Array) -> Array:
-    """What steps of the gain (k, m, n), forth and back, do to the residual: (2 k, r).
+    """What steps of the gain (k, m n), forth and back, do to the residual: (2 k, r).
 
     A step that cannot be simulated is halved, and what it does scaled by the square: the first
     order of a step that is not told has no part in those that are.
     """
     here, shifts = residual_only(problem, gain, metric), []
-    for step in (sign * step for step in steps for sign in (1.0, -1.0)):
+    for step in (sign * step.reshape(gain.shape) for step in steps for sign in (1.0, -1.0)):
         for share in _STEPS:
             there = gain + share * step
             if not misfit_or_reason(problem, there, metric)[1]:

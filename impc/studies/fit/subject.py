@@ -41,6 +41,9 @@ if TYPE_CHECKING:
 
     from impc.assess.printed_gain import GainEstimate
     from impc.assess.resampling import Replicate
+    from impc.assess.vaf import TrialAgreement
+    from impc.control.closed_loop import Simulation
+    from impc.model.bounds import Bounds
     from impc.model.plant import Plant
     from impc.model.plant_family import PlantFamily
     from impc.model.recordings import Recording
@@ -160,7 +163,6 @@ def fit_recordings(
             progress.done(_without(index))
         weights_found = whole_set.result()
         progress.done("set of weights")
-    runs, bounds = methods[-1].runs, problem.bounds
     certainty = assess(
         problem, fitted, estimate, weights_found, settings, progress.done, progress.replicate
     )
@@ -173,15 +175,21 @@ def fit_recordings(
         intent(plant, K, metrics, sizes, fitted.weights),
         identifiability(known, fitted.weights),
         certainty,
-        tuple(
-            agreement(plant, trial, run, np.array(bounds.u_min), np.array(bounds.u_max))
-            for trial, run in zip(known.recordings, runs, strict=True)
-        ),
+        _agreements(known, methods[-1].runs, problem.bounds),
         tuple(held_out),
         methods,
         residual_diagnostics(fitted.problem, K, np.array(fitted.solution.S)),
         _terminal_set_difference(known, fitted),
         time.perf_counter() - started,
+    )
+
+
+def _agreements(
+    known: Problem, runs: Sequence[Simulation], bounds: Bounds
+) -> tuple[TrialAgreement, ...]:
+    return tuple(
+        agreement(known.plant, trial, run, np.array(bounds.u_min), np.array(bounds.u_max))
+        for trial, run in zip(known.recordings, runs, strict=True)
     )
 
 
