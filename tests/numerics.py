@@ -21,9 +21,9 @@ THREADS = ("1", "2")
 FILES = (
     "tests/plants",
     "tests/studies/reliability/test_icc.py",
-    "tests/studies/reliability/test_spectra.py",
-    "tests/studies/reliability/test_tests.py",
-    "tests/studies/selection/test_information.py",
+    "tests/studies/reliability/test_transfer.py",
+    "tests/studies/reliability/test_anova.py",
+    "tests/studies/selection/test_fisher.py",
     "tests/studies/selection/test_methods.py",
     "tests/assess/test_vaf.py",
     "tests/control/test_closed_loop.py",
