@@ -58,11 +58,11 @@ def width(found: tuple[Interval, ...]) -> Array:
 
 
 def test_bootstrap_agrees_with_the_sandwich(fitted: FittedController) -> None:
-    """30 replicates, seed 4: widths within a third of the sandwich's, for both ways to draw."""
+    """20 replicates, seed 4: widths within a third of the sandwich's, for both ways to draw."""
     estimate = gain_estimate(fitted)
     sandwich = width(covariance_intervals(estimate, estimate.covariance, "sandwich"))
     for draw in (block_residuals, model_residuals):
-        found = [drawn(fitted, index, SEED, draw) for index in range(30)]
+        found = [drawn(fitted, index, SEED, draw) for index in range(20)]
         ratio = width(bootstrap_intervals(estimate, found, "bootstrap", 0.95)) / sandwich
         assert np.all(np.abs(np.log(ratio)) < np.log(1.5)), ratio
 

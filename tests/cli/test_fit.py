@@ -232,14 +232,13 @@ def test_a_configuration_that_cannot_be(
 
 
 def test_an_interrupted_command_says_what_it_kept(
-    subject: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    subject: Path, quick: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    (tmp_path / "easier.toml").write_text(easier_seat((subject / "subject.toml").read_text()))
     arguments = ("fit", *[str(subject / f"trial_{n}.csv") for n in (1, 2)], "--plant",
-                 "seated-balance", "--config", str(tmp_path / "easier.toml"), "--out",
+                 "seated-balance", "--config", str(quick), "--out",
                  str(tmp_path / "out"))  # fmt: skip
     with monkeypatch.context() as patch:
         patch.setattr("impc.studies.fit.subject.compare_methods", interrupt)
