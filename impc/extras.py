@@ -1,7 +1,7 @@
 """Optional libraries: each is imported here, or one line says how to get it.
 
 A plain installation has what `impc example`, and `impc fit` and `impc compare` of CSV and MATLAB
-files need. The rest are extras of pyproject.toml.
+files need. The rest are extras of pyproject.toml, listed in docs/release.md.
 """
 
 from __future__ import annotations

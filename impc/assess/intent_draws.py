@@ -105,7 +105,7 @@ def drawn_gains(
     """
     rng = np.random.default_rng(seed)
     n = plant.n
-    factor = np.linalg.cholesky(weights.block)
+    factor: Array = np.asarray(np.linalg.cholesky(weights.block), dtype=np.float64)
     centre = solve_lqr(plant, weights)
     deviations = np.maximum(np.array(covariance.deviations), _SHARPEST)
     basis, left, values = _directions(centre, factor, covariance, deviations)

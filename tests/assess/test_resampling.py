@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import control
 import numpy as np
 import pytest
@@ -24,6 +22,7 @@ from impc.assess.resampling import (
     model_residuals,
     replicate,
 )
+from impc.checking import replace
 from impc.errors import InputError
 from impc.inverse.noisy_fit import FittedController, fit_controller
 from impc.inverse.residuals import misfit_or_reason
@@ -58,11 +57,11 @@ def width(found: tuple[Interval, ...]) -> Array:
 
 
 def test_bootstrap_agrees_with_the_sandwich(fitted: FittedController) -> None:
-    """20 replicates, seed 4: widths within a third of the sandwich's, for both ways to draw."""
+    """30 replicates, seed 4: widths within a third of the sandwich's, for both ways to draw."""
     estimate = gain_estimate(fitted)
     sandwich = width(covariance_intervals(estimate, estimate.covariance, "sandwich"))
     for draw in (block_residuals, model_residuals):
-        found = [drawn(fitted, index, SEED, draw) for index in range(20)]
+        found = [drawn(fitted, index, SEED, draw) for index in range(30)]
         ratio = width(bootstrap_intervals(estimate, found, "bootstrap", 0.95)) / sandwich
         assert np.all(np.abs(np.log(ratio)) < np.log(1.5)), ratio
 
@@ -88,8 +87,8 @@ def test_plain_intervals_are_narrower_with_coloured_noise() -> None:
 
 def test_profile_against_brute_force(fitted: FittedController) -> None:
     """D at one value against a dense search over the only other entry, initial state refitted."""
-    problem = dataclasses.replace(fitted.problem, unknown_start=False)
-    known = gain_estimate(dataclasses.replace(fitted, problem=problem))
+    problem = replace(fitted.problem, unknown_start=False)
+    known = gain_estimate(replace(fitted, problem=problem))
     name = entry_names(problem.plant)[0]
     profile = profile_likelihood(known, name)
     value, distance = profile.values[0], profile.distances[0]

@@ -99,14 +99,14 @@ def estimate(
         raise DataError("trials", "there are none", "give at least one")
     chosen: IntArray = np.asarray(free, dtype=np.int64)
     base = normalised(model, np.asarray(start, dtype=np.float64))
-    evaluated = _evaluation(model, trials, base, chosen)
+    residual, derivative = _evaluation(model, trials, base, chosen)
     begin = np.clip(base[chosen], -1 + 1e-9, 1 - 1e-9)
-    if not np.all(np.isfinite(evaluated(begin)[0])):
+    if not np.all(np.isfinite(residual(begin))):
         raise DataError("model", "is not finite at the start", "start elsewhere")
     found = scipy.optimize.least_squares(
-        lambda t: evaluated(t)[0],
+        residual,
         begin,
-        jac=lambda t: evaluated(t)[1],
+        jac=derivative,
         bounds=(-1.0, 1.0),
         ftol=_TOLERANCE,
         xtol=_TOLERANCE,
@@ -182,7 +182,7 @@ def pooled_vaf(model: ParametricModel, theta: Array, trials: Sequence[Trial]) ->
 
 def _evaluation(
     model: ParametricModel, trials: Sequence[Trial], base: Array, chosen: IntArray
-) -> Callable[[Array], tuple[Array, Array]]:
+) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
     """Residual and Jacobian of the chosen parameters; the last point is not computed twice."""
     last: tuple[bytes, Array, Array] | None = None
 
@@ -196,7 +196,13 @@ def _evaluation(
             last = (t.tobytes(), residual, jacobian)
         return last[1], last[2]
 
-    return evaluated
+    def residual(t: Array) -> Array:
+        return evaluated(t)[0]
+
+    def derivative(t: Array) -> Array:
+        return evaluated(t)[1]
+
+    return residual, derivative
 
 
 def _part(model: ParametricModel, t: Array, trial: Trial, chosen: IntArray) -> tuple[Array, Array]:
