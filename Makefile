@@ -5,7 +5,7 @@
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
-.PHONY: help env demo test check docs architecture reproduce wheel slow coverage search numerics bench fuzz lock clean
+.PHONY: help env demo test full check docs architecture reproduce wheel slow coverage search numerics bench fuzz lock clean
 
 PYTHON ?= python3
 # Not to be set from outside: the environment is made with `venv --clear`.
@@ -19,6 +19,8 @@ LOCKED := $(VENV)/.stamp-locked
 PROJECT := $(VENV)/.stamp-project
 POLYTOPE := $(VENV)/.stamp-polytope
 POLYTOPE_LOG := $(VENV)/polytope-install.log
+
+PYTEST := OPENBLAS_NUM_THREADS=1 $(PY) -m pytest -n logical --maxprocesses 8 --dist loadfile --no-loadscope-reorder
 
 SUPPORTED := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))
 
@@ -37,9 +39,10 @@ endif
 
 help:
 	@echo 'make demo    set up .venv and run the example:   impc example'
-	@echo 'make test    set up .venv, then check and pytest: all but the slow tests, the site too'
+	@echo 'make test    set up .venv, then check and pytest: all that matters, about five minutes'
+	@echo 'make full    the site, and studies in full size: what .ci/run does after make test'
 	@echo 'make check   ruff check, ruff format --check, mypy --strict'
-	@echo 'make slow    the slow tests'
+	@echo 'make slow    hundreds of recordings, fits and subjects: an hour'
 	@echo 'make coverage  how often printed intervals hold the truth: the table of docs/fitting.md'
 	@echo 'make search   new examples for the tests by hypothesis, from a seed that is printed'
 	@echo 'make numerics the numerical tests on other processors and dependencies (an hour; needs uv)'
@@ -59,7 +62,11 @@ demo: env
 
 # A file of tests stays on one process, in the order of the folders: the longest are first.
 test: check
-	OPENBLAS_NUM_THREADS=1 $(PY) -m pytest -m "not slow" -n logical --maxprocesses 8 --dist loadfile --no-loadscope-reorder
+	$(PYTEST) -m "not slow and not full"
+
+# The site on one process, the studies on the other.
+full: env
+	$(PYTEST) -m full
 
 check: env
 	$(PY) -m ruff check .
@@ -95,7 +102,7 @@ coverage: env
 SEED ?= $(shell date +%s)
 search: env
 	@echo 'make search SEED=$(SEED)'
-	IMPC_SEARCH=20 OPENBLAS_NUM_THREADS=1 $(PY) -m pytest -m "not slow" --hypothesis-seed=$(SEED) $(SEARCHED)
+	IMPC_SEARCH=20 OPENBLAS_NUM_THREADS=1 $(PY) -m pytest -m "not slow and not full" --hypothesis-seed=$(SEED) $(SEARCHED)
 SEARCHED := tests/inverse/test_inverse_lqr.py tests/inverse/test_equivalent_weights.py tests/control/test_terminal_set.py
 
 # The floors of pyproject.toml on the oldest Python, the newest there are on the newest.

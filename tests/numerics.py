@@ -21,9 +21,9 @@ THREADS = ("1", "2")
 FILES = (
     "tests/plants",
     "tests/studies/reliability/test_icc.py",
-    "tests/studies/reliability/test_spectra.py",
-    "tests/studies/reliability/test_tests.py",
-    "tests/studies/selection/test_information.py",
+    "tests/studies/reliability/test_transfer.py",
+    "tests/studies/reliability/test_anova.py",
+    "tests/studies/selection/test_fisher.py",
     "tests/studies/selection/test_methods.py",
     "tests/assess/test_variance_accounted_for.py",
     "tests/control/test_closed_loop.py",
@@ -35,6 +35,7 @@ FILES = (
     "tests/inverse/test_direct_and_reduced.py",
     "tests/model/test_riccati.py",
     "tests/control/test_casadi_controller.py",
+    "tests/control/test_solvers.py",
     "tests/control/test_nonlinear_controller.py",
     "tests/inverse/test_random_inverse.py",
     "tests/inverse/test_semidefinite.py",
@@ -59,7 +60,15 @@ def main(pythons: list[str]) -> int:
                 print(f"{python} {core}: skipped, this processor cannot run it", flush=True)
                 continue
             for threads in THREADS:
-                command = [python, "-m", "pytest", "-m", "not slow", "-p", "no:cacheprovider"]
+                command = [
+                    python,
+                    "-m",
+                    "pytest",
+                    "-m",
+                    "not slow and not full",
+                    "-p",
+                    "no:cacheprovider",
+                ]
                 done = _run([*command, "-n", "2", "--dist", "loadfile", *FILES], core, threads)
                 lines = done.stdout.strip().splitlines() or done.stderr.strip().splitlines()
                 print(f"{python} {core} {threads}: {lines[-1]}", flush=True)

@@ -106,22 +106,12 @@ def drawn_gains(
         All numbers drawn follow from it.
     """
     rng = np.random.default_rng(seed)
-    n, m = plant.n, plant.m
-    factor = np.linalg.cholesky(weights.block)
+    n = plant.n
+    factor: Array = np.asarray(np.linalg.cholesky(weights.block), dtype=np.float64)
     centre = solve_lqr(plant, weights)
     deviations = np.maximum(np.array(covariance.deviations), _SHARPEST)
-    basis = _symmetric_blocks(n, m)
-    moved = factor @ basis @ factor.T
-    slopes = gain_gradients(centre)
-    dK = np.einsum("abij,kij->kab", slopes.Q, moved[:, :n, :n])
-    dK += np.einsum("abij,kij->kab", slopes.R, moved[:, n:, n:])
-    derivative = np.array([covariance.along(one) for one in dK]).T
-    # Along what leaves the gain as it is nothing need move: the set of weights has all of it.
-    _, _, moving = np.linalg.svd(derivative, full_matrices=False)
-    basis = np.tensordot(moving, basis, 1)
-    left, values, rows = np.linalg.svd(derivative @ moving.T / deviations[:, None])
+    basis, left, values = _directions(centre, factor, covariance, deviations)
     spread = 1 / np.sqrt(values**2 + 1 / _DECADE**2)
-    basis = np.tensordot(rows, basis, 1)
     # The linearised posterior has its mean where weights come nearest to the estimate.
     wrong = covariance.along(centre.K - gain) / deviations
     mean = -spread * values * (left.T @ wrong)[: len(values)]
@@ -146,6 +136,26 @@ def drawn_gains(
             a = _slice(a, excess, rng)
         drawn.append(solve_lqr(plant, Weights(*weights_at(a))))
     return tuple(drawn)
+
+
+def _directions(
+    centre: LqrSolution, factor: Array, covariance: GainCovariance, deviations: Array
+) -> tuple[Array, Array, Array]:
+    """Steps D that move the gain (k, n + m, n + m), and the left singular vectors and values.
+
+    Those of the derivative of the gain, in the covariance's directions and deviations, along D.
+    """
+    n, m = centre.plant.n, centre.plant.m
+    basis = _symmetric_blocks(n, m)
+    moved = factor @ basis @ factor.T
+    slopes = gain_gradients(centre)
+    dK = np.einsum("abij,kij->kab", slopes.Q, moved[:, :n, :n])
+    dK += np.einsum("abij,kij->kab", slopes.R, moved[:, n:, n:])
+    derivative = np.array([covariance.along(one) for one in dK]).T
+    # Along what leaves the gain as it is nothing need move: the set of weights has all of it.
+    _, _, moving = np.linalg.svd(derivative, full_matrices=False)
+    left, values, rows = np.linalg.svd(derivative @ moving.T / deviations[:, None])
+    return np.tensordot(rows, np.tensordot(moving, basis, 1), 1), left, values
 
 
 def with_confidence(

@@ -14,6 +14,7 @@ from impc.cli.output import print_files
 from impc.cli.simulate_cohort import cohort
 from impc.cli.simulate_head_tracking import head_tracking
 from impc.cli.simulate_reliability import reliability_study
+from impc.extras import installed
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -30,6 +31,8 @@ _PLANT, _STEP = "plants:seated_balance_for", "plants:seated_balance_step_for"
 _TORQUE = "plants:ternary_torque"
 _ENDINGS = {"csv": ".csv", "tsv": ".tsv", "mat": ".mat", "tdms": ".tdms", "c3d": ".c3d"}
 _FORMATS = (*_ENDINGS, "mat73")
+# What a plain installation cannot write.
+_LIBRARIES = {"tdms": "nptdms", "c3d": "c3d"}
 _RATE, _HORIZON = 1000.0, 20
 
 
@@ -77,10 +80,10 @@ def command() -> None:
 @seed_option
 @click.option(
     "--formats",
-    default="csv,tsv,mat,mat73,tdms,c3d",
-    help="Which file formats, with commas between.",
+    show_default="all that are installed",
+    help="Which of csv, tsv, mat, mat73, tdms and c3d, with commas between.",
 )
-def seated_balance(out: Path, formats: str, **given: Any) -> None:
+def seated_balance(out: Path, formats: str | None, **given: Any) -> None:
     """A person on a seat that tilts sideways, holding it by a constrained controller.
 
     1000 samples a second; the nonlinear plant of the dissertation with parameters from body mass
@@ -106,7 +109,13 @@ def seated_balance(out: Path, formats: str, **given: Any) -> None:
     print_files(out, written)
 
 
-def _wanted(formats: str) -> tuple[str, ...]:
+def _wanted(formats: str | None) -> tuple[str, ...]:
+    if formats is None:
+        absent = {name for name, library in _LIBRARIES.items() if not installed(library)}
+        if absent:
+            remedy = "to write them too: pip install 'impc[formats]'"
+            click.echo(f"without {', '.join(sorted(absent))}; {remedy}")
+        return tuple(name for name in _FORMATS if name not in absent)
     wanted = tuple(part.strip() for part in formats.split(",") if part.strip())
     for name in wanted or ("",):
         if name not in _FORMATS:

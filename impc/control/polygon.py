@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import importlib
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.spatial import HalfspaceIntersection
 
-from impc.errors import ImpcError, InputError
+from impc.errors import InputError
+from impc.extras import optional
 
 if TYPE_CHECKING:
     from impc.arrays import Array
@@ -53,11 +53,7 @@ def as_pytope(terminal: TerminalSet) -> Any:
     ImpcError
         When pytope is not installed.
     """
-    try:
-        pytope = importlib.import_module("pytope")
-    except ImportError:
-        remedy = "install the extra polytope: pip install 'impc[polytope]'"
-        raise ImpcError("pytope", "is not installed", remedy) from None
+    pytope = optional("pytope", "terminal set")
     if not len(terminal.h):
         raise InputError("terminal set", "is the whole space", "give at least one bound")
     # pytope 0.0.4 squeezes the right side to a scalar when there is one row: state it twice.

@@ -166,21 +166,14 @@ def maximal_invariant_set(
     F = plant.A - plant.B @ K
     _check(plant, F, bounds, tolerance, max_steps)
     rows = bound_rows(bounds, plant)
-    normal = (rows.E - rows.F @ K) / rows.b[:, None]
-    basis = seen_directions(_steps(normal, F, plant.n))
-    families, mirror = _half(normal, np.flatnonzero(np.any(normal @ basis, axis=1)))
-    loop = _Loop(normal, F, basis, mirror is not None, tolerance, max_steps)
+    loop, families, mirror = _loop((rows.E - rows.F @ K) / rows.b[:, None], F, tolerance, max_steps)
     hints = near.bases if near is not None else {}
     family, step, Z, bases = _grow(loop, families, hints)
     last = int(np.max(step, initial=0))
     kept, bases[0] = needed_rows(Z, loop.mirrored, tolerance, hints.get(0))
-    family, step = family[kept], step[kept]
-    if mirror is not None:
-        family, step = np.concatenate([family, mirror[family]]), np.tile(step, 2)
-    order = np.lexsort((family, step))
-    family, step = _read_only(family[order]), _read_only(step[order])
+    family, step = _in_order(family[kept], step[kept], mirror)
     return TerminalSet(
-        H=frozen(_steps(normal, F, last + 1)[step, family] * rows.b[family, None]),
+        H=frozen(_steps(loop.normal, F, last + 1)[step, family] * rows.b[family, None]),
         h=frozen(rows.b[family]),
         family=family,
         step=step,
@@ -260,6 +253,23 @@ def _check(plant: Plant, F: Array, bounds: Bounds, tolerance: float, max_steps: 
     if not 0 <= tolerance <= 1e-2 or max_steps < 1:
         problem = f"are {tolerance!r} and {max_steps!r}"
         raise InputError("tolerance, max_steps", problem, "give 0 to 0.01, and at least 1")
+
+
+def _loop(
+    normal: Array, F: Array, tolerance: float, max_steps: int
+) -> tuple[_Loop, IntArray, IntArray | None]:
+    """The construction, the bounds that it follows, and their mirror images, as in `_half`."""
+    basis = seen_directions(_steps(normal, F, len(F)))
+    families, mirror = _half(normal, np.flatnonzero(np.any(normal @ basis, axis=1)))
+    return _Loop(normal, F, basis, mirror is not None, tolerance, max_steps), families, mirror
+
+
+def _in_order(family: IntArray, step: IntArray, mirror: IntArray | None) -> tuple[IntArray, ...]:
+    """Rows and their mirror images, by step and then by bound."""
+    if mirror is not None:
+        family, step = np.concatenate([family, mirror[family]]), np.tile(step, 2)
+    order = np.lexsort((family, step))
+    return _read_only(family[order]), _read_only(step[order])
 
 
 def _steps(normal: Array, F: Array, count: int) -> Array:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from impc.errors import DataError, OutputError
+from impc.extras import optional
 from impc.files.table import make_table
 
 if TYPE_CHECKING:
@@ -19,8 +20,6 @@ if TYPE_CHECKING:
     from impc.files.table import Table
 
 __all__ = ["encode_c3d", "read_c3d"]
-
-_REMEDY = "install it: pip install 'impc[c3d]'"
 
 
 def read_c3d(path: Path, largest: int) -> Table:
@@ -37,12 +36,11 @@ def read_c3d(path: Path, largest: int) -> Table:
     ------
     DataError
         When the file has no analog channels, or fewer frames than its header says.
+    ImpcError
+        When c3d is not installed.
     """
-    try:
-        import c3d  # noqa: PLC0415
-    except ImportError:
-        raise DataError(str(path), "needs the package c3d", _REMEDY) from None
     source = str(path)
+    c3d = optional("c3d", source)
     # c3d warns of headers that contradict themselves in small things; what matters is checked here.
     with warnings.catch_warnings(), path.open("rb") as handle:
         warnings.simplefilter("ignore")
@@ -76,12 +74,11 @@ def encode_c3d(table: Table) -> bytes:
     Raises
     ------
     OutputError
-        When c3d is not installed, or the table has no rate.
+        When the table has no rate.
+    ImpcError
+        When c3d is not installed.
     """
-    try:
-        import c3d  # noqa: PLC0415
-    except ImportError:
-        raise OutputError("C3D", "needs the package c3d", _REMEDY) from None
+    c3d = optional("c3d", "C3D")
     if table.rate is None:
         raise OutputError("C3D", "needs the rate of the samples", "give the table a rate")
     writer = c3d.Writer(point_rate=table.rate, analog_rate=table.rate, point_scale=-1.0)

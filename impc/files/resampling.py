@@ -21,7 +21,7 @@ import scipy.signal
 if TYPE_CHECKING:
     from impc.arrays import Array
 
-__all__ = ["edge", "held_means", "instants", "resampled_samples", "same_rate"]
+__all__ = ["held_means", "instants", "resampled_samples", "same_rate"]
 
 # Attenuation in dB of what would alias, and the largest ripple below: 10^(-70/20) = 3e-4.
 _ATTENUATION = 70.0
@@ -47,17 +47,6 @@ def same_rate(samples: int, period: float, dt: float) -> bool:
 def resampled_samples(samples: int, period: float, dt: float) -> int:
     """Number of instants k dt within a recording of that many samples; `period` and dt in s."""
     return int(np.floor((samples - 1) * period / dt + 1e-6)) + 1
-
-
-def edge(period: float, dt: float) -> float:
-    """Seconds at either end in which the filter sees continued samples.
-
-    Parameters
-    ----------
-    period, dt : float
-        Of the recording and of the plant, s.
-    """
-    return _half_width(period, dt)
 
 
 def instants(values: Array, period: float, dt: float) -> Array:

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from impc.errors import DataError, OutputError
+from impc.errors import DataError
+from impc.extras import optional
 from impc.files.table import make_table
 
 if TYPE_CHECKING:
@@ -21,8 +22,6 @@ if TYPE_CHECKING:
     from impc.files.table import Table
 
 __all__ = ["encode_tdms", "read_tdms"]
-
-_REMEDY = "install it: pip install 'impc[tdms]'"
 
 
 def read_tdms(path: Path, largest: int) -> Table:
@@ -41,14 +40,13 @@ def read_tdms(path: Path, largest: int) -> Table:
     ------
     DataError
         When the file was cut off while it was written or copied, or has no numeric channel.
+    ImpcError
+        When nptdms is not installed.
     """
-    try:
-        from nptdms import TdmsFile  # noqa: PLC0415
-    except ImportError:
-        raise DataError(str(path), "needs the package nptdms", _REMEDY) from None
     source = str(path)
+    nptdms = optional("nptdms", source)
     # Opened here, because nptdms leaves a file open when its head is damaged.
-    with _silent(), _Bounded(io.FileIO(path)) as handle, TdmsFile.open(handle) as file:
+    with _silent(nptdms), _Bounded(io.FileIO(path)) as handle, nptdms.TdmsFile.open(handle) as file:
         if file.file_status.incomplete_final_segment:
             raise DataError(
                 source, "ends in the middle of its data", "copy it again, or close it in LabVIEW"
@@ -66,13 +64,10 @@ def encode_tdms(table: Table) -> bytes:
 
     Raises
     ------
-    OutputError
+    ImpcError
         When nptdms is not installed.
     """
-    try:
-        from nptdms import ChannelObject, TdmsWriter  # noqa: PLC0415
-    except ImportError:
-        raise OutputError("TDMS", "needs the package nptdms", _REMEDY) from None
+    nptdms = optional("nptdms", "TDMS")
     channels = []
     for name, values in table.columns.items():
         properties: dict[str, object] = {}
@@ -80,9 +75,9 @@ def encode_tdms(table: Table) -> bytes:
             properties |= {"wf_start_offset": 0.0, "wf_increment": 1 / table.rate}
         if name in table.units:
             properties["unit_string"] = table.units[name]
-        channels.append(ChannelObject("recording", name, values, properties))
+        channels.append(nptdms.ChannelObject("recording", name, values, properties))
     content = io.BytesIO()
-    with TdmsWriter(content) as writer:
+    with nptdms.TdmsWriter(content) as writer:
         writer.write_segment(channels)
     return content.getvalue()
 
@@ -134,13 +129,12 @@ def _table(source: str, channels: list[Any]) -> Table:
 
 
 @contextlib.contextmanager
-def _silent() -> Iterator[None]:
+def _silent(nptdms: Any) -> Iterator[None]:
     """Keep nptdms from printing warnings of its own: what matters becomes an error here."""
-    from nptdms.log import log_manager  # noqa: PLC0415
-
-    before = log_manager.console_handler.level
-    log_manager.console_handler.setLevel(logging.CRITICAL + 1)
+    handler = nptdms.log.log_manager.console_handler
+    before = handler.level
+    handler.setLevel(logging.CRITICAL + 1)
     try:
         yield
     finally:
-        log_manager.console_handler.setLevel(before)
+        handler.setLevel(before)

@@ -244,7 +244,7 @@ def other_weights(
     """
     centre = least_condition_weights(fibre)
     ends, frame = _ends(fibre, centre.weights, condition_ratio * centre.condition)
-    chosen = [np.eye(len(frame))]
+    chosen: list[Array] = [np.eye(len(frame))]
     while ends and len(chosen) <= count:
         nearest = [min(_distance(end, item) for item in chosen) for end in ends]
         chosen.append(ends.pop(int(np.argmax(nearest))))

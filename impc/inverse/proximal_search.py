@@ -154,11 +154,7 @@ def conditioned_fit(
     SolverError
         When the residual cannot be computed at the start.
     """
-    here = _point(plant, objective, start)
-    if not here.residual.usable:
-        raise SolverError(
-            "start", "the closed loop cannot be simulated with these weights", "start elsewhere"
-        )
+    here = _first(plant, objective, start)
     radius, evaluations, iteration, stationarity = 0.5, 1, 0, np.inf
     while iteration < max_iterations:
         iteration += 1
@@ -175,10 +171,7 @@ def conditioned_fit(
             ratio = (here.objective - there.objective) / decrease
         if ratio > 1e-4 and there is not None:
             here = there
-        if ratio > 0.75:
-            radius = min(2 * radius, _LARGEST_RADIUS)
-        elif ratio < 0.25:
-            radius = 0.25 * min(radius, float(np.linalg.norm(step)))
+        radius = _next_radius(radius, ratio, step)
         if radius < _LEAST_RADIUS:
             break
     return ConditionedFit(
@@ -235,6 +228,24 @@ def _point(plant: Plant, objective: Objective, weights: Weights) -> _Point:
     fit = size**2 if objective.squared else size
     value = objective.fit_weight * fit + objective.condition_weight * condition_number(scaled)
     return _Point(scaled, solution, residual, value)
+
+
+def _first(plant: Plant, objective: Objective, start: Weights) -> _Point:
+    here = _point(plant, objective, start)
+    if not here.residual.usable:
+        raise SolverError(
+            "start", "the closed loop cannot be simulated with these weights", "start elsewhere"
+        )
+    return here
+
+
+def _next_radius(radius: float, ratio: float, step: Array) -> float:
+    """Of the trust region, after a step of which so much of the promise came true."""
+    if ratio > 0.75:
+        return min(2 * radius, _LARGEST_RADIUS)
+    if ratio < 0.25:
+        return 0.25 * min(radius, float(np.linalg.norm(step)))
+    return radius
 
 
 def _linearise(here: _Point, objective: Objective) -> StepProgram:

@@ -31,7 +31,6 @@ __all__ = [
     "Gradients",
     "LqrSolution",
     "gain_gradients",
-    "gain_plant_differential",
     "is_stable",
     "lyapunov_series",
     "metric_gradients",
@@ -223,33 +222,6 @@ def metric_gradients(solution: LqrSolution) -> Gradients:
     units = np.eye(m * m).reshape(m * m, m, m)
     gradients = _adjoint(solution, B @ units @ B.T, units)
     return Gradients(gradients.Q.reshape(m, m, n, n), gradients.R.reshape(m, m, m, m))
-
-
-def gain_plant_differential(solution: LqrSolution, dA: Array, dB: Array) -> tuple[Array, Array]:
-    """Differentials of K and S of a discrete plant along directions of A and B, weights fixed.
-
-    dP = F'dP F + (dF0'PF + F'P dF0) with dF0 = dA - dB K;
-    dK = S^-1 (B'dP F + dB'PF + B'P dF0), dS = B'dP B + dB'PB + B'P dB.
-
-    Parameters
-    ----------
-    dA, dB : Array
-        Shapes (p, n, n) and (p, n, m).
-
-    Returns
-    -------
-    dK, dS : Array
-        Shapes (p, m, n) and (p, m, m).
-    """
-    B, K, F, S, P = solution.plant.B, solution.K, solution.F, solution.S, solution.P
-    moved = dA - dB @ K
-    source = F.T @ P @ moved
-    dP = lyapunov_series(F.T, source + source.transpose(0, 2, 1))
-    dBP = dB.transpose(0, 2, 1) @ P
-    numerator = B.T @ dP @ F + dBP @ F + B.T @ P @ moved
-    dK = np.asarray(np.linalg.solve(S, numerator), dtype=np.float64)
-    dBPB = dBP @ B
-    return dK, B.T @ dP @ B + dBPB + dBPB.transpose(0, 2, 1)
 
 
 def _adjoint(solution: LqrSolution, source: Array, direct: Array) -> Gradients:

@@ -10,7 +10,7 @@ The controller is that of (3.1); docs/fitting.md has what a fit makes of such su
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -97,33 +97,59 @@ def simulate_subject(
     InputError
         When the rate is no whole multiple of the controller's.
     """
-    plant = controller.plant
-    within = round(rate * plant.dt)
-    if within < 1 or abs(within / (rate * plant.dt) - 1) > 1e-9:
-        raise InputError(
-            "rate", f"got {rate:g} per s", f"give a multiple of {1 / plant.dt:g} per s"
-        )
+    plant, within = controller.plant, _samples_within(rate, controller.plant.dt)
     columns = np.asarray(disturbance, dtype=np.float64)
     d = finite_array(
         "disturbance", columns[:, None] if columns.ndim == 1 else columns, (None, plant.E.shape[1])
     )
     rng = np.random.default_rng(seed)
-    samples = len(d)
+    noise = _Noise(rng, np.asarray(motor))
+    x, u, end = _moved(controller, step.mapaccum(within), d, within, noise, largest)
+    limits = controller.bounds
+    sensed = np.asarray(sensor) * rng.standard_normal((len(d), len(plant.outputs)))
+    return SubjectTrial(
+        frozen(np.arange(len(d)) / rate),
+        frozen(x @ plant.C.T + sensed),
+        frozen(d),
+        frozen(x),
+        frozen(u),
+        saturated_share(u[::within], np.array(limits.u_min), np.array(limits.u_max)),
+        None if end is None else end / rate,
+    )
+
+
+class _Noise(NamedTuple):
+    """Noise of the motor: numbers drawn, and their standard deviation, one or (m,)."""
+
+    rng: np.random.Generator
+    deviation: Array
+
+
+def _samples_within(rate: float, dt: float) -> int:
+    """How many samples of the recording one of the controller's takes."""
+    within = round(rate * dt)
+    if within < 1 or abs(within / (rate * dt) - 1) > 1e-9:
+        raise InputError("rate", f"got {rate:g} per s", f"give a multiple of {1 / dt:g} per s")
+    return within
+
+
+def _moved(
+    controller: Controller, several: Any, d: Array, within: int, noise: _Noise, largest: float
+) -> tuple[Array, Array, int | None]:
+    """States (samples, n), commands (samples, m), and the sample of a fall, from rest."""
+    plant, samples = controller.plant, len(d)
     prepared = prepare_loop(controller, directions(controller, 0))
-    several = step.mapaccum(within)
     still = np.zeros((1, plant.E.shape[1]))
     x, u = np.zeros((samples, plant.n)), np.zeros((samples, plant.m))
-    fell: float | None = None
     state = np.zeros(plant.n)
     for first in range(0, samples, within):
         run, _ = run_loop(prepared, Scenario(state, still))
         last = min(first + within, samples)
         if run.status[0] > Status.SOFTENED:
-            fell = first / rate
             x[first:], u[first:] = state, u[first - 1]
-            break
+            return x, u, first
         command = run.u[0]
-        moved = command + np.asarray(motor) * rng.standard_normal(plant.m)
+        moved = command + noise.deviation * noise.rng.standard_normal(plant.m)
         inputs = np.hstack(
             [np.tile(moved, (within, 1)), np.resize(d[first:last], (within, d.shape[1]))]
         )
@@ -132,17 +158,6 @@ def simulate_subject(
         u[first:last] = command
         state = ahead[-1]
         if not np.all(np.isfinite(state)) or np.max(np.abs(plant.C @ state)) > largest:
-            fell = last / rate
             x[last:], u[last:] = x[last - 1], command
-            break
-    limits = controller.bounds
-    noise = np.asarray(sensor) * rng.standard_normal((samples, len(plant.outputs)))
-    return SubjectTrial(
-        frozen(np.arange(samples) / rate),
-        frozen(x @ plant.C.T + noise),
-        frozen(d),
-        frozen(x),
-        frozen(u),
-        saturated_share(u[::within], np.array(limits.u_min), np.array(limits.u_max)),
-        fell,
-    )
+            return x, u, last
+    return x, u, None

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import control
 import numpy as np
 import pytest
@@ -24,6 +22,7 @@ from impc.assess.resampling import (
     model_residuals,
     replicate,
 )
+from impc.checking import replace
 from impc.errors import InputError
 from impc.inverse.estimate import Estimate
 from impc.inverse.noisy_fit import fit_controller
@@ -89,8 +88,8 @@ def test_plain_intervals_are_narrower_with_coloured_noise() -> None:
 
 def test_profile_against_brute_force(fitted: Estimate) -> None:
     """D at one value against a dense search over the only other entry, initial state refitted."""
-    problem = dataclasses.replace(fitted.problem, unknown_start=False)
-    known = gain_estimate(dataclasses.replace(fitted, problem=problem))
+    problem = replace(fitted.problem, unknown_start=False)
+    known = gain_estimate(replace(fitted, problem=problem))
     name = entry_names(problem.plant)[0]
     profile = profile_likelihood(known, name)
     value, distance = profile.values[0], profile.distances[0]

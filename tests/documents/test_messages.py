@@ -27,7 +27,7 @@ from impc.errors import ImpcError
 from impc.files import apart
 from impc.files.alignment import misaligned
 from impc.files.configuration import read_configuration
-from impc.files.formats import read_table
+from impc.files.formats import encode_table, read_table
 from impc.files.plant_sources import PlantSource, make_plant, plant_source
 from impc.files.reading import read_recordings, recording_of
 from impc.files.sealed import Kept
@@ -308,6 +308,12 @@ def large_request(seconds: float, gigabytes: float) -> Callable[[Path], object]:
     return lambda _: require_consent(Effort(seconds, gigabytes), given=False)
 
 
+def format_of_an_extra(_: Path) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(sys.modules, "nptdms", None)
+        encode_table(".tdms", make_table("t", {"x": np.arange(9.0)}))
+
+
 #: Message -> what provokes it: raises the error, or returns the text.
 PROVOKED: dict[str, Callable[[Path], object]] = {
     "does not exist; check the path": damaged("missing file"),
@@ -416,6 +422,7 @@ PROVOKED: dict[str, Callable[[Path], object]] = {
     "matches no file; check the path": lambda folder: read_study(study_file(folder, STUDY)),
     "is not in ...; add a row": unknown_subject,
     "study.model: is missing": no_model,
+    "needs the package ...; install it: pip install 'impc[...]'": format_of_an_extra,
     "scheduler ...: does not answer (...)": no_scheduler,
 }
 

@@ -7,9 +7,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from tests.documents.blocks import ROOT
 
 
+@pytest.mark.full
 def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
     """About four minutes; a link within the site that leads nowhere is a warning too."""
     command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html",

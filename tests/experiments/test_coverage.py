@@ -14,7 +14,7 @@ def shares(count: int, root: float) -> np.ndarray[tuple[int, ...], np.dtype[np.f
     return np.asarray(np.mean(np.abs(scores) <= 1.96, axis=0))
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_fifty_recordings() -> None:
     """Binomial bounds: 50 of 95 % fall below 42 once in a thousand."""
     white, coloured = shares(50, 0.0), shares(50, 0.9)

@@ -65,5 +65,5 @@ def test_no_cell_of_a_table_is_a_formula_and_numbers_stay_numbers() -> None:
 
 
 def test_json_takes_names_that_are_not_utf_8() -> None:
-    """Pages do too: tests/cli/test_fit_command.py has a file of such a name."""
+    """Pages do too: tests/cli/test_fit.py has a file of such a name."""
     assert plain({"file": ["m\udcff"]}) == {"file": [r"m\udcff"]}

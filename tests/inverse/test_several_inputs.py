@@ -106,7 +106,7 @@ def test_reported_weights_reproduce_the_recording(path: str, m: int) -> None:
     [
         pytest.param(2, 2, marks=pytest.mark.slow),
         pytest.param(2, 8, marks=pytest.mark.slow),
-        (3, 1),
+        pytest.param(3, 1, marks=pytest.mark.full),
     ],
 )
 def test_direct_form_reproduces_the_recording(m: int, seed: int) -> None:

@@ -11,7 +11,6 @@ from impc.errors import InputError, WeightsError
 from impc.model.plant import Plant
 from impc.model.riccati import (
     gain_gradients,
-    gain_plant_differential,
     lyapunov_series,
     metric_gradients,
     solve_lqr,
@@ -76,27 +75,6 @@ def test_gradients_equal_central_differences(seed: int, discrete: bool) -> None:
         np.testing.assert_allclose(
             exact, difference / (2 * step), rtol=1e-6, atol=1e-6 * np.max(np.abs(exact))
         )
-
-
-def test_plant_differential_equals_central_differences() -> None:
-    rng = np.random.default_rng(7)
-    plant = random_plant(rng, 4, 2, 1.1)
-    weights = Weights(random_weights(rng, 4), random_weights(rng, 2))
-    dA, dB = rng.normal(size=(2, 4, 4)), rng.normal(size=(2, 4, 2))
-    dK, dS = gain_plant_differential(solve_lqr(plant, weights), dA, dB)
-    step = 1e-6
-    for index in range(2):
-        up, down = (
-            solve_lqr(
-                Plant(
-                    control.ss(plant.A + s * dA[index], plant.B + s * dB[index], np.eye(4), 0, True)
-                ),
-                weights,
-            )
-            for s in (step, -step)
-        )
-        np.testing.assert_allclose(dK[index], (up.K - down.K) / (2 * step), rtol=1e-5, atol=1e-6)
-        np.testing.assert_allclose(dS[index], (up.S - down.S) / (2 * step), rtol=1e-5, atol=1e-6)
 
 
 def test_lyapunov_series_equals_scipy_up_to_slow_loops() -> None:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from impc.errors import InputError, OutputError
+from impc.extras import optional
 from impc.studies.cohort.workers import Done, local_workers
 
 if TYPE_CHECKING:
@@ -52,6 +53,8 @@ def connected(cluster: Cluster) -> Iterator[Workers]:
     ------
     InputError
         When no scheduler answers at the address, or its certificates are missing or refused.
+    ImpcError
+        When distributed, which a scheduler needs and this machine alone does not, is not installed.
     """
     if cluster.scheduler is None:
         if any((cluster.tls_ca, cluster.tls_cert, cluster.tls_key)):
@@ -65,8 +68,8 @@ def connected(cluster: Cluster) -> Iterator[Workers]:
 
 @contextmanager
 def _client(cluster: Cluster, address: str) -> Iterator[Client]:
-    import dask  # noqa: PLC0415
-    import distributed  # noqa: PLC0415
+    distributed = optional("distributed", f"scheduler {address}")
+    import dask  # noqa: PLC0415  # distributed needs it, and brings it
 
     security = _security(cluster, address)
     patience = {"distributed.comm.timeouts.connect": _PATIENCE}
@@ -98,8 +101,6 @@ def _silent(package: str) -> Iterator[None]:
 
 
 def _security(cluster: Cluster, address: str) -> Any:
-    from distributed.security import Security  # noqa: PLC0415
-
     files = {
         "--tls-ca": cluster.tls_ca,
         "--tls-cert": cluster.tls_cert,
@@ -119,7 +120,8 @@ def _security(cluster: Cluster, address: str) -> Any:
     for name, path in files.items():
         if path is None or not path.is_file():
             raise InputError(f"{name} {path}", "is no file", "check the path")
-    return Security(
+    distributed = optional("distributed", f"scheduler {address}")
+    return distributed.Security(
         tls_ca_file=str(cluster.tls_ca),
         tls_client_cert=str(cluster.tls_cert),
         tls_client_key=str(cluster.tls_key),
@@ -131,12 +133,9 @@ class _SchedulerWorkers:
     """The workers of a scheduler, see `Workers`."""
 
     def __init__(self, client: Client, address: str) -> None:
-        import distributed  # noqa: PLC0415
-
         self._client, self._address = client, address
         self._keys: dict[Any, Hashable] = {}
-        make: Any = distributed.as_completed  # distributed types few of its functions
-        self._out = make()
+        self._out = optional("distributed", f"scheduler {address}").as_completed()
 
     @property
     def threads(self) -> int:

@@ -43,7 +43,9 @@ if TYPE_CHECKING:
     from impc.assess.judged import MethodFit
     from impc.assess.printed_gain import GainEstimate
     from impc.assess.resampling import Replicate
+    from impc.assess.variance_accounted_for import TrialAgreement
     from impc.control.closed_loop import Simulation
+    from impc.model.bounds import Bounds
     from impc.model.plant import Plant
     from impc.model.plant_family import PlantFamily
     from impc.model.recordings import Recording
@@ -199,7 +201,6 @@ def fit_recordings(
             progress.done(_without(index))
         weights_found = whole_set.result()
         progress.done("set of weights")
-    runs, bounds = methods[-1].runs, problem.bounds
     certainty = assess(
         problem, fitted, estimate, weights_found, settings, progress.done, progress.replicate
     )
@@ -212,15 +213,21 @@ def fit_recordings(
         intent(plant, K, metrics, sizes, weights),
         identifiability(known, weights),
         certainty,
-        tuple(
-            agreement(plant, trial, run, np.array(bounds.u_min), np.array(bounds.u_max))
-            for trial, run in zip(known.recordings, runs, strict=True)
-        ),
+        _agreements(known, methods[-1].runs, problem.bounds),
         tuple(held_out),
         tuple(methods),
         residual_diagnostics(fitted.problem, K, np.array(fitted.metric)),
         _terminal_set_difference(methods[-1]),
         time.perf_counter() - started,
+    )
+
+
+def _agreements(
+    known: Problem, runs: Sequence[Simulation], bounds: Bounds
+) -> tuple[TrialAgreement, ...]:
+    return tuple(
+        agreement(known.plant, trial, run, np.array(bounds.u_min), np.array(bounds.u_max))
+        for trial, run in zip(known.recordings, runs, strict=True)
     )
 
 

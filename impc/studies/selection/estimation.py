@@ -18,7 +18,7 @@ from impc.errors import DataError, InputError
 from impc.studies.selection.model import normalised, physical, sensitivity
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from impc.studies.selection.model import ParametricModel, Trial
 
@@ -99,26 +99,9 @@ def estimate(
         raise DataError("trials", "there are none", "give at least one")
     chosen: IntArray = np.asarray(free, dtype=np.int64)
     base = normalised(model, np.asarray(start, dtype=np.float64))
-    last: tuple[bytes, Array, Array] | None = None
-
-    def evaluated(t: Array) -> tuple[Array, Array]:
-        nonlocal last
-        if last is None or last[0] != t.tobytes():
-            full = base.copy()
-            full[chosen] = t
-            parts = [_part(model, full, trial, chosen) for trial in trials]
-            residual, jacobian = (np.concatenate(item) for item in zip(*parts, strict=True))
-            last = (t.tobytes(), residual, jacobian)
-        return last[1], last[2]
-
-    def residual(t: Array) -> Array:
-        return evaluated(t)[0]
-
-    def derivative(t: Array) -> Array:
-        return evaluated(t)[1]
-
+    residual, derivative = _evaluation(model, trials, base, chosen)
     begin = np.clip(base[chosen], -1 + 1e-9, 1 - 1e-9)
-    if not np.all(np.isfinite(evaluated(begin)[0])):
+    if not np.all(np.isfinite(residual(begin))):
         raise DataError("model", "is not finite at the start", "start elsewhere")
     found = scipy.optimize.least_squares(
         residual,
@@ -195,6 +178,31 @@ def pooled_vaf(model: ParametricModel, theta: Array, trials: Sequence[Trial]) ->
     recorded = np.concatenate([item.outputs for item in trials])
     simulated = np.concatenate([model.simulate(theta, item.input) for item in trials])
     return np.asarray(vaf(recorded, simulated))
+
+
+def _evaluation(
+    model: ParametricModel, trials: Sequence[Trial], base: Array, chosen: IntArray
+) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
+    """Residual and Jacobian of the chosen parameters; the last point is not computed twice."""
+    last: tuple[bytes, Array, Array] | None = None
+
+    def evaluated(t: Array) -> tuple[Array, Array]:
+        nonlocal last
+        if last is None or last[0] != t.tobytes():
+            full = base.copy()
+            full[chosen] = t
+            parts = [_part(model, full, trial, chosen) for trial in trials]
+            residual, jacobian = (np.concatenate(item) for item in zip(*parts, strict=True))
+            last = (t.tobytes(), residual, jacobian)
+        return last[1], last[2]
+
+    def residual(t: Array) -> Array:
+        return evaluated(t)[0]
+
+    def derivative(t: Array) -> Array:
+        return evaluated(t)[1]
+
+    return residual, derivative
 
 
 def _part(model: ParametricModel, t: Array, trial: Trial, chosen: IntArray) -> tuple[Array, Array]:

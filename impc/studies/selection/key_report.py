@@ -27,19 +27,7 @@ def key_files(
     model: ParametricModel, found: KeyParameters, command: str, inputs: Inputs
 ) -> dict[str, bytes]:
     """Build all files of `impc key-parameters`; they name `command` and `inputs`, all as bytes."""
-    rows = tuple(
-        (
-            names_of(model, item.subset),
-            number(item.variance),
-            number(item.vaf, 4),
-            number(item.reliability, 2),
-            str(item.diversity),
-            "kept" if item.kept else "",
-        )
-        for item in found.candidates
-    )
-    heads = ("subset", "largest variance", "mean VAF %", "least ICC(A,k)", "pathways", "")
-    table = TextTable("Subsets and the filters that they pass, best first.", heads, rows)
+    table = _candidate_table(model, found)
     chosen = names_of(model, found.chosen) if found.chosen else "none: no subset passes all filters"
     with journal_style():
         pictures = render(_solution_figure(model, found))
@@ -58,7 +46,18 @@ def key_files(
         "fit; filled ones pass all filters.",
         command=command,
     )
-    content = {
+    content = _content(model, found) | {"command": command, "sha256": inputs.plain()}
+    return {
+        "report.html": page.encode(),
+        "result.json": (json.dumps(plain(content), indent=1) + "\n").encode(),
+        "candidates.csv": table_csv(table),
+        **{f"solution-space.{kind}": picture for kind, picture in pictures.items()},
+    }
+
+
+def _content(model: ParametricModel, found: KeyParameters) -> dict[str, object]:
+    """What result.json holds, but for the command."""
+    return {
         "chosen": [model.names[index] for index in found.chosen],
         "size": found.selection.size,
         "subsets": len(found.selection.subsets),
@@ -91,14 +90,6 @@ def key_files(
             }
             for item in found.candidates
         ],
-        "command": command,
-        "sha256": inputs.plain(),
-    }
-    return {
-        "report.html": page.encode(),
-        "result.json": (json.dumps(plain(content), indent=1) + "\n").encode(),
-        "candidates.csv": table_csv(table),
-        **{f"solution-space.{kind}": picture for kind, picture in pictures.items()},
     }
 
 
@@ -106,6 +97,22 @@ def _icc(values: Array) -> dict[str, float]:
     """With its 95 % interval; NaN where there is none."""
     told = between_visits(values)
     return {key: getattr(told, key, np.nan) for key in ("value", "low", "high")}
+
+
+def _candidate_table(model: ParametricModel, found: KeyParameters) -> TextTable:
+    rows = tuple(
+        (
+            names_of(model, item.subset),
+            number(item.variance),
+            number(item.vaf, 4),
+            number(item.reliability, 2),
+            str(item.diversity),
+            "kept" if item.kept else "",
+        )
+        for item in found.candidates
+    )
+    heads = ("subset", "largest variance", "mean VAF %", "least ICC(A,k)", "pathways", "")
+    return TextTable("Subsets and the filters that they pass, best first.", heads, rows)
 
 
 def _estimate_table(model: ParametricModel, found: KeyParameters) -> TextTable:
