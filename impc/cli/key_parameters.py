@@ -48,7 +48,7 @@ def command(
     """
     from impc.reporting.writer import write_files  # noqa: PLC0415
     from impc.studies.selection.key_parameters import key_parameters  # noqa: PLC0415
-    from impc.studies.selection.key_report import key_files  # noqa: PLC0415
+    from impc.studies.selection.key_report import key_report  # noqa: PLC0415
     from impc.studies.selection.settings import select_settings  # noqa: PLC0415
 
     study, source, recorded = read_model_study(study_file, model_name, allowed)
@@ -59,7 +59,7 @@ def command(
             bound=bound, least_vaf=vaf, least_reliability=icc,
         )  # fmt: skip
     line = f"impc key-parameters {study_file.name} --bound {bound:g} --vaf {vaf:g} --icc {icc:g}"
-    written = write_files(out, key_files(source.model, found, line))
+    written = write_files(out, key_report(source.model, found, line).files())
     kept_results(out).forget()
     names = source.model.names
     chosen = ", ".join(names[index] for index in found.chosen) or "none passes all filters"

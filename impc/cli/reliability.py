@@ -40,13 +40,13 @@ def command(study_file: Path, plant_name: str | None, allowed: bool, out: Path, 
     from impc.studies.cohort.study import read_study  # noqa: PLC0415
     from impc.studies.reliability.analysis import analyse  # noqa: PLC0415
     from impc.studies.reliability.findings import findings  # noqa: PLC0415
-    from impc.studies.reliability.report import reliability_files  # noqa: PLC0415
+    from impc.studies.reliability.report import reliability_report  # noqa: PLC0415
 
     study = read_study(study_file)
     trials = _trials(study, named_plant(study_file, study, plant_name, allowed), last)
     result = analyse(trials)
-    files = reliability_files(trials, result, f"impc reliability {study_file.name} --last {last}")
-    written = write_files(out, files)
+    line = f"impc reliability {study_file.name} --last {last}"
+    written = write_files(out, reliability_report(trials, result, line).files())
     for item in findings(result):
         click.echo(f"{'found' if item.found else 'not found'}: {item.statement} ({item.numbers})")
     for line in result.notes:

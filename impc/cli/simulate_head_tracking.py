@@ -10,6 +10,7 @@ import click
 
 from impc.cli.numbers import Number
 from impc.cli.options import out_option, seed_option
+from impc.cli.seat import numbered
 
 __all__ = ["head_tracking"]
 
@@ -68,9 +69,7 @@ def head_tracking(out: Path, **given: Any) -> None:
                 return theta
 
     truth: dict[str, Any] = {}
-    width = max(2, len(str(given["subjects"])))
-    for number in range(given["subjects"]):
-        name = f"{number + 1:0{width}d}"
+    for name in numbered(given["subjects"]):
         own = drawn(typical, _SPREAD)
         truth[name] = dict(zip(model.names, own.tolist(), strict=True))
         for visit in range(1, given["visits"] + 1):

@@ -1,12 +1,9 @@
-"""What an interrupted command had done: the results of its stages, one sealed file each.
-
-They belong to one set of recordings, settings, plant and versions, told by a digest of all of them;
-what belongs to any other, or was damaged, is not used and is done again.
-"""
+"""What an interrupted fit or comparison had done, for one set of recordings, settings and plant."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import functools
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,6 +18,7 @@ from impc.inverse.methods import decode_estimate, encode_estimate
 from impc.inverse.noisy_fit import FittedController, fit_controller
 from impc.model.riccati import solve_lqr
 from impc.model.weights import Weights
+from impc.studies.cache import Cache, Codec, by_fields
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -35,28 +33,16 @@ __all__ = ["FitMemory", "open_memory"]
 
 # Where a family of plants is looked at: two families may agree at their nominal values.
 _FACTORS = (0.9, 1.1)
+# Fields of a result that are made again, or written in their own way.
+_APART = ("problem", "free", "weights", "solution")
 
 
 @dataclass(frozen=True)
-class FitMemory:
-    """Controllers and estimates of the stages done so far.
-
-    Attributes
-    ----------
-    files : Kept
-        One a stage; the folder is made when the first stage is done.
-    digest : str
-        Of recordings, settings, plant and versions.
-    stages : dict
-        Name of stage -> what `_encode` keeps of it.
-    """
-
-    files: Kept
-    digest: str
-    stages: dict[str, Any] = field(default_factory=dict)
+class FitMemory(Cache):
+    """The cache of `impc fit` and `impc compare`; its methods are what these two keep."""
 
     def controller(self, name: str, problem: Problem) -> FittedController:
-        """The controller of the stage `name`, remembered or fitted now and then written down.
+        """The controller of the stage `name`, fitted to the `problem`.
 
         Raises
         ------
@@ -65,61 +51,28 @@ class FitMemory:
         OutputError
             When the file cannot be written.
         """
-        if name in self.stages:
-            return _restore(problem, self.stages[name])
-        found = fit_controller(problem)
-        self._keep(name, _encode(found))
-        return found
+        codec = Codec(_encode, functools.partial(_restore, problem))
+        return self.get(name, lambda: fit_controller(problem), codec)
 
     def estimate(self, name: str, compute: Callable[[], Estimate]) -> Estimate:
-        """The estimate of the stage `name`, remembered or computed now and then written down.
+        """The estimate of the stage `name`, as `compute` makes it.
 
         Raises
         ------
         OutputError
             When the file cannot be written.
         """
-        if name in self.stages:
-            return decode_estimate(self.stages[name])
-        found = compute()
-        self._keep(name, encode_estimate(found))
-        return found
+        return self.get(name, compute, Codec(encode_estimate, decode_estimate))
 
     def replicate(self, name: str, compute: Callable[[], Replicate]) -> Replicate:
-        """The bootstrap replicate of the stage `name`, in the same way.
+        """The bootstrap replicate of the stage `name`, as `compute` makes it.
 
         Raises
         ------
         OutputError
             When the file cannot be written.
         """
-        if name in self.stages:
-            kept = self.stages[name]
-            return Replicate(frozen(kept["K"]), frozen(kept["parameters"]))
-        found = compute()
-        self._keep(name, {"K": found.K.tolist(), "parameters": found.parameters.tolist()})
-        return found
-
-    def kept(self) -> str:
-        """What to tell whoever interrupts the command."""
-        if not self.stages:
-            return "nothing was done yet"
-        done = ", ".join(self.stages)
-        return f"kept in {self.files.folder}: {done}; the same command goes on from there"
-
-    def forget(self) -> None:
-        """Remove the folder: the result has been written.
-
-        Raises
-        ------
-        OutputError
-            When that cannot be done.
-        """
-        self.files.forget()
-
-    def _keep(self, name: str, value: dict[str, Any]) -> None:
-        self.files.keep(name, self.digest, value)
-        self.stages[name] = value
+        return self.get(name, compute, by_fields(Replicate))
 
 
 def open_memory(
@@ -142,9 +95,8 @@ def open_memory(
     made_of : str
         Digest of the files that the problem was made of (`Inputs.digest`).
     """
-    files = Kept(folder / f"{command}-in-progress")
     known = digest(_content(problem), settings, made_of, versions())
-    return FitMemory(files, known, files.recall_all(known))
+    return FitMemory(Kept(folder / f"{command}-in-progress"), known)
 
 
 def _content(problem: Problem) -> tuple[Any, ...]:
@@ -162,62 +114,44 @@ def _probes(family: PlantFamily) -> list[Array]:
 
 
 def _encode(found: FittedController) -> dict[str, Any]:
-    free = found.free
-    return {
-        "Q": found.weights.Q.tolist(),
-        "R": found.weights.R.tolist(),
-        "misfit": found.misfit,
-        "exact": found.exact,
-        "converged": found.converged,
-        "metrics": found.metrics.tolist(),
-        **_nuisance(found.problem),
-        "free": {
-            "K": free.K.tolist(),
-            "S": free.S.tolist(),
-            "misfit": free.misfit,
-            "explained": free.explained,
-            "stabilises": free.stabilises,
-            "singular_values": free.singular_values.tolist(),
-            "metrics": free.metrics.tolist(),
-            "evaluations": free.evaluations,
-            "refused": list(free.refused),
-            **_nuisance(free.problem),
-        },
-    }
+    weights = {"Q": found.weights.Q.tolist(), "R": found.weights.R.tolist()}
+    return _fields(found) | weights | {"free": _fields(found.free)}
 
 
-def _nuisance(problem: Problem) -> dict[str, Any]:
+def _fields(found: FittedController | GainFit) -> dict[str, Any]:
+    """What JSON takes of a result, and what was found of its problem."""
+    own = {name: value for name, value in vars(found).items() if name not in _APART}
+    own["starts"] = np.array([trial.x0 for trial in found.problem.recordings])
+    own["logarithms"] = found.problem.logarithms
     return {
-        "starts": [trial.x0.tolist() for trial in problem.recordings],
-        "logarithms": problem.logarithms.tolist(),
+        name: value.tolist() if isinstance(value, np.ndarray) else value
+        for name, value in own.items()
     }
 
 
 def _restore(problem: Problem, kept: dict[str, Any]) -> FittedController:
-    free = kept["free"]
-    here = _problem(problem, kept)
-    weights = Weights(kept["Q"], kept["R"])
+    here, weights = _problem(problem, kept), Weights(kept["Q"], kept["R"])
+    free = GainFit(problem=_problem(problem, kept["free"]), **_values(GainFit, kept["free"]))
     return FittedController(
-        here,
-        GainFit(
-            frozen(free["K"]),
-            frozen(free["S"]),
-            _problem(problem, free),
-            free["misfit"],
-            free["explained"],
-            free["stabilises"],
-            frozen(free["singular_values"]),
-            frozen(free["metrics"]),
-            free["evaluations"],
-            tuple(free["refused"]),
-        ),
-        weights,
-        solve_lqr(here.plant, weights),
-        kept["misfit"],
-        kept["exact"],
-        kept["converged"],
-        frozen(kept["metrics"]),
+        problem=here,
+        free=free,
+        weights=weights,
+        solution=solve_lqr(here.plant, weights),
+        **_values(FittedController, kept),
     )
+
+
+def _values(kind: type, kept: dict[str, Any]) -> dict[str, Any]:
+    """Inverse of `_fields`, of those that JSON took."""
+    return {
+        item.name: frozen(kept[item.name]) if item.type == "Array" else _tuple(kept[item.name])
+        for item in fields(kind)
+        if item.name not in _APART
+    }
+
+
+def _tuple(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value
 
 
 def _problem(problem: Problem, kept: dict[str, Any]) -> Problem:

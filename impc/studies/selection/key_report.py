@@ -1,30 +1,59 @@
-"""Files of `impc key-parameters`: page, table, result.json, figure of the solution space."""
+"""The report of `impc key-parameters`: page, table, result.json, figure of the solution space."""
 
 from __future__ import annotations
 
-import json
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from impc.reporting.rendering import TextTable, embedded, number, plain, render_template
-from impc.reporting.style import BLUE, DOUBLE_COLUMN, INK, journal_style, new_figure, render
+from impc.reporting.document import Lines, Picture, Report, TextTable
+from impc.reporting.rendering import number
+from impc.reporting.style import BLUE, DOUBLE_COLUMN, INK, drawn, journal_style, new_figure
 from impc.studies.selection.key_parameters import between_visits
-from impc.studies.selection.report import names_of, table_csv
+from impc.studies.selection.report import names_of, results_section
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from matplotlib.figure import Figure
 
     from impc.arrays import Array
     from impc.studies.selection.key_parameters import KeyParameters
     from impc.studies.selection.model import ParametricModel
 
-__all__ = ["key_files"]
+__all__ = ["key_report"]
 
 
-def key_files(model: ParametricModel, found: KeyParameters, command: str) -> dict[str, bytes]:
-    """Build all files of `impc key-parameters`; they name the `command`; nothing is written."""
-    rows = tuple(
+def key_report(model: ParametricModel, found: KeyParameters, command: str) -> Report:
+    """Page, result.json, table and figure of `impc key-parameters`; they name the `command`."""
+    candidates = _candidate_table(model, found)
+    chosen = names_of(model, found.chosen) if found.chosen else "none: no subset passes all filters"
+    findings = [
+        f"{len(found.selection.subsets)} subsets of {found.selection.size} parameters are "
+        f"estimated well enough for every subject and visit (variance at most "
+        f"{found.selection.bound:g}).",
+        f"Chosen: {chosen}.",
+    ]
+    caption = (
+        "Counterpart of figure 5.3: subsets in the space of reliability and goodness of fit; "
+        "filled ones pass all filters."
+    )
+    tables = [candidates, _estimate_table(model, found), _sweep_table(model, found)]
+    with journal_style():
+        figures = drawn({"solution-space": _solution_figure(model, found)})
+    return Report(
+        "impc: Key parameters",
+        "Key parameters",
+        (Lines(findings),),
+        [results_section(tables, Picture("solution-space", caption, caption), command)],
+        figures=figures,
+        tables={"candidates": candidates},
+        data=_data(model, found, command),
+    )
+
+
+def _candidate_table(model: ParametricModel, found: KeyParameters) -> TextTable:
+    rows = [
         (
             names_of(model, item.subset),
             number(item.variance),
@@ -34,52 +63,31 @@ def key_files(model: ParametricModel, found: KeyParameters, command: str) -> dic
             "kept" if item.kept else "",
         )
         for item in found.candidates
-    )
+    ]
     heads = ("subset", "largest variance", "mean VAF %", "least ICC(A,k)", "pathways", "")
-    table = TextTable("Subsets and the filters that they pass, best first.", heads, rows)
-    chosen = names_of(model, found.chosen) if found.chosen else "none: no subset passes all filters"
-    with journal_style():
-        pictures = render(_solution_figure(model, found))
-    page = render_template(
-        "studies/selection/selection_page.html",
-        title="Key parameters",
-        findings=[
-            f"{len(found.selection.subsets)} subsets of {found.selection.size} parameters are "
-            f"estimated well enough for every subject and visit (variance at most "
-            f"{found.selection.bound:g}).",
-            f"Chosen: {chosen}.",
-        ],
-        tables=[table, _estimate_table(model, found), _sweep_table(model, found)],
-        picture_source=embedded(pictures["png"]),
-        caption="Counterpart of figure 5.3: subsets in the space of reliability and goodness of "
-        "fit; filled ones pass all filters.",
-        command=command,
-    )
-    content = {
-        "chosen": [model.names[index] for index in found.chosen],
+    return TextTable("Subsets and the filters that they pass, best first.", heads, rows)
+
+
+def _data(model: ParametricModel, found: KeyParameters, command: str) -> dict[str, Any]:
+    def names(subset: Sequence[int]) -> list[str]:
+        return [model.names[index] for index in subset]
+
+    estimates = zip(names(found.chosen), map(_icc, found.estimates), strict=True)
+    return {
+        "chosen": names(found.chosen),
         "size": found.selection.size,
         "subsets": len(found.selection.subsets),
         "sweep": [
-            {
-                "bound": item.bound,
-                "size": item.size,
-                "subsets": [[model.names[index] for index in subset] for subset in item.subsets],
-            }
+            {"bound": item.bound, "size": item.size, "subsets": [names(s) for s in item.subsets]}
             for item in found.sweep
         ],
         "icc": {
             "nominal": dict(zip(model.names, map(_icc, found.nominal), strict=True)),
-            "chosen": dict(
-                zip(
-                    (model.names[index] for index in found.chosen),
-                    map(_icc, found.estimates),
-                    strict=True,
-                )
-            ),
+            "chosen": dict(estimates),
         },
         "candidates": [
             {
-                "names": [model.names[index] for index in item.subset],
+                "names": names(item.subset),
                 "variance": item.variance,
                 "vaf": item.vaf,
                 "icc": item.reliability,
@@ -89,12 +97,6 @@ def key_files(model: ParametricModel, found: KeyParameters, command: str) -> dic
             for item in found.candidates
         ],
         "command": command,
-    }
-    return {
-        "report.html": page.encode(),
-        "result.json": (json.dumps(plain(content), indent=1) + "\n").encode(),
-        "candidates.csv": table_csv(table),
-        **{f"solution-space.{kind}": picture for kind, picture in pictures.items()},
     }
 
 
@@ -123,7 +125,7 @@ def _estimate_table(model: ParametricModel, found: KeyParameters) -> TextTable:
         )
     heads = ("parameter", "unit", "all free", "ICC, all free", *visits, "ICC")
     title = "Estimates, mean ± SD over subjects; ICC(A,k) between visits with its 95 % interval."
-    return TextTable(title, heads, tuple(rows))
+    return TextTable(title, heads, rows)
 
 
 def _mean_sd(values: Array) -> str:
@@ -146,9 +148,7 @@ def _sweep_table(model: ParametricModel, found: KeyParameters) -> TextTable:
         )
         rows.append((f"{item.bound:.2f}", str(item.size), str(len(item.subsets)), counts or "-"))
     heads = ("variance bound", "size", "subsets", "in how many of them")
-    return TextTable(
-        "The first filter, for every subject and visit at once (5.5).", heads, tuple(rows)
-    )
+    return TextTable("The first filter, for every subject and visit at once (5.5).", heads, rows)
 
 
 def _solution_figure(model: ParametricModel, found: KeyParameters) -> Figure:
