@@ -21,6 +21,7 @@ __all__ = [
     "as_numbers",
     "finite_array",
     "frozen",
+    "percentiles",
     "require_finite",
     "symmetric_matrix",
     "with_shape",
@@ -66,6 +67,16 @@ def frozen(values: ArrayLike) -> Array:
     array = np.array(values, dtype=np.float64)
     array.flags.writeable = False
     return array
+
+
+def percentiles(drawn: ArrayLike, level: float) -> tuple[Array, Array]:
+    """Ends of the interval that holds the share `level` of what was `drawn`, along its first axis.
+
+    Both have the shape (any shape) of one draw.
+    """
+    values = np.asarray(drawn, dtype=np.float64)
+    low, high = np.quantile(values, [0.5 - level / 2, 0.5 + level / 2], axis=0)
+    return np.asarray(low), np.asarray(high)
 
 
 def as_numbers(name: str, values: ArrayLike) -> Array:

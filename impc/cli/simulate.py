@@ -44,12 +44,7 @@ def command() -> None:
     help="Largest torque of the subject, Nm.",
 )
 @click.option("--trials", type=click.IntRange(1, 99), default=3)
-@click.option(
-    "--duration",
-    type=Number(min=2, max=600),
-    default=30.0,
-    help="Of a trial, s.",
-)
+@click.option("--duration", type=Number(min=2, max=600), default=30.0, help="Of a trial, s.")
 @click.option(
     "--amplitude",
     type=Number(min=0, max=1e6, min_open=True),

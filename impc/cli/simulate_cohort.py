@@ -35,10 +35,7 @@ _BETWEEN, _WITHIN = 0.2, 0.05
 @click.command("cohort")
 @out_option("cohort-data", "the recordings, study.toml, participants.tsv and truth.json")
 @click.option(
-    "--subjects",
-    type=click.IntRange(2, 9999),
-    default=30,
-    help="In both groups together.",
+    "--subjects", type=click.IntRange(2, 9999), default=30, help="In both groups together."
 )
 @click.option("--visits", type=click.IntRange(1, 9), default=1, help="Of each subject.")
 @click.option("--trials", type=click.IntRange(1, 9), default=3, help="Of each visit.")

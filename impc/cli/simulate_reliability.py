@@ -9,15 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from impc.cli.options import out_option, seed_option
-from impc.cli.seat import (
-    PLANT,
-    SIGNALS,
-    TORQUE,
-    numbered,
-    random_person,
-    seat_table,
-    seat_weights,
-)
+from impc.cli.seat import PLANT, SIGNALS, TORQUE, numbered, random_person, seat_table, seat_weights
 
 if TYPE_CHECKING:
     import numpy as np
@@ -48,12 +40,7 @@ _LEAN = (0.1, 0.8)
 @out_option("reliability-data", "the recordings, study.toml and truth.json")
 @click.option("--subjects", type=click.IntRange(2, 999), default=30, help="How many.")
 @click.option("--visits", type=click.IntRange(2, 9), default=3, help="Of each subject.")
-@click.option(
-    "--trials",
-    type=click.IntRange(2, 9),
-    default=3,
-    help="Of each visit and condition.",
-)
+@click.option("--trials", type=click.IntRange(2, 9), default=3, help="Of each visit and condition.")
 @seed_option
 def reliability_study(out: Path, **given: Any) -> None:
     """Thirty subjects, three visits, three conditions and three trials on the seat.

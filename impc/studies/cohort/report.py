@@ -274,11 +274,7 @@ def _unit_blocks(unit: Unit, fit: dict[str, Any], failures: Failures) -> list[Bl
 
 def _fit_table(fit: dict[str, Any]) -> TextTable:
     rows = tuple(
-        (
-            name,
-            number(_nan(fit["vaf"][name]), 5),
-            number(_nan(fit["held_out_vaf"][name]), 5),
-        )
+        (name, number(_nan(fit["vaf"][name]), 5), number(_nan(fit["held_out_vaf"][name]), 5))
         for name in fit["outputs"]
     )
     return TextTable(

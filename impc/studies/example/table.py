@@ -81,16 +81,7 @@ METHODS: dict[str, MethodText] = {
 }
 
 #: Heads of the table.
-COLUMNS = (
-    "method",
-    "Q11 Q12 Q22 / R",
-    "gain K",
-    "misfit",
-    "max |u|",
-    "kept",
-    "(3.10)",
-    "seconds",
-)
+COLUMNS = ("method", "Q11 Q12 Q22 / R", "gain K", "misfit", "max |u|", "kept", "(3.10)", "seconds")
 _NONE = "-"
 
 

@@ -76,11 +76,7 @@ class FitMemory(Cache):
 
 
 def open_memory(
-    folder: Path,
-    problem: Problem,
-    settings: FitSettings,
-    command: str = "fit",
-    made_of: str = "",
+    folder: Path, problem: Problem, settings: FitSettings, command: str = "fit", made_of: str = ""
 ) -> FitMemory:
     """The memory of a command in a folder, empty when there is none for this very problem.
 

@@ -53,10 +53,7 @@ def in_turn(model: ParametricModel) -> Runner:
 
 
 def on_workers(
-    workers: Workers,
-    source: ModelSource,
-    kept: Kept,
-    done: Callable[[str], None] = lambda _: None,
+    workers: Workers, source: ModelSource, kept: Kept, done: Callable[[str], None] = lambda _: None
 ) -> Runner:
     """On workers; what is kept already is not done again.
 
