@@ -296,10 +296,10 @@ def _generalised(
     )
     # Occasions whose variance would be negative have none.
     drawn = (r - e) / (r + (k - 1) * e + k * np.maximum(c - e, 0.0) / n)
-    low, high = percentiles(drawn, level)
+    low, high = map(float, percentiles(drawn, level))
     if form == "A,k":
-        low, high = (_stepped_up(float(end), k) for end in (low, high))
-    return min(float(low), value), max(float(high), value)
+        low, high = (_stepped_up(end, k) for end in (low, high))
+    return min(low, value), max(high, value)
 
 
 def _stepped_up(limit: float, k: int) -> float:
