@@ -228,7 +228,8 @@ def _subject_files(
     subject: str, units: list[Unit], store: Store, failures: Failures
 ) -> dict[str, bytes]:
     """The page of a subject and the figures on it."""
-    sections, figures = [], {}
+    sections: list[Section] = []
+    figures: dict[str, bytes] = {}
     for unit in units:
         fit = store.fit(unit.name)
         if fit is None:
