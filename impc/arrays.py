@@ -70,9 +70,19 @@ def frozen(values: ArrayLike) -> Array:
 
 
 def percentiles(drawn: ArrayLike, level: float) -> tuple[Array, Array]:
-    """Ends of the interval that holds the share `level` of what was `drawn`, along its first axis.
+    """Ends of the interval that holds the share `level` of draws.
 
-    Both have the shape (any shape) of one draw.
+    Parameters
+    ----------
+    drawn : array_like
+        One draw after the other, each of any shape.
+    level : float
+        Between 0 and 1.
+
+    Returns
+    -------
+    low, high : Array
+        Of the same shape as a draw.
     """
     values = np.asarray(drawn, dtype=np.float64)
     low, high = np.quantile(values, [0.5 - level / 2, 0.5 + level / 2], axis=0)

@@ -30,8 +30,9 @@ __all__ = [
     "seat_weights",
 ]
 
-#: Import paths of the linear plant, of a step of the nonlinear one, and of the torque on the seat.
+#: Import paths of the linear plant, and of a step of the nonlinear one.
 PLANT, STEP = "plants:seated_balance_for", "plants:seated_balance_step_for"
+#: Import path of the torque on the seat.
 TORQUE = "plants:ternary_torque"
 #: Of the controller, in samples of 0.01 s.
 HORIZON = 20

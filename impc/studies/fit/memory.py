@@ -39,7 +39,19 @@ _APART = ("problem", "free", "weights", "solution")
 
 @dataclass(frozen=True)
 class FitMemory(Cache):
-    """The cache of `impc fit` and `impc compare`; its methods are what these two keep."""
+    """The cache of `impc fit` and `impc compare`; its methods are what these two keep.
+
+    Attributes
+    ----------
+    files : Kept
+        One a stage.
+    digest : str
+        Of recordings, settings, plant and versions.
+    done : callable
+        Told the name of each stage.
+    stages : dict
+        Name of stage -> what is kept of it.
+    """
 
     def controller(self, name: str, problem: Problem) -> FittedController:
         """The controller of the stage `name`, fitted to the `problem`.
