@@ -41,16 +41,7 @@ _APART = ("problem", "free", "weights", "solution")
 class FitMemory(Cache):
     """The cache of `impc fit` and `impc compare`; its methods are what these two keep.
 
-    Attributes
-    ----------
-    files : Kept
-        One a stage.
-    digest : str
-        Of recordings, settings, plant and versions.
-    done : callable
-        Told the name of each stage.
-    stages : dict
-        Name of stage -> what is kept of it.
+    `files`, `digest`, `done` and `stages` are as in `Cache`.
     """
 
     def controller(self, name: str, problem: Problem) -> FittedController:
