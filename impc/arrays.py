@@ -21,6 +21,7 @@ __all__ = [
     "as_numbers",
     "finite_array",
     "frozen",
+    "percentiles",
     "require_finite",
     "symmetric_matrix",
     "with_shape",
@@ -66,6 +67,26 @@ def frozen(values: ArrayLike) -> Array:
     array = np.array(values, dtype=np.float64)
     array.flags.writeable = False
     return array
+
+
+def percentiles(drawn: ArrayLike, level: float) -> tuple[Array, Array]:
+    """Ends of the interval that holds the share `level` of draws.
+
+    Parameters
+    ----------
+    drawn : array_like
+        One draw after the other, each of any shape.
+    level : float
+        Between 0 and 1.
+
+    Returns
+    -------
+    low, high : Array
+        Of the same shape as a draw.
+    """
+    values = np.asarray(drawn, dtype=np.float64)
+    low, high = np.quantile(values, [0.5 - level / 2, 0.5 + level / 2], axis=0)
+    return np.asarray(low), np.asarray(high)
 
 
 def as_numbers(name: str, values: ArrayLike) -> Array:

@@ -188,11 +188,11 @@ def one_line(text: object, longest: int = _LONGEST) -> str:
     return f"{line[:half]} ... {line[-half:]}"
 
 
-def brief(value: object) -> str:
-    """A `value` that somebody gave, for a message: at most sixty characters of it."""
+def brief(value: object, longest: int = 60) -> str:
+    """A `value` that somebody gave, for a message: at most `longest` characters of it."""
     if isinstance(value, int) and value.bit_length() > _MANY_BITS:
         return f"an integer of about {value.bit_length() * 0.30103:.0f} digits"
-    return one_line(value, 60)
+    return one_line(value, longest)
 
 
 def _text(value: object) -> str:

@@ -5,53 +5,71 @@ from __future__ import annotations
 import json
 import os
 import re
+from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
 import numpy as np
 import pytest
+from markupsafe import Markup
 
 from impc.checking import replace
 from impc.errors import OutputError
 from impc.model.plant import Plant
 from impc.model.riccati import solve_lqr
 from impc.model.weights import Weights
-from impc.reporting.provenance import Provenance, example_provenance
+from impc.reporting.document import (
+    Heading,
+    Lines,
+    Note,
+    Picture,
+    Report,
+    Section,
+    Terms,
+    TextTable,
+    json_bytes,
+)
+from impc.reporting.provenance import Provenance
 from impc.reporting.style import journal_style
 from impc.reporting.writer import require_writable, write_files
 from impc.studies.example.cases import CASES, SETTINGS, CaseResult, run_case
 from impc.studies.example.figures import example_figures
-from impc.studies.example.page import render_page
-from impc.studies.example.result import result_json
+from impc.studies.example.report import example_report
+from impc.studies.example.result import example_data
 from impc.studies.example.table import (
     METHODS,
     determined_sentences,
+    methods_table,
     significant,
     table_rows,
-    text_table,
 )
 from plants import yalmip_example
 
 
 @pytest.fixture(scope="module")
 def provenance() -> Provenance:
-    return example_provenance("plants:yalmip_example", Plant(yalmip_example()), SETTINGS)
+    return Provenance("plants:yalmip_example")
 
 
 @pytest.fixture(scope="module")
-def case_a(provenance: Provenance) -> CaseResult:
-    return run_case(provenance.plant, "A")
+def case_a() -> CaseResult:
+    return run_case(Plant(yalmip_example()), "A")
 
 
 @pytest.fixture(scope="module")
-def figures(case_a: CaseResult) -> dict[str, bytes]:
-    return example_figures(case_a)
+def report(case_a: CaseResult, provenance: Provenance) -> Report:
+    return example_report([case_a], provenance)
 
 
 @pytest.fixture(scope="module")
-def page(case_a: CaseResult, figures: dict[str, bytes], provenance: Provenance) -> str:
-    return render_page([case_a], figures, provenance)
+def figures(report: Report) -> dict[str, bytes]:
+    return dict(report.figures)
+
+
+@pytest.fixture(scope="module")
+def page(report: Report) -> str:
+    return report.page()
 
 
 def snapshot(folder: Path) -> dict[str, bytes]:
@@ -69,7 +87,7 @@ def test_the_table_has_the_truth_and_every_method_in_order(case_a: CaseResult) -
     assert by_name["inverse_lqr_lmi"].weights == "infeasible"
     assert by_name["feedback_gain"].kept == "no"
     assert by_name["inverse_mpc"].kept == "yes"
-    assert "-0.000" not in text_table(case_a)
+    assert "-0.000" not in methods_table(case_a).text()
 
 
 def test_sentences_say_what_was_determined_and_what_was_chosen(case_a: CaseResult) -> None:
@@ -92,7 +110,7 @@ def test_significant(value: float, text: str) -> None:
 def test_result_json_holds_the_numbers_of_an_independent_computation(
     case_a: CaseResult, provenance: Provenance
 ) -> None:
-    content = json.loads(result_json([case_a], provenance))
+    content = json.loads(json_bytes(example_data([case_a], provenance, SETTINGS)))
     case = content["cases"]["A"]
     assert tuple(case["x0"]) == CASES["A"]
     A, B = np.array(content["plant"]["A"]), np.array(content["plant"]["B"])
@@ -110,7 +128,7 @@ def test_result_json_holds_the_numbers_of_an_independent_computation(
             assert method["state_misfit"] == pytest.approx(np.linalg.norm(run - x), abs=1e-12)
             assert method["simulations"] >= 0
         if "Q" in method:
-            check_weights(provenance.plant, method)
+            check_weights(case_a.controller.plant, method)
 
 
 def check_weights(plant: Plant, method: dict[str, Any]) -> None:
@@ -165,16 +183,79 @@ def test_the_page_says_what_a_reader_must_know(page: str, case_a: CaseResult) ->
     assert "condition weight" in page
 
 
-def test_the_page_escapes_what_it_is_given(
-    case_a: CaseResult, figures: dict[str, bytes], provenance: Provenance
-) -> None:
+def test_the_page_escapes_what_it_is_given(case_a: CaseResult, provenance: Provenance) -> None:
     evil = "<script>alert(1)</script>"
-    named = {key.replace("case-A", f"case-{evil}"): value for key, value in figures.items()}
-    text = render_page(
-        [replace(case_a, name=evil, branch=evil)], named, replace(provenance, plant_name=evil)
-    )
+    text = example_report(
+        [replace(case_a, name=evil, branch=evil)], replace(provenance, plant_name=evil)
+    ).page()
     assert "<script" not in text
     assert text.count("&lt;script&gt;") >= 3
+
+
+EVIL = '<script>alert("1")</script>&'
+
+
+class Texts(HTMLParser):
+    """The texts of a page as a browser reads them."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[str] = []
+
+    def handle_data(self, data: str) -> None:
+        self.found.append(data)
+
+
+def every_block() -> Report:
+    """Each kind of block, each of its texts hostile."""
+    lines = (EVIL, Markup("<code>{}</code>").format(EVIL))
+    blocks = (
+        *lines,
+        Lines(lines),
+        Terms([(EVIL, lines)]),
+        TextTable(EVIL, (EVIL, "=1"), [(EVIL, "2"), ("=1+1", EVIL)]),
+        Picture(EVIL, EVIL, EVIL),
+        Heading(EVIL),
+        Note(EVIL, EVIL),
+    )
+    return Report(
+        EVIL, EVIL, blocks, [Section(EVIL, blocks, contents="In short"), Section("2", ())],
+        figures={f"{EVIL}.png": b"png"},
+        tables={"numbers": TextTable("", ("=a", "b"), [("-x", 0.1)])},
+        data={"a": np.array([1.0, np.nan])},
+    )  # fmt: skip
+
+
+def test_every_block_is_escaped_and_there() -> None:
+    page = every_block().page()
+    assert "<script" not in page
+    assert "default-src 'none'; img-src data:; style-src 'unsafe-inline'" in page
+    heads = re.findall(r"<(h1|h2|h3|ul|dl|table|figure|nav)[ >]", page)
+    both = ["ul", "dl", "table", "figure", "h3"]
+    assert heads == ["h1", "nav", *both, "h2", *both, "h2"]
+    shown = Texts()
+    shown.feed(page)
+    # Title, first heading and section; in each of two places: 2 paragraphs, 2 lines, 3 of the
+    # terms, caption, head and 2 cells, caption of the figure, heading, 2 of the note.
+    assert sum(text.count(EVIL) for text in shown.found) == 3 + 2 * 15
+    assert 'href="#in-short"' in page
+    assert 'id="in-short"' in page
+
+
+def test_a_report_is_its_files() -> None:
+    files = every_block().files()
+    assert list(files) == ["report.html", "result.json", "numbers.csv", f"{EVIL}.png"]
+    assert json.loads(files["result.json"]) == {"a": [1.0, None]}
+    assert files["numbers.csv"] == b"'=a,b\n'-x,0.1\n"
+
+
+def test_columns_for_a_terminal() -> None:
+    table = TextTable("", ("method", "VAF", ""), [("a", "1.00", "falls"), ("longer", "-10.00", "")])
+    assert table.text().splitlines() == [
+        "method     VAF",
+        "a         1.00  falls",
+        "longer  -10.00",
+    ]
 
 
 # Writing

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
-from tqdm import tqdm
 
 from impc.checking import replace
 from impc.cli.exit_status import ExitStatus
 from impc.cli.options import code_options, out_option, scheduler_options, yes_option
 from impc.cli.plant import named_plant
+from impc.cli.progress import progress
 
 if TYPE_CHECKING:
     from impc.studies.cohort.cluster import Cluster
@@ -83,41 +82,35 @@ def _run(
     from impc.cli.consent import require_consent  # noqa: PLC0415
     from impc.studies.cohort.cluster import connected  # noqa: PLC0415
     from impc.studies.cohort.effort import study_effort  # noqa: PLC0415
-    from impc.studies.cohort.engine import Progress, run_study, work_left  # noqa: PLC0415
+    from impc.studies.cohort.engine import run_study, work_left  # noqa: PLC0415
 
     done, total = work_left(study, store)
 
     def log(line: str) -> None:
         store.log(f"{datetime.now(UTC).isoformat(timespec='seconds')} {line}")
 
-    with tqdm(
-        total=total, initial=done, unit="task", file=sys.stderr, disable=None, smoothing=0.05
-    ) as bar:
-        begun, here = time.monotonic(), 0
+    begun, here = time.monotonic(), 0
 
-        def told(unit: str, what: str, _: float) -> None:
+    def said(_: int) -> str:
+        finished, _ = work_left(study, store)
+        return f"{finished} of {total} tasks are kept in {store.folder}; the same command goes on"
+
+    with progress(total, "task", said, done) as tell, connected(cluster) as workers:
+
+        def told(name: str) -> None:
             nonlocal here
             here += 1
-            bar.set_postfix_str(f"{unit} {what}", refresh=False)
-            bar.update()
+            tell(name)
             left = (total - done - here) * (time.monotonic() - begun) / here
             log(f"{done + here} of {total} tasks, {left / 60:.1f} min left")
 
-        try:
-            with connected(cluster) as workers:
-                if done < total:
-                    one, units = study_effort(tasks)
-                    left = units * (total - done) / total
-                    effort = one.shared(left, workers.threads)
-                    if cluster.scheduler:  # memory is not this machine's
-                        effort = replace(effort, gigabytes=0.0)
-                    require_consent(effort, yes)
-                failures = run_study(study, tasks, store, workers, Progress(told, log))
-        except KeyboardInterrupt:
-            finished, _ = work_left(study, store)
-            raise KeyboardInterrupt(
-                f"{finished} of {total} tasks are kept in {store.folder}; the same command goes on"
-            ) from None
+        if done < total:
+            one, units = study_effort(tasks)
+            effort = one.shared(units * (total - done) / total, workers.threads)
+            if cluster.scheduler:  # memory is not this machine's
+                effort = replace(effort, gigabytes=0.0)
+            require_consent(effort, yes)
+        failures = run_study(study, tasks, store, workers, told, log)
     log(
         f"end: {len(failures.units)} of {len(study.units)} units without a result, "
         f"{sum(map(len, failures.replicates.values()))} replicates failed"

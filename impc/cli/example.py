@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
-from tqdm import tqdm
 
 from impc.cli.options import out_option
 from impc.cli.output import print_files
 from impc.cli.plant import load_plant
+from impc.cli.progress import progress
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -40,16 +39,15 @@ def command(case: str, out: Path) -> None:
     everything its text says stands in for them.
     """
     # Imported here: the libraries take seconds to load, and --help and --version need none.
-    from impc.reporting.provenance import example_provenance  # noqa: PLC0415
+    from impc.reporting.provenance import Provenance  # noqa: PLC0415
     from impc.reporting.writer import require_writable, write_files  # noqa: PLC0415
-    from impc.studies.example.cases import CASES, LOST, SETTINGS  # noqa: PLC0415
-    from impc.studies.example.report import example_files  # noqa: PLC0415
+    from impc.studies.example.cases import CASES, LOST  # noqa: PLC0415
+    from impc.studies.example.report import example_report  # noqa: PLC0415
 
     require_writable(out)
     plant = load_plant(_EXAMPLE_PLANT)
     cases = _run(plant, tuple(CASES) if case == "all" else (case,))
-    files = example_files(cases, example_provenance(_EXAMPLE_PLANT, plant, SETTINGS))
-    written = write_files(out, files)
+    written = write_files(out, example_report(cases, Provenance(_EXAMPLE_PLANT)).files())
     click.echo(click.wrap_text(LOST, width=100))
     for result in cases:
         _print_case(result)
@@ -61,21 +59,18 @@ def _run(plant: Plant, names: Sequence[str]) -> list[CaseResult]:
     from impc.studies.example.table import METHODS  # noqa: PLC0415
 
     total = len(names) * (len(METHODS) - 1)  # the truth is no method
-    # disable=None: no bar where stderr is a file.
-    with tqdm(total=total, unit="method", file=sys.stderr, disable=None, leave=False) as bar:
-
-        def step(method: str) -> None:
-            bar.set_postfix_str(method, refresh=False)
-            bar.update()
-
+    with progress(total, "method") as step:
         return [run_case(plant, name, progress=step) for name in names]
 
 
 def _print_case(result: CaseResult) -> None:
-    from impc.studies.example.table import determined_sentences, text_table  # noqa: PLC0415
+    from impc.studies.example.table import (  # noqa: PLC0415
+        determined_sentences,
+        methods_table,
+    )
 
     start = ", ".join(f"{value:g}" for value in result.x0)
     click.echo(f"\nCase {result.name}: start at ({start}), {result.branch} branch of Table 3.1\n")
-    click.echo(text_table(result) + "\n")
+    click.echo(methods_table(result).text() + "\n")
     for line in determined_sentences(result.identifiability):
         click.echo(line)

@@ -52,7 +52,7 @@ def command(
     from impc.reporting.writer import write_files  # noqa: PLC0415
     from impc.studies.selection.effort import key_evaluations, selection_effort  # noqa: PLC0415
     from impc.studies.selection.key_parameters import key_parameters  # noqa: PLC0415
-    from impc.studies.selection.key_report import key_files  # noqa: PLC0415
+    from impc.studies.selection.key_report import key_report  # noqa: PLC0415
     from impc.studies.selection.settings import select_settings  # noqa: PLC0415
 
     study, source, recorded, inputs = read_model_study(study_file, model_name, allowed)
@@ -66,7 +66,7 @@ def command(
         )  # fmt: skip
     options = f"--model {source.name} --bound {bound:g} --vaf {vaf:g} --icc {icc:g}"
     line = f"impc key-parameters {study_file.name} {options}"
-    written = write_files(out, key_files(source.model, found, line, inputs))
+    written = write_files(out, key_report(source.model, found, line, inputs).files())
     kept_results(out).forget()
     names = source.model.names
     chosen = ", ".join(names[index] for index in found.chosen) or "none passes all filters"

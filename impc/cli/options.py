@@ -9,11 +9,19 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 import click
 
 from impc.cli.numbers import LARGEST_SEED
+from impc.cli.plant import KNOWN
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-__all__ = ["code_options", "out_option", "scheduler_options", "seed_option", "yes_option"]
+__all__ = [
+    "code_options",
+    "out_option",
+    "scheduler_options",
+    "seed_option",
+    "subject_arguments",
+    "yes_option",
+]
 
 F = TypeVar("F", bound="Callable[..., Any]")
 
@@ -57,6 +65,22 @@ def out_option(folder: str, holds: str) -> Callable[[F], F]:
     return added
 
 
+def subject_arguments(config: str) -> Callable[[F], F]:
+    """FILES, --plant and --config of one subject; `config` is the help of the last."""
+    options = (
+        click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path)),
+        click.option(
+            "--plant",
+            "plant_name",
+            required=True,
+            help=f"{', '.join(KNOWN)}; module:function of your own; or a .mat, .npz or .json state "
+            "space.",
+        ),
+        click.option("--config", required=True, type=click.Path(path_type=Path), help=config),
+    )
+    return lambda command: functools.reduce(lambda found, one: one(found), options[::-1], command)
+
+
 def scheduler_options(command: F) -> F:
     """Add --scheduler, its certificates, and --workers to a `command`."""
     path = click.Path(path_type=Path)
@@ -89,10 +113,7 @@ def scheduler_options(command: F) -> F:
         cluster = Cluster(scheduler, workers, tls_ca, tls_cert, tls_key)
         return command(*given, cluster=cluster, **named)
 
-    found = cast("F", connecting)
-    for option in reversed(options):
-        found = option(found)
-    return found
+    return functools.reduce(lambda found, one: one(found), options[::-1], cast("F", connecting))
 
 
 def code_options(kind: str) -> Callable[[F], F]:

@@ -15,10 +15,7 @@ if TYPE_CHECKING:
 __all__ = ["KNOWN", "find_plant", "load_plant", "named_plant"]
 
 #: Short names of plants, by their import paths: the library itself knows no plant.
-KNOWN = {
-    "seated-balance": "plants:seated_balance_for",
-    "cursor": "plants:cursor_plant",
-}
+KNOWN = {"seated-balance": "plants:seated_balance_for", "cursor": "plants:cursor_plant"}
 
 
 def find_plant(name: str, arguments: Mapping[str, Any]) -> PlantSource:

@@ -45,7 +45,7 @@ def command(study_file: Path, plant_name: str | None, allowed: bool, out: Path, 
     from impc.studies.cohort.study import read_study  # noqa: PLC0415
     from impc.studies.reliability.analysis import analyse  # noqa: PLC0415
     from impc.studies.reliability.findings import findings  # noqa: PLC0415
-    from impc.studies.reliability.report import reliability_files  # noqa: PLC0415
+    from impc.studies.reliability.report import reliability_report  # noqa: PLC0415
 
     study = read_study(study_file)
     source = named_plant(study_file, study, plant_name, allowed)
@@ -54,7 +54,7 @@ def command(study_file: Path, plant_name: str | None, allowed: bool, out: Path, 
     inputs = study_inputs(units, study_file, "plant", source.name, source.arguments)
     result = analyse(trials)
     line = f"impc reliability {study_file.name} --plant {source.name} --last {last}"
-    written = write_files(out, reliability_files(trials, result, line, inputs))
+    written = write_files(out, reliability_report(trials, result, line, inputs).files())
     for item in findings(result):
         click.echo(f"{'found' if item.found else 'not found'}: {item.statement} ({item.numbers})")
     for line in result.notes:

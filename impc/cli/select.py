@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import sys
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-from tqdm import tqdm
 
 from impc.cli.options import code_options, out_option, scheduler_options, yes_option
 from impc.cli.output import print_files
+from impc.cli.progress import progress
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -45,7 +44,7 @@ def command(
     from impc.reporting.writer import write_files  # noqa: PLC0415
     from impc.studies.selection.analysis import select_study  # noqa: PLC0415
     from impc.studies.selection.effort import select_evaluations, selection_effort  # noqa: PLC0415
-    from impc.studies.selection.report import selection_files  # noqa: PLC0415
+    from impc.studies.selection.report import selection_report  # noqa: PLC0415
     from impc.studies.selection.settings import select_settings  # noqa: PLC0415
 
     study, source, recorded, inputs = read_model_study(study_file, model_name, allowed)
@@ -57,7 +56,7 @@ def command(
         require_consent(effort.shared(len(named), threads), yes, FEWER_STARTS)
         found = select_study(named, settings, run)
     line = f"impc select {study_file.name} --model {source.name}"
-    written = write_files(out, selection_files(source.model, found, line, inputs))
+    written = write_files(out, selection_report(source.model, found, line, inputs).files())
     kept_results(out).forget()
     names = source.model.names
     click.echo(f"information: {', '.join(names[index] for index in found.free)}")
@@ -96,19 +95,12 @@ def study_runner(
     from impc.studies.selection.queue import on_workers  # noqa: PLC0415
 
     kept = kept_results(out)
-    with tqdm(total=tasks, unit="task", file=sys.stderr, disable=None, leave=False) as bar:
 
-        def done(name: str) -> None:
-            bar.set_postfix_str(name, refresh=False)
-            bar.update()
+    def said(count: int) -> str:
+        return f"{count} of {tasks} tasks are kept in {kept.folder}; the same command goes on"
 
-        try:
-            with connected(cluster) as workers:
-                yield on_workers(workers, source, kept, done), workers.threads
-        except KeyboardInterrupt:
-            raise KeyboardInterrupt(
-                f"{bar.n} of {tasks} tasks are kept in {kept.folder}; the same command goes on"
-            ) from None
+    with progress(tasks, "task", said) as done, connected(cluster) as workers:
+        yield on_workers(workers, source, kept, done), workers.threads
 
 
 def read_model_study(

@@ -11,6 +11,7 @@ import click
 from impc.cli.numbers import Number
 from impc.cli.options import out_option, seed_option
 from impc.cli.output import print_files
+from impc.cli.seat import HORIZON, SIGNALS, STEP, TORQUE, seat_controller, seat_table, seat_weights
 from impc.cli.simulate_cohort import cohort
 from impc.cli.simulate_head_tracking import head_tracking
 from impc.cli.simulate_reliability import reliability_study
@@ -20,20 +21,16 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from impc.control.controller import Controller
-    from impc.files.plant_sources import PlantSource
-    from impc.model.plant import Plant
-    from impc.model.weights import Weights
     from impc.studies.simulated_people import SubjectTrial
 
 __all__ = ["command"]
 
-_PLANT, _STEP = "plants:seated_balance_for", "plants:seated_balance_step_for"
-_TORQUE = "plants:ternary_torque"
 _ENDINGS = {"csv": ".csv", "tsv": ".tsv", "mat": ".mat", "tdms": ".tdms", "c3d": ".c3d"}
 _FORMATS = (*_ENDINGS, "mat73")
 # What a plain installation cannot write.
 _LIBRARIES = {"tdms": "nptdms", "c3d": "c3d"}
-_RATE, _HORIZON = 1000.0, 20
+_RATE = 1000.0
+_STOP = "limit = 12.0                 # mechanical stop, in this unit\n"
 
 
 @click.group("simulate")
@@ -50,12 +47,7 @@ def command() -> None:
     help="Largest torque of the subject, Nm.",
 )
 @click.option("--trials", type=click.IntRange(1, 99), default=3)
-@click.option(
-    "--duration",
-    type=Number(min=2, max=600),
-    default=30.0,
-    help="Of a trial, s.",
-)
+@click.option("--duration", type=Number(min=2, max=600), default=30.0, help="Of a trial, s.")
 @click.option(
     "--amplitude",
     type=Number(min=0, max=1e6, min_open=True),
@@ -95,7 +87,7 @@ def seated_balance(out: Path, formats: str | None, **given: Any) -> None:
     wanted = _wanted(formats)
     require_writable(out)
     person = {key: given[key] for key in ("mass", "height", "sex")}
-    controller = _controller(person, given["torque_limit"])
+    controller = seat_controller(person, given["torque_limit"])
     trials = _trials(controller, person, given)
     files: dict[str, bytes] = {"subject.toml": _configuration(person, given).encode()}
     files["truth.json"] = (json.dumps(_truth(controller, given), indent=1) + "\n").encode()
@@ -123,44 +115,15 @@ def _wanted(formats: str | None) -> tuple[str, ...]:
     return wanted
 
 
-def _controller(person: dict[str, Any], limit: float) -> Controller:
-    from impc.control.controller import Controller  # noqa: PLC0415
-    from impc.files.plant_sources import make_plant  # noqa: PLC0415
-    from impc.model.bounds import Bounds  # noqa: PLC0415
-
-    plant = make_plant(_source(_PLANT, person), ("perturbation",))
-    bounds = Bounds(plant, u_min=-limit, u_max=limit)
-    return Controller(plant, _weights(plant), bounds, _HORIZON, terminal_set=False)
-
-
-def _weights(plant: Plant) -> Weights:
-    """The intent: one direction of angles and rates, little else."""
-    import numpy as np  # noqa: PLC0415
-
-    from impc.model.weights import Weights  # noqa: PLC0415
-
-    v = np.array([0.70, 0.65, 0.22, 0.20])
-    v /= np.linalg.norm(v)
-    Q = 1e-2 * np.eye(plant.n)
-    Q[:4, :4] = 6e5 * np.outer(v, v) + np.diag([2e4, 2e4, 500, 500])
-    return Weights(Q, 1)
-
-
-def _source(path: str, person: dict[str, Any]) -> PlantSource:
-    from impc.files.plant_sources import plant_source  # noqa: PLC0415
-
-    return plant_source(path, person)
-
-
 def _trials(
     controller: Controller, person: dict[str, Any], given: dict[str, Any]
 ) -> list[SubjectTrial]:
     import numpy as np  # noqa: PLC0415
 
-    from impc.files.plant_sources import import_function  # noqa: PLC0415
+    from impc.files.plant_sources import import_function, plant_source  # noqa: PLC0415
     from impc.studies.simulated_people import simulate_subject  # noqa: PLC0415
 
-    torque, step = import_function(_TORQUE), _source(_STEP, person).make(**person)
+    torque, step = import_function(TORQUE), plant_source(STEP, person).make(**person)
     seeds = np.random.SeedSequence(given["seed"]).spawn(given["trials"])
     return [
         simulate_subject(
@@ -187,17 +150,8 @@ def _encoded(name: str, trial: SubjectTrial, wanted: Sequence[str]) -> dict[str,
 
     from impc.files.formats import encode_table  # noqa: PLC0415
     from impc.files.matlab73 import matlab73_bytes  # noqa: PLC0415
-    from impc.files.table import make_table  # noqa: PLC0415
 
-    degrees = np.degrees(trial.outputs)
-    columns = {
-        "time": trial.time,
-        "seat_angle": degrees[:, 0],
-        "trunk_angle": degrees[:, 1],
-        "perturbation": trial.disturbance[:, 0],
-    }
-    units = {"time": "s", "seat_angle": "deg", "trunk_angle": "deg", "perturbation": "Nm"}
-    table = make_table(name, columns, units=units, rate=_RATE)
+    table = seat_table(name, np.degrees(trial.outputs), trial.disturbance[:, 0], _RATE)
     files = {
         f"{name}{ending}": encode_table(ending, table)
         for key, ending in _ENDINGS.items()
@@ -212,7 +166,7 @@ def _truth(controller: Controller, given: dict[str, Any]) -> dict[str, Any]:
     """What a fit of these recordings should find."""
     import importlib.metadata  # noqa: PLC0415
 
-    weights = _weights(controller.plant)
+    weights = seat_weights(controller.plant)
     return {
         "impc": importlib.metadata.version("impc"),
         "states": list(controller.plant.states),
@@ -233,26 +187,14 @@ time = "time"
 subject = "simulated"
 pattern = "trial_(?P<trial>[0-9]+)(_v73)?"
 
-[signals.theta1]
-column = "seat_angle"
-unit = "deg"
-limit = 12.0                 # mechanical stop, in this unit
-
-[signals.theta2]
-column = "trunk_angle"
-unit = "deg"
-
-[signals.perturbation]
-column = "perturbation"
-unit = "N*m"
-
+{SIGNALS.replace("LIMIT", _STOP)}
 [plant]
 mass = {person["mass"]}
 height = {person["height"]}
 sex = "{person["sex"]}"
 
 [fit]
-horizon = {_HORIZON}                 # samples of 0.01 s
+horizon = {HORIZON}                 # samples of 0.01 s
 u_max = {given["torque_limit"]}                  # N m
 """
 

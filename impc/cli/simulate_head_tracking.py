@@ -10,6 +10,7 @@ import click
 
 from impc.cli.numbers import Number
 from impc.cli.options import out_option, seed_option
+from impc.cli.seat import numbered
 
 __all__ = ["head_tracking"]
 
@@ -23,20 +24,12 @@ _SPREAD, _VISIT, _VAF = 0.25, 0.05, (82.3, 7.7)
 @click.command("head-tracking")
 @out_option("head-data", "the recordings, study.toml and truth.json")
 @click.option(
-    "--axis",
-    type=click.Choice(["yaw", "pitch"]),
-    default="yaw",
-    help="Of the head's rotation.",
+    "--axis", type=click.Choice(["yaw", "pitch"]), default="yaw", help="Of the head's rotation."
 )
 @click.option("--subjects", type=click.IntRange(1, 999), default=10, help="How many.")
 @click.option("--visits", type=click.IntRange(1, 9), default=1, help="Of each subject.")
 @click.option("--trials", type=click.IntRange(1, 9), default=3, help="Of each visit.")
-@click.option(
-    "--duration",
-    type=Number(5, 300),
-    default=30.0,
-    help="Of a trial, s.",
-)
+@click.option("--duration", type=Number(5, 300), default=30.0, help="Of a trial, s.")
 @seed_option
 def head_tracking(out: Path, **given: Any) -> None:
     """Ten subjects of chapter 4; --subjects 40 --visits 2 for chapter 5.
@@ -68,9 +61,7 @@ def head_tracking(out: Path, **given: Any) -> None:
                 return theta
 
     truth: dict[str, Any] = {}
-    width = max(2, len(str(given["subjects"])))
-    for number in range(given["subjects"]):
-        name = f"{number + 1:0{width}d}"
+    for name in numbered(given["subjects"]):
         own = drawn(typical, _SPREAD)
         truth[name] = dict(zip(model.names, own.tolist(), strict=True))
         for visit in range(1, given["visits"] + 1):

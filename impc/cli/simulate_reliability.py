@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-from tqdm import tqdm
 
 from impc.cli.options import out_option, seed_option
-from impc.cli.simulate_cohort import random_person
+from impc.cli.seat import PLANT, SIGNALS, TORQUE, numbered, random_person, seat_table, seat_weights
 
 if TYPE_CHECKING:
     import numpy as np
@@ -21,7 +19,6 @@ if TYPE_CHECKING:
 
 __all__ = ["reliability_study"]
 
-_PLANT, _TORQUE = "plants:seated_balance_for", "plants:ternary_torque"
 _RATE = 100.0
 # 242 steps of 0.12 s: one whole period of the register, so that its lines are lines.
 _DWELL, _DURATION = 0.12, 242 * 0.12
@@ -43,12 +40,7 @@ _LEAN = (0.1, 0.8)
 @out_option("reliability-data", "the recordings, study.toml and truth.json")
 @click.option("--subjects", type=click.IntRange(2, 999), default=30, help="How many.")
 @click.option("--visits", type=click.IntRange(2, 9), default=3, help="Of each subject.")
-@click.option(
-    "--trials",
-    type=click.IntRange(2, 9),
-    default=3,
-    help="Of each visit and condition.",
-)
+@click.option("--trials", type=click.IntRange(2, 9), default=3, help="Of each visit and condition.")
 @seed_option
 def reliability_study(out: Path, **given: Any) -> None:
     """Thirty subjects, three visits, three conditions and three trials on the seat.
@@ -65,37 +57,37 @@ def reliability_study(out: Path, **given: Any) -> None:
     require_writable(out)
     rng = np.random.default_rng(given["seed"])
     torque = np.asarray(
-        import_function(_TORQUE)(dwell=_DWELL, duration=_DURATION, rate=_RATE), dtype=np.float64
+        import_function(TORQUE)(dwell=_DWELL, duration=_DURATION, rate=_RATE), dtype=np.float64
     )
-    width = max(2, len(str(given["subjects"])))
     truth: dict[str, Any] = {}
-    numbers = range(given["subjects"])
-    with tqdm(numbers, unit="subject", file=sys.stderr, disable=None, leave=False) as bar:
-        for number in bar:
-            name = f"{number + 1:0{width}d}"
-            plant = make_plant(plant_source(_PLANT, random_person(rng)), ("perturbation",))
-            price, sway = np.exp(np.array([_PRICE, _SWAY]) * rng.standard_normal(2))
-            truth[name] = {"price": float(price), "sway": float(sway)}
-            for visit in range(given["visits"]):
-                files: dict[str, bytes] = {}
-                lean = np.array(_LEAN) * rng.standard_normal(2)
-                for condition in _CONDITIONS:
-                    here, level = np.exp(_VISIT * rng.standard_normal(2)) * (price, sway)
-                    level *= float(np.exp(_LEARNING * visit))
-                    cell = _cell(plant, torque, condition, (float(here), level), lean, given, rng)
-                    stem = f"sub-{name}_ses-{visit + 1}_task-{condition}"
-                    files |= {
-                        f"{stem}_run-{run + 1}_motion.csv": content
-                        for run, content in enumerate(cell)
-                    }
-                write_files(out / f"sub-{name}" / f"ses-{visit + 1}", files)
+    for name in numbered(given["subjects"]):
+        plant = make_plant(plant_source(PLANT, random_person(rng)), ("perturbation",))
+        price, sway = np.exp(np.array([_PRICE, _SWAY]) * rng.standard_normal(2))
+        truth[name] = {"price": float(price), "sway": float(sway)}
+        for visit in range(given["visits"]):
+            files: dict[str, bytes] = {}
+            lean = np.array(_LEAN) * rng.standard_normal(2)
+            for condition in _CONDITIONS:
+                here, level = np.exp(_VISIT * rng.standard_normal(2)) * (price, sway)
+                level *= float(np.exp(_LEARNING * visit))
+                cell = _cell(plant, torque, condition, (float(here), level), lean, given, rng)
+                stem = f"sub-{name}_ses-{visit + 1}_task-{condition}"
+                for run, content in enumerate(cell, 1):
+                    files[f"{stem}_run-{run}_motion.csv"] = content
+            write_files(out / f"sub-{name}" / f"ses-{visit + 1}", files)
     settings = {
         "price": _PRICE, "sway": _SWAY, "visit": _VISIT, "trial": _TRIAL, "learning": _LEARNING,
         "lean": _LEAN,
         "conditions": _CONDITIONS, **given,
     }  # fmt: skip
     text = json.dumps({"settings": settings, "subjects": truth}, indent=1) + "\n"
-    write_files(out, {"study.toml": _STUDY.encode(), "truth.json": text.encode()})
+    write_files(
+        out,
+        {
+            "study.toml": (_STUDY + SIGNALS.replace("LIMIT", "")).encode(),
+            "truth.json": text.encode(),
+        },
+    )
     click.echo(f"{given['subjects']} subjects, {given['visits']} visits: {out / 'study.toml'}")
 
 
@@ -112,29 +104,16 @@ def _cell(
     import numpy as np  # noqa: PLC0415
 
     from impc.files.formats import encode_table  # noqa: PLC0415
-    from impc.files.table import make_table  # noqa: PLC0415
     from impc.model.riccati import solve_lqr  # noqa: PLC0415
-    from impc.model.weights import Weights  # noqa: PLC0415
 
     (price, sway), (factor, own, noise) = size, _CONDITIONS[condition]
-    v = np.array([0.70, 0.65, 0.22, 0.20])
-    v /= np.linalg.norm(v)
-    Q = 1e-2 * np.eye(plant.n)
-    Q[:4, :4] = factor * price * (6e5 * np.outer(v, v) + np.diag([2e4, 2e4, 500, 500]))
-    K = solve_lqr(plant, Weights(Q, 1)).K
+    K = solve_lqr(plant, seat_weights(plant, factor * price)).K
     files = []
     for _ in range(given["trials"]):
         here = own * sway * float(np.exp(_TRIAL * rng.standard_normal()))
         outputs = lean + np.degrees(_simulated(plant, K, torque, here, rng))
         outputs += np.array(noise) * rng.standard_normal(outputs.shape)
-        columns = {
-            "time": np.arange(len(torque)) / _RATE,
-            "seat_angle": outputs[:, 0],
-            "trunk_angle": outputs[:, 1],
-            "perturbation": torque,
-        }
-        units = {"time": "s", "seat_angle": "deg", "trunk_angle": "deg", "perturbation": "Nm"}
-        table = make_table("trial", columns, units=units, rate=_RATE)
+        table = seat_table("trial", outputs, torque, _RATE)
         files.append(encode_table(".csv", table))
     return files
 
@@ -168,15 +147,4 @@ bids = "."                       # folders and files that are named sub-, ses-, 
 [recording]
 time = "time"
 
-[signals.theta1]
-column = "seat_angle"
-unit = "deg"
-
-[signals.theta2]
-column = "trunk_angle"
-unit = "deg"
-
-[signals.perturbation]
-column = "perturbation"
-unit = "N*m"
 """

@@ -10,6 +10,7 @@ from impc.files.configuration import read_configuration
 from impc.files.inputs import gather_inputs
 from impc.files.plant_sources import make_plant, plant_family_of
 from impc.files.reading import read_recordings
+from impc.reporting.provenance import Provenance
 from impc.studies.fit.settings import fit_settings
 from impc.studies.fit.subject import fit_problem
 
@@ -37,19 +38,34 @@ class Subject:
         Of the plant.
     inputs : Inputs
         Digests of all files that went in.
+    command : str
+        The command line, without folders.
+    files : tuple of str
+        Names of the recordings.
     """
 
     problem: Problem
     settings: FitSettings
     source: PlantSource
     inputs: Inputs
+    command: str
+    files: tuple[str, ...]
+
+    @property
+    def provenance(self) -> Provenance:
+        """Where what is made of it now comes from."""
+        source = self.source
+        arguments = dict(source.arguments)
+        return Provenance(source.name, self.command, arguments, self.files, self.inputs)
 
 
-def read_subject(files: Sequence[Path], plant_name: str, config: Path) -> Subject:
+def read_subject(command: str, files: Sequence[Path], plant_name: str, config: Path) -> Subject:
     """Read recordings, one file a trial.
 
     Parameters
     ----------
+    command : str
+        Which command asks for them.
     files : sequence of Path
         The recordings.
     plant_name : str
@@ -70,4 +86,7 @@ def read_subject(files: Sequence[Path], plant_name: str, config: Path) -> Subjec
     family = plant_family_of(source, recorded, settings.free)
     recordings = read_recordings(files, configuration, plant)
     inputs = gather_inputs(files, config, source.name, source.arguments)
-    return Subject(fit_problem(plant, recordings, settings, family), settings, source, inputs)
+    names = tuple(path.name for path in files)
+    line = f"impc {command} {' '.join(names)} --plant {plant_name} --config {config.name}"
+    problem = fit_problem(plant, recordings, settings, family)
+    return Subject(problem, settings, source, inputs, line, names)

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import msgspec
 
-from impc.errors import InputError
-from impc.files.names import require_ordinary, shown
+from impc.errors import InputError, brief
+from impc.files.names import require_ordinary
 from impc.files.units import si_unit
 
 if TYPE_CHECKING:
@@ -163,8 +163,8 @@ def read_configuration(path: Path | str, *more: str) -> Configuration:
     _check_recording(source, recording)
     signals = {}
     for name, table in tables["signals"].items():
-        signals[name] = _convert(source, f"signals.{shown(name)}", table, SignalTable)
-        _check_signal(source, f"signals.{shown(name)}", signals[name])
+        signals[name] = _convert(source, f"signals.{brief(name, 80)}", table, SignalTable)
+        _check_signal(source, f"signals.{brief(name, 80)}", signals[name])
     if not signals:
         raise InputError(
             f"{source}: signals", "names no signal", "write a table [signals.NAME] for each"
@@ -188,7 +188,7 @@ def _parsed(source: str, path: Path) -> dict[str, Any]:
         raise InputError(source, "is not UTF-8 text", "save it as UTF-8") from None
     except ValueError as error:  # an integer of 5000 digits is no TOMLDecodeError
         raise InputError(
-            source, f"is not TOML ({shown(str(error), 160)})", "correct that line"
+            source, f"is not TOML ({brief(str(error), 160)})", "correct that line"
         ) from None
     except RecursionError:
         raise InputError(source, "is nested too deep", "give a plain TOML file") from None
@@ -200,7 +200,7 @@ def _require_known(source: str, place: str, table: Mapping[str, Any], known: Ite
         if key not in names:
             near = difflib.get_close_matches(key, names, n=1, cutoff=0.5)
             remedy = f"did you mean {near[0]}?" if near else f"known: {', '.join(names)}"
-            where = f"{place}.{shown(key)}" if place else shown(key)
+            where = f"{place}.{brief(key, 80)}" if place else brief(key, 80)
             raise InputError(f"{source}: {where}", "is not known", remedy)
 
 
@@ -237,7 +237,7 @@ def _check_recording(source: str, table: RecordingTable) -> None:
         "second"
     ):
         raise refuse(
-            "time_unit", f"{shown(table.time_unit)!r} is no time", 'write "s", "ms" or "us"'
+            "time_unit", f"{brief(table.time_unit, 80)!r} is no time", 'write "s", "ms" or "us"'
         )
     if table.pattern is not None:
         _check_pattern(refuse, table, table.pattern)
@@ -250,12 +250,12 @@ def _check_pattern(refuse: Any, table: RecordingTable, pattern: str) -> None:
             groups = re.compile(pattern).groupindex
     except (re.error, OverflowError, RecursionError) as error:
         raise refuse(
-            "pattern", f"is no regular expression ({shown(str(error))})", "correct it"
+            "pattern", f"is no regular expression ({brief(str(error), 80)})", "correct it"
         ) from None
     if not groups or not set(groups) <= set(_LABELS):
         named = ", ".join(f"(?P<{name}>...)" for name in _LABELS)
         raise refuse(
-            "pattern", f"has the groups {shown(str(list(groups)))}", f"name some of {named}"
+            "pattern", f"has the groups {brief(str(list(groups)), 80)}", f"name some of {named}"
         )
     for name in groups:
         if getattr(table, name):

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.errors import InputError
+from impc.files.columns import in_columns
 from impc.files.configuration import UNKNOWN_UNIT
 from impc.files.units import si_unit
 
@@ -33,15 +34,7 @@ _ALIKE = 0.6  # theta1 and theta_2 are, push and perturbation are not
 def summary(table: Table) -> str:
     """A table of the columns: unit, samples, range, mean, missing, and a rate where it rises."""
     heads = ("column", "unit", "samples", "min", "max", "mean", "not finite", "rate")
-    rows = [heads, *(_row(table, name) for name in table.columns)]
-    widths = [max(len(row[index]) for row in rows) for index in range(len(heads))]
-    lines = [
-        "  ".join(
-            item.ljust(width) if index < 2 else item.rjust(width)
-            for index, (item, width) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in rows
-    ]
+    lines = [in_columns([heads, *(_row(table, name) for name in table.columns)], left=2)]
     if table.rate is not None:
         lines.append(f"The file says {table.rate:g} samples per second.")
     lines += [f"Not read: {name} {reason}" for name, reason in table.skipped.items()]

@@ -5,12 +5,12 @@ from __future__ import annotations
 import stat
 from typing import TYPE_CHECKING
 
-from impc.errors import DataError, ImpcError
+from impc.errors import DataError, ImpcError, brief
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-__all__ = ["LARGEST", "damaged", "require_ordinary", "shown"]
+__all__ = ["LARGEST", "damaged", "require_ordinary"]
 
 #: Bytes of a file, and of its arrays in memory: an hour of 16 channels at 2 kHz.
 LARGEST = 1_000_000_000
@@ -74,22 +74,8 @@ def damaged(source: str, fault: Exception) -> DataError:
     fault : Exception
         Of any kind: struct.error, KeyError, AssertionError.
     """
-    reason = shown(" ".join(str(fault).split()), 120) or type(fault).__name__
+    reason = brief(" ".join(str(fault).split()), 120) or type(fault).__name__
     return DataError(source, f"is damaged and cannot be read ({reason})", "copy or export it again")
-
-
-def shown(text: str, most: int = 80) -> str:
-    """A text of somebody else's in one line of ours.
-
-    Parameters
-    ----------
-    text : str
-        A name, a key, the message of a library.
-    most : int
-        Characters after which it is cut.
-    """
-    line = "".join(mark if mark.isprintable() else " " for mark in text[: 10 * most]).strip()
-    return line if len(line) <= most else f"{line[: most - 3]}..."
 
 
 def _size(size: int) -> str:

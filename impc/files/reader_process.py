@@ -19,8 +19,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from impc.errors import ImpcError
-from impc.files.names import damaged, shown
+from impc.errors import ImpcError, brief
+from impc.files.names import damaged
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -148,7 +148,7 @@ def _matrices(found: dict[str, Any]) -> tuple[dict[str, Any], Iterable[Array]]:
 def _refused(request: dict[str, Any], error: ImpcError) -> dict[str, Any]:
     """The parts of an error, with the file's name as the user gave it."""
     subject = error.subject.replace(request["path"], request["source"], 1)
-    return {"refused": [subject, shown(error.problem, 300), error.remedy]}
+    return {"refused": [subject, brief(error.problem, 300), error.remedy]}
 
 
 def _send(answers: BinaryIO, reply: dict[str, Any], columns: Iterable[Array]) -> None:

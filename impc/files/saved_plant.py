@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 import control
 import numpy as np
 
-from impc.errors import ImpcError, InputError
+from impc.errors import ImpcError, InputError, brief
 from impc.files.apart import matrices_apart
-from impc.files.names import require_ordinary, shown
+from impc.files.names import require_ordinary
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -85,7 +85,9 @@ def state_space(name: str, given: Mapping[str, Any]) -> Any:
     subject = f"plant {name}"
     unknown = [key for key in given if key not in (*_MATRICES, "dt", *_NAMES)]
     if unknown:
-        raise InputError(subject, f"does not know {shown(unknown[0])}", f"names: {list(_NAMES)}")
+        raise InputError(
+            subject, f"does not know {brief(unknown[0], 80)}", f"names: {list(_NAMES)}"
+        )
     matrices = {key: _matrix(subject, key, given[key]) for key in _MATRICES if key in given}
     dt = _matrix(subject, "dt", given["dt"])
     if dt.size != 1 or not math.isfinite(dt.item()):

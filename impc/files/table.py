@@ -10,7 +10,6 @@ import numpy as np
 
 from impc.arrays import Frozen, frozen
 from impc.errors import DataError
-from impc.files.names import shown
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -86,13 +85,11 @@ def make_table(
     >>> table.samples, dict(table.units)
     (2, {'tilt': 'deg'})
     """
-    given, columns = columns, {shown(name, _LONGEST): value for name, value in columns.items()}
+    given, columns = columns, {_line(name): value for name, value in columns.items()}
     if len(columns) < len(given):
         raise DataError(source, "has two columns of one name", "give each its own")
-    units = {shown(name, _LONGEST): shown(unit, _LONGEST) for name, unit in (units or {}).items()}
-    left_out = {
-        shown(name, _LONGEST): shown(reason, _LONGEST) for name, reason in (skipped or {}).items()
-    }
+    units = {_line(name): _line(unit) for name, unit in (units or {}).items()}
+    left_out = {_line(name): _line(reason) for name, reason in (skipped or {}).items()}
     lengths = Counter(len(values) for values in columns.values() if len(values) > 1)
     if not lengths:
         left_out |= {name: f"has {len(values)} values" for name, values in columns.items()}
@@ -110,3 +107,9 @@ def make_table(
             left_out[name] = f"has {len(values)} values where most columns have {usual}"
     told = {name: unit for name, unit in units.items() if name in kept and unit}
     return Table(source, kept, told, rate, left_out)
+
+
+def _line(text: str) -> str:
+    """A name or a unit of a file's, of printable signs."""
+    line = "".join(mark if mark.isprintable() else " " for mark in text[: 10 * _LONGEST]).strip()
+    return line if len(line) <= _LONGEST else f"{line[: _LONGEST - 3]}..."

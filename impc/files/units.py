@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from impc.checking import checked
-from impc.errors import InputError
-from impc.files.names import shown
+from impc.errors import InputError, brief
 
 __all__ = ["Unit", "is_unit", "si_unit"]
 
@@ -113,7 +112,7 @@ def _registry() -> Any:
 
 def _unknown(written: str) -> InputError:
     return InputError(
-        f"unit {shown(written, 40)!r}",
+        f"unit {brief(written, 40)!r}",
         "is not known",
         'write it as in "deg", "rad/s", "N*m", "mV", "1"',
     )

@@ -1,41 +1,21 @@
-"""What the pages share: the template environment, pictures inside a page, numbers in a cell."""
+"""What the pages share: the template environment, numbers in a cell, values as JSON has them."""
 
 from __future__ import annotations
 
-import base64
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-__all__ = ["TextTable", "embedded", "number", "plain", "render_template"]
-
-
-@dataclass(frozen=True)
-class TextTable:
-    """A table of texts.
-
-    Attributes
-    ----------
-    caption : str
-        Above the table.
-    heads : tuple of str
-        One a column.
-    rows : tuple of tuple of str
-        Their first cell is a head of its own.
-    """
-
-    caption: str
-    heads: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
+__all__ = ["number", "plain", "render_template"]
 
 
 def render_template(name: str, **values: Any) -> str:
     """Render a template of this package; all `values` that enter it are escaped.
 
-    Templates of this folder go by their name, others by their path: "studies/fit/fit_page.html".
+    Templates of this folder go by their name, others by their path, such as
+    "studies/example/example_page.html".
     """
     here = Path(__file__).parent
     environment = Environment(
@@ -46,11 +26,6 @@ def render_template(name: str, **values: Any) -> str:
         lstrip_blocks=True,
     )
     return _encodable(environment.get_template(name).render(**values))
-
-
-def embedded(png: bytes) -> str:
-    """The picture `png` as the address of an <img> that needs no other file."""
-    return "data:image/png;base64," + base64.b64encode(png).decode("ascii")
 
 
 def number(value: float, digits: int = 3) -> str:

@@ -21,7 +21,7 @@ from matplotlib.ticker import FixedFormatter, FuncFormatter
 from impc.errors import one_line
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Mapping
 
     from matplotlib.ticker import Formatter
 
@@ -36,6 +36,7 @@ __all__ = [
     "STATE_MARKS",
     "VERMILLION",
     "Mark",
+    "drawn",
     "journal_style",
     "new_figure",
     "render",
@@ -116,6 +117,23 @@ def new_figure(width: float, height: float) -> Figure:
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
+
+
+def drawn(figures: Mapping[str, Figure], *, mathematics: bool = False) -> dict[str, bytes]:
+    """Each of the `figures` as PNG and PDF, by the name of its file.
+
+    Parameters
+    ----------
+    figures : mapping of str to Figure
+        By their names without an ending.
+    mathematics : bool
+        As for `render`.
+    """
+    return {
+        f"{name}.{kind}": content
+        for name, figure in figures.items()
+        for kind, content in render(figure, mathematics=mathematics).items()
+    }
 
 
 def render(figure: Figure, *, mathematics: bool = False) -> dict[str, bytes]:

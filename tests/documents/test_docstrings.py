@@ -62,6 +62,7 @@ PLUMBING = {
     ),
     "import paths": ("impc.studies.selection.model_source",),
     "queues and settings of a study": (
+        "impc.studies.cache",
         "impc.studies.selection.queue",
         "impc.studies.selection.settings",
     ),

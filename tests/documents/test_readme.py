@@ -8,7 +8,7 @@ import pytest
 
 from impc.model.plant import Plant
 from impc.studies.example.cases import run_case
-from impc.studies.example.table import text_table
+from impc.studies.example.table import methods_table
 from tests.documents.blocks import PAGES, blocks
 
 # What is to be the first Python of the README: `estimate` and `report` are not there yet. When they
@@ -55,7 +55,7 @@ def test_the_first_lines_are_the_two_commands() -> None:
 def test_the_table_is_what_comes_out(example_plant: Plant) -> None:
     texts = (block.text for block in blocks("README.md") if block.language == "text")
     shown = next(text for text in texts if "feedback_gain" in text)
-    found = text_table(run_case(example_plant, "A"))
+    found = methods_table(run_case(example_plant, "A")).text()
     shown_rows, found_rows = shown.splitlines(), found.splitlines()
     assert len(shown_rows) == len(found_rows)
     assert shown_rows[0].split() == found_rows[0].split()

@@ -243,7 +243,7 @@ def test_matrices_that_are_no_plant(
         ({"states": {"x": 1}}, "that are not names"),
         ({"states": [["x"], []]}, "names 1 states"),
         ({"states": ["x", None]}, "that are not names"),
-        ({"state\x1bs": ["x", "v"]}, "does not know state s"),
+        ({"state\x1bs": ["x", "v"]}, r"does not know state\\x1bs"),
     ],
 )
 def test_names_that_are_not_those_of_the_plant(

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import psutil
 
 from impc.files.digests import versions
+from impc.reporting.writer import write_files
 from impc.studies.cohort.unit_task import FitTask, fit_unit, replicate_unit
 
 if TYPE_CHECKING:
@@ -26,29 +27,13 @@ if TYPE_CHECKING:
     from impc.studies.cohort.study import Study, Unit
     from impc.studies.cohort.workers import Done, Workers
 
-__all__ = ["Failures", "Progress", "run_study", "work_left"]
+__all__ = ["Failures", "run_study", "work_left"]
 
 # Tasks given out for each thread of the cluster: one that runs, and two that wait for it.
 _AHEAD = 3
 _FIT = -1
 # What a replicate needs of its fit.
 _NEEDED = ("starts", "logarithms", "K", "S", "Q", "R")
-
-
-@dataclass(frozen=True)
-class Progress:
-    """What a caller is told.
-
-    Attributes
-    ----------
-    done : callable
-        (unit, what was done, seconds of the task).
-    log : callable
-        A line for the log.
-    """
-
-    done: Callable[[str, str, float], None] = lambda *_: None
-    log: Callable[[str], None] = lambda _: None
 
 
 @dataclass
@@ -114,7 +99,8 @@ def run_study(
     tasks: Mapping[str, FitTask],
     store: Store,
     workers: Workers,
-    progress: Progress | None = None,
+    done: Callable[[str], None] = lambda _: None,
+    log: Callable[[str], None] = lambda _: None,
 ) -> Failures:
     """Do what is left of a study.
 
@@ -126,7 +112,10 @@ def run_study(
     store : Store
         Held open by this run.
     workers : Workers
-    progress : Progress, optional
+    done : callable
+        Told each unit and what was done to it.
+    log : callable
+        Told what goes to the log.
 
     Raises
     ------
@@ -135,14 +124,13 @@ def run_study(
     OutputError
         When a result cannot be written.
     """
-    progress = progress or Progress()
-    run = _Run(study, tasks, store, workers, progress)
+    run = _Run(study, tasks, store, workers, done, log)
     for unit in study.units:
         if unit.name in tasks:
             run.begin(unit)
     manifest = json.dumps(_manifest(study, tasks), indent=1, sort_keys=True) + "\n"
-    store.write("manifest.json", manifest.encode())
-    progress.log(f"run of {len(study.units)} units on {workers.threads} threads")
+    write_files(store.folder, {"manifest.json": manifest.encode()})
+    log(f"run of {len(study.units)} units on {workers.threads} threads")
     run.drain()
     return run.failures
 
@@ -156,9 +144,11 @@ class _Run:
         tasks: Mapping[str, FitTask],
         store: Store,
         workers: Workers,
-        progress: Progress,
+        done: Callable[[str], None],
+        log: Callable[[str], None],
     ) -> None:
-        self.store, self.workers, self.progress, self.tasks = store, workers, progress, tasks
+        self.store, self.workers, self.tasks = store, workers, tasks
+        self.done, self.log = done, log
         self.count = int(study.configuration.fit.get("replicates", 0))
         self.queue: deque[_Work] = deque()
         self.out = 0
@@ -202,7 +192,7 @@ class _Run:
         else:
             self.failures.replicates.setdefault(work.unit, {})[work.index + 1] = reason
             self.store.keep_failure(work.unit, work.index, reason)
-        self.progress.log(f"{work.unit}: {work.name}: {reason}")
+        self.log(f"{work.unit}: {work.name}: {reason}")
 
     def _fill(self) -> None:
         most = _AHEAD * self.workers.threads
@@ -228,9 +218,9 @@ class _Run:
 
     def _tell(self, work: _Work, content: dict[str, Any]) -> None:
         seconds = float(content.get("seconds", 0.0))
-        self.progress.done(work.unit, work.name, seconds)
+        self.done(f"{work.unit} {work.name}")
         here = psutil.Process(os.getpid()).memory_info().rss / 1e6
-        self.progress.log(
+        self.log(
             f"{work.unit}: {work.name} in {seconds:.2f} s; memory of worker "
             f"{content.get('memory_mb', float('nan')):.0f} MB, of client {here:.0f} MB"
         )

@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-import json
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
+from markupsafe import Markup
 
 from impc.errors import DataError
-from impc.reporting.rendering import TextTable, embedded, number, plain, render_template
-from impc.reporting.style import journal_style, render
+from impc.reporting.document import Block, Lines, Picture, Report, Section, TextTable
+from impc.reporting.rendering import number
+from impc.reporting.style import drawn, journal_style
+from impc.reporting.writer import write_files
 from impc.studies.cohort.comparison import compare_cohort, measures_of
 from impc.studies.cohort.figures import group_figure, memory_figure, subject_figure
 from impc.studies.cohort.study import safe_name
 from impc.studies.cohort.tables import cohort_tables, table_bytes
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from impc.studies.cohort.comparison import Comparison
     from impc.studies.cohort.engine import Failures
     from impc.studies.cohort.store import Store
@@ -32,6 +32,16 @@ _QUESTIONS = {
     "change": ("Do groups change differently from visit to visit?", "Hedges' g"),
     "reliability": ("Reliability between visits, ICC(A,1)", ""),
 }
+_GROUPS = Picture(
+    "groups",
+    "Measures of every unit by group",
+    "Every unit, by group; bars are means. The measures that differ most.",
+)
+_MEMORY = Picture(
+    "memory",
+    "Memory of workers and client over the run",
+    "Memory of the worker that did each task, and of the client.",
+)
 
 
 def write_report(study: Study, store: Store, failures: Failures, command: str) -> None:
@@ -53,76 +63,96 @@ def write_report(study: Study, store: Store, failures: Failures, command: str) -
         When a file cannot be written.
     """
     tables = cohort_tables(study, store)
-    for name, table in tables.items():
-        store.write(f"{name}.csv", table_bytes(table))
+    units = tables["units"]
     try:
-        compared = compare_cohort(tables["units"])
+        compared = compare_cohort(units)
     except DataError:
         compared = ()
     rows = [item.__dict__ for item in compared]
-    store.write("comparisons.csv", table_bytes(pd.DataFrame(rows)))
     subjects: dict[str, list[Unit]] = {}
     for unit in study.units:
         subjects.setdefault(unit.subject, []).append(unit)
-    for subject, units in subjects.items():
-        page = _subject_page(subject, units, store, failures)
-        store.write(f"subjects/sub-{safe_name(subject)}.html", page.encode())
-    page = _page(study, store, tables, compared, subjects, failures, command)
-    store.write("report.html", page.encode())
-    content = {
-        "command": command,
-        "units": len(study.units),
-        "fitted": len(tables["units"]),
-        "failed": failures.units,
-        "failed_replicates": failures.replicates,
-        "digests": store.digests,
-        "comparisons": rows,
-    }
-    store.write("result.json", (json.dumps(plain(content), indent=1) + "\n").encode())
+    for subject, own in subjects.items():
+        # One after the other: the figures of a thousand subjects would fill the memory.
+        write_files(store.folder, _subject_files(subject, own, store, failures))
+    figures = _figures(store, units, compared)
+    report = Report(
+        "impc cohort",
+        "A cohort",
+        (_summary(study, tables, subjects, failures), Lines(_findings(compared))),
+        [
+            *([Section("Not fitted", (Lines(failures.lines),))] if failures.lines else ()),
+            Section("1. Groups and visits", _comparisons(compared, figures)),
+            Section("2. Subjects", _subjects(subjects, units)),
+            Section("3. The run", _run(figures, command)),
+        ],
+        figures=figures,
+        data={
+            "command": command,
+            "units": len(study.units),
+            "fitted": len(units),
+            "failed": failures.units,
+            "failed_replicates": failures.replicates,
+            "digests": store.digests,
+            "comparisons": rows,
+        },
+    )
+    tables["comparisons"] = pd.DataFrame(rows)
+    numbers = {f"{name}.csv": table_bytes(table) for name, table in tables.items()}
+    write_files(store.folder, numbers | report.files())
 
 
-def _page(
+def _comparisons(compared: tuple[Comparison, ...], figures: dict[str, bytes]) -> list[Block]:
+    blocks: list[Block] = [
+        "Gains are what the recordings give. Prices (centre_price) are those of the analytic "
+        "centre of all weights with the same gain: a choice, the same for every subject. Holm's "
+        "correction is over the measures of one question."
+    ]
+    if "groups.png" in figures:
+        blocks.append(_GROUPS)
+    return blocks + _comparison_tables(compared)
+
+
+def _subjects(subjects: dict[str, list[Unit]], units: pd.DataFrame) -> list[Block]:
+    links = [
+        Markup('<a href="subjects/sub-{}.html">{}</a>').format(safe_name(name), name)
+        for name in subjects
+    ]
+    table = _unit_table(units)
+    return [Markup(", ").join(links), *(() if table is None else (table,))]
+
+
+def _run(figures: dict[str, bytes], command: str) -> list[Block]:
+    said = Markup(
+        "<code>{}</code>. units.csv, replicates.csv, intervals.csv and comparisons.csv hold all "
+        "numbers, cohort.log the times."
+    ).format(command)
+    return [_MEMORY, said] if "memory.png" in figures else [said]
+
+
+def _figures(
+    store: Store, units: pd.DataFrame, compared: tuple[Comparison, ...]
+) -> dict[str, bytes]:
+    with journal_style():
+        memory = memory_figure(store.folder / "cohort.log")
+        figures = {} if memory is None else {"memory": memory}
+        if len(units):
+            figures["groups"] = group_figure(units, _most_telling(compared, units))
+        return drawn(figures)
+
+
+def _summary(
     study: Study,
-    store: Store,
     tables: dict[str, pd.DataFrame],
-    compared: tuple[Comparison, ...],
     subjects: dict[str, list[Unit]],
     failures: Failures,
-    command: str,
 ) -> str:
-    pictures = {"groups": "", "memory": ""}
-    with journal_style():
-        if len(tables["units"]):
-            measures = _most_telling(compared, tables["units"])
-            pictures["groups"] = _kept(store, "groups", group_figure(tables["units"], measures))
-        memory = memory_figure(store.folder / "cohort.log")
-        if memory is not None:
-            pictures["memory"] = _kept(store, "memory", memory)
-    count = int(study.configuration.fit.get("replicates", 0))
-    return render_template(
-        "studies/cohort/cohort_page.html",
-        summary=(
-            f"{len(tables['units'])} of {len(study.units)} units of {len(subjects)} subjects were "
-            f"fitted, {len(tables['replicates'])} bootstrap replicates of "
-            f"{count * len(tables['units'])} done, {sum(map(len, failures.replicates.values()))} "
-            "failed."
-        ),
-        findings=_findings(compared),
-        failures=failures.lines,
-        comparisons=_comparison_tables(compared),
-        units=_unit_table(tables["units"]),
-        subjects={subject: safe_name(subject) for subject in subjects},
-        pictures=pictures,
-        command=command,
+    fitted, count = len(tables["units"]), int(study.configuration.fit.get("replicates", 0))
+    return (
+        f"{fitted} of {len(study.units)} units of {len(subjects)} subjects were fitted, "
+        f"{len(tables['replicates'])} bootstrap replicates of {count * fitted} done, "
+        f"{sum(map(len, failures.replicates.values()))} failed."
     )
-
-
-def _kept(store: Store, name: str, figure: Figure) -> str:
-    """Write the figure as PNG and PDF; return it for the page."""
-    files = render(figure)
-    for kind, content in files.items():
-        store.write(f"{name}.{kind}", content)
-    return embedded(files["png"])
 
 
 def _findings(compared: tuple[Comparison, ...]) -> list[str]:
@@ -157,7 +187,7 @@ def _comparison_tables(compared: tuple[Comparison, ...]) -> list[TextTable]:
             continue
         estimate = "ICC" if question == "reliability" else "difference"
         heads = ("measure", "condition", "compared", "n", estimate, "95 %", effect or "effect")
-        tables.append(TextTable(title, (*heads, "p", "p, Holm"), tuple(rows)))
+        tables.append(TextTable(title, (*heads, "p", "p, Holm"), rows))
     return tables
 
 
@@ -194,39 +224,58 @@ def _unit_table(units: pd.DataFrame) -> TextTable | None:
     return TextTable("Every unit. units.csv has all numbers.", heads, rows)
 
 
-def _subject_page(subject: str, units: list[Unit], store: Store, failures: Failures) -> str:
-    sections: list[dict[str, Any]] = []
+def _subject_files(
+    subject: str, units: list[Unit], store: Store, failures: Failures
+) -> dict[str, bytes]:
+    """The page of a subject and the figures on it."""
+    sections: list[Section] = []
+    figures: dict[str, bytes] = {}
     for unit in units:
         fit = store.fit(unit.name)
         if fit is None:
             reason = failures.units.get(unit.name, "not fitted yet")
-            sections.append({"name": unit.name, "reason": reason})
+            sections.append(Section(unit.name, (f"Not fitted: {reason}",)))
             continue
         with journal_style():
-            picture = _kept(store, f"subjects/{unit.name}", subject_figure(fit))
-        sections.append(
-            {
-                "name": unit.name,
-                "reason": "",
-                "failed": len(failures.replicates.get(unit.name, {})),
-                "picture": picture,
-                "tables": [_fit_table(fit), _gain_table(fit)],
-                "findings": [line for trial in fit["findings"] for line in trial],
-            }
-        )
-    group = units[0].group
-    return render_template(
-        "studies/cohort/subject_page.html", subject=subject, group=group, sections=sections
+            figures |= drawn({unit.name: subject_figure(fit)})
+        sections.append(Section(unit.name, _unit_blocks(unit, fit, failures)))
+    group = f", group {units[0].group}" if units[0].group else ""
+    report = Report(
+        f"impc cohort: {subject}",
+        f"Subject {subject}{group}",
+        (Markup('<a href="../report.html">The cohort</a>'),),
+        sections,
+        figures=figures,
     )
+    files = {f"sub-{safe_name(subject)}.html": report.page().encode(), **figures}
+    return {f"subjects/{name}": content for name, content in files.items()}
+
+
+def _unit_blocks(unit: Unit, fit: dict[str, Any], failures: Failures) -> list[Block]:
+    blocks: list[Block] = [
+        Picture(
+            unit.name,
+            "Recorded and simulated outputs of the first trial",
+            "First trial. Grey: recorded. Dashed: simulated from the disturbance alone.",
+        )
+    ]
+    failed = len(failures.replicates.get(unit.name, {}))
+    if failed:
+        blocks.append(
+            f"{failed} bootstrap replicates could not be fitted; the reasons are in "
+            "failed_replicates of result.json."
+        )
+    return [
+        *blocks,
+        _fit_table(fit),
+        _gain_table(fit),
+        *(line for trial in fit["findings"] for line in trial),
+    ]
 
 
 def _fit_table(fit: dict[str, Any]) -> TextTable:
     rows = tuple(
-        (
-            name,
-            number(_nan(fit["vaf"][name]), 5),
-            number(_nan(fit["held_out_vaf"][name]), 5),
-        )
+        (name, number(_nan(fit["vaf"][name]), 5), number(_nan(fit["held_out_vaf"][name]), 5))
         for name in fit["outputs"]
     )
     return TextTable(
@@ -259,7 +308,7 @@ def _gain_table(fit: dict[str, Any]) -> TextTable:
         "condition number: a choice among all weights with the latter gain."
     )
     heads = ("entry", "gain", "deviation", "gain of the weights", "price of the state")
-    return TextTable(caption, heads, tuple(rows))
+    return TextTable(caption, heads, rows)
 
 
 def _nan(value: float | None) -> float:

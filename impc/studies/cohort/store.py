@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 from impc.errors import OutputError
 from impc.files.sealed import Kept
 from impc.files.writing import require_ordinary
-from impc.reporting.writer import owned, write_files
+from impc.reporting.writer import owned
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -98,16 +98,6 @@ class Store:
         name = "failed" if index is None else f"{_replicate(index)}-failed"
         digest = self.digests.get(unit, "")
         self._kept.keep(f"{unit}/{name}", digest, {"reason": reason})
-
-    def write(self, name: str, content: bytes) -> None:
-        """Write any other file of the folder: its `name` and `content`.
-
-        Raises
-        ------
-        OutputError
-            When that cannot be done.
-        """
-        write_files(self.folder, {name: content})
 
     def log(self, line: str) -> None:
         """Add a `line` to cohort.log.

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
+from impc.arrays import percentiles
 from impc.reporting.csv_text import csv_bytes
 
 if TYPE_CHECKING:
@@ -105,8 +106,8 @@ def _intervals(unit: Unit, fit: dict[str, Any], drawn: pd.DataFrame) -> list[dic
     rows = []
     for name in drawn.columns:
         # Replicates stay where the search began along what is not told: their spread says nothing.
-        ends = [0.5 - _LEVEL / 2, 0.5 + _LEVEL / 2]
-        low, high = np.quantile(drawn[name], ends) if told.get(name, True) else (np.nan, np.nan)
+        known = told.get(name, True)
+        low, high = percentiles(drawn[name], _LEVEL) if known else (np.nan, np.nan)
         rows.append(
             _labels(unit)
             | {

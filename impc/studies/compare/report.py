@@ -1,16 +1,16 @@
-"""All files of a comparison of methods: page, table as CSV, result.json, one figure."""
+"""The report of a comparison of methods: page, table as CSV, result.json, one figure."""
 
 from __future__ import annotations
 
-import json
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from markupsafe import Markup
 
 from impc.inverse.methods import METHODS
-from impc.reporting.csv_text import csv_bytes
-from impc.reporting.rendering import TextTable, embedded, number, plain, render_template
-from impc.reporting.style import BLUE, DOUBLE_COLUMN, INK, journal_style, new_figure, render
+from impc.reporting.document import Lines, Picture, Report, Section, Terms, TextTable
+from impc.reporting.rendering import number
+from impc.reporting.style import BLUE, DOUBLE_COLUMN, INK, drawn, journal_style, new_figure
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -18,47 +18,61 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from impc.inverse.problem import Problem
-    from impc.reporting.provenance import FitProvenance
+    from impc.reporting.provenance import Provenance
     from impc.studies.compare.subject import MethodComparison
 
-__all__ = ["compare_files", "text_table"]
+__all__ = ["compare_report", "methods_table"]
+
+_PICTURE = Picture(
+    "comparison",
+    "VAF in and out of sample and largest command of every method",
+    "Left: variance accounted for, mean over outputs; filled, all trials; open, trials left out. "
+    "Bars that would be negative end at zero. Right: largest command; the dotted line is the "
+    "subject's bound, hatched bars exceed it.",
+)
 
 
-def compare_files(
-    problem: Problem, compared: Sequence[MethodComparison], provenance: FitProvenance
-) -> dict[str, bytes]:
-    """Build all files; nothing is written."""
+def compare_report(
+    problem: Problem, compared: Sequence[MethodComparison], provenance: Provenance
+) -> Report:
+    """Page, result.json, comparison.csv and the figure."""
+    subject = str(problem.recordings[0].label.subject) or "a subject"
+    methods = [METHODS[item.name] for item in compared]
     with journal_style():
-        pictures = render(_figure(problem, compared))
-    page = render_template(
-        "studies/compare/compare_page.html",
-        title=str(problem.recordings[0].label.subject) or "a subject",
-        findings=_findings(compared),
-        methods=_methods(problem, compared),
-        weights=_weights(problem, compared),
-        source=embedded(pictures["png"]),
-        sentences=[(METHODS[item.name].label, METHODS[item.name].sentence) for item in compared],
-        provenance=provenance,
-    )
-    return {
-        "report.html": page.encode(),
-        "result.json": _json(problem, compared, provenance),
-        "comparison.csv": _csv(problem, compared),
-        **{f"comparison.{kind}": content for kind, content in pictures.items()},
-    }
-
-
-def text_table(problem: Problem, compared: Sequence[MethodComparison]) -> str:
-    """The table for a terminal."""
-    table = _methods(problem, compared)
-    rows = [table.heads, *table.rows]
-    widths = [max(len(row[column]) for row in rows) for column in range(len(table.heads))]
-    return "\n".join(
-        "  ".join(
-            cell.ljust(width) if column == 0 else cell.rjust(width)
-            for column, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in rows
+        figures = drawn({"comparison": _figure(problem, compared)})
+    sections = [
+        Section(
+            "1. All methods on the same recordings",
+            (methods_table(problem, compared), _PICTURE),
+            together=True,
+        ),
+        Section("2. Weights", (_weights(problem, compared),)),
+        Section(
+            "3. What each method does",
+            (Terms([(one.label, (one.sentence,)) for one in methods]),),
+        ),
+        Section(
+            "4. Versions",
+            (
+                Markup("<code>{}</code>").format(provenance.command),
+                Terms(
+                    [
+                        ("Made", (provenance.made,)),
+                        ("Plant", (Markup("<code>{}</code>").format(provenance.plant_name),)),
+                        ("Versions", (provenance.all_versions,)),
+                    ]
+                ),
+            ),
+        ),
+    ]
+    return Report(
+        f"impc compare: {subject}",
+        f"Methods for the weights behind the recordings of {subject}",
+        (Lines(_findings(compared)),),
+        sections,
+        figures=figures,
+        tables={"comparison": _numbers(problem, compared)},
+        data=_data(problem, compared, provenance),
     )
 
 
@@ -94,7 +108,8 @@ def _score(item: MethodComparison) -> np.ndarray[tuple[int, ...], np.dtype[np.fl
     return item.fit.vaf if np.any(np.isnan(held)) else held
 
 
-def _methods(problem: Problem, compared: Sequence[MethodComparison]) -> TextTable:
+def methods_table(problem: Problem, compared: Sequence[MethodComparison]) -> TextTable:
+    """What the `compared` methods reach on the recordings of the `problem`."""
     outputs = problem.plant.outputs
     heads = ["method"]
     heads += [f"VAF {name} %" for name in outputs] + [f"left out {name} %" for name in outputs]
@@ -118,7 +133,7 @@ def _methods(problem: Problem, compared: Sequence[MethodComparison]) -> TextTabl
         "Variance accounted for (3.24): all trials, and each trial predicted from the others after "
         "the time that serves to find where it starts. Beyond bound: share of samples."
     )
-    return TextTable(caption, tuple(heads), tuple(rows))
+    return TextTable(caption, heads, rows)
 
 
 def _weights(problem: Problem, compared: Sequence[MethodComparison]) -> TextTable:
@@ -141,7 +156,7 @@ def _weights(problem: Problem, compared: Sequence[MethodComparison]) -> TextTabl
         "Diagonal of Q in plant units at R[0, 0] = 1, and kappa(blkdiag(Q, R)). result.json has "
         "all entries.",
         heads,
-        tuple(rows),
+        rows,
     )
 
 
@@ -171,7 +186,8 @@ def _figure(problem: Problem, compared: Sequence[MethodComparison]) -> Figure:
     return figure
 
 
-def _csv(problem: Problem, compared: Sequence[MethodComparison]) -> bytes:
+def _numbers(problem: Problem, compared: Sequence[MethodComparison]) -> TextTable:
+    """comparison.csv: numbers to the last digit."""
     plant = problem.plant
     heads = [
         "method",
@@ -191,12 +207,12 @@ def _csv(problem: Problem, compared: Sequence[MethodComparison]) -> bytes:
         )
         for item in compared
     ]
-    return csv_bytes(heads, rows)
+    return TextTable("", heads, rows)
 
 
-def _json(
-    problem: Problem, compared: Sequence[MethodComparison], provenance: FitProvenance
-) -> bytes:
+def _data(
+    problem: Problem, compared: Sequence[MethodComparison], provenance: Provenance
+) -> dict[str, Any]:
     plant = problem.plant
     methods: dict[str, Any] = {}
     for item in compared:
@@ -215,15 +231,10 @@ def _json(
             "seconds": fit.estimate.seconds,
             "reason": fit.estimate.reason,
         }
-    content = {
+    return {
         "methods": methods,
         "states": plant.states,
         "outputs": plant.outputs,
         "horizon": problem.horizon,
-        "files": provenance.files,
-        "command": provenance.command,
-        "versions": dict(provenance.versions),
-        "made": provenance.made,
-        "sha256": provenance.inputs.plain(),
+        **provenance.data(),
     }
-    return (json.dumps(plain(content), indent=1, allow_nan=False) + "\n").encode()

@@ -18,9 +18,9 @@ from impc.reporting.style import (
     STATE_MARKS,
     VERMILLION,
     Mark,
+    drawn,
     journal_style,
     new_figure,
-    render,
 )
 from impc.studies.example.cases import BOUND
 
@@ -53,13 +53,9 @@ def example_figures(case: CaseResult) -> dict[str, bytes]:
     """
     with journal_style():
         figures = {f"figure-{number}": _fit(case, method) for number, method, _ in FIGURES}
-        figures["terminal-set"] = _terminal_set(case)
-        figures["comparison"] = _comparison(case)
-        return {
-            f"{name}-case-{case.name}.{kind}": content
-            for name, figure in figures.items()
-            for kind, content in render(figure, mathematics=True).items()
-        }
+        figures |= {"terminal-set": _terminal_set(case), "comparison": _comparison(case)}
+        named = {f"{name}-case-{case.name}": figure for name, figure in figures.items()}
+        return drawn(named, mathematics=True)
 
 
 def _fit(case: CaseResult, method: str) -> Figure:

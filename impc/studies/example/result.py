@@ -12,7 +12,6 @@ and `seconds`. Matrices are lists of rows.
 
 from __future__ import annotations
 
-import json
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,29 +20,28 @@ from impc.model.weights import condition_number
 from impc.studies.example.cases import true_weights
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from impc.assess.identified_directions import Identifiability
     from impc.model.weights import Weights
     from impc.reporting.provenance import Provenance
     from impc.studies.example.cases import CaseResult, MethodResult
 
-__all__ = ["result_json"]
+__all__ = ["example_data"]
 
 
-def result_json(cases: Sequence[CaseResult], provenance: Provenance) -> bytes:
-    """Return result.json, UTF-8, one line an array."""
-    plant = provenance.plant
-    content = {
+def example_data(
+    cases: Sequence[CaseResult], provenance: Provenance, settings: Mapping[str, float]
+) -> dict[str, Any]:
+    """Content of result.json, with the `settings` of the example."""
+    plant = cases[0].controller.plant
+    return {
         "made": provenance.made,
         "plant": {"name": provenance.plant_name, "A": plant.A, "B": plant.B, "dt": plant.dt},
-        "settings": dict(provenance.settings),
-        "versions": dict(provenance.versions),
+        "settings": settings,
+        "versions": provenance.versions,
         "cases": {case.name: _case(case) for case in cases},
     }
-    # NaN is not JSON: a program that meets one should fail here, not in its reader.
-    text = json.dumps(_plain(content), indent=1, allow_nan=False)
-    return (text + "\n").encode()
 
 
 def _case(case: CaseResult) -> dict[str, Any]:
@@ -99,12 +97,3 @@ def _identifiability(found: Identifiability) -> dict[str, Any]:
             {**_weights(item.weights), "state_misfit": item.misfit} for item in found.others
         ],
     }
-
-
-def _plain(value: Any) -> Any:
-    """Replace arrays and numpy numbers by lists and numbers, at every depth."""
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_plain(item) for item in value]
-    return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value

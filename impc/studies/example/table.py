@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from impc.inverse.methods import METHODS as REGISTRY
 from impc.model.weights import normalised
+from impc.reporting.document import TextTable
 from impc.studies.example.cases import EXAMPLE, true_weights
 
 if TYPE_CHECKING:
@@ -24,9 +25,9 @@ __all__ = [
     "Row",
     "compact_weights",
     "determined_sentences",
+    "methods_table",
     "significant",
     "table_rows",
-    "text_table",
 ]
 
 
@@ -53,16 +54,7 @@ METHODS: dict[str, MethodText] = {
 }
 
 #: Heads of the table.
-COLUMNS = (
-    "method",
-    "Q11 Q12 Q22 / R",
-    "gain K",
-    "misfit",
-    "max |u|",
-    "kept",
-    "(3.10)",
-    "seconds",
-)
+COLUMNS = ("method", "Q11 Q12 Q22 / R", "gain K", "misfit", "max |u|", "kept", "(3.10)", "seconds")
 _NONE = "-"
 
 
@@ -96,16 +88,7 @@ class Row:
     @property
     def cells(self) -> tuple[str, ...]:
         """The cells in the order of `COLUMNS`."""
-        return (
-            self.name,
-            self.weights,
-            self.gain,
-            self.misfit,
-            self.largest,
-            self.kept,
-            self.residual,
-            self.seconds,
-        )
+        return astuple(self)
 
 
 def table_rows(case: CaseResult) -> tuple[Row, ...]:
@@ -123,14 +106,10 @@ def table_rows(case: CaseResult) -> tuple[Row, ...]:
     return (truth, *(_method_row(method) for method in case.methods))
 
 
-def text_table(case: CaseResult) -> str:
-    """Return the table in fixed-width columns, for a terminal."""
-    lines = [COLUMNS, *(row.cells for row in table_rows(case))]
-    widths = [max(len(line[i]) for line in lines) for i in range(len(COLUMNS))]
-    return "\n".join(
-        "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip()
-        for line in lines
-    )
+def methods_table(case: CaseResult) -> TextTable:
+    """The table for a terminal."""
+    caption = f"Case {case.name}: every method on the same recording"
+    return TextTable(caption, COLUMNS, [row.cells for row in table_rows(case)])
 
 
 def determined_sentences(found: Identifiability) -> tuple[str, ...]:

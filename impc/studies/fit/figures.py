@@ -14,9 +14,9 @@ from impc.reporting.style import (
     GREEN,
     INK,
     VERMILLION,
+    drawn,
     journal_style,
     new_figure,
-    render,
 )
 from impc.studies.fit.sentences import trial_name
 
@@ -52,11 +52,7 @@ def fit_figures(result: FitResult) -> dict[str, bytes]:
         figures["residuals"] = _residuals(result)
         figures["intent"] = _intent(result)
         figures["methods"] = _methods(result)
-        return {
-            f"{name}.{kind}": content
-            for name, figure in figures.items()
-            for kind, content in render(figure).items()
-        }
+        return drawn(figures)
 
 
 def shown_trials(result: FitResult) -> list[int]:

@@ -1,8 +1,4 @@
-"""What an interrupted command had done: the results of its stages, one sealed file each.
-
-They belong to one set of recordings, settings, plant and versions, told by a digest of all of them;
-what belongs to any other, or was damaged, is not used and is done again.
-"""
+"""What an interrupted fit or comparison had done, for one set of recordings, settings and plant."""
 
 from __future__ import annotations
 
@@ -12,13 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from impc.arrays import Array, frozen
+from impc.arrays import Array
 from impc.assess.resampling import Replicate
 from impc.checking import replace
 from impc.files.digests import digest, versions
 from impc.files.sealed import Kept
 from impc.inverse.estimate import Estimate, decode_estimate, encode_estimate
 from impc.inverse.methods import METHODS, Method
+from impc.studies.cache import Cache, Codec, by_fields
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -37,84 +34,41 @@ _LEFT_OUT = re.compile(r"without (?:trial )?(\d+)")
 
 
 @dataclass(frozen=True)
-class FitMemory:
-    """Controllers and estimates of the stages done so far.
+class FitMemory(Cache):
+    """The cache of `impc fit` and `impc compare`; its methods are what these two keep.
 
-    Attributes
-    ----------
-    problem : Problem
-        As it was posed.
-    files : Kept
-        One a stage; the folder is made when the first stage is done.
-    digest : str
-        Of recordings, settings, plant and versions.
-    stages : dict
-        Name of stage -> what `_encode` keeps of it.
+    `files`, `digest`, `done` and `stages` are as in `Cache`; `problem` is as it was posed.
     """
 
-    problem: Problem
-    files: Kept
-    digest: str
-    stages: dict[str, Any] = field(default_factory=dict)
+    problem: Problem = field(kw_only=True)
 
     def estimate(self, name: str, compute: Callable[[], Estimate]) -> Estimate:
-        """The estimate of the stage `name`, remembered or computed now and then written down.
+        """The estimate of the stage `name`, as `compute` makes it.
 
         Raises
         ------
         OutputError
             When the file cannot be written.
         """
-        if name in self.stages:
-            kept = self.stages[name]
+
+        def decode(kept: dict[str, Any]) -> Estimate:
             return decode_estimate(_seen(self.problem, name, METHODS[kept["method"]]), kept)
-        found = compute()
-        self._keep(name, encode_estimate(found))
-        return found
+
+        return self.get(name, compute, Codec(encode_estimate, decode))
 
     def replicate(self, name: str, compute: Callable[[], Replicate]) -> Replicate:
-        """The bootstrap replicate of the stage `name`, in the same way.
+        """The bootstrap replicate of the stage `name`, as `compute` makes it.
 
         Raises
         ------
         OutputError
             When the file cannot be written.
         """
-        if name in self.stages:
-            kept = self.stages[name]
-            return Replicate(frozen(kept["K"]), frozen(kept["parameters"]))
-        found = compute()
-        self._keep(name, {"K": found.K.tolist(), "parameters": found.parameters.tolist()})
-        return found
-
-    def kept(self) -> str:
-        """What to tell whoever interrupts the command."""
-        if not self.stages:
-            return "nothing was done yet"
-        done = ", ".join(self.stages)
-        return f"kept in {self.files.folder}: {done}; the same command goes on from there"
-
-    def forget(self) -> None:
-        """Remove the folder: the result has been written.
-
-        Raises
-        ------
-        OutputError
-            When that cannot be done.
-        """
-        self.files.forget()
-
-    def _keep(self, name: str, value: dict[str, Any]) -> None:
-        self.files.keep(name, self.digest, value)
-        self.stages[name] = value
+        return self.get(name, compute, by_fields(Replicate))
 
 
 def open_memory(
-    folder: Path,
-    problem: Problem,
-    settings: FitSettings,
-    command: str = "fit",
-    made_of: str = "",
+    folder: Path, problem: Problem, settings: FitSettings, command: str = "fit", made_of: str = ""
 ) -> FitMemory:
     """The memory of a command in a folder, empty when there is none for this very problem.
 
@@ -129,9 +83,8 @@ def open_memory(
     made_of : str
         Digest of the files that the problem was made of (`Inputs.digest`).
     """
-    files = Kept(folder / f"{command}-in-progress")
     known = digest(_content(problem), settings, made_of, versions())
-    return FitMemory(problem, files, known, files.recall_all(known))
+    return FitMemory(Kept(folder / f"{command}-in-progress"), known, problem=problem)
 
 
 def _content(problem: Problem) -> tuple[Any, ...]:

@@ -20,28 +20,24 @@ Matrices are lists of rows, in SI units. What is not a number, or not determined
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from impc.assess.intent_rules import dominant_sentence
-from impc.reporting.rendering import plain
 
 if TYPE_CHECKING:
     from impc.assess.printed_gain import GainEstimate
-    from impc.reporting.provenance import FitProvenance
+    from impc.reporting.provenance import Provenance
     from impc.studies.fit.result import FitResult
 
-__all__ = ["fit_json"]
+__all__ = ["fit_data"]
 
 
-def fit_json(result: FitResult, provenance: FitProvenance) -> bytes:
-    """Return result.json, UTF-8."""
-    content = _controller(result) | _found(result) | _made(result, provenance)
-    text = json.dumps(plain(content), indent=1, allow_nan=False)
-    return (text + "\n").encode()
+def fit_data(result: FitResult, provenance: Provenance) -> dict[str, Any]:
+    """Content of result.json."""
+    return _controller(result) | _found(result) | _made(result, provenance)
 
 
 def _controller(result: FitResult) -> dict[str, Any]:
@@ -182,7 +178,7 @@ def _trial(result: FitResult, index: int) -> dict[str, Any]:
     }
 
 
-def _made(result: FitResult, provenance: FitProvenance) -> dict[str, Any]:
+def _made(result: FitResult, provenance: Provenance) -> dict[str, Any]:
     plant = result.fitted.problem.plant
     return {
         "plant": {
@@ -195,10 +191,6 @@ def _made(result: FitResult, provenance: FitProvenance) -> dict[str, Any]:
             "dt": plant.dt,
         },
         "settings": asdict(result.settings),
-        "files": provenance.files,
-        "command": provenance.command,
-        "versions": dict(provenance.versions),
-        "made": provenance.made,
-        "sha256": provenance.inputs.plain(),
+        **provenance.data(),
         "seconds": result.seconds,
     }

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal
+from dataclasses import dataclass, field, fields
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import msgspec
 import numpy as np
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
     from impc.model.recordings import Recording
 
-__all__ = ["FitSettings", "fit_bounds", "fit_settings"]
+__all__ = ["FitSettings", "fit_bounds", "fit_settings", "read_settings"]
 
 # A recorded angle is differentiated over this time, by a parabola: noise of 1 % of the largest
 # angle at 100 Hz then gives a rate of a few per cent of the largest.
@@ -36,6 +36,9 @@ _RANGES: dict[str, tuple[float, float]] = {
 }
 # A limit of an input is squared and divided by: beyond these the square is no number any more.
 _LIMITS = (1e-100, 1e100)
+_PAGES = {"fit": "docs/fitting.md", "select": "docs/selection.md"}
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -111,6 +114,24 @@ class FitSettings:
     horizons: list[int] = field(default_factory=list)
 
 
+def read_settings(name: str, kind: type[T], table: Mapping[str, Any]) -> T:
+    """The `table` of a file that is called `name`, as a dataclass of this `kind`.
+
+    Raises
+    ------
+    InputError
+        When a key is unknown or a value is of the wrong kind.
+    """
+    known = [item.name for item in fields(kind)]  # type: ignore[arg-type]
+    unknown = [key for key in table if key not in known]
+    if unknown:
+        raise InputError(f"[{name}] {unknown[0]}", "is not a setting", f"known: {', '.join(known)}")
+    try:
+        return msgspec.convert(dict(table), kind, strict=True)
+    except msgspec.ValidationError as error:
+        raise InputError(f"[{name}]", str(error), f"see {_PAGES[name]}") from None
+
+
 def fit_settings(table: Mapping[str, Any]) -> FitSettings:
     """Read the [fit] table of a configuration.
 
@@ -119,14 +140,7 @@ def fit_settings(table: Mapping[str, Any]) -> FitSettings:
     InputError
         When a key is unknown or a value is of the wrong kind or out of range.
     """
-    known = FitSettings.__dataclass_fields__
-    unknown = [key for key in table if key not in known]
-    if unknown:
-        raise InputError(f"[fit] {unknown[0]}", "is not a setting", f"known: {', '.join(known)}")
-    try:
-        settings = msgspec.convert(dict(table), FitSettings, strict=True)
-    except msgspec.ValidationError as error:
-        raise InputError("[fit]", str(error), "see docs/fitting.md") from None
+    settings = read_settings("fit", FitSettings, table)
     for name, (least, most) in _RANGES.items():
         _require_between(name, getattr(settings, name), least, most)
     if 0 < settings.replicates < _FEWEST:

@@ -8,7 +8,8 @@ import numpy as np
 
 from impc.assess.intervals import entry_names
 from impc.assess.other_models import verdict
-from impc.reporting.rendering import TextTable, number
+from impc.reporting.document import TextTable, table_of
+from impc.reporting.rendering import number
 
 if TYPE_CHECKING:
     from impc.assess.all_intervals import Certainty
@@ -67,7 +68,7 @@ def intervals_table(result: FitResult) -> TextTable:
         "quite behave as the recordings do."
     )
     heads = ("number", "value", *(_METHODS[method] for method in methods), "gain of the weights")
-    return TextTable(caption, heads, tuple(rows))
+    return TextTable(caption, heads, rows)
 
 
 def set_sentences(summary: WeightsSummary) -> tuple[str, ...]:
@@ -97,10 +98,6 @@ def _over_drawn(summary: WeightsSummary) -> tuple[str, ...]:
 
 def statements_table(summary: WeightsSummary) -> TextTable:
     """Statements that hold for every member, and those that members disagree on."""
-    rows = tuple(
-        (item.says, _verdict(item), _over_gains(item), f"{item.low:.3g} to {item.high:.3g}")
-        for item in sorted(summary.statements, key=lambda item: (not item.made, item.holds is None))
-    )
     tried = (
         f"The gain is an estimate: each statement was tried on {summary.drawn} other gains that "
         "the recordings allow. One that holds for all weights of all gains but one at most may be "
@@ -109,60 +106,66 @@ def statements_table(summary: WeightsSummary) -> TextTable:
         else "The gain is an estimate, and other gains were not tried ([fit] intent_draws): none "
         "may be made of the subject."
     )
-    caption = (
+    return table_of(
         "Statements on the states that are recorded or cost most, at the size that they have in "
         f"the recordings. {tried} The range is that of the difference, or of the mixed price, over "
-        "the price of the state named first, at the fitted gain."
+        "the price of the state named first, at the fitted gain.",
+        sorted(summary.statements, key=lambda item: (not item.made, item.holds is None)),
+        {
+            "statement": lambda item: item.says,
+            "at 95 %": _verdict,
+            "other gains that agree": _over_gains,
+            "range at the fitted gain": lambda item: f"{item.low:.3g} to {item.high:.3g}",
+        },
     )
-    heads = ("statement", "at 95 %", "other gains that agree", "range at the fitted gain")
-    return TextTable(caption, heads, rows)
 
 
 def prices_table(summary: WeightsSummary) -> TextTable | None:
     """Prices of the named states, for the fitted gain and for all that the recordings allow."""
     if not summary.prices:
         return None
-    rows = tuple(
-        (
-            item.state,
-            f"{number(item.low)} to {number(item.high)}",
-            f"{number(item.low_drawn)} to {number(item.high_drawn)}",
-        )
-        for item in summary.prices
-    )
-    caption = (
+    return table_of(
         "What a typical excursion costs, d^2 Q at trace R = m, over all weights: with the fitted "
-        f"gain, and with it or any of {summary.drawn} others that the recordings allow (95 %)."
+        f"gain, and with it or any of {summary.drawn} others that the recordings allow (95 %).",
+        summary.prices,
+        {
+            "state": lambda item: item.state,
+            "fitted gain": lambda item: f"{number(item.low)} to {number(item.high)}",
+            "95 % interval": lambda item: f"{number(item.low_drawn)} to {number(item.high_drawn)}",
+        },
     )
-    return TextTable(caption, ("state", "fitted gain", "95 % interval"), rows)
 
 
 def entries_table(summary: WeightsSummary) -> TextTable:
     """Ranges of entries of Q."""
-    rows = tuple(
-        (f"Q {item.first}, {item.second}", number(item.low), number(item.high))
-        for item in summary.entries
+    return table_of(
+        "Range of entries of Q over the set, at trace R = m, by semidefinite programs.",
+        summary.entries,
+        {
+            "entry": lambda item: f"Q {item.first}, {item.second}",
+            "least": lambda item: number(item.low),
+            "most": lambda item: number(item.high),
+        },
     )
-    caption = "Range of entries of Q over the set, at trace R = m, by semidefinite programs."
-    return TextTable(caption, ("entry", "least", "most"), rows)
 
 
 def eigenvalues_table(summary: WeightsSummary) -> TextTable:
     """Ranges of eigenvalues of Q."""
     count = len(summary.eigenvalues)
-    rows = tuple(
-        (
-            str(count - index),
-            number(item.low) + (" (proved)" if item.low_proved else ""),
-            number(item.high) + (" (proved)" if item.high_proved else ""),
-        )
-        for index, item in reversed(list(enumerate(summary.eigenvalues)))
-    )
-    caption = (
+    return table_of(
         "Range of the eigenvalues of Q over the set, largest first. Ends that are not proved are "
-        "values that some member has; others may go farther."
+        "values that some member has; others may go farther.",
+        list(enumerate(summary.eigenvalues))[::-1],
+        {
+            "eigenvalue": lambda item: str(count - item[0]),
+            "least": lambda item: _end(item[1].low, item[1].low_proved),
+            "most": lambda item: _end(item[1].high, item[1].high_proved),
+        },
     )
-    return TextTable(caption, ("eigenvalue", "least", "most"), rows)
+
+
+def _end(value: float, proved: bool) -> str:
+    return number(value) + (" (proved)" if proved else "")
 
 
 def limit_sentences(certainty: Certainty) -> tuple[str, ...]:
@@ -181,18 +184,18 @@ def alternatives_table(certainty: Certainty) -> TextTable | None:
     if not certainty.alternatives:
         return None
     first = certainty.alternatives[0]
-    rows = []
-    for item in certainty.alternatives:
-        said = "" if item is first else verdict(first, item)
-        rows.append(
-            (item.name, str(item.horizon), number(item.aic), number(item.held_out, 5), said)
-        )
-    caption = (
+    return table_of(
         "The same recordings with other horizons and without limit. AIC is above the least, for "
-        "the innovations of the residuals; VAF is of trials left out."
+        "the innovations of the residuals; VAF is of trials left out.",
+        certainty.alternatives,
+        {
+            "fit": lambda item: item.name,
+            "horizon": lambda item: str(item.horizon),
+            "AIC above the least": lambda item: number(item.aic),
+            "left out VAF %": lambda item: number(item.held_out, 5),
+            "the recordings say": lambda item: "" if item is first else verdict(first, item),
+        },
     )
-    heads = ("fit", "horizon", "AIC above the least", "left out VAF %", "the recordings say")
-    return TextTable(caption, heads, tuple(rows))
 
 
 def _verdict(item: Statement) -> str:

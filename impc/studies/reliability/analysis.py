@@ -30,14 +30,7 @@ if TYPE_CHECKING:
     from impc.studies.reliability.transfer import TransferFunction
     from impc.studies.reliability.variance_components import VarianceComponent
 
-__all__ = [
-    "MEASURES",
-    "CmcResult",
-    "MeasureResult",
-    "Reliability",
-    "Trials",
-    "analyse",
-]
+__all__ = ["MEASURES", "CmcResult", "MeasureResult", "Reliability", "Trials", "analyse"]
 
 #: Name of a measure -> what it is.
 MEASURES = {"rms": "root-mean-square about upright", "energy": "mean bandpass signal energy (2.1)"}

@@ -14,9 +14,9 @@ from impc.reporting.style import (
     GREEN,
     INK,
     VERMILLION,
+    drawn,
     journal_style,
     new_figure,
-    render,
 )
 
 if TYPE_CHECKING:
@@ -45,11 +45,7 @@ def reliability_figures(trials: Trials, result: Reliability) -> dict[str, bytes]
                 result, [(name, first[1], first[2]) for name in result.subjects[:4]], 0, "subject"
             ),
         }
-        return {
-            f"{name}.{kind}": content
-            for name, figure in figures.items()
-            for kind, content in render(figure).items()
-        }
+        return drawn(figures)
 
 
 def _time_series(trials: Trials, result: Reliability) -> Figure:

@@ -40,7 +40,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 import numpy as np
 import scipy.stats
 
-from impc.arrays import Array, frozen
+from impc.arrays import Array, frozen, percentiles
 from impc.errors import DataError, InputError
 
 if TYPE_CHECKING:
@@ -296,10 +296,10 @@ def _generalised(
     )
     # Occasions whose variance would be negative have none.
     drawn = (r - e) / (r + (k - 1) * e + k * np.maximum(c - e, 0.0) / n)
-    low, high = np.quantile(drawn, [0.5 - level / 2, 0.5 + level / 2])
+    low, high = map(float, percentiles(drawn, level))
     if form == "A,k":
-        low, high = (_stepped_up(float(end), k) for end in (low, high))
-    return min(float(low), value), max(float(high), value)
+        low, high = (_stepped_up(end, k) for end in (low, high))
+    return min(low, value), max(high, value)
 
 
 def _stepped_up(limit: float, k: int) -> float:

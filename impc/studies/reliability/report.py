@@ -1,15 +1,14 @@
-"""All files of a reliability study: page, tables as CSV, result.json, figures."""
+"""The report of a reliability study: page, tables as CSV, result.json, figures."""
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from markupsafe import Markup
 
-from impc.reporting.csv_text import csv_bytes
-from impc.reporting.rendering import embedded, plain, render_template
+from impc.reporting.document import Lines, Picture, Report, Section
 from impc.studies.reliability.figures import reliability_figures
 from impc.studies.reliability.findings import findings
 from impc.studies.reliability.tables import reliability_tables
@@ -19,42 +18,68 @@ if TYPE_CHECKING:
     from impc.files.inputs import Inputs
     from impc.studies.reliability.analysis import Reliability, Trials
 
-__all__ = ["reliability_files"]
+__all__ = ["reliability_report"]
+
+_TABLES = {
+    "1. Between visits": ("icc-rms", "icc-energy", "cmc"),
+    "2. Over visits": ("visits-rms", "visits-energy", "pairs", "dissertation"),
+    "3. Where the variance is": ("components-rms", "components-energy"),
+}
+_PICTURES = (
+    Picture(
+        "time-series",
+        "Perturbation and angles of one trial",
+        "Counterpart of figure 2.3: one trial.",
+    ),
+    Picture(
+        "spectra",
+        "Power of perturbation and angles",
+        "Counterpart of figure 2.4: power at the excited frequencies; the passband is shaded.",
+    ),
+    Picture(
+        "transfer-visits",
+        "Transfer functions of one subject over visits",
+        "Counterpart of figure 2.5: one subject and condition, every visit.",
+    ),
+    Picture(
+        "transfer-subjects",
+        "Transfer functions of several subjects",
+        "Counterpart of figure 2.6: one condition and visit, several subjects.",
+    ),
+)
 
 
-def reliability_files(
-    trials: Trials, result: Reliability, command: str, inputs: Inputs
-) -> dict[str, bytes]:
-    """Build all files; nothing is written. They name the `command` and its `inputs`."""
-    figures = reliability_figures(trials, result)
+def reliability_report(trials: Trials, result: Reliability, command: str, inputs: Inputs) -> Report:
+    """Page, result.json, tables and figures; they name the `command` and its `inputs`."""
     tables = reliability_tables(result)
-    pictures = {
-        name.removesuffix(".png"): embedded(content)
-        for name, content in figures.items()
-        if name.endswith(".png")
-    }
-    page = render_template(
-        "studies/reliability/reliability_page.html",
-        summary=(
-            f"{len(result.subjects)} subjects, {len(result.visits)} visits, conditions "
-            f"{', '.join(result.conditions)}; passband {result.band.low:.2f} to "
-            f"{result.band.high:.2f} Hz, {len(result.band.excited)} excited frequencies."
-        ),
-        findings=findings(result),
-        notes=result.notes,
-        tables=tables,
-        pictures=pictures,
-        command=command,
+    found = [
+        Markup("<strong>{}:</strong> {} ({})").format(
+            "Found" if item.found else "Not found", item.statement, item.numbers
+        )
+        for item in findings(result)
+    ]
+    summary = (
+        f"{len(result.subjects)} subjects, {len(result.visits)} visits, conditions "
+        f"{', '.join(result.conditions)}; passband {result.band.low:.2f} to "
+        f"{result.band.high:.2f} Hz, {len(result.band.excited)} excited frequencies."
     )
-    return {
-        "report.html": page.encode(),
-        "result.json": _json(result, command, inputs),
-        **{f"{name}.csv": csv_bytes(table.heads, table.rows) for name, table in tables.items()},
-        **figures,
-    }
+    sections = [
+        Section("The dissertation's findings, looked for here", (Lines(found), *result.notes)),
+        *(Section(title, [tables[name] for name in names]) for title, names in _TABLES.items()),
+        Section("4. Pictures", (*_PICTURES, Markup("<code>{}</code>").format(command))),
+    ]
+    return Report(
+        "impc reliability",
+        "Reliability of a test",
+        (summary,),
+        sections,
+        figures=reliability_figures(trials, result),
+        tables=tables,
+        data=_data(result, command, inputs),
+    )
 
 
-def _json(result: Reliability, command: str, inputs: Inputs) -> bytes:
+def _data(result: Reliability, command: str, inputs: Inputs) -> dict[str, Any]:
     found: dict[str, dict[str, Any]] = {"icc": {}, "anova": {}, "components": {}}
     for item in result.measures:
         name = f"{item.measure}.{item.output}"
@@ -75,7 +100,7 @@ def _json(result: Reliability, command: str, inputs: Inputs) -> bytes:
     for curve in result.cmc:
         for kind, values in (("within", curve.within), ("between", curve.between)):
             cmc[kind].setdefault(curve.output, {})[curve.condition] = _mean(values)
-    content = {
+    return {
         **found,
         "cmc": cmc,
         "passband": {"low": result.band.low, "high": result.band.high},
@@ -84,7 +109,6 @@ def _json(result: Reliability, command: str, inputs: Inputs) -> bytes:
         "command": command,
         "sha256": inputs.plain(),
     }
-    return (json.dumps(plain(content), indent=1, allow_nan=False) + "\n").encode()
 
 
 def _mean(values: Array) -> float:

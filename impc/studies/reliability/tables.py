@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.reporting.rendering import TextTable, number
+from impc.reporting.document import TextTable
+from impc.reporting.rendering import number
 from impc.studies.reliability.analysis import MEASURES
 from impc.studies.reliability.findings import QUOTED, band_of
 
@@ -67,7 +68,7 @@ def _icc_table(result: Reliability, measure: str) -> TextTable:
         "minimal detectable change (95 %) of the score of a single visit."
     )
     heads = ("condition", "output", "ICC(A,k)", "band", "SEM", "MDC", "notes")
-    return TextTable(caption, heads, tuple(rows))
+    return TextTable(caption, heads, rows)
 
 
 def _visit_table(result: Reliability, measure: str) -> TextTable:
@@ -102,7 +103,7 @@ def _visit_table(result: Reliability, measure: str) -> TextTable:
     )
     visits = tuple(f"visit {name}" for name in result.visits)
     heads = ("condition", "output", *visits, "p", "p (G-G)", "change per visit", "p (change)")
-    return TextTable(caption, heads, tuple(rows))
+    return TextTable(caption, heads, rows)
 
 
 def _component_table(result: Reliability, measure: str) -> TextTable:
@@ -119,7 +120,7 @@ def _component_table(result: Reliability, measure: str) -> TextTable:
             (item.condition, f"{item.output} ({unit})²", *(cells.get(key, "-") for key in names))
         )
     caption = f"Variance of subjects, visits and trials behind {MEASURES[measure]}, 95 % intervals."
-    return TextTable(caption, ("condition", "output", "subjects", "visits", "trials"), tuple(rows))
+    return TextTable(caption, ("condition", "output", "subjects", "visits", "trials"), rows)
 
 
 def _cmc_table(result: Reliability) -> TextTable:
@@ -136,9 +137,7 @@ def _cmc_table(result: Reliability) -> TextTable:
         "Counterpart of table 2.4: coefficient of multiple correlation of the transfer functions "
         "from perturbation to angle, mean ± SD over subjects."
     )
-    return TextTable(
-        caption, ("condition", "output", "within visits", "between visits", ""), tuple(rows)
-    )
+    return TextTable(caption, ("condition", "output", "within visits", "between visits", ""), rows)
 
 
 def _pair_table(result: Reliability) -> TextTable:
@@ -158,9 +157,7 @@ def _pair_table(result: Reliability) -> TextTable:
                 )
             )
     heads = ("condition", "output", "measure", "visits", "difference", "p", "p (Holm)")
-    return TextTable(
-        "Paired t between visits, without and with Holm's correction.", heads, tuple(rows)
-    )
+    return TextTable("Paired t between visits, without and with Holm's correction.", heads, rows)
 
 
 def _quoted_table() -> TextTable:
@@ -175,5 +172,5 @@ def _quoted_table() -> TextTable:
         "tables 2.5 and 2.6 that survive."
     )
     return TextTable(
-        caption, ("table", "measure", "condition", "p lower body", "p upper body"), tuple(rows)
+        caption, ("table", "measure", "condition", "p lower body", "p upper body"), rows
     )

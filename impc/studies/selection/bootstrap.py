@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.arrays import Array, Frozen, frozen
+from impc.arrays import Array, Frozen, frozen, percentiles
 from impc.studies.selection.estimation import estimate, residuals
 from impc.studies.selection.model import Trial
 
@@ -118,7 +118,7 @@ def bootstrap_subset(
     # The compiled recursion lets other threads run.
     with ThreadPoolExecutor(_THREADS) as pool:
         drawn = np.array(list(pool.map(one, range(replicates))))
-    low, high = np.quantile(drawn, [0.5 - level / 2, 0.5 + level / 2], axis=0)
+    low, high = percentiles(drawn, level)
     return BootstrapIntervals(
         tuple(model.names[index] for index in fit.free),
         frozen(theta[list(fit.free)]),

@@ -1,18 +1,20 @@
-"""Files of `impc key-parameters`: page, table, result.json, figure of the solution space."""
+"""The report of `impc key-parameters`: page, table, result.json, figure of the solution space."""
 
 from __future__ import annotations
 
-import json
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from impc.reporting.rendering import TextTable, embedded, number, plain, render_template
-from impc.reporting.style import BLUE, DOUBLE_COLUMN, INK, journal_style, new_figure, render
+from impc.reporting.document import Lines, Picture, Report, TextTable
+from impc.reporting.rendering import number
+from impc.reporting.style import BLUE, DOUBLE_COLUMN, INK, drawn, journal_style, new_figure
 from impc.studies.selection.key_parameters import between_visits
-from impc.studies.selection.report import names_of, table_csv
+from impc.studies.selection.report import names_of, results_section
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from matplotlib.figure import Figure
 
     from impc.arrays import Array
@@ -20,87 +22,41 @@ if TYPE_CHECKING:
     from impc.studies.selection.key_parameters import KeyParameters
     from impc.studies.selection.model import ParametricModel
 
-__all__ = ["key_files"]
+__all__ = ["key_report"]
 
 
-def key_files(
+def key_report(
     model: ParametricModel, found: KeyParameters, command: str, inputs: Inputs
-) -> dict[str, bytes]:
-    """Build all files of `impc key-parameters`; they name `command` and `inputs`, all as bytes."""
-    table = _candidate_table(model, found)
+) -> Report:
+    """Page, result.json, table and figure of `impc key-parameters`, with `command` and `inputs`."""
+    candidates = _candidate_table(model, found)
     chosen = names_of(model, found.chosen) if found.chosen else "none: no subset passes all filters"
-    with journal_style():
-        pictures = render(_solution_figure(model, found))
-    page = render_template(
-        "studies/selection/selection_page.html",
-        title="Key parameters",
-        findings=[
-            f"{len(found.selection.subsets)} subsets of {found.selection.size} parameters are "
-            f"estimated well enough for every subject and visit (variance at most "
-            f"{found.selection.bound:g}).",
-            f"Chosen: {chosen}.",
-        ],
-        tables=[table, _estimate_table(model, found), _sweep_table(model, found)],
-        picture_source=embedded(pictures["png"]),
-        caption="Counterpart of figure 5.3: subsets in the space of reliability and goodness of "
-        "fit; filled ones pass all filters.",
-        command=command,
+    findings = [
+        f"{len(found.selection.subsets)} subsets of {found.selection.size} parameters are "
+        f"estimated well enough for every subject and visit (variance at most "
+        f"{found.selection.bound:g}).",
+        f"Chosen: {chosen}.",
+    ]
+    caption = (
+        "Counterpart of figure 5.3: subsets in the space of reliability and goodness of fit; "
+        "filled ones pass all filters."
     )
-    content = _content(model, found) | {"command": command, "sha256": inputs.plain()}
-    return {
-        "report.html": page.encode(),
-        "result.json": (json.dumps(plain(content), indent=1) + "\n").encode(),
-        "candidates.csv": table_csv(table),
-        **{f"solution-space.{kind}": picture for kind, picture in pictures.items()},
-    }
-
-
-def _content(model: ParametricModel, found: KeyParameters) -> dict[str, object]:
-    """What result.json holds, but for the command."""
-    return {
-        "chosen": [model.names[index] for index in found.chosen],
-        "size": found.selection.size,
-        "subsets": len(found.selection.subsets),
-        "sweep": [
-            {
-                "bound": item.bound,
-                "size": item.size,
-                "subsets": [[model.names[index] for index in subset] for subset in item.subsets],
-            }
-            for item in found.sweep
-        ],
-        "icc": {
-            "nominal": dict(zip(model.names, map(_icc, found.nominal), strict=True)),
-            "chosen": dict(
-                zip(
-                    (model.names[index] for index in found.chosen),
-                    map(_icc, found.estimates),
-                    strict=True,
-                )
-            ),
-        },
-        "candidates": [
-            {
-                "names": [model.names[index] for index in item.subset],
-                "variance": item.variance,
-                "vaf": item.vaf,
-                "icc": item.reliability,
-                "diversity": item.diversity,
-                "kept": item.kept,
-            }
-            for item in found.candidates
-        ],
-    }
-
-
-def _icc(values: Array) -> dict[str, float]:
-    """With its 95 % interval; NaN where there is none."""
-    told = between_visits(values)
-    return {key: getattr(told, key, np.nan) for key in ("value", "low", "high")}
+    tables = [candidates, _estimate_table(model, found), _sweep_table(model, found)]
+    with journal_style():
+        figures = drawn({"solution-space": _solution_figure(model, found)})
+    return Report(
+        "impc: Key parameters",
+        "Key parameters",
+        (Lines(findings),),
+        [results_section(tables, Picture("solution-space", caption, caption), command)],
+        figures=figures,
+        tables={"candidates": candidates},
+        data=_data(model, found, command) | {"sha256": inputs.plain()},
+    )
 
 
 def _candidate_table(model: ParametricModel, found: KeyParameters) -> TextTable:
-    rows = tuple(
+    rows = [
         (
             names_of(model, item.subset),
             number(item.variance),
@@ -110,9 +66,47 @@ def _candidate_table(model: ParametricModel, found: KeyParameters) -> TextTable:
             "kept" if item.kept else "",
         )
         for item in found.candidates
-    )
+    ]
     heads = ("subset", "largest variance", "mean VAF %", "least ICC(A,k)", "pathways", "")
     return TextTable("Subsets and the filters that they pass, best first.", heads, rows)
+
+
+def _data(model: ParametricModel, found: KeyParameters, command: str) -> dict[str, Any]:
+    def names(subset: Sequence[int]) -> list[str]:
+        return [model.names[index] for index in subset]
+
+    estimates = zip(names(found.chosen), map(_icc, found.estimates), strict=True)
+    return {
+        "chosen": names(found.chosen),
+        "size": found.selection.size,
+        "subsets": len(found.selection.subsets),
+        "sweep": [
+            {"bound": item.bound, "size": item.size, "subsets": [names(s) for s in item.subsets]}
+            for item in found.sweep
+        ],
+        "icc": {
+            "nominal": dict(zip(model.names, map(_icc, found.nominal), strict=True)),
+            "chosen": dict(estimates),
+        },
+        "candidates": [
+            {
+                "names": names(item.subset),
+                "variance": item.variance,
+                "vaf": item.vaf,
+                "icc": item.reliability,
+                "diversity": item.diversity,
+                "kept": item.kept,
+            }
+            for item in found.candidates
+        ],
+        "command": command,
+    }
+
+
+def _icc(values: Array) -> dict[str, float]:
+    """With its 95 % interval; NaN where there is none."""
+    told = between_visits(values)
+    return {key: getattr(told, key, np.nan) for key in ("value", "low", "high")}
 
 
 def _estimate_table(model: ParametricModel, found: KeyParameters) -> TextTable:
@@ -134,7 +128,7 @@ def _estimate_table(model: ParametricModel, found: KeyParameters) -> TextTable:
         )
     heads = ("parameter", "unit", "all free", "ICC, all free", *visits, "ICC")
     title = "Estimates, mean ± SD over subjects; ICC(A,k) between visits with its 95 % interval."
-    return TextTable(title, heads, tuple(rows))
+    return TextTable(title, heads, rows)
 
 
 def _mean_sd(values: Array) -> str:
@@ -157,9 +151,7 @@ def _sweep_table(model: ParametricModel, found: KeyParameters) -> TextTable:
         )
         rows.append((f"{item.bound:.2f}", str(item.size), str(len(item.subsets)), counts or "-"))
     heads = ("variance bound", "size", "subsets", "in how many of them")
-    return TextTable(
-        "The first filter, for every subject and visit at once (5.5).", heads, tuple(rows)
-    )
+    return TextTable("The first filter, for every subject and visit at once (5.5).", heads, rows)
 
 
 def _solution_figure(model: ParametricModel, found: KeyParameters) -> Figure:

@@ -160,11 +160,7 @@ def fixed_bias(
 
 
 def profile_interval(
-    model: ParametricModel,
-    trials: Sequence[Trial],
-    fit: Estimate,
-    index: int,
-    level: float = 0.95,
+    model: ParametricModel, trials: Sequence[Trial], fit: Estimate, index: int, level: float = 0.95
 ) -> tuple[float, float]:
     """Profile likelihood of a free parameter: where the misfit grows by chi-squared's quantile.
 

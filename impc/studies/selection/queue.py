@@ -10,12 +10,11 @@ import functools
 import json
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
-import msgspec
 import numpy as np
 
-from impc.arrays import frozen
 from impc.errors import ImpcError, InputError, SolverError
 from impc.files.digests import digest, source_digest, versions
+from impc.studies.cache import Cache, by_fields
 from impc.studies.selection.model import Trial
 from impc.studies.selection.model_source import model_source
 
@@ -54,10 +53,7 @@ def in_turn(model: ParametricModel) -> Runner:
 
 
 def on_workers(
-    workers: Workers,
-    source: ModelSource,
-    kept: Kept,
-    done: Callable[[str], None] = lambda _: None,
+    workers: Workers, source: ModelSource, kept: Kept, done: Callable[[str], None] = lambda _: None
 ) -> Runner:
     """On workers; what is kept already is not done again.
 
@@ -76,11 +72,11 @@ def on_workers(
     ) -> dict[str, T]:
         found: dict[str, T] = {}
         made_of = _made_of(source.name, source.arguments)
+        cache, codec = Cache(kept, made_of), by_fields(kind)
         keys = {name: _digest(source, made_of, work, given) for name, given in arguments.items()}
         for name, given in arguments.items():
-            before = kept.recall(keys[name], keys[name])
-            if before is not None:
-                found[name] = msgspec.convert(before, kind, dec_hook=_array)
+            if keys[name] in cache.stages:
+                found[name] = codec.decode(cache.stages[keys[name]])
                 done(name)
                 continue
             workers.submit(
@@ -93,8 +89,7 @@ def on_workers(
             if isinstance(item.value, ImpcError):
                 raise item.value
             found[name] = item.value
-            content = msgspec.to_builtins(item.value, enc_hook=np.ndarray.tolist)
-            kept.keep(keys[name], keys[name], content)
+            cache.keep(keys[name], item.value, codec)
             done(name)
         return {name: found[name] for name in arguments}
 
@@ -141,7 +136,3 @@ def _digest(
     ]
     ranges = model.names, model.low, model.high, model.typical
     return digest(made_of, ranges, outputs, work.__module__, work.__qualname__, given)
-
-
-def _array(kind: type, value: Any) -> Any:
-    return frozen(value)

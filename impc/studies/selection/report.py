@@ -1,19 +1,19 @@
-"""All files of a selection: page, tables as CSV, result.json, figure."""
+"""The report of a selection: page, tables as CSV, result.json, figure."""
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from markupsafe import Markup
 
-from impc.reporting.csv_text import csv_bytes
-from impc.reporting.rendering import TextTable, embedded, number, plain, render_template
-from impc.reporting.style import BLUE, DOUBLE_COLUMN, INK, journal_style, new_figure, render
+from impc.reporting.document import Lines, Picture, Report, Section, TextTable
+from impc.reporting.rendering import number
+from impc.reporting.style import BLUE, DOUBLE_COLUMN, INK, drawn, journal_style, new_figure
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
     from matplotlib.figure import Figure
 
@@ -21,13 +21,13 @@ if TYPE_CHECKING:
     from impc.studies.selection.analysis import StudySelection
     from impc.studies.selection.model import ParametricModel
 
-__all__ = ["names_of", "selection_files", "selection_table", "table_csv"]
+__all__ = ["names_of", "results_section", "selection_report", "selection_table"]
 
 
-def selection_files(
+def selection_report(
     model: ParametricModel, found: StudySelection, command: str, inputs: Inputs
-) -> dict[str, bytes]:
-    """Build all files of `impc select`; they name the `command` and `inputs`; none is written."""
+) -> Report:
+    """Page, result.json, tables and figure of `impc select`; they name `command` and `inputs`."""
     tables = {
         "identifiability": _rank_table(model, found),
         "sweep": _sweep_table(model, found),
@@ -37,24 +37,28 @@ def selection_files(
         "bias": _bias_table(model, found),
         "doubt": _three_intervals(model, found),
     }
-    with journal_style():
-        pictures = render(_interval_figure(model, found))
-    page = render_template(
-        "studies/selection/selection_page.html",
-        title="Sensitive parameters",
-        findings=_findings(model, found),
-        tables=list(tables.values()),
-        picture_source=embedded(pictures["png"]),
-        caption="Widths of the 95 % bootstrap intervals of the chosen parameters, relative to "
-        "their ranges: a point a subject, a bar at the mean.",
-        command=command,
+    caption = (
+        "Widths of the 95 % bootstrap intervals of the chosen parameters, relative to their "
+        "ranges: a point a subject, a bar at the mean."
     )
-    return {
-        "report.html": page.encode(),
-        "result.json": _json(model, found, command, inputs),
-        **{f"{name}.csv": table_csv(table) for name, table in tables.items()},
-        **{f"intervals.{kind}": content for kind, content in pictures.items()},
-    }
+    picture = Picture("intervals", caption, caption)
+    with journal_style():
+        figures = drawn({"intervals": _interval_figure(model, found)})
+    return Report(
+        "impc: Sensitive parameters",
+        "Sensitive parameters",
+        (Lines(_findings(model, found)),),
+        [results_section(tables.values(), picture, command)],
+        figures=figures,
+        tables=tables,
+        data=_data(model, found, command, inputs),
+    )
+
+
+def results_section(tables: Iterable[TextTable], picture: Picture, command: str) -> Section:
+    """The one section of a selection, which ends with its `command`."""
+    ending = Markup("<code>{}</code>").format(command)
+    return Section("Results", (*tables, picture, ending), together=True)
 
 
 def selection_table(model: ParametricModel, found: StudySelection) -> TextTable:
@@ -86,7 +90,7 @@ def selection_table(model: ParametricModel, found: StudySelection) -> TextTable:
             )
         )  # fmt: skip
     heads = ("method", "selected", "mean VAF %", "seconds a subject", "over FIM")
-    return TextTable("Methods of selection.", heads, tuple(tuple(row) for row in rows))
+    return TextTable("Methods of selection.", heads, rows)
 
 
 def _findings(model: ParametricModel, found: StudySelection) -> list[str]:
@@ -135,7 +139,7 @@ def _sweep_table(model: ParametricModel, found: StudySelection) -> TextTable:
             )
         )
     heads = ("variance bound", "size, each subject", "size, all at once (5.5)", "subsets", "best")
-    return TextTable("Largest feasible subsets.", heads, tuple(rows))
+    return TextTable("Largest feasible subsets.", heads, rows)
 
 
 def _interval_table(model: ParametricModel, found: StudySelection) -> TextTable:
@@ -152,7 +156,7 @@ def _interval_table(model: ParametricModel, found: StudySelection) -> TextTable:
             )
         )  # fmt: skip
     heads = ("parameter", "unit", "estimate", "width of the interval", "% of its range")
-    return TextTable("Chosen parameters, mean ± SD over subjects.", heads, tuple(rows))
+    return TextTable("Chosen parameters, mean ± SD over subjects.", heads, rows)
 
 
 def _three_intervals(model: ParametricModel, found: StudySelection) -> TextTable:
@@ -173,7 +177,7 @@ def _three_intervals(model: ParametricModel, found: StudySelection) -> TextTable
         "95 % intervals in the first subject. The last two take the residuals for white; an "
         "infinite end is not met inside the parameter's range."
     )
-    return TextTable(caption, heads, tuple(rows))
+    return TextTable(caption, heads, rows)
 
 
 def _finite(ends: tuple[float, float]) -> list[float | None]:
@@ -190,7 +194,7 @@ def _agreement_table(model: ParametricModel, found: StudySelection) -> TextTable
         f"What other rules select in the first subject. The chosen subset's collinearity is "
         f"{found.doubts.collinearity:.3g}; 10 to 20 is the usual limit."
     )
-    return TextTable(caption, ("rule", "subset", "shared with the chosen"), tuple(rows))
+    return TextTable(caption, ("rule", "subset", "shared with the chosen"), rows)
 
 
 def _bias_table(model: ParametricModel, found: StudySelection) -> TextTable:
@@ -221,7 +225,9 @@ def _interval_figure(model: ParametricModel, found: StudySelection) -> Figure:
     return figure
 
 
-def _json(model: ParametricModel, found: StudySelection, command: str, inputs: Inputs) -> bytes:
+def _data(
+    model: ParametricModel, found: StudySelection, command: str, inputs: Inputs
+) -> dict[str, Any]:
     def names(subset: Sequence[int]) -> list[str]:
         return [model.names[index] for index in subset]
 
@@ -235,7 +241,7 @@ def _json(model: ParametricModel, found: StudySelection, command: str, inputs: I
         }
         for subject, item in found.chosen.items()
     }  # fmt: skip
-    content = {
+    return {
         "selected": {
             "fim": names(found.free),
             "lasso": names(found.lasso),
@@ -271,7 +277,6 @@ def _json(model: ParametricModel, found: StudySelection, command: str, inputs: I
         "command": command,
         "sha256": inputs.plain(),
     }
-    return (json.dumps(plain(content), indent=1, allow_nan=False) + "\n").encode()
 
 
 def names_of(model: ParametricModel, subset: Sequence[int]) -> str:
@@ -281,8 +286,3 @@ def names_of(model: ParametricModel, subset: Sequence[int]) -> str:
 
 def _sd(values: np.ndarray[Any, np.dtype[np.float64]]) -> float:
     return float(np.std(values, ddof=1)) if len(values) > 1 else float("nan")
-
-
-def table_csv(table: TextTable) -> bytes:
-    """Encode a table as CSV."""
-    return csv_bytes(table.heads, table.rows)

@@ -6,9 +6,8 @@ import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-import msgspec
-
 from impc.errors import InputError
+from impc.studies.fit.settings import read_settings
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -61,14 +60,7 @@ def select_settings(table: Mapping[str, Any]) -> SelectSettings:
     InputError
         When a key is unknown or a value of the wrong kind.
     """
-    unknown = [key for key in table if key not in SelectSettings.__dataclass_fields__]
-    if unknown:
-        known = ", ".join(SelectSettings.__dataclass_fields__)
-        raise InputError(f"[select] {unknown[0]}", "is not a setting", f"known: {known}")
-    try:
-        found = msgspec.convert(dict(table), SelectSettings, strict=True)
-    except msgspec.ValidationError as error:
-        raise InputError("[select]", str(error), "see docs/selection.md") from None
+    found = read_settings("select", SelectSettings, table)
     _require_in_range(found)
     if found.draw not in ("single", "block"):
         raise InputError("[select] draw", f"got {found.draw!r}", "give single or block")

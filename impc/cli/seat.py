@@ -1,0 +1,109 @@
+"""The person on the seat: what the commands that simulate one have alike."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from impc.cli.progress import progress
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    import numpy as np
+
+    from impc.arrays import Array
+    from impc.control.controller import Controller
+    from impc.files.table import Table
+    from impc.model.plant import Plant
+    from impc.model.weights import Weights
+
+__all__ = [
+    "HORIZON",
+    "PLANT",
+    "SIGNALS",
+    "STEP",
+    "TORQUE",
+    "numbered",
+    "random_person",
+    "seat_controller",
+    "seat_table",
+    "seat_weights",
+]
+
+#: Import paths of the linear plant, and of a step of the nonlinear one.
+PLANT, STEP = "plants:seated_balance_for", "plants:seated_balance_step_for"
+#: Import path of the torque on the seat.
+TORQUE = "plants:ternary_torque"
+#: Of the controller, in samples of 0.01 s.
+HORIZON = 20
+#: The columns of `seat_table` for a configuration.
+SIGNALS = """\
+[signals.theta1]
+column = "seat_angle"
+unit = "deg"
+LIMIT
+[signals.theta2]
+column = "trunk_angle"
+unit = "deg"
+
+[signals.perturbation]
+column = "perturbation"
+unit = "N*m"
+"""
+
+
+def random_person(rng: np.random.Generator) -> dict[str, Any]:
+    """Body mass (kg), height (m) and sex of an adult, drawn from `rng`."""
+    sex = "male" if rng.random() < 0.5 else "female"
+    height = rng.normal(1.76 if sex == "male" else 1.63, 0.06)
+    mass = rng.normal(23.0, 2.0) * height**2
+    return {"mass": round(float(mass), 1), "height": round(float(height), 3), "sex": sex}
+
+
+def numbered(subjects: int) -> Iterator[str]:
+    """Names of so many `subjects`, 01, 02 and so on, with a bar."""
+    width = max(2, len(str(subjects)))
+    with progress(subjects, "subject") as done:
+        for number in range(1, subjects + 1):
+            yield f"{number:0{width}d}"
+            done("")
+
+
+def seat_weights(plant: Plant, price: float = 1.0) -> Weights:
+    """The intent: one direction of angles and rates of the `plant` at a `price`, little else."""
+    import numpy as np  # noqa: PLC0415
+
+    from impc.model.weights import Weights  # noqa: PLC0415
+
+    v = np.array([0.70, 0.65, 0.22, 0.20])
+    v /= np.linalg.norm(v)
+    Q = 1e-2 * np.eye(plant.n)
+    Q[:4, :4] = price * (6e5 * np.outer(v, v) + np.diag([2e4, 2e4, 500, 500]))
+    return Weights(Q, 1)
+
+
+def seat_controller(person: dict[str, Any], limit: float, price: float = 1.0) -> Controller:
+    """The controller of a `person` with a torque `limit` (Nm) and a `price` of angles and rates."""
+    from impc.control.controller import Controller  # noqa: PLC0415
+    from impc.files.plant_sources import make_plant, plant_source  # noqa: PLC0415
+    from impc.model.bounds import Bounds  # noqa: PLC0415
+
+    plant = make_plant(plant_source(PLANT, person), ("perturbation",))
+    bounds = Bounds(plant, u_min=-limit, u_max=limit)
+    return Controller(plant, seat_weights(plant, price), bounds, HORIZON, terminal_set=False)
+
+
+def seat_table(name: str, degrees: Array, torque: Array, rate: float) -> Table:
+    """The trial `name`: angles in `degrees` (samples, 2), `torque` in Nm (samples,) at a `rate`."""
+    import numpy as np  # noqa: PLC0415
+
+    from impc.files.table import make_table  # noqa: PLC0415
+
+    columns = {
+        "time": np.arange(len(torque)) / rate,
+        "seat_angle": degrees[:, 0],
+        "trunk_angle": degrees[:, 1],
+        "perturbation": torque,
+    }
+    units = {"time": "s", "seat_angle": "deg", "trunk_angle": "deg", "perturbation": "Nm"}
+    return make_table(name, columns, units=units, rate=rate)
