@@ -35,7 +35,7 @@ from impc.assess.input_limits import with_limit
 from impc.assess.variance_accounted_for import centred_vaf
 from impc.checking import replace
 from impc.control.closed_loop import simulate
-from impc.inverse.estimate import Estimate
+from impc.inverse.estimates import Estimate
 from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.problem import Problem, controller_for, scenarios
 from impc.inverse.residuals import misfit_or_reason

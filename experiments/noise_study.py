@@ -26,7 +26,8 @@ from experiments.benchmarks.workloads import seat
 from impc.assess.variance_accounted_for import vaf
 from impc.checking import replace
 from impc.control.closed_loop import simulate
-from impc.inverse.methods import METHODS, NaturalUnits, estimate_all
+from impc.inverse.groundwork import NaturalUnits
+from impc.inverse.methods import METHODS, estimate_all
 from impc.inverse.problem import controller_for
 from impc.inverse.solution_set import natural_coordinates
 from impc.model.recordings import Recording
@@ -51,7 +52,7 @@ if TYPE_CHECKING:
 
     from impc.arrays import Array
     from impc.control.closed_loop import Scenario
-    from impc.inverse.estimate import Estimate
+    from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
 
 __all__ = ["Cell", "Outcome", "study_cell"]

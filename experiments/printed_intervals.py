@@ -37,7 +37,7 @@ from impc.studies.fit.subject import fit_problem
 
 if TYPE_CHECKING:
     from impc.arrays import Array
-    from impc.inverse.estimate import Estimate
+    from impc.inverse.estimates import Estimate
 
 __all__ = [
     "Scores",

@@ -28,7 +28,7 @@ import plants
 from impc.arrays import Array
 from impc.assess.diagnostics import ResidualDiagnostics, residual_diagnostics
 from impc.control.controller import Controller
-from impc.inverse.estimate import Estimate
+from impc.inverse.estimates import Estimate
 from impc.inverse.noisy_fit import fit_controller
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant

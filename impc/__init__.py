@@ -44,8 +44,10 @@ if TYPE_CHECKING:
     from impc.inverse.direct_and_reduced import inverse_mpc_reduced as inverse_mpc_reduced
     from impc.inverse.equivalent_weights import least_condition_weights as least_condition_weights
     from impc.inverse.equivalent_weights import other_weights as other_weights
+    from impc.inverse.estimates import Estimate as Estimate
     from impc.inverse.inverse_lqr import inverse_lqr_gradient as inverse_lqr_gradient
     from impc.inverse.inverse_lqr import inverse_lqr_lmi as inverse_lqr_lmi
+    from impc.inverse.methods import estimate as estimate
     from impc.inverse.problem import Problem as Problem
     from impc.inverse.solution_set import gain_fibre as gain_fibre
     from impc.model.bounds import Bounds as Bounds
@@ -60,6 +62,7 @@ if TYPE_CHECKING:
     from impc.model.weights import condition_number as condition_number
     from impc.model.weights import normalised as normalised
     from impc.model.weights import weight_error as weight_error
+    from impc.studies.estimate_page import report as report
     from impc.studies.fit.settings import FitSettings as FitSettings
     from impc.studies.fit.subject import fit_problem as fit_problem
     from impc.studies.fit.subject import fit_recordings as fit_recordings
@@ -83,7 +86,9 @@ _NAMES = {
     "inverse.cross_term": "inverse_lqr_cross_term",
     "inverse.direct_and_reduced": "infer_weights inverse_mpc inverse_mpc_reduced",
     "inverse.equivalent_weights": "least_condition_weights other_weights",
+    "inverse.estimates": "Estimate",
     "inverse.inverse_lqr": "inverse_lqr_gradient inverse_lqr_lmi",
+    "inverse.methods": "estimate",
     "inverse.problem": "Problem",
     "inverse.solution_set": "gain_fibre",
     "model.bounds": "Bounds",
@@ -92,6 +97,7 @@ _NAMES = {
     "model.recordings": "Label Recording",
     "model.riccati": "LqrSolution gain_gradients solve_lqr",
     "model.weights": "Weights condition_number normalised weight_error",
+    "studies.estimate_page": "report",
     "studies.fit.settings": "FitSettings",
     "studies.fit.subject": "fit_problem fit_recordings",
 }

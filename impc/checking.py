@@ -372,7 +372,7 @@ _VALUES = {
     "MpcSolver": ("impc.control.casadi_controller", "make it with build_mpc"),
     "FitSettings": ("impc.studies.fit.settings", "make it with FitSettings"),
     "FitProgress": ("impc.studies.fit.subject", "make it with FitProgress, or leave it out"),
-    "Estimate": ("impc.inverse.estimate", "make it with estimate(problem)"),
+    "Estimate": ("impc.inverse.estimates", "make it with estimate(problem)"),
     "Rows": ("impc.control.constraint_rows", "make it with build_rows"),
 }
 _MADE_BY = {kind: remedy for kind, (_, remedy) in _VALUES.items()}
@@ -386,6 +386,7 @@ _KINDS: dict[str, Kind] = {
     "int": _whole,
     "bool": _truth,
     "str": _text,
+    "str | Path": _as_it_is,
     "Any": _as_it_is,
     "Sequence[str]": _several(_text, "names"),
     "tuple[str, ...]": _several(_text, "names"),

@@ -133,12 +133,15 @@ class InfeasibleError(ImpcError):
 
     Examples
     --------
+    >>> import warnings
     >>> import impc
     >>> from plants import yalmip_example
     >>> plant = impc.Plant(yalmip_example())
     >>> bounds = impc.Bounds(plant, u_min=-1, u_max=1)
     >>> law = impc.Controller(plant, impc.Weights([[1, 0], [0, 1]], 1), bounds, horizon=3)
-    >>> impc.require_complete(law, law.simulate([9, 3], steps=20))
+    >>> with warnings.catch_warnings(action="ignore"):
+    ...     run = law.simulate([9, 3], steps=20)
+    >>> impc.require_complete(law, run)
     Traceback (most recent call last):
         ...
     impc.errors.InfeasibleError: x0: no input sequence keeps the bound u <= 1 ...
@@ -150,11 +153,14 @@ class SolverError(ImpcError):
 
     Examples
     --------
+    >>> import warnings
     >>> import impc
     >>> from plants import yalmip_example
     >>> plant = impc.Plant(yalmip_example())
     >>> law = impc.Controller.from_gain(plant, [[0, 0]], impc.Bounds(plant), 3, terminal_set=False)
-    >>> impc.require_complete(law, law.simulate([1, 3], steps=200))
+    >>> with warnings.catch_warnings(action="ignore"):
+    ...     run = law.simulate([1, 3], steps=200)
+    >>> impc.require_complete(law, run)
     Traceback (most recent call last):
         ...
     impc.errors.SolverError: sample ...: the state left every reasonable range; ...

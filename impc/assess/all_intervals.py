@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from impc.assess.printed_gain import GainEstimate
     from impc.assess.resampling import Replicate
     from impc.assess.weights_ranges import WeightsSummary
-    from impc.inverse.estimate import Estimate
+    from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
     from impc.model.weights import Weights
 

@@ -16,7 +16,7 @@ from impc.inverse.problem import controller_for, scenarios
 from impc.inverse.solution_set import natural_coordinates
 
 if TYPE_CHECKING:
-    from impc.inverse.estimate import Estimate
+    from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
     from impc.model.recordings import Recording
 

@@ -35,7 +35,7 @@ from impc.model.bounds import Bounds, bound_rows
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from impc.inverse.estimate import Estimate
+    from impc.inverse.estimates import Estimate
     from impc.inverse.gain_search import GainFit
     from impc.inverse.problem import Problem
 

@@ -16,7 +16,7 @@ from impc.control.closed_loop import Simulation, simulate
 from impc.inverse.problem import scenarios
 
 if TYPE_CHECKING:
-    from impc.inverse.estimate import Estimate
+    from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
     from impc.model.bounds import Bounds
 

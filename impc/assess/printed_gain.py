@@ -31,7 +31,7 @@ from impc.inverse.coordinates import Coordinates
 from impc.inverse.many_trials import has_many_trials, search_many
 
 if TYPE_CHECKING:
-    from impc.inverse.estimate import Estimate
+    from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
 
 __all__ = ["GainEstimate", "gain_estimate"]

@@ -406,6 +406,7 @@ def require_complete(controller: Controller, simulation: Simulation) -> Simulati
 
     Examples
     --------
+    >>> import warnings
     >>> import impc
     >>> from plants import yalmip_example
     >>> plant = impc.Plant(yalmip_example())
@@ -413,7 +414,9 @@ def require_complete(controller: Controller, simulation: Simulation) -> Simulati
     >>> law = impc.Controller(plant, impc.Weights([[1, 0], [0, 1]], 1), bounds, horizon=3)
     >>> impc.require_complete(law, law.simulate([1, 3], steps=20)).reached
     20
-    >>> impc.require_complete(law, law.simulate([90, 3], steps=20))
+    >>> with warnings.catch_warnings(action="ignore"):
+    ...     run = law.simulate([90, 3], steps=20)
+    >>> impc.require_complete(law, run)
     Traceback (most recent call last):
         ...
     impc.errors.InfeasibleError: x0: no input sequence keeps the bound u <= 1 ...

@@ -10,14 +10,15 @@ scale, its bounds, its horizon and its terminal set. The weights are one way to 
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from impc.arrays import Array, finite_array, frozen, symmetric_matrix
-from impc.checking import Value, checked
-from impc.control.closed_loop import scenario, simulate
+from impc.checking import Value, checked, replace
+from impc.control.closed_loop import Status, scenario, simulate
 from impc.control.terminal_set import maximal_invariant_set
 from impc.errors import InputError
 from impc.model.riccati import is_stable, solve_lqr
@@ -210,7 +211,9 @@ class Controller(Value):
         Returns
         -------
         Simulation
-            With a status for each sample; `require_complete` turns a failure into an error.
+            With a status for each sample. Samples that are not reached, because no input keeps the
+            bounds or the loop diverges, are NaN, and a warning names the first of them;
+            `require_complete` turns that into an error.
 
         Raises
         ------
@@ -226,7 +229,17 @@ class Controller(Value):
         >>> law.simulate([1.0], steps=4).x.shape
         (5, 1)
         """
-        return simulate(self, scenario(self.plant, x0, steps, disturbance))
+        run = simulate(self, scenario(self.plant, x0, steps, disturbance))
+        if run.complete:
+            return run
+        end = run.reached
+        warnings.warn(
+            f"sample {end}: {Status(int(run.status[end])).sentence}; what follows is NaN",
+            stacklevel=3,
+        )
+        x, u = np.array(run.x), np.array(run.u)
+        x[end + 1 :], u[end:] = np.nan, np.nan
+        return replace(run, x=x, u=u)
 
     @property
     def penalty(self) -> float:

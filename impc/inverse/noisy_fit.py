@@ -20,7 +20,7 @@ from impc.errors import SolverError, WeightsError
 from impc.inverse.diagonal_start import diagonal_weights
 from impc.inverse.direct_and_reduced import auxiliary_weights
 from impc.inverse.equivalent_weights import least_condition_weights
-from impc.inverse.estimate import Estimate, Status
+from impc.inverse.estimates import Estimate, Status
 from impc.inverse.explaining_weights import weights_behind
 from impc.inverse.gain_search import EXPLAINED, GainFit, describe_gain, fit_gain
 from impc.inverse.initial_states import with_fitted_starts

@@ -11,7 +11,7 @@ from experiments.simulated_subjects import noisy_recordings
 from impc.assess.input_limits import LimitEstimate, input_limit, with_limit
 from impc.control.closed_loop import scenario, simulate
 from impc.errors import InputError
-from impc.inverse.estimate import Estimate
+from impc.inverse.estimates import Estimate
 from impc.inverse.noisy_fit import fit_controller
 from impc.model.recordings import Recording
 from impc.studies.fit.settings import FitSettings

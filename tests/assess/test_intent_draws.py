@@ -11,7 +11,7 @@ from impc.assess.covariance import GainCovariance, gain_covariance
 from impc.assess.intent_draws import drawn_gains
 from impc.assess.weights_ranges import summarise_weights
 from impc.checking import replace
-from impc.inverse.estimate import Estimate
+from impc.inverse.estimates import Estimate
 from impc.inverse.noisy_fit import fit_controller
 from impc.model.riccati import solve_lqr
 from impc.studies.fit.result import FittedParameter

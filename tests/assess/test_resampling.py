@@ -24,7 +24,7 @@ from impc.assess.resampling import (
 )
 from impc.checking import replace
 from impc.errors import InputError
-from impc.inverse.estimate import Estimate
+from impc.inverse.estimates import Estimate
 from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.residuals import misfit_or_reason
 from impc.model.plant import Plant

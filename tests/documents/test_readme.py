@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
 from impc.model.plant import Plant
@@ -11,20 +9,6 @@ from impc.studies.example.cases import run_case
 from impc.studies.example.table import methods_table
 from tests.documents.blocks import PAGES, blocks
 
-# What is to be the first Python of the README: `estimate` and `report` are not there yet. When they
-# are, this test fails because it passes; then the program takes the place of the README's.
-FIRST_PROGRAM = """
-import impc
-from plants import yalmip_example
-
-plant = impc.Plant(yalmip_example())  # any discrete control.StateSpace
-bounds = impc.Bounds(plant, u_min=-1, u_max=1)
-truth = impc.Controller(plant, impc.Weights([[1, 0], [0, 1]], 1), bounds, horizon=3)
-trial = impc.Recording(plant, truth.simulate(x0=[1, 3], steps=20).x)
-found = impc.estimate(impc.Problem(plant, bounds, 3, [trial]), "inverse_mpc")
-print(found.weights, found.identifiability())
-impc.report(found, "results/first")
-"""
 README = PAGES["README.md"].read_text(encoding="utf-8")
 
 
@@ -34,15 +18,6 @@ def close(shown: str, found: str) -> bool:
         return float(found) == pytest.approx(float(shown), rel=2e-2, abs=2e-3)
     except ValueError:
         return shown == found
-
-
-@pytest.mark.xfail(
-    raises=AttributeError, strict=True, reason="impc.estimate and impc.report are not written yet"
-)
-def test_the_first_program_of_the_design(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    exec(compile(FIRST_PROGRAM, "README.md", "exec"), {"__name__": "page"})
-    assert (tmp_path / "results/first/report.html").exists()
 
 
 def test_the_first_lines_are_the_two_commands() -> None:

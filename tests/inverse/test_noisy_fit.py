@@ -17,9 +17,10 @@ from impc.checking import replace
 from impc.control.closed_loop import scenario, simulate
 from impc.inverse.coordinates import Coordinates
 from impc.inverse.diagonal_start import diagonal_weights
-from impc.inverse.estimate import Estimate
+from impc.inverse.estimates import Estimate
+from impc.inverse.groundwork import NaturalUnits
 from impc.inverse.initial_states import with_fitted_starts
-from impc.inverse.methods import NaturalUnits, estimate_all
+from impc.inverse.methods import estimate_all
 from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.problem import Problem
 from impc.inverse.residuals import evaluate

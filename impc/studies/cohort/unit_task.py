@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.assess.judged import MethodFit
     from impc.files.configuration import Configuration
-    from impc.inverse.estimate import Estimate
+    from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
     from impc.studies.fit.settings import FitSettings
 

@@ -14,12 +14,13 @@ from impc.arrays import Array, Frozen, frozen
 from impc.assess.held_out import left_out_vaf
 from impc.assess.judged import judge
 from impc.errors import SolverError, WeightsError
-from impc.inverse.methods import NaturalUnits, compute, estimate_all
+from impc.inverse.groundwork import NaturalUnits, afresh
+from impc.inverse.methods import estimate_all
 
 if TYPE_CHECKING:
     from impc.assess.judged import MethodFit
-    from impc.inverse.estimate import Estimate
-    from impc.inverse.methods import Remember
+    from impc.inverse.estimates import Estimate
+    from impc.inverse.groundwork import Remember
     from impc.inverse.problem import Problem
 
 __all__ = ["COMPARED", "MethodComparison", "compare_recordings", "stages"]
@@ -66,7 +67,7 @@ def stages(trials: int) -> int:
 
 
 def compare_recordings(
-    problem: Problem, settle: float, remember: Remember = compute
+    problem: Problem, settle: float, remember: Remember = afresh
 ) -> tuple[MethodComparison, ...]:
     """Run every method on all trials, then on all but each one.
 

@@ -13,7 +13,7 @@ from impc.assess.resampling import Replicate
 from impc.checking import replace
 from impc.files.digests import digest, versions
 from impc.files.sealed import Kept
-from impc.inverse.estimate import Estimate, decode_estimate, encode_estimate
+from impc.inverse.estimates import Estimate, decode_estimate, encode_estimate
 from impc.inverse.methods import METHODS, Method
 from impc.studies.cache import Cache, Codec, by_fields
 
@@ -37,7 +37,12 @@ _LEFT_OUT = re.compile(r"without (?:trial )?(\d+)")
 class FitMemory(Cache):
     """The cache of `impc fit` and `impc compare`; its methods are what these two keep.
 
-    `files`, `digest`, `done` and `stages` are as in `Cache`; `problem` is as it was posed.
+    `files`, `digest`, `done` and `stages` are as in `Cache`.
+
+    Attributes
+    ----------
+    problem : Problem
+        As it was posed.
     """
 
     problem: Problem = field(kw_only=True)

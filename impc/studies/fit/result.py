@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from impc.assess.judged import MethodFit
     from impc.assess.printed_gain import GainEstimate
     from impc.assess.variance_accounted_for import TrialAgreement
-    from impc.inverse.estimate import Estimate
+    from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
     from impc.studies.fit.settings import FitSettings
 

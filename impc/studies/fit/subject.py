@@ -30,8 +30,9 @@ from impc.assess.weights_ranges import weights_summary_or_reason
 from impc.checking import checked, replace
 from impc.control.closed_loop import simulate
 from impc.errors import DataError, SolverError
-from impc.inverse.estimate import Estimate
-from impc.inverse.methods import NaturalUnits, Remember, compute, estimate_all
+from impc.inverse.estimates import Estimate
+from impc.inverse.groundwork import NaturalUnits, Remember, afresh
+from impc.inverse.methods import estimate_all
 from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.problem import Problem, controller_for, scenarios
 from impc.studies.fit.result import FitResult, FittedParameter
@@ -54,7 +55,7 @@ if TYPE_CHECKING:
 __all__ = ["BESIDE", "FitProgress", "fit_problem", "fit_recordings", "stages", "state_sizes"]
 
 _THREADS = 2
-# Shown beside inverse MPC, which comes last.
+#: Methods that are shown beside inverse MPC, which comes last (docs/fitting.md).
 BESIDE = ("feedback_gain", "inverse_lqr", "inverse_lqr_output", "clipped_lqr")
 
 
@@ -74,7 +75,7 @@ class FitProgress:
     """
 
     done: Callable[[str], None] = lambda _: None
-    estimate: Remember = compute
+    estimate: Remember = afresh
     replicate: Callable[[str, Callable[[], Replicate]], Replicate] = lambda _, compute: compute()
 
 

@@ -14,7 +14,7 @@ from click.testing import CliRunner
 from experiments.coverage import cart, noisy_trial, true_controller
 from impc.arrays import Array
 from impc.cli.main import main
-from impc.inverse.estimate import Estimate, decode_estimate, encode_estimate
+from impc.inverse.estimates import Estimate, decode_estimate, encode_estimate
 from impc.studies.compare.subject import (
     COMPARED,
     MethodComparison,

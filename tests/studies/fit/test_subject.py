@@ -18,7 +18,7 @@ from impc.control.closed_loop import scenario, simulate
 from impc.control.controller import Controller
 from impc.errors import DataError, InputError, SolverError
 from impc.inverse.delayed_feedback import preliminary_gain
-from impc.inverse.estimate import Estimate
+from impc.inverse.estimates import Estimate
 from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.problem import Problem
 from impc.model.bounds import Bounds

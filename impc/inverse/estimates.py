@@ -25,7 +25,13 @@ __all__ = ["Estimate", "Status", "decode_estimate", "encode_estimate"]
 
 
 class Status(Enum):
-    """How a method ended."""
+    """How a method ended; each has a sentence.
+
+    Attributes
+    ----------
+    EXPLAINED, SETTLED, STOPPED, GAIN_ONLY, NONE : Status
+        See `sentence`.
+    """
 
     EXPLAINED = "explained"
     SETTLED = "settled"
@@ -35,7 +41,7 @@ class Status(Enum):
 
     @property
     def sentence(self) -> str:
-        """The same as a sentence."""
+        """The same as a sentence (docs/fitting.md)."""
         return _SENTENCES[self]
 
 
@@ -76,6 +82,20 @@ class Estimate(Frozen):
         Simulations with derivatives.
     seconds : float
         Time of the method, given what it starts from, s.
+
+    Examples
+    --------
+    >>> import control
+    >>> import impc
+    >>> plant = impc.Plant(control.ss([[0.9]], [[1]], [[1]], 0, 1))
+    >>> bounds = impc.Bounds(plant, u_min=-0.3, u_max=0.3)
+    >>> truth = impc.Controller(plant, impc.Weights(1, 1), bounds, horizon=3)
+    >>> trial = impc.Recording(plant, truth.simulate([1.0], steps=20).x)
+    >>> found = impc.estimate(impc.Problem(plant, bounds, 3, [trial]))
+    >>> found.status.sentence
+    'The weights reproduce the recordings to 1e-9 of them.'
+    >>> bool(abs(found.gain - truth.K) < 1e-9)
+    True
     """
 
     method: str
@@ -174,7 +194,15 @@ def encode_estimate(estimate: Estimate) -> dict[str, Any]:
 
 
 def decode_estimate(seen: Problem, kept: dict[str, Any]) -> Estimate:
-    """Inverse of `encode_estimate`; the problem is as the method has `seen` it."""
+    """Make an estimate again.
+
+    Parameters
+    ----------
+    seen : Problem
+        As the method saw it.
+    kept : dict
+        Of `encode_estimate`.
+    """
     m = seen.plant.m
     return Estimate(
         kept["method"],
