@@ -1,6 +1,6 @@
 """Controllers at and beyond the edge of what they can keep: right, or a status that says no.
 
-The reference is `tests/exact_mpc.py`: the program in u from (Q, R, P), proved with eighty digits.
+The reference is `tests/exact_mpc.py`: the program in u from (Q, R, P), proved in a hundred digits.
 """
 
 from __future__ import annotations
