@@ -174,7 +174,7 @@ def _sample_time(dt: object) -> float:
 
 def _of_length_one(B: Array) -> Array:
     """Columns divided by their largest entries, where that is not zero."""
-    return B / np.maximum(np.max(np.abs(B), axis=0), 1e-300)
+    return np.asarray(B / np.maximum(np.max(np.abs(B), axis=0), 1e-300))
 
 
 def _require_stabilisable(plant: Plant) -> None:

@@ -132,13 +132,18 @@ class _Equalities:
         self.program = program
         upper, lower = active[: 2 * width].reshape(2, N, m).copy()
         self.upper, self.lower, self.free = upper, lower, ~(upper | lower)
-        self.dependent: list[int] = []
+        self.P: list[Exact] = [program.P]
+        self.gain: list[Exact] = []
+        self.inverse: list[Exact] = []
+        self.responses: dict[int, tuple[Exact, Exact]] = {}
         if last is not None and np.array_equal(self.free, last.free):
             self.P, self.gain, self.inverse = last.P, last.gain, last.inverse
             self.responses = last.responses
         else:
-            self.responses: dict[int, tuple[Exact, Exact]] = {}
             self._recur()
+        self.factor: list[Exact] = []
+        self.tight: list[int] = []
+        self.dependent: list[int] = []
         self._factor(np.flatnonzero(active[2 * width :]))
 
     def answer(self, x: Exact) -> _Plan:
@@ -157,7 +162,6 @@ class _Equalities:
     def _recur(self) -> None:
         A, B, Q, R = self.program.matrices
         P = self.program.P
-        self.P, self.gain, self.inverse = [P], [], []
         for k in range(self.program.horizon - 1, -1, -1):
             free = self.free[k]
             moved = P @ A
@@ -203,13 +207,12 @@ class _Equalities:
             else:
                 on_x[stage[row - 2 * width]] = normal[row - 2 * width]
             self.responses[row] = self._plan(zeros(n), zeros(N, m), on_x, on_u)
-        return self.responses[row]
+        found: tuple[Exact, Exact] = self.responses[row]
+        return found
 
     def _factor(self, rows: np.ndarray) -> None:
         """Cholesky's factor of what tight rows of states gain from each other; none depends."""
         stage, normal, _ = self.program.rows
-        self.factor: list[Exact] = []
-        self.tight: list[int] = []
         for row in rows:
             at = [*self.tight, int(row)]
             _, x = self._response(2 * self.program.width + row)
