@@ -15,20 +15,22 @@ import numpy as np
 
 from impc.bounds import bound_rows, box_bounds
 from impc.closed_loop import (
+    PreparedLoop,
     Scenario,
     Simulation,
     Status,
     prepare_loop,
+    run_loop,
     scenario,
     simulate,
 )
 from impc.compiled import solve_dual
 from impc.controller import Controller, mpc_controller
 from impc.errors import SolverError
-from impc.prediction import build_rows, directions
+from impc.prediction import directions
 from impc.saturated import solve_saturated
 from impc.weights import Weights, stage_weights
-from tests.exact_mpc import NOTHING, ExactProgram
+from tests.exact_mpc import NOTHING, ExactProgram, exact
 from tests.exact_search import first_input
 from tests.support import random_plant, random_weights
 
@@ -70,10 +72,12 @@ def hard_case(seed: int, largest: int = 60) -> HardCase:
 
 def _edge(controller: Controller, direction: np.ndarray) -> float:
     """The size of a start between those that end well and those that do not."""
+    prepared = prepare_loop(controller, directions(controller, 0))
     inside, outside = 1e-3, 1e3
     for _ in range(20):
         middle = float(np.sqrt(inside * outside))
-        if simulate(controller, scenario(controller.plant, middle * direction, STEPS)).complete:
+        start = scenario(controller.plant, middle * direction, STEPS)
+        if run_loop(prepared, start)[0].complete:
             inside = middle
         else:
             outside = middle
@@ -99,19 +103,22 @@ def reference(case: HardCase) -> ExactProgram:
     )
 
 
-def guess(controller: Controller, x: np.ndarray) -> np.ndarray:
-    """The rows that the package takes to be active, in the order of the reference."""
+def prices(prepared: PreparedLoop, x: np.ndarray) -> np.ndarray:
+    """Multipliers of the package, in the order of the reference's rows; 1 where only the sign is.
+
+    Those of the rows that are active, or of those that exclude each other.
+    """
+    controller, rows = prepared.controller, prepared.rows
     plant, horizon = controller.plant, controller.horizon
-    bounds, rows = bound_rows(controller.bounds, plant), build_rows(controller)
+    bounds = bound_rows(controller.bounds, plant)
     on, m = bounds.on_state, plant.m
-    upper, lower = np.zeros((2, horizon, m), dtype=bool)
-    state = np.zeros((horizon, int(on.sum())), dtype=bool)
-    last = np.zeros(int(np.sum(rows.stage >= horizon)), dtype=bool)
+    upper, lower = np.zeros((2, horizon, m))
+    state = np.zeros((horizon, int(on.sum())))
+    last = np.zeros(int(np.sum(rows.stage >= horizon)))
     if not np.any(on) and not len(last):
         sides = np.array(controller.bounds.u_min), np.array(controller.bounds.u_max)
-        loop = prepare_loop(controller, directions(controller, 0)).matrices
-        plan = solve_saturated(loop, np.array(controller.S), *sides, horizon, x)
-        upper, lower = plan.at > 0, plan.at < 0
+        plan = solve_saturated(prepared.matrices, np.array(controller.S), *sides, horizon, x)
+        upper, lower = np.maximum(plan.at, 0), np.maximum(-plan.at, 0)
     else:
         count, width = rows.M.shape
         room, lam = min(count, width) + 1, np.zeros(count)
@@ -122,13 +129,13 @@ def guess(controller: Controller, x: np.ndarray) -> np.ndarray:
         for r in np.flatnonzero(lam > 0):
             family, k = rows.family[r], rows.stage[r]
             if k >= horizon:
-                last[r - (len(lam) - len(last))] = True
+                last[r - (len(lam) - len(last))] = lam[r]
             elif on[family]:
-                state[k, family - 2 * m] = True
+                state[k, family - 2 * m] = lam[r]
             elif family < m:
-                upper[k, family] = True
+                upper[k, family] = lam[r]
             else:
-                lower[k, family - m] = True
+                lower[k, family - m] = lam[r]
     return np.concatenate([part.ravel() for part in (upper, lower, state, last)])
 
 
@@ -155,16 +162,18 @@ def faults(case: HardCase, run: Simulation, samples: int) -> list[str]:
         found.append("the states are not those of the plant")
     if status == Status.DIVERGED and not np.max(abs(moved[-1])) > 1e6:
         found.append("called diverged with a state in range")
-    program = reference(case)
+    program, prepared = reference(case), prepare_loop(controller, directions(controller, 0))
     if status == Status.INFEASIBLE:
         x = run.x[run.reached]
-        if first_input(program, x, guess(controller, x), NOTHING) is not None:
+        price = prices(prepared, x)
+        excluded = program.is_excluded(exact(x), exact(price))
+        if not excluded and first_input(program, x, price > 0, NOTHING) is not None:
             found.append("called infeasible, and there is a plan")
     busy = np.flatnonzero(run.status[:applied] != Status.FREE)
     if not len(busy):
         busy = np.arange(min(applied, 1))
     for t in busy[np.linspace(0, len(busy) - 1, min(samples, len(busy))).astype(int)]:
-        true = first_input(program, run.x[t], guess(controller, run.x[t]))
+        true = first_input(program, run.x[t], prices(prepared, run.x[t]) > 0)
         if true is None:
             found.append(f"sample {t}: an input where there is none")
             continue
