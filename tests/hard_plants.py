@@ -10,6 +10,7 @@ from __future__ import annotations
 import sys
 from collections import Counter
 from dataclasses import dataclass
+from decimal import Decimal
 
 import numpy as np
 
@@ -35,6 +36,8 @@ from tests.exact_search import first_input
 from tests.support import random_plant, random_weights
 
 STEPS = 40
+# What a bound may be exceeded by, as a share of it.
+_PROMISED = Decimal("1e-9")
 
 
 @dataclass(frozen=True)
@@ -145,7 +148,8 @@ def faults(case: HardCase, run: Simulation, samples: int) -> list[str]:
     Inputs keep their bounds to 1e-9; at up to `samples` samples, the first and the last that a
     program was solved at among them (the last is the one after which the state is out of range,
     where it is), they are those of the reference to 1e-7 of the bound. Where it is said that there
-    is none, the reference has none.
+    is none, the reference has none. A program that the rounding of the states before has made
+    infeasible (seed 10994, by 1e-11 of a bound) is compared with rows moved by what is promised.
     """
     controller, plant = case.controller, case.controller.plant
     low, high = controller.bounds.u_min, controller.bounds.u_max
@@ -173,7 +177,10 @@ def faults(case: HardCase, run: Simulation, samples: int) -> list[str]:
     if not len(busy):
         busy = np.arange(min(applied, 1))
     for t in busy[np.linspace(0, len(busy) - 1, min(samples, len(busy))).astype(int)]:
-        true = first_input(program, run.x[t], prices(prepared, run.x[t]) > 0)
+        active = prices(prepared, run.x[t]) > 0
+        true = first_input(program, run.x[t], active)
+        if true is None:
+            true = first_input(program, run.x[t], active, _PROMISED)
         if true is None:
             found.append(f"sample {t}: an input where there is none")
             continue
