@@ -1,22 +1,31 @@
-"""The controller (3.1) as a dense quadratic program in u with eighty digits, without the package.
+"""The controller (3.1) as a quadratic program in u with a hundred digits, without the package.
 
-Condensed with the open plant from (Q, R, P), P from Newton's iteration on the Riccati equation. An
-active set is guessed, the program on it solved by elimination, and the answer accepted when all of
-the Karush-Kuhn-Tucker conditions hold: then it is *the* answer, wherever the guess came from.
+    minimise over u_0 .. u_{N-1}    x_N'P x_N / 2 + sum_k (x_k'Q x_k + u_k'R u_k) / 2
+    subject to    u_min <= u_k <= u_max,    E x_k <= b (k < N),    H x_N <= h
+
+from (Q, R, P), P by Newton's iteration on the Riccati equation. Where an answer comes from does not
+matter (`tests/exact_search.py`): it is proved here, in the plainest recursions. x_k forward and the
+multipliers backward give every Karush-Kuhn-Tucker condition; where there is no answer, they give
+the best that inputs within their bounds can do against the multipliers of excluded rows.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from decimal import Decimal, getcontext
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import scipy.linalg
 
 Exact = Any  # an array of Decimal: numpy has no type for it
-getcontext().prec = 80  # numbers grow by 2^60, their squares by 1e36
-_ZERO: Any = Decimal(0)
-_KEPT = Decimal("1e-12")  # a state on its bound was rounded there: share of the bound
+getcontext().prec = 100  # numbers grow by 2^60, their squares by 1e36
+ZERO: Any = Decimal(0)
+#: Zero, relative to what it is the difference of: rounding of a hundred digits is below 1e-60.
+NOTHING = Decimal("1e-40")
+#: A state on its bound was rounded there: what a row may be exceeded by, as a share of its bound.
+ROUNDED = Decimal("1e-12")
 
 
 def exact(values: Any) -> Exact:
@@ -24,127 +33,130 @@ def exact(values: Any) -> Exact:
     return np.vectorize(Decimal, otypes=[object])(np.asarray(values, dtype=float))
 
 
-class ExactProgram:
-    """The condensed program of a horizon; rows are the inputs' upper and lower bounds, then others.
+def zeros(*shape: int) -> Exact:
+    """Zeros as decimals."""
+    return np.full(shape, ZERO)
 
-    `E x_k <= b` holds for k = 0 .. N-1, `H x_N <= h` at the end.
+
+@dataclass(frozen=True)
+class ExactProgram:
+    """The program of a horizon.
+
+    Its rows, in order: the inputs' upper bounds, stage by stage, then their lower bounds, the rows
+    `E x_k <= b` for k = 0 .. N-1, and `H x_N <= h`.
     """
 
-    def __init__(
-        self,
-        A: np.ndarray,
-        B: np.ndarray,
-        Q: np.ndarray,
-        R: np.ndarray,
-        horizon: int,
-        u_min: np.ndarray,
-        u_max: np.ndarray,
-        stage: tuple[np.ndarray, np.ndarray] | None = None,
-        terminal: tuple[np.ndarray, np.ndarray] | None = None,
-    ) -> None:
-        a, b, q, r = exact(A), exact(B), exact(Q), exact(R)
-        n, m = b.shape
-        self.m, width = m, horizon * m
-        P = _riccati(A, B, Q, R)
-        phi, gamma = [exact(np.eye(n))], [exact(np.zeros((n, width)))]
-        for k in range(horizon):
-            moved = a @ gamma[k]
-            moved[:, k * m : (k + 1) * m] += b
-            phi.append(a @ phi[k])
-            gamma.append(moved)
-        self.H = np.kron(exact(np.eye(horizon)), r)
-        self.f = exact(np.zeros((width, n)))
-        for k in range(horizon + 1):
-            reached = slice(0, k * m)  # later inputs do not act on x_k
-            weighted = gamma[k][:, reached].T @ (q if k < horizon else P)
-            self.H[reached, reached] += weighted @ gamma[k][:, reached]
-            self.f[reached] += weighted @ phi[k]
-        rows, free, right = [], [], []
-        eye = exact(np.eye(width))
-        for sign, side in ((1, u_max), (-1, u_min)):
-            rows.append(sign * eye)
-            free.append(exact(np.zeros((width, n))))
-            right.append(np.tile(exact(sign * np.asarray(side)), horizon))
-        general = [(k, *stage) for k in range(horizon)] if stage is not None else []
-        if terminal is not None:
-            general.append((horizon, *terminal))
-        for k, E, bound in general:
-            rows.append(exact(E) @ gamma[k])
-            free.append(exact(E) @ phi[k])
-            right.append(exact(bound))
-        self.G, self.F, self.b = (np.concatenate(parts) for parts in (rows, free, right))
+    A: np.ndarray
+    B: np.ndarray
+    Q: np.ndarray
+    R: np.ndarray
+    horizon: int
+    u_min: np.ndarray
+    u_max: np.ndarray
+    stage: tuple[np.ndarray, np.ndarray] | None = None
+    terminal: tuple[np.ndarray, np.ndarray] | None = None
 
-    def first_input(self, x: np.ndarray, guess: np.ndarray, tries: int = 30) -> np.ndarray | None:
-        """The proved first input at a state (n,), or None when no guess is proved.
+    @property
+    def width(self) -> int:
+        """Number of unknowns N m."""
+        return self.horizon * len(self.u_max)
 
-        `guess` are the rows that are thought to be active, (r,) of bool.
+    @cached_property
+    def matrices(self) -> tuple[Exact, Exact, Exact, Exact]:
+        """A, B, Q, R."""
+        return exact(self.A), exact(self.B), exact(self.Q), exact(self.R)
+
+    @cached_property
+    def P(self) -> Exact:
+        """The terminal weight (n, n)."""
+        return _riccati(self.A, self.B, self.Q, self.R)
+
+    @cached_property
+    def rows(self) -> tuple[np.ndarray, Exact, Exact]:
+        """Stage (r,), normal (r, n) and right side (r,) of the rows of states."""
+        n = self.A.shape[0]
+        stages, normals, sides = [np.zeros(0, dtype=int)], [np.zeros((0, n))], [np.zeros(0)]
+        for k in range(self.horizon + 1):
+            given = self.stage if k < self.horizon else self.terminal
+            if given is not None:
+                stages.append(np.full(len(given[1]), k))
+                normals.append(given[0])
+                sides.append(given[1])
+        return np.concatenate(stages), exact(np.concatenate(normals)), exact(np.concatenate(sides))
+
+    @cached_property
+    def sides(self) -> Exact:
+        """Right side of every row (2 N m + r,)."""
+        upper, lower = (np.tile(exact(side), self.horizon) for side in (self.u_max, -self.u_min))
+        return np.concatenate([upper, lower, self.rows[2]])
+
+    def states(self, x: Exact, u: Exact) -> Exact:
+        """States (N + 1, n) from the first on, with inputs (N, m)."""
+        A, B, _, _ = self.matrices
+        found = [x]
+        for k in range(self.horizon):
+            found.append(A @ found[-1] + B @ u[k])
+        return np.array(found)
+
+    def heights(self, x: Exact, u: Exact) -> Exact:
+        """Left side of every row (2 N m + r,)."""
+        stage, normal, _ = self.rows
+        return np.concatenate([u.ravel(), -u.ravel(), (normal * x[stage]).sum(axis=1)])
+
+    def pull(self, x: Exact, u: Exact, price: Exact) -> Exact:
+        """Derivative of the Lagrangian by the inputs (N, m), with the rows' multipliers."""
+        A, B, Q, R = self.matrices
+        p = self.P @ x[-1]
+        found = self.push(price)
+        found += (price[: self.width] - price[self.width : 2 * self.width]).reshape(u.shape)
+        for k in range(self.horizon - 1, -1, -1):
+            found[k] += R @ u[k] + p @ B
+            p = Q @ x[k] + p @ A
+        return found
+
+    def push(self, price: Exact) -> Exact:
+        """Derivative by the inputs (N, m) of the rows of states, weighted by their multipliers."""
+        A, B, _, _ = self.matrices
+        stage, normal, _ = self.rows
+        pushed = zeros(self.horizon + 1, len(A))
+        for row in np.flatnonzero(price[2 * self.width :]):
+            pushed[stage[row]] += price[2 * self.width + row] * normal[row]
+        p, found = pushed[-1], zeros(self.horizon, B.shape[1])
+        for k in range(self.horizon - 1, -1, -1):
+            found[k] = p @ B
+            p = pushed[k] + p @ A
+        return found
+
+    def is_optimal(self, x: Exact, u: Exact, price: Exact, kept: Decimal) -> bool:
+        """Karush, Kuhn and Tucker, of the program whose rows are moved by less than `kept`.
+
+        What the derivative g misses of zero moves u by |g| / min eig(R) at most.
         """
-        f, room = self.f @ exact(x), self.b - self.F @ exact(x)
-        active = np.array(guess, dtype=bool)
-        for attempt in range(tries):
-            u, price = self._on(active, f, room)
-            if u is None:
-                return None
-            excess = self.G @ u - room
-            broken = excess > _KEPT * self.b
-            wrong = active & (price < 0)
-            if not np.any(broken) and not np.any(wrong):
-                return np.array([float(value) for value in u[: self.m]])
-            if attempt >= 5:  # all at once may go in circles
-                worst = np.argmax(np.where(broken, excess / self.b, _ZERO))
-                if np.any(broken):
-                    broken = np.arange(len(active)) == worst
-                    wrong = wrong & False
-                else:
-                    wrong = np.arange(len(active)) == np.argmin(np.where(wrong, price, _ZERO))
-            active = (active & ~wrong) | broken
-        return None
+        plan = self.states(x, u)
+        excess, room = self.heights(plan, u) - self.sides, kept * self.sides
+        reach = np.min(self.sides[: 2 * self.width]) * Decimal(np.linalg.eigvalsh(self.R)[0])
+        return bool(
+            np.all(price >= 0)
+            and np.all(excess <= room)
+            and np.all(abs(excess[price > 0]) <= room[price > 0])
+            and np.max(abs(self.pull(plan, u, price))) <= Decimal("1e-15") * reach
+        )
 
-    def _on(self, active: np.ndarray, f: Exact, room: Exact) -> tuple[Exact | None, Exact]:
-        """Minimiser with the given rows tight, and their multipliers."""
-        width = len(f)
-        upper, lower, other = active[:width], active[width : 2 * width], active[2 * width :]
-        fixed = upper | lower
-        u = np.where(upper, room[:width], np.where(lower, -room[width : 2 * width], _ZERO))
-        loose, rows = np.flatnonzero(~fixed), 2 * width + np.flatnonzero(other)
-        G = self.G[rows]
-        price = np.full(len(self.b), _ZERO)
-        held = np.flatnonzero(fixed)
-        tight = room[rows] - G[:, held] @ u[held] if len(rows) else room[rows]
-        push = f[loose] + self.H[np.ix_(loose, held)] @ u[held]
-        if len(loose):
-            # H_ll u + G_l' p = -push,  G_l u = tight
-            right = np.concatenate([push[:, None], G[:, loose].T], axis=1)
-            solved = _solve(self.H[np.ix_(loose, loose)], right)
-            if len(rows):
-                schur = G[:, loose] @ solved[:, 1:]
-                try:
-                    p = _solve(schur, -(tight + G[:, loose] @ solved[:, 0])[:, None])[:, 0]
-                except ZeroDivisionError:
-                    return None, price
-                price[rows] = p
-                u[loose] = -solved[:, 0] - solved[:, 1:] @ p
-            else:
-                u[loose] = -solved[:, 0]
-        elif len(rows):
-            return None, price
-        pull = self.H @ u + f
-        if len(rows):
-            pull = pull + G.T @ price[rows]
-        price[:width] = np.where(upper, -pull, _ZERO)
-        price[width : 2 * width] = np.where(lower, pull, _ZERO)
-        return u, price
+    def is_excluded(self, x: Exact, price: Exact) -> bool:
+        """Whether no inputs within their bounds bring the priced sum of rows of states to zero."""
+        still = zeros(self.horizon, len(self.u_max))
+        excess = (self.heights(self.states(x, still), still) - self.sides)[2 * self.width :]
+        push = self.push(price)
+        least = np.minimum(push * exact(self.u_max), push * exact(self.u_min)).sum()
+        return bool(np.all(price >= 0) and price[2 * self.width :] @ excess + least > 0)
 
 
-def _solve(matrix: Exact, right: Exact) -> Exact:
+def solve(matrix: Exact, right: Exact) -> Exact:
     """Elimination with a symmetric positive definite matrix."""
     matrix, right = matrix.copy(), right.copy()
     count = len(matrix)
     for i in range(count):
-        pivot = matrix[i, i]
-        if pivot <= 0:
-            raise ZeroDivisionError
-        share = matrix[i + 1 :, i] / pivot
+        share = matrix[i + 1 :, i] / matrix[i, i]
         matrix[i + 1 :, i + 1 :] -= np.outer(share, matrix[i, i + 1 :])
         right[i + 1 :] -= np.outer(share, right[i])
     for i in range(count - 1, -1, -1):
@@ -159,7 +171,7 @@ def _riccati(A: np.ndarray, B: np.ndarray, Q: np.ndarray, R: np.ndarray) -> Exac
     a, b, q, r = exact(A), exact(B), exact(Q), exact(R)
     P = exact(scipy.linalg.solve_discrete_are(A, B, Q, R))
     for _ in range(4):
-        K = _solve(r + b.T @ P @ b, b.T @ P @ a)
+        K = solve(r + b.T @ P @ b, b.T @ P @ a)
         power, P = a - b @ K, q + K.T @ r @ K
         while max(abs(power).ravel()) > Decimal("1e-45"):
             P = P + power.T @ P @ power

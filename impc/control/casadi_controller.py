@@ -21,6 +21,7 @@ from impc.arrays import Array, BoolArray, finite_array
 from impc.checking import checked
 from impc.control.closed_loop import Simulation, Status
 from impc.control.constraint_rows import build_rows
+from impc.control.infeasibility import excluded_row
 from impc.errors import InputError
 
 if TYPE_CHECKING:
@@ -58,6 +59,9 @@ _IPOPT: dict[str, Any] = {
         "jac_d_constant": "yes",
     },
 }
+
+# A row that is exceeded by this share of its bound is not kept, whatever the solver's flag says.
+_EXCEEDED = 1e-6
 
 #: Names of the solvers that `build_mpc` takes.
 SOLVERS = (*_QUADRATIC, "ipopt")
@@ -99,8 +103,13 @@ class MpcStep:
     states : Array
         Planned states (N + 1, n).
     status : Status
+        UNSOLVED when the solver found no plan that keeps the hard rows; INFEASIBLE when it is
+        proved that there is none. What a solver says of that is not believed: on a plant that
+        runs away IPOPT and qpOASES call feasible programs infeasible.
     excess : float
         Largest violation of a hard row relative to its bound, recomputed from the answer.
+    failed_row : int
+        Row of `Rows` that no plan keeps beside the others, -1 when there is none.
     """
 
     u: Array
@@ -108,6 +117,7 @@ class MpcStep:
     states: Array
     status: Status
     excess: float
+    failed_row: int
 
 
 @checked
@@ -193,9 +203,13 @@ def solve_mpc(mpc: MpcSolver, x: ArrayLike) -> MpcStep:
     excess = rows.T @ state + rows.M @ v - rows.b
     hard = excess[~mpc.soft] / rows.b[~mpc.soft]
     violation = float(np.max(hard, initial=0.0))
-    status = _judge(solved, violation, excess[mpc.soft] / rows.b[mpc.soft], v)
+    status = _judge(excess[mpc.soft] / rows.b[mpc.soft], v)
+    row = -1
+    if not solved or violation > _EXCEEDED:
+        row = excluded_row(controller, rows, state)
+        status = Status.INFEASIBLE if row >= 0 else Status.UNSOLVED
     plan, states = _unroll(controller, state, v)
-    return MpcStep(plan[0], plan, states, status, violation)
+    return MpcStep(plan[0], plan, states, status, violation, row)
 
 
 @checked
@@ -204,23 +218,20 @@ def simulate_mpc(mpc: MpcSolver, given: Scenario) -> Simulation:
     plant = mpc.controller.plant
     x, u = np.zeros((given.steps + 1, plant.n)), np.zeros((given.steps, plant.m))
     status = np.full(given.steps, Status.NOT_REACHED, dtype=np.int8)
-    x[0] = given.x0
+    x[0], failed_row = given.x0, -1
     for t in range(given.steps):
         step = solve_mpc(mpc, x[t])
         status[t] = step.status
         if step.status > Status.SOFTENED:
-            x[t + 1 :] = x[t]
+            x[t + 1 :], failed_row = x[t], step.failed_row
             break
         u[t] = step.u
         x[t + 1] = plant.A @ x[t] + plant.B @ u[t] + plant.E @ given.disturbance[t]
-    return Simulation(x, u, status, 0, -1)
+    return Simulation(x, u, status, 0, failed_row)
 
 
-def _judge(solved: bool, violation: float, soft_excess: Array, v: Array) -> Status:
-    """Trust the rows, not the solver's flag alone: a hard row broken by 1e-6 is a failure."""
-    if not solved or violation > 1e-6:
-        return Status.INFEASIBLE
-    if np.max(soft_excess, initial=0.0) > 1e-6:
+def _judge(soft_excess: Array, v: Array) -> Status:
+    if np.max(soft_excess, initial=0.0) > _EXCEEDED:
         return Status.SOFTENED
     return Status.ACTIVE if np.max(np.abs(v), initial=0.0) > 1e-8 else Status.FREE
 

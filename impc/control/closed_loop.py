@@ -329,7 +329,8 @@ def run_loop(prepared: PreparedLoop, given: Scenario) -> tuple[Simulation, Sensi
     x[0], dx[0] = given.x0, along.x0
     multipliers = np.zeros(len(prepared.rows.b))
     disturbance, divergence = np.array(given.disturbance), _divergence(plant, given)
-    t, weakly_active, plan = 0, 0, None
+    t, weakly_active = 0, 0
+    plan: Plan | None = None  # of the sample before, where the rows did not tell its input
     while True:
         first = t
         weak, failed_row = run(
@@ -347,22 +348,27 @@ def run_loop(prepared: PreparedLoop, given: Scenario) -> tuple[Simulation, Sensi
             du,
             status,
             multipliers,
+            plan is not None,
         )
         weakly_active += weak
         t = int(np.count_nonzero(status <= Status.SOFTENED))
         if t == steps or status[t] == Status.DIVERGED:
             break
-        if status[t] == Status.INFEASIBLE:
+        asked = plan is None  # the rows, which did not tell
+        if asked and status[t] == Status.INFEASIBLE:
             if proves_infeasible(prepared.controller, prepared.rows, multipliers, x[t]):
                 break
             status[t], failed_row = Status.UNSOLVED, -1
-        if not _only_inputs_are_bounded(prepared.controller):
+        if asked and not _only_inputs_are_bounded(prepared.controller):
             break
         plan = _saturated_plan(prepared, x[t], plan if t == first + 1 else None)
-        if not plan.told:
+        if plan.told:
+            u[t], status[t] = plan.u[0], Status.ACTIVE
+            du[t] = _differentiate_first_input(prepared, plan, dx[t])
+        elif asked:
             break
-        u[t], status[t] = plan.u[0], Status.ACTIVE
-        du[t] = _differentiate_first_input(prepared, plan, dx[t])
+        else:
+            plan = None
     return Simulation(x, u, status, weakly_active, failed_row), Sensitivity(dx, du)
 
 
@@ -382,6 +388,8 @@ def _saturated_plan(prepared: PreparedLoop, x: Array, last: Plan | None) -> Plan
 
 def _differentiate_first_input(prepared: PreparedLoop, plan: Plan, dx: Array) -> Array:
     controller, along = prepared.controller, prepared.along
+    if along.count == 0:
+        return np.zeros((controller.plant.m, 0))
     rows = bound_rows(controller.bounds, controller.plant)
     sides = np.zeros((3, controller.plant.m, along.count))  # at -1 the last one
     for row, direction in zip(rows.F, along.bounds, strict=True):

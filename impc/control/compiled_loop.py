@@ -301,6 +301,7 @@ def run(
     du: Buffer,
     status: Buffer,
     lam: Buffer,
+    gain_only: bool,
 ) -> tuple[int, int]:
     """Simulate from x[first] and dx[first], with derivatives along p directions (p may be 0).
 
@@ -325,6 +326,8 @@ def run(
     lam : Buffer
         Written: the multipliers of the last problem (r,), or the combination of rows that should
         prove it inconsistent.
+    gain_only : bool
+        Whether to end, UNSOLVED, at the first sample where the gain breaks a bound.
 
     Returns
     -------
@@ -352,9 +355,12 @@ def run(
             dv0[:] = 0.0
             status[t] = _FREE
             if needs_qp:
-                status[t], near, row = _solve(
-                    loop, dloop, rows, drows, unit, work, x[t], dx[t], lam
-                )
+                if gain_only:
+                    status[t], row = _UNSOLVED, -1
+                else:
+                    status[t], near, row = _solve(
+                        loop, dloop, rows, drows, unit, work, x[t], dx[t], lam
+                    )
                 if status[t] > _SOFTENED:
                     _hold(x, dx, t)
                     return weakly_active, row

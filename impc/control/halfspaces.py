@@ -231,9 +231,11 @@ def _bases(system: Array, limits: Array, corners: Array) -> IntArray:
     """Rows active at each corner (t, q), where they are exactly q; else -1."""
     q = system.shape[2]
     slack = limits - np.einsum("tsq,tq->ts", system, corners)
-    bases = np.argsort(slack, axis=1)[:, :q]
     simple = np.sum(slack <= 100 * _FEASIBLE, axis=1) == q
-    return np.where(simple[:, None], bases, -1)
+    nearest = np.argsort(slack, axis=1)[:, :q]  # fewer than q where the set has fewer rows
+    bases = np.full(corners.shape, -1)
+    bases[:, : nearest.shape[1]] = np.where(simple[:, None], nearest, -1)
+    return bases
 
 
 def _verified(

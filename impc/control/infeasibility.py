@@ -17,6 +17,7 @@ from decimal import Decimal, localcontext
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.optimize import linprog
 
 from impc.model.bounds import bound_rows
 
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
     from impc.control.constraint_rows import Rows
     from impc.control.controller import Controller
 
-__all__ = ["proves_infeasible"]
+__all__ = ["excluded_row", "proves_infeasible"]
 
 # Enough for numbers that grow by 2^60, and 60 digits left.
 _DIGITS = 100
@@ -34,6 +35,33 @@ _DIGITS = 100
 _MARGIN = Decimal("1e-30")
 # An input without a bound is taken to have one: this often what the gain asks for.
 _REACH = Decimal(10**9)
+
+
+def excluded_row(controller: Controller, rows: Rows, x: Array) -> int:
+    """A hard row that, it is proved, no input sequence keeps beside the others; -1 if none is.
+
+    The multipliers are those of the least share t of their bounds by which all rows are exceeded,
+    T x + M v <= (1 + t) b, by HiGHS; the row is the one that weighs most in the proof.
+
+    Parameters
+    ----------
+    x : Array
+        State (n,).
+    """
+    hard = np.isinf(rows.limit)
+    width, b = rows.M.shape[1], rows.b[hard]
+    answer: Any = linprog(
+        np.r_[np.zeros(width), 1.0],
+        A_ub=np.column_stack([rows.M[hard] / b[:, None], -np.ones(len(b))]),
+        b_ub=1 - rows.T[hard] @ x / b,
+        bounds=[*[(None, None)] * width, (-1.0, None)],
+        method="highs",
+    )
+    if answer.status != 0:
+        return -1
+    y = np.zeros(len(hard))
+    y[hard] = np.maximum(-answer.ineqlin.marginals, 0.0) / b
+    return int(np.argmax(y * rows.b)) if proves_infeasible(controller, rows, y, x) else -1
 
 
 def proves_infeasible(controller: Controller, rows: Rows, y: Array, x: Array) -> bool:

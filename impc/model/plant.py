@@ -178,6 +178,11 @@ def _sample_time(dt: object) -> float:
     return float(dt)  # type: ignore[arg-type]  # python-control: a number from here on
 
 
+def _of_length_one(B: Array) -> Array:
+    """Columns divided by their largest entries, where that is not zero."""
+    return np.asarray(B / np.maximum(np.max(np.abs(B), axis=0), 1e-300))
+
+
 def _require_stabilisable(plant: Plant) -> None:
     """Hautus test on the modes that do not decay: [A - s I, B] must keep full row rank.
 
@@ -185,9 +190,9 @@ def _require_stabilisable(plant: Plant) -> None:
     then taken at 1e-10 of the largest singular value; a mode that is stabilisable by less would
     need gains beyond the reach of double precision.
     """
-    A, scaling = scipy.linalg.matrix_balance(plant.A, permute=False)
-    B = np.linalg.solve(scaling, plant.B)
-    B = B / np.maximum(np.max(np.abs(B), axis=0), 1e-300) * max(1.0, np.max(np.abs(A)))
+    # scipy.linalg.matrix_balance casts the scales, 1e200 and more beside a denormal, to integers.
+    A, _, _, scale, _ = scipy.linalg.lapack.dgebal(plant.A, scale=1, permute=0)
+    B = _of_length_one(_of_length_one(plant.B) / scale[:, None]) * max(1.0, np.max(np.abs(A)))
     for mode in scipy.linalg.eigvals(A):
         decays = abs(mode) < 1 if plant.discrete else mode.real < 0
         if decays:

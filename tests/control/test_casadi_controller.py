@@ -6,7 +6,7 @@ import control
 import numpy as np
 import pytest
 
-from impc.control.casadi_controller import SOLVERS, build_mpc, solve_mpc
+from impc.control.casadi_controller import SOLVERS, build_mpc, simulate_mpc, solve_mpc
 from impc.control.closed_loop import Status, require_complete, scenario, simulate
 from impc.control.controller import Controller
 from impc.errors import (
@@ -15,11 +15,13 @@ from impc.errors import (
     InfeasibleError,
     InputError,
     PlantError,
+    SolverError,
     WeightsError,
 )
 from impc.model.bounds import Bounds, bound_rows
 from impc.model.plant import Plant
 from impc.model.weights import Weights
+from tests.independent_mpc import has_plan
 from tests.support import random_plant, random_weights
 
 STEPS = 12
@@ -48,6 +50,46 @@ def test_a_solver_says_what_happened(example_plant: Plant, example_bounds: Bound
         assert controller.terminal is not None
         assert np.all(controller.terminal.H @ step.states[-1] <= controller.terminal.h + 1e-8)
         assert solve_mpc(mpc, [30, 1]).status is Status.INFEASIBLE
+        run = simulate_mpc(mpc, scenario(example_plant, [30, 1], 3))
+        with pytest.raises(InfeasibleError, match=r"^x0: no input sequence keeps the bound u\[0\]"):
+            require_complete(controller, run)
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_a_solver_that_fails_proves_nothing(name: str) -> None:
+    """Nothing but the input is bounded, so every program has plans; each was called infeasible.
+
+    The rows lose their digits as the plant runs away: DAQP finds nothing, and qpOASES and IPOPT
+    say that there is nothing.
+    """
+    A = [[2, 1, 0], [0, 2, 0.5], [0, 0, 0.8]]
+    plant = Plant(control.ss(A, [[0], [0.1], [1]], np.eye(3), 0, True))
+    bounds = Bounds(plant, u_min=-1, u_max=1)
+    controller = Controller(plant, Weights(np.eye(3), 1), bounds, 60, terminal_set=False)
+    run = simulate_mpc(build_mpc(controller, name), scenario(plant, np.ones(3), 2))
+    assert run.status[0] == Status.UNSOLVED
+    with pytest.raises(SolverError, match="could not be told in double precision"):
+        require_complete(controller, run)
+
+
+@pytest.mark.parametrize("block", range(3))
+def test_infeasible_is_said_where_linear_programming_finds_no_plan(block: int) -> None:
+    """Starts inside, at and outside of what a random plant can keep, each with another solver."""
+    said = set()
+    for seed in range(15):
+        rng = np.random.default_rng([17, block, seed])
+        n = 2 + seed % 3
+        plant = random_plant(rng, n, 1, 1.2)
+        bounds = Bounds(plant, u_min=-1, u_max=1, x_min=-3, x_max=3)
+        weights = Weights(np.eye(n), 1)
+        controller = Controller(plant, weights, bounds, 6, terminal_set=False)
+        x = 10 ** rng.uniform(-0.5, 0.8) * rng.normal(size=n)
+        status = solve_mpc(build_mpc(controller, SOLVERS[block]), x).status
+        assert (status is Status.INFEASIBLE) == (not has_plan(plant.A, plant.B, 6, x, 1.0, 3.0)), (
+            seed
+        )
+        said.add(status)
+    assert {Status.INFEASIBLE, Status.FREE} <= said
 
 
 def test_an_infeasible_start_names_the_bound_and_the_step(
@@ -128,6 +170,19 @@ def test_bad_input_names_the_argument(example_plant: Plant, example_bounds: Boun
         with pytest.raises(kind, match=message) as caught:
             call()  # type: ignore[operator]
         assert "\n" not in str(caught.value)
+
+
+def test_units_1e200_apart_do_not_decide_what_an_input_reaches() -> None:
+    """The same plant in other units; scipy's balancing cast its scales to integers and warned."""
+    units = np.diag([1e-100, 1e100])
+    for link, reached in ((0.4, True), (0.0, False)):
+        A = np.array([[1.2, link], [2.6, 0.5]])
+        moved = control.ss(np.linalg.inv(units) @ A @ units, [[0], [1]], np.eye(2), 0, True)
+        if reached:
+            assert Plant(moved).n == 2
+        else:
+            with pytest.raises(PlantError, match="is not stabilisable"):
+                Plant(moved)
 
 
 def test_only_finite_bounds_make_rows(example_plant: Plant) -> None:

@@ -1,6 +1,6 @@
 """Controllers at and beyond the edge of what they can keep: right, or a status that says no.
 
-The reference is `tests/exact_mpc.py`: the program in u from (Q, R, P), proved with eighty digits.
+The reference is `tests/exact_mpc.py`: the program in u from (Q, R, P), proved in a hundred digits.
 """
 
 from __future__ import annotations
@@ -119,6 +119,12 @@ def test_random_plants_are_right_or_say_no(block: int) -> None:
     check(range(10 * block, 10 * block + 10), largest=16, samples=1)
 
 
+@pytest.mark.parametrize("seed", [10115, 10461, 10622, 10994])
+def test_seeds_that_were_wrong_once(seed: int) -> None:
+    """No reference; no terminal set; a search of 44 s; a state that rounding left outside."""
+    check(range(seed, seed + 1), largest=60, samples=2)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("block", range(40))
 def test_two_thousand_random_plants_are_right_or_say_no(block: int) -> None:
@@ -136,4 +142,4 @@ def check(seeds: range, largest: int, samples: int) -> None:
         if found:
             wrong[seed] = found
     assert wrong == {}
-    assert untold <= 0.1 * len(seeds)
+    assert untold <= 0.1 * len(seeds)  # 35 of the 2000

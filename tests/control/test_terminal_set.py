@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from scipy.optimize import linprog
 
 from impc.checking import replace
+from impc.control.halfspaces import supports
 from impc.control.polygon import as_pytope, polygon
 from impc.control.terminal_set import (
     TerminalSet,
@@ -127,6 +128,19 @@ def test_scalar_set_with_one_bound_is_an_interval() -> None:
     np.testing.assert_allclose(terminal.h[:, None] / terminal.H, [[1], [-2]], rtol=1e-12)
     assert terminal.determinedness == 1
     assert_certified(terminal)
+
+
+def test_a_set_of_fewer_rows_than_states_has_supports_and_no_corner() -> None:
+    """Six states and four rows: the hints had the wrong size, and the terminal set ended in it."""
+    Z = np.eye(4, 6)
+    targets = np.array([[0.5, -0.25, 0, 0, 0, 0], [1, 0, 0, 1, 0, 0], [0, 0, 0, 0, 0, 0.1]])
+    mirrored = np.concatenate([Z, -Z])
+    for rows, expected in ((Z, [2, 2, 2]), (mirrored, [0.75, 2, 2])):
+        values, bases = supports(rows, targets)
+        np.testing.assert_allclose(values, expected, atol=1e-12)
+        assert bases.shape == targets.shape
+        again, _ = supports(rows, targets, hints=bases)
+        np.testing.assert_allclose(again, values, atol=1e-12)
 
 
 def test_the_tighter_of_two_bounds_stays_and_of_equal_ones_the_first() -> None:

@@ -32,7 +32,7 @@ _TIMES = ("seconds",)
 @pytest.fixture
 def study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """Two subjects and visits, and a model in a file of its own."""
-    source = (Path(__file__).parents[2] / "selection" / "dosing.py").read_text()
+    source = (Path(__file__).parents[2] / "tests/studies/selection/dosing.py").read_text()
     (tmp_path / "my_model.py").write_text(source)
     monkeypatch.syspath_prepend(str(tmp_path))
     path = blood_study(tmp_path, 2, 2)
