@@ -93,7 +93,7 @@ def _key_tables(yaw: dict[str, Any], pitch: dict[str, Any]) -> list[Entry]:
             "Table 5.5",
             "The sensitive subsets and their ICC. Yaw: 9 in all, size 3 first at .35. Pitch: 16 in"
             " all, 6 of size 3 by .35.",
-            ("impc.studies.selection.key_report:key_files",),
+            ("impc.studies.selection.key_report:key_report",),
             f"Yaw: {_counts(yaw)}. Pitch: {_counts(pitch)}.",
             Verdict.NOT,
             "Sizes and numbers depend on the subjects. " + _FORTY,
@@ -117,7 +117,7 @@ def _key_tables(yaw: dict[str, Any], pitch: dict[str, Any]) -> list[Entry]:
         Entry(
             "Figure 5.3",
             "The solution space, yaw.",
-            ("impc.studies.selection.key_report:key_files",),
+            ("impc.studies.selection.key_report:key_report",),
             f"Sizes {_sizes(yaw)} (dissertation 2 to 3).",
             Verdict.IN_KIND,
             _FORTY,
@@ -126,7 +126,7 @@ def _key_tables(yaw: dict[str, Any], pitch: dict[str, Any]) -> list[Entry]:
         Entry(
             "Figure 5.3",
             "The solution space, pitch.",
-            ("impc.studies.selection.key_report:key_files",),
+            ("impc.studies.selection.key_report:key_report",),
             f"Sizes {_sizes(pitch)} (dissertation 2 to 4).",
             Verdict.IN_KIND,
             _FORTY,
@@ -180,7 +180,7 @@ def _key_claims(yaw: dict[str, Any], pitch: dict[str, Any]) -> list[Entry]:
         Entry(
             "Claim, 5.3",
             "Sensitive parameters are more reliable than all twelve.",
-            ("impc.studies.selection.key_report:key_files",),
+            ("impc.studies.selection.key_report:key_report",),
             "; ".join(
                 f"{name}: least ICC {_least(axis, 'chosen'):.2f} of the chosen,"
                 f" {_least(axis, 'nominal'):.2f} of all twelve"
@@ -194,7 +194,7 @@ def _key_claims(yaw: dict[str, Any], pitch: dict[str, Any]) -> list[Entry]:
             "Claim, 5.4",
             "Pathways of the subsets: visual 7, proprioceptive 6, vestibular 5, intrinsic 0 of 9"
             " in yaw; 14, 9, 13, 0 of 16 in pitch. The visual delay is in 6 and 14.",
-            ("impc.studies.selection.key_report:key_files",),
+            ("impc.studies.selection.key_report:key_report",),
             "; ".join(f"{name}: {text}" for name, (text, _) in shares.items()) + ".",
             kind(all(intrinsic == 0 for _, intrinsic in shares.values())),
             "Found: the intrinsic pathway is in none. The other counts are the subjects'. "
@@ -225,7 +225,7 @@ def _estimates(item: str, axis: str, result: dict[str, Any], quoted: str) -> Ent
     return Entry(
         item,
         f"{axis}: estimates of all and of the key parameters, by visit; {quoted}.",
-        ("impc.studies.selection.key_report:key_files",),
+        ("impc.studies.selection.key_report:key_report",),
         f"ICC(A,k): {told}.",
         Verdict.LOST,
         "The estimates are lost. " + _FORTY,

@@ -131,7 +131,7 @@ def _tables(
         Entry(
             "Figure 4.2",
             "Best fits of a trial with FIM-5 and LASSO-5.",
-            ("impc.studies.selection.report:selection_files",),
+            ("impc.studies.selection.report:selection_report",),
             f"Mean VAF {fim:.2f} and {lasso:.2f} %.",
             kind(abs(fim - lasso) < 1),
             _TEN,

@@ -224,9 +224,12 @@ class Coordinates:
 
     def _compress(self, found: Evaluation, dK: Array, dS: Array) -> Compressed:
         """Factor derivative and residual together, trial by trial, then apply the chain rule."""
-        along = found.dK.reshape(-1, self.m * self.n) @ dK.reshape(len(dK), -1).T
+        # Initial states move neither K nor S: with hundreds of trials they are most of the columns.
+        first, last = int(self.ends[1]), int(self.ends[2])
+        shared = np.delete(np.arange(len(dK)), slice(first, last))
+        along = found.dK.reshape(-1, self.m * self.n) @ dK[shared].reshape(len(shared), -1).T
         if self.m > 1:
-            along += found.dS.reshape(-1, self.m**2) @ dS.reshape(len(dS), -1).T
+            along += found.dS.reshape(-1, self.m**2) @ dS[shared].reshape(len(shared), -1).T
         rows, row = [], 0
         sizes = [trial.outputs.size for trial in self.problem.recordings]
         if not self.problem.unknown_start:  # no column belongs to one trial: all are one block
@@ -234,18 +237,18 @@ class Coordinates:
         for size in sizes:
             mine = slice(row, row + size)
             row = mine.stop
-            blocks = [along[mine, : self.ends[1]]]
+            blocks = [along[mine, :first]]
             blocks += [found.dx0[mine] @ self.start_unit] if found.dx0.shape[1] else []
-            parameters = found.dparameters[mine] * PARAMETER_UNIT + along[mine, self.ends[2] :]
+            parameters = found.dparameters[mine] * PARAMETER_UNIT + along[mine, first:]
             blocks += [parameters, found.residual[mine, None]]
             triangle = triangular_rows(blocks)
             full = np.zeros((triangle.shape[1], triangle.shape[1]))
             full[: len(triangle)] = triangle
             rows.append(full)
-        table, split = np.stack(rows), int(self.ends[1])
-        own = slice(split, split + found.dx0.shape[1])
-        shared = np.delete(table[..., :-1], own, axis=2)
-        return Compressed(ArrowRows(table[..., -1], shared, table[..., own]), split)
+        table = np.stack(rows)
+        own = slice(first, first + found.dx0.shape[1])
+        rest = np.delete(table[..., :-1], own, axis=2)
+        return Compressed(ArrowRows(table[..., -1], rest, table[..., own]), first)
 
 
 @dataclass(frozen=True)

@@ -322,7 +322,8 @@ def _metrics(space: Coordinates, z: Array, jacobian: Array) -> Array:
     dK, dS = (change[: jacobian.shape[1]] for change in space.changes(here, z))
     natural = space.natural(dK).reshape(len(dK), -1).T
     alone = scipy.linalg.null_space(natural, rcond=_ALONE)
-    _, values, rows = np.linalg.svd(jacobian @ alone)
+    # Of the triangle: the left vectors of all samples would take memory in their square.
+    _, values, rows = np.linalg.svd(np.linalg.qr(jacobian @ alone, mode="r"))
     told = np.count_nonzero(values > _TOLD * float(np.linalg.norm(jacobian, 2)))
     untold = np.tensordot(rows[told:] @ alone.T, dS, 1)
     return frozen(np.concatenate([here.S[None], untold]))
