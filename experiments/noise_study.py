@@ -43,7 +43,7 @@ from impc.reporting.style import (
     render,
 )
 from impc.reporting.writer import write_files
-from impc.studies.compare.subject import COMPARED
+from impc.studies.compare.subject import compared_methods
 from impc.studies.fit.settings import FitSettings
 from impc.studies.fit.subject import fit_problem
 
@@ -66,6 +66,7 @@ _MARKS = {
     "inverse_lqr_auxiliary": (BLUE, "^", "--"),
     "inverse_lqr_output": (BLUE, "D", "--"),
     "inverse_lqr_lmi": (BLUE, "x", "--"),
+    "clipped_lqr": (BLUE, "*", "--"),
     "inverse_kkt": (GREEN, "v", "-."),
     "inverse_mpc_reduced": (VERMILLION, "P", "-"),
     "inverse_mpc": (VERMILLION, "o", "-"),
@@ -123,7 +124,7 @@ def study_cell(cell: Cell) -> dict[str, Outcome]:
     judged = replace(work.problem, recordings=(unseen,))
     return {
         name: _judge(estimate, judged, work.drives[1], truth)
-        for name, estimate in estimate_all(NaturalUnits(problem), COMPARED).items()
+        for name, estimate in estimate_all(NaturalUnits(problem), compared_methods()).items()
     }
 
 
@@ -191,7 +192,7 @@ def _table(found: dict[str, dict[str, Outcome]], seeds: int) -> str:
             f"\nlimit {limit:g} Nm: VAF % of an unseen trial without noise (error of the gain)",
             f"{'noise leaves':<38}" + "".join(f"{ceiling:>15.2f} %" for ceiling in _CEILINGS),
         ]
-        for name in COMPARED:
+        for name in compared_methods():
             cells = []
             for ceiling in _CEILINGS:
                 share, error, count = _median(found, limit, ceiling, seeds, name)
@@ -206,7 +207,7 @@ def _figure(found: dict[str, dict[str, Outcome]], seeds: int) -> Figure:
     axes = figure.subplots(1, len(_LIMITS), sharey=True)
     noise = [100 - ceiling for ceiling in _CEILINGS]
     for position, (ax, limit) in enumerate(zip(axes, _LIMITS, strict=True)):
-        for name in COMPARED:
+        for name in compared_methods():
             color, marker, line = _MARKS[name]
             missed = [100 - _median(found, limit, ceiling, seeds, name)[0] for ceiling in _CEILINGS]
             ax.loglog(

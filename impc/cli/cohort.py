@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 
 __all__ = ["command"]
 
+# Assessments that a worker makes of each unit; intent is told by rules, not by draws.
+_USED = ("bootstrap", "held_out", "intent_draws", "replicates", "seed")
+
 
 @click.command("cohort")
 @click.argument("study_file", metavar="STUDY", type=click.Path(path_type=Path))
@@ -51,10 +54,10 @@ def command(
     from impc.studies.cohort.store import Store  # noqa: PLC0415
     from impc.studies.cohort.study import read_study  # noqa: PLC0415
     from impc.studies.cohort.tasks import study_tasks, unused_columns  # noqa: PLC0415
-    from impc.studies.fit.settings import fit_settings  # noqa: PLC0415
+    from impc.studies.fit.settings import fit_settings, require_used  # noqa: PLC0415
 
     study = read_study(study_file)
-    fit_settings(study.configuration.fit)
+    require_used(fit_settings(study.configuration.fit), _USED, "cohort")
     source = named_plant(study_file, study, plant_name, allowed)
     study = replace(study, plant=source.name)
     unused = unused_columns(study, source)

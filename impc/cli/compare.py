@@ -36,10 +36,12 @@ def command(files: tuple[Path, ...], plant_name: str, config: Path, out: Path, y
     from impc.studies.compare.subject import compare_recordings, stages  # noqa: PLC0415
     from impc.studies.effort import fit_effort  # noqa: PLC0415
     from impc.studies.fit.memory import open_memory  # noqa: PLC0415
+    from impc.studies.fit.settings import require_used  # noqa: PLC0415
 
     require_writable(out)
     subject = read_subject("compare", files, plant_name, config)
     problem, settings = subject.problem, subject.settings
+    require_used(settings, (), "compare")
     fits = replace(settings, replicates=0, profiles=[], horizons=[], held_out=True)
     require_consent(fit_effort(problem, fits), yes)
     memory = open_memory(out, problem, settings, "compare", subject.inputs.digest)

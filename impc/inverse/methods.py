@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
     from impc.inverse.problem import Problem
 
-__all__ = ["METHODS", "Method", "estimate", "estimate_all"]
+__all__ = ["METHODS", "Method", "estimate", "estimate_all", "method_named"]
 
 
 @dataclass(frozen=True)
@@ -227,6 +227,7 @@ _TABLE = (
 METHODS: dict[str, Method] = {method.name: method for method in _TABLE}
 
 
+@checked
 def method_named(name: str) -> Method:
     """Return a method of the registry.
 

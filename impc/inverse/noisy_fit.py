@@ -5,7 +5,7 @@
 
 A gain that explains its recordings to 1e-9 has weights to find, and the reduced form finds them:
 one semidefinite program. With noise a fitted gain has none as a rule, and the direct form in
-natural coordinates (`natural_fit`) takes the weights that fit best (docs/fitting.md).
+natural coordinates (`natural_search`) takes the weights that fit best (docs/fitting.md).
 """
 
 from __future__ import annotations

@@ -45,7 +45,7 @@ from impc.studies.cohort.sheet import Sheet, column_values, read_sheet
 from impc.studies.cohort.store import open_store
 from impc.studies.cohort.study import read_study
 from impc.studies.effort import Effort
-from impc.studies.fit.settings import FitSettings, fit_settings
+from impc.studies.fit.settings import FitSettings, fit_settings, require_used
 from impc.studies.fit.subject import fit_problem
 from impc.studies.selection.subsets import largest_subsets
 from tests.documents.blocks import PAGES
@@ -315,6 +315,20 @@ def format_of_an_extra(_: Path) -> None:
 
 
 #: Message -> what provokes it: raises the error, or returns the text.
+
+
+def unused_setting(_: Path) -> None:
+    require_used(fit_settings({"profiles": ["K.u.x"]}), (), "compare")
+
+
+def beyond_feasibility(_: Path) -> str:
+    plant = Plant(control.ss([[2.0]], [[1]], [[1]], 0, 1))
+    law = Controller(plant, Weights(1, 1), Bounds(plant, u_min=-1, u_max=1), 3)
+    with pytest.warns(UserWarning, match="NaN") as told:
+        law.simulate([2.0], steps=5)
+    return str(told[0].message)
+
+
 PROVOKED: dict[str, Callable[[Path], object]] = {
     "does not exist; check the path": damaged("missing file"),
     "has the ending '...', and not .csv, .tsv, .txt, .mat, .tdms, .c3d": damaged("excel workbook"),
@@ -339,6 +353,11 @@ PROVOKED: dict[str, Callable[[Path], object]] = {
     "is damaged and cannot be read (...)": damaged("truncated mat"),
     "is not TOML (...)": damaged("configuration that is no toml"),
     "is not known; did you mean ...": damaged("misspelled key"),
+    "[fit] ...: is not used by impc ...; take the line out, or use impc fit": lambda _: (
+        require_used(fit_settings({"profiles": ["K.u.x"]}), (), "compare")
+    ),
+    "sample ...: ...; what follows is NaN": beyond_feasibility,
+    "method: got ...; choose one of ...": lambda _: fit_settings({"methods": ["best"]}),
     "[fit] ...: is not a setting; known: ...": lambda _: fit_settings({"horzon": 20}),
     "is still '?'; fill in the column's unit": damaged("unit not filled in"),
     "unit '...' is not known": damaged("unknown unit"),

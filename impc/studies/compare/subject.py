@@ -15,7 +15,7 @@ from impc.assess.held_out import left_out_vaf
 from impc.assess.judged import judge
 from impc.errors import SolverError, WeightsError
 from impc.inverse.groundwork import NaturalUnits, afresh
-from impc.inverse.methods import estimate_all
+from impc.inverse.methods import METHODS, estimate_all
 
 if TYPE_CHECKING:
     from impc.assess.judged import MethodFit
@@ -23,20 +23,10 @@ if TYPE_CHECKING:
     from impc.inverse.groundwork import Remember
     from impc.inverse.problem import Problem
 
-__all__ = ["COMPARED", "MethodComparison", "compare_recordings", "stages"]
+__all__ = ["MethodComparison", "compare_recordings", "compared_methods", "stages"]
 
-#: The methods that are compared, in the order of the table.
-COMPARED = (
-    "feedback_gain",
-    "inverse_lqr_lmi",
-    "inverse_lqr_gradient",
-    "inverse_lqr_auxiliary",
-    "inverse_lqr_output",
-    "inverse_kkt",
-    "clipped_lqr",
-    "inverse_mpc_reduced",
-    "inverse_mpc",
-)
+# Needs states to be named; and what is compared in its two parts.
+_LEFT_OUT = ("preliminary", "inverse_lqr")
 
 
 @dataclass(frozen=True)
@@ -61,9 +51,14 @@ class MethodComparison(Frozen):
         return self.fit.name
 
 
+def compared_methods() -> tuple[str, ...]:
+    """Names of the methods that are compared: those of the registry, in its order."""
+    return tuple(name for name in METHODS if name not in _LEFT_OUT)
+
+
 def stages(trials: int) -> int:
     """Number of estimates that `compare_recordings` makes for so many `trials`."""
-    return len(COMPARED) * (1 + (trials if trials > 1 else 0))
+    return len(compared_methods()) * (1 + (trials if trials > 1 else 0))
 
 
 def compare_recordings(
@@ -85,13 +80,13 @@ def compare_recordings(
     WeightsError, SolverError
         When no regulator can be simulated on all trials.
     """
-    count = len(problem.recordings)
-    whole = estimate_all(NaturalUnits(problem, _within("all", remember)), COMPARED)
+    count, names = len(problem.recordings), compared_methods()
+    whole = estimate_all(NaturalUnits(problem, _within("all", remember)), names)
     parts = []
     for index in range(count if count > 1 else 0):
         ground = NaturalUnits(problem.leaving_out(index), _within(f"without {index + 1}", remember))
         try:
-            parts.append(estimate_all(ground, COMPARED))
+            parts.append(estimate_all(ground, names))
         except (WeightsError, SolverError):  # nothing fits these trials: NaN in the table
             parts.append({})
     return tuple(
@@ -99,7 +94,7 @@ def compare_recordings(
             judge(whole[name], problem.bounds),
             _held_out(problem, [part.get(name) for part in parts], settle),
         )
-        for name in COMPARED
+        for name in names
     )
 
 

@@ -94,9 +94,9 @@ def _saturation(result: FitResult) -> list[str]:
 
 def _against_inverse_lqr(result: FitResult) -> list[str]:
     methods = {item.name: item for item in result.methods}
-    other, own = methods["inverse_lqr_output"], result.inverse_mpc
+    other, own = methods.get("inverse_lqr_output"), result.inverse_mpc
     lines = []
-    if other.estimate.K is not None and not np.any(np.isnan(other.vaf)):
+    if other is not None and other.estimate.K is not None and not np.any(np.isnan(other.vaf)):
         gain = float(np.mean(own.vaf - other.vaf))
         kept = "keeps the bound too" if other.keeps_bounds else "exceeds the bound"
         sign = "more" if gain >= 0 else "less"
@@ -104,7 +104,7 @@ def _against_inverse_lqr(result: FitResult) -> list[str]:
             f"Inverse MPC accounts for {abs(gain):.2f} points {sign} than inverse LQR on the "
             f"outputs, which {kept} (largest command {number(float(other.largest_input[0]))})."
         )
-    clipped = method_note(result, methods["clipped_lqr"])
+    clipped = method_note(result, methods["clipped_lqr"]) if "clipped_lqr" in methods else ""
     if clipped.startswith("falls"):
         lines.append(f"The same gain merely clipped at the bound {clipped}; inverse MPC stands.")
     return lines

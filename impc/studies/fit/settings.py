@@ -10,16 +10,17 @@ import numpy as np
 import scipy.signal
 
 from impc.errors import InputError, brief
+from impc.inverse.methods import method_named
 from impc.model.bounds import Bounds
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Collection, Mapping, Sequence
 
     from impc.arrays import Array
     from impc.model.plant import Plant
     from impc.model.recordings import Recording
 
-__all__ = ["FitSettings", "fit_bounds", "fit_settings", "read_settings"]
+__all__ = ["BESIDE", "FitSettings", "fit_bounds", "fit_settings", "read_settings", "require_used"]
 
 # A recorded angle is differentiated over this time, by a parabola: noise of 1 % of the largest
 # angle at 100 Hz then gives a rate of a few per cent of the largest.
@@ -36,6 +37,11 @@ _RANGES: dict[str, tuple[float, float]] = {
 }
 # A limit of an input is squared and divided by: beyond these the square is no number any more.
 _LIMITS = (1e-100, 1e100)
+# Settings that are not of the problem: assessments, which not every command makes.
+_OF_SOME = (
+    "bootstrap", "feedback_states", "held_out", "horizons", "intent_draws", "methods", "profiles",
+    "replicates", "seed", "unknown_limit",
+)  # fmt: skip
 _PAGES = {"fit": "docs/fitting.md", "select": "docs/selection.md"}
 
 T = TypeVar("T")
@@ -87,6 +93,8 @@ class FitSettings:
         Whether the limit of each input is estimated too.
     horizons : list of int
         Other horizons, in samples, to compare with; and the fit without limit beside them.
+    methods : list of str
+        Methods that are shown beside inverse MPC, by their names in `impc.inverse.methods`.
 
     Examples
     --------
@@ -112,6 +120,37 @@ class FitSettings:
     intent_draws: bool = True
     unknown_limit: bool = False
     horizons: list[int] = field(default_factory=list)
+    methods: list[str] = field(default_factory=lambda: list(BESIDE))
+
+
+#: Methods that a fit shows beside inverse MPC, which comes last (docs/fitting.md).
+BESIDE = ("feedback_gain", "inverse_lqr", "inverse_lqr_output", "clipped_lqr")
+
+
+def require_used(settings: FitSettings, used: Collection[str], command: str) -> None:
+    """Refuse what is set and not used, so that nothing is left out without a word.
+
+    Parameters
+    ----------
+    settings : FitSettings
+    used : collection of str
+        Of the settings that only some commands use, those that this one does.
+    command : str
+        Its name.
+
+    Raises
+    ------
+    InputError
+        When one of the others differs from its default.
+    """
+    usual = FitSettings()
+    for name in _OF_SOME:
+        if name not in used and getattr(settings, name) != getattr(usual, name):
+            raise InputError(
+                f"[fit] {name}",
+                f"is not used by impc {command}",
+                "take the line out, or use impc fit",
+            )
 
 
 def read_settings(name: str, kind: type[T], table: Mapping[str, Any]) -> T:
@@ -157,6 +196,8 @@ def fit_settings(table: Mapping[str, Any]) -> FitSettings:
         if not isinstance(bound, str) and bound != np.inf:
             _require_between(f"bounded_states {name}", bound, *_LIMITS)
     _require_distinct(settings)
+    for name in settings.methods:
+        method_named(name)
     return settings
 
 
@@ -168,7 +209,7 @@ def _require_between(name: str, value: float, least: float, most: float) -> None
 
 
 def _require_distinct(settings: FitSettings) -> None:
-    for name in ("free", "feedback_states", "profiles", "horizons"):
+    for name in ("free", "feedback_states", "profiles", "horizons", "methods"):
         given = getattr(settings, name)
         twice = [item for index, item in enumerate(given) if item in given[:index]]
         if twice:

@@ -52,11 +52,9 @@ if TYPE_CHECKING:
     from impc.model.recordings import Recording
     from impc.model.riccati import LqrSolution
 
-__all__ = ["BESIDE", "FitProgress", "fit_problem", "fit_recordings", "stages", "state_sizes"]
+__all__ = ["FitProgress", "fit_problem", "fit_recordings", "stages", "state_sizes"]
 
 _THREADS = 2
-#: Methods that are shown beside inverse MPC, which comes last (docs/fitting.md).
-BESIDE = ("feedback_gain", "inverse_lqr", "inverse_lqr_output", "clipped_lqr")
 
 
 @dataclass(frozen=True)
@@ -88,7 +86,8 @@ def stages(problem: Problem, settings: FitSettings) -> int:
 
 def _beside(settings: FitSettings) -> tuple[str, ...]:
     """Methods that are shown beside inverse MPC, in the order of the table."""
-    return ("preliminary", *BESIDE) if settings.feedback_states else BESIDE
+    first = ("preliminary",) if settings.feedback_states else ()
+    return (*first, *settings.methods)
 
 
 @checked

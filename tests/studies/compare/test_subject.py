@@ -16,9 +16,9 @@ from impc.arrays import Array
 from impc.cli.main import main
 from impc.inverse.estimates import Estimate, decode_estimate, encode_estimate
 from impc.studies.compare.subject import (
-    COMPARED,
     MethodComparison,
     compare_recordings,
+    compared_methods,
     stages,
 )
 from impc.studies.fit.memory import open_memory
@@ -40,7 +40,7 @@ def compared() -> dict[str, MethodComparison]:
 
     found = compare_recordings(problem, 1.0, remember)
     assert len(heard) == stages(2)
-    assert [item.name for item in found] == list(COMPARED)
+    assert [item.name for item in found] == list(compared_methods())
     return {item.name: item for item in found}
 
 
@@ -149,7 +149,7 @@ def test_the_command(tmp_path: Path) -> None:
     pictures = {"comparison.png", "comparison.pdf"}
     assert names == {"report.html", "result.json", "comparison.csv", ".impc", *pictures}
     found = json.loads((out / "result.json").read_text())["methods"]
-    assert list(found) == list(COMPARED)
+    assert list(found) == list(compared_methods())
     with (out / "comparison.csv").open() as stream:
         rows = list(csv.DictReader(stream))
     for row in rows:

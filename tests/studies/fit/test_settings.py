@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import plants
-from impc.errors import ImpcError
+from impc.errors import ImpcError, InputError
 from impc.model.plant import Plant
 from impc.model.recordings import Recording
-from impc.studies.fit.settings import FitSettings, fit_bounds, fit_settings
+from impc.studies.fit.settings import FitSettings, fit_bounds, fit_settings, require_used
 
 
 @pytest.fixture(scope="module")
@@ -102,3 +102,31 @@ def test_as_many_limits_as_inputs(seat: Plant) -> None:
         with pytest.raises(ImpcError, match=r"^\[fit\] u_max: has . numbers"):
             fit_bounds(seat, FitSettings(u_max=given), [trial])
     assert fit_bounds(seat, FitSettings(u_max=[2.0]), [trial]).u_max[0] == 2.0
+
+
+@pytest.mark.parametrize(
+    ("table", "used", "says"),
+    [
+        ({"profiles": ["K.u.x"]}, (), "[fit] profiles: is not used by impc compare"),
+        ({"held_out": False}, (), "[fit] held_out: is not used by impc compare"),
+        ({"replicates": 40}, ("replicates",), ""),
+        ({"horizon": 10, "settle": 2.0}, (), ""),
+    ],
+)
+def test_what_a_command_does_not_use_is_refused_by_name(
+    table: dict[str, object], used: tuple[str, ...], says: str
+) -> None:
+    """`impc compare` and `impc cohort` left profiles and horizons out without a word."""
+    settings = fit_settings(table)
+    if not says:
+        require_used(settings, used, "compare")
+        return
+    with pytest.raises(InputError) as caught:
+        require_used(settings, used, "compare")
+    assert str(caught.value).startswith(says)
+
+
+def test_a_method_of_a_fit_is_one_of_the_registry() -> None:
+    assert fit_settings({"methods": ["inverse_kkt"]}).methods == ["inverse_kkt"]
+    with pytest.raises(InputError, match="method: got 'inverse_mpc_direct'; choose one of"):
+        fit_settings({"methods": ["inverse_mpc_direct"]})
