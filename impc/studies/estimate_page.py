@@ -32,6 +32,8 @@ __all__ = ["report"]
 
 # Trials that are drawn, the first ones.
 _DRAWN = 6
+# Of the largest entry of a matrix: below it stands the rounding of a search.
+_ROUNDING = 1e-12
 
 
 @checked
@@ -180,7 +182,7 @@ def _trajectories(fit: MethodFit, index: int) -> Figure:
     simulated = run.x @ plant.C.T
     for place, name in enumerate(plant.outputs):
         factor, unit = display_unit(name)
-        axes[place].plot(time, factor * trial.outputs[:, place], color="#999999", linewidth=1.8)
+        axes[place].plot(time, factor * trial.outputs[:, place], color="#BBBBBB", linewidth=3.5)
         axes[place].plot(time, factor * simulated[:, place], color=BLUE, linewidth=1.0)
         axes[place].set_ylabel(f"{name} ({unit})")
     for place, name in enumerate(plant.controls):
