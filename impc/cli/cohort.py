@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 
 __all__ = ["command"]
 
-# Assessments that a worker makes of each unit; intent is told by rules, not by draws.
-_USED = ("bootstrap", "held_out", "intent_draws", "replicates", "seed")
+# Of the settings that ask for more, those that a worker takes.
+_USED = ("replicates",)
 
 
 @click.command("cohort")

@@ -42,12 +42,13 @@ def command(files: tuple[Path, ...], plant_name: str, config: Path, out: Path, y
     subject = read_subject("compare", files, plant_name, config)
     problem, settings = subject.problem, subject.settings
     require_used(settings, (), "compare")
-    fits = replace(settings, replicates=0, profiles=[], horizons=[], held_out=True)
-    require_consent(fit_effort(problem, fits), yes)
+    require_consent(fit_effort(problem, settings), yes)
     memory = open_memory(out, problem, settings, "compare", subject.inputs.digest)
-    with progress(stages(len(problem.recordings)), "estimate", lambda _: memory.kept()) as done:
-        told = replace(memory, done=done)
-        compared = compare_recordings(problem, settings.settle, told.estimate)
+    held_out = settings.held_out
+    count = stages(len(problem.recordings), held_out=held_out)
+    with progress(count, "estimate", lambda _: memory.kept()) as done:
+        remember = replace(memory, done=done).estimate
+        compared = compare_recordings(problem, settings.settle, remember, held_out=held_out)
     written = write_files(out, compare_report(problem, compared, subject.provenance).files())
     memory.forget()
     click.echo(methods_table(problem, compared).text())

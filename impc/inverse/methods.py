@@ -229,7 +229,7 @@ METHODS: dict[str, Method] = {method.name: method for method in _TABLE}
 
 @checked
 def method_named(name: str) -> Method:
-    """Return a method of the registry.
+    """Return the method of the registry that is called `name`.
 
     Raises
     ------

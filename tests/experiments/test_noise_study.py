@@ -9,13 +9,13 @@ import pytest
 
 from experiments import noise_study
 from experiments.noise_study import Cell, Outcome, study_cell
-from impc.inverse.methods import METHODS
+from impc.studies.compare.subject import compared_methods
 
 
 def test_a_cell_with_saturation() -> None:
     """At 4.5 Nm and 1 % noise inverse MPC wins by more than a point over all without bounds."""
     found = study_cell(Cell(4.5, 99.0, 0))
-    assert list(found) == list(METHODS)
+    assert list(found) == list(compared_methods())
     ours = found["inverse_mpc"].vaf
     assert ours is not None
     assert ours > 99.9
@@ -34,7 +34,7 @@ def test_cells_that_are_done_are_not_done_again(
     cells = [Cell(6.0, 90.0, seed) for seed in range(2)]
     (tmp_path / "cells").mkdir()
     for cell in cells:
-        content = json.dumps(dict.fromkeys(METHODS, outcome))
+        content = json.dumps(dict.fromkeys(compared_methods(), outcome))
         (tmp_path / "cells" / f"{cell.name}.json").write_text(content)
     monkeypatch.setattr(noise_study, "study_cell", None)
     found = noise_study._run(cells, tmp_path)

@@ -218,6 +218,8 @@ def test_an_interrupt_leaves_no_reader_behind(sound: Path) -> None:
     text = (
         "import os, signal, sys, threading\nfrom pathlib import Path\n"
         "from impc.files import apart\nfrom impc.files.formats import read_table\n"
+        # Whatever starts in the background of a shell ignores interrupts.
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         f"read_table(Path({sound.name!r}))\n"
         "pid = apart._current[0].popen.pid\n"
         "os.kill(pid, signal.SIGSTOP)\n"  # it will not answer

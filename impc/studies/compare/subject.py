@@ -56,13 +56,13 @@ def compared_methods() -> tuple[str, ...]:
     return tuple(name for name in METHODS if name not in _LEFT_OUT)
 
 
-def stages(trials: int) -> int:
-    """Number of estimates that `compare_recordings` makes for so many `trials`."""
-    return len(compared_methods()) * (1 + (trials if trials > 1 else 0))
+def stages(trials: int, *, held_out: bool = True) -> int:
+    """Number of estimates that `compare_recordings` makes of `trials`, some `held_out` or none."""
+    return len(compared_methods()) * (1 + (trials if held_out and trials > 1 else 0))
 
 
 def compare_recordings(
-    problem: Problem, settle: float, remember: Remember = afresh
+    problem: Problem, settle: float, remember: Remember = afresh, *, held_out: bool = True
 ) -> tuple[MethodComparison, ...]:
     """Run every method on all trials, then on all but each one.
 
@@ -74,6 +74,8 @@ def compare_recordings(
         Seconds at the start of a left-out trial that find its start and do not count.
     remember : callable
         (stage, compute) -> the estimate; stages are named "all/METHOD" and "without K/METHOD".
+    held_out : bool
+        Whether each trial is predicted from the others.
 
     Raises
     ------
@@ -83,7 +85,7 @@ def compare_recordings(
     count, names = len(problem.recordings), compared_methods()
     whole = estimate_all(NaturalUnits(problem, _within("all", remember)), names)
     parts = []
-    for index in range(count if count > 1 else 0):
+    for index in range(count if held_out and count > 1 else 0):
         ground = NaturalUnits(problem.leaving_out(index), _within(f"without {index + 1}", remember))
         try:
             parts.append(estimate_all(ground, names))

@@ -37,12 +37,12 @@ _RANGES: dict[str, tuple[float, float]] = {
 }
 # A limit of an input is squared and divided by: beyond these the square is no number any more.
 _LIMITS = (1e-100, 1e100)
-# Settings that are not of the problem: assessments, which not every command makes.
-_OF_SOME = (
-    "bootstrap", "feedback_states", "held_out", "horizons", "intent_draws", "methods", "profiles",
-    "replicates", "seed", "unknown_limit",
-)  # fmt: skip
+# Settings that ask for assessments which not every command makes.
+_OF_SOME = ("feedback_states", "horizons", "methods", "profiles", "replicates", "unknown_limit")
 _PAGES = {"fit": "docs/fitting.md", "select": "docs/selection.md"}
+
+#: Methods that a fit shows beside inverse MPC, which comes last (docs/fitting.md).
+BESIDE = ("feedback_gain", "inverse_lqr", "inverse_lqr_output", "clipped_lqr")
 
 T = TypeVar("T")
 
@@ -121,10 +121,6 @@ class FitSettings:
     unknown_limit: bool = False
     horizons: list[int] = field(default_factory=list)
     methods: list[str] = field(default_factory=lambda: list(BESIDE))
-
-
-#: Methods that a fit shows beside inverse MPC, which comes last (docs/fitting.md).
-BESIDE = ("feedback_gain", "inverse_lqr", "inverse_lqr_output", "clipped_lqr")
 
 
 def require_used(settings: FitSettings, used: Collection[str], command: str) -> None:

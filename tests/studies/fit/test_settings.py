@@ -108,7 +108,7 @@ def test_as_many_limits_as_inputs(seat: Plant) -> None:
     ("table", "used", "says"),
     [
         ({"profiles": ["K.u.x"]}, (), "[fit] profiles: is not used by impc compare"),
-        ({"held_out": False}, (), "[fit] held_out: is not used by impc compare"),
+        ({"unknown_limit": True}, (), "[fit] unknown_limit: is not used by impc compare"),
         ({"replicates": 40}, ("replicates",), ""),
         ({"horizon": 10, "settle": 2.0}, (), ""),
     ],

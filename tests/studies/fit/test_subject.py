@@ -194,7 +194,7 @@ def test_an_interrupted_fit_goes_on(
         computed.append(len(problem.recordings))
         return fit_controller(problem, start)
 
-    for module in ("impc.studies.fit.subject", "impc.inverse.methods"):
+    for module in ("impc.studies.fit.subject", "impc.inverse.groundwork"):
         monkeypatch.setattr(f"{module}.fit_controller", counting)
     result = fit_recordings(*small, FitProgress(lambda _: None, again.estimate))
     fits = {"inverse_mpc", *(f"without trial {number}" for number in (1, 2, 3))}
