@@ -143,7 +143,7 @@ def controller_entries() -> list[Entry]:
             "(3.7)",
             "Auxiliary problem: weights with a gain near the estimated one, and a small condition"
             " number; where inverse MPC starts.",
-            ("impc.inverse.direct_and_reduced:auxiliary_weights",),
+            ("impc.inverse.nearest_regulator:auxiliary_weights",),
             "Used on the gradient branch; its result in the example is under (3.14).",
             Verdict.IN_KIND,
             "Whether the gain estimated from data or the one of the gradient problem is fitted is"

@@ -106,7 +106,7 @@ def _subject(fit: dict[str, Any], truth: dict[str, Any]) -> list[Entry]:
             "(3.21)",
             "The LQR gain nearest to the estimated one.",
             (
-                "impc.inverse.direct_and_reduced:auxiliary_weights",
+                "impc.inverse.nearest_regulator:auxiliary_weights",
                 "impc.inverse.inverse_lqr:inverse_lqr_gradient",
             ),
             f"From the unbounded estimate: VAF {_both(fit, 'inverse_lqr')} % where that"

@@ -8,7 +8,6 @@ name is an argument of the plant, and not otherwise (docs/security.md).
 
 from __future__ import annotations
 
-import ast
 import dataclasses
 import functools
 import hashlib
@@ -19,7 +18,9 @@ import sys
 from collections.abc import Mapping, Sequence, Set
 from datetime import date, datetime
 from datetime import time as time_of_day
+from modulefinder import ModuleFinder
 from pathlib import Path, PurePath
+from types import CodeType
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -194,25 +195,41 @@ def _gather(name: str, file: Path | None, found: dict[str, bytes]) -> None:
 
 
 def _imports(source: bytes, package: str) -> set[str]:
-    """Names of all modules that a source may import, anywhere in it."""
-    names: set[str] = set()
-    for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.Import):
-            names.update(item.name for item in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            base = _base(node, package)
-            names.update({base, *(f"{base}.{item.name}" for item in node.names)})
+    """Names of all modules that a source may import, anywhere in it.
+
+    From its code and not from its syntax tree: `ast.parse` fails now and then in Python 3.11 when
+    another thread parses at the same time.
+    """
+    try:
+        code = compile(source, package, "exec", dont_inherit=True)
+    except (SyntaxError, ValueError):  # of a file that cannot be imported
+        return set()
     # A package's own __init__ runs too when a module in it is imported.
-    return {part for name in names for part in _with_parents(name)}
+    return {part for name in _imported(code, package) for part in _with_parents(name)}
 
 
-def _base(node: ast.ImportFrom, package: str) -> str:
-    """What `from ... import` imports from, its leading dots resolved."""
-    if not node.level:
-        return node.module or ""
+def _imported(code: CodeType, package: str) -> Iterator[str]:
+    for kind, found in ModuleFinder().scan_opcodes(code):
+        if kind == "absolute_import":
+            level, (names, base) = 0, found
+        elif kind == "relative_import":
+            level, names, base = found
+        else:
+            continue
+        base = _absolute(base, level, package)
+        yield base
+        yield from (f"{base}.{name}" for name in names or ())
+    for inner in code.co_consts:
+        if isinstance(inner, CodeType):
+            yield from _imported(inner, package)
+
+
+def _absolute(name: str, level: int, package: str) -> str:
+    """What `from ..name import` imports from, its leading dots resolved."""
+    if not level:
+        return name
     parts = package.split(".")
-    above = parts[: len(parts) - node.level + 1]
-    return ".".join([*above, *([node.module] if node.module else [])])
+    return ".".join([*parts[: len(parts) - level + 1], *([name] if name else [])])
 
 
 def _with_parents(name: str) -> list[str]:

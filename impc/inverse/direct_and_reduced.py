@@ -20,11 +20,16 @@ from impc.inverse.diagonal_start import bryson_regulators
 from impc.inverse.explaining_weights import weights_behind
 from impc.inverse.gain_search import EXPLAINED, GainFit, fit_gain
 from impc.inverse.inverse_lqr import inverse_lqr_gradient, inverse_lqr_lmi
+from impc.inverse.nearest_regulator import (
+    AUXILIARY_CONDITION_WEIGHT,
+    auxiliary_weights,
+    definite,
+)
 from impc.inverse.problem import recorded_size, scenarios, typical_output
 from impc.inverse.proximal_search import ConditionedFit, Objective, Residual, conditioned_fit
 from impc.inverse.residuals import evaluate
 from impc.model.riccati import solve_lqr
-from impc.model.weights import Weights, condition_number, normalised
+from impc.model.weights import Weights
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -39,13 +44,11 @@ if TYPE_CHECKING:
     from impc.model.riccati import LqrSolution
 
 __all__ = [
-    "AUXILIARY_CONDITION_WEIGHT",
     "CONDITION_WEIGHT",
     "DirectFit",
     "Inference",
     "ReducedFit",
     "Start",
-    "auxiliary_weights",
     "infer_weights",
     "inverse_mpc",
     "inverse_mpc_reduced",
@@ -58,12 +61,8 @@ __all__ = [
 # c of (3.5) to (3.7) is lost. Small enough that the exact fit wins in the 2-norm (docs/theory.md).
 #: Weight of the condition number in (3.6) and (3.16), against 1 for a misfit of a typical output.
 CONDITION_WEIGHT = 1e-4
-#: The same in (3.7), against 1 for a distance as large as the gain in `infer_weights`.
-AUXILIARY_CONDITION_WEIGHT = 1e-3
 # Steps of the direct form inside the reduced one: it need not end, only change the valley.
 _DETOUR = 60
-# Starting weights are kept this definite: the search takes the Cholesky factor of them.
-_LARGEST_START_CONDITION = 1e6
 
 
 @dataclass(frozen=True)
@@ -272,7 +271,7 @@ def inverse_mpc(
     if weight is None:
         weight = CONDITION_WEIGHT * typical_output(problem)
     objective = Objective(_closed_loop_residual(problem), 1.0, weight, squared)
-    fit = conditioned_fit(problem.plant, objective, _definite(start), max_iterations=max_iterations)
+    fit = conditioned_fit(problem.plant, objective, definite(start), max_iterations=max_iterations)
     found = _direct(problem, fit)
     if found.explained or not explain or squared or condition_weight is not None:
         return found
@@ -375,45 +374,6 @@ def _most_promising(problem: Problem) -> Weights:
     return min(bryson_regulators(problem), key=lambda item: distance(item[1]))[0]
 
 
-@checked(gain="m n", condition_weight=0)
-def auxiliary_weights(
-    plant: Plant,
-    gain: Array,
-    start: Weights | None,
-    *,
-    condition_weight: float = AUXILIARY_CONDITION_WEIGHT,
-) -> ConditionedFit:
-    """Auxiliary problem (3.7): weights whose regulator is near the gain, and well conditioned.
-
-    minimise  ||K(Q, R) - gain||_2 + condition_weight kappa(blkdiag(Q, R))
-
-    Parameters
-    ----------
-    gain : Array
-        (m, n).
-    start : Weights or None
-        Where the search begins; the identity for None.
-    condition_weight : float
-        Against 1 for the distance.
-
-    Raises
-    ------
-    WeightsError
-        When the start has no stabilising Riccati solution.
-    """
-    size = gain.size
-    dK = np.eye(size).reshape(size, *gain.shape)
-    dS = np.zeros((size, plant.m, plant.m))
-
-    def distance(solution: LqrSolution) -> Residual:
-        return Residual((solution.K - gain).ravel(), dK, dS, usable=True)
-
-    begin = Weights(np.eye(plant.n), np.eye(plant.m)) if start is None else start
-    return conditioned_fit(
-        plant, Objective(distance, 1.0, condition_weight, squared=False), _definite(begin)
-    )
-
-
 @checked(condition_weight=0)
 def output_penalty_weights(
     problem: Problem,
@@ -467,15 +427,3 @@ def _closed_loop_residual(problem: Problem) -> Callable[[LqrSolution], Residual]
         return Residual(found.residual, found.dK, found.dS, usable=not found.reason)
 
     return residual
-
-
-def _definite(weights: Weights) -> Weights:
-    """Lift the least eigenvalues of Q and R so that the condition number is at most 1e6."""
-    if condition_number(weights) <= _LARGEST_START_CONDITION:
-        return normalised(weights)
-    floor = float(np.linalg.eigvalsh(weights.block)[-1]) / _LARGEST_START_CONDITION
-    lifted = []
-    for matrix in (weights.Q, weights.R):
-        values, vectors = np.linalg.eigh(matrix)
-        lifted.append((vectors * np.maximum(values, floor)) @ vectors.T)
-    return normalised(Weights(*lifted))

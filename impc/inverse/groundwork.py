@@ -24,7 +24,6 @@ from impc.checking import replace
 from impc.errors import WeightsError
 from impc.inverse.direct_and_reduced import (
     CONDITION_WEIGHT,
-    auxiliary_weights,
     inverse_mpc,
     inverse_mpc_reduced,
     output_penalty_weights,
@@ -36,6 +35,7 @@ from impc.inverse.gain_search import EXPLAINED, GainFit, fit_gain
 from impc.inverse.initial_states import with_fitted_starts
 from impc.inverse.inverse_lqr import InverseLqr, inverse_lqr_gradient, inverse_lqr_lmi
 from impc.inverse.natural_search import in_plant_units, inverse_mpc_natural
+from impc.inverse.nearest_regulator import auxiliary_weights
 from impc.inverse.noisy_fit import fit_controller, free_gain, noise_of
 from impc.inverse.problem import recorded_size
 from impc.inverse.solution_set import gain_fibre, natural_coordinates

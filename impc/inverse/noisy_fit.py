@@ -18,13 +18,13 @@ from impc.arrays import frozen
 from impc.checking import checked, replace
 from impc.errors import SolverError, WeightsError
 from impc.inverse.diagonal_start import diagonal_weights
-from impc.inverse.direct_and_reduced import auxiliary_weights
 from impc.inverse.equivalent_weights import least_condition_weights
 from impc.inverse.estimates import Estimate, Status
 from impc.inverse.explaining_weights import weights_behind
 from impc.inverse.gain_search import EXPLAINED, GainFit, describe_gain, fit_gain
 from impc.inverse.initial_states import with_fitted_starts
 from impc.inverse.natural_search import in_plant_units, inverse_mpc_natural
+from impc.inverse.nearest_regulator import auxiliary_weights
 from impc.inverse.problem import recorded_size
 from impc.inverse.residuals import residual_only
 from impc.inverse.solution_set import gain_fibre, natural_coordinates

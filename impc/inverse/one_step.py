@@ -19,7 +19,7 @@ import numpy as np
 
 from impc.arrays import frozen
 from impc.checking import replace
-from impc.inverse.quiet_samples import recorded_states
+from impc.inverse.problem import recorded_states
 from impc.inverse.smoothing import smoothed_trials
 
 if TYPE_CHECKING:

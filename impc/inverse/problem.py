@@ -39,6 +39,7 @@ __all__ = [
     "controller_for",
     "misfit",
     "recorded_size",
+    "recorded_states",
     "scenarios",
     "typical_output",
 ]
@@ -228,6 +229,17 @@ def recorded_size(problem: Problem) -> float:
     """2-norm of all recorded outputs, each divided by its scale."""
     parts = [(trial.outputs / problem.output_scale).ravel() for trial in problem.recordings]
     return float(np.linalg.norm(np.concatenate(parts)))
+
+
+def recorded_states(problem: Problem) -> list[Array] | None:
+    """States (samples, n) of each trial, where the outputs determine them."""
+    C = problem.plant.C
+    if C.shape[0] != C.shape[1] or np.linalg.matrix_rank(C) < len(C):
+        return None
+    return [
+        np.asarray(np.linalg.solve(C, trial.outputs.T).T, dtype=np.float64)
+        for trial in problem.recordings
+    ]
 
 
 def typical_output(problem: Problem) -> float:

@@ -22,7 +22,7 @@ import scipy.optimize
 
 from impc.arrays import Array
 from impc.inverse.consistent_pairs import scaled_changes
-from impc.inverse.problem import recorded_size
+from impc.inverse.problem import recorded_size, recorded_states
 from impc.inverse.residuals import evaluate, unusable
 from impc.model.riccati import is_stable
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from impc.inverse.problem import Problem
     from impc.inverse.residuals import Evaluation
 
-__all__ = ["follows_plant", "quiet_feedback", "quiet_pairs", "recorded_states"]
+__all__ = ["follows_plant", "quiet_feedback", "quiet_pairs"]
 
 # Runs looked at, evenly spread.
 _MOST = 500
@@ -251,14 +251,3 @@ def follows_plant(problem: Problem) -> bool:
         missed += float(np.sum((rest @ left) ** 2))
         size += float(np.sum(x**2))
     return missed <= _FOLLOWS**2 * size
-
-
-def recorded_states(problem: Problem) -> list[Array] | None:
-    """States (samples, n) of each trial, where the outputs determine them."""
-    C = problem.plant.C
-    if C.shape[0] != C.shape[1] or np.linalg.matrix_rank(C) < len(C):
-        return None
-    return [
-        np.asarray(np.linalg.solve(C, trial.outputs.T).T, dtype=np.float64)
-        for trial in problem.recordings
-    ]

@@ -13,10 +13,9 @@ import impc
 from docs.rooms import DRAWING, ROOMS, drawing, floors, imports, room
 from tests.documents.blocks import PAGES, ROOT, blocks
 
-# Modules of the longest chain in which each needs the one below to be loaded. 20 when the rooms
-# were made, 22 with the quiet samples and the search for pairs; docs/architecture.md says why it is
-# no less.
-FLOORS = 22
+# Modules of the longest chain in which each needs the one below to be loaded; docs/architecture.md
+# says why it is no less.
+FLOORS = 20
 ORDER = list(ROOMS)
 CODE = [path for folder in ("impc", "plants", "experiments", "tests", "docs")
         for path in sorted((ROOT / folder).rglob("*.py"))

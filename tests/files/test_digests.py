@@ -70,15 +70,17 @@ def test_a_file_is_read_from_end_to_end(tmp_path: Path) -> None:
             content_digest(tmp_path / name)
 
 
-@pytest.mark.parametrize("where", ["plant", "body", "deep/inner"])
+@pytest.mark.parametrize("where", ["plant", "body", "deep/inner", "deep/near", "broken"])
 def test_code_of_a_plant_and_of_what_it_imports(
     where: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Length 1.0 to 1.6 in the module itself, in one it imports, and in one inside a function."""
+    """1.0 to 1.6 in the module itself, in those it imports, and in one that cannot be read."""
     texts = {
         "plant": "LENGTH = 1.0\nfrom body import MASS\ndef make():\n    from deep.inner import G\n",
         "body": "MASS = 1.0\n",
-        "deep/inner": "G = 1.0\n",
+        "deep/inner": "from .near import H\nG = 1.0\ndef never():\n    import broken\n",
+        "deep/near": "H = 1.0\n",
+        "broken": "H = 1.0 (\n",
     }
     found: list[str] = []
     for number, length in enumerate(("1.0", "1.0", "1.6")):

@@ -9,9 +9,7 @@ from impc.assess.identified_directions import identifiability
 from impc.control.closed_loop import Status, require_complete, scenario, simulate
 from impc.control.controller import Controller
 from impc.inverse.direct_and_reduced import (
-    AUXILIARY_CONDITION_WEIGHT,
     CONDITION_WEIGHT,
-    auxiliary_weights,
     infer_weights,
     inverse_mpc,
     inverse_mpc_reduced,
@@ -102,32 +100,6 @@ def test_example_identifiability_shows_other_weights_that_explain_the_data(
     for item in found.others:
         assert item.misfit < 1e-9
         assert np.linalg.norm(item.weights.Q - np.eye(2)) > 0.1
-
-
-def auxiliary_objective(plant: Plant, gain: np.ndarray, weights: Weights) -> float:
-    distance = np.linalg.norm(solve_lqr(plant, weights).K - gain)
-    return float(distance + AUXILIARY_CONDITION_WEIGHT * condition_number(weights))
-
-
-def test_auxiliary_problem_reaches_what_a_derivative_free_search_reaches(
-    example_plant: Plant,
-) -> None:
-    gain = np.array([[1.21183, -0.71277]])
-    found = auxiliary_weights(example_plant, gain, IDENTITY)
-    best = auxiliary_objective(example_plant, gain, found.weights)
-    assert found.objective == pytest.approx(best, rel=1e-9)
-    # The reference's Q_0 (section 3, case A), from Nelder-Mead on its own scaling of the weights.
-    assert best <= auxiliary_objective(
-        example_plant, gain, Weights([[0.1901, 0.0716], [0.0716, 0.2163]], 1)
-    )
-    for seed in range(3):
-        start = np.random.default_rng(seed).normal(size=3)
-        search = nelder_mead(
-            lambda z: auxiliary_objective(example_plant, gain, weights_from_parameters(z, 2, 1)),
-            start,
-            2000,
-        )
-        assert best <= search + 1e-9
 
 
 def test_output_penalty_reaches_what_a_derivative_free_search_reaches(

@@ -17,9 +17,10 @@ from impc.assess.identified_directions import Identifiability, identifiability
 from impc.assess.judged import judge
 from impc.control.closed_loop import Simulation, require_complete, scenario, simulate
 from impc.control.controller import Controller
-from impc.inverse.direct_and_reduced import AUXILIARY_CONDITION_WEIGHT, CONDITION_WEIGHT
+from impc.inverse.direct_and_reduced import CONDITION_WEIGHT
 from impc.inverse.groundwork import PlantUnits
 from impc.inverse.methods import METHODS
+from impc.inverse.nearest_regulator import AUXILIARY_CONDITION_WEIGHT
 from impc.inverse.problem import Problem, misfit
 from impc.model.bounds import Bounds
 from impc.model.recordings import Recording

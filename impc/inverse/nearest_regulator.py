@@ -1,0 +1,75 @@
+"""The auxiliary problem (3.7): well-conditioned weights whose regulator is near a given gain."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.arrays import Array
+from impc.checking import checked
+from impc.inverse.proximal_search import ConditionedFit, Objective, Residual, conditioned_fit
+from impc.model.weights import Weights, condition_number, normalised
+
+if TYPE_CHECKING:
+    from impc.model.plant import Plant
+    from impc.model.riccati import LqrSolution
+
+__all__ = ["AUXILIARY_CONDITION_WEIGHT", "auxiliary_weights", "definite"]
+
+#: Weight of the condition number in (3.7), against 1 for a distance as large as the gain in
+#: `infer_weights`.
+AUXILIARY_CONDITION_WEIGHT = 1e-3
+# Starting weights are kept this definite: the search takes the Cholesky factor of them.
+_LARGEST_START_CONDITION = 1e6
+
+
+@checked(gain="m n", condition_weight=0)
+def auxiliary_weights(
+    plant: Plant,
+    gain: Array,
+    start: Weights | None,
+    *,
+    condition_weight: float = AUXILIARY_CONDITION_WEIGHT,
+) -> ConditionedFit:
+    """Auxiliary problem (3.7): weights whose regulator is near the gain, and well conditioned.
+
+    minimise  ||K(Q, R) - gain||_2 + condition_weight kappa(blkdiag(Q, R))
+
+    Parameters
+    ----------
+    gain : Array
+        (m, n).
+    start : Weights or None
+        Where the search begins; the identity for None.
+    condition_weight : float
+        Against 1 for the distance.
+
+    Raises
+    ------
+    WeightsError
+        When the start has no stabilising Riccati solution.
+    """
+    size = gain.size
+    dK = np.eye(size).reshape(size, *gain.shape)
+    dS = np.zeros((size, plant.m, plant.m))
+
+    def distance(solution: LqrSolution) -> Residual:
+        return Residual((solution.K - gain).ravel(), dK, dS, usable=True)
+
+    begin = Weights(np.eye(plant.n), np.eye(plant.m)) if start is None else start
+    return conditioned_fit(
+        plant, Objective(distance, 1.0, condition_weight, squared=False), definite(begin)
+    )
+
+
+def definite(weights: Weights) -> Weights:
+    """Lift the least eigenvalues of Q and R so that the condition number is at most 1e6."""
+    if condition_number(weights) <= _LARGEST_START_CONDITION:
+        return normalised(weights)
+    floor = float(np.linalg.eigvalsh(weights.block)[-1]) / _LARGEST_START_CONDITION
+    lifted = []
+    for matrix in (weights.Q, weights.R):
+        values, vectors = np.linalg.eigh(matrix)
+        lifted.append((vectors * np.maximum(values, floor)) @ vectors.T)
+    return normalised(Weights(*lifted))

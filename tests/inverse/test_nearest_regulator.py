@@ -1,0 +1,40 @@
+"""The auxiliary problem against a search without derivatives."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from impc.inverse.nearest_regulator import AUXILIARY_CONDITION_WEIGHT, auxiliary_weights
+from impc.model.plant import Plant
+from impc.model.riccati import solve_lqr
+from impc.model.weights import Weights, condition_number, weights_from_parameters
+from tests.support import nelder_mead
+
+IDENTITY = Weights(np.eye(2), 1)
+
+
+def auxiliary_objective(plant: Plant, gain: np.ndarray, weights: Weights) -> float:
+    distance = np.linalg.norm(solve_lqr(plant, weights).K - gain)
+    return float(distance + AUXILIARY_CONDITION_WEIGHT * condition_number(weights))
+
+
+def test_auxiliary_problem_reaches_what_a_derivative_free_search_reaches(
+    example_plant: Plant,
+) -> None:
+    gain = np.array([[1.21183, -0.71277]])
+    found = auxiliary_weights(example_plant, gain, IDENTITY)
+    best = auxiliary_objective(example_plant, gain, found.weights)
+    assert found.objective == pytest.approx(best, rel=1e-9)
+    # The reference's Q_0 (section 3, case A), from Nelder-Mead on its own scaling of the weights.
+    assert best <= auxiliary_objective(
+        example_plant, gain, Weights([[0.1901, 0.0716], [0.0716, 0.2163]], 1)
+    )
+    for seed in range(3):
+        start = np.random.default_rng(seed).normal(size=3)
+        search = nelder_mead(
+            lambda z: auxiliary_objective(example_plant, gain, weights_from_parameters(z, 2, 1)),
+            start,
+            2000,
+        )
+        assert best <= search + 1e-9
