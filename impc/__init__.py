@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from impc.files.formats import read_table as read_table
     from impc.files.formats import write_table as write_table
     from impc.files.reading import read_recordings as read_recordings
+    from impc.files.results import read_result as read_result
     from impc.files.table import make_table as make_table
     from impc.inverse.cross_term import inverse_lqr_cross_term as inverse_lqr_cross_term
     from impc.inverse.direct_and_reduced import infer_weights as infer_weights
@@ -82,6 +83,7 @@ _NAMES = {
     "files.configuration": "read_configuration",
     "files.formats": "read_table write_table",
     "files.reading": "read_recordings",
+    "files.results": "read_result",
     "files.table": "make_table",
     "inverse.cross_term": "inverse_lqr_cross_term",
     "inverse.direct_and_reduced": "infer_weights inverse_mpc inverse_mpc_reduced",

@@ -390,6 +390,7 @@ _KINDS: dict[str, Kind] = {
     "Any": _as_it_is,
     "Sequence[str]": _several(_text, "names"),
     "tuple[str, ...]": _several(_text, "names"),
+    "tuple[tuple[str, str], ...]": _as_it_is,
     "Sequence[int]": _several(_whole, "whole numbers"),
     "Sequence[float]": _several(_number, "numbers"),
     "tuple[Recording, ...]": _several(

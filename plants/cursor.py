@@ -24,13 +24,18 @@ import numpy as np
 import scipy.linalg
 
 from plants._checks import finite_number
+from plants._units import with_units
 from plants.actuation import delayed_muscle
 
 __all__ = ["cursor_plant"]
 
 
 def cursor_plant(
-    delay: float = 0.15, lag: float = 0.08, sample_time: float = 1 / 60, delay_order: int = 4
+    delay: float = 0.15,
+    lag: float = 0.08,
+    sample_time: float = 1 / 60,
+    delay_order: int = 4,
+    length: str = "px",
 ) -> Any:
     """Return the linear plant, sampled with its inputs held.
 
@@ -44,6 +49,8 @@ def cursor_plant(
         s; a screen of 60 Hz by default.
     delay_order : int
         Order of the Padé approximant of the delay.
+    length : str
+        The unit in which the recordings have the error.
 
     Returns
     -------
@@ -67,7 +74,14 @@ def cursor_plant(
     # exp([A B; 0 0] T) = [Ad Bd; 0 I]: exact also where A is singular, as here.
     held = scipy.linalg.expm(np.block([[A, B], [np.zeros((2, n + 2))]]) * sample_time)
     delays = [f"delay_{k}" for k in range(1, delay_order + 1)]
-    return control.ss(
+    acceleration = f"{length}/s^2"
+    units = {
+        "error": length,
+        "velocity": f"{length}/s",
+        **dict.fromkeys([*delays, "acceleration", "command"], acceleration),
+        "target_rate": f"{length}/s",
+    }
+    system = control.ss(
         held[:n, :n],
         held[:n, n:],
         np.eye(1, n),
@@ -78,3 +92,4 @@ def cursor_plant(
         inputs=["command", "target_rate"],
         outputs=["error"],
     )
+    return with_units(system, units)

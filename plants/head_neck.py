@@ -31,6 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plants._checks import finite_number, whole_number
+from plants._units import with_units
 from plants.actuation import pade_delay
 
 __all__ = [
@@ -194,7 +195,7 @@ def head_neck_plant(values: NDArray[np.float64], axis: Axis = "yaw", delay_order
         finite_number(item.name, float(value), f"give it in {item.unit}")
     A, B, C = (item.full() for item in head_neck_matrices(axis, delay_order)(given))
     names: dict[str, Any] = {"inputs": ["reference"], "outputs": ["head"]}
-    return control.ss(A, B, C, 0, **names)
+    return with_units(control.ss(A, B, C, 0, **names), {"reference": "rad", "head": "rad"})
 
 
 def step_reference(

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any
 import control
 import numpy as np
 
+from plants._units import with_units
+
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
@@ -28,7 +30,7 @@ def _two_states(
     name: str, A: ArrayLike, B: ArrayLike, C: ArrayLike | None = None
 ) -> Any:  # control has no types
     output = np.eye(2) if C is None else np.asarray(C, dtype=float)
-    return control.ss(
+    system = control.ss(
         np.asarray(A, dtype=float),
         np.asarray(B, dtype=float),
         output,
@@ -38,6 +40,9 @@ def _two_states(
         states=["x1", "x2"],
         inputs=["u"],
         outputs=["x1", "x2"] if C is None else ["y"],
+    )
+    return with_units(
+        system, dict.fromkeys([*system.state_labels, *system.output_labels, "u"], "1")
     )
 
 

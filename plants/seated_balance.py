@@ -30,6 +30,7 @@ import numpy as np
 import scipy.linalg
 
 from plants._checks import finite_number
+from plants._units import with_units
 from plants.actuation import delayed_muscle
 from plants.seated_parameters import SeatedBalanceLimits, SeatedBalanceParameters
 
@@ -215,7 +216,11 @@ def _mass(p: SeatedBalanceParameters, angle: ca.SX) -> ca.SX:
 def _named(A: Any, B: Any, sample_time: float, name: str) -> Any:
     n = A.shape[0]
     delays = [f"delay_{k}" for k in range(1, n - 4)]
-    return control.ss(
+    units = {
+        **dict(zip(_BODY, ("rad", "rad", "rad/s", "rad/s"), strict=True)),
+        **dict.fromkeys([*delays, "muscle_torque", *_INPUTS], "N m"),
+    }
+    system = control.ss(
         A,
         B,
         np.eye(2, n),
@@ -226,3 +231,4 @@ def _named(A: Any, B: Any, sample_time: float, name: str) -> Any:
         inputs=list(_INPUTS),
         outputs=list(_BODY[:2]),
     )
+    return with_units(system, units)

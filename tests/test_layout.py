@@ -29,7 +29,8 @@ ELSEWHERE = {
     "cli/test_ending.py": "cli/exit_status.py",
     "cli/test_fit.py": """
         cli/simulate.py cli/subject.py cli/output.py
-        cli/seat.py studies/fit/report.py studies/fit/schema.py studies/fit/sentences.py""",
+        cli/seat.py studies/fit/csv_tables.py
+        studies/fit/report.py studies/fit/schema.py studies/fit/sentences.py""",
     "cli/test_folders.py": "cli/options.py",
     "cli/test_main.py": """
         cli/example.py cli/numbers.py studies/example/cases.py studies/example/table.py""",

@@ -244,8 +244,10 @@ def test_every_block_is_escaped_and_there() -> None:
 
 def test_a_report_is_its_files() -> None:
     files = every_block().files()
-    assert list(files) == ["report.html", "result.json", "numbers.csv", f"{EVIL}.png"]
-    assert json.loads(files["result.json"]) == {"a": [1.0, None]}
+    assert list(files) == ["report.html", "result.json", "numbers.csv", "tables.mat", f"{EVIL}.png"]
+    found = json.loads(files["result.json"])
+    assert list(found) == ["schema", *every_block().provenance.data(), "a"]
+    assert found["a"] == [1.0, None]
     assert files["numbers.csv"] == b"'=a,b\n'-x,0.1\n"
 
 

@@ -34,7 +34,12 @@ def stick(length=1.0, sample_time=0.02):
         inputs=["acceleration", "push"],
         outputs=["angle", "position"],
     )
-    return control.c2d(continuous, sample_time)
+    system = control.c2d(continuous, sample_time)
+    system.units = {
+        "angle": "rad", "angle_rate": "rad/s", "position": "m", "speed": "m/s",
+        "acceleration": "m/s^2", "push": "rad/s^2",
+    }
+    return system
 ''',
 )
 
@@ -68,7 +73,7 @@ for trial in (1, 2):
 
 # %%
 # **What the columns mean.** The file tells no units, so they are ours to say. ``impc inspect``
-# writes a first version of this, with a ``?`` for every unit:
+# writes a first version of this, with a ``?`` for what it cannot know:
 terminal("impc inspect stick_1.csv --plant stick:stick")
 
 # %%

@@ -37,6 +37,9 @@ class MethodFit(Frozen):
         (3.24) over all trials, % (p,); NaN when a simulation does not reach the end.
     trial_vaf : Array
         (trials, p), the same for each.
+    held_out : Array
+        (trials, p), VAF of each trial predicted from the others; NaN where there is no gain or the
+        simulation ends early; (0, p) where none was left out, as `judge` has it.
     largest_input : Array
         Largest magnitude of each input (m,).
     exceeded : float
@@ -49,6 +52,7 @@ class MethodFit(Frozen):
     runs: tuple[Simulation, ...]
     vaf: Array
     trial_vaf: Array
+    held_out: Array
     largest_input: Array
     exceeded: float
     fell: tuple[float | None, ...]
@@ -93,6 +97,7 @@ def judge(estimate: Estimate, bounds: Bounds) -> MethodFit:
         runs,
         frozen(_pooled_vaf(problem, runs)),
         frozen([_trial_vaf(problem, index, run) for index, run in enumerate(runs)]),
+        frozen(np.empty((0, len(problem.plant.outputs)))),
         frozen(np.max(np.abs(commands), axis=0)),
         float(np.mean(np.any(beyond, axis=1))),
         tuple(None if run.complete else run.reached * problem.plant.dt for run in runs),
@@ -107,6 +112,7 @@ def _without_gain(estimate: Estimate) -> MethodFit:
         (),
         frozen(np.full(p, np.nan)),
         frozen(np.full((count, p), np.nan)),
+        frozen(np.empty((0, p))),
         frozen(np.full(plant.m, np.nan)),
         0.0,
         (None,) * count,

@@ -20,7 +20,7 @@ __all__ = ["command"]
 
 @click.command("compare")
 @subject_arguments("What the columns mean, and settings, as for `impc fit`.")
-@out_option("compare", "report.html, result.json, comparison.csv and the figure")
+@out_option("compare", "report.html, result.json, tables and the figure")
 @yes_option
 def command(files: tuple[Path, ...], plant_name: str, config: Path, out: Path, yes: bool) -> None:
     """Compare feedback gain, inverse LQR, inverse KKT and inverse MPC, one file a trial.
@@ -32,11 +32,12 @@ def command(files: tuple[Path, ...], plant_name: str, config: Path, out: Path, y
     from impc.cli.consent import require_consent  # noqa: PLC0415
     from impc.cli.subject import read_subject  # noqa: PLC0415
     from impc.reporting.writer import require_writable, write_files  # noqa: PLC0415
-    from impc.studies.compare.report import compare_report, methods_table  # noqa: PLC0415
+    from impc.studies.compare.report import compare_report  # noqa: PLC0415
     from impc.studies.compare.subject import compare_recordings, stages  # noqa: PLC0415
     from impc.studies.effort import fit_effort  # noqa: PLC0415
     from impc.studies.fit.memory import open_memory  # noqa: PLC0415
     from impc.studies.fit.settings import require_used  # noqa: PLC0415
+    from impc.studies.methods_table import methods_table  # noqa: PLC0415
 
     require_writable(out)
     subject = read_subject("compare", files, plant_name, config)
@@ -51,5 +52,5 @@ def command(files: tuple[Path, ...], plant_name: str, config: Path, out: Path, y
         compared = compare_recordings(problem, settings.settle, remember, held_out=held_out)
     written = write_files(out, compare_report(problem, compared, subject.provenance).files())
     memory.forget()
-    click.echo(methods_table(problem, compared).text())
+    click.echo(methods_table(compared).text())
     print_files(out, written)

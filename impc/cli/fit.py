@@ -20,7 +20,7 @@ __all__ = ["command"]
 
 @click.command("fit")
 @subject_arguments("What the columns mean, and settings; `impc inspect FILE` writes one.")
-@out_option("fit", "report.html, result.json and the figures")
+@out_option("fit", "report.html, result.json, tables and the figures")
 @yes_option
 def command(files: tuple[Path, ...], plant_name: str, config: Path, out: Path, yes: bool) -> None:
     """Fit the controller behind the trials of one subject, one file a trial.
@@ -57,19 +57,12 @@ def command(files: tuple[Path, ...], plant_name: str, config: Path, out: Path, y
 def _print(result: FitResult) -> None:
     """The table of methods and the intent, as the page has them."""
     from impc.assess.intent_rules import dominant_sentence  # noqa: PLC0415
-    from impc.files.columns import in_columns  # noqa: PLC0415
+    from impc.studies.methods_table import methods_table  # noqa: PLC0415
 
     for line in result.warnings:
         click.echo(line)
     plant = result.fitted.problem.plant
-    rows = [("method", *(f"VAF {name}" for name in plant.outputs), "largest input", "")]
-    for method in result.methods:
-        largest = " ".join(f"{value:.3g}" for value in method.largest_input)
-        kept = "" if method.keeps_bounds else "exceeds its bound"
-        fell = [time for time in method.fell if time is not None]
-        note = f"falls at {min(fell):.1f} s" if fell else kept
-        rows.append((method.name, *(f"{value:.2f}" for value in method.vaf), largest, note))
-    click.echo(in_columns(rows))
+    click.echo(methods_table(result.methods).text())
     if result.held_out:
         for index, name in enumerate(plant.outputs):
             each = ", ".join(f"{item.vaf[index]:.2f}" for item in result.held_out)

@@ -52,14 +52,23 @@ def command(file: Path, plant_name: str | None, out: Path | None, config: Path |
 
 
 def _draft(table: Table, plant_name: str | None) -> str:
-    from impc.files.inspection import draft_configuration  # noqa: PLC0415
+    from impc.files.inspection import Wanted, draft_configuration  # noqa: PLC0415
     from impc.files.plant_sources import make_plant  # noqa: PLC0415
 
     if plant_name is None:
         return draft_configuration(table)
-    plant = make_plant(find_plant(plant_name, {}), ())
-    # Without a configuration nothing says which input is the command: all but the first.
-    return draft_configuration(table, plant.outputs, plant.controls[1:])
+    source = find_plant(plant_name, {})
+    plant = make_plant(source, ())
+    # Without a configuration nothing says which input is the command: the first.
+    wanted = Wanted(
+        plant.outputs,
+        plant.controls[1:],
+        plant.controls[:1],
+        dict(plant.units),
+        source.defaults(),
+        plant.dt,
+    )
+    return draft_configuration(table, wanted)
 
 
 def _check(file: Path, config: Path, plant_name: str | None) -> None:

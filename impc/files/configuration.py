@@ -25,15 +25,15 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
 __all__ = [
-    "UNKNOWN_UNIT",
+    "FILL_IN",
     "Configuration",
     "RecordingTable",
     "SignalTable",
     "read_configuration",
 ]
 
-#: What `impc inspect` writes where the file tells no unit; it has to be filled in.
-UNKNOWN_UNIT = "?"
+#: What `impc inspect` writes where nothing tells; it has to be filled in.
+FILL_IN = "?"
 
 _LARGEST = 1_000_000
 _LABELS = ("subject", "visit", "condition", "trial")
@@ -263,7 +263,7 @@ def _check_pattern(refuse: Any, table: RecordingTable, pattern: str) -> None:
 
 
 def _check_signal(source: str, place: str, table: SignalTable) -> None:
-    if table.unit != UNKNOWN_UNIT:
+    if table.unit != FILL_IN:
         _unit(source, f"{place}.unit", table.unit)
     if not math.isfinite(table.offset):
         raise InputError(f"{source}: {place}.offset", f"is {table.offset}", "give a number")

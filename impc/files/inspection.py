@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,22 +12,23 @@ import numpy as np
 
 from impc.errors import InputError
 from impc.files.columns import in_columns
-from impc.files.configuration import UNKNOWN_UNIT
+from impc.files.configuration import FILL_IN
 from impc.files.units import si_unit
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from impc.arrays import Array
     from impc.files.table import Table
 
-__all__ = ["clock_column", "draft_configuration", "summary"]
+__all__ = ["Wanted", "clock_column", "draft_configuration", "summary"]
 
 _CLOCKS = ("time", "t", "zeit", "temps", "tiempo", "timestamp", "clock", "seconds", "sec")
 # Units of a clock that tells none, and how many make a second: the first in which the steps are
 # shorter than those of any recording of movement, s.
 _GUESSES = (("s", 1.0), ("ms", 1e3), ("us", 1e6), ("ns", 1e9))
 _SLOWEST = 0.2
+_HORIZON = 20
 _ALIKE = 0.6  # theta1 and theta_2 are, push and perturbation are not
 
 
@@ -49,21 +51,43 @@ def clock_column(table: Table) -> str | None:
     return next(iter(named or rising), None)
 
 
+@dataclass(frozen=True)
+class Wanted:
+    """What a plant needs a configuration for.
+
+    Attributes
+    ----------
+    outputs, disturbances, controls : sequence of str
+        Names of its signals.
+    units : mapping of str to str
+        Of those whose unit the plant says.
+    arguments : mapping of str to object
+        Of its function, with their defaults; `FILL_IN` for one that has none.
+    dt : float
+        Sample time, s.
+    """
+
+    outputs: Sequence[str]
+    disturbances: Sequence[str]
+    controls: Sequence[str]
+    units: Mapping[str, str]
+    arguments: Mapping[str, object]
+    dt: float
+
+
 @np.errstate(all="ignore")
-def draft_configuration(
-    table: Table, outputs: Sequence[str] = (), disturbances: Sequence[str] = ()
-) -> str:
-    """A commented TOML file that `read_configuration` reads.
+def draft_configuration(table: Table, wanted: Wanted | None = None) -> str:
+    """A commented TOML file that `read_configuration` reads (docs/recordings.md).
 
     Parameters
     ----------
     table : Table
-    outputs, disturbances : sequence of str
-        Names of the plant's signals; without them every column becomes a signal by its own name.
+    wanted : Wanted, optional
+        Of the plant; without it every column becomes a signal by its own name.
     """
     lines = [
-        f"# What the columns of {Path(table.source).name!r} mean. Check every line; units",
-        f'# that the file does not tell are "{UNKNOWN_UNIT}" and must be filled in.',
+        f"# What the columns of {Path(table.source).name!r} mean. Check every line; what neither",
+        f'# file nor plant tells is "{FILL_IN}" and must be filled in.',
         "",
         "[recording]",
         *_clock_lines(table),
@@ -72,17 +96,66 @@ def draft_configuration(
     ]
     clock = clock_column(table)
     rest = [name for name in table.columns if name != clock] or list(table.columns)
-    if outputs:
-        pairs = _guessed((*outputs, *disturbances), rest)
-    else:
-        pairs = [(name, name) for name in rest]
+    if wanted is None:
         lines += ["", "# Name each table [signals.NAME] by an output or disturbance of the plant;"]
         lines += ["# remove the columns that are none."]
-    for signal, column in pairs:
-        lines += ["", *_signal_lines(table, signal, column, signal in disturbances)]
-    lines += ["", "[plant]", "# arguments of the plant's function", ""]
-    lines += ["[fit]", "# settings of the fit"]
-    return "\n".join(lines) + "\n"
+        for column in rest:
+            lines += ["", *_signal_lines(table, column, column, _span(table, column), "")]
+        lines += ["", "[plant]", "# arguments of the plant's function", ""]
+        return "\n".join([*lines, "[fit]", "# settings of the fit"]) + "\n"
+    signals = (*wanted.outputs, *wanted.disturbances)
+    chosen = _guessed(signals, rest, lambda signal, column: _fits(table, column, signal, wanted))
+    for signal in signals:
+        column, why = chosen.get(signal, (FILL_IN, "no column is left that fits: name it"))
+        acts = signal in wanted.disturbances
+        kind = "a disturbance: may be left out where none acts" if acts else _span(table, column)
+        lines += ["", *_signal_lines(table, signal, column, kind, why)]
+    unused = [name for name in rest if name not in [column for column, _ in chosen.values()]]
+    if unused:
+        named = ", ".join(_told(table, name) for name in unused)
+        lines += ["", f"# Columns that are not used: {named}"]
+    return "\n".join([*lines, "", *_plant_lines(wanted), "", *_fit_lines(wanted)]) + "\n"
+
+
+def _plant_lines(wanted: Wanted) -> list[str]:
+    lines = ["[plant]", "# Arguments of the plant's function. They are the subject's own: correct"]
+    lines += ["# what is known of them and take away the #."] if wanted.arguments else []
+    for name, value in wanted.arguments.items():
+        if isinstance(value, bool | int | float | str):
+            text = json.dumps(value, ensure_ascii=False)
+            lines.append(f"{name} = {text}" if value == FILL_IN else f"# {name} = {text}")
+    return lines
+
+
+def _fit_lines(wanted: Wanted) -> list[str]:
+    seconds = f", {_HORIZON * wanted.dt:.3g} s" if wanted.dt else ""
+    units = ", ".join(f"{name} in {wanted.units.get(name, 'SI')}" for name in wanted.controls)
+    return [
+        "[fit]",
+        _line(f"horizon = {_HORIZON}", f"samples that the controller looks ahead{seconds}"),
+        _line(f'u_max = "{FILL_IN}"', f"the most that the subject can do: {units}; without"),
+        _line("", "this line there is no limit, and all is inverse LQR"),
+    ]
+
+
+def _told(table: Table, column: str) -> str:
+    unit = table.units.get(column)
+    return f"{_quoted(column)} ({unit})" if unit else _quoted(column)
+
+
+def _span(table: Table, column: str) -> str:
+    values = table.columns.get(column, np.empty(0))
+    values = values[np.isfinite(values)]
+    return f"recorded from {values.min():.4g} to {values.max():.4g}" if len(values) else "missing"
+
+
+def _fits(table: Table, column: str, signal: str, wanted: Wanted) -> bool:
+    """Whether the unit that the file tells of a column may be one of the signal."""
+    try:
+        told, needed = si_unit(table.units[column]), si_unit(wanted.units[signal])
+    except (KeyError, InputError):  # one of the two says nothing that is known
+        return True
+    return told.base in (needed.base, "dimensionless")
 
 
 def _row(table: Table, name: str) -> tuple[str, ...]:
@@ -159,39 +232,43 @@ def _time_unit(told: str | None, step: float) -> tuple[str, str]:
     return unit, f"a guess: {second / step:.4g} samples per second; a counter needs rate"
 
 
-def _guessed(signals: Sequence[str], columns: Sequence[str]) -> list[tuple[str, str]]:
-    """A column for each signal: the most alike first, then by order."""
+def _guessed(
+    signals: Sequence[str], columns: Sequence[str], fits: Callable[[str, str], bool]
+) -> dict[str, tuple[str, str]]:
+    """A column for each signal, and why: the most alike first, then by order; none that misfits."""
     likeness = {
         (signal, column): difflib.SequenceMatcher(None, signal.lower(), column.lower()).ratio()
         for signal in signals
         for column in columns
+        if fits(signal, column)
     }
-    chosen: dict[str, str] = {}
+    chosen: dict[str, tuple[str, str]] = {}
+    free = list(columns)
     for signal, column in sorted(likeness, key=lambda pair: -likeness[pair]):
         alike = likeness[signal, column] >= _ALIKE
-        if alike and signal not in chosen and column not in chosen.values():
-            chosen[signal] = column
-    left = [column for column in columns if column not in chosen.values()]
+        if alike and signal not in chosen and column in free:
+            same = signal.lower() == column.lower()
+            chosen[signal] = column, "" if same else "a guess, by its name"
+            free.remove(column)
     for signal in signals:
-        if signal not in chosen:
-            chosen[signal] = left.pop(0) if left else columns[0]
-    return [(signal, chosen[signal]) for signal in signals]
+        left = [column for column in free if (signal, column) in likeness]
+        if signal not in chosen and left:
+            chosen[signal] = left[0], "A GUESS, by its place: check it"
+            free.remove(left[0])
+    return chosen
 
 
-def _signal_lines(table: Table, signal: str, column: str, acts: bool) -> list[str]:
+def _signal_lines(table: Table, signal: str, column: str, kind: str, why: str) -> list[str]:
     told = table.units.get(column)
     try:
-        unit, why = (told, "as the file says") if told and si_unit(told) else (UNKNOWN_UNIT, "")
+        unit, how = (told, "as the file says") if told and si_unit(told) else (FILL_IN, "")
     except InputError:
-        unit, why = UNKNOWN_UNIT, f"the file says {told!r}, which is not known"
-    values = table.columns[column][np.isfinite(table.columns[column])]
-    span = f"from {values.min():.4g} to {values.max():.4g}" if len(values) else "all missing"
+        unit, how = FILL_IN, f"the file says {told!r}, which is not known"
     key = signal if signal.isidentifier() and signal.isascii() else _quoted(signal)
-    kind = "a disturbance: may be left out where none acts" if acts else f"recorded {span}"
     return [
         _line(f"[signals.{key}]", kind),
-        f"column = {_quoted(column)}",
-        _line(f"unit = {_quoted(unit)}", why or "fill in: deg, rad, N*m, ..."),
+        _line(f"column = {_quoted(column)}", why) if why else f"column = {_quoted(column)}",
+        _line(f"unit = {_quoted(unit)}", how or "fill in: deg, rad, N*m, ..."),
         _line("# limit = 12.0", "mechanical stop, in this unit"),
         _line("# offset = 0.0", "subtracted, in this unit"),
         _line("# sign = -1", "where the sensor counts the other way"),

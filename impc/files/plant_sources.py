@@ -22,6 +22,7 @@ import numpy as np
 
 from impc.checking import checked
 from impc.errors import ImpcError, InputError, PlantError, one_line
+from impc.files.configuration import FILL_IN
 from impc.files.saved_plant import SAVED, read_matrices, state_space
 from impc.model.plant import Plant
 from impc.model.plant_family import PlantFamily
@@ -58,6 +59,14 @@ class PlantSource:
     name: str
     make: Callable[..., Any]
     arguments: Mapping[str, Any]
+
+    def defaults(self) -> dict[str, object]:
+        """Arguments of the function with their defaults, `FILL_IN` for one that has none."""
+        found = {}
+        for name, item in inspect.signature(self.make).parameters.items():
+            if item.kind not in (item.VAR_POSITIONAL, item.VAR_KEYWORD):
+                found[name] = FILL_IN if item.default is item.empty else item.default
+        return found
 
 
 @checked
@@ -167,6 +176,9 @@ def make_plant(source: PlantSource, recorded: Sequence[str], **changed: float) -
         When the arguments do not fit the function, or what it returns is no usable plant.
     """
     arguments = {**source.arguments, **changed}
+    for key, value in arguments.items():
+        if isinstance(value, str) and value == FILL_IN:
+            raise InputError(f"[plant] {key}", f"is still {FILL_IN!r}", "fill it in")
     name = f"plant {source.name}"
     try:
         with users_code(name, TypeError, ValueError, np.exceptions.ComplexWarning):

@@ -15,11 +15,12 @@ from impc.files import checks, measurable
 from impc.files.alignment import misaligned
 from impc.files.apart import match_apart
 from impc.files.clock import column_of, on_even_instants, read_clock
-from impc.files.configuration import UNKNOWN_UNIT
+from impc.files.configuration import FILL_IN
 from impc.files.formats import read_table
 from impc.files.resampling import held_means, instants, resampled_samples, same_rate
 from impc.files.units import si_unit
 from impc.model.recordings import Label, Recording
+from impc.model.signal_units import UNKNOWN
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -151,10 +152,31 @@ def _require_names(configuration: Configuration, plant: Plant) -> None:
             "write a table [signals.NAME] for each",
         )
     for name, entry in configuration.signals.items():
-        if entry.unit == UNKNOWN_UNIT:
-            raise InputError(
-                f"signals.{name}.unit", f"is still {UNKNOWN_UNIT!r}", "fill in the column's unit"
-            )
+        for key, meant in (("column", "its name in the file"), ("unit", "the column's unit")):
+            if getattr(entry, key) == FILL_IN:
+                raise InputError(
+                    f"signals.{name}.{key}", f"is still {FILL_IN!r}", f"fill in {meant}"
+                )
+        _require_kind(name, entry.unit, plant.unit(name))
+
+
+def _require_kind(name: str, written: str, expected: str) -> None:
+    """A force cannot stand for an angle; what has no unit may stand for anything."""
+    if expected == UNKNOWN:
+        return
+    unit = si_unit(expected)
+    if unit.factor != 1:
+        raise InputError(
+            f"plant.units {name}",
+            f"is {expected!r}",
+            "make the plant in SI units",
+        )
+    if si_unit(written).base not in (unit.base, "dimensionless"):
+        raise InputError(
+            f"signals.{name}.unit",
+            f"is {written!r}, and the plant has {name} in {expected}",
+            "correct the unit or the column",
+        )
 
 
 def _require_distinct(paths: Sequence[Path]) -> None:

@@ -83,7 +83,7 @@ def state_space(name: str, given: Mapping[str, Any]) -> Any:
         names, or dt is none.
     """
     subject = f"plant {name}"
-    unknown = [key for key in given if key not in (*_MATRICES, "dt", *_NAMES)]
+    unknown = [key for key in given if key not in (*_MATRICES, "dt", *_NAMES, "units")]
     if unknown:
         raise InputError(
             subject, f"does not know {brief(unknown[0], 80)}", f"names: {list(_NAMES)}"
@@ -103,7 +103,9 @@ def state_space(name: str, given: Mapping[str, Any]) -> Any:
                 f"names {len(names)} {key} and has {sizes[key]}",
                 f"give a name for each of the {key}, or none",
             )
-    return control.ss(A, B, C, D, dt.item(), **labels)
+    system = control.ss(A, B, C, D, dt.item(), **labels)
+    system.units = given.get("units", {})
+    return system
 
 
 def _from_json(path: Path) -> Any:

@@ -9,6 +9,7 @@ disturbances has an E with no columns. What the controller makes of it: docs/the
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -17,10 +18,11 @@ import scipy.linalg
 
 from impc.arrays import Array, frozen
 from impc.checking import Value, checked, replace
-from impc.errors import PlantError
+from impc.errors import PlantError, brief
+from impc.model.signal_units import UNKNOWN
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
 __all__ = ["Plant", "change_coordinates"]
 
@@ -36,6 +38,9 @@ class Plant(Value):
     controls : sequence of str, optional
         Names of the inputs that the controller commands; the others are disturbances. By default
         every input is a control.
+    units : mapping of str to str, optional
+        Unit of each signal by its name, as in "rad/s"; "1" where it has none. By default those of
+        `system.units`, which a function that makes a plant may set; what neither says is unknown.
 
     Attributes
     ----------
@@ -45,12 +50,15 @@ class Plant(Value):
         Sample time in seconds; 0 for continuous time.
     states, controls, disturbances, outputs : tuple of str
         Names of the signals, in the order of the arrays.
+    units : tuple of (str, str)
+        Names of signals with their units; `unit` finds one.
 
     Raises
     ------
     PlantError
         When the matrices are missing or not finite, when an output depends directly on an input,
-        when a control is not among the inputs, or when (A, B) is not stabilisable.
+        when a control is not among the inputs, a unit is of no signal, or when (A, B) is not
+        stabilisable.
 
     Examples
     --------
@@ -79,9 +87,15 @@ class Plant(Value):
     controls: tuple[str, ...]
     disturbances: tuple[str, ...]
     outputs: tuple[str, ...]
+    units: tuple[tuple[str, str], ...]
 
     @checked
-    def __init__(self, system: Any, controls: Sequence[str] | None = None) -> None:
+    def __init__(
+        self,
+        system: Any,
+        controls: Sequence[str] | None = None,
+        units: Mapping[str, Any] | None = None,
+    ) -> None:
         if isinstance(system, Plant):
             self._fill(**vars(system))
             return
@@ -104,6 +118,7 @@ class Plant(Value):
             controls=chosen,
             disturbances=rest,
             outputs=tuple(system.output_labels),
+            units=_units(system, getattr(system, "units", {}) if units is None else units),
         )
         _require_stabilisable(self)
 
@@ -116,6 +131,10 @@ class Plant(Value):
     def m(self) -> int:
         """Number of control inputs."""
         return self.B.shape[1]
+
+    def unit(self, name: str) -> str:
+        """The unit of a signal by its `name`; "SI" where it is not known."""
+        return dict(self.units).get(name, UNKNOWN)
 
     @property
     def discrete(self) -> bool:
@@ -168,6 +187,19 @@ def _matrices(system: Any) -> dict[str, Array]:
             "plant.D", "is not zero", "delay the output by a sample or drop the feedthrough"
         )
     return matrices
+
+
+def _units(system: Any, given: Any) -> tuple[tuple[str, str], ...]:
+    known = {*system.state_labels, *system.input_labels, *system.output_labels}
+    pairs = tuple(given.items()) if isinstance(given, Mapping) else (("units", given),)
+    for name, unit in pairs:
+        if name not in known or not isinstance(unit, str) or not unit.isprintable():
+            raise PlantError(
+                "plant.units",
+                f"names {brief(name)} with {brief(unit)}",
+                'give a text by the name of a signal, as in {"angle": "rad"}',
+            )
+    return pairs
 
 
 def _sample_time(dt: object) -> float:

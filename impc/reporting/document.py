@@ -13,7 +13,10 @@ from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 from impc.files.columns import in_columns
+from impc.files.results import SCHEMA
 from impc.reporting.csv_text import csv_bytes
+from impc.reporting.matlab_tables import matlab_tables
+from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import plain, render_template
 
 __all__ = [
@@ -194,9 +197,11 @@ class Report:
     figures : mapping of str to bytes
         By the name of the file.
     tables : mapping of str to TextTable
-        Written as CSV under these names.
+        Written as CSV under these names, and together as tables.mat.
     data : mapping
-        Content of result.json.
+        Content of result.json, beside what every one has (docs/results.md).
+    provenance : Provenance
+        Where the result comes from.
     template : str
         page.html, or one that extends it, by its path in this package.
     values : mapping
@@ -210,6 +215,7 @@ class Report:
     figures: Mapping[str, bytes] = field(default_factory=dict)
     tables: Mapping[str, TextTable] = field(default_factory=dict)
     data: Mapping[str, Any] = field(default_factory=dict)
+    provenance: Provenance = field(default_factory=Provenance)
     template: str = "page.html"
     values: Mapping[str, Any] = field(default_factory=dict)
 
@@ -225,8 +231,9 @@ class Report:
         """Page, result.json, tables and figures by name."""
         return {
             "report.html": self.page().encode(),
-            "result.json": json_bytes(self.data),
+            "result.json": json_bytes({"schema": SCHEMA, **self.provenance.data(), **self.data}),
             **{f"{name}.csv": table.csv() for name, table in self.tables.items()},
+            **({"tables.mat": matlab_tables(self.tables)} if self.tables else {}),
             **self.figures,
         }
 

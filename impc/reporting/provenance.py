@@ -39,7 +39,7 @@ class Provenance:
     Attributes
     ----------
     plant_name : str
-        Import path or file.
+        Import path or file; empty where a result has none.
     command : str
         Command line that made the result.
     plant_arguments : mapping
@@ -54,7 +54,7 @@ class Provenance:
         Date and time, UTC, ISO 8601.
     """
 
-    plant_name: str
+    plant_name: str = ""
     command: str = ""
     plant_arguments: Mapping[str, object] = field(default_factory=dict)
     files: tuple[str, ...] = ()

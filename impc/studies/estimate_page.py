@@ -14,14 +14,15 @@ import numpy as np
 from impc.assess.judged import judge
 from impc.checking import checked
 from impc.errors import InputError
-from impc.inverse.estimates import Estimate, encode_estimate
+from impc.inverse.estimates import Estimate
 from impc.inverse.methods import METHODS
 from impc.reporting.document import Lines, Picture, Report, Section, TextTable
 from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import number
+from impc.reporting.shown_units import axis_label, shown_unit
 from impc.reporting.style import BLUE, DOUBLE_COLUMN, INK, drawn, journal_style, new_figure
 from impc.reporting.writer import owned, write_files
-from impc.studies.fit.figures import display_unit
+from impc.studies.methods_table import column_terms, methods_data, methods_table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -103,7 +104,11 @@ def _document(fit: MethodFit) -> Report:
         f"Estimate: {method.label}",
         (method.sentence, Lines(_findings(fit))),
         [
-            Section("1. Recorded and simulated", (tables["vaf"], *pictures), together=True),
+            Section(
+                "1. Recorded and simulated",
+                (methods_table([fit]), column_terms(), tables["vaf"], *pictures),
+                together=True,
+            ),
             Section(
                 "2. Controller", [tables[name] for name in ("gain", "weights") if name in tables]
             ),
@@ -111,8 +116,16 @@ def _document(fit: MethodFit) -> Report:
         ],
         figures=figures,
         tables=tables,
-        data=encode_estimate(estimate)
-        | {"vaf": fit.vaf, "largest_input": fit.largest_input, **provenance.data()},
+        data={
+            "methods": methods_data([fit]),
+            "states": estimate.problem.plant.states,
+            "controls": estimate.problem.plant.controls,
+            "outputs": estimate.problem.plant.outputs,
+            "horizon": estimate.problem.horizon,
+            "starts": estimate.problem.starts,
+            "logarithms": estimate.problem.logarithms,
+        },
+        provenance=provenance,
     )
 
 
@@ -181,7 +194,7 @@ def _trajectories(fit: MethodFit, index: int) -> Figure:
     axes = figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0]
     simulated = run.x @ plant.C.T
     for place, name in enumerate(plant.outputs):
-        factor, unit = display_unit(name)
+        factor, unit = shown_unit(plant, name)
         axes[place].plot(time, factor * trial.outputs[:, place], color="#BBBBBB", linewidth=3.5)
         axes[place].plot(time, factor * simulated[:, place], color=BLUE, linewidth=1.0)
         axes[place].set_ylabel(f"{name} ({unit})")
@@ -191,6 +204,6 @@ def _trajectories(fit: MethodFit, index: int) -> Figure:
         for limit in (problem.bounds.u_min[place], problem.bounds.u_max[place]):
             if np.isfinite(limit):
                 ax.axhline(float(limit), color=INK, linestyle=":", linewidth=1.0)
-        ax.set_ylabel(f"{name} (SI)")
+        ax.set_ylabel(axis_label(plant, name))
     axes[-1].set_xlabel("time (s)")
     return figure

@@ -7,9 +7,12 @@ import os
 import re
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
+import scipy.io
 from click.testing import CliRunner, Result
 
 from impc.checking import replace
@@ -17,6 +20,7 @@ from impc.cli.main import main
 from impc.files.configuration import read_configuration
 from impc.files.plant_sources import make_plant, plant_source
 from impc.files.reading import read_recordings
+from impc.inverse.methods import METHODS
 from impc.studies.fit.settings import fit_settings
 from impc.studies.fit.subject import fit_problem, fit_recordings
 from tests.files.damaged import DAMAGED, PLANT
@@ -140,10 +144,39 @@ def test_the_page_says_what_the_numbers_say(fitted: tuple[Result, Path]) -> None
     assert not (fitted[1] / "fit-in-progress").exists()
 
 
+def test_the_tables_are_those_of_result_json(fitted: tuple[Result, Path]) -> None:
+    """As pandas reads them, and as MATLAB does."""
+    found = json.loads((fitted[1] / "result.json").read_text())
+    names = ("gain", "weights", "methods", "trajectories")
+    tables = {name: pd.read_csv(fitted[1] / f"{name}.csv") for name in names}
+    gain = tables["gain"].query("method == 'sandwich'").set_index("number")
+    for name, told in found["intervals"].items():
+        row = gain.loc[name]
+        low, high = (float("nan") if told[end] is None else told[end] for end in ("low", "high"))
+        np.testing.assert_allclose([row.value, row.low, row.high], [told["value"], low, high])
+    assert gain.loc["K.command.theta1", "unit"] == "N m/rad"
+    weights = tables["weights"].query("matrix == 'Q'").set_index(["first", "second"]).value
+    for index, first in enumerate(found["states"]):
+        for column, second in enumerate(found["states"][: index + 1]):
+            assert weights[first, second] == found["Q"][index][column]
+    assert list(tables["methods"].method) == list(found["methods"])
+    sway = tables["trajectories"].query("trial == 2")
+    recorded, simulated = sway.theta1_recorded.to_numpy(), sway.theta1_simulated.to_numpy()
+    share = 100 * (1 - np.sum((recorded - simulated) ** 2) / np.sum(recorded**2))
+    assert share == pytest.approx(found["trials"][1]["vaf"][0])
+    assert abs(sway.command_simulated).max() <= 6 * (1 + 1e-9)
+    load: Any = scipy.io.loadmat
+    kept = load(fitted[1] / "tables.mat")
+    for name, table in tables.items():
+        assert list(kept[name].dtype.names) == list(table.columns)
+    matlab = kept["trajectories"][0, 0]["theta1_simulated"][:, 0]
+    np.testing.assert_array_equal(matlab, tables["trajectories"].theta1_simulated)
+
+
 def test_the_command_prints_the_table(fitted: tuple[Result, Path]) -> None:
     printed = fitted[0].stdout
     for name in ("feedback_gain", "inverse_lqr_output", "clipped_lqr", "inverse_mpc"):
-        assert f"\n{name} " in printed
+        assert f"\n{METHODS[name].label} " in printed
     assert "VAF of trials left out, theta1" in printed
     assert "degrees: so far it is not the subject's" in printed
 

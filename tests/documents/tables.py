@@ -123,7 +123,9 @@ SMALLER = {
     ): Smaller(
         (
             "edit subject.toml [plant] '[plant]\ndelay_order = 1'",
-            "edit subject.toml [fit] '[fit]\nheld_out = false\nintent_draws = false\nhorizon = 4'",
+            "edit subject.toml 'horizon = 20' 'held_out = false\nhorizon = 4'",
+            "edit subject.toml [fit] '[fit]\nintent_draws = false'",
+            "edit subject.toml 'u_max = \"?\"' 'u_max = 6.0'",
             "impc fit trial_*.csv --plant seated-balance --config subject.toml",
         ),
         _SHORT,

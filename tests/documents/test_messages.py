@@ -30,6 +30,7 @@ from impc.files.configuration import read_configuration
 from impc.files.formats import encode_table, read_table
 from impc.files.plant_sources import PlantSource, make_plant, plant_source
 from impc.files.reading import read_recordings, recording_of
+from impc.files.results import read_result
 from impc.files.sealed import Kept
 from impc.files.table import Table, make_table
 from impc.jit import keep_caches
@@ -48,9 +49,10 @@ from impc.studies.effort import Effort
 from impc.studies.fit.settings import FitSettings, fit_settings, require_used
 from impc.studies.fit.subject import fit_problem
 from impc.studies.selection.subsets import largest_subsets
+from plants import seated_balance_plant
 from tests.documents.blocks import PAGES
 from tests.files.damaged import DAMAGED, PLANT
-from tests.files.samples import hdf5_mat, pushed_seat, settings
+from tests.files.samples import csv_text, hdf5_mat, pushed_seat, settings
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -79,6 +81,23 @@ def damaged(name: str) -> Callable[[Path], None]:
         read_recordings([path], configuration, plant)
 
     return read
+
+
+def asked_for(before: str, after: str, **units: str) -> Callable[[Path], None]:
+    """Read a sound recording of the seat with one line of its configuration changed."""
+
+    def read(folder: Path) -> None:
+        (folder / "a.csv").write_text(csv_text(pushed_seat(600)))
+        (folder / "c.toml").write_text(settings((before, after)))
+        plant = Plant(seated_balance_plant(), ["command"], units=units or None)
+        read_recordings([folder / "a.csv"], read_configuration(folder / "c.toml"), plant)
+
+    return read
+
+
+def old_result(folder: Path) -> None:
+    (folder / "result.json").write_text('{"K": [[1.0]], "versions": {}}')
+    read_result(folder)
 
 
 def cart(growth: float = 1.1) -> Plant:
@@ -360,6 +379,14 @@ PROVOKED: dict[str, Callable[[Path], object]] = {
     "method: got ...; choose one of ...": lambda _: fit_settings({"methods": ["best"]}),
     "[fit] ...: is not a setting; known: ...": lambda _: fit_settings({"horzon": 20}),
     "is still '?'; fill in the column's unit": damaged("unit not filled in"),
+    "is still '?'; fill in its name in the file": asked_for('column = "trunk"', 'column = "?"'),
+    "is still '?'; fill it in, or take the line out": lambda _: fit_settings({"u_max": "?"}),
+    "is '...', and the plant has ... in ...; correct the unit or the column": asked_for(
+        'column = "trunk"\nunit = "deg"', 'column = "trunk"\nunit = "mV"'
+    ),
+    "plant.units ...: is '...'; make the plant in SI units": asked_for("", "", theta1="deg"),
+    "plant.units: names ... with ...": lambda _: Plant(seated_balance_plant(), units={"x": "m"}),
+    "is of another version of impc (schema ..., not ...)": old_result,
     "unit '...' is not known": damaged("unknown unit"),
     "is missing: the plant's outputs are ...": damaged("output without a column"),
     "is no output or disturbance of the plant": damaged("signal that the plant lacks"),

@@ -13,11 +13,13 @@ from click.testing import CliRunner, Result
 
 from impc.cli.main import main
 from impc.errors import InputError
-from impc.files.configuration import UNKNOWN_UNIT, read_configuration
+from impc.files.configuration import FILL_IN, read_configuration
 from impc.files.formats import write_table
+from impc.files.plant_sources import PlantSource, make_plant
 from impc.files.reading import read_recordings
 from impc.files.table import make_table
 from impc.model.plant import Plant
+from impc.studies.fit.settings import fit_settings
 from plants import seated_balance_plant
 from tests.files.damaged import PLANT
 from tests.files.samples import csv_text, pushed_seat, settings
@@ -85,12 +87,61 @@ def test_from_a_file_never_seen_to_a_recording(tmp_path: Path) -> None:
         read_recordings([path], read_configuration(out), plant)
     text = out.read_text(encoding="utf-8")
     for unit in ("deg", "deg", "Nm"):
-        text = text.replace(f'"{UNKNOWN_UNIT}"  ', f'"{unit}"  ', 1)
+        text = text.replace(f'unit = "{FILL_IN}"  ', f'unit = "{unit}"  ', 1)
     out.write_text(text, encoding="utf-8")
     (found,) = read_recordings([path], read_configuration(out), plant)
     np.testing.assert_allclose(found.outputs[:, 0], np.deg2rad(columns["seat"]), atol=1e-10)
     result = inspect(path, "--config", out, "--plant", PLANT)
     assert result.stdout == "trial: 600 samples at 100 per second\nNothing was found.\n"
+
+
+def test_a_column_is_not_taken_for_a_signal_of_another_kind(tmp_path: Path) -> None:
+    """EMG in mV stands where an angle would: it is named, and the angle is still to be found."""
+    path, out = tmp_path / "trial.csv", tmp_path / "new.toml"
+    columns = pushed_seat(600)
+    units = {"emg (mV)": "seat", "lean (deg)": "trunk", "push (N*m)": "push"}
+    text = csv_text(columns)
+    header, rest = text.split("\n", 1)
+    names = {before: after for after, before in units.items()}
+    header = ",".join(names.get(name, name) for name in header.split(","))
+    path.write_text(f"{header}\n{rest}")
+    done = inspect(path, "--out", out, "--plant", PLANT)
+    assert done.exit_code == 0, done.output
+    found = read_configuration(out).signals
+    assert (found["theta1"].column, found["theta1"].unit) == ("lean", "deg")
+    assert found["perturbation"].column == "push"
+    assert found["theta2"].column == FILL_IN
+    text = out.read_text()
+    assert '# Columns that are not used: "emg" (mV)' in text
+    assert "A GUESS, by its place: check it" in text
+    assert "no column is left that fits: name it" in text
+    plant = Plant(seated_balance_plant(), ["command"])
+    with pytest.raises(InputError, match=r"theta2.column: is still '\?'; fill in its name"):
+        read_recordings([path], read_configuration(out), plant)
+
+
+def test_settings_that_only_the_user_knows_are_asked_for(trial: Path, tmp_path: Path) -> None:
+    """The subject's own numbers stand as comments, what has no default is refused until given."""
+    out = tmp_path / "new.toml"
+    assert inspect(trial, "--out", out, "--plant", "seated-balance").exit_code == 0
+    text = out.read_text()
+    assert "# mass = 79.7" in text
+    assert "# height = 1.66" in text
+    assert "command in N m" in text
+    assert "0.2 s" in text
+    table = read_configuration(out).fit
+    assert table == {"horizon": 20, "u_max": FILL_IN}
+    with pytest.raises(InputError, match=r"\[fit\] u_max: is still '\?'; fill it in, or take"):
+        fit_settings(table)
+    assert fit_settings({"horizon": 20, "u_max": 60.0}).u_max == 60.0
+
+    def seat(mass: float, height: float = 1.66) -> None:
+        pytest.fail("what is not filled in is refused before")
+
+    source = PlantSource("mine:seat", seat, {})
+    assert source.defaults() == {"mass": FILL_IN, "height": 1.66}
+    with pytest.raises(InputError, match=r"\[plant\] mass: is still '\?'; fill it in"):
+        make_plant(PlantSource("mine:seat", seat, {"mass": FILL_IN}), ())
 
 
 def test_names_that_toml_must_quote_and_units_nobody_knows(tmp_path: Path) -> None:
@@ -106,7 +157,7 @@ def test_names_that_toml_must_quote_and_units_nobody_knows(tmp_path: Path) -> No
     assert list(configuration.signals) == names
     assert [entry.column for entry in configuration.signals.values()] == names
     assert configuration.signals["# no"].unit == "mV"
-    assert configuration.signals["a.b"].unit == UNKNOWN_UNIT
+    assert configuration.signals["a.b"].unit == FILL_IN
 
 
 def test_it_writes_over_nothing(trial: Path, tmp_path: Path) -> None:

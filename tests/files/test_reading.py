@@ -216,3 +216,28 @@ def test_of_a_sinusoid_nothing_is_said() -> None:
     time = 0.01 * np.arange(3000)
     assert misaligned(np.sin(3 * time), np.sin(3 * time + 1), 0.01) == ""
     assert misaligned(np.sin(3 * time[:30]), np.sin(3 * time[:30]), 0.01) == ""
+
+
+@pytest.mark.parametrize(
+    ("signal", "before", "after", "words"),
+    [
+        ("theta2", 'column = "trunk"\nunit = "deg"', 'column = "trunk"\nunit = "mV"', "in rad"),
+        ("perturbation", 'unit = "Nm"', 'unit = "N"', "in N m"),
+    ],
+)
+def test_a_unit_of_another_kind_is_refused(
+    tmp_path: Path, seat: Plant, signal: str, before: str, after: str, words: str
+) -> None:
+    """EMG in mV is no angle."""
+    with pytest.raises(InputError, match=words) as refused:
+        read(tmp_path, seat, csv_text(seated()), (before, after))
+    assert refused.value.subject == f"signals.{signal}.unit"
+    without = Plant(seated_balance_plant(), ["command"], units={})
+    assert read(tmp_path, without, csv_text(seated()), (before, after)).samples > 0
+
+
+def test_a_plant_in_degrees_is_refused(tmp_path: Path) -> None:
+    """Recordings are turned into SI units: they would be too small by a factor of 57."""
+    plant = Plant(seated_balance_plant(), ["command"], units={"theta1": "deg"})
+    with pytest.raises(InputError, match="make the plant in SI units"):
+        read(tmp_path, plant, csv_text(seated()))

@@ -84,16 +84,17 @@ def subject_figure(fit: dict[str, Any]) -> Figure:
     axes = np.ravel(figure.subplots(recorded.shape[1], 1, sharex=True, squeeze=False))
     time = np.arange(len(recorded)) * shown["dt"]
     for index, ax in enumerate(axes):
-        ax.plot(time, recorded[:, index], color=_SOFT, linewidth=1.6, label="recorded")
+        factor, unit = fit["shown_units"][index]
+        ax.plot(time, factor * recorded[:, index], color=_SOFT, linewidth=1.6, label="recorded")
         ax.plot(
             time,
-            simulated[:, index],
+            factor * simulated[:, index],
             color=VERMILLION,
             linestyle="--",
             linewidth=1.0,
             label="simulated",
         )
-        ax.set_ylabel(f"{fit['outputs'][index]} (SI)")
+        ax.set_ylabel(f"{fit['outputs'][index]} ({unit})")
     axes[-1].set_xlabel("time (s)")
     axes[0].legend(loc="upper right", ncols=2, bbox_to_anchor=(1.0, 1.3))
     return figure

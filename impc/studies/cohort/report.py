@@ -10,6 +10,7 @@ from markupsafe import Markup
 
 from impc.errors import DataError
 from impc.reporting.document import Block, Lines, Picture, Report, Section, TextTable
+from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import number
 from impc.reporting.style import drawn, journal_style
 from impc.reporting.writer import write_files
@@ -87,8 +88,8 @@ def write_report(study: Study, store: Store, failures: Failures, command: str) -
             Section("3. The run", _run(figures, command)),
         ],
         figures=figures,
+        provenance=Provenance(command=command),
         data={
-            "command": command,
             "units": len(study.units),
             "fitted": len(units),
             "failed": failures.units,

@@ -17,6 +17,7 @@ import numpy as np
 import pandas as pd
 
 from impc.arrays import percentiles
+from impc.assess.assessments import ASSESSMENTS
 from impc.reporting.csv_text import csv_bytes
 
 if TYPE_CHECKING:
@@ -72,8 +73,9 @@ def _labels(unit: Unit) -> dict[str, Any]:
 
 def _unit_row(fit: dict[str, Any]) -> dict[str, Any]:
     row: dict[str, Any] = {"trials": fit["trials"], "samples": fit["samples"]}
-    row |= {f"vaf.{name}": value for name, value in fit["vaf"].items()}
-    row |= {f"held_out_vaf.{name}": value for name, value in fit["held_out_vaf"].items()}
+    for name in ASSESSMENTS:
+        given = fit[name] if isinstance(fit[name], dict) else {"": fit[name]}
+        row |= {f"{name}.{signal}".rstrip("."): value for signal, value in given.items()}
     row["saturated"] = fit["saturated"]
     for name in ("K", "K_deviation", "K_told", "K_of_weights"):
         row |= _gain(fit, name, fit[name])

@@ -17,17 +17,21 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import psutil
 
+from impc.arrays import frozen
+from impc.assess.assessments import assessed
 from impc.assess.held_out import predict
 from impc.assess.intent_rules import intent
 from impc.assess.judged import judge
 from impc.assess.printed_gain import gain_estimate
 from impc.assess.resampling import DRAWS, replicate
+from impc.checking import replace
 from impc.errors import ImpcError
 from impc.files.plant_sources import make_plant, plant_family_of, plant_source
 from impc.files.reading import read_recordings
 from impc.inverse.noisy_fit import fit_controller
 from impc.model.weights import Weights
 from impc.reporting.rendering import plain
+from impc.reporting.shown_units import shown_unit
 from impc.studies.cohort.unit_digest import require_same_inputs, unit_digest
 from impc.studies.fit.settings import fit_settings
 from impc.studies.fit.subject import fit_problem, state_sizes
@@ -136,6 +140,7 @@ def unit_problem(task: FitTask) -> tuple[Problem, FitSettings]:
 def _described(problem: Problem, fitted: Estimate, settings: FitSettings) -> dict[str, Any]:
     plant, K, weights = fitted.problem.plant, np.array(fitted.gain), fitted.stage_weights
     fit = judge(fitted, problem.bounds)
+    fit = replace(fit, held_out=_held_out(problem, fitted, settings))
     estimate = gain_estimate(fitted)
     sizes = state_sizes(fit.runs)
     readings = intent(plant, K, np.array(fitted.metrics), sizes, weights)
@@ -147,6 +152,7 @@ def _described(problem: Problem, fitted: Estimate, settings: FitSettings) -> dic
         "states": plant.states,
         "controls": plant.controls,
         "outputs": plant.outputs,
+        "shown_units": [shown_unit(plant, name) for name in plant.outputs],
         "trials": len(problem.recordings),
         "samples": sum(trial.samples for trial in problem.recordings),
         "K": estimate.K,
@@ -159,8 +165,7 @@ def _described(problem: Problem, fitted: Estimate, settings: FitSettings) -> dic
         "misfit": fitted.misfit,
         "exact": fitted.explained,
         "converged": fitted.converged,
-        "vaf": dict(zip(plant.outputs, fit.vaf, strict=True)),
-        "held_out_vaf": dict(zip(plant.outputs, _held_out(problem, fitted, settings), strict=True)),
+        **assessed(fit),
         "saturated": float(np.mean(np.any(commands >= limit * (1 - 1e-6), axis=1))),
         "state_sizes": sizes,
         "readings": {
@@ -176,15 +181,13 @@ def _described(problem: Problem, fitted: Estimate, settings: FitSettings) -> dic
 
 
 def _held_out(problem: Problem, fitted: Estimate, settings: FitSettings) -> Array:
-    """Mean VAF over trials left out, %; NaN when they are not wanted or there is but one."""
+    """VAF of each trial left out (trials, p), %; of none when not wanted or there is but one."""
     count = len(problem.recordings)
-    if not settings.held_out or count < 2:
-        return np.full(len(problem.plant.outputs), np.nan)
-    shares = []
-    for index in range(count):
+    rows = np.empty((count if settings.held_out and count > 1 else 0, len(problem.plant.outputs)))
+    for index in range(len(rows)):
         other = fit_controller(problem.leaving_out(index), fitted.stage_weights)
-        shares.append(predict(problem, other, fitted, index, settings.settle).vaf)
-    return np.asarray(np.mean(shares, axis=0))
+        rows[index] = predict(problem, other, fitted, index, settings.settle).vaf
+    return frozen(rows)
 
 
 def _trajectory(fit: MethodFit) -> dict[str, Any]:

@@ -5,14 +5,14 @@ docs/comparing.md says what each method is and where it breaks.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.arrays import Array, Frozen, frozen
+from impc.arrays import Array, frozen
 from impc.assess.held_out import left_out_vaf
 from impc.assess.judged import judge
+from impc.checking import replace
 from impc.errors import SolverError, WeightsError
 from impc.inverse.groundwork import NaturalUnits, afresh
 from impc.inverse.methods import METHODS, estimate_all
@@ -23,32 +23,10 @@ if TYPE_CHECKING:
     from impc.inverse.groundwork import Remember
     from impc.inverse.problem import Problem
 
-__all__ = ["MethodComparison", "compare_recordings", "compared_methods", "stages"]
+__all__ = ["compare_recordings", "compared_methods", "stages"]
 
 # Needs states to be named; and what is compared in its two parts.
 _LEFT_OUT = ("preliminary", "inverse_lqr")
-
-
-@dataclass(frozen=True)
-class MethodComparison(Frozen):
-    """One method.
-
-    Attributes
-    ----------
-    fit : MethodFit
-        On all trials.
-    held_out : Array
-        VAF of each trial predicted from the others (trials, p), %; NaN where there is no gain or
-        the simulation ends early; (0, p) for a single trial.
-    """
-
-    fit: MethodFit
-    held_out: Array
-
-    @property
-    def name(self) -> str:
-        """Of the method."""
-        return self.fit.name
 
 
 def compared_methods() -> tuple[str, ...]:
@@ -63,7 +41,7 @@ def stages(trials: int, *, held_out: bool = True) -> int:
 
 def compare_recordings(
     problem: Problem, settle: float, remember: Remember = afresh, *, held_out: bool = True
-) -> tuple[MethodComparison, ...]:
+) -> tuple[MethodFit, ...]:
     """Run every method on all trials, then on all but each one.
 
     Parameters
@@ -92,9 +70,9 @@ def compare_recordings(
         except (WeightsError, SolverError):  # nothing fits these trials: NaN in the table
             parts.append({})
     return tuple(
-        MethodComparison(
+        replace(
             judge(whole[name], problem.bounds),
-            _held_out(problem, [part.get(name) for part in parts], settle),
+            held_out=_held_out(problem, [part.get(name) for part in parts], settle),
         )
         for name in names
     )

@@ -57,6 +57,7 @@ def example_report(cases: Sequence[CaseResult], provenance: Provenance) -> Repor
         (),
         figures=figures,
         data=example_data(cases, provenance, SETTINGS),
+        provenance=provenance,
         template="studies/example/example_page.html",
         values={
             "cases": [_view(case) for case in cases],

@@ -36,10 +36,8 @@ def example_data(
     """Content of result.json, with the `settings` of the example."""
     plant = cases[0].controller.plant
     return {
-        "made": provenance.made,
         "plant": {"name": provenance.plant_name, "A": plant.A, "B": plant.B, "dt": plant.dt},
         "settings": settings,
-        "versions": provenance.versions,
         "cases": {case.name: _case(case) for case in cases},
     }
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.inverse.methods import METHODS
+from impc.reporting.shown_units import axis_label, shown_unit
 from impc.reporting.style import (
     BLUE,
     DOUBLE_COLUMN,
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.studies.fit.result import FitResult
 
-__all__ = ["display_unit", "fit_figures", "shown_trials"]
+__all__ = ["fit_figures", "shown_trials"]
 
 # Trials that are drawn one by one: 500 made a page of 51 MB and took 6.3 GB.
 _MOST_TRIALS = 24
@@ -62,22 +63,6 @@ def shown_trials(result: FitResult) -> list[int]:
     return sorted(least[:_MOST_TRIALS])
 
 
-def display_unit(name: str) -> tuple[float, str]:
-    """Factor and unit in which the signal `name` is drawn.
-
-    Plants work in SI units and their signals carry none, so angles are told by their names: what
-    begins with theta, angle, yaw, pitch or roll is shown in degrees, everything else as it is.
-    """
-    angles = ("theta", "angle", "yaw", "pitch", "roll")
-    if name.lower().startswith(angles):
-        return float(np.degrees(1.0)), "deg/s" if name.endswith("_rate") else "deg"
-    return 1.0, "SI"
-
-
-def _label(name: str) -> str:
-    return f"{name} ({display_unit(name)[1]})"
-
-
 def _trajectories(result: FitResult, index: int) -> Figure:
     plant = result.fitted.problem.plant
     trial, run = result.given.recordings[index], result.inverse_mpc.runs[index]
@@ -86,7 +71,7 @@ def _trajectories(result: FitResult, index: int) -> Figure:
     figure = new_figure(DOUBLE_COLUMN, 0.5 + 1.15 * rows)
     axes = np.atleast_1d(figure.subplots(rows, 1, sharex=True))
     for column, name in enumerate(plant.outputs):
-        factor, _ = display_unit(name)
+        factor, _ = shown_unit(plant, name)
         ax = axes[column]
         ax.plot(
             time,
@@ -105,13 +90,13 @@ def _trajectories(result: FitResult, index: int) -> Figure:
             linewidth=1.0,
             label="simulated",
         )
-        ax.set_ylabel(_label(name))
+        ax.set_ylabel(axis_label(plant, name))
     for column, name in enumerate(plant.controls):
         _command(axes[len(plant.outputs) + column], result, index, column, name)
     if np.any(trial.disturbance):
         ax = axes[-1]
         ax.plot(time, trial.disturbance, color=INK, linewidth=0.8, drawstyle="steps-post")
-        ax.set_ylabel(f"{', '.join(plant.disturbances)} (SI)")
+        ax.set_ylabel(", ".join(axis_label(plant, name) for name in plant.disturbances))
     axes[0].set_title(trial_name(result, index), loc="right")
     axes[0].legend(loc="upper left", ncols=2, bbox_to_anchor=(0, 1.28))
     axes[-1].set_xlabel("time (s)")
@@ -139,7 +124,7 @@ def _command(ax: Axes, result: FitResult, index: int, column: int, name: str) ->
                 step="post",
             )
     ax.plot(time, u, color=BLUE, linewidth=0.9, drawstyle="steps-post")
-    ax.set_ylabel(f"{name} (SI)")
+    ax.set_ylabel(axis_label(result.given.plant, name))
 
 
 def _residuals(result: FitResult) -> Figure:
@@ -148,7 +133,7 @@ def _residuals(result: FitResult) -> Figure:
     figure = new_figure(DOUBLE_COLUMN, 0.4 + 1.3 * p * 1.0)
     axes = np.array(figure.subplots(p, 2, width_ratios=[3, 1], squeeze=False, sharex="col"))
     for column, name in enumerate(plant.outputs):
-        factor, unit = display_unit(name)
+        factor, unit = shown_unit(plant, name)
         series = [
             factor * (trial.outputs - run.x @ plant.C.T)[:, column]
             for trial, run in zip(result.given.recordings, result.inverse_mpc.runs, strict=True)
@@ -224,7 +209,7 @@ def _intent(result: FitResult) -> Figure:
         )
     left.set_yscale("log")
     left.set_xlabel("eigenvalue of Q, largest first (-)")
-    left.set_ylabel("price at R = 1 (SI)")
+    left.set_ylabel("price at R = 1 (SI units)")
     right.set_xticks(np.arange(plant.n), plant.states, rotation=35, ha="right")
     right.set_ylabel("share in dominant cost (%)")
     right.legend(fontsize=5.5, loc="upper right")
@@ -245,7 +230,7 @@ def _methods(result: FitResult) -> Figure:
     time = np.arange(window.start, window.stop) * plant.dt
     figure = new_figure(DOUBLE_COLUMN, 3.4)
     above, below = figure.subplots(2, 1, sharex=True)
-    factor, _ = display_unit(plant.outputs[0])
+    factor, _ = shown_unit(plant, plant.outputs[0])
     recorded = factor * trial.outputs[window, 0]
     above.plot(time, recorded, color=_SOFT, linewidth=1.8, label="recorded")
     for name, method in shown.items():
@@ -261,8 +246,8 @@ def _methods(result: FitResult) -> Figure:
             below.axhline(limit, color=INK, linewidth=0.8, linestyle=":")
     reach = 1.6 * float(np.max(np.abs(recorded)))
     above.set_ylim(-reach, reach)
-    above.set_ylabel(_label(plant.outputs[0]))
-    below.set_ylabel(f"{plant.controls[0]} (SI)")
+    above.set_ylabel(axis_label(plant, plant.outputs[0]))
+    below.set_ylabel(axis_label(plant, plant.controls[0]))
     largest = max(float(np.max(np.abs(item.runs[index].u[window, 0]))) for item in shown.values())
     below.set_ylim(-1.1 * largest, 1.1 * largest)
     below.set_xlabel("time (s)")

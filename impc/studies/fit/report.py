@@ -9,7 +9,6 @@ import numpy as np
 from markupsafe import Markup
 
 from impc.assess.covariance import TOLD
-from impc.inverse.methods import METHODS
 from impc.reporting.document import (
     Block,
     Heading,
@@ -23,12 +22,12 @@ from impc.reporting.document import (
     table_of,
 )
 from impc.reporting.rendering import number
+from impc.studies.fit.csv_tables import fit_tables
 from impc.studies.fit.figures import fit_figures, shown_trials
 from impc.studies.fit.schema import fit_data
 from impc.studies.fit.sentences import (
     direction_name,
     findings,
-    method_note,
     trial_name,
 )
 from impc.studies.fit.tables import (
@@ -41,6 +40,7 @@ from impc.studies.fit.tables import (
     set_sentences,
     statements_table,
 )
+from impc.studies.methods_table import column_terms, methods_table
 
 if TYPE_CHECKING:
     from impc.arrays import Array
@@ -84,7 +84,7 @@ _INTENT = Picture(
 
 
 def fit_report(result: FitResult, provenance: Provenance) -> Report:
-    """Page, result.json and figures."""
+    """Page, result.json, tables and figures."""
     subject = str(result.given.recordings[0].label.subject) or "a subject"
     converged = result.fitted.converged
     found = [
@@ -92,7 +92,7 @@ def fit_report(result: FitResult, provenance: Provenance) -> Report:
         Section("2. What is left", (_LEFT, _RESIDUALS), "What is left"),
         Section(
             "3. Inverse LQR on the same recordings",
-            (_methods(result), _METHODS),
+            (methods_table(result.methods), column_terms(), _METHODS),
             "Inverse LQR beside it",
         ),
         Section("4. Intent: what the weights say, and what they do not", _intent(result), "Intent"),
@@ -106,7 +106,9 @@ def fit_report(result: FitResult, provenance: Provenance) -> Report:
         (Lines(findings(result)), *(() if converged else (_NOT_AT_REST,))),
         found,
         figures=fit_figures(result),
+        tables=fit_tables(result),
         data=fit_data(result, provenance),
+        provenance=provenance,
     )
 
 
@@ -222,23 +224,6 @@ def _agreement(result: FitResult) -> TextTable:
 
 def _probability(value: float) -> str:
     return "< 0.001" if value < 1e-3 else number(value, 2)
-
-
-def _methods(result: FitResult) -> TextTable:
-    outputs = result.fitted.problem.plant.outputs
-    heads = ("method", *(f"VAF {name} %" for name in outputs), "largest input", "", "seconds")
-    rows = tuple(
-        (
-            METHODS[item.name].label,
-            *(number(value, 5) for value in item.vaf),
-            ", ".join(number(value) for value in item.largest_input),
-            method_note(result, item),
-            f"{item.estimate.seconds:.2f}",
-        )
-        for item in result.methods
-    )
-    caption = "Every method on the same recordings, all trials at once."
-    return TextTable(caption, heads, rows)
 
 
 def _readings(result: FitResult) -> TextTable:

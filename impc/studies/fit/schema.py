@@ -2,6 +2,7 @@
 
     vaf.<output>, held_out_vaf.<output>      %, all trials; the mean of the trials left out
     states, controls, outputs, disturbances  names, in the order of every array below
+    units.<signal>                           where the plant says them
     K, S, Q, R, P, horizon, bounds           the controller of the weights, at R[0][0] = 1
     estimate                                 the gain that the recordings tell, without weights: K,
                                              deviations, directions, and which of them are told
@@ -11,8 +12,7 @@
     identifiability                          rank, free, chosen, singular_values
     parameters.<name>                        nominal, value, deviation, determined
     trials                                   label, vaf, whiteness, x0, held_out_vaf, findings
-    methods.<name>                           K, Q, R, vaf, trial_vaf, largest_input, keeps_bounds,
-                                             fell (s, one a trial)
+    methods.<name>                           as in every result (docs/results.md)
     plant, settings, files, versions, made
 
 Matrices are lists of rows, in SI units. What is not a number, or not determined, is null.
@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from impc.assess.intent_rules import dominant_sentence
+from impc.studies.methods_table import methods_data
 
 if TYPE_CHECKING:
     from impc.assess.printed_gain import GainEstimate
@@ -56,6 +57,7 @@ def _controller(result: FitResult) -> dict[str, Any]:
         "controls": plant.controls,
         "outputs": plant.outputs,
         "disturbances": plant.disturbances,
+        "units": dict(plant.units),
         "K": fitted.gain,
         "S": fitted.metric * scale,
         "Q": weights.Q,
@@ -110,21 +112,7 @@ def _found(result: FitResult) -> dict[str, Any]:
             item.name: {**asdict(item), "determined": item.determined} for item in result.parameters
         },
         "trials": [_trial(result, index) for index in range(len(result.trials))],
-        "methods": {
-            item.name: {
-                "K": item.estimate.K,
-                "Q": None if item.estimate.weights is None else item.estimate.weights.Q,
-                "R": None if item.estimate.weights is None else item.estimate.weights.R,
-                "vaf": dict(zip(plant.outputs, item.vaf, strict=True)),
-                "trial_vaf": item.trial_vaf,
-                "largest_input": item.largest_input,
-                "keeps_bounds": item.keeps_bounds,
-                "fell": item.fell,
-                "seconds": item.estimate.seconds,
-                "reason": item.estimate.reason,
-            }
-            for item in result.methods
-        },
+        "methods": methods_data(result.methods),
     }
 
 
@@ -191,6 +179,5 @@ def _made(result: FitResult, provenance: Provenance) -> dict[str, Any]:
             "dt": plant.dt,
         },
         "settings": asdict(result.settings),
-        **provenance.data(),
         "seconds": result.seconds,
     }

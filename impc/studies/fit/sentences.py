@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from impc.assess.judged import MethodFit
     from impc.studies.fit.result import FitResult
 
-__all__ = ["direction_name", "findings", "method_note", "trial_name"]
+__all__ = ["direction_name", "findings", "limited", "trial_name"]
 
 # Parts of a direction below this are not named.
 _NAMED = 0.15
@@ -40,18 +40,18 @@ def trial_name(result: FitResult, index: int) -> str:
     return str(result.given.recordings[index].label) or f"trial {index + 1}"
 
 
-def method_note(result: FitResult, method: MethodFit) -> str:
-    """Why a method is no explanation, in a few words; empty when it may be one."""
-    if method.estimate.K is None:
-        return method.estimate.reason
-    fell = [
+def limited(result: FitResult) -> bool:
+    """Whether the settings give a limit on any input."""
+    return bool(np.any(np.isfinite(result.given.bounds.u_max)))
+
+
+def _falls(result: FitResult, method: MethodFit) -> str:
+    """The trials in which a method falls, and when; empty when it never does."""
+    return ", ".join(
         f"{trial_name(result, index)} at {time:.1f} s"
         for index, time in enumerate(method.fell)
         if time is not None
-    ]
-    if fell:
-        return f"falls: {', '.join(fell)}"
-    return "" if method.keeps_bounds else "exceeds the input bound"
+    )
 
 
 def direction_name(
@@ -80,9 +80,11 @@ def _agreement(result: FitResult) -> list[str]:
 
 
 def _saturation(result: FitResult) -> list[str]:
-    limits = np.array(result.given.bounds.u_max)
-    if not np.any(np.isfinite(limits)):
-        return ["The controller was given no bound on its command."]
+    if not limited(result):
+        return [
+            "The settings give no limit on the command ([fit] u_max): inverse MPC is inverse LQR "
+            "here, and nothing can be said of how the subject uses what strength there is."
+        ]
     share = 100 * float(np.mean([item.saturated for item in result.trials]))
     if share == 0:
         return [
@@ -98,15 +100,19 @@ def _against_inverse_lqr(result: FitResult) -> list[str]:
     lines = []
     if other is not None and other.estimate.K is not None and not np.any(np.isnan(other.vaf)):
         gain = float(np.mean(own.vaf - other.vaf))
-        kept = "keeps the bound too" if other.keeps_bounds else "exceeds the bound"
+        kept = ", which keeps the bound too" if other.keeps_bounds else ", which exceeds the bound"
         sign = "more" if gain >= 0 else "less"
+        plant = result.given.plant
+        largest = f"{number(float(other.largest_input[0]))} {plant.unit(plant.controls[0])}"
         lines.append(
             f"Inverse MPC accounts for {abs(gain):.2f} points {sign} than inverse LQR on the "
-            f"outputs, which {kept} (largest command {number(float(other.largest_input[0]))})."
+            f"outputs{kept if limited(result) else ''} (largest command {largest})."
         )
-    clipped = method_note(result, methods["clipped_lqr"]) if "clipped_lqr" in methods else ""
-    if clipped.startswith("falls"):
-        lines.append(f"The same gain merely clipped at the bound {clipped}; inverse MPC stands.")
+    clipped = _falls(result, methods["clipped_lqr"]) if "clipped_lqr" in methods else ""
+    if clipped:
+        lines.append(
+            f"The same gain merely clipped at the bound falls: {clipped}; inverse MPC stands."
+        )
     return lines
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import scipy.signal
 
 from impc.errors import InputError, brief
+from impc.files.configuration import FILL_IN
 from impc.inverse.methods import method_named
 from impc.model.bounds import Bounds
 
@@ -175,6 +176,11 @@ def fit_settings(table: Mapping[str, Any]) -> FitSettings:
     InputError
         When a key is unknown or a value is of the wrong kind or out of range.
     """
+    for name, value in table.items():
+        if value == FILL_IN:
+            raise InputError(
+                f"[fit] {name}", f"is still {FILL_IN!r}", "fill it in, or take the line out"
+            )
     settings = read_settings("fit", FitSettings, table)
     for name, (least, most) in _RANGES.items():
         _require_between(name, getattr(settings, name), least, most)

@@ -199,6 +199,9 @@ def fit_recordings(
         for index, other in enumerate(others):
             held_out.append(predict(problem, other.result(), fitted, index, settings.settle))
             progress.done(_without(index))
+        if held_out:
+            shares = frozen([item.vaf for item in held_out])
+            methods[-1] = replace(methods[-1], held_out=shares)
         weights_found = whole_set.result()
         progress.done("set of weights")
     certainty = assess(

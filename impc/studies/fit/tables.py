@@ -8,6 +8,7 @@ import numpy as np
 
 from impc.assess.intervals import entry_names
 from impc.assess.other_models import verdict
+from impc.model.signal_units import UNKNOWN, gain_unit
 from impc.reporting.document import TextTable, table_of
 from impc.reporting.rendering import number
 
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from impc.assess.intent_statements import Statement
     from impc.assess.intervals import Interval
     from impc.assess.weights_ranges import WeightsSummary
+    from impc.model.plant import Plant
     from impc.studies.fit.result import FitResult
 
 __all__ = [
@@ -24,6 +26,7 @@ __all__ = [
     "entries_table",
     "intervals_table",
     "limit_sentences",
+    "number_units",
     "prices_table",
     "set_sentences",
     "statements_table",
@@ -46,7 +49,7 @@ def intervals_table(result: FitResult) -> TextTable:
     methods = [key for key in _METHODS if any(item.method == key for item in certainty.intervals)]
     found = {(item.name, item.method): item for item in certainty.intervals}
     names = list(dict.fromkeys(item.name for item in certainty.intervals))
-    rows = []
+    rows, units = [], number_units(plant)
     for name in names:
         known = [found[name, method] for method in methods if (name, method) in found]
         value = known[0].value
@@ -56,7 +59,7 @@ def intervals_table(result: FitResult) -> TextTable:
             cells.append("-" if item is None else _told(item))
         shown = "not determined" if value is None else number(value, 4)
         theirs = number(float(of_weights[name]), 4) if name in of_weights else "-"
-        rows.append((name, shown, *cells, theirs))
+        rows.append((name, units.get(name, UNKNOWN), shown, *cells, theirs))
     level = certainty.intervals[0].level
     caption = (
         f"What the recordings tell, with intervals of {100 * level:.0f} %. Where residuals are "
@@ -67,8 +70,18 @@ def intervals_table(result: FitResult) -> TextTable:
         "them, so it has no interval of its own: outside the estimate's, these weights do not "
         "quite behave as the recordings do."
     )
-    heads = ("number", "value", *(_METHODS[method] for method in methods), "gain of the weights")
+    shown_methods = [_METHODS[method] for method in methods]
+    heads = ("number", "unit", "value", *shown_methods, "gain of the weights")
     return TextTable(caption, heads, rows)
+
+
+def number_units(plant: Plant) -> dict[str, str]:
+    """Units of the numbers of a fit by their names: K.<control>.<state>, u_max.<control>."""
+    return {
+        f"K.{control}.{state}": gain_unit(plant, control, state)
+        for control in plant.controls
+        for state in plant.states
+    } | {f"u_max.{control}": plant.unit(control) for control in plant.controls}
 
 
 def set_sentences(summary: WeightsSummary) -> tuple[str, ...]:

@@ -9,6 +9,7 @@ import numpy as np
 from markupsafe import Markup
 
 from impc.reporting.document import Lines, Picture, Report, Section
+from impc.reporting.provenance import Provenance
 from impc.studies.reliability.figures import reliability_figures
 from impc.studies.reliability.findings import findings
 from impc.studies.reliability.tables import reliability_tables
@@ -75,11 +76,12 @@ def reliability_report(trials: Trials, result: Reliability, command: str, inputs
         sections,
         figures=reliability_figures(trials, result),
         tables=tables,
-        data=_data(result, command, inputs),
+        data=_data(result),
+        provenance=Provenance(command=command, inputs=inputs),
     )
 
 
-def _data(result: Reliability, command: str, inputs: Inputs) -> dict[str, Any]:
+def _data(result: Reliability) -> dict[str, Any]:
     found: dict[str, dict[str, Any]] = {"icc": {}, "anova": {}, "components": {}}
     for item in result.measures:
         name = f"{item.measure}.{item.output}"
@@ -106,8 +108,6 @@ def _data(result: Reliability, command: str, inputs: Inputs) -> dict[str, Any]:
         "passband": {"low": result.band.low, "high": result.band.high},
         "findings": [asdict(item) for item in findings(result)],
         "notes": result.notes,
-        "command": command,
-        "sha256": inputs.plain(),
     }
 
 

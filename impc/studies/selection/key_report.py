@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from impc.reporting.document import Lines, Picture, Report, TextTable
+from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import number
 from impc.reporting.style import BLUE, DOUBLE_COLUMN, INK, drawn, journal_style, new_figure
 from impc.studies.selection.key_parameters import between_visits
@@ -51,7 +52,8 @@ def key_report(
         [results_section(tables, Picture("solution-space", caption, caption), command)],
         figures=figures,
         tables={"candidates": candidates},
-        data=_data(model, found, command) | {"sha256": inputs.plain()},
+        data=_data(model, found),
+        provenance=Provenance(command=command, inputs=inputs),
     )
 
 
@@ -71,7 +73,7 @@ def _candidate_table(model: ParametricModel, found: KeyParameters) -> TextTable:
     return TextTable("Subsets and the filters that they pass, best first.", heads, rows)
 
 
-def _data(model: ParametricModel, found: KeyParameters, command: str) -> dict[str, Any]:
+def _data(model: ParametricModel, found: KeyParameters) -> dict[str, Any]:
     def names(subset: Sequence[int]) -> list[str]:
         return [model.names[index] for index in subset]
 
@@ -99,7 +101,6 @@ def _data(model: ParametricModel, found: KeyParameters, command: str) -> dict[st
             }
             for item in found.candidates
         ],
-        "command": command,
     }
 
 

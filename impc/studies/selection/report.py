@@ -9,6 +9,7 @@ import numpy as np
 from markupsafe import Markup
 
 from impc.reporting.document import Lines, Picture, Report, Section, TextTable
+from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import number
 from impc.reporting.style import BLUE, DOUBLE_COLUMN, INK, drawn, journal_style, new_figure
 
@@ -51,7 +52,8 @@ def selection_report(
         [results_section(tables.values(), picture, command)],
         figures=figures,
         tables=tables,
-        data=_data(model, found, command, inputs),
+        data=_data(model, found),
+        provenance=Provenance(command=command, inputs=inputs),
     )
 
 
@@ -225,9 +227,7 @@ def _interval_figure(model: ParametricModel, found: StudySelection) -> Figure:
     return figure
 
 
-def _data(
-    model: ParametricModel, found: StudySelection, command: str, inputs: Inputs
-) -> dict[str, Any]:
+def _data(model: ParametricModel, found: StudySelection) -> dict[str, Any]:
     def names(subset: Sequence[int]) -> list[str]:
         return [model.names[index] for index in subset]
 
@@ -274,8 +274,6 @@ def _data(
             {"bound": item.bound, "size": item.size, "subsets": [names(s) for s in item.subsets]}
             for item in found.worst_case
         ],
-        "command": command,
-        "sha256": inputs.plain(),
     }
 
 

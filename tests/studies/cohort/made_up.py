@@ -43,10 +43,13 @@ def fit_of(seed: int) -> dict[str, Any]:
     weights = {"Q": [[1.0, 0.0], [0.0, 2.0]], "dominant": [0.6, 0.8], "angle": 1.0}
     return {
         "states": ["position", "position_rate"], "controls": ["force"], "outputs": ["position"],
+        "shown_units": [[1.0, "m"]],
         "trials": 2, "samples": 100, "K": gain, "K_deviation": [[0.1, None]],
         "K_told": [[True, False]], "K_of_weights": gain, "S": [[1.0]],
         "Q": weights["Q"], "R": [[1.0]], "misfit": 0.1, "exact": True, "converged": True,
         "vaf": {"position": 98.0 + rng.random()}, "held_out_vaf": {"position": None},
+        "largest_input": {"force": 1.0}, "beyond_bound": 0.0, "first_fall": None,
+        "condition_number": 10.0,
         "saturated": 0.1, "state_sizes": [1.0, 1.0],
         "readings": {"least condition": weights, "analytic centre (no units)": weights},
         "parameters": {"mass": 2.0 + rng.random()}, "starts": [[0.0, 0.0]], "logarithms": [0.0],

@@ -13,10 +13,10 @@ from click.testing import CliRunner
 
 from experiments.coverage import cart, noisy_trial, true_controller
 from impc.arrays import Array
+from impc.assess.judged import MethodFit
 from impc.cli.main import main
 from impc.inverse.estimates import Estimate, decode_estimate, encode_estimate
 from impc.studies.compare.subject import (
-    MethodComparison,
     compare_recordings,
     compared_methods,
     stages,
@@ -30,7 +30,7 @@ SETTINGS = FitSettings(horizon=10, u_max=1.0)
 
 
 @pytest.fixture(scope="module")
-def compared() -> dict[str, MethodComparison]:
+def compared() -> dict[str, MethodFit]:
     problem = fit_problem(cart(), [noisy_trial(seed, 0.0) for seed in (21, 22)], SETTINGS)
     heard: list[str] = []
 
@@ -44,24 +44,24 @@ def compared() -> dict[str, MethodComparison]:
     return {item.name: item for item in found}
 
 
-def gain_error(item: MethodComparison) -> float:
+def gain_error(item: MethodFit) -> float:
     truth = true_controller().K
-    assert item.fit.estimate.K is not None
-    return float(np.linalg.norm(item.fit.estimate.K - truth) / np.linalg.norm(truth))
+    assert item.estimate.K is not None
+    return float(np.linalg.norm(item.estimate.K - truth) / np.linalg.norm(truth))
 
 
 def test_inverse_mpc_finds_the_gain_and_keeps_the_limit(
-    compared: dict[str, MethodComparison],
+    compared: dict[str, MethodFit],
 ) -> None:
     for name in ("inverse_mpc", "inverse_mpc_reduced"):
         assert gain_error(compared[name]) < 0.05
-        assert compared[name].fit.keeps_bounds
+        assert compared[name].keeps_bounds
     feedback = compared["feedback_gain"]
     assert gain_error(feedback) > 2 * gain_error(compared["inverse_mpc"])
-    assert not feedback.fit.keeps_bounds
+    assert not feedback.keeps_bounds
 
 
-def test_left_out_trials(compared: dict[str, MethodComparison]) -> None:
+def test_left_out_trials(compared: dict[str, MethodFit]) -> None:
     ours = compared["inverse_mpc"]
     assert ours.held_out.shape == (2, 1)
     # Noise of 20 % leaves 1 / 1.04 to explain.
@@ -69,14 +69,14 @@ def test_left_out_trials(compared: dict[str, MethodComparison]) -> None:
     assert np.mean(compared["feedback_gain"].held_out) < np.mean(ours.held_out)
 
 
-def test_exceeding_is_counted_sample_by_sample(compared: dict[str, MethodComparison]) -> None:
-    fit = compared["feedback_gain"].fit
+def test_exceeding_is_counted_sample_by_sample(compared: dict[str, MethodFit]) -> None:
+    fit = compared["feedback_gain"]
     u: Array = np.concatenate([run.u for run in fit.runs])
     assert fit.exceeded == pytest.approx(float(np.mean(np.abs(u) > 1 + 1e-6)))
     assert fit.largest_input[0] == pytest.approx(float(np.max(np.abs(u))))
 
 
-def test_estimates_go_through_json(compared: dict[str, MethodComparison]) -> None:
+def test_estimates_go_through_json(compared: dict[str, MethodFit]) -> None:
     problem = fit_problem(cart(), [noisy_trial(21, 0.0)], SETTINGS)
     kept: dict[str, Estimate] = {}
 
@@ -126,7 +126,7 @@ def test_an_interrupted_comparison_goes_on(tmp_path: Path) -> None:
     again = compare_recordings(problem, 1.0, going_on)
     assert len(computed) == stages(2) - 6
     for one, other in zip(whole, again, strict=True):
-        np.testing.assert_array_equal(one.fit.vaf, other.fit.vaf)
+        np.testing.assert_array_equal(one.vaf, other.vaf)
         np.testing.assert_array_equal(one.held_out, other.held_out)
 
 
@@ -147,10 +147,10 @@ def test_the_command(tmp_path: Path) -> None:
     assert done.exit_code == 0, done.stderr
     names = {path.name for path in out.iterdir()}
     pictures = {"comparison.png", "comparison.pdf"}
-    assert names == {"report.html", "result.json", "comparison.csv", ".impc", *pictures}
+    assert names == {"report.html", "result.json", "methods.csv", "tables.mat", ".impc", *pictures}
     found = json.loads((out / "result.json").read_text())["methods"]
     assert list(found) == list(compared_methods())
-    with (out / "comparison.csv").open() as stream:
+    with (out / "methods.csv").open() as stream:
         rows = list(csv.DictReader(stream))
     for row in rows:
         told = found[row["method"]]["vaf"]["theta1"]

@@ -1,0 +1,134 @@
+"""result.json of every command: what is in each, checked when it is read (docs/results.md).
+
+Written by `impc.reporting.document`. `schema` counts changes of a key's meaning: a program that
+reads results sees from it whether it knows them.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from impc.checking import checked
+from impc.errors import DataError
+from impc.files.writing import require_ordinary
+
+__all__ = ["SCHEMA", "MethodRecord", "ResultFile", "read_result"]
+
+#: Of the files that are written now. Before the first one that has a number there were others.
+SCHEMA = 2
+
+Matrix = list[list[float]]
+
+
+class MethodRecord(msgspec.Struct, frozen=True):
+    """What a method found, as result.json has it.
+
+    Attributes
+    ----------
+    K, S : list of list of float or None
+        Gain (m, n) and metric (m, m), in SI units; None without a gain.
+    Q, R : list of list of float or None
+        Weights (n, n) and (m, m), at R[0][0] = 1; None without weights.
+    seconds : float
+        Of the method, s.
+    status, reason : str
+        How the method ended (`impc.inverse.estimates.Status`), and why without an answer; empty for
+        the methods of the example, which end in an answer.
+    """
+
+    seconds: float
+    K: Matrix | None = None
+    S: Matrix | None = None
+    Q: Matrix | None = None
+    R: Matrix | None = None
+    status: str = ""
+    reason: str = ""
+
+
+class _Case(msgspec.Struct, frozen=True):
+    methods: dict[str, Any]
+
+
+class ResultFile(msgspec.Struct, frozen=True):
+    """result.json of any command.
+
+    Attributes
+    ----------
+    schema : int
+        Which version of docs/results.md it follows.
+    command : str
+        The command line, without folders.
+    made : str
+        Date and time, UTC, ISO 8601.
+    versions : dict
+        Of Python and of the packages that compute.
+    files : list of str
+        Names of the recordings.
+    sha256 : dict or None
+        Digests of all files that went in.
+    methods : dict of str to MethodRecord
+        Of `impc fit`, `impc compare` and `impc.report`; empty for the other commands.
+    content : dict
+        All of the file, as JSON has it.
+    """
+
+    schema: int
+    command: str
+    made: str
+    versions: dict[str, str]
+    files: list[str]
+    sha256: dict[str, Any] | None
+    methods: dict[str, MethodRecord] = {}
+    content: dict[str, Any] = {}
+
+
+@checked
+def read_result(path: str | Path) -> ResultFile:
+    """Read the result of a command, from its folder or its result.json.
+
+    Parameters
+    ----------
+    path : str or Path
+        The folder or the file.
+
+    Raises
+    ------
+    DataError
+        When there is none, it is damaged, or another version of impc wrote it.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import control
+    >>> import impc
+    >>> plant = impc.Plant(control.ss([[0.9]], [[1]], [[1]], 0, 1))
+    >>> bounds = impc.Bounds(plant, u_min=-0.3, u_max=0.3)
+    >>> truth = impc.Controller(plant, impc.Weights(1, 1), bounds, horizon=3)
+    >>> trial = impc.Recording(plant, truth.simulate([1.0], steps=20).x)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     files = impc.report(impc.estimate(impc.Problem(plant, bounds, 3, [trial])), folder)
+    ...     found = impc.read_result(folder)
+    >>> found.methods["inverse_mpc"].status, found.content["states"]
+    ('explained', ['x[0]'])
+    """
+    place = Path(path)
+    file = place / "result.json" if place.is_dir() else place
+    try:
+        require_ordinary(file)
+        content = msgspec.json.decode(file.read_bytes(), type=dict[str, Any])
+    except (OSError, msgspec.DecodeError, RecursionError) as error:
+        raise _refused(file, f"is no result ({error})") from None
+    schema = content.get("schema", 1)
+    if schema != SCHEMA:
+        raise _refused(file, f"is of another version of impc (schema {schema}, not {SCHEMA})")
+    try:
+        return msgspec.convert({**content, "content": content}, ResultFile)
+    except msgspec.ValidationError as error:
+        raise _refused(file, f"is no result ({error})") from None
+
+
+def _refused(file: Path, problem: str) -> DataError:
+    return DataError(f"file {file}", problem, "run the command that wrote it again")

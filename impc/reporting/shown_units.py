@@ -1,0 +1,35 @@
+"""In which unit a signal is shown: angles in degrees, everything else as the plant has it.
+
+Every page and figure asks here (docs/fitting.md).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from impc.model.signal_units import UNKNOWN
+
+if TYPE_CHECKING:
+    from impc.model.plant import Plant
+
+__all__ = ["axis_label", "shown_unit"]
+
+_DEGREES = {"rad": "deg", "rad/s": "deg/s", "rad/s^2": "deg/s^2"}
+# Of plants that say no units, angles are told by their names.
+_ANGLES = ("theta", "angle", "yaw", "pitch", "roll")
+
+
+def shown_unit(plant: Plant, name: str) -> tuple[float, str]:
+    """Factor from the plant's unit of a signal, by its name, and the unit that is shown."""
+    unit = plant.unit(name)
+    if unit == UNKNOWN and name.lower().startswith(_ANGLES):
+        unit = "rad/s" if name.endswith("_rate") else "rad"
+    if unit in _DEGREES:
+        return math.degrees(1.0), _DEGREES[unit]
+    return 1.0, "-" if unit == "1" else unit
+
+
+def axis_label(plant: Plant, name: str) -> str:
+    """The name of a signal with the unit in which it is shown."""
+    return f"{name} ({shown_unit(plant, name)[1]})"

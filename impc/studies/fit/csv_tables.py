@@ -1,0 +1,90 @@
+"""The numbers of a fit as tables for spreadsheets: gain, weights, methods, trajectories.
+
+    gain.csv          a row a number and method: name, unit, value, ends, level, whether it is told
+    weights.csv       a row an entry of the reported Q and R, at R[0][0] = 1
+    trajectories.csv  a row a sample of the trials that the page draws: recorded and simulated
+
+Numbers are in the units of the plant (docs/results.md).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.model.signal_units import UNKNOWN, price_unit
+from impc.reporting.document import TextTable
+from impc.studies.fit.figures import shown_trials
+from impc.studies.fit.tables import number_units
+from impc.studies.methods_table import methods_numbers
+
+if TYPE_CHECKING:
+    from impc.studies.fit.result import FitResult
+
+__all__ = ["fit_tables"]
+
+
+def fit_tables(result: FitResult) -> dict[str, TextTable]:
+    """The tables by name."""
+    return {
+        "gain": _gain(result),
+        "weights": _weights(result),
+        "methods": methods_numbers(result.methods),
+        "trajectories": _trajectories(result),
+    }
+
+
+def _gain(result: FitResult) -> TextTable:
+    units = number_units(result.given.plant)
+    rows = [
+        (
+            item.name,
+            units.get(item.name, UNKNOWN),
+            item.method,
+            *(np.nan if value is None else float(value) for value in (item.value, item.low)),
+            float(item.high),
+            item.level,
+            "yes" if item.told else "no",
+        )
+        for item in result.certainty.intervals
+    ]
+    heads = ("number", "unit", "method", "value", "low", "high", "level", "told")
+    return TextTable("", heads, rows)
+
+
+def _weights(result: FitResult) -> TextTable:
+    plant, weights = result.given.plant, result.intent.reported.weights
+    rows = [
+        (which, one, other, price_unit(plant, one, other), float(matrix[i, j]))
+        for which, names, matrix in (
+            ("Q", plant.states, weights.Q),
+            ("R", plant.controls, weights.R),
+        )
+        for i, one in enumerate(names)
+        for j, other in enumerate(names[: i + 1])
+    ]
+    return TextTable("", ("matrix", "first", "second", "unit", "value"), rows)
+
+
+def _trajectories(result: FitResult) -> TextTable:
+    plant, blocks = result.given.plant, []
+    for index in shown_trials(result):
+        trial, run = result.given.recordings[index], result.inverse_mpc.runs[index]
+        steps = trial.samples
+        commands = np.vstack([run.u, np.full((1, plant.m), np.nan)])
+        number = np.full((steps, 1), index + 1.0)
+        time = plant.dt * np.arange(steps)[:, None]
+        simulated = run.x @ plant.C.T
+        blocks.append(
+            np.hstack([number, time, trial.outputs, simulated, commands[:steps], trial.disturbance])
+        )
+    heads = [
+        "trial",
+        "time",
+        *(f"{name}_recorded" for name in plant.outputs),
+        *(f"{name}_simulated" for name in plant.outputs),
+        *(f"{name}_simulated" for name in plant.controls),
+        *plant.disturbances,
+    ]
+    return TextTable("", heads, np.vstack(blocks).tolist())

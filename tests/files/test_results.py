@@ -1,0 +1,61 @@
+"""Results are read again by their schema, and refused in one line when they are not of it."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+
+from impc.errors import DataError
+from impc.files.results import SCHEMA, read_result
+from impc.reporting.document import Report
+
+HEAD = {"schema": SCHEMA, "command": "", "made": "", "versions": {}, "files": [], "sha256": None}
+
+
+def test_what_a_report_writes_is_read(tmp_path: Path) -> None:
+    data = {"methods": {"inverse_mpc": {"K": [[1.0, 2.0]], "seconds": 2.0}}, "more": [1]}
+    files = Report("w", "t", (), (), data=data).files()
+    (tmp_path / "result.json").write_bytes(files["result.json"])
+    found = read_result(tmp_path)
+    assert found.methods["inverse_mpc"].K == [[1.0, 2.0]]
+    assert found.methods["inverse_mpc"].Q is None
+    assert found.content["more"] == [1]
+    assert found.schema == SCHEMA
+    assert found.versions["numpy"] == found.content["versions"]["numpy"]
+    assert read_result(tmp_path / "result.json") == found
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("{}", "another version of impc (schema 1, not 2)"),
+        (json.dumps({"K": [[1.0]], "versions": {}, "made": ""}), "schema 1, not 2"),
+        (json.dumps(HEAD | {"schema": 99}), "schema 99, not 2"),
+        (json.dumps(HEAD | {"versions": 3}), "is no result"),
+        (json.dumps({"schema": SCHEMA}), "is no result"),
+        (json.dumps(HEAD | {"methods": {"a": {"seconds": "x"}}}), "$.methods[...].seconds"),
+        ("", "is no result"),
+        ("[]", "is no result"),
+        ("null", "is no result"),
+        ('{"schema"', "is no result"),
+        ("[" * 100_000, "is no result"),
+        ('{"a":' * 100_000, "is no result"),
+    ],
+)
+def test_what_is_not_a_result(content: str, words: str, tmp_path: Path) -> None:
+    (tmp_path / "result.json").write_text(content)
+    with pytest.raises(DataError) as refused:
+        read_result(tmp_path)
+    assert words in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_what_is_no_file(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="is no result"):
+        read_result(tmp_path)
+    os.mkfifo(tmp_path / "result.json")
+    with pytest.raises(DataError, match="no ordinary file"):
+        read_result(tmp_path)

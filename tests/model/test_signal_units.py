@@ -1,0 +1,70 @@
+"""Units of gains and weights, against pint's, and units that a plant may carry."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import control
+import numpy as np
+import pint
+import pytest
+
+from impc.errors import PlantError
+from impc.model.plant import Plant
+from impc.model.signal_units import gain_unit, price_unit
+from plants import cursor_plant, seated_balance_plant, yalmip_example
+
+UNITS = {"angle": "rad", "rate": "rad/s", "torque": "N m", "share": "1"}
+
+
+def plant(units: dict[str, str]) -> Plant:
+    system = control.ss(
+        np.diag([0.5, 0.4, 0.3]), np.ones((3, 1)), np.eye(1, 3), 0, 0.1,
+        states=["angle", "rate", "share"], inputs=["torque"], outputs=["angle"],
+    )  # fmt: skip
+    return Plant(system, units=units)
+
+
+def same(one: str, other: str) -> bool:
+    registry: Any = pint.UnitRegistry()
+    written = one.replace("N m", "(N*m)").replace("²", "**2").replace(") (", ")*(")
+    return bool(registry(written or "1") == registry(other))
+
+
+def test_units_are_those_of_the_algebra() -> None:
+    found = plant(UNITS)
+    assert gain_unit(found, "torque", "angle") == "N m/rad"
+    assert gain_unit(found, "torque", "rate") == "N m/(rad/s)"
+    assert gain_unit(found, "torque", "share") == "N m"
+    assert price_unit(found, "angle", "angle") == "(N m)²/rad²"
+    assert price_unit(found, "torque", "torque") == "1"
+    assert price_unit(found, "rate", "rate") == "(N m)²/(rad/s)²"
+    assert same(gain_unit(found, "torque", "rate"), "N*m*s/rad")
+    assert same(price_unit(found, "rate", "rate"), "(N*m)**2*s**2/rad**2")
+    assert same(price_unit(found, "angle", "angle"), "(N*m)**2/rad**2")
+
+
+def test_what_is_not_known_is_si() -> None:
+    found = plant({"angle": "rad"})
+    assert found.unit("rate") == "SI"
+    assert gain_unit(found, "torque", "angle") == price_unit(found, "rate", "angle") == "SI"
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"angel": "rad"}, {"angle": 3}, {"angle": "ra\nd"}, {3: "rad"}, "rad", ["rad"]]
+)
+def test_units_of_no_signal(wrong: object) -> None:
+    system = control.ss([[0.5]], [[1]], [[1]], 0, 0.1, states=["angle"], outputs=["angle"])
+    system.units = wrong
+    with pytest.raises(PlantError, match=r"plant\.units"):
+        Plant(system)
+
+
+def test_plants_of_the_package_say_all_units() -> None:
+    for made in (seated_balance_plant(), cursor_plant(), yalmip_example()):
+        found = Plant(made)
+        for name in (*found.states, *found.controls, *found.disturbances, *found.outputs):
+            assert found.unit(name) != "SI", name
+    seat = Plant(seated_balance_plant(), ["command"])
+    assert gain_unit(seat, "command", "theta1") == "N m/rad"
+    assert Plant(seat).units == seat.units

@@ -1,0 +1,66 @@
+"""One table of methods for every command: words, numbers and result.json agree."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+
+import numpy as np
+import pytest
+
+from experiments.coverage import cart, noisy_trial
+from impc.assess.assessments import ASSESSMENTS, Assessment
+from impc.assess.judged import MethodFit, judge
+from impc.checking import replace
+from impc.inverse.methods import METHODS, estimate
+from impc.reporting.document import json_bytes
+from impc.studies.fit.settings import FitSettings
+from impc.studies.fit.subject import fit_problem
+from impc.studies.methods_table import column_terms, methods_data, methods_numbers, methods_table
+
+
+@pytest.fixture(scope="module")
+def fits() -> list[MethodFit]:
+    settings = FitSettings(horizon=10, u_max=1.0)
+    problem = fit_problem(cart(), [noisy_trial(21, 0.0)], settings)
+    gain = judge(estimate(problem, "feedback_gain"), problem.bounds)
+    none = replace(gain.estimate, method="inverse_kkt", K=None, S=None, reason="it was not tried")
+    return [gain, judge(none, problem.bounds)]
+
+
+def test_the_three_say_the_same(fits: list[MethodFit]) -> None:
+    table = methods_table(fits)
+    numbers = list(csv.DictReader(io.StringIO(methods_numbers(fits).csv().decode())))
+    data = json.loads(json_bytes(methods_data(fits)))
+    assert list(data) == ["feedback_gain", "inverse_kkt"] == [row["method"] for row in numbers]
+    output = fits[0].estimate.problem.plant.outputs[0]
+    share = data["feedback_gain"]["vaf"][output]
+    assert float(numbers[0][f"vaf_{output}"]) == share
+    assert table.rows[0][1] == f"{share:.5g}"
+    assert table.rows[0][0] == METHODS["feedback_gain"].label
+    assert (numbers[1][f"vaf_{output}"], data["inverse_kkt"]["vaf"]) == ("", {output: None})
+    assert table.rows[1][-1] == numbers[1]["reason"] == "it was not tried"
+
+
+def test_columns_without_a_number_are_not_shown(fits: list[MethodFit]) -> None:
+    output = fits[0].estimate.problem.plant.outputs[0]
+    assert f"left out {output} %" not in methods_table(fits).heads
+    left = [replace(fits[0], held_out=np.array([[50.0], [60.0]]))]
+    table = methods_table(left)
+    assert table.rows[0][table.heads.index(f"left out {output} %")] == "55"
+    assert "note" not in table.heads
+
+
+def test_an_assessment_more_is_a_column_more(
+    fits: list[MethodFit], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    count = Assessment(
+        "trials", "trials", "That were simulated.", lambda _: ("",),
+        lambda fit: np.array([float(len(fit.runs)) if fit.runs else np.nan]),
+    )  # fmt: skip
+    monkeypatch.setitem(ASSESSMENTS, "trials", count)
+    assert methods_table(fits).rows[0][methods_table(fits).heads.index("trials")] == "1"
+    assert methods_numbers(fits).heads[-3] == "trials"
+    assert methods_data(fits)["feedback_gain"]["trials"] == 1
+    assert ("trials", ("That were simulated.",)) in column_terms().terms
