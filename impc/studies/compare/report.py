@@ -27,12 +27,14 @@ if TYPE_CHECKING:
 
 __all__ = ["compare_report"]
 
+# Percent that exact recordings leave, and less.
+_ROUNDING = 1e-6
 _PICTURE = Picture(
     "comparison",
     "VAF in and out of sample and largest command of every method",
-    "Left: variance accounted for, mean over outputs; filled, all trials; open, trials left out. "
-    "Bars that would be negative end at zero. Right: largest command; the dotted line is the "
-    "subject's bound, hatched bars exceed it.",
+    "Left: what a method does not explain, 100 % less its VAF, mean over outputs; filled, all "
+    "trials; open, trials left out; farther left is better. Right: largest command; the dotted "
+    "line is the subject's bound, hatched bars exceed it.",
 )
 
 
@@ -142,15 +144,17 @@ def _figure(problem: Problem, compared: Sequence[MethodFit]) -> Figure:
     figure = new_figure(DOUBLE_COLUMN, 0.5 + 0.36 * max(len(shown), 2))
     left, right = figure.subplots(1, 2, sharey=True, width_ratios=(1.6, 1))
     rows = np.arange(len(shown))
-    inside = [max(float(np.nan_to_num(np.mean(item.vaf))), 0.0) for item in shown]
-    outside = [max(float(np.nan_to_num(np.mean(_held_out(item)))), 0.0) for item in shown]
-    left.barh(rows + 0.2, inside, 0.38, color=BLUE, label="all trials")
-    left.barh(
-        rows - 0.2, outside, 0.38, color="white", edgecolor=INK, linewidth=0.8, label="left out"
-    )
+    inside = [_unexplained(item.vaf) for item in shown]
+    outside = [_unexplained(_held_out(item)) for item in shown]
+    left.plot(inside, rows, "o", color=BLUE, label="all trials")
+    if not np.all(np.isnan(outside)):
+        left.plot(
+            outside, rows, "o", color=INK, markerfacecolor="none", markersize=9, label="left out"
+        )
+    left.set_xscale("log")
+    left.grid(axis="y", linewidth=0.4)
     left.set_yticks(rows, [METHODS[item.name].label for item in shown])
-    left.set_xlim(0, 100)
-    left.set_xlabel("VAF, mean over outputs (%)")
+    left.set_xlabel("not explained, 100 - VAF (%)")
     left.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
     largest = [float(item.largest_input[0]) for item in shown]
     hatches = ["" if item.keeps_bounds else "////" for item in shown]
@@ -161,6 +165,11 @@ def _figure(problem: Problem, compared: Sequence[MethodFit]) -> Figure:
         right.set_xlim(0, min(1.05 * max(largest), 5 * limit))
     right.set_xlabel(f"largest {axis_label(problem.plant, problem.plant.controls[0])}")
     return figure
+
+
+def _unexplained(shares: Array) -> float:
+    """100 % less the mean VAF; rounding where all is explained, so that it has a logarithm."""
+    return max(100.0 - float(np.mean(shares)), _ROUNDING)
 
 
 def _data(problem: Problem, compared: Sequence[MethodFit]) -> dict[str, Any]:

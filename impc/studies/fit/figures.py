@@ -252,8 +252,8 @@ def _methods(result: FitResult) -> Figure:
     below.set_ylim(-1.1 * largest, 1.1 * largest)
     below.set_xlabel("time (s)")
     below.set_xlim(time[0], time[-1])
-    above.legend(ncols=4, loc="upper left", bbox_to_anchor=(0, 1.25))
-    above.set_title(trial_name(result, index), loc="right", y=1.12)
+    above.legend(ncols=2, loc="lower left", bbox_to_anchor=(0, 1.02))
+    above.set_title(trial_name(result, index), loc="right")
     return figure
 
 
