@@ -10,10 +10,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from impc.studies.reliability.verdict import band_of
+
 if TYPE_CHECKING:
     from impc.studies.reliability.analysis import Reliability
 
-__all__ = ["QUOTED", "Finding", "band_of", "findings"]
+__all__ = ["QUOTED", "Finding", "findings"]
 
 #: p-values of tables 2.5 (RMS) and 2.6 (energy) that survive in the text, lower and upper body.
 #: They are the dissertation's, of its own thirty subjects, and are never compared with as truth.
@@ -21,7 +23,6 @@ QUOTED = {
     "rms": {"EO": (0.05, 0.29), "EC": (0.14, 0.66), "VIB": (0.02, 0.71)},
     "energy": {"EO": (0.06, 0.37), "EC": (0.44, 0.57), "VIB": (0.05, 0.70)},
 }
-_BANDS = ((0.40, "poor"), (0.60, "fair"), (0.75, "good"), (np.inf, "excellent"))
 
 
 @dataclass(frozen=True)
@@ -41,13 +42,6 @@ class Finding:
     statement: str
     found: bool
     numbers: str
-
-
-def band_of(value: float) -> str:
-    """Cicchetti's (1994) word for a reliability of that `value`."""
-    if np.isnan(value):
-        return "not defined"
-    return next(word for limit, word in _BANDS if value < limit)
 
 
 def findings(result: Reliability) -> tuple[Finding, ...]:

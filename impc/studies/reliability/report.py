@@ -13,6 +13,7 @@ from impc.reporting.provenance import Provenance
 from impc.studies.reliability.figures import reliability_figures
 from impc.studies.reliability.findings import findings
 from impc.studies.reliability.tables import reliability_tables
+from impc.studies.reliability.verdict import answer
 
 if TYPE_CHECKING:
     from impc.arrays import Array
@@ -64,15 +65,18 @@ def reliability_report(trials: Trials, result: Reliability, command: str, inputs
         f"{', '.join(result.conditions)}; passband {result.band.low:.2f} to "
         f"{result.band.high:.2f} Hz, {len(result.band.excited)} excited frequencies."
     )
+    # One visit has no reliability: a table of dashes says less than the sentence above it.
+    shown = _TABLES if len(result.visits) > 1 else {"1. The visit": ("visits-rms", "visits-energy")}
     sections = [
-        Section("The dissertation's findings, looked for here", (Lines(found), *result.notes)),
-        *(Section(title, [tables[name] for name in names]) for title, names in _TABLES.items()),
-        Section("4. Pictures", (*_PICTURES, Markup("<code>{}</code>").format(command))),
+        *(Section(title, [tables[name] for name in names]) for title, names in shown.items()),
+        Section("4. Pictures", _PICTURES),
+        Section("5. The dissertation's findings, looked for here", (Lines(found),)),
+        Section("6. Versions", (Markup("<code>{}</code>").format(command),)),
     ]
     return Report(
         "impc reliability",
         "Reliability of a test",
-        (summary,),
+        (Lines(answer(result)), summary, *result.notes),
         sections,
         figures=reliability_figures(trials, result),
         tables=tables,

@@ -9,7 +9,8 @@ import numpy as np
 from impc.reporting.document import TextTable
 from impc.reporting.rendering import number
 from impc.studies.reliability.analysis import MEASURES
-from impc.studies.reliability.findings import QUOTED, band_of
+from impc.studies.reliability.findings import QUOTED
+from impc.studies.reliability.verdict import interval_band, shown_score
 
 if TYPE_CHECKING:
     from impc.studies.reliability.analysis import MeasureResult, Reliability
@@ -37,15 +38,10 @@ def _of(result: Reliability, measure: str) -> list[MeasureResult]:
     return [item for item in result.measures if item.measure == measure]
 
 
-def _units(item: MeasureResult) -> tuple[float, str]:
-    """Angles are shown in degrees: factor and unit of a score."""
-    return (np.degrees(1.0), "deg") if item.measure == "rms" else (np.degrees(1.0) ** 2, "deg²")
-
-
 def _icc_table(result: Reliability, measure: str) -> TextTable:
     rows = []
     for item in _of(result, measure):
-        factor, unit = _units(item)
+        factor, unit = shown_score(item)
         found, error = item.icc, item.error
         if found is None or error is None:
             rows.append((item.condition, item.output, "-", "-", "-", "-", "; ".join(item.notes)))
@@ -55,7 +51,7 @@ def _icc_table(result: Reliability, measure: str) -> TextTable:
                 item.condition,
                 item.output,
                 f"{found.value:.2f} ({found.low:.2f}, {found.high:.2f})",
-                band_of(found.value),
+                interval_band(found.low, found.high),
                 f"{factor * error.sem:.3g} {unit}",
                 f"{factor * error.mdc:.3g} {unit}",
                 "; ".join((f"{found.subjects} subjects", *item.notes)),
@@ -65,16 +61,17 @@ def _icc_table(result: Reliability, measure: str) -> TextTable:
         f"Counterpart of table {_NUMBERS[measure]}: between-visit reliability of "
         f"{MEASURES[measure]}, ICC(A,k) of the mean over visits with its generalised 95 % "
         "interval, which allows for few visits that differ; standard error of measurement and "
-        "minimal detectable change (95 %) of the score of a single visit."
+        "minimal detectable change (95 %) of the score of a single visit. The word is that of the "
+        "whole interval."
     )
-    heads = ("condition", "output", "ICC(A,k)", "band", "SEM", "MDC", "notes")
+    heads = ("condition", "output", "ICC(A,k)", "reliability", "SEM", "MDC", "notes")
     return TextTable(caption, heads, rows)
 
 
 def _visit_table(result: Reliability, measure: str) -> TextTable:
     rows = []
     for item in _of(result, measure):
-        factor, unit = _units(item)
+        factor, unit = shown_score(item)
         scores = factor * item.scores
         cells = []
         for column in scores.T:
@@ -109,7 +106,7 @@ def _visit_table(result: Reliability, measure: str) -> TextTable:
 def _component_table(result: Reliability, measure: str) -> TextTable:
     rows = []
     for item in _of(result, measure):
-        factor, unit = _units(item)
+        factor, unit = shown_score(item)
         cells = {
             part.name: f"{factor**2 * part.value:.3g} ({factor**2 * part.low:.3g}, "
             f"{factor**2 * part.high:.3g})"
@@ -143,7 +140,7 @@ def _cmc_table(result: Reliability) -> TextTable:
 def _pair_table(result: Reliability) -> TextTable:
     rows = []
     for item in result.measures:
-        factor, unit = _units(item)
+        factor, unit = shown_score(item)
         for pair in item.pairs:
             rows.append(
                 (

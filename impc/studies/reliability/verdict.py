@@ -1,0 +1,95 @@
+"""The answer that a test's users ask for: is it reliable, in which measure, and what change shows.
+
+A word for an ICC (Cicchetti 1994) is that of its whole 95 % interval: where its ends have different
+words the study does not tell, however high the estimate (docs/reliability.md).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.studies.reliability.analysis import MEASURES
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from impc.studies.reliability.analysis import MeasureResult, Reliability
+
+__all__ = ["answer", "band_of", "interval_band", "shown_score"]
+
+_BANDS = ((0.40, "poor"), (0.60, "fair"), (0.75, "good"), (np.inf, "excellent"))
+
+
+def band_of(value: float) -> str:
+    """Cicchetti's (1994) word for a reliability of that `value`."""
+    if np.isnan(value):
+        return "not defined"
+    return next(word for limit, word in _BANDS if value < limit)
+
+
+def interval_band(low: float, high: float) -> str:
+    """The word for an interval from `low` to `high`; of both ends where they differ."""
+    ends = band_of(low), band_of(high)
+    return ends[0] if ends[0] == ends[1] else f"not told: {ends[0]} to {ends[1]}"
+
+
+def shown_score(item: MeasureResult) -> tuple[float, str]:
+    """Factor and unit in which a score is shown: angles in degrees."""
+    return (np.degrees(1.0), "deg") if item.measure == "rms" else (np.degrees(1.0) ** 2, "deg²")
+
+
+def answer(result: Reliability) -> tuple[str, ...]:
+    """Sentences, the first of which says whether the test is reliable."""
+    if len(result.visits) < 2:
+        return (
+            "Whether the test is reliable cannot be said of one visit: measure the same people "
+            "again, at least once, in the same conditions.",
+        )
+    known = [item for item in result.measures if item.icc is not None]
+    if not known:
+        return (
+            "Whether the test is reliable cannot be said: no measure has a full set of scores.",
+        )
+    words = {id(item): _word(item) for item in known}
+    lines = []
+    for word in ("excellent", "good", "fair", "poor"):
+        found = [item for item in known if words[id(item)] == word]
+        if found:
+            lines.append(f"Reliability between visits is {word} for {_named(found)}.")
+    open_ = [item for item in known if words[id(item)].startswith("not told")]
+    if open_:
+        lines.append(
+            f"For {_named(open_)} {len(result.subjects)} subjects and {len(result.visits)} visits "
+            "do not tell: the interval reaches from one word to another. More subjects or visits "
+            "narrow it."
+        )
+    return (*lines, *_changes(known))
+
+
+def _word(item: MeasureResult) -> str:
+    assert item.icc is not None
+    return interval_band(item.icc.low, item.icc.high)
+
+
+def _named(items: Sequence[MeasureResult]) -> str:
+    return "; ".join(
+        f"{MEASURES[item.measure]} of {item.output}, {item.condition}" for item in items
+    )
+
+
+def _changes(known: Sequence[MeasureResult]) -> list[str]:
+    """What a single person's score must change by, of the first measure in each condition."""
+    first = [item for item in known if item.measure == known[0].measure and item.error is not None]
+    if not first:
+        return []
+    parts = []
+    for item in first:
+        assert item.error is not None
+        factor, unit = shown_score(item)
+        parts.append(f"{factor * item.error.mdc:.2g} {unit} ({item.output}, {item.condition})")
+    return [
+        f"A change of one person's {MEASURES[known[0].measure]} between two visits is more than "
+        f"the test's own scatter, at 95 %, from: {'; '.join(parts)}."
+    ]
