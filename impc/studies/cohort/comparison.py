@@ -87,11 +87,8 @@ def measures_of(units: pd.DataFrame) -> tuple[str, ...]:
     gains = [name for name in units.columns if name.startswith("K.")]
     named = [name for name in gains if name.split(".", 2)[2] in shown]
     prices = [f"centre_price.{name}" for name in outputs]
-    return tuple(
-        name
-        for name in units.columns
-        if name in (named or gains) or name in prices or name.startswith("vaf.")
-    )
+    shares = [name for name in units.columns if name.startswith("vaf.")]
+    return (*(named or gains), *(name for name in prices if name in units.columns), *shares)
 
 
 def compare_cohort(

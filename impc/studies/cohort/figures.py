@@ -1,27 +1,24 @@
-"""Figures of a cohort: measures by group, memory over a run, a subject's fit."""
+"""Figures of a cohort: measures by group, and a subject's fit."""
 
 from __future__ import annotations
 
-import re
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from impc.files.writing import require_ordinary
-from impc.reporting.style import BLUE, DOUBLE_COLUMN, INK, STATE_MARKS, VERMILLION, new_figure
+from impc.reporting.style import DOUBLE_COLUMN, INK, STATE_MARKS, VERMILLION, new_figure
+from impc.studies.cohort.words import measure_words
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from pathlib import Path
 
     import pandas as pd
     from matplotlib.figure import Figure
 
-__all__ = ["group_figure", "memory_figure", "subject_figure"]
+__all__ = ["group_figure", "subject_figure"]
 
 _COLUMNS = 3
 _SOFT = "#8C8C8C"
-_LINE = re.compile(r"memory of worker (\d{1,7}) MB, of client (\d{1,7}) MB")
 
 
 def group_figure(units: pd.DataFrame, measures: Sequence[str]) -> Figure:
@@ -50,29 +47,7 @@ def group_figure(units: pd.DataFrame, measures: Sequence[str]) -> Figure:
             ax.hlines(np.nanmean(values), place - 0.35, place + 0.35, color=INK, linewidth=1.5)
         ax.set_xticks(range(len(groups)), [group or "all" for group in groups])
         ax.set_xlim(-0.6, len(groups) - 0.4)
-        ax.set_ylabel(f"{name} ({_unit(name)})")
-    return figure
-
-
-def memory_figure(log: Path) -> Figure | None:
-    """Memory of workers and client over the tasks of a log; None when it has none."""
-    try:
-        require_ordinary(log)
-        found = _LINE.findall(log.read_text(encoding="utf-8", errors="replace"))
-    except OSError:
-        return None
-    if not found:
-        return None
-    worker, client = np.array(found, dtype=float).T
-    figure = new_figure(DOUBLE_COLUMN, 2.2)
-    ax = figure.subplots()
-    tasks = np.arange(1, len(worker) + 1)
-    ax.plot(tasks, worker, linestyle="none", marker=".", color=BLUE, markersize=3, label="worker")
-    ax.plot(tasks, client, color=VERMILLION, linestyle="--", label="client")
-    ax.set_xlabel("tasks done (-)")
-    ax.set_ylabel("memory (MB)")
-    ax.set_ylim(0, 1.2 * max(worker.max(), client.max()))
-    ax.legend(loc="lower right", ncols=2)
+        ax.set_ylabel(f"{measure_words(name)} ({_unit(name)})")
     return figure
 
 

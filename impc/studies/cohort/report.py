@@ -15,9 +15,10 @@ from impc.reporting.rendering import number
 from impc.reporting.style import drawn, journal_style
 from impc.reporting.writer import write_files
 from impc.studies.cohort.comparison import compare_cohort, measures_of
-from impc.studies.cohort.figures import group_figure, memory_figure, subject_figure
+from impc.studies.cohort.figures import group_figure, subject_figure
 from impc.studies.cohort.study import safe_name
 from impc.studies.cohort.tables import cohort_tables, table_bytes
+from impc.studies.cohort.words import measure_words
 
 if TYPE_CHECKING:
     from impc.studies.cohort.comparison import Comparison
@@ -37,11 +38,6 @@ _GROUPS = Picture(
     "groups",
     "Measures of every unit by group",
     "Every unit, by group; bars are means. The measures that differ most.",
-)
-_MEMORY = Picture(
-    "memory",
-    "Memory of workers and client over the run",
-    "Memory of the worker that did each task, and of the client.",
 )
 
 
@@ -76,16 +72,19 @@ def write_report(study: Study, store: Store, failures: Failures, command: str) -
     for subject, own in subjects.items():
         # One after the other: the figures of a thousand subjects would fill the memory.
         write_files(store.folder, _subject_files(subject, own, store, failures))
-    figures = _figures(store, units, compared)
+    figures = _figures(units, compared)
     report = Report(
         "impc cohort",
-        "A cohort",
-        (_summary(study, tables, subjects, failures), Lines(_findings(compared))),
+        f"Groups and visits of {len(subjects)} subjects",
+        (
+            Lines([*_findings(compared), *_limits(units)]),
+            _summary(study, tables, subjects, failures),
+        ),
         [
             *([Section("Not fitted", (Lines(failures.lines),))] if failures.lines else ()),
             Section("1. Groups and visits", _comparisons(compared, figures)),
             Section("2. Subjects", _subjects(subjects, units)),
-            Section("3. The run", _run(figures, command)),
+            Section("3. The run", _run(command)),
         ],
         figures=figures,
         provenance=Provenance(command=command),
@@ -123,23 +122,20 @@ def _subjects(subjects: dict[str, list[Unit]], units: pd.DataFrame) -> list[Bloc
     return [Markup(", ").join(links), *(() if table is None else (table,))]
 
 
-def _run(figures: dict[str, bytes], command: str) -> list[Block]:
+def _run(command: str) -> list[Block]:
     said = Markup(
         "<code>{}</code>. units.csv, replicates.csv, intervals.csv and comparisons.csv hold all "
         "numbers, cohort.log the times."
     ).format(command)
-    return [_MEMORY, said] if "memory.png" in figures else [said]
+    return [said]
 
 
-def _figures(
-    store: Store, units: pd.DataFrame, compared: tuple[Comparison, ...]
-) -> dict[str, bytes]:
+def _figures(units: pd.DataFrame, compared: tuple[Comparison, ...]) -> dict[str, bytes]:
     with journal_style():
-        memory = memory_figure(store.folder / "cohort.log")
-        figures = {} if memory is None else {"memory": memory}
-        if len(units):
-            figures["groups"] = group_figure(units, _most_telling(compared, units))
-        return drawn(figures)
+        shown = (
+            {"groups": group_figure(units, _most_telling(compared, units))} if len(units) else {}
+        )
+        return drawn(shown)
 
 
 def _summary(
@@ -163,11 +159,25 @@ def _findings(compared: tuple[Comparison, ...]) -> list[str]:
         if np.isfinite(item.p_holm) and item.p_holm <= 0.05:
             what = f"{item.first} and {item.second}" if item.first else "groups over visits"
             effect = f", effect {item.effect:+.2f}" if np.isfinite(item.effect) else ""
+            where = f"{item.condition}: " if item.condition else ""
             lines.append(
-                f"{item.condition + ': ' if item.condition else ''}{item.measure} differs between "
-                f"{what} (p = {item.p_holm:.2g} after Holm{effect})."
+                f"{where}{measure_words(item.measure)} differs between {what} "
+                f"(p = {item.p_holm:.2g} after Holm{effect})."
             )
     return lines or ["No difference between groups or visits stands after Holm's correction."]
+
+
+def _limits(units: pd.DataFrame) -> list[str]:
+    """What those units tell of the limit that never reach it."""
+    if not len(units):
+        return []
+    never = int(np.sum(units["saturated"] == 0))
+    if not never:
+        return []
+    return [
+        f"{never} of {len(units)} units never reach the limit of their command: they cannot tell "
+        "inverse MPC from inverse LQR, nor where the limit is."
+    ]
 
 
 def _most_telling(compared: tuple[Comparison, ...], units: pd.DataFrame) -> list[str]:
@@ -196,7 +206,7 @@ def _comparison_row(item: Comparison) -> tuple[str, ...]:
     interval = f"{number(item.low)} to {number(item.high)}" if np.isfinite(item.low) else "-"
     pair = f"{item.second} - {item.first}" if item.first else ""
     return (
-        item.measure,
+        measure_words(item.measure),
         item.condition,
         item.note or pair,
         str(item.n),
@@ -221,7 +231,7 @@ def _unit_table(units: pd.DataFrame) -> TextTable | None:
         )
         for _, row in units.iterrows()
     )
-    heads = ("unit", "group", *(f"{name} %" for name in shown), "at the bound %")
+    heads = ("unit", "group", *(f"{measure_words(name)} %" for name in shown), "at the bound %")
     return TextTable("Every unit. units.csv has all numbers.", heads, rows)
 
 
