@@ -5,6 +5,7 @@ What nobody has foreseen is a defect: its line names the place in the code and a
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import errno
 import os
@@ -116,6 +117,8 @@ def own_process() -> Iterator[None]:
     threading.excepthook = lambda _: None
     with contextlib.suppress(ValueError):  # not the main thread
         signal.signal(signal.SIGINT, _Interrupts())
+        # After all that may take long: Python itself would end by the signal, and not with 130.
+        atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
     yield
     with contextlib.suppress(OSError, ValueError, AttributeError):
         sys.stdout.flush()
