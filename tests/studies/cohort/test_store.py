@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from pathlib import Path
 from typing import Any
@@ -166,11 +167,16 @@ def test_no_unit_fitted_is_a_report_of_reasons(
     assert json.loads((tmp_path / "result.json").read_text())["fitted"] == 0
 
 
-def test_no_room_for_the_log_is_one_line(tmp_path: Path) -> None:
-    (tmp_path / "cohort.log").mkdir()
+@pytest.mark.parametrize("what", ["folder", "pipe", "device"])
+def test_what_stands_in_the_place_of_the_log_is_to_be_moved(what: str, tmp_path: Path) -> None:
+    """Room on the disk would not help, and is not asked for."""
+    path = tmp_path / "cohort.log"
+    {"folder": path.mkdir, "pipe": lambda: os.mkfifo(path),
+     "device": lambda: path.symlink_to("/dev/full")}[what]()  # fmt: skip
     with pytest.raises(OutputError, match=r"cohort\.log: cannot be written") as caught:
         Store(tmp_path, DIGESTS).log("run")
     assert "\n" not in str(caught.value)
+    assert caught.value.remedy == "move what is in its place, or give another folder"
 
 
 def test_formulas_are_no_cells() -> None:
