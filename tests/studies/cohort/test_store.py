@@ -158,6 +158,35 @@ def test_failed_replicates_are_said_and_no_unit_is_lost(
 
 
 @pytest.mark.usefixtures("blank_figures")
+@pytest.mark.parametrize("text", ["{}", "[]", "null", "[" * 100_000])
+def test_any_file_of_a_folder_may_be_damaged(
+    text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each in turn: the run is refused in one line, or ends with the tables of the first."""
+
+    def draw(task: object, fit: object, index: int) -> dict[str, Any]:
+        return refusing() if index == 1 else replicate_of(index)
+
+    def run() -> dict[str, bytes]:
+        run_and_report(tmp_path, monkeypatch, lambda _: fit_of(0), draw)
+        return {path.name: path.read_bytes() for path in tmp_path.glob("*.csv")}
+
+    right, refused = run(), set()
+    found = sorted(tmp_path.rglob("*.json"))
+    assert len(found) == 2 + 2 * (1 + REPLICATES)  # manifest, result; and of each unit
+    for path in [*found, tmp_path / ".impc"]:
+        whole = path.read_bytes()
+        path.write_text(text)
+        try:
+            assert run() == right, path
+        except ImpcError as error:
+            assert "\n" not in str(error)
+            refused.add(path.name)
+            path.write_bytes(whole)
+    assert refused == {"fit.json", "replicate-0000.json", "replicate-0002.json", ".impc"}
+
+
+@pytest.mark.usefixtures("blank_figures")
 def test_no_unit_fitted_is_a_report_of_reasons(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
