@@ -125,12 +125,13 @@ def test_no_room_for_the_log(tmp_path: Path) -> None:
     limit = resource.getrlimit(resource.RLIMIT_FSIZE)
     try:
         resource.setrlimit(resource.RLIMIT_FSIZE, (50, limit[1]))
-        with pytest.raises(OutputError, match=r"cohort\.log: .*make room") as caught:
-            for _ in range(9):
-                store.log("a line of twenty")
-        said = str(caught.value)
+        for _ in range(9):
+            store.log("a line of twenty")
+    except OutputError as error:
+        said = str(error)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+    assert "cohort.log: cannot be written (File too large); make room" in said
     assert "\n" not in said
     store.log("later")
     assert (tmp_path / "cohort.log").read_text().endswith("later\n")
