@@ -99,7 +99,7 @@ def test_workers_and_client_may_die(
     out = tmp_path / "out"
     killed = 0
     for count, kill_client in zip(kills, (True, False), strict=True):
-        before = len(list(out.rglob("replicate-*.json")))
+        before = len(list((out / "units").rglob("replicate-*.json")))
         client = subprocess.Popen(
             command(study, out, "--workers", "2"), cwd=ROOT, stderr=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
@@ -109,13 +109,13 @@ def test_workers_and_client_may_die(
             workers: list[psutil.Process] = []
             while client.poll() is None and not workers:
                 time.sleep(0.005)
-                if len(list(out.rglob("replicate-*.json"))) > before + 4:
+                if len(list((out / "units").rglob("replicate-*.json"))) > before + 4:
                     workers = workers_of(process)
             if not workers:
                 break
             os.kill(rng.choice(workers).pid, signal.SIGKILL)
             killed += 1
-            before = len(list(out.rglob("replicate-*.json")))
+            before = len(list((out / "units").rglob("replicate-*.json")))
         if kill_client and client.poll() is None:
             family = [process, *process.children(recursive=True)]
             os.kill(client.pid, signal.SIGKILL)
@@ -200,7 +200,7 @@ def test_a_killed_scheduler_is_one_line_and_the_run_goes_on(
             command(study, out, "--scheduler", address, *given), cwd=ROOT, text=True,
             stdout=subprocess.PIPE, stderr=subprocess.PIPE,
         )  # fmt: skip
-        while client.poll() is None and len(list(out.rglob("replicate-*.json"))) < 3:
+        while client.poll() is None and len(list((out / "units").rglob("replicate-*.json"))) < 3:
             time.sleep(0.005)
         server.kill()
         said = client.communicate()
@@ -208,7 +208,7 @@ def test_a_killed_scheduler_is_one_line_and_the_run_goes_on(
     assert said[0] == ""
     assert len(said[1].splitlines()) == 1
     assert "was lost while tasks were out" in said[1]
-    assert len(list(out.rglob("replicate-*.json"))) >= 3
+    assert len(list((out / "units").rglob("replicate-*.json"))) >= 3
     done = run(study, out, "--workers", "1")
     assert done.returncode == 0, done.stderr
     same_tables(out, undisturbed)
