@@ -16,6 +16,8 @@ import numpy as np
 from impc.arrays import Array, Frozen, frozen
 from impc.checking import checked
 from impc.control.closed_loop import simulate
+from impc.errors import SolverError, WeightsError
+from impc.inverse.arrow import triangular_rows
 from impc.inverse.equivalent_weights import other_weights
 from impc.inverse.problem import controller_for, misfit, scenarios
 from impc.inverse.proximal_search import Residual, weight_jacobian
@@ -28,6 +30,9 @@ from impc.model.weights import Weights, condition_number
 if TYPE_CHECKING:
     from impc.inverse.equivalent_weights import EquivalentWeights
     from impc.inverse.problem import Problem
+    from impc.inverse.residuals import Evaluation
+    from impc.inverse.solution_set import GainFibre
+    from impc.model.riccati import LqrSolution
 
 __all__ = ["Identifiability", "OtherWeights", "identifiability"]
 
@@ -71,7 +76,8 @@ class Identifiability(Frozen):
     tolerance : float
         That share of the largest.
     others : tuple of OtherWeights
-        Other weights that explain the recordings equally well.
+        Other weights that explain the recordings equally well; empty where they cannot be found in
+        double precision.
 
     Examples
     --------
@@ -126,14 +132,36 @@ def identifiability(problem: Problem, weights: Weights) -> Identifiability:
     found = evaluate(problem, solution.K, solution.S)
     factor = np.linalg.cholesky(weights.block)
     basis = factor @ block_basis(plant.n, plant.m) @ factor.T
-    residual = Residual(found.residual, found.dK, found.dS, usable=True)
-    values = np.linalg.svd(weight_jacobian(solution, residual, basis), compute_uv=False)
+    values = _singular_values(solution, found, basis)
     rank = int(np.count_nonzero(values > _DETERMINED * values[0]))
     free = len(basis) - 1
     metric = solution.S if plant.m > 1 else None
     fibre = gain_fibre(plant, solution.K, metric)
-    others = tuple(_explain(problem, item) for item in other_weights(fibre, 2))
-    return Identifiability(frozen(values), free, rank, free - rank, _DETERMINED, others)
+    return Identifiability(
+        frozen(values), free, rank, free - rank, _DETERMINED, _others(problem, fibre)
+    )
+
+
+def _singular_values(solution: LqrSolution, found: Evaluation, basis: Array) -> Array:
+    """Of the derivative along a `basis` of the weights; all but a few rows are gone before."""
+    parts = [found.dK, found.dS]
+    rows = triangular_rows([part.reshape(len(part), -1) for part in parts])
+    first = int(np.prod(found.dK.shape[1:]))
+    dK, dS = (
+        columns.reshape(len(rows), *part.shape[1:])
+        for columns, part in zip((rows[:, :first], rows[:, first:]), parts, strict=True)
+    )
+    residual = Residual(np.zeros(len(rows)), dK, dS, usable=True)
+    values = np.linalg.svd(weight_jacobian(solution, residual, basis), compute_uv=False)
+    # More directions than gain and metric have entries leave the outputs as they are.
+    return np.pad(values, (0, min(len(found.residual), len(basis)) - len(values)))
+
+
+def _others(problem: Problem, fibre: GainFibre) -> tuple[OtherWeights, ...]:
+    try:
+        return tuple(_explain(problem, item) for item in other_weights(fibre, 2))
+    except (WeightsError, SolverError):  # weights at the edge of what a program can tell
+        return ()
 
 
 def _explain(problem: Problem, found: EquivalentWeights) -> OtherWeights:

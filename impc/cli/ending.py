@@ -5,8 +5,8 @@ What nobody has foreseen is a defect: its line names the place in the code and a
 
 from __future__ import annotations
 
+import atexit
 import contextlib
-import errno
 import os
 import signal
 import sys
@@ -17,6 +17,7 @@ import click
 
 from impc.cli.exit_status import ExitStatus
 from impc.errors import ImpcError, one_line
+from impc.files.writing import NO_ROOM
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -30,8 +31,6 @@ __all__ = [
     "interruptions",
     "own_process",
 ]
-
-_NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
 
 
 class InterruptionError(Exception):
@@ -63,7 +62,7 @@ def ended(run: Callable[[], Any]) -> int:
         told = error.format_message() if isinstance(error, click.ClickException) else error
         return _say(f"error: {told}", ExitStatus.BAD_INPUT)
     except BaseException as error:  # the net itself
-        if isinstance(error, OSError) and error.errno in _NO_ROOM:
+        if isinstance(error, OSError) and error.errno in NO_ROOM:
             where = error.filename or "output"
             return _say(f"error: {where}: {error.strerror}; make room", ExitStatus.BAD_INPUT)
         return _defect(error, heard)
@@ -116,6 +115,8 @@ def own_process() -> Iterator[None]:
     threading.excepthook = lambda _: None
     with contextlib.suppress(ValueError):  # not the main thread
         signal.signal(signal.SIGINT, _Interrupts())
+        # After all that may take long: Python itself would end by the signal, and not with 130.
+        atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
     yield
     with contextlib.suppress(OSError, ValueError, AttributeError):
         sys.stdout.flush()

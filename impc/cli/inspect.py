@@ -96,11 +96,14 @@ def _require_new(out: Path | None) -> None:
 
 
 def _write(out: Path, text: str) -> None:
-    from impc.errors import OutputError  # noqa: PLC0415
+    from impc.files.writing import unwritable  # noqa: PLC0415
 
+    made = False
     try:
         with out.open("x", encoding="utf-8", newline="\n") as file:
+            made = True
             file.write(text)
     except OSError as error:
-        reason = error.strerror or type(error).__name__
-        raise OutputError(str(out), f"cannot be written ({reason})", "give another path") from None
+        if made:  # half of it
+            out.unlink(missing_ok=True)
+        raise unwritable(str(out), error, "give another path") from None

@@ -50,8 +50,7 @@ def out_option(folder: str, holds: str) -> Callable[[F], F]:
         def holding(*given: Any, out: Path, **named: Any) -> Any:
             from impc.reporting.writer import owned  # noqa: PLC0415
 
-            name = click.get_current_context().command_path.partition(" ")[2]
-            with owned(out, name):
+            with owned(out, _command_name(click.get_current_context())):
                 return command(*given, out=out, **named)
 
         option = click.option(
@@ -63,6 +62,15 @@ def out_option(folder: str, holds: str) -> Callable[[F], F]:
         return option(cast("F", holding))
 
     return added
+
+
+def _command_name(context: click.Context) -> str:
+    """Without the program's own, which is `impc` or `python -m impc` for the same command."""
+    names = list[str]()
+    while context.parent is not None:
+        names.insert(0, str(context.info_name))
+        context = context.parent
+    return " ".join(names)
 
 
 def subject_arguments(config: str) -> Callable[[F], F]:

@@ -17,6 +17,7 @@ from impc.files.matlab import encode_matlab
 from impc.files.matlab73 import HDF5_SIGNATURE, matlab73_bytes
 from impc.files.names import LARGEST, damaged, require_ordinary
 from impc.files.tdms import encode_tdms
+from impc.files.writing import unwritable
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -220,8 +221,7 @@ def _write(path: Path, content: bytes) -> None:
             new.write_bytes(content)
             os.replace(new, path)
     except OSError as error:
-        reason = error.strerror or type(error).__name__
-        raise OutputError(str(path), f"cannot be written ({reason})", "give another path") from None
+        raise unwritable(str(path), error, "give another path") from None
 
 
 #: By ending: the formats that are read and written. A new one is a line here.

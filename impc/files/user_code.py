@@ -65,20 +65,20 @@ def consented_name(
             where, f"names code that would be run, {name!a}",
             f"look at it, then say --{option} {name}, or --allow-{option}",
         )  # fmt: skip
-    _require_users_module(where, module)
+    _require_users_module(where, module, name)
     return name
 
 
-def _require_users_module(where: str, module: str) -> None:
+def _require_users_module(where: str, module: str, name: str) -> None:
     """Before anything is imported."""
     if not all(part.isidentifier() for part in module.split(".")):
         raise InputError(where, f"{module[:80]!a} is no module's name", "write module:function")
     top = module.partition(".")[0]
     if top in sys.stdlib_module_names or top in sys.builtin_module_names or top == "impc":
-        raise _not_yours(where, module)
+        raise _not_yours(where, name)
     file = module_file(top, Path())
     if file is not None and is_installed(file):
-        raise _not_yours(where, module)
+        raise _not_yours(where, name)
 
 
 def require_users_function(where: str, function: Callable[..., Any]) -> None:

@@ -11,7 +11,37 @@ from impc.errors import OutputError
 if TYPE_CHECKING:
     from pathlib import Path
 
-__all__ = ["flush_folder", "require_ordinary", "write_whole"]
+__all__ = [
+    "IN_ITS_PLACE",
+    "NO_ROOM",
+    "flush_folder",
+    "require_ordinary",
+    "unwritable",
+    "write_whole",
+]
+
+#: What to do about a file that cannot be written, where room would not help.
+IN_ITS_PLACE = "move what is in its place, or give another folder"
+#: Numbers of errors that room on the disk, or a larger quota or limit, would mend.
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+
+def unwritable(subject: str, error: OSError | ValueError, remedy: str) -> OutputError:
+    """What to say of something that cannot be written: `remedy`, or to make room if there is none.
+
+    Parameters
+    ----------
+    subject : str
+        The file or folder.
+    error : OSError or ValueError
+        Of the attempt.
+    remedy : str
+        What to do about it otherwise.
+    """
+    number = getattr(error, "errno", None)
+    reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
+    told = "make room and start again" if number in NO_ROOM else remedy
+    return OutputError(subject, f"cannot be written ({reason})", told)
 
 
 def require_ordinary(path: Path) -> None:
@@ -52,10 +82,7 @@ def write_whole(path: Path, content: bytes) -> None:
             raise
         flush_folder(path.parent)
     except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-        raise OutputError(
-            f"file {path}", f"cannot be written ({reason})", "make room and start again"
-        ) from None
+        raise unwritable(f"file {path}", error, IN_ITS_PLACE) from None
 
 
 def flush_folder(folder: Path) -> None:

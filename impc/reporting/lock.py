@@ -12,7 +12,7 @@ except ImportError:  # Windows
     import msvcrt
 
 from impc.errors import OutputError
-from impc.files.writing import require_ordinary
+from impc.files.writing import require_ordinary, unwritable
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -50,11 +50,7 @@ def _opened(path: Path) -> IO[bytes]:
             require_ordinary(path)
             stream = path.open("ab")
         except OSError as error:
-            raise OutputError(
-                f"folder {path.parent}",
-                f"cannot be written to ({error.strerror})",
-                "give another folder",
-            ) from None
+            raise unwritable(f"folder {path.parent}", error, "give another folder") from None
         try:
             _take(stream)
         except OSError:

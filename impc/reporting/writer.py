@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from impc.errors import OutputError
-from impc.files.writing import require_ordinary, write_whole
+from impc.files.writing import require_ordinary, unwritable, write_whole
 from impc.reporting.lock import locked
 
 if TYPE_CHECKING:
@@ -293,5 +293,4 @@ def _made(folder: Path) -> Iterator[None]:
 
 
 def _unwritable(folder: Path, error: OSError | ValueError) -> OutputError:
-    reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
-    return OutputError(f"folder {folder}", f"cannot be written to ({reason})", _REMEDY)
+    return unwritable(f"folder {folder}", error, _REMEDY)

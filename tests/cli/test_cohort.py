@@ -9,7 +9,9 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 import psutil
@@ -17,6 +19,10 @@ import pytest
 
 from impc.studies.cohort.store import open_store
 from tests.studies.cohort.carts import write_study
+from tests.studies.cohort.test_cluster import certificates
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
 
 ROOT = Path(__file__).parents[2]
 SEED = 8
@@ -93,7 +99,7 @@ def test_workers_and_client_may_die(
     out = tmp_path / "out"
     killed = 0
     for count, kill_client in zip(kills, (True, False), strict=True):
-        before = len(list(out.rglob("replicate-*.json")))
+        before = len(list((out / "units").rglob("replicate-*.json")))
         client = subprocess.Popen(
             command(study, out, "--workers", "2"), cwd=ROOT, stderr=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
@@ -103,13 +109,13 @@ def test_workers_and_client_may_die(
             workers: list[psutil.Process] = []
             while client.poll() is None and not workers:
                 time.sleep(0.005)
-                if len(list(out.rglob("replicate-*.json"))) > before + 4:
+                if len(list((out / "units").rglob("replicate-*.json"))) > before + 4:
                     workers = workers_of(process)
             if not workers:
                 break
             os.kill(rng.choice(workers).pid, signal.SIGKILL)
             killed += 1
-            before = len(list(out.rglob("replicate-*.json")))
+            before = len(list((out / "units").rglob("replicate-*.json")))
         if kill_client and client.poll() is None:
             family = [process, *process.children(recursive=True)]
             os.kill(client.pid, signal.SIGKILL)
@@ -136,40 +142,76 @@ def test_going_on_repeats_nothing(study: Path, undisturbed: Path) -> None:
     assert {path: path.stat().st_mtime_ns for path in stamps} == stamps
 
 
-@pytest.mark.full
-def test_a_scheduler_of_ones_own(study: Path, undisturbed: Path, tmp_path: Path) -> None:
-    """Scheduler and two workers started apart: the same bytes."""
-    place = tmp_path / "scheduler.json"
+@contextmanager
+def scheduler_and_workers(folder: Path, workers: int, *tls: str) -> Iterator[tuple[Any, str]]:
+    """Started apart, with certificates of Dask's options `tls`; the scheduler and its address."""
+    place = folder / "scheduler.json"
     environment = os.environ | {"PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    start = [sys.executable, "-m", "distributed.cli.dask_scheduler"]
-    arguments = ["--host", "127.0.0.1", "--port", "0", "--no-dashboard"]
-    started = [
-        subprocess.Popen(
-            [*start, *arguments, "--scheduler-file", str(place)], env=environment, **quiet
-        )  # type: ignore[call-overload]
-    ]
+    quiet: Any = {
+        "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "env": environment, "cwd": ROOT,
+    }  # fmt: skip
+    common = ["--no-dashboard", "--scheduler-file", str(place), *tls]
+    host = "tls://127.0.0.1" if tls else "127.0.0.1"
+    server = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", host, "--port", "0"]
     worker = [sys.executable, "-m", "distributed.cli.dask_worker", "--nthreads", "1"]
-    for _ in range(2):
+    started = [subprocess.Popen([*server, *common], **quiet)]
+    for _ in range(workers):
         started.append(
-            subprocess.Popen(
-                [*worker, "--no-dashboard", "--scheduler-file", str(place), "--local-directory",
-                 str(tmp_path)],
-                env=environment, cwd=ROOT, **quiet,
-            )  # type: ignore[call-overload]
-        )  # fmt: skip
+            subprocess.Popen([*worker, *common, "--local-directory", str(folder)], **quiet)
+        )
     try:
         while not place.exists():
             time.sleep(0.05)
-        address = json.loads(place.read_text())["address"]
-        done = run(study, tmp_path / "out", "--scheduler", address)
-        assert done.returncode == 0, done.stderr
+        yield started[0], json.loads(place.read_text())["address"]
     finally:
         for process in reversed(started):
             process.terminate()
         for process in started:
             process.wait()
+
+
+@pytest.mark.full
+def test_a_scheduler_of_ones_own(study: Path, undisturbed: Path, tmp_path: Path) -> None:
+    """Scheduler and two workers started apart: the same bytes."""
+    with scheduler_and_workers(tmp_path, 2) as (_, address):
+        done = run(study, tmp_path / "out", "--scheduler", address)
+    assert done.returncode == 0, done.stderr
     same_tables(tmp_path / "out", undisturbed)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("secure", [False, True])
+def test_a_killed_scheduler_is_one_line_and_the_run_goes_on(
+    secure: bool, study: Path, undisturbed: Path, tmp_path: Path
+) -> None:
+    """Killed in the middle, with certificates too; then what was kept is used on this machine."""
+    out, given, tls = tmp_path / "out", list[str](), list[str]()
+    if secure:
+        ca, cert, key = map(str, certificates(tmp_path))
+        tls = ["--tls-ca-file", ca, "--tls-cert", cert, "--tls-key", key]
+        given = ["--tls-ca", ca, "--tls-cert", cert, "--tls-key", key]
+    with scheduler_and_workers(tmp_path, 1, *tls) as (server, address):
+        if secure:
+            refused = run(study, out, "--scheduler", address)
+            assert refused.returncode == 2
+            assert "needs --tls-ca, --tls-cert, --tls-key" in refused.stderr
+            assert len(refused.stderr.splitlines()) == 1
+        client = subprocess.Popen(
+            command(study, out, "--scheduler", address, *given), cwd=ROOT, text=True,
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        )  # fmt: skip
+        while client.poll() is None and len(list((out / "units").rglob("replicate-*.json"))) < 3:
+            time.sleep(0.005)
+        server.kill()
+        said = client.communicate()
+    assert client.returncode == 2, said
+    assert said[0] == ""
+    assert len(said[1].splitlines()) == 1
+    assert "was lost while tasks were out" in said[1]
+    assert len(list((out / "units").rglob("replicate-*.json"))) >= 3
+    done = run(study, out, "--workers", "1")
+    assert done.returncode == 0, done.stderr
+    same_tables(out, undisturbed)
 
 
 def test_no_scheduler_is_one_line(study: Path, tmp_path: Path) -> None:

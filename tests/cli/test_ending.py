@@ -175,10 +175,17 @@ def twice():
 def late():
     atexit.register(interrupt)  # while Python waits for what is still at work
     interrupt()
+class Last:
+    def __del__(self, kill=os.kill, me=os.getpid(), number=signal.SIGINT):
+        kill(me, number)  # while Python takes its modules apart
+def last():
+    global kept
+    kept = Last()
+    interrupt()
 """
 
 
-@pytest.mark.parametrize("function", ["twice", "late"])
+@pytest.mark.parametrize("function", ["twice", "late", "last"])
 def test_interruptions_from_the_keyboard(tmp_path: Path, function: str) -> None:
     (tmp_path / "mine.py").write_text(INTERRUPTED)
     (tmp_path / "a.csv").write_text(RECORDING)

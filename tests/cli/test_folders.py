@@ -131,8 +131,11 @@ def test_every_command_with_out_holds_its_folder(tmp_path: Path) -> None:
         with pytest.raises(OutputError, match="another run is writing"), owned(out, "make"):
             pytest.fail("entered")
 
-    done = CliRunner().invoke(main, ["make", "--out", str(tmp_path / "out")])
-    assert done.exception is None
+    # `impc` and `python -m impc` are one program.
+    for program in ("main", "python -m main"):
+        words = ["make", "--out", str(tmp_path / "out")]
+        done = CliRunner().invoke(main, words, prog_name=program)
+        assert done.exception is None
     first = (tmp_path / "out" / ".impc").read_text().splitlines()
     assert first[0] == "make"
     assert {json.loads(line)[0] for line in first[1:]} == set(PAGE)

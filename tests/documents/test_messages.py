@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+import resource
 import sys
 import tempfile
 import time
@@ -43,7 +44,7 @@ from impc.reporting.writer import owned, require_writable, write_files
 from impc.studies.cohort import cluster
 from impc.studies.cohort.names import checked_name
 from impc.studies.cohort.sheet import Sheet, column_values, read_sheet
-from impc.studies.cohort.store import open_store
+from impc.studies.cohort.store import Store, open_store
 from impc.studies.cohort.study import read_study
 from impc.studies.effort import Effort
 from impc.studies.fit.settings import FitSettings, fit_settings, require_used
@@ -203,8 +204,17 @@ def damaged_result(folder: Path) -> None:
 
 
 def no_room(folder: Path) -> None:
-    (folder / "units").write_text("")  # a file where a folder should go
-    Kept(folder / "units").keep("fit", "", {})
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10, limit[1]))
+    try:
+        Kept(folder / "units").keep("fit", "", {})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+
+
+def folder_for_a_file(folder: Path) -> None:
+    (folder / "cohort.log").mkdir()
+    Store(folder, {}).log("run")
 
 
 def own_plant(folder: Path) -> Path:
@@ -448,6 +458,9 @@ PROVOKED: dict[str, Callable[[Path], object]] = {
     "is not of an earlier run of this command": file_of_ones_own,
     "is damaged, or not what this program wrote": damaged_result,
     "cannot be written (...); make room and start again": no_room,
+    "cannot be written (...); move what is in its place, or give another folder": (
+        folder_for_a_file
+    ),
     "names code that would be run, ...": lambda folder: command(
         "cohort", str(own_plant(folder)), "--out", str(folder / "out")
     ),

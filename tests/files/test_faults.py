@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import errno
 import os
+import resource
 import subprocess
 import sys
 from pathlib import Path
@@ -87,6 +88,52 @@ def _fail_at(patch: pytest.MonkeyPatch, place: int) -> None:
 
     for name in ("fsync", "replace"):
         patch.setattr(os, name, full(getattr(os, name)))
+
+
+@pytest.mark.skipif(os.name != "posix", reason="a limit that the system keeps")
+def test_a_disk_that_takes_only_a_part_of_a_file(tmp_path: Path) -> None:
+    """The system cuts a write in its middle, at every 40th byte: files are whole or absent."""
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)
+    refused = 0
+    for room in range(0, 1000, 40):
+        folder, said = tmp_path / f"{room}", ""
+        work(folder, OLD)
+        try:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (room, limit[1]))
+            work(folder, NEW)
+        except OutputError as error:
+            said = str(error)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+        if not said:
+            break
+        refused += 1
+        assert said.endswith("make room and start again")
+        found = shown(folder)
+        assert found in (OLD, NEW) or "INCOMPLETE.txt" in found
+        assert not list(folder.rglob("*.part"))
+        assert Kept(folder / "fit-in-progress").recall_all("digest").items() <= STAGES.items()
+    assert refused >= 5
+    assert shown(folder) == NEW
+
+
+@pytest.mark.skipif(os.name != "posix", reason="a limit that the system keeps")
+def test_no_room_for_the_log(tmp_path: Path) -> None:
+    """A line may be cut; the run ends in one line, and the next one goes on below it."""
+    store, said = Store(tmp_path), ""
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (50, limit[1]))
+        for _ in range(9):
+            store.log("a line of twenty")
+    except OutputError as error:
+        said = str(error)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+    assert "cohort.log: cannot be written (File too large); make room" in said
+    assert "\n" not in said
+    store.log("later")
+    assert (tmp_path / "cohort.log").read_text().endswith("later\n")
 
 
 KILLED = """

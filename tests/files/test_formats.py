@@ -184,6 +184,24 @@ def test_version_73_by_h5py(tmp_path: Path) -> None:
     assert table.skipped == {"note": "is text"}
 
 
+@pytest.mark.parametrize("name", ["seat", "s.seat"])
+@pytest.mark.parametrize("version", ["5", "7.3", "7.3, whole numbers"])
+def test_no_imaginary_part_is_dropped(name: str, version: str, tmp_path: Path) -> None:
+    """At the top and in a field of a struct: no column, and said why."""
+    path = tmp_path / "trial.mat"
+    numbers = np.exp(1j * np.arange(200.0))
+    if version == "5":
+        save_mat(path, {"time": SEAT["time"], "s": {"seat": numbers}, "seat": numbers})
+    else:
+        kind = "<i2" if "whole" in version else "<f8"
+        pairs = np.zeros((1, 200), [("real", kind), ("imag", kind)])
+        pairs["imag"] = 1
+        hdf5_mat(path, {"time": SEAT["time"], "s/seat": pairs, "seat": pairs})
+    table = read_table(path)
+    assert list(table.columns) == ["time"]
+    assert table.skipped[name] == "is complex"
+
+
 def matlab_file(name: str) -> Path:
     """A file that MATLAB wrote, from the tests of scipy."""
     spec = importlib.util.find_spec("scipy.io.matlab")

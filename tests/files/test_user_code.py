@@ -52,7 +52,7 @@ def test_the_users_own_needs_it() -> None:
 )
 def test_code_of_others_is_refused_with_consent(name: str) -> None:
     for given, allowed in ((name, False), (None, True)):
-        with pytest.raises(InputError, match="no function of a module of yours"):
+        with pytest.raises(InputError, match=f"{name} is no function of a module of yours"):
             consent(name, given, allowed)
 
 

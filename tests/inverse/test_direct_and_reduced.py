@@ -8,6 +8,7 @@ import pytest
 from impc.assess.identified_directions import identifiability
 from impc.control.closed_loop import Status, require_complete, scenario, simulate
 from impc.control.controller import Controller
+from impc.errors import SolverError
 from impc.inverse.direct_and_reduced import (
     CONDITION_WEIGHT,
     infer_weights,
@@ -100,6 +101,41 @@ def test_example_identifiability_shows_other_weights_that_explain_the_data(
     for item in found.others:
         assert item.misfit < 1e-9
         assert np.linalg.norm(item.weights.Q - np.eye(2)) > 0.1
+
+
+def test_what_is_determined_is_told_where_no_other_weights_can_be_found(
+    example_plant: Plant, example_bounds: Bounds, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At a condition number of 5e10 no program proves anything: a fit of hours once ended there."""
+    problem = example(example_plant, example_bounds, "A")
+    expected = identifiability(problem, IDENTITY)
+
+    def undecided(*_: object) -> None:
+        raise SolverError("least condition number", "proven only to 0.89", "scale the states")
+
+    monkeypatch.setattr("impc.assess.identified_directions.other_weights", undecided)
+    found = identifiability(problem, IDENTITY)
+    assert found.others == ()
+    assert (found.rank, found.free) == (expected.rank, expected.free)
+
+
+def test_singular_values_are_those_of_differences(
+    example_plant: Plant, example_bounds: Bounds
+) -> None:
+    """Of the simulated outputs along relative changes of Q and R: three directions and scale."""
+    problem = example(example_plant, example_bounds, "A")
+    columns = []
+    for direction in block_basis(2, 1):
+        pair = []
+        for step in (1e-5, -1e-5):
+            block = np.eye(3) + step * direction
+            solution = solve_lqr(problem.plant, Weights(block[:2, :2], block[2:, 2:]))
+            pair.append(evaluate(problem, solution.K, solution.S).residual)
+        columns.append((pair[0] - pair[1]) / 2e-5)
+    expected = np.linalg.svd(np.column_stack(columns), compute_uv=False)
+    found = identifiability(problem, IDENTITY).singular_values
+    # The differences end at 1e-10 of the largest.
+    np.testing.assert_allclose(found, expected, atol=1e-7 * float(expected[0]))
 
 
 def test_output_penalty_reaches_what_a_derivative_free_search_reaches(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -129,8 +130,26 @@ def _security(cluster: Cluster, address: str) -> Any:
     )
 
 
+@contextmanager
+def _reached(address: str) -> Iterator[None]:
+    """What Dask raises in the block for a scheduler that is gone, as one line."""
+    from distributed.client import ClosedClientError  # noqa: PLC0415  # in the extra `cohort`
+
+    try:
+        yield
+    except (OSError, ClosedClientError, asyncio.CancelledError):
+        raise _was_lost(address) from None
+
+
+def _was_lost(address: str) -> OutputError:
+    return OutputError(
+        f"scheduler {address}", "was lost while tasks were out",
+        "start it again: the same command goes on from what is kept",
+    )  # fmt: skip
+
+
 class _SchedulerWorkers:
-    """The workers of a scheduler, see `Workers`."""
+    """The workers of a scheduler, see `Workers`; OutputError from each when it is lost."""
 
     def __init__(self, client: Client, address: str) -> None:
         self._client, self._address = client, address
@@ -141,30 +160,28 @@ class _SchedulerWorkers:
     def threads(self) -> int:
         """How many tasks run at a time."""
         client: Any = self._client
-        return max(int(sum(client.nthreads().values())), 1)
+        with _reached(self._address):
+            return max(int(sum(client.nthreads().values())), 1)
 
     def submit(self, key: Hashable, work: Callable[..., Any], *given: Any) -> None:
         """As `Workers.submit`."""
-        future = self._client.submit(work, *given, pure=False, retries=0)
+        with _reached(self._address):
+            future = self._client.submit(work, *given, pure=False, retries=0)
         self._keys[future] = key
         self._out.add(future)
 
     def results(self) -> Iterator[Done]:
-        """As `Workers.results`.
-
-        Raises
-        ------
-        OutputError
-            When the scheduler is lost.
-        """
+        """As `Workers.results`."""
         for future in self._out:
-            if future.status in ("cancelled", "lost"):
-                raise OutputError(
-                    f"scheduler {self._address}", "was lost while tasks were out",
-                    "start it again: the same command goes on from what is kept",
-                )  # fmt: skip
-            key, error = self._keys.pop(future), future.exception()
-            fault = "" if error is None else " ".join(f"{type(error).__name__}: {error}".split())
-            value = None if error is not None else future.result()
-            future.release()
-            yield Done(key, value, fault)
+            with _reached(self._address):
+                found = self._received(future)
+            yield found
+
+    def _received(self, future: Any) -> Done:
+        if future.status in ("cancelled", "lost"):
+            raise _was_lost(self._address)
+        key, error = self._keys.pop(future), future.exception()
+        fault = "" if error is None else " ".join(f"{type(error).__name__}: {error}".split())
+        value = None if error is not None else future.result()
+        future.release()
+        return Done(key, value, fault)

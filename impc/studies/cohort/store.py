@@ -16,9 +16,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from impc.errors import OutputError
 from impc.files.sealed import Kept
-from impc.files.writing import require_ordinary
+from impc.files.writing import IN_ITS_PLACE, require_ordinary, unwritable
 from impc.reporting.writer import owned
 
 if TYPE_CHECKING:
@@ -107,16 +106,13 @@ class Store:
         OutputError
             When that cannot be done.
         """
+        path = self.folder / "cohort.log"
         try:
-            require_ordinary(self.folder / "cohort.log")
-            with (self.folder / "cohort.log").open("a", encoding="utf-8") as stream:
+            require_ordinary(path)
+            with path.open("a", encoding="utf-8") as stream:
                 stream.write(line + "\n")
         except OSError as error:
-            raise OutputError(
-                f"file {self.folder / 'cohort.log'}",
-                f"cannot be written ({error.strerror})",
-                "make room and start again",
-            ) from None
+            raise unwritable(f"file {path}", error, IN_ITS_PLACE) from None
 
     @property
     def _kept(self) -> Kept:

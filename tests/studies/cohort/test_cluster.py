@@ -121,6 +121,9 @@ def test_a_scheduler_that_is_lost(
         scheduler.close()
         with pytest.raises(OutputError, match="was lost") as caught:
             list(workers.results())
+        # How many threads it has was asked while nobody knew that it was gone: a defect once.
+        with pytest.raises(OutputError, match="was lost"):
+            assert workers.threads
     assert "\n" not in str(caught.value)
 
 

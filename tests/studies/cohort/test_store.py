@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from pathlib import Path
 from typing import Any
@@ -157,6 +158,37 @@ def test_failed_replicates_are_said_and_no_unit_is_lost(
 
 
 @pytest.mark.usefixtures("blank_figures")
+@pytest.mark.parametrize("text", ["{}", "[]", "null", "[" * 100_000])
+def test_any_file_of_a_folder_may_be_damaged(
+    text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each in turn: the run is refused in one line, or ends with the tables of the first."""
+
+    def draw(task: object, fit: object, index: int) -> dict[str, Any]:
+        return refusing() if index == 1 else replicate_of(index)
+
+    def run() -> dict[str, bytes]:
+        run_and_report(tmp_path, monkeypatch, lambda _: fit_of(0), draw)
+        return {path.name: path.read_bytes() for path in tmp_path.glob("*.csv")}
+
+    right, refused = run(), set()
+    found = sorted(tmp_path.rglob("*.json"))
+    assert len(found) == 2 + 2 * (1 + REPLICATES)  # manifest, result; and of each unit
+    for path in [*found, tmp_path / ".impc"]:
+        whole = path.read_bytes()
+        path.write_text(text)
+        said = ""
+        try:
+            assert run() == right, path
+        except ImpcError as error:
+            said = str(error)
+            refused.add(path.name)
+            path.write_bytes(whole)
+        assert "\n" not in said
+    assert refused == {"fit.json", "replicate-0000.json", "replicate-0002.json", ".impc"}
+
+
+@pytest.mark.usefixtures("blank_figures")
 def test_no_unit_fitted_is_a_report_of_reasons(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -166,11 +198,20 @@ def test_no_unit_fitted_is_a_report_of_reasons(
     assert json.loads((tmp_path / "result.json").read_text())["fitted"] == 0
 
 
-def test_no_room_for_the_log_is_one_line(tmp_path: Path) -> None:
-    (tmp_path / "cohort.log").mkdir()
+@pytest.mark.parametrize("what", ["folder", "pipe", "device"])
+def test_what_stands_in_the_place_of_the_log_is_to_be_moved(what: str, tmp_path: Path) -> None:
+    """Room on the disk would not help, and is not asked for."""
+    path = tmp_path / "cohort.log"
+    if what == "folder":
+        path.mkdir()
+    elif what == "pipe":
+        os.mkfifo(path)
+    else:
+        path.symlink_to("/dev/full")
     with pytest.raises(OutputError, match=r"cohort\.log: cannot be written") as caught:
         Store(tmp_path, DIGESTS).log("run")
     assert "\n" not in str(caught.value)
+    assert caught.value.remedy == "move what is in its place, or give another folder"
 
 
 def test_formulas_are_no_cells() -> None:

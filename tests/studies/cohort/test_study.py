@@ -100,6 +100,13 @@ def test_faults_are_one_sentence(tmp_path: Path, text: str, match: str) -> None:
 HOSTILE = [
     ("table = 't.csv'", "file,subject\n1.csv,../../../../evil\n", "begins oddly|has '/' in it"),
     ("table = 't.csv'", "file,subject\n1.csv,a/b\n", "has '/' in it"),
+    ("table = 't.csv'", "file,subject\n1.csv,../..\n", "begins oddly|has '/' in it"),
+    ("table = 't.csv'", "file,subject\n1.csv,..\n", "begins oddly"),
+    ("table = 't.csv'", "file,subject\n1.csv,/tmp/evil\n", "begins oddly|has '/' in it"),
+    ("table = 't.csv'", "file,subject\n1.csv,C:\\evil\n", "in it"),
+    ("table = 't.csv'", "file,subject,visit\n1.csv,a,../..\n", "begins oddly|has '/' in it"),
+    ("table = 't.csv'", "file,subject,condition\n1.csv,a,/b\n", "begins oddly|has '/' in it"),
+    ("table = 't.csv'", "file,subject,trial\n1.csv,a,b/c\n", "has '/' in it"),
     ("table = 't.csv'", "file,subject\n1.csv,a\\b\n", "in it"),
     ("table = 't.csv'", "file,subject\n1.csv,=HYPERLINK(1)\n", "has '=' in it"),
     ("table = 't.csv'", "file,subject\n1.csv,@SUM(A1)\n", "has '@' in it"),
