@@ -131,6 +131,13 @@ def solve_semidefinite(
     settings.verbose = False
     settings.max_threads = 1
     settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = tolerance
+    # Whoever writes a program scales it. Scaled again, those of a seat's set of weights take 18.7
+    # steps instead of 11.8 and end at gaps up to 1.5e-7 instead of 4e-8; those of least condition
+    # number 24.3 instead of 15.3, and 7e-8 instead of 4e-10.
+    settings.equilibrate_enable = False
+    # Refining each linear system takes a third of the time. Without it programs with a quadratic
+    # term break their cones by up to 3e-6 instead of 3e-12; the linear ones end as they do with it.
+    settings.iterative_refinement_enable = squares is not None
     count = len(objective)
     quadratic = np.zeros((count, count)) if squares is None else np.diag(2 * squares)
     found = clarabel.DefaultSolver(
