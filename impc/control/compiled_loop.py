@@ -347,8 +347,7 @@ def run(
     # One column of T and M after the other: sums over columns then run over all rows at once.
     T, M = np.ascontiguousarray(rows.T.T), np.ascontiguousarray(rows.M.T)
     plant_moves = bool(np.any(dloop.A) or np.any(dloop.B) or np.any(dloop.E))
-    rows_move = bool(np.any(drows.T) or np.any(drows.M) or np.any(drows.b))
-    work = _Workspace(slack, kept, free, factor, basis, v, rounding, dv0, T, M, rows_move)
+    work = _Workspace(slack, kept, free, factor, basis, v, rounding, dv0, T, M)
     weakly_active = 0
     for t in range(first, len(u)):
         if status[t] > _SOFTENED:
@@ -386,7 +385,7 @@ def run(
 
 
 class _Workspace(NamedTuple):
-    """What one sample after the other uses."""
+    """Arrays that one sample after the other uses."""
 
     slack: Buffer
     kept: Buffer
@@ -398,7 +397,6 @@ class _Workspace(NamedTuple):
     dv0: Buffer
     T: Buffer
     M: Buffer
-    rows_move: bool
 
 
 @njit(cache=True)
@@ -552,73 +550,72 @@ def _differentiate(
     x: Buffer,
     dx: Buffer,
 ) -> None:
-    """Write the derivative of the first v; the module `closed_loop` has the equations.
-
-    Backwards, because few numbers are wanted: with w = Gram_aa^-1 N_a e_i and z = N_a'w - S^-1 e_i,
-
-        dv_i = z'q - w'(dM_a v - db_a + dT_a x + T_a dx).
-    """
-    m, n, p, v = work.dv0.shape[0], len(x), dx.shape[1], work.v
-    column, z = np.empty(active), np.empty(len(v))
-    w, on_state, on_metric = np.empty(len(lam)), np.empty(n), np.empty((m, m))
-    for i in range(m):
-        found = work.dv0[i]
-        for a in range(active):
-            column[a] = rows.N[work.free[a], i]
-        substitute(work.factor, active, column)
-        z[:] = 0.0
-        z[:m] = -loop.S[i]
-        w[:] = 0.0
-        on_state[:] = 0.0
-        for a in range(active):
-            r = work.free[a]
-            w[r] = column[a]
-            for k in range(len(v)):
-                z[k] += w[r] * rows.N[r, k]
-            for j in range(n):
-                on_state[j] += w[r] * rows.T[r, j]
-        for j in range(n):
+    """Write the derivative of the first v; the module `closed_loop` has the equations."""
+    v, free, dv0 = work.v, work.free, work.dv0
+    width, p = len(v), dx.shape[1]
+    m, n = dv0.shape[0], len(x)
+    q, dlam = np.zeros((width, p)), np.empty((active, p))
+    for i in range(width):
+        for j in range(m):
             for c in range(p):
-                found[c] -= on_state[j] * dx[j, c]
-        on_metric[:] = 0.0
-        for k in range(len(v)):
-            for j in range(m):
-                on_metric[k % m, j] += z[k] * v[k - k % m + j]
-        for k in range(m):
-            for j in range(m):
-                for c in range(p):
-                    found[c] += on_metric[k, j] * dloop.S[k, j, c]
-        if work.rows_move:
-            _add_row_directions(rows, drows, lam, w, z, v, x, found)
+                q[i, c] += dloop.S[i % m, j, c] * v[i - i % m + j]
+    _add_pulls(rows, drows, lam, m, q)
+    for a in range(active):
+        r = free[a]
+        for c in range(p):
+            dlam[a, c] = -drows.b[r, c]
+        for i in range(n):
+            for c in range(p):
+                dlam[a, c] += drows.T[r, i, c] * x[i] + rows.T[r, i] * dx[i, c]
+        for i in range(_reach(rows, r, m)):
+            for c in range(p):
+                dlam[a, c] += drows.M[r, i, c] * v[i] - rows.N[r, i] * q[i, c]
+    _substitute_all(work.factor, active, dlam)
+    for i in range(m):
+        for j in range(m):
+            for c in range(p):
+                dv0[i, c] -= loop.S[i, j] * q[j, c]
+        for a in range(active):
+            for c in range(p):
+                dv0[i, c] -= rows.N[free[a], i] * dlam[a, c]
+
+
+@njit(cache=True, inline="always")
+def _reach(rows: Rows, r: int, m: int) -> int:
+    """Columns of M before those that row r, at its stage, cannot have."""
+    return min(rows.M.shape[1], m * (rows.stage[r] + 1))  # type: ignore[no-any-return]
 
 
 @njit(cache=True)
-def _add_row_directions(
-    rows: Rows,
-    drows: RowDirections,
-    lam: Buffer,
-    w: Buffer,
-    z: Buffer,
-    v: Buffer,
-    x: Buffer,
-    found: Buffer,
-) -> None:
-    """Add to the derivative of an input what the rows' own derivatives do, row by row."""
+def _add_pulls(rows: Rows, drows: RowDirections, lam: Buffer, m: int, q: Buffer) -> None:
+    """Add dM' lam to q, and what the price of soft rows does."""
     for r in range(len(lam)):
-        if lam[r] == 0.0 and w[r] == 0.0:
-            continue
-        on_bound = w[r]
-        if lam[r] == rows.limit[r]:
-            # The price of a soft row is penalty / b: it moves with the bound.
-            on_bound -= _dot(z, rows.M[r]) * lam[r] / rows.b[r]
-        for c in range(len(found)):
-            found[c] += on_bound * drows.b[r, c]
-        for j in range(len(x)):
-            for c in range(len(found)):
-                found[c] -= w[r] * x[j] * drows.T[r, j, c]
-        for k in range(len(v)):
-            for c in range(len(found)):
-                found[c] += (lam[r] * z[k] - w[r] * v[k]) * drows.M[r, k, c]
+        if lam[r] != 0.0:
+            for i in range(_reach(rows, r, m)):
+                for c in range(q.shape[1]):
+                    q[i, c] += lam[r] * drows.M[r, i, c]
+            if lam[r] == rows.limit[r]:
+                # The price of a soft row is penalty / b: it moves with the bound.
+                for i in range(len(q)):
+                    for c in range(q.shape[1]):
+                        q[i, c] -= rows.M[r, i] * lam[r] / rows.b[r] * drows.b[r, c]
+
+
+@njit(cache=True)
+def _substitute_all(factor: Buffer, count: int, right: Buffer) -> None:
+    """`substitute` for every column of right at once."""
+    for i in range(count):
+        for k in range(i):
+            for c in range(right.shape[1]):
+                right[i, c] -= factor[i, k] * right[k, c]
+        for c in range(right.shape[1]):
+            right[i, c] /= factor[i, i]
+    for i in range(count - 1, -1, -1):
+        for k in range(i + 1, count):
+            for c in range(right.shape[1]):
+                right[i, c] -= factor[k, i] * right[k, c]
+        for c in range(right.shape[1]):
+            right[i, c] /= factor[i, i]
 
 
 @njit(cache=True)
