@@ -85,7 +85,7 @@ def replicate(
     problem : Problem
         At the initial states and parameters of the estimate.
     clean : sequence of Array
-        `simulated_outputs` of the estimate.
+        `simulated_outputs` of the estimate, (samples, p) each.
     start : Weights
         Where the fit begins.
     index : int

@@ -352,12 +352,8 @@ def run(
     for t in range(first, len(u)):
         if status[t] > _SOFTENED:
             needs_qp, near = False, False
-            slack[:] = 0.0
-            for i in range(x.shape[1]):
-                for r in range(count):
-                    slack[r] += T[i, r] * x[t, i]
+            _fill_slack(T, rows.b, x[t], slack)
             for r in range(count):
-                slack[r] = rows.b[r] - slack[r]
                 needs_qp |= not slack[r] >= -kept[r]
                 near |= abs(slack[r]) < _WEAK * rows.b[r]
             v[: u.shape[1]] = 0.0
@@ -382,6 +378,17 @@ def run(
             _hold(x, dx, t)
             return weakly_active, -1
     return weakly_active, -1
+
+
+@njit(cache=True)
+def _fill_slack(T: Buffer, b: Buffer, x: Buffer, slack: Buffer) -> None:
+    """slack = b - T'x, with T one column of the rows after the other."""
+    slack[:] = 0.0
+    for i in range(len(x)):
+        for r in range(len(slack)):
+            slack[r] += T[i, r] * x[i]
+    for r in range(len(slack)):
+        slack[r] = b[r] - slack[r]
 
 
 class _Workspace(NamedTuple):
