@@ -17,7 +17,12 @@ from impc.assess.input_limits import input_limit
 from impc.assess.intervals import LEVEL, Interval, covariance_intervals
 from impc.assess.other_models import fit_alternatives
 from impc.assess.profiles import profile_likelihood
-from impc.assess.resampling import DRAWS, bootstrap_intervals, replicate
+from impc.assess.resampling import (
+    DRAWS,
+    bootstrap_intervals,
+    replicate,
+    simulated_outputs,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -170,13 +175,12 @@ def _bootstrap(
 ) -> tuple[Interval, ...]:
     if not settings.replicates:
         return ()
-    draw, K, S = DRAWS[settings.bootstrap], np.array(estimate.K), np.array(estimate.S)
+    draw, problem = DRAWS[settings.bootstrap], estimate.problem
+    clean = simulated_outputs(problem, np.array(estimate.K), np.array(estimate.S))
     found = []
     for index in range(settings.replicates):
         name = f"replicate {index + 1}"
-        compute = functools.partial(
-            replicate, estimate.problem, K, S, weights, index, settings.seed, draw
-        )
+        compute = functools.partial(replicate, problem, clean, weights, index, settings.seed, draw)
         found.append(remember(name, compute))
         done(name)
     return bootstrap_intervals(estimate, found, settings.bootstrap, LEVEL)

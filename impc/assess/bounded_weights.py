@@ -18,7 +18,8 @@ farther: what the programs then returned was 1.4e-3 from the optimum and called 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.linalg
@@ -31,7 +32,7 @@ from impc.inverse.semidefinite import Cone, matrix_inequality, norm_bound, solve
 from impc.inverse.solution_set import pair_blocks, split_blocks
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from impc.inverse.equivalent_weights import EquivalentWeights
     from impc.inverse.solution_set import GainFibre
@@ -83,23 +84,47 @@ class WeightsSet(Frozen):
     inverse: Array
     reach: float
 
+    @cached_property
+    def cones(self) -> list[Cone]:
+        """t l I <= X <= limit t l I in the variables (y, t), with l I at most I as seen."""
+        n, size = self.fibre.plant.n, len(self.first)
+        seen_first = self.inverse @ self.first @ self.inverse.T
+        seen = self.inverse @ self.level @ self.inverse.T
+        unit = float(1 / np.linalg.norm(self.inverse, 2) ** 2)
+        floor = self.inverse @ self.inverse.T * unit
+        top = self.limit * unit
+        cones = []
+        for block in (slice(0, n), slice(n, size)):
+            below = np.concatenate([seen[:, block, block], -floor[None, block, block]])
+            cones.append(matrix_inequality(seen_first[block, block], below))
+            eye = np.eye(size)[None, block, block]
+            above = np.concatenate([-self.level[:, block, block] / top, eye])
+            cones.append(matrix_inequality(-self.first[block, block] / top, above))
+        return cones
 
-class End(NamedTuple):
+
+@dataclass(frozen=True)
+class End:
     """The member at which a program ends, its value, and what no member goes beyond.
 
     Attributes
     ----------
     value : float
         Of the function at the member.
-    bound : float
-        From the dual program.
     weights : Weights
         The member, at trace R = m.
+    prove : callable
+        Computes `bound`.
     """
 
     value: float
-    bound: float
     weights: Weights
+    prove: Callable[[], float]
+
+    @cached_property
+    def bound(self) -> float:
+        """What no member goes beyond, from the dual program."""
+        return self.prove()
 
 
 @dataclass(frozen=True)
@@ -108,19 +133,21 @@ class Range:
 
     Attributes
     ----------
-    low, high : float
-        Values at the two members.
-    low_bound, high_bound : float
-        What no member goes beyond, by the programs' dual solutions.
-    low_weights, high_weights : Weights
+    least, most : End
     """
 
-    low: float
-    high: float
-    low_bound: float
-    high_bound: float
-    low_weights: Weights
-    high_weights: Weights
+    least: End
+    most: End
+
+    @property
+    def low(self) -> float:
+        """The least value."""
+        return self.least.value
+
+    @property
+    def high(self) -> float:
+        """The largest value."""
+        return self.most.value
 
 
 @checked
@@ -186,8 +213,7 @@ def linear_range(found: WeightsSet, direction: Array) -> Range:
     SolverError
         When a program returns no finite point.
     """
-    low, high = _minimum(found, direction), linear_maximum(found, direction)
-    return Range(low.value, high.value, low.bound, high.bound, low.weights, high.weights)
+    return Range(_minimum(found, direction), linear_maximum(found, direction))
 
 
 @checked(direction="n+m n+m")
@@ -200,7 +226,7 @@ def linear_maximum(found: WeightsSet, direction: Array) -> End:
         When the program returns no finite point.
     """
     end = _minimum(found, -direction)
-    return End(-end.value, -end.bound, end.weights)
+    return End(-end.value, end.weights, lambda: -end.bound)
 
 
 @checked
@@ -244,7 +270,7 @@ def nearest_diagonal(found: WeightsSet, scaling: Array) -> End:
     least = found.least.weights.Q * (m / np.trace(found.least.weights.R))
     unit = float(np.linalg.norm(least[rows, columns] * size))
     if unit == 0 or len(found.level) == 0:  # diagonal as it is, or there is but one
-        return End(unit, unit, found.least.weights)
+        return End(unit, found.least.weights, lambda: unit)
     vectors = found.level[:, rows, columns] * size / unit
     # Variables (y, t, s): s bounds the norm; at the best it is at most 1, that of the least.
     count = len(found.level)
@@ -255,13 +281,13 @@ def nearest_diagonal(found: WeightsSet, scaling: Array) -> End:
     )
     solved = solve_semidefinite(
         np.append(np.zeros(count + 1), 1.0),
-        [*_cones(found, 1), spread],
+        [*_with_one_more(found.cones), spread],
         reach=_reach(found, 1.0),
         tolerance=_GAP,
     )
     X = _member(found, solved.y)
     value = float(np.linalg.norm(X[rows, columns] * size))
-    return End(value, unit * solved.bound, split_blocks(X, n))
+    return End(value, split_blocks(X, n), lambda: unit * solved.bound)
 
 
 @checked
@@ -284,10 +310,11 @@ def extreme_eigenvalue(found: WeightsSet, *, largest: bool) -> End:
     objective = np.append(np.zeros(count + 1), sign)
     # No member's least eigenvalue is above R's mean of 1.
     reach = _reach(found, 1.0 if largest else 1 / unit)
-    solved = solve_semidefinite(objective, [*_cones(found, 1), bound], reach=reach, tolerance=_GAP)
+    cones = [*_with_one_more(found.cones), bound]
+    solved = solve_semidefinite(objective, cones, reach=reach, tolerance=_GAP)
     X = _member(found, solved.y)
     value = float(np.linalg.eigvalsh(X[:n, :n])[-1 if largest else 0])
-    return End(value, sign * unit * solved.bound, split_blocks(X, n))
+    return End(value, split_blocks(X, n), lambda: sign * unit * solved.bound)
 
 
 def _minimum(found: WeightsSet, direction: Array) -> End:
@@ -295,13 +322,12 @@ def _minimum(found: WeightsSet, direction: Array) -> End:
     slopes = np.tensordot(found.level, direction, 2)
     scale = float(np.linalg.norm(slopes))
     if scale == 0:  # the same for every member, or there is but one
-        return End(constant, constant, found.least.weights)
-    solved = solve_semidefinite(
-        np.append(slopes / scale, 0.0), _cones(found), reach=_reach(found), tolerance=_GAP
-    )
+        return End(constant, found.least.weights, lambda: constant)
+    objective = np.append(slopes / scale, 0.0)
+    solved = solve_semidefinite(objective, found.cones, reach=_reach(found), tolerance=_GAP)
     X = _member(found, solved.y)
-    bound = constant + scale * solved.bound
-    return End(float(np.sum(direction * X)), bound, split_blocks(X, found.fibre.plant.n))
+    member = split_blocks(X, found.fibre.plant.n)
+    return End(float(np.sum(direction * X)), member, lambda: constant + scale * solved.bound)
 
 
 def _member(found: WeightsSet, y: Array) -> Array:
@@ -328,32 +354,9 @@ def _member(found: WeightsSet, y: Array) -> Array:
     return np.asarray(centre + inside * (X - centre))
 
 
-def _cones(found: WeightsSet, more: int = 0) -> list[Cone]:
-    """t l I <= X <= limit t l I in the variables (y, t), with l I at most I as seen.
-
-    `more` variables follow that do not occur here.
-    """
-    n, size = found.fibre.plant.n, len(found.first)
-    inverse = found.inverse
-    seen_first = inverse @ found.first @ inverse.T
-    seen = inverse @ found.level @ inverse.T
-    unit = _floor_unit(found)
-    floor = inverse @ inverse.T * unit
-    top = found.limit * unit
-    cones = []
-    for block in (slice(0, n), slice(n, size)):
-        width = block.stop - block.start
-        others = np.zeros((more, width, width))
-        below = np.concatenate([seen[:, block, block], -floor[None, block, block], others])
-        cones.append(matrix_inequality(seen_first[block, block], below))
-        eye = np.eye(size)[None, block, block]
-        above = np.concatenate([-found.level[:, block, block] / top, eye, others])
-        cones.append(matrix_inequality(-found.first[block, block] / top, above))
-    return cones
-
-
-def _floor_unit(found: WeightsSet) -> float:
-    return float(1 / np.linalg.norm(found.inverse, 2) ** 2)
+def _with_one_more(cones: list[Cone]) -> list[Cone]:
+    """The cones with a variable after theirs that does not occur in them."""
+    return [Cone(np.pad(one.rows, ((0, 0), (0, 1))), one.right, one.kind) for one in cones]
 
 
 def _reach(found: WeightsSet, *more: float) -> Array:

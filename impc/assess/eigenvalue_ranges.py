@@ -79,7 +79,7 @@ def eigenvalue_ranges(
     if not members:
         for vector in np.linalg.eigh(centre[:n, :n])[1].T:
             ends = linear_range(found, _on_states(found, vector))
-            known += [ends.low_weights.block, ends.high_weights.block]
+            known += [ends.least.weights.block, ends.most.weights.block]
     values = np.array([np.linalg.eigvalsh(X[:n, :n]) for X in known])
     ranges = []
     for index in range(n):

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.optimize
-import scipy.stats
+import scipy.special
 
 from impc.arrays import Array, Frozen, frozen
 from impc.assess.long_run_covariance import residual_noise, spread_of_sum, white_noise
@@ -126,7 +126,7 @@ def input_limit(fitted: Estimate, control: int = 0, *, level: float = 0.95) -> L
     top = max(_typical_peak(search.fitted, control), search.limit_of(best))
     noise = best.misfit**2 / search.samples
     factor = _colour_factor(best, search.limit_of(best), control)
-    quantile = float(scipy.stats.chi2.ppf(level, 1))
+    quantile = float(scipy.special.chdtri(1, 1 - level))
     unit = noise * factor
 
     def distance(limit: float) -> float:

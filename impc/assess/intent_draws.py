@@ -130,10 +130,11 @@ def drawn_gains(
         return float(a @ a - off @ off - far @ far) / 2
 
     a: Array = np.zeros(len(spread))
+    here = excess(a)
     drawn = []
     for _ in range(count):
         for _ in range(_STEPS):
-            a = _slice(a, excess, rng)
+            a, here = _slice(a, here, excess, rng)
         drawn.append(solve_lqr(plant, Weights(*weights_at(a))))
     return tuple(drawn)
 
@@ -280,16 +281,21 @@ def _gain(plant: Plant, Q: Array, R: Array) -> Array | None:
     return None
 
 
-def _slice(a: Array, excess: Callable[[Array], float], rng: np.random.Generator) -> Array:
-    """One step of elliptical slice sampling from N(0, I) times exp(excess)."""
+def _slice(
+    a: Array, here: float, excess: Callable[[Array], float], rng: np.random.Generator
+) -> tuple[Array, float]:
+    """One step of elliptical slice sampling from N(0, I) times exp(excess); `here` is excess(a)."""
     other = rng.standard_normal(len(a))
-    level = excess(a) + np.log(rng.uniform())
+    level = here + np.log(rng.uniform())
     angle = rng.uniform(0, 2 * np.pi)
     low, high = angle - 2 * np.pi, angle
     while True:
         moved = a * np.cos(angle) + other * np.sin(angle)
-        if excess(moved) > level or high - low < 1e-9:
-            return np.asarray(moved if high - low >= 1e-9 else a)
+        there = excess(moved)
+        if high - low < 1e-9:
+            return a, here
+        if there > level:
+            return moved, there
         low, high = (angle, high) if angle < 0 else (low, angle)
         angle = rng.uniform(low, high)
 

@@ -179,7 +179,7 @@ def _rules(
         ("analytic centre (no units)", lambda: [analytic_centre(fibre).weights]),
         (
             "least trace, states over their size",
-            lambda: [trace_range(members(), sizes).low_weights],
+            lambda: [trace_range(members(), sizes).least.weights],
         ),
         ("nearest to diagonal, states over their size", lambda: [_diagonal(members(), sizes)]),
     ]

@@ -96,7 +96,7 @@ def order_statements(
             direction[i, i], direction[j, j] = sizes[i] ** 2, -(sizes[j] ** 2)
             says = f"a typical {one} costs more than a typical {other}"
             ends = linear_range(found, direction)
-            span = (ends.low_bound, ends.high_bound)  # no member goes beyond
+            span = (ends.least.bound, ends.most.bound)  # no member goes beyond
             statements.append(_statement(found, span, one, other, says, sizes[i], "order"))
     return tuple(statements)
 
@@ -125,7 +125,7 @@ def sense_statements(
             i, j = names.index(one), names.index(other)
             ends, scale = ranges[max(i, j), min(i, j)], sizes[i] * sizes[j]
             says = f"{one} and {other} of the same sign cost more than of opposite signs"
-            span = (scale * ends.low_bound, scale * ends.high_bound)
+            span = (scale * ends.least.bound, scale * ends.most.bound)
             statements.append(_statement(found, span, one, other, says, sizes[i], "sense"))
     return tuple(statements)
 
@@ -150,7 +150,7 @@ def widest_dominant_angle(found: WeightsSet, sizes: Array) -> tuple[float, Weigh
         direction = np.zeros_like(found.first)
         direction[index, index] = 1.0
         ends = linear_range(found, direction)
-        starts += [ends.low_weights.block, ends.high_weights.block]
+        starts += [ends.least.weights.block, ends.most.weights.block]
     best_angle, best = 0.0, found.least.weights.block
     for start in starts:
         X = _frank_wolfe(found, D, centre, start)

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.stats
+import scipy.special
 
 if TYPE_CHECKING:
     from impc.arrays import Array
@@ -80,7 +80,7 @@ def covariance_intervals(
     level : float
         Of the interval, between 0 and 1.
     """
-    z = float(scipy.stats.norm.ppf(0.5 + level / 2))
+    z = float(scipy.special.ndtri(0.5 + level / 2))
     names = entry_names(estimate.problem.plant)
     found = [
         Interval(name, method, level, float(value), float(value - half), float(value + half), told)

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy.optimize
 import scipy.signal
-import scipy.stats
+import scipy.special
 
 from impc.arrays import Array, frozen
 
@@ -136,7 +136,7 @@ def loop_noise(plant: Plant, gain: Array, residuals: list[Array]) -> LoopNoise |
         ((_shares(item.x, shapes, spectrum, p), _root(item.x)) for item in good or [best]),
         key=lambda pair: float(np.max(pair[0])),
     )
-    threshold = float(scipy.stats.chi2.ppf(_LEVEL, m + 1))
+    threshold = float(scipy.special.chdtri(m + 1, 1 - _LEVEL))
     return LoopNoise(frozen(shares), statistic, threshold, root)
 
 

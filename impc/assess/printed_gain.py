@@ -26,6 +26,7 @@ import scipy.optimize
 from impc.arrays import Array, frozen
 from impc.assess.covariance import GainCovariance, gain_covariance
 from impc.assess.long_run_covariance import white_noise
+from impc.checking import replace
 from impc.inverse.arrow import Tolerances
 from impc.inverse.coordinates import Coordinates
 from impc.inverse.many_trials import has_many_trials, search_many
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
     from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
 
-__all__ = ["GainEstimate", "gain_estimate"]
+__all__ = ["GainEstimate", "ToldGain", "gain_estimate", "told_gain"]
 
 # On 60 random plants 51 searches ended after two rounds, 9 after three.
 _ROUNDS = 4
@@ -45,8 +46,8 @@ _SAME = 1e-10
 
 
 @dataclass(frozen=True)
-class GainEstimate:
-    """What the recordings say of the gain.
+class ToldGain:
+    """The gain that the recordings tell.
 
     Attributes
     ----------
@@ -58,18 +59,15 @@ class GainEstimate:
         (m, m); the weights' where the recordings do not tell it.
     misfit : float
         2-norm of the residual.
-    covariance : GainCovariance
-        For noise of the colour that the residuals show, with curvature.
-    white : GainCovariance
-        As if the residuals were white.
+    linear : GainCovariance
+        To first order.
     """
 
     problem: Problem
     K: Array
     S: Array
     misfit: float
-    covariance: GainCovariance
-    white: GainCovariance
+    linear: GainCovariance
 
     @property
     def parameters(self) -> Array:
@@ -80,8 +78,48 @@ class GainEstimate:
         return np.asarray(family.nominal * np.exp(self.problem.logarithms))
 
 
+@dataclass(frozen=True)
+class GainEstimate(ToldGain):
+    """The gain that the recordings tell, and how far it is determined.
+
+    Attributes
+    ----------
+    covariance : GainCovariance
+        For noise of the colour that the residuals show, with curvature.
+    white : GainCovariance
+        As if the residuals were white.
+    """
+
+    covariance: GainCovariance
+    white: GainCovariance
+
+
 def gain_estimate(fitted: Estimate) -> GainEstimate:
     """Estimate the gain behind a fit, and how far it is determined.
+
+    Parameters
+    ----------
+    fitted : Estimate
+        As for `told_gain`.
+
+    Raises
+    ------
+    SolverError
+        As `told_gain`.
+    """
+    here = told_gain(fitted)
+    at = here.problem, here.K, here.S
+    return GainEstimate(
+        *at,
+        here.misfit,
+        here.linear,
+        gain_covariance(*at, curvature=True),
+        gain_covariance(*at, white_noise, curvature=True),
+    )
+
+
+def told_gain(fitted: Estimate) -> ToldGain:
+    """Estimate the gain behind a fit.
 
     Parameters
     ----------
@@ -94,35 +132,16 @@ def gain_estimate(fitted: Estimate) -> GainEstimate:
         When the residual at that gain is not finite.
     """
     K, S = np.array(fitted.gain), np.array(fitted.metric)
-    here = _Found(fitted.problem, K, S, fitted.misfit, gain_covariance(fitted.problem, K, S))
+    here = ToldGain(fitted.problem, K, S, fitted.misfit, gain_covariance(fitted.problem, K, S))
     for _ in range(0 if fitted.explained else _ROUNDS):
         before, here = here, _round(here)
         same = np.count_nonzero(here.linear.told) == np.count_nonzero(before.linear.told)
         if same and here.misfit > (1 - _SETTLED) * before.misfit:
             break
-    at = here.problem, here.K, here.S
-    return GainEstimate(
-        here.problem,
-        frozen(here.K),
-        frozen(here.S),
-        here.misfit,
-        gain_covariance(*at, curvature=True),
-        gain_covariance(*at, white_noise, curvature=True),
-    )
+    return replace(here, K=frozen(here.K), S=frozen(here.S))
 
 
-@dataclass(frozen=True)
-class _Found:
-    """A gain of the search, with its covariance to first order."""
-
-    problem: Problem
-    K: Array
-    S: Array
-    misfit: float
-    linear: GainCovariance
-
-
-def _round(here: _Found) -> _Found:
+def _round(here: ToldGain) -> ToldGain:
     """Least squares over the told directions and everything beside the gain.
 
     What is beside the gain has the normal prior of any search (`fit_gain`): it is not printed with
@@ -135,7 +154,7 @@ def _round(here: _Found) -> _Found:
     there = space.unpack(z)
     misfit = float(np.linalg.norm(space.at(z).residual))
     covariance = gain_covariance(there.problem, there.K, there.S)
-    return _Found(there.problem, there.K, there.S, misfit, covariance)
+    return ToldGain(there.problem, there.K, there.S, misfit, covariance)
 
 
 def _least_squares(space: Coordinates, linear: GainCovariance, noise: float) -> Array:

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy.linalg
 import scipy.optimize
-import scipy.stats
+import scipy.special
 
 from impc.arrays import Array, Frozen, frozen
 from impc.assess.intervals import LEVEL, Interval, entry_names
@@ -83,7 +83,7 @@ def profile_likelihood(estimate: GainEstimate, name: str, level: float = LEVEL) 
         When there is no such entry or parameter.
     """
     search = _Search(estimate, name)
-    quantile = float(scipy.stats.chi2.ppf(level, 1))
+    quantile = float(scipy.special.chdtri(1, 1 - level))
     ends = search.ends(quantile)
     tried = sorted(search.tried)
     low, high = (search.number(offset) for offset in ends)

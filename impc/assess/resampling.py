@@ -19,11 +19,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.signal
-from statsmodels.regression.linear_model import burg
 
 from impc.arrays import Array, Frozen, frozen
 from impc.assess.intervals import Interval, entry_names
-from impc.assess.printed_gain import gain_estimate
+from impc.assess.printed_gain import told_gain
 from impc.checking import replace
 from impc.control.closed_loop import simulate
 from impc.inverse.noisy_fit import fit_controller
@@ -45,6 +44,7 @@ __all__ = [
     "bootstrap_intervals",
     "model_residuals",
     "replicate",
+    "simulated_outputs",
 ]
 
 #: Draws residuals again: (residuals (samples, p) of each trial, generator) -> as many.
@@ -61,7 +61,7 @@ class Replicate(Frozen):
     Attributes
     ----------
     K : Array
-        (m, n), of `gain_estimate`.
+        (m, n), of `told_gain`.
     parameters : Array
         Physical parameters in their units (k,).
     """
@@ -72,8 +72,7 @@ class Replicate(Frozen):
 
 def replicate(
     problem: Problem,
-    gain: Array,
-    metric: Array,
+    clean: Sequence[Array],
     start: Weights,
     index: int,
     seed: int,
@@ -85,8 +84,8 @@ def replicate(
     ----------
     problem : Problem
         At the initial states and parameters of the estimate.
-    gain, metric : Array
-        K (m, n) and S (m, m) of the estimate: what is simulated.
+    clean : sequence of Array
+        `simulated_outputs` of the estimate, (samples, p) each.
     start : Weights
         Where the fit begins.
     index : int
@@ -102,13 +101,16 @@ def replicate(
         When it cannot be fitted.
     """
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index,)))
-    clean, residuals = _split(problem, gain, metric)
+    residuals = [
+        np.asarray(trial.outputs - outputs)
+        for trial, outputs in zip(problem.recordings, clean, strict=True)
+    ]
     drawn = resample(residuals, rng)
     trials = tuple(
         replace(trial, outputs=frozen(outputs + noise))
         for trial, outputs, noise in zip(problem.recordings, clean, drawn, strict=True)
     )
-    again = gain_estimate(fit_controller(replace(problem, recordings=trials), start))
+    again = told_gain(fit_controller(replace(problem, recordings=trials), start))
     return Replicate(again.K, frozen(again.parameters))
 
 
@@ -201,6 +203,9 @@ DRAWS: dict[str, Draw] = {"block": block_residuals, "model": model_residuals}
 
 def _autoregression(parts: list[Array]) -> Array:
     """1, -a_1, ..., -a_r: Burg's on the trials end to end, its order by AIC."""
+    # Imported here: it takes half a second, and only this needs it.
+    from statsmodels.regression.linear_model import burg  # noqa: PLC0415
+
     joined = np.concatenate(parts)
     best, chosen = np.inf, np.array([1.0])
     for order in range(1, _HIGHEST_ORDER + 1):
@@ -211,13 +216,14 @@ def _autoregression(parts: list[Array]) -> Array:
     return np.asarray(chosen)
 
 
-def _split(problem: Problem, gain: Array, metric: Array) -> tuple[list[Array], list[Array]]:
-    """Simulated outputs of every trial, and what is left of the recorded ones."""
+def simulated_outputs(problem: Problem, gain: Array, metric: Array) -> list[Array]:
+    """Outputs (samples, p) of every trial of a `problem` at a `gain` (m, n) and `metric` (m, m).
+
+    Raises
+    ------
+    InputError, SolverError
+        As `controller_for`.
+    """
     controller = controller_for(problem, gain, metric)
     runs = [simulate(controller, drive) for drive in scenarios(problem)]
-    clean = [np.asarray(run.x @ problem.plant.C.T) for run in runs]
-    residuals = [
-        np.asarray(trial.outputs - outputs)
-        for trial, outputs in zip(problem.recordings, clean, strict=True)
-    ]
-    return clean, residuals
+    return [np.asarray(run.x @ problem.plant.C.T) for run in runs]

@@ -131,7 +131,7 @@ def summarise_weights(
     members = [
         weights.block
         for item in ranges.values()
-        for weights in (item.low_weights, item.high_weights)
+        for weights in (item.least.weights, item.most.weights)
     ]
     angle, widest = widest_dominant_angle(found, sizes)
     statements = order_statements(found, sizes, names) + sense_statements(

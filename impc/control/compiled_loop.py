@@ -134,7 +134,9 @@ def solve_dual(
         which it was found, with the combination of rows that should prove it in `lam`; UNSOLVED.
     """
     rows = len(d)
-    slack = d.copy()
+    slack, change, lengths = d.copy(), np.empty(len(d)), np.empty(len(d))
+    for r in range(rows):
+        lengths[r] = np.sqrt(gram[r, r])
     at_limit = np.zeros(rows, dtype=np.bool_)
     is_free = np.zeros(rows, dtype=np.bool_)
     step = np.empty(len(free))
@@ -142,14 +144,14 @@ def solve_dual(
     count = 0
     for _ in range(50 * (rows + 10)):
         row, worst = -1, 0.0
-        noise = _ROUNDING * _largest_pull(gram, lam)
+        noise = _ROUNDING * _largest_pull(lengths, lam)
         for r in range(rows):
             if is_free[r]:
                 continue
             wrong = slack[r] if at_limit[r] else -slack[r]
-            if wrong > tolerance[r] + noise * np.sqrt(gram[r, r]):
+            if wrong > tolerance[r] + noise * lengths[r]:
                 # Distance of v to the row, so that the choice does not depend on its scale.
-                distance = wrong / np.sqrt(gram[r, r]) if gram[r, r] > 0 else np.inf
+                distance = wrong / lengths[r] if lengths[r] > 0 else np.inf
                 if distance > worst:
                     row, worst = r, distance
         if row < 0:
@@ -164,18 +166,18 @@ def solve_dual(
                     part -= factor[k, i] * step[k]
                 step[i] = part / factor[i, i]
             length = np.inf
-            if new > _DEPENDENT * np.sqrt(gram[row, row]):
+            if new > _DEPENDENT * lengths[row]:
                 length = -sign * slack[row] / new**2
             blocked = -1
             room = lam[row] if sign < 0 else limit[row] - lam[row]
             if room <= length:
                 length, blocked = room, count
             for i in range(count):
-                change = -sign * step[i]
-                if change < 0:
-                    room = lam[free[i]] / -change
-                elif change > 0:
-                    room = (limit[free[i]] - lam[free[i]]) / change
+                rate = -sign * step[i]
+                if rate < 0:
+                    room = lam[free[i]] / -rate
+                elif rate > 0:
+                    room = (limit[free[i]] - lam[free[i]]) / rate
                 else:
                     continue
                 if room < length:
@@ -187,11 +189,13 @@ def solve_dual(
                     lam[free[i]] = -step[i]
                 return INCONSISTENT, row
             lam[row] += sign * length
+            # Row after row of the symmetric matrix, because memory is read in that order.
+            change[:] = gram[row]
+            for i in range(count):
+                for r in range(rows):
+                    change[r] -= gram[free[i], r] * step[i]
             for r in range(rows):
-                change = gram[r, row]
-                for i in range(count):
-                    change -= gram[r, free[i]] * step[i]
-                slack[r] += sign * length * change
+                slack[r] += sign * length * change[r]
             for i in range(count):
                 lam[free[i]] -= sign * length * step[i]
             if blocked < 0:
@@ -213,12 +217,11 @@ def solve_dual(
 
 
 @njit(cache=True)
-def _largest_pull(gram: Buffer, lam: Buffer) -> float:
+def _largest_pull(lengths: Buffer, lam: Buffer) -> float:
     """Largest multiplier times the length of its row."""
     largest = 0.0
     for r in range(len(lam)):
-        if lam[r] != 0.0:
-            largest = max(largest, abs(lam[r]) * np.sqrt(gram[r, r]))
+        largest = max(largest, abs(lam[r]) * lengths[r])
     return largest
 
 
@@ -341,14 +344,16 @@ def run(
     v, dv0 = np.zeros(width), np.zeros(du.shape[1:])
     free, factor = np.empty(room, dtype=np.int64), np.empty((room, room))
     basis, rounding = np.empty((room, width)), np.empty(width)
-    work = _Workspace(slack, kept, free, factor, basis, v, rounding, dv0)
+    # One column of T and M after the other: sums over columns then run over all rows at once.
+    T, M = np.ascontiguousarray(rows.T.T), np.ascontiguousarray(rows.M.T)
     plant_moves = bool(np.any(dloop.A) or np.any(dloop.B) or np.any(dloop.E))
+    work = _Workspace(slack, kept, free, factor, basis, v, rounding, dv0, T, M)
     weakly_active = 0
     for t in range(first, len(u)):
         if status[t] > _SOFTENED:
             needs_qp, near = False, False
+            _fill_slack(T, rows.b, x[t], slack)
             for r in range(count):
-                slack[r] = rows.b[r] - _dot(rows.T[r], x[t])
                 needs_qp |= not slack[r] >= -kept[r]
                 near |= abs(slack[r]) < _WEAK * rows.b[r]
             v[: u.shape[1]] = 0.0
@@ -375,6 +380,17 @@ def run(
     return weakly_active, -1
 
 
+@njit(cache=True)
+def _fill_slack(T: Buffer, b: Buffer, x: Buffer, slack: Buffer) -> None:
+    """slack = b - T'x, with T one column of the rows after the other."""
+    slack[:] = 0.0
+    for i in range(len(x)):
+        for r in range(len(slack)):
+            slack[r] += T[i, r] * x[i]
+    for r in range(len(slack)):
+        slack[r] = b[r] - slack[r]
+
+
 class _Workspace(NamedTuple):
     """Arrays that one sample after the other uses."""
 
@@ -386,6 +402,8 @@ class _Workspace(NamedTuple):
     v: Buffer
     rounding: Buffer
     dv0: Buffer
+    T: Buffer
+    M: Buffer
 
 
 @njit(cache=True)
@@ -417,7 +435,7 @@ def _solve(
     if not told:
         return _UNSOLVED, False, -1
     if dx.shape[1]:
-        _differentiate(loop, dloop, rows, drows, lam, free, factor, active, work.v, x, dx, work.dv0)
+        _differentiate(loop, dloop, rows, drows, lam, work, active, x, dx)
     return (_SOFTENED if soft else _ACTIVE), near, -1
 
 
@@ -484,16 +502,18 @@ def _check(
     """
     soft, near, m = False, False, len(unit)
     slack, free, factor, v = work.slack, work.free, work.factor, work.v
-    wrong = np.empty(len(lam))
+    wrong, lefts, sizes = np.empty(len(lam)), slack.copy(), rows.b.copy()
+    for i in range(len(x)):
+        for r in range(len(lam)):
+            sizes[r] += abs(work.T[i, r] * x[i])
+    for i in range(len(v)):
+        for r in range(len(lam)):
+            part = work.M[i, r] * v[i]
+            lefts[r] -= part
+            sizes[r] += abs(part)
     for r in range(len(lam)):
-        left, size, bound = slack[r], rows.b[r], rows.b[r]
-        for i in range(len(x)):
-            size += abs(rows.T[r, i] * x[i])
-        for i in range(len(v)):
-            part = rows.M[r, i] * v[i]
-            left -= part
-            size += abs(part)
-        wrong[r] = abs(left) + _ROW_ROUNDING * size
+        left, bound = lefts[r], rows.b[r]
+        wrong[r] = abs(left) + _ROW_ROUNDING * sizes[r]
         pulled = lam[r] * rows.gram[r, r]
         if lam[r] == rows.limit[r]:
             soft |= left < -_WEAK * bound
@@ -532,35 +552,21 @@ def _differentiate(
     rows: Rows,
     drows: RowDirections,
     lam: Buffer,
-    free: Buffer,
-    factor: Buffer,
+    work: _Workspace,
     active: int,
-    v: Buffer,
     x: Buffer,
     dx: Buffer,
-    dv0: Buffer,
 ) -> None:
     """Write the derivative of the first v; the module `closed_loop` has the equations."""
+    v, free, dv0 = work.v, work.free, work.dv0
     width, p = len(v), dx.shape[1]
     m, n = dv0.shape[0], len(x)
-    q = np.zeros((width, p))
+    q, dlam = np.zeros((width, p)), np.empty((active, p))
     for i in range(width):
-        stage = i - i % m
         for j in range(m):
-            weight = v[stage + j]
             for c in range(p):
-                q[i, c] += dloop.S[i % m, j, c] * weight
-    for r in range(len(lam)):
-        if lam[r] != 0.0:
-            for i in range(width):
-                for c in range(p):
-                    q[i, c] += lam[r] * drows.M[r, i, c]
-            if lam[r] == rows.limit[r]:
-                # The price of a soft row is penalty / b: it moves with the bound.
-                for i in range(width):
-                    for c in range(p):
-                        q[i, c] -= rows.M[r, i] * lam[r] / rows.b[r] * drows.b[r, c]
-    dlam = np.zeros((active, p))
+                q[i, c] += dloop.S[i % m, j, c] * v[i - i % m + j]
+    _add_pulls(rows, drows, lam, m, q)
     for a in range(active):
         r = free[a]
         for c in range(p):
@@ -568,14 +574,10 @@ def _differentiate(
         for i in range(n):
             for c in range(p):
                 dlam[a, c] += drows.T[r, i, c] * x[i] + rows.T[r, i] * dx[i, c]
-        for i in range(width):
+        for i in range(_reach(rows, r, m)):
             for c in range(p):
                 dlam[a, c] += drows.M[r, i, c] * v[i] - rows.N[r, i] * q[i, c]
-    column = np.empty(active)
-    for c in range(p):
-        column[:] = dlam[:, c]
-        substitute(factor, active, column)
-        dlam[:, c] = column
+    _substitute_all(work.factor, active, dlam)
     for i in range(m):
         for j in range(m):
             for c in range(p):
@@ -583,6 +585,44 @@ def _differentiate(
         for a in range(active):
             for c in range(p):
                 dv0[i, c] -= rows.N[free[a], i] * dlam[a, c]
+
+
+@njit(cache=True, inline="always")
+def _reach(rows: Rows, r: int, m: int) -> int:
+    """Columns of M before those that row r, at its stage, cannot have."""
+    return min(rows.M.shape[1], m * (rows.stage[r] + 1))  # type: ignore[no-any-return]
+
+
+@njit(cache=True)
+def _add_pulls(rows: Rows, drows: RowDirections, lam: Buffer, m: int, q: Buffer) -> None:
+    """Add dM' lam to q, and what the price of soft rows does."""
+    for r in range(len(lam)):
+        if lam[r] != 0.0:
+            for i in range(_reach(rows, r, m)):
+                for c in range(q.shape[1]):
+                    q[i, c] += lam[r] * drows.M[r, i, c]
+            if lam[r] == rows.limit[r]:
+                # The price of a soft row is penalty / b: it moves with the bound.
+                for i in range(len(q)):
+                    for c in range(q.shape[1]):
+                        q[i, c] -= rows.M[r, i] * lam[r] / rows.b[r] * drows.b[r, c]
+
+
+@njit(cache=True)
+def _substitute_all(factor: Buffer, count: int, right: Buffer) -> None:
+    """`substitute` for every column of right at once."""
+    for i in range(count):
+        for k in range(i):
+            for c in range(right.shape[1]):
+                right[i, c] -= factor[i, k] * right[k, c]
+        for c in range(right.shape[1]):
+            right[i, c] /= factor[i, i]
+    for i in range(count - 1, -1, -1):
+        for k in range(i + 1, count):
+            for c in range(right.shape[1]):
+                right[i, c] -= factor[k, i] * right[k, c]
+        for c in range(right.shape[1]):
+            right[i, c] /= factor[i, i]
 
 
 @njit(cache=True)
@@ -624,8 +664,9 @@ def _advance(
     for i in range(n):
         x[t + 1, i] = _dot(loop.A[i], x[t]) + _dot(loop.B[i], u) + _dot(loop.E[i], disturbance)
         for j in range(n):
-            for c in range(p):
-                dx[t + 1, i, c] += loop.A[i, j] * dx[t, j, c]
+            if loop.A[i, j] != 0.0:
+                for c in range(p):
+                    dx[t + 1, i, c] += loop.A[i, j] * dx[t, j, c]
         for j in range(len(u)):
             for c in range(p):
                 dx[t + 1, i, c] += loop.B[i, j] * du[j, c]

@@ -188,11 +188,8 @@ def differentiate_rows(controller: Controller, along: Directions) -> RowDirectio
     for k in range(last):
         dpowers[k + 1] = dpowers[k] @ closed + powers[k] @ dclosed
     dresponse = dpowers @ plant.B + powers[:, None] @ dB  # of H Phi^k B, (stage, p, c, m)
-    dM = np.zeros((len(family), controller.horizon * plant.m, along.count))
-    for index in range(along.count):
-        dM[:, :, index] = _inputs(
-            controller, family, stage, dresponse[:, index], np.zeros_like(bounds.F)
-        )
+    dresponse = np.moveaxis(dresponse, 1, -1)
+    dM = _inputs(controller, family, stage, dresponse, np.zeros_like(dresponse[0]))
     dT = np.ascontiguousarray(np.moveaxis(dpowers[stage, :, family], 1, -1))
     return RowDirections(dT, dM, along.bounds[family])
 
@@ -228,12 +225,15 @@ def _powers(controller: Controller, last: int) -> Array:
 def _inputs(
     controller: Controller, family: IntArray, stage: IntArray, response: Array, direct: Array
 ) -> Array:
-    """Place the response H Phi^j B at column k - 1 - j, and the direct term at column k < N."""
+    """Place the response H Phi^j B at column k - 1 - j, and the direct term at column k < N.
+
+    Both may have one axis more, of directions.
+    """
     horizon, m = controller.horizon, controller.plant.m
-    placed = np.zeros((len(family), horizon, m))
+    placed = np.zeros((len(family), horizon, *direct.shape[1:]))
     delay = stage[:, None] - 1 - np.arange(horizon)
     row, column = np.nonzero(delay >= 0)
     placed[row, column] = response[delay[row, column], family[row]]
     inside = np.nonzero(stage < horizon)[0]
     placed[inside, stage[inside]] = direct[family[inside]]
-    return placed.reshape(len(family), horizon * m)
+    return placed.reshape(len(family), horizon * m, *direct.shape[2:])

@@ -291,6 +291,7 @@ def triangular_rows(columns: list[Array]) -> Array:
     triangle = np.zeros((0, width))
     for first in range(0, len(columns[0]), _BLOCK):
         block = np.hstack([part[first : first + _BLOCK] for part in columns])
-        (upper,) = scipy.linalg.qr(np.vstack([triangle, block]), mode="r", check_finite=False)
-        triangle = np.asarray(upper[:width], dtype=np.float64)
+        # "raw" copies the triangle alone, "r" all rows below it too.
+        _, upper = scipy.linalg.qr(np.vstack([triangle, block]), mode="raw", check_finite=False)
+        triangle = np.asarray(upper, dtype=np.float64)
     return triangle

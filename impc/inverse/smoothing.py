@@ -16,11 +16,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy.linalg
 import scipy.optimize
-from statsmodels.tsa.statespace.kalman_smoother import KalmanSmoother
 
 from impc.arrays import Array, Frozen, frozen
 
 if TYPE_CHECKING:
+    from statsmodels.tsa.statespace.kalman_smoother import KalmanSmoother
+
     from impc.inverse.problem import Problem
     from impc.model.plant import Plant
     from impc.model.recordings import Recording
@@ -76,6 +77,9 @@ def smoothed_trials(problem: Problem) -> tuple[Smoothed, ...]:
 
 def _model(problem: Problem, trial: Recording, ratio: float) -> KalmanSmoother:
     """The state-space model of the module's text with states (x, u), at r = 1."""
+    # Imported here: it takes half a second, and few recordings need it.
+    from statsmodels.tsa.statespace.kalman_smoother import KalmanSmoother  # noqa: PLC0415
+
     plant, scale = problem.plant, np.asarray(problem.output_scale)
     n, m, p = plant.n, plant.m, len(plant.outputs)
     model = KalmanSmoother(k_endog=p, k_states=n + m, k_posdef=m)

@@ -100,9 +100,9 @@ def test_ranges_of_several_inputs_are_never_passed() -> None:
         width = ends.high - ends.low
         assert np.min(sampled[:, i, j]) >= ends.low - 1e-7 * width
         assert np.max(sampled[:, i, j]) <= ends.high + 1e-7 * width
-        assert abs(ends.low - ends.low_bound) <= 1e-5 * width
-        assert abs(ends.high - ends.high_bound) <= 1e-5 * width
-        for weights in (ends.low_weights, ends.high_weights):
+        assert abs(ends.low - ends.least.bound) <= 1e-5 * width
+        assert abs(ends.high - ends.most.bound) <= 1e-5 * width
+        for weights in (ends.least.weights, ends.most.weights):
             assert condition_number(weights) <= found.limit * (1 + 1e-4)
             K = solve_lqr(work.problem.plant, Weights(weights.Q, weights.R)).K
             np.testing.assert_allclose(K, work.controller.K, atol=1e-6 * np.max(np.abs(K)))

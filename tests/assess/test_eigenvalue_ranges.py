@@ -52,7 +52,7 @@ def test_ten_states_reach_at_least_what_sampling_does() -> None:
     members = [
         weights.block
         for item in entry_ranges(found, [0, 1]).values()
-        for weights in (item.low_weights, item.high_weights)
+        for weights in (item.least.weights, item.most.weights)
     ]
     ranges = eigenvalue_ranges(found, members)
     sampled = eigenvalues(found, [*random_members(found, 200), *members])

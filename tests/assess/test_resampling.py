@@ -21,6 +21,7 @@ from impc.assess.resampling import (
     bootstrap_intervals,
     model_residuals,
     replicate,
+    simulated_outputs,
 )
 from impc.checking import replace
 from impc.errors import InputError
@@ -49,8 +50,8 @@ def first_order(root: float, samples: int, seed: int) -> Array:
 
 def drawn(fitted: Estimate, index: int, seed: int, draw: Draw) -> Replicate:
     at = gain_estimate(fitted)
-    K, S = np.array(at.K), np.array(at.S)
-    return replicate(at.problem, K, S, fitted.stage_weights, index, seed, draw)
+    clean = simulated_outputs(at.problem, np.array(at.K), np.array(at.S))
+    return replicate(at.problem, clean, fitted.stage_weights, index, seed, draw)
 
 
 def width(found: tuple[Interval, ...]) -> Array:

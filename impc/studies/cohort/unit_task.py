@@ -23,7 +23,7 @@ from impc.assess.held_out import predict
 from impc.assess.intent_rules import intent
 from impc.assess.judged import judge
 from impc.assess.printed_gain import gain_estimate
-from impc.assess.resampling import DRAWS, replicate
+from impc.assess.resampling import DRAWS, replicate, simulated_outputs
 from impc.checking import replace
 from impc.errors import ImpcError
 from impc.files.plant_sources import make_plant, plant_family_of, plant_source
@@ -97,8 +97,7 @@ def replicate_unit(task: FitTask, fit: dict[str, Any], index: int) -> dict[str, 
         here = problem.at(np.array(fit["starts"]), np.array(fit["logarithms"]))
         found = replicate(
             here,
-            np.array(fit["K"]),
-            np.array(fit["S"]),
+            simulated_outputs(here, np.array(fit["K"]), np.array(fit["S"])),
             Weights(fit["Q"], fit["R"]),
             index,
             settings.seed,
