@@ -145,14 +145,15 @@ def solve_semidefinite(
     settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = tolerance
     count = len(objective)
     quadratic = (count, count) if squares is None else np.diag(2 * squares)
-    found = clarabel.DefaultSolver(
+    solver = clarabel.DefaultSolver(
         scipy.sparse.csc_matrix(quadratic),
         objective,
         scipy.sparse.csc_matrix(np.vstack([cone.rows for cone in cones])),
         np.concatenate([cone.right for cone in cones]),
         [cone.kind for cone in cones],
         settings,
-    ).solve()
+    )
+    found = _solved(solver)
     y = np.asarray(found.x, dtype=np.float64)
     if not np.all(np.isfinite(y)):
         raise SolverError("semidefinite program", f"Clarabel: {found.status}", "scale the states")
@@ -163,6 +164,18 @@ def solve_semidefinite(
         return _proved_bound(objective, cones, np.asarray(found.z, dtype=np.float64), reach)
 
     return SemidefiniteSolution(y, str(found.status), prove)
+
+
+def _solved(solver: Any) -> Any:
+    """Its solution; Clarabel panics where an eigenvalue decomposition inside it fails."""
+    try:
+        return solver.solve()
+    except BaseException as error:  # a PanicException is no Exception
+        if type(error).__name__ != "PanicException":
+            raise
+        raise SolverError(
+            "semidefinite program", "Clarabel broke off", "scale the states"
+        ) from None
 
 
 def _proved_bound(objective: Array, cones: list[Cone], dual: Array, reach: Array) -> float:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import clarabel
 import numpy as np
 import pytest
 
+from impc.errors import SolverError
 from impc.inverse.semidefinite import matrix_inequality, norm_bound, solve_semidefinite
 from tests.support import random_weights
 
@@ -37,3 +39,28 @@ def test_a_bound_with_a_norm_is_never_above_the_distance() -> None:
         )
         assert found.bound <= truth * (1 + 1e-14)
         assert found.bound >= truth - 100 * tolerance
+
+
+def test_a_panic_inside_the_solver_is_an_error_of_ours(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As of an eigenvalue decomposition that fails; an interrupt stays what it is."""
+
+    class PanicException(BaseException):
+        pass
+
+    def solver_that_raises(error: BaseException) -> type:
+        class Solver:
+            def __init__(self, *_: object) -> None:
+                pass
+
+            def solve(self) -> None:
+                raise error
+
+        return Solver
+
+    cone = norm_bound(np.eye(1), np.zeros(1), constant=1.0)
+    monkeypatch.setattr(clarabel, "DefaultSolver", solver_that_raises(PanicException("Eigval")))
+    with pytest.raises(SolverError, match="Clarabel broke off"):
+        solve_semidefinite(np.ones(1), [cone])
+    monkeypatch.setattr(clarabel, "DefaultSolver", solver_that_raises(KeyboardInterrupt()))
+    with pytest.raises(KeyboardInterrupt):
+        solve_semidefinite(np.ones(1), [cone])
