@@ -24,7 +24,7 @@ from impc.inverse.diagonal_start import bryson_regulators
 from impc.inverse.many_trials import has_many_trials, search_many
 from impc.inverse.one_step import one_step
 from impc.inverse.problem import recorded_size
-from impc.inverse.quiet_samples import quiet_pairs
+from impc.inverse.quiet_samples import follows_plant, quiet_pairs
 from impc.inverse.residuals import misfit_or_reason
 from impc.model.riccati import is_stable
 
@@ -146,8 +146,9 @@ def fit_gain(
         quiet = quiet_pairs(problem, metrics)
         given, attempts = [*given, *quiet], attempts + len(quiet[:_QUIET_ATTEMPTS])
     found, reason = _best_search(problem, given, attempts, max_evaluations, spread)
-    if found is None:
-        found = _by_single_steps(problem, starts, max_evaluations, spread)
+    if found is None or (not found.explained and problem.plant.m > 1 and follows_plant(problem)):
+        other = _by_single_steps(problem, starts, max_evaluations, spread)
+        found = min(filter(None, (found, other)), key=_preference, default=None)
     if found is None:
         raise SolverError(
             "gain", f"no start can be simulated: {reason}", "give a start of your own"

@@ -18,9 +18,10 @@ import itertools
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy.linalg
 import scipy.optimize
 
-from impc.arrays import Array
+from impc.arrays import Array, BoolArray
 from impc.inverse.consistent_pairs import scaled_changes
 from impc.inverse.problem import recorded_size
 from impc.inverse.residuals import evaluate, unusable
@@ -31,17 +32,22 @@ if TYPE_CHECKING:
 
     from impc.inverse.problem import Problem
     from impc.inverse.residuals import Evaluation
+    from impc.model.plant import Plant
 
 __all__ = ["follows_plant", "quiet_feedback", "quiet_pairs", "recorded_states"]
 
-# Runs looked at, evenly spread.
-_MOST = 500
-# Of the states: noise that a laboratory would call none is above, rounding in files is below.
-_FOLLOWS = 1e-6
+# Runs looked at, evenly spread, and sets of samples from anywhere, for recordings with short runs.
+_MOST, _ANYWHERE = 500, 2000
+# Of the states: noise that a laboratory would call none is above, rounding in files is below. Laws
+# are ranked by digits from there to rounding: with two states chance ones have more samples, to
+# six digits and no more.
+_FOLLOWS, _EXACTLY = 1e-6, 1e-12
 # A command this near to its bound, of the largest, counts as at it.
 _AT_BOUND = 1e-6
-# A run of samples whose states have a larger condition number tells no gain to six digits.
+# A set of samples whose states have a larger condition number tells no gain to six digits.
 _TELLS = 1e6
+# Eigenvalues of S^-1 B'PB are real and between 0 and 1, to the digits that a set tells.
+_BETWEEN = 1e-6
 # Laws that are tried: of 200 random problems the first was the true one in 191, the second in 6.
 _LAWS = 3
 # Misfit, of the recorded outputs, at which no other metric is tried; how far about their start
@@ -96,31 +102,53 @@ def _random_metrics(problem: Problem) -> list[Array]:
 
 
 def quiet_feedback(problem: Problem) -> list[Array]:
-    """B K (n, n) of the gains that many neighbouring samples follow exactly; the most first.
+    """B K (n, n) of the gains that many samples follow to most digits; the best first.
 
     Empty where the recordings do not follow the plant.
     """
     if not follows_plant(problem):
         return []
     x, moved = _free_samples(problem)
-    n, size = problem.plant.n, float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))
-    if len(x) < n or size == 0:
+    n = problem.plant.n
+    if len(x) < n or not np.any(moved):
         return []
-    first = np.arange(0, len(x) - n + 1, max(1, (len(x) - n + 1) // _MOST))
-    runs = first[:, None] + np.arange(n)
-    runs = runs[np.linalg.cond(x[runs]) < _TELLS]
-    laws = -np.swapaxes(np.linalg.solve(x[runs], moved[runs]), 1, 2)
-    wrong = np.linalg.norm(moved + x @ np.swapaxes(laws, 1, 2), axis=2)
-    follow = wrong < _FOLLOWS * size
+    sets = _sets(len(x), n)
+    sets = sets[np.linalg.cond(x[sets]) < _TELLS]
+    laws = -np.swapaxes(np.linalg.solve(x[sets], moved[sets]), 1, 2)
+    laws = laws[_can_be_of_weights(problem.plant, laws)]
+    wrong = [np.linalg.norm(moved + x @ law.T, axis=1) for law in laws]
+    size = np.sqrt(np.mean(np.sum(moved**2, axis=1)))
+    share = np.array(wrong).reshape(-1, len(x)) / size
+    digits = np.log10(_FOLLOWS / np.clip(share, _EXACTLY, _FOLLOWS))
     found: list[Array] = []
     for _ in range(_LAWS):
-        if not np.any(follow):
+        if not np.any(digits):
             break
-        best = follow[int(np.argmax(np.sum(follow, axis=1)))]
+        best = digits[int(np.argmax(np.sum(digits, axis=1)))] > 0
         found.append(-np.linalg.lstsq(x[best], moved[best])[0].T)
         # Other laws of the samples that follow this one are the same again.
-        follow = follow & ~best
+        digits = digits * ~best
     return found
+
+
+def _sets(count: int, n: int) -> Array:
+    """Runs of n of so many samples, and n from anywhere: the same at every call."""
+    first = np.arange(0, count - n + 1, max(1, (count - n + 1) // _MOST))
+    anywhere = np.random.default_rng(0).integers(count, size=(_ANYWHERE, n))
+    return np.concatenate([first[:, None] + np.arange(n), anywhere])
+
+
+def _can_be_of_weights(plant: Plant, laws: Array) -> BoolArray:
+    """Which of the laws B K (k, n, n) leave W A^-1 = B S^-1 B'P the eigenvalues that it has.
+
+    They are those of S^-1 B'PB where S = R + B'PB. Where A is singular, all laws pass.
+    """
+    if np.linalg.matrix_rank(plant.A) < plant.n:
+        return np.full(len(laws), fill_value=True)
+    basis = scipy.linalg.orth(plant.B)
+    values = np.linalg.eigvals(basis.T @ laws @ np.linalg.solve(plant.A, basis))
+    within = (values.real > -_BETWEEN) & (values.real < 1 + _BETWEEN)
+    return np.asarray(np.all(within & (np.abs(values.imag) < _BETWEEN), axis=1))
 
 
 def _free_samples(problem: Problem) -> tuple[Array, Array]:
