@@ -116,6 +116,8 @@ def fit_gain(
     The misfit has local minima, and beyond some of them the gain no longer stabilises the plant
     although the recording ends before that shows. So the search is made from the few most
     promising of the given starts and of a family of regulators, until one explains the recordings.
+    Where none does although they are exact, or none can be simulated, it is made once more from
+    the gain that fits each step by itself (`one_step`).
 
     Parameters
     ----------
@@ -146,7 +148,7 @@ def fit_gain(
         quiet = quiet_pairs(problem, metrics)
         given, attempts = [*given, *quiet], attempts + len(quiet[:_QUIET_ATTEMPTS])
     found, reason = _best_search(problem, given, attempts, max_evaluations, spread)
-    if found is None or (not found.explained and problem.plant.m > 1 and follows_plant(problem)):
+    if found is None or (not found.explained and _is_exact_and_bounded(problem)):
         other = _by_single_steps(problem, starts, max_evaluations, spread)
         found = min(filter(None, (found, other)), key=_preference, default=None)
     if found is None:
@@ -154,6 +156,12 @@ def fit_gain(
             "gain", f"no start can be simulated: {reason}", "give a start of your own"
         )
     return found
+
+
+def _is_exact_and_bounded(problem: Problem) -> bool:
+    """Whether a misfit of several inputs is a local minimum of the search, and not noise."""
+    bounded = np.any(np.isfinite([problem.bounds.u_min, problem.bounds.u_max]))
+    return problem.plant.m > 1 and bool(bounded) and follows_plant(problem)
 
 
 def _by_single_steps(
