@@ -24,7 +24,7 @@ from impc.inverse.diagonal_start import bryson_regulators
 from impc.inverse.many_trials import has_many_trials, search_many
 from impc.inverse.one_step import one_step
 from impc.inverse.problem import recorded_size
-from impc.inverse.quiet_samples import follows_plant, quiet_pairs
+from impc.inverse.quiet_samples import follows_plant, has_bounds, quiet_pairs
 from impc.inverse.residuals import misfit_or_reason
 from impc.model.riccati import is_stable
 
@@ -148,7 +148,7 @@ def fit_gain(
         quiet = quiet_pairs(problem, metrics)
         given, attempts = [*given, *quiet], attempts + len(quiet[:_QUIET_ATTEMPTS])
     found, reason = _best_search(problem, given, attempts, max_evaluations, spread)
-    if found is None or (not found.explained and _is_exact_and_bounded(problem)):
+    if found is None or (not found.explained and _is_local_minimum(problem)):
         other = _by_single_steps(problem, starts, max_evaluations, spread)
         found = min(filter(None, (found, other)), key=_preference, default=None)
     if found is None:
@@ -158,10 +158,9 @@ def fit_gain(
     return found
 
 
-def _is_exact_and_bounded(problem: Problem) -> bool:
-    """Whether a misfit of several inputs is a local minimum of the search, and not noise."""
-    bounded = np.any(np.isfinite([problem.bounds.u_min, problem.bounds.u_max]))
-    return problem.plant.m > 1 and bool(bounded) and follows_plant(problem)
+def _is_local_minimum(problem: Problem) -> bool:
+    """Whether a misfit of several inputs is one of the search, and none of noise or bounds."""
+    return problem.plant.m > 1 and has_bounds(problem) and follows_plant(problem)
 
 
 def _by_single_steps(

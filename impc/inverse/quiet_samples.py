@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from impc.inverse.residuals import Evaluation
     from impc.model.plant import Plant
 
-__all__ = ["follows_plant", "quiet_feedback", "quiet_pairs", "recorded_states"]
+__all__ = ["follows_plant", "has_bounds", "quiet_feedback", "quiet_pairs", "recorded_states"]
 
 # Runs looked at, evenly spread, and sets of samples from anywhere, for recordings with short runs.
 _MOST, _ANYWHERE = 500, 2000
@@ -71,7 +71,8 @@ def quiet_pairs(problem: Problem, metrics: Sequence[Array]) -> list[tuple[Array,
     ----------
     metrics : sequence of Array
         (m, m) each: where a search for a metric begins; random ones follow. They are tried until
-        one explains the recordings, and then it is the only answer.
+        one explains the recordings, and then it is the only answer. Without bounds no metric
+        shows, and the first stands for all.
 
     Returns
     -------
@@ -82,7 +83,8 @@ def quiet_pairs(problem: Problem, metrics: Sequence[Array]) -> list[tuple[Array,
     laws = [W for W in quiet_feedback(problem) if is_stable(plant.A - W, discrete=True)]
     if not laws:
         return []
-    for metric, law in itertools.product([*metrics, *_random_metrics(problem)], laws):
+    tried = [*metrics, *_random_metrics(problem)] if has_bounds(problem) else metrics[:1]
+    for metric, law in itertools.product(tried, laws):
         pair = _Pairs(problem, law, metric).search()
         if pair is None:
             continue
@@ -265,6 +267,13 @@ class _Pairs:
         found, count = self._at(z), len(z)
         on_gain = found.dK.reshape(len(found.residual), -1) @ dK.reshape(count, -1).T
         return np.asarray(on_gain + found.dS.reshape(len(on_gain), -1) @ dS.reshape(count, -1).T)
+
+
+def has_bounds(problem: Problem) -> bool:
+    """Whether any input or state has a bound; the metric shows through bounds only."""
+    bounds = problem.bounds
+    every = np.concatenate([bounds.u_min, bounds.u_max, bounds.x_min, bounds.x_max])
+    return bool(np.any(np.isfinite(every)))
 
 
 def follows_plant(problem: Problem) -> bool:
