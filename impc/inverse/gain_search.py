@@ -44,7 +44,7 @@ _ALONE = 1e-8
 _ROUNDS = 8
 # Searches step by step: of 20 random problems that needed them the fourth helped one.
 _STEP_ATTEMPTS = 4
-# Searches from gains of unbounded samples, whose metrics are still guesses. Other starts are searched
+# Searches from gains of unbounded samples, whose metrics are guesses. Other starts are searched
 # too where these do not explain: ranked with them, wrong pairs of small misfit took all attempts.
 _QUIET_ATTEMPTS = 4
 # A round of a noisy search ends when the misfit falls by less than 1e-6 of itself; the rounds end
