@@ -48,7 +48,7 @@ _AT_BOUND = 1e-6
 _TELLS = 1e6
 # Eigenvalues of S^-1 B'PB are real and between 0 and 1, to the digits that a set tells.
 _BETWEEN = 1e-6
-# Laws that are tried: of 200 random problems the first was the true one in 191, the second in 6.
+# Laws that are tried: of 600 random problems the first was the true one in 597, the second in 2.
 _LAWS = 3
 # Misfit, of the recorded outputs, at which no other metric is tried; how far about their start
 # coordinates (logarithms, in part) are looked for; evaluations of a search, which a valley of one
@@ -84,7 +84,7 @@ def quiet_pairs(problem: Problem, metrics: Sequence[Array]) -> list[tuple[Array,
     if not laws:
         return []
     tried = [*metrics, *_random_metrics(problem)] if has_bounds(problem) else metrics[:1]
-    for metric, law in itertools.product(tried, laws):
+    for law, metric in itertools.product(laws, tried):
         pair = _Pairs(problem, law, metric).search()
         if pair is None:
             continue
