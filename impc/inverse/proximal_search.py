@@ -152,14 +152,20 @@ def conditioned_fit(
     WeightsError
         When the start has no stabilising Riccati solution.
     SolverError
-        When the residual cannot be computed at the start.
+        When the residual cannot be computed at the start, or no step at all.
     """
     here = _first(plant, objective, start)
     radius, evaluations, iteration, stationarity = 0.5, 1, 0, np.inf
     while iteration < max_iterations:
         iteration += 1
         program = _linearise(here, objective)
-        step, predicted = solve_step(program, radius)
+        try:
+            step, predicted = solve_step(program, radius)
+        except SolverError:  # numerical: a step of zero is feasible, a shorter one another program
+            radius /= 4
+            if radius < _LEAST_RADIUS:
+                raise
+            continue
         decrease = here.objective - predicted
         stationarity = max(decrease, 0.0) / max(here.objective * min(radius, 1.0), 1e-300)
         if decrease <= tolerance * here.objective:

@@ -4,12 +4,13 @@ From a sample at which no bound is met within the horizon the plan is v = 0, so 
 
     x_{k+1} - A x_k - E d_k  =  -B K x_k
 
-exactly. Such samples come in runs: each run of n tells B K, and how many others follow it shows
-whether it was one. The pairs (K, S) with that B K that weights have (`consistent_pairs`) are a
-family of m - 1 numbers, of a few more when the inputs outnumber the states, about a loop that is
-stable. On exact recordings of random plants with two and three inputs, searches over all of (K, S)
-end in local minima where a search over the family does not (docs/fitting.md). With noise there is
-no such run, and no start from here.
+exactly. Any n of them tell B K, and to how many digits others follow it shows whether they were
+such: runs of neighbours are tried, since they come in runs, and sets from anywhere. The pairs
+(K, S) with that B K that weights have (`consistent_pairs`) are a family of m - 1 numbers, of a few
+more when the inputs outnumber the states, about a loop that is stable. A search over the family
+has local minima too, but where one over all of (K, S) needs luck with its start, a few metrics to
+begin at were enough in random problems (docs/fitting.md). With noise there are no such samples,
+and no start from here.
 """
 
 from __future__ import annotations

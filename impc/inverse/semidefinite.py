@@ -125,7 +125,7 @@ def solve_semidefinite(
     Raises
     ------
     SolverError
-        When no finite point comes back.
+        When no finite point comes back, or the solver breaks off.
     """
     settings = clarabel.DefaultSettings()
     settings.verbose = False
@@ -133,14 +133,23 @@ def solve_semidefinite(
     settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = tolerance
     count = len(objective)
     quadratic = np.zeros((count, count)) if squares is None else np.diag(2 * squares)
-    found = clarabel.DefaultSolver(
-        scipy.sparse.csc_matrix(quadratic),
-        objective,
-        scipy.sparse.csc_matrix(np.vstack([cone.rows for cone in cones])),
-        np.concatenate([cone.right for cone in cones]),
-        [cone.kind for cone in cones],
-        settings,
-    ).solve()
+    try:
+        found = clarabel.DefaultSolver(
+            scipy.sparse.csc_matrix(quadratic),
+            objective,
+            scipy.sparse.csc_matrix(np.vstack([cone.rows for cone in cones])),
+            np.concatenate([cone.right for cone in cones]),
+            [cone.kind for cone in cones],
+            settings,
+        ).solve()
+    except BaseException as error:
+        # Of Rust: no Exception, and of a class that cannot be imported. One fit of 1200 met it, at
+        # eigenvalues that LAPACK did not find.
+        if type(error).__name__ != "PanicException":
+            raise
+        raise SolverError(
+            "semidefinite program", f"Clarabel: {error}", "scale the states"
+        ) from None
     y = np.asarray(found.x, dtype=np.float64)
     if not np.all(np.isfinite(y)):
         raise SolverError("semidefinite program", f"Clarabel: {found.status}", "scale the states")

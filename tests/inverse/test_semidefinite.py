@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import pytest
 
+from impc.errors import SolverError
 from impc.inverse.semidefinite import matrix_inequality, norm_bound, solve_semidefinite
 from tests.support import random_weights
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 
 @pytest.mark.parametrize("tolerance", [0.3, 1e-2, 1e-4, 1e-6, 1e-9])
@@ -37,3 +43,22 @@ def test_a_bound_with_a_norm_is_never_above_the_distance() -> None:
         )
         assert found.bound <= truth * (1 + 1e-14)
         assert found.bound >= truth - 100 * tolerance
+
+
+def test_a_solver_that_breaks_off_is_an_error_of_ours(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A panic of Rust is no Exception; whatever else is none, an interrupt, passes."""
+
+    def broken(kind: type[BaseException]) -> Callable[..., None]:
+        def solver(*_: object) -> None:
+            raise kind("Eigval error: Eigen(1)")
+
+        return solver
+
+    cone = matrix_inequality(np.eye(2), np.eye(2)[None])
+    panic = type("PanicException", (BaseException,), {})
+    monkeypatch.setattr("clarabel.DefaultSolver", broken(panic))
+    with pytest.raises(SolverError, match="Clarabel: Eigval error"):
+        solve_semidefinite(np.ones(1), [cone])
+    monkeypatch.setattr("clarabel.DefaultSolver", broken(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        solve_semidefinite(np.ones(1), [cone])
