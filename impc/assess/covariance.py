@@ -165,9 +165,8 @@ def gain_covariance(
         told = np.flatnonzero(deviations < TOLD)
         reach = np.minimum(deviations, 1.0)[:, None] * directions
         untold = reach[deviations >= TOLD]
-        steps = (untold @ in_units.T).reshape(-1, m, n)
-        metrics = np.tensordot(untold, with_gain, 1)
-        shifts = _shifts(problem, gain, metric, steps, metrics) @ along[:, told]
+        steps = (untold @ in_units.T).reshape(-1, m, n), np.tensordot(untold, with_gain, 1)
+        shifts = _shifts(problem, gain, metric, *steps) @ along[:, told]
         spread[np.ix_(told, told)] += shifts.T @ shifts / 2
         deviations[usable] = np.sqrt(np.maximum(np.diag(spread), 0.0))
     entries, foreign = _entries(in_units @ directions.T, deviations, spread)

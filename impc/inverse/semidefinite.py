@@ -133,23 +133,14 @@ def solve_semidefinite(
     settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = tolerance
     count = len(objective)
     quadratic = np.zeros((count, count)) if squares is None else np.diag(2 * squares)
-    try:
-        found = clarabel.DefaultSolver(
-            scipy.sparse.csc_matrix(quadratic),
-            objective,
-            scipy.sparse.csc_matrix(np.vstack([cone.rows for cone in cones])),
-            np.concatenate([cone.right for cone in cones]),
-            [cone.kind for cone in cones],
-            settings,
-        ).solve()
-    except BaseException as error:
-        # Of Rust: no Exception, and of a class that cannot be imported. One fit of 1200 met it, at
-        # eigenvalues that LAPACK did not find.
-        if type(error).__name__ != "PanicException":
-            raise
-        raise SolverError(
-            "semidefinite program", f"Clarabel: {error}", "scale the states"
-        ) from None
+    found = _solved(
+        scipy.sparse.csc_matrix(quadratic),
+        objective,
+        scipy.sparse.csc_matrix(np.vstack([cone.rows for cone in cones])),
+        np.concatenate([cone.right for cone in cones]),
+        [cone.kind for cone in cones],
+        settings,
+    )
     y = np.asarray(found.x, dtype=np.float64)
     if not np.all(np.isfinite(y)):
         raise SolverError("semidefinite program", f"Clarabel: {found.status}", "scale the states")
@@ -158,6 +149,19 @@ def solve_semidefinite(
     else:
         bound = _proved_bound(objective, cones, np.asarray(found.z, dtype=np.float64), reach)
     return SemidefiniteSolution(y, bound, str(found.status))
+
+
+def _solved(*program: Any) -> Any:
+    """Clarabel's solution."""
+    try:
+        return clarabel.DefaultSolver(*program).solve()
+    except BaseException as error:
+        # Of Rust: no Exception, and of a class that cannot be imported. One fit of 1200 met it, at
+        # eigenvalues that LAPACK did not find.
+        if type(error).__name__ != "PanicException":
+            raise
+        reason = f"Clarabel: {error}"
+        raise SolverError("semidefinite program", reason, "scale the states") from None
 
 
 def _proved_bound(objective: Array, cones: list[Cone], dual: Array, reach: Array) -> float:
