@@ -156,7 +156,7 @@ def _solved(*program: Any) -> Any:
     try:
         return clarabel.DefaultSolver(*program).solve()
     except BaseException as error:
-        # Of Rust: no Exception, and of a class that cannot be imported. One fit of 1200 met it, at
+        # Of Rust: no Exception, and of a class that cannot be imported. Two fits of 1176 met it, at
         # eigenvalues that LAPACK did not find.
         if type(error).__name__ != "PanicException":
             raise
