@@ -11,9 +11,9 @@ Cramér-Rao bound.
 
 Beside the gain everything else that was fitted is unknown: initial states, physical parameters
 and, for several inputs, the metric S. Gain and metric move within the pairs that weights have
-(`consistent_pairs`): a step of the gain takes the metric along, and what is left for the metric
-alone is m - 1 numbers. The prior of a search (`fit_gain`) is left out: the result
-says what the recordings determine, and in a direction that they hardly do it is wide.
+(`consistent_pairs`): a step of the gain, or of a parameter, takes the metric along, and what is
+left for the metric alone is m - 1 numbers. The prior of a search (`fit_gain`) is left out: the
+result says what the recordings determine, and in a direction that they hardly do it is wide.
 
 To first order a direction that is not told has no part in those that are; to second order it has,
 and it may be wrong by as much as a gain can be. `curvature` adds that (docs/fitting.md).
@@ -29,10 +29,11 @@ import numpy as np
 
 from impc.arrays import Array, BoolArray, Frozen, frozen
 from impc.assess.long_run_covariance import ResidualNoise, residual_noise, spread_of_sum
-from impc.inverse.consistent_pairs import metric_changes, scaled_changes
+from impc.inverse.consistent_pairs import gain_changes, metric_changes, scaled_changes
 from impc.inverse.residuals import evaluate, misfit_or_reason, residual_only
 from impc.inverse.solution_set import natural_coordinates
 from impc.inverse.trial_span import trial_span
+from impc.model.plant_family import plant_differential
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -149,7 +150,9 @@ def gain_covariance(
     metric_columns = _told_metric(_seen(on_metric, metric, alone))
     # What the rest can explain is taken out of the gain's columns; the gain's
     # block of the inverse of H is that of what is left.
-    rest = _span(problem, found, metric_columns, found.dparameters)
+    on_parameters = _on_parameters(problem, found, (gain, metric, T, G), with_gain)
+    rest = _span(problem, found, metric_columns, on_parameters)
+    others = _span(problem, found, on_gain, metric_columns)
     seen = rest.without(on_gain)
     _, values, directions = np.linalg.svd(seen, full_matrices=False)
     usable = values > DETERMINED * values[0]
@@ -162,9 +165,8 @@ def gain_covariance(
         told = np.flatnonzero(deviations < TOLD)
         reach = np.minimum(deviations, 1.0)[:, None] * directions
         untold = reach[deviations >= TOLD]
-        steps = (untold @ in_units.T).reshape(-1, m, n)
-        metrics = np.tensordot(untold, with_gain, 1)
-        shifts = _shifts(problem, gain, metric, steps, metrics) @ along[:, told]
+        steps = (untold @ in_units.T).reshape(-1, m, n), np.tensordot(untold, with_gain, 1)
+        shifts = _shifts(problem, gain, metric, *steps) @ along[:, told]
         spread[np.ix_(told, told)] += shifts.T @ shifts / 2
         deviations[usable] = np.sqrt(np.maximum(np.diag(spread), 0.0))
     entries, foreign = _entries(in_units @ directions.T, deviations, spread)
@@ -176,7 +178,7 @@ def gain_covariance(
         frozen(deviations),
         frozen(entries.reshape(m, n)),
         frozen(foreign.reshape(m, n)),
-        frozen(_parameter_deviations(problem, found, [on_gain, metric_columns], colour)),
+        frozen(_parameter_deviations(problem, on_parameters, others, colour)),
         colour,
     )
 
@@ -245,15 +247,28 @@ def _span(problem: Problem, found: Evaluation, *shared: Array) -> TrialSpan:
     return trial_span(found.dx0, sizes, np.hstack(shared))
 
 
-def _parameter_deviations(
-    problem: Problem, found: Evaluation, others: list[Array], colour: ResidualNoise
+def _on_parameters(
+    problem: Problem, found: Evaluation, at: tuple[Array, Array, Array, Array], with_gain: Array
 ) -> Array:
-    """Standard deviations of the logarithms, everything else being fitted too."""
-    count = len(problem.logarithms)
+    """Derivative (r, k) along the parameters: the gain stands, its metric stays that of weights."""
+    if problem.family is None or problem.plant.m == 1:
+        return found.dparameters
+    _, metric, T, G = at
+    change = plant_differential(problem.family, problem.logarithms)
+    steps = gain_changes(problem.plant, *at, change)
+    back = np.linalg.solve(G, steps @ T).reshape(len(steps), -1)
+    on_metric = found.dS.reshape(len(found.residual), -1)
+    return found.dparameters - _seen(on_metric, metric, np.tensordot(back, with_gain, 1))
+
+
+def _parameter_deviations(
+    problem: Problem, own: Array, others: TrialSpan, colour: ResidualNoise
+) -> Array:
+    """Standard deviations of the logarithms (derivatives `own`), all else being fitted too."""
+    count = own.shape[1]
     if count == 0:
         return np.zeros(0)
-    own = found.dparameters
-    seen = _span(problem, found, *others).without(own)
+    seen = others.without(own)
     _, values, directions = np.linalg.svd(seen, full_matrices=False)
     if values[-1] <= DETERMINED * np.linalg.norm(own, 2):
         return np.full(count, np.inf)

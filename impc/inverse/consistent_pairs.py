@@ -32,6 +32,7 @@ __all__ = [
     "ConsistentGains",
     "consistent_gains",
     "consistent_pair",
+    "gain_changes",
     "metric_changes",
     "scaled_changes",
 ]
@@ -159,6 +160,31 @@ def metric_changes(
     changes = [np.tensordot(rows, units, 1) for rows in (-by_gain @ inverse, left[:, count:].T)]
     with_gain, alone = (np.asarray(back.T @ one @ back) for one in changes)
     return with_gain, alone
+
+
+def gain_changes(
+    plant: Plant, gain: Array, metric: Array, T: Array, G: Array, change: PlantDifferential
+) -> Array:
+    """How a gain follows the plant's k parameters while its metric stands and weights have both.
+
+    Parameters
+    ----------
+    plant : Plant
+    gain, metric : Array
+        K (m, n) and S (m, m).
+    T, G : Array
+        Natural coordinates (n, n) and (m, m).
+    change : PlantDifferential
+        Of the k parameters.
+
+    Returns
+    -------
+    Array
+        (k, m, n): one such change; others differ by those of the gain at the same plant.
+    """
+    gains = consistent_gains(plant, metric, T, G)
+    z = np.tensordot(np.linalg.solve(G, gains.gains @ T), np.linalg.solve(G, gain @ T), 2)
+    return np.asarray(np.linalg.solve(metric, gains.drift(plant, z, change)))
 
 
 def scaled_changes(metric: Array, changes: Array) -> Array:

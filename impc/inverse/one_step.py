@@ -6,9 +6,9 @@ at one sample is carried into all that follow. From one sample to the next nothi
     x_k  as recorded,    u_k = controller(x_k),    x_{k+1} = A x_k + B u_k + E d_k
 
 is compared with the recording at k + 1 only. With noise the answer is biased (x_k is on both sides
-of the equation), so it is a start and no result. Of random problems with three inputs whose exact
-recordings no search over trajectories explains, three in four are explained from here
-(docs/fitting.md).
+of the equation), so it is a start and no result. Of exact recordings of 25 random plants with two
+inputs (seeds 0 to 24 of the test) searches over trajectories alone left three unexplained; all
+three are explained from here.
 """
 
 from __future__ import annotations

@@ -152,14 +152,14 @@ def conditioned_fit(
     WeightsError
         When the start has no stabilising Riccati solution.
     SolverError
-        When the residual cannot be computed at the start.
+        When the residual cannot be computed at the start, or no step at all.
     """
     here = _first(plant, objective, start)
     radius, evaluations, iteration, stationarity = 0.5, 1, 0, np.inf
     while iteration < max_iterations:
         iteration += 1
         program = _linearise(here, objective)
-        step, predicted = solve_step(program, radius)
+        step, predicted, radius = _step(program, radius)
         decrease = here.objective - predicted
         stationarity = max(decrease, 0.0) / max(here.objective * min(radius, 1.0), 1e-300)
         if decrease <= tolerance * here.objective:
@@ -185,6 +185,20 @@ def conditioned_fit(
         stationarity,
         stationarity <= _STATIONARY,
     )
+
+
+def _step(program: StepProgram, radius: float) -> tuple[Array, float, float]:
+    """`solve_step`, within a smaller radius where that fails, and the radius.
+
+    A step of zero is feasible, so failures are numerical, and a shorter step is another program.
+    """
+    while True:
+        try:
+            return *solve_step(program, radius), radius
+        except SolverError:
+            radius /= 4
+            if radius < _LEAST_RADIUS:
+                raise
 
 
 def weight_jacobian(solution: LqrSolution, residual: Residual, basis: Array) -> Array:

@@ -137,7 +137,7 @@ def solve_semidefinite(
     Raises
     ------
     SolverError
-        When no finite point comes back.
+        When no finite point comes back, or the solver breaks off.
     """
     settings = clarabel.DefaultSettings()
     settings.verbose = False
@@ -145,7 +145,7 @@ def solve_semidefinite(
     settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = tolerance
     count = len(objective)
     quadratic = (count, count) if squares is None else np.diag(2 * squares)
-    solver = clarabel.DefaultSolver(
+    found = _solved(
         scipy.sparse.csc_matrix(quadratic),
         objective,
         scipy.sparse.csc_matrix(np.vstack([cone.rows for cone in cones])),
@@ -153,7 +153,6 @@ def solve_semidefinite(
         [cone.kind for cone in cones],
         settings,
     )
-    found = _solved(solver)
     y = np.asarray(found.x, dtype=np.float64)
     if not np.all(np.isfinite(y)):
         raise SolverError("semidefinite program", f"Clarabel: {found.status}", "scale the states")
@@ -166,16 +165,17 @@ def solve_semidefinite(
     return SemidefiniteSolution(y, str(found.status), prove)
 
 
-def _solved(solver: Any) -> Any:
-    """Its solution; Clarabel panics where an eigenvalue decomposition inside it fails."""
+def _solved(*program: Any) -> Any:
+    """Clarabel's solution."""
     try:
-        return solver.solve()
-    except BaseException as error:  # a PanicException is no Exception
+        return clarabel.DefaultSolver(*program).solve()
+    except BaseException as error:
+        # Of Rust: no Exception, and of a class that cannot be imported. Two fits of 1176 met it, at
+        # eigenvalues that LAPACK did not find.
         if type(error).__name__ != "PanicException":
             raise
-        raise SolverError(
-            "semidefinite program", "Clarabel broke off", "scale the states"
-        ) from None
+        reason = f"Clarabel: {error}"
+        raise SolverError("semidefinite program", reason, "scale the states") from None
 
 
 def _proved_bound(objective: Array, cones: list[Cone], dual: Array, reach: Array) -> float:

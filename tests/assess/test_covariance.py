@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import control
 import numpy as np
 import pytest
 
@@ -22,9 +23,15 @@ from impc.checking import replace
 from impc.inverse.diagonal_start import diagonal_weights
 from impc.inverse.noisy_fit import free_gain
 from impc.inverse.problem import Problem
+from impc.inverse.proximal_step import block_basis
 from impc.inverse.residuals import residual_only
+from impc.inverse.solution_set import split_blocks
+from impc.model.plant import Plant
+from impc.model.plant_family import PlantFamily
+from impc.model.riccati import solve_lqr
 from impc.studies.fit.settings import FitSettings
 from impc.studies.fit.subject import fit_problem
+from tests.support import saturated_problem
 
 SETTINGS = FitSettings(horizon=8, u_max=1.0)
 STEP = 1e-6
@@ -63,6 +70,50 @@ def test_deviations_of_two_inputs_count_the_metric_as_unknown() -> None:
     np.testing.assert_allclose(np.ravel(found.entries), deviations(J), rtol=1e-4)
     known = deviations(np.delete(J, [K.size, K.size + 1], axis=1))
     assert np.max(1 - known / deviations(J)) > 0.1
+
+
+def stronger(plant: Plant) -> PlantFamily:
+    """Its first input, and what moves its first state, by one factor."""
+
+    def make(values: Array) -> Plant:
+        A, B = np.array(plant.A), np.array(plant.B)
+        A[0] *= values[0]
+        B[:, 0] *= values[0]
+        every = [*plant.controls, *plant.disturbances]
+        system = control.ss(A, np.hstack([B, plant.E]), plant.C, 0, plant.dt, inputs=every)
+        return Plant(system, plant.controls)
+
+    return PlantFamily(make, ["force"], [1.0])
+
+
+@pytest.mark.parametrize(("m", "seed"), [(2, 6), (3, 2)])
+def test_deviations_where_a_parameter_is_fitted_are_those_of_weights(m: int, seed: int) -> None:
+    """Unit white noise: (J'J)^-1 over Q, R and the parameter, J by differences of simulations.
+
+    At (2, 6) a metric that stands while the parameter moves halves the parameter's deviation, and
+    takes a third off one of the gain's.
+    """
+    rng = np.random.default_rng([14, m, seed])
+    weights, controller, problem = saturated_problem(rng, 2 + seed % 5, m)
+    n, K, S = problem.plant.n, np.array(controller.K), np.array(controller.S)
+    problem = replace(problem, family=stronger(problem.plant), logarithms=np.zeros(1))
+    white = ResidualNoise(np.zeros(n), np.eye(n)[None])
+    found = gain_covariance(problem, K, S, lambda _residuals, _lost: white)
+    units = block_basis(n, m)
+
+    def moved(step: Array) -> tuple[Array, Array]:
+        there = problem.at(problem.recordings[0].x0[None], step[-1:])
+        X = weights.block + np.tensordot(step[:-1], units, 1)
+        solution = solve_lqr(there.plant, split_blocks(X, n))
+        return residual_only(there, np.array(solution.K), np.array(solution.S)), solution.K
+
+    pairs = [(moved(step), moved(-step)) for step in STEP * np.eye(len(units) + 1)]
+    J, dK = (np.array([(a[i] - b[i]) / (2 * STEP) for a, b in pairs]) for i in (0, 1))
+    # What weights cannot be told apart by has singular values of 1e-8, the others 6e-3 and more.
+    back = np.linalg.pinv(J.T, 1e-7)
+    np.testing.assert_allclose(found.parameters, np.linalg.norm(back[-1]), rtol=1e-4)
+    gain = np.linalg.norm(np.tensordot(dK, back, (0, 0)), axis=-1)
+    np.testing.assert_allclose(found.entries, gain, rtol=1e-4)
 
 
 @pytest.mark.parametrize("seed", [52])
