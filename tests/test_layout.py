@@ -68,6 +68,7 @@ ELSEWHERE = {
         inverse/consistent_pairs.py inverse/explaining_weights.py inverse/one_step.py
         inverse/quiet_samples.py""",
     "inverse/test_arrow.py": "inverse/trial_span.py",
+    "inverse/test_structured_fit.py": "inverse/structured_search.py",
     "inverse/test_stationarity.py": "inverse/smoothing.py",
     "model/test_riccati.py": "model/bounds.py model/plant.py model/weights.py",
     "studies/cohort/test_store.py": """
