@@ -25,6 +25,9 @@ ELSEWHERE = {
     "assess/test_covariance.py": "assess/long_run_covariance.py assess/printed_gain.py",
     "assess/test_diagnostics.py": "assess/loop_noise.py assess/residual_structure.py",
     "assess/test_intent_draws.py": "assess/weights_ranges.py studies/fit/tables.py",
+    "assess/test_structures.py": """
+        assess/near_fit.py assess/price_profiles.py assess/structure_test.py
+        assess/structured_weights.py""",
     "assess/test_resampling.py": "assess/intervals.py assess/profiles.py",
     "cli/test_ending.py": "cli/exit_status.py",
     "cli/test_fit.py": """

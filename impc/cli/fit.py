@@ -58,8 +58,9 @@ def _print(result: FitResult) -> None:
     """The table of methods and the intent, as the page has them."""
     from impc.assess.intent_rules import dominant_sentence  # noqa: PLC0415
     from impc.files.columns import in_columns  # noqa: PLC0415
+    from impc.studies.fit.structures import structure_sentences  # noqa: PLC0415
 
-    for line in result.warnings:
+    for line in (*structure_sentences(result), *result.warnings):
         click.echo(line)
     plant = result.fitted.problem.plant
     rows = [("method", *(f"VAF {name}" for name in plant.outputs), "largest input", "")]

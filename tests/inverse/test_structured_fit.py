@@ -78,7 +78,7 @@ def test_the_prices_of_the_seat_without_noise() -> None:
 
 
 @pytest.mark.parametrize("family", [False, True])
-def test_derivatives_through_the_riccati_equation(family: bool) -> None:  # noqa: FBT001
+def test_derivatives_through_the_riccati_equation(family: bool) -> None:
     """Two inputs at their limits; with a family the plant moves the gain too."""
     plant = carts(2)
     structure = Structure(plant, ["x[0]", "x[1] - x[0]", "x[2]", "x[3]"], "full")
@@ -168,7 +168,7 @@ def test_a_structure_of_another_plant_is_refused() -> None:
     truth, push = pushed(Structure(carts(1)), carts(1), np.log([4.0, 1.0]))
     run = truth.simulate(np.zeros(2), disturbance=push)
     trial = Recording(truth.plant, (run.x @ truth.plant.C.T)[:-1], push)
-    with pytest.raises(InputError, match="^structure: has 4 states, what stands before it 2"):
+    with pytest.raises(InputError, match=r"^structure: has 4 states, what stands before it 2"):
         posed(truth, trial, structure=Structure(carts(2)))
 
 

@@ -46,7 +46,7 @@ def test_combinations_are_read(text: str, row: list[float]) -> None:
     "text", ["", "c", "a b", "a +", "2", "a - a", "a*b", "__import__('os')", "a(1)", "a_", "+-a"]
 )
 def test_what_is_no_combination_is_refused(text: str) -> None:
-    with pytest.raises(InputError, match="^feature ") as caught:
+    with pytest.raises(InputError, match=r"^feature ") as caught:
         linear_combination(text, NAMES)
     assert "\n" not in str(caught.value)
 

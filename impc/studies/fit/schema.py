@@ -8,6 +8,8 @@
     intervals.<number>                       of that gain and of the parameters
     warnings, residuals                      sentences; the tests behind them
     intent                                   eigenvalues (ascending), dominant, sentence, readings
+    structures                               of each that was named: prices and ratios with
+                                             intervals, rank, directions, test, vaf, aic
     identifiability                          rank, free, chosen, singular_values
     parameters.<name>                        nominal, value, deviation, determined
     trials                                   label, vaf, whiteness, x0, held_out_vaf, findings
@@ -26,6 +28,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from impc.assess.intent_rules import dominant_sentence
+from impc.studies.fit.structures import structure_data
 
 if TYPE_CHECKING:
     from impc.assess.printed_gain import GainEstimate
@@ -106,6 +109,7 @@ def _found(result: FitResult) -> dict[str, Any]:
             "singular_values": found.singular_values,
         },
         **_certainty(result),
+        "structures": structure_data(result),
         "parameters": {
             item.name: {**asdict(item), "determined": item.determined} for item in result.parameters
         },
