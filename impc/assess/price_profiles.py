@@ -116,7 +116,8 @@ class PriceProfiles:
     def _smallest_seen(self, index: int) -> float:
         """Logarithm of the price that moves the outputs by a tenth of a deviation."""
         column = self.at.without_nuisance(np.array(self.at.on_prices[:, index])[:, None])
-        return float(np.log(0.1 * self.at.noise / max(np.linalg.norm(column), 1e-300)))
+        size = max(float(np.linalg.norm(column)), 1e-300)
+        return float(np.log(0.1 * self.at.noise / size))
 
     def _walk(self, row: Array, near: Array, begin: tuple[float, float], quantile: float) -> float:
         """Where D passes the quantile on the way from a value in growing steps, or infinity."""

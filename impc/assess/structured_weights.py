@@ -186,8 +186,10 @@ class PriceCovariance(Frozen):
 
     def spread(self, combination: Array) -> tuple[float, float]:
         """Deviation of a combination of unknowns (count,), and over that for white residuals."""
-        own = float(np.sqrt(max(combination @ self.covariance @ combination, 0.0)))
-        plain = float(np.sqrt(max(combination @ self.white @ combination, 0.0)))
+        own, plain = (
+            float(np.sqrt(max(float(combination @ matrix @ combination), 0.0)))
+            for matrix in (self.covariance, self.white)
+        )
         blind = self.directions[~np.isfinite(self.deviations)] @ combination
         if np.linalg.norm(blind) > _SHARE * np.linalg.norm(combination) or plain == 0:
             return np.inf, 1.0
@@ -208,12 +210,12 @@ def price_covariance(at: Tangent) -> PriceCovariance:
     along = by_trial(at.problem, seen @ rows[usable].T / sizes[usable] ** 2)
     spread, plain = (spread_of_sum(kind, along) for kind in (colour, white_noise(residuals, lost)))
     deviations = np.full(len(sizes), np.inf)
-    deviations[usable] = np.sqrt(np.maximum(np.diag(spread), 0.0))
+    deviations[usable] = _roots(spread)
     directions = np.zeros((len(sizes), at.structure.count))
     directions[:, moving] = rows
     back = directions[usable]
     covariance = back.T @ spread @ back
-    each = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    each = _roots(covariance)
     blind = np.linalg.norm(directions[~usable], axis=0) > _SHARE
     each[blind | ~moving] = np.inf
     return PriceCovariance(
@@ -227,6 +229,10 @@ def price_covariance(at: Tangent) -> PriceCovariance:
         frozen(back.T @ plain @ back),
         colour,
     )
+
+
+def _roots(covariance: Array) -> Array:
+    return np.asarray(np.sqrt(np.maximum(np.diag(covariance), 0.0)))
 
 
 def fitted_beside(at: Tangent) -> int:

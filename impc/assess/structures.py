@@ -23,7 +23,6 @@ from impc.assess.price_profiles import PriceInterval, PriceProfiles
 from impc.assess.structure_test import StructureTest, structure_test
 from impc.assess.structured_weights import PriceCovariance, price_covariance, tangent
 from impc.assess.variance_accounted_for import vaf
-from impc.checking import replace
 from impc.control.closed_loop import simulate
 from impc.inverse.gain_search import EXPLAINED
 from impc.inverse.problem import scenarios
@@ -220,8 +219,7 @@ def _intervals(
         shift = 2 * float(np.log(sizes[i] / sizes[j]))
         if at.prices[i] - at.prices[j] + shift >= 0:  # the dearer one first
             found = profiles.interval(rows[i] - rows[j])
-            moved = replace(
-                found, value=found.value + shift, low=found.low + shift, high=found.high + shift
-            )
+            ends = (end + shift for end in (found.value, found.low, found.high))
+            moved = PriceInterval(*ends, level=found.level)
             ratios.append(Ratio(structure.labels[i], structure.labels[j], moved))
     return intervals, tuple(ratios)

@@ -197,13 +197,12 @@ class _Target:
             except WeightsError:
                 return np.full(len(self.form) + len(step), 1e6 * max(self.noise, 1.0))
 
+        def derivative(step: Array) -> Array:
+            return np.vstack([regulated(tuple(step))[1], weight * np.eye(len(step))])
+
         try:
             found = scipy.optimize.least_squares(
-                residual,
-                np.zeros(len(prices)),
-                jac=lambda step: np.vstack([regulated(tuple(step))[1], weight * np.eye(len(step))]),
-                ftol=1e-6,
-                max_nfev=40,
+                residual, np.zeros(len(prices)), jac=derivative, ftol=1e-6, max_nfev=40
             )
             far, _ = regulated(tuple(found.x))
         except WeightsError:

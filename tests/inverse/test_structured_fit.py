@@ -100,9 +100,11 @@ def test_derivatives_through_the_riccati_equation(family: bool) -> None:
     exact = space.at(z).jacobian.T @ space.at(z).residual
     for index in range(len(z)):
         step = np.eye(len(z))[index]
-        slope = extrapolated_slope(
-            lambda h, step=step: np.array(np.sum(space.at(z + h * step).residual ** 2) / 2), 1e-4
-        )
+
+        def half(h: float, step: np.ndarray = step) -> np.ndarray:
+            return np.array(np.sum(space.at(z + h * step).residual ** 2) / 2)
+
+        slope = extrapolated_slope(half, 1e-4)
         # Kinks where a limit begins to hold: 1e-6 of the gradient.
         assert exact[index] == pytest.approx(float(slope), rel=1e-4, abs=1e-5 * abs(exact).max())
 
