@@ -231,6 +231,7 @@ def _list(shares: list[np.floating]) -> str:
 
 def _run(given: argparse.Namespace) -> None:
     study = f"{given.plant}, VAF {given.vaf:g}, root {given.root:g}, cross {given.cross:g}"
+    Path(given.out).parent.mkdir(parents=True, exist_ok=True)
     with Path(given.out).open("a", encoding="utf-8") as file:
         for seed in range(given.first, given.first + given.subjects):
             if given.plant == "seat":

@@ -223,7 +223,7 @@ def _entries(back: Array, deviations: Array, spread: Array) -> tuple[Array, Arra
 
 
 def by_trial(problem: Problem, rows: Array) -> list[Array]:
-    """Rows of all trials (r, ...) as one (samples, p, ...) array a trial."""
+    """The `rows` (r, ...) of all trials as one (samples, p, ...) array a trial."""
     p, row, parts = len(problem.plant.outputs), 0, []
     for trial in problem.recordings:
         mine = rows[row : row + trial.outputs.size]

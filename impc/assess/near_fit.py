@@ -6,7 +6,7 @@ the misfit is taken as a quadratic form of gain and metric, known from one simul
     m^2(z) = |q + R (k(z) - k)|^2 + const,       k = (G^-1 K T, S),
 
 R and q the triangle and the residual in the columns of k, without what initial states and
-parameters can make up for, these to first order.
+parameters can make up for, these to first order (docs/structures.md).
 """
 
 from __future__ import annotations
@@ -66,6 +66,13 @@ class NearFit:
             Columns of those that move (moving, a), orthonormal.
         aim : LqrSolution, optional
             Its gain and metric explain the recordings, in the place of what was recorded.
+
+        Returns
+        -------
+        float
+            m^2, up to its constant.
+        Array
+            Unknowns (count,).
         """
         moving = np.isfinite(z)
         offset = self.rest if aim is None else self.triangle @ (self.here - self._place(aim))

@@ -7,7 +7,7 @@ With a combination a'z of the unknowns held at v, all other prices are fitted ag
 
 s^2 the variance of a residual and f the factor by which their colour widens the variance of a'z.
 The interval is {v : D(v) <= q}, q chi-squared's quantile. It has no lower end where the price may
-be zero: the answer is "at most".
+be zero: the answer is "at most" (docs/structures.md).
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class PriceInterval:
     level: float
 
     def holds(self, value: float) -> bool:
-        """Whether a logarithm lies in it."""
+        """Whether a logarithm, `value`, lies in it."""
         return self.low <= value <= self.high
 
 
@@ -104,7 +104,12 @@ class PriceProfiles:
     def zero(self, index: int, level: float = LEVEL) -> PriceInterval:
         """Interval of the price `index` that is zero in the fit: at most its upper end.
 
-        `level` is between 0 and 1.
+        Parameters
+        ----------
+        index : int
+            Of the unknown.
+        level : float
+            Between 0 and 1.
         """
         near = np.array(self.at.prices)
         near[index] = self._smallest_seen(index)

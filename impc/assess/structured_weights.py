@@ -7,7 +7,8 @@ to the unknowns, once initial states and physical parameters have taken what the
 
 of the logarithms of prices, and of the correlations where products of features have prices too
 (`Structure.reported`). A physical parameter moves the gain too, because the weights stay. A price
-of zero stands at its limit and is left out; `price_profiles` gives its upper end.
+of zero stands at its limit and is left out; `price_profiles` gives its upper end
+(docs/structures.md).
 """
 
 from __future__ import annotations
@@ -89,15 +90,33 @@ class Tangent(Frozen):
         return float(np.sqrt(np.mean(self.residual**2)))
 
     def without_nuisance(self, columns: Array, *beside: Array) -> Array:
-        """Columns (r, a) without what initial states, parameters and others (r, b) can make up."""
+        """What initial states, parameters and others cannot make up of columns.
+
+        Parameters
+        ----------
+        columns : Array
+            (r, a).
+        *beside : Array
+            Others (r, b).
+
+        Returns
+        -------
+        Array
+            (r, a).
+        """
         sizes = [trial.outputs.size for trial in self.problem.recordings]
         shared = np.hstack([self.on_parameters, *beside])
         return trial_span(self.found.dx0, sizes, shared).without(columns)
 
     def gain_columns(self) -> tuple[Array, Array]:
-        """Derivative with respect to G^-1 K T (r, m n) with the metric that goes with it.
+        """Derivatives with respect to gain and metric.
 
-        And with respect to what is left for the metric alone (r, b).
+        Returns
+        -------
+        Array
+            Along G^-1 K T, the metric moving with it, (r, mn).
+        Array
+            Along what is left for the metric alone (r, b).
         """
         gain, metric = np.array(self.solution.K), np.array(self.solution.S)
         T, G = natural_coordinates(self.problem.plant, gain)
@@ -111,7 +130,7 @@ class Tangent(Frozen):
         return np.asarray(on_gain + tied), np.asarray(own)
 
     def natural(self, gains: Array) -> Array:
-        """G^-1 K T of gains (..., m, n)."""
+        """G^-1 K T, (..., m, n), of gains (..., m, n)."""
         T, G = natural_coordinates(self.problem.plant, np.array(self.solution.K))
         return np.asarray(np.linalg.solve(G, gains @ T))
 

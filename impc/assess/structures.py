@@ -2,7 +2,7 @@
 
 Each structure is fitted from the weights that fit at all, and again without each trial in turn. The
 criterion is Akaike's for the innovations of the residuals (`other_models`), with two for each
-combination of unknowns that the recordings tell.
+combination of unknowns that the recordings tell (docs/structures.md).
 """
 
 from __future__ import annotations
@@ -77,9 +77,9 @@ class StructureFit(Frozen):
         Of each two features that have a price, when they are priced one by one.
     test : StructureTest or None
     vaf : Array
-        Of each output, all trials together, %.
+        Of each output, all trials together (p,), %.
     held_out : Array
-        Mean over trials left out, of each output, %; NaN when none is.
+        Mean over trials left out, of each output (p,), %; NaN when none is.
     aic : float
         Akaike's criterion.
     """
@@ -109,7 +109,7 @@ class StructureFit(Frozen):
 
 
 def no_structure(structure: Structure, outputs: int, reason: str) -> StructureFit:
-    """A structure of which nothing can be simulated on recordings of so many outputs."""
+    """A structure that cannot be simulated, and the `reason`; recordings have so many `outputs`."""
     nothing, missing = frozen(np.full(outputs, np.nan)), frozen(np.zeros(0))
     return StructureFit(
         structure, None, reason, missing, np.nan, None, (), (), None, nothing, nothing, np.inf

@@ -144,7 +144,15 @@ class Coordinates:
         return Point(np.asarray(gain, dtype=np.float64), metric, problem)
 
     def problem_at(self, starts: Array, parameters: Array) -> Problem:
-        """The problem at coordinates of initial states (trials * n,) and of parameters (k,)."""
+        """The problem at coordinates of its other unknowns.
+
+        Parameters
+        ----------
+        starts : Array
+            Of initial states (trials * n,); (0,) when they are known.
+        parameters : Array
+            (k,).
+        """
         given = np.array([trial.x0 for trial in self.problem.recordings])
         if len(starts):
             given = given + starts.reshape(self.trials, self.n) @ self.start_unit.T

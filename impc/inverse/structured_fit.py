@@ -6,7 +6,8 @@ The misfit of trajectories has local minima in the prices. Near a gain that fits
 quadratic form of the gain, known from one simulation: |J (K(z) - K)|^2, J the derivative of the
 residual with respect to the gain, without what initial states and parameters can make up for. The
 regulators of this small problem take a millisecond, so it is solved from prices by Bryson's rule at
-many prices of the command; from the few ends that differ the recordings themselves are searched.
+many prices of the command; from the few ends that differ the recordings themselves are searched
+(docs/structures.md).
 """
 
 from __future__ import annotations
@@ -122,9 +123,9 @@ def fit_structured(problem: Problem, structure: Structure, near: Estimate) -> Es
 
 
 def feature_sizes(problem: Problem, structure: Structure, gain: Array, metric: Array) -> Array:
-    """Root-mean-square of each feature (k,) under the controller of a gain and a metric.
+    """Root-mean-square of each feature (k,), in its unit; of one that never moves the least other.
 
-    In the feature's unit; one that never moves counts as the least that does.
+    Under the controller of a `gain` (m, n) and a `metric` (m, m).
     """
     controller = controller_for(problem, gain, metric)
     runs = [simulate(controller, drive) for drive in scenarios(problem)]

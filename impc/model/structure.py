@@ -59,6 +59,7 @@ class Structure(Value):
     Attributes
     ----------
     name : str
+        What it is called.
     labels : tuple of str
         Of the features of the states (k,).
     features : Array
@@ -172,10 +173,22 @@ class Structure(Value):
         )
 
     def reported(self, z: Array) -> tuple[Array, Array]:
-        """The unknowns as they are told, and their derivative (count, count), at z (count,).
+        """The unknowns as they are told.
 
         Logarithms of the prices of features, W_ii; where they are coupled, of each pair the
         correlation W_ij / sqrt(W_ii W_jj), between -1 and 1.
+
+        Parameters
+        ----------
+        z : Array
+            (count,).
+
+        Returns
+        -------
+        Array
+            (count,).
+        Array
+            Their derivative with respect to z (count, count).
         """
         z = np.asarray(z, dtype=np.float64)
         beside = np.concatenate([[0.0], z[self._split :]])

@@ -40,7 +40,8 @@ __all__ = ["fit_data"]
 
 def fit_data(result: FitResult, provenance: Provenance) -> dict[str, Any]:
     """Content of result.json."""
-    return _controller(result) | _found(result) | _made(result, provenance)
+    within = {"structures": structure_data(result)}
+    return _controller(result) | _found(result) | within | _made(result, provenance)
 
 
 def _controller(result: FitResult) -> dict[str, Any]:
@@ -109,7 +110,6 @@ def _found(result: FitResult) -> dict[str, Any]:
             "singular_values": found.singular_values,
         },
         **_certainty(result),
-        "structures": structure_data(result),
         "parameters": {
             item.name: {**asdict(item), "determined": item.determined} for item in result.parameters
         },
