@@ -219,7 +219,8 @@ def _intervals(
         shift = 2 * float(np.log(sizes[i] / sizes[j]))
         if at.prices[i] - at.prices[j] + shift >= 0:  # the dearer one first
             found = profiles.interval(rows[i] - rows[j])
-            ends = (end + shift for end in (found.value, found.low, found.high))
-            moved = PriceInterval(*ends, level=found.level)
+            moved = PriceInterval(
+                found.value + shift, found.low + shift, found.high + shift, found.level
+            )
             ratios.append(Ratio(structure.labels[i], structure.labels[j], moved))
     return intervals, tuple(ratios)
