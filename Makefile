@@ -5,7 +5,7 @@
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
-.PHONY: help env demo test full check docs architecture reproduce wheel slow coverage search numerics bench fuzz lock clean
+.PHONY: help env demo test full check docs architecture reproduce wheel slow coverage structures search numerics bench fuzz lock clean
 
 PYTHON ?= python3
 # Not to be set from outside: the environment is made with `venv --clear`.
@@ -44,6 +44,7 @@ help:
 	@echo 'make check   ruff check, ruff format --check, mypy --strict'
 	@echo 'make slow    hundreds of recordings, fits and subjects: an hour'
 	@echo 'make coverage  how often printed intervals hold the truth: the table of docs/fitting.md'
+	@echo 'make structures  coverage of prices, level and power of the test of a structure (hours)'
 	@echo 'make search   new examples for the tests by hypothesis, from a seed that is printed'
 	@echo 'make numerics the numerical tests on other processors and dependencies (an hour; needs uv)'
 	@echo 'make docs    build the site in docs/_build/html; warnings are errors, tutorials run (minutes)'
@@ -114,6 +115,16 @@ numerics: .venv-oldest/.stamp .venv-newest/.stamp
 	$(UV) venv -q --clear --python $(if $(findstring oldest,$@),3.11,3.13) $(@D)
 	$(UV) pip install -q --python $(@D) $(if $(findstring oldest,$@),--resolution lowest-direct) -r pyproject.toml --extra dev
 	@touch $@
+
+# Hundreds of simulated subjects: the table of docs/structures.md.
+STUDY = OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.structure_study
+structures: env
+	$(STUDY) run seat --vaf 90 --subjects 200 --out results/structures-seat.jsonl
+	$(STUDY) run seat --vaf 99 --subjects 200 --out results/structures-seat.jsonl
+	$(STUDY) run carts --test-only --subjects 400 --out results/structures-carts.jsonl
+	$(STUDY) run carts --test-only --root 0.8 --subjects 400 --out results/structures-carts.jsonl
+	$(STUDY) run carts --test-only --cross 0.5 --subjects 100 --out results/structures-carts.jsonl
+	$(STUDY) sum results/structures-seat.jsonl results/structures-carts.jsonl
 
 bench: env
 	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(PY) -m experiments.benchmarks

@@ -59,6 +59,7 @@ if TYPE_CHECKING:
     from impc.model.riccati import LqrSolution as LqrSolution
     from impc.model.riccati import gain_gradients as gain_gradients
     from impc.model.riccati import solve_lqr as solve_lqr
+    from impc.model.structure import Structure as Structure
     from impc.model.weights import Weights as Weights
     from impc.model.weights import condition_number as condition_number
     from impc.model.weights import normalised as normalised
@@ -98,6 +99,7 @@ _NAMES = {
     "model.plant_family": "PlantFamily",
     "model.recordings": "Label Recording",
     "model.riccati": "LqrSolution gain_gradients solve_lqr",
+    "model.structure": "Structure",
     "model.weights": "Weights condition_number normalised weight_error",
     "studies.estimate_page": "report",
     "studies.fit.settings": "FitSettings",

@@ -25,6 +25,9 @@ ELSEWHERE = {
     "assess/test_covariance.py": "assess/long_run_covariance.py assess/printed_gain.py",
     "assess/test_diagnostics.py": "assess/loop_noise.py assess/residual_structure.py",
     "assess/test_intent_draws.py": "assess/weights_ranges.py studies/fit/tables.py",
+    "assess/test_structures.py": """
+        assess/near_fit.py assess/price_profiles.py assess/structure_test.py
+        assess/structured_weights.py""",
     "assess/test_resampling.py": "assess/intervals.py assess/profiles.py",
     "cli/test_ending.py": "cli/exit_status.py",
     "cli/test_fit.py": """
@@ -69,6 +72,7 @@ ELSEWHERE = {
         inverse/consistent_pairs.py inverse/explaining_weights.py inverse/one_step.py
         inverse/quiet_samples.py""",
     "inverse/test_arrow.py": "inverse/trial_span.py",
+    "inverse/test_structured_fit.py": "inverse/structured_search.py",
     "inverse/test_stationarity.py": "inverse/smoothing.py",
     "model/test_riccati.py": "model/bounds.py model/plant.py model/weights.py",
     "studies/cohort/test_store.py": """

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from impc.inverse.residuals import Evaluation
     from impc.inverse.trial_span import TrialSpan
 
-__all__ = ["DETERMINED", "FOREIGN", "TOLD", "GainCovariance", "gain_covariance"]
+__all__ = ["DETERMINED", "FOREIGN", "TOLD", "GainCovariance", "by_trial", "gain_covariance"]
 
 #: A direction whose singular value is below this, of the largest, is not determined at all.
 DETERMINED = 1e-6
@@ -156,9 +156,9 @@ def gain_covariance(
     seen = rest.without(on_gain)
     _, values, directions = np.linalg.svd(seen, full_matrices=False)
     usable = values > DETERMINED * values[0]
-    colour = noise(_by_trial(problem, found.residual), rest.rank + int(np.count_nonzero(usable)))
+    colour = noise(by_trial(problem, found.residual), rest.rank + int(np.count_nonzero(usable)))
     along = seen @ directions[usable].T / values[usable] ** 2
-    spread = spread_of_sum(colour, _by_trial(problem, along))
+    spread = spread_of_sum(colour, by_trial(problem, along))
     deviations = np.full(m * n, np.inf)
     deviations[usable] = np.sqrt(np.maximum(np.diag(spread), 0.0))
     if curvature:
@@ -224,8 +224,8 @@ def _entries(back: Array, deviations: Array, spread: Array) -> tuple[Array, Arra
     return np.where(foreign < FOREIGN, by_itself, whole), foreign
 
 
-def _by_trial(problem: Problem, rows: Array) -> list[Array]:
-    """Rows of all trials as one (samples, p, ...) array a trial."""
+def by_trial(problem: Problem, rows: Array) -> list[Array]:
+    """The `rows` (r, ...) of all trials as one (samples, p, ...) array a trial."""
     p, row, parts = len(problem.plant.outputs), 0, []
     for trial in problem.recordings:
         mine = rows[row : row + trial.outputs.size]
@@ -273,5 +273,5 @@ def _parameter_deviations(
     if values[-1] <= DETERMINED * np.linalg.norm(own, 2):
         return np.full(count, np.inf)
     along = seen @ directions.T / values**2 @ directions
-    spread = spread_of_sum(colour, _by_trial(problem, along))
+    spread = spread_of_sum(colour, by_trial(problem, along))
     return np.sqrt(np.maximum(np.diag(spread), 0.0))

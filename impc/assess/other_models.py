@@ -31,7 +31,13 @@ if TYPE_CHECKING:
     from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
 
-__all__ = ["Alternative", "fit_alternatives", "verdict"]
+__all__ = [
+    "Alternative",
+    "fit_alternatives",
+    "innovations_criterion",
+    "residuals_of",
+    "verdict",
+]
 
 _SAME, _RULED_OUT = 2.0, 10.0
 
@@ -94,7 +100,7 @@ def fit_alternatives(
         for length in horizons
         if length != problem.horizon
     ]
-    roots = np.asarray(residual_noise(_residuals(fitted, fitted.problem)).root)
+    roots = np.asarray(residual_noise(residuals_of(fitted, fitted.problem)).root)
     found = []
     for name, other in posed:
         found.append(_fit(name, other, fitted, settle, roots))
@@ -126,7 +132,7 @@ def _fit(name: str, problem: Problem, fitted: Estimate, settle: float, roots: Ar
         held = [_left_out(problem, found, index, settle) for index in range(_trials(problem))]
     except (WeightsError, SolverError) as error:
         return Alternative(name, problem.horizon, np.inf, np.inf, np.nan, str(error))
-    aic = _criterion(_residuals(found, found.problem), roots)
+    aic = innovations_criterion(residuals_of(found, found.problem), roots)
     mean = float(np.mean(held)) if held else float("nan")
     return Alternative(name, problem.horizon, found.misfit, aic, mean, "")
 
@@ -141,7 +147,8 @@ def _left_out(problem: Problem, found: Estimate, index: int, settle: float) -> A
     return left_out_vaf(fit, problem.recordings[index], settle)[0]
 
 
-def _residuals(found: Estimate, problem: Problem) -> list[Array]:
+def residuals_of(found: Estimate, problem: Problem) -> list[Array]:
+    """Scaled residuals (samples, p) of each trial of a problem under the controller found."""
     flat = residual_only(problem, found.gain, found.metric)
     ends = np.cumsum([trial.outputs.size for trial in problem.recordings])[:-1]
     parts = np.split(flat, ends)
@@ -151,7 +158,11 @@ def _residuals(found: Estimate, problem: Problem) -> list[Array]:
     ]
 
 
-def _criterion(residuals: list[Array], roots: Array) -> float:
+def innovations_criterion(residuals: list[Array], roots: Array) -> float:
+    """Akaike's criterion for residuals (samples, p) of trials, no unknown counted.
+
+    Of their innovations under autoregressions of order one with given `roots` (p,).
+    """
     innovations = np.concatenate([part[1:] - roots * part[:-1] for part in residuals])
     covariance = innovations.T @ innovations / len(innovations)
     return float(len(innovations) * np.linalg.slogdet(covariance)[1])

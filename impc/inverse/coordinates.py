@@ -137,14 +137,26 @@ class Coordinates:
     def unpack(self, z: Array) -> Point:
         """The values at z (q,)."""
         along, factor, starts, parameters = np.split(z, self.ends[:-1])
-        given = np.array([trial.x0 for trial in self.problem.recordings])
-        if len(starts):
-            given = given + starts.reshape(self.trials, self.n) @ self.start_unit.T
-        problem = self.problem.at(given, self.problem.logarithms + PARAMETER_UNIT * parameters)
+        problem = self.problem_at(starts, parameters)
         product = np.tensordot(along, self.gains.products(problem.plant), 1)
         metric = self._metric(factor)
         gain = np.linalg.solve(metric, product)
         return Point(np.asarray(gain, dtype=np.float64), metric, problem)
+
+    def problem_at(self, starts: Array, parameters: Array) -> Problem:
+        """The problem at coordinates of its other unknowns.
+
+        Parameters
+        ----------
+        starts : Array
+            Of initial states (trials * n,); (0,) when they are known.
+        parameters : Array
+            (k,).
+        """
+        given = np.array([trial.x0 for trial in self.problem.recordings])
+        if len(starts):
+            given = given + starts.reshape(self.trials, self.n) @ self.start_unit.T
+        return self.problem.at(given, self.problem.logarithms + PARAMETER_UNIT * parameters)
 
     def at(self, z: Array) -> Compressed:
         """Residual and derivative at z (q,)."""

@@ -82,6 +82,9 @@ class Estimate(Frozen):
         Simulations with derivatives.
     seconds : float
         Time of the method, given what it starts from, s.
+    prices : Array or None
+        Unknowns of the problem's structure (count,), for the method that searches them; minus
+        infinity is a price of zero.
 
     Examples
     --------
@@ -110,6 +113,7 @@ class Estimate(Frozen):
     reason: str
     evaluations: int
     seconds: float
+    prices: Array | None = None
 
     @property
     def gain(self) -> Array:
@@ -190,6 +194,7 @@ def encode_estimate(estimate: Estimate) -> dict[str, Any]:
         "reason": estimate.reason,
         "evaluations": estimate.evaluations,
         "seconds": estimate.seconds,
+        "prices": None if estimate.prices is None else _finite(estimate.prices),
     }
 
 
@@ -217,4 +222,14 @@ def decode_estimate(seen: Problem, kept: dict[str, Any]) -> Estimate:
         kept["reason"],
         kept["evaluations"],
         kept["seconds"],
+        None if kept["prices"] is None else _unknowns(kept["prices"]),
     )
+
+
+def _finite(prices: Array) -> list[float | None]:
+    """Unknowns as JSON has them: None for a price of zero."""
+    return [float(item) if np.isfinite(item) else None for item in prices]
+
+
+def _unknowns(kept: list[float | None]) -> Array:
+    return frozen([-np.inf if item is None else item for item in kept])

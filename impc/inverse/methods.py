@@ -25,6 +25,7 @@ from impc.inverse.groundwork import Found, Groundwork, NaturalUnits, PlantUnits,
 from impc.inverse.problem import recorded_size
 from impc.inverse.residuals import residual_only
 from impc.inverse.stationarity import inverse_kkt
+from impc.inverse.structured_fit import fit_structured
 from impc.model.bounds import Bounds
 from impc.model.weights import normalised
 
@@ -137,6 +138,16 @@ def _preliminary(ground: Groundwork) -> Found | Estimate:
     return Found(np.array(found.K), problem=found.problem.known())
 
 
+def _structured(ground: Groundwork) -> Estimate:
+    structure = ground.problem.structure
+    if structure is None:
+        raise InputError(
+            "structured", "the problem names no structure", "give Problem(..., structure=...)"
+        )
+    assert isinstance(ground, NaturalUnits)  # no row of Table 3.1
+    return fit_structured(ground.problem, structure, ground.fitted)
+
+
 _TABLE = (
     Method(
         "preliminary",
@@ -220,6 +231,14 @@ _TABLE = (
         "Weights whose controller, with its bounds, fits the outputs best.",
         _as_posed,
         lambda ground: ground.inverse_mpc(),
+    ),
+    Method(
+        "structured",
+        "inverse MPC within a structure",
+        "Prices of the features that the user names, whose controller, with its bounds, fits the "
+        "outputs best.",
+        _as_posed,
+        _structured,
     ),
 )
 

@@ -8,7 +8,7 @@ at one sample is carried into all that follow. From one sample to the next nothi
 is compared with the recording at k + 1 only. With noise the answer is biased (x_k is on both sides
 of the equation), so it is a start and no result. Of exact recordings of 25 random plants with two
 inputs (seeds 0 to 24 of the test) searches over trajectories alone left three unexplained; all
-three are explained from here.
+three are explained from here (docs/fitting.md).
 """
 
 from __future__ import annotations

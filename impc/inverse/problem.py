@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
     from impc.model.plant_family import PlantFamily
     from impc.model.recordings import Recording
+    from impc.model.structure import Structure
 
 __all__ = [
     "Problem",
@@ -57,7 +58,7 @@ class Problem(Value):
     horizon : int
         N, in samples.
     recordings : sequence of Recording
-    terminal_set, softening, unknown_start, family
+    terminal_set, softening, unknown_start, family, structure
         See the attributes.
     output_scale : array_like, optional
         (p,), positive; by default the root-mean-square of each output over all recordings, so
@@ -83,6 +84,8 @@ class Problem(Value):
         Plants among which the search goes on; None when the plant is known.
     logarithms : Array
         Logarithms of the family's parameters over their nominal values at which `plant` is (k,).
+    structure : Structure or None
+        What may be costed, for the method "structured"; other methods do not ask.
 
     Raises
     ------
@@ -117,6 +120,7 @@ class Problem(Value):
     unknown_start: bool
     family: PlantFamily | None
     logarithms: Array
+    structure: Structure | None
 
     @checked(horizon=(1, LONGEST_HORIZON), output_scale="p")
     def __init__(
@@ -131,6 +135,7 @@ class Problem(Value):
         output_scale: ArrayLike | None = None,
         unknown_start: bool = False,
         family: PlantFamily | None = None,
+        structure: Structure | None = None,
     ) -> None:
         plant.require_discrete()
         if not recordings:
@@ -150,6 +155,7 @@ class Problem(Value):
             unknown_start=unknown_start,
             family=family,
             logarithms=frozen(np.zeros(0 if family is None else len(family.names))),
+            structure=structure,
         )
 
     def without_bounds(self) -> Problem:

@@ -34,6 +34,7 @@ __all__ = [
     "is_stable",
     "lyapunov_series",
     "metric_gradients",
+    "regulator_changes",
     "solve_lqr",
 ]
 
@@ -222,6 +223,35 @@ def metric_gradients(solution: LqrSolution) -> Gradients:
     units = np.eye(m * m).reshape(m * m, m, m)
     gradients = _adjoint(solution, B @ units @ B.T, units)
     return Gradients(gradients.Q.reshape(m, m, n, n), gradients.R.reshape(m, m, m, m))
+
+
+def regulator_changes(
+    solution: LqrSolution, dQ: Array, dR: Array, dA: Array, dB: Array
+) -> tuple[Array, Array]:
+    """Change of the gain and of the metric of a discrete plant along k directions.
+
+    With dF = dA - dB K and the gain held:  dP = F'dP F + dF'PF + F'P dF + dQ + K'dR K,
+    S dK = dB'PF + B'dP F + B'P dF - dR K,  dS = dR + dB'PB + B'dP B + B'P dB.
+
+    Parameters
+    ----------
+    solution : LqrSolution
+    dQ, dR, dA, dB : Array
+        Directions of the weights (k, n, n), (k, m, m) and of the plant (k, n, n), (k, n, m).
+
+    Returns
+    -------
+    dK, dS : Array
+        (k, m, n) and (k, m, m).
+    """
+    B, P, K, F = solution.plant.B, solution.P, solution.K, solution.F
+    dF = dA - dB @ K
+    turned = F.T @ P @ dF
+    dP = lyapunov_series(F.T, turned + turned.transpose(0, 2, 1) + dQ + K.T @ dR @ K)
+    beside = dB.transpose(0, 2, 1) @ P
+    product = beside @ F + B.T @ dP @ F + B.T @ P @ dF - dR @ K
+    dS = dR + beside @ B + B.T @ dP @ B + (beside @ B).transpose(0, 2, 1)
+    return np.asarray(np.linalg.solve(solution.S, product)), np.asarray(dS)
 
 
 def _adjoint(solution: LqrSolution, source: Array, direct: Array) -> Gradients:

@@ -34,11 +34,14 @@ from impc.files.reading import read_recordings, recording_of
 from impc.files.results import read_result
 from impc.files.sealed import Kept
 from impc.files.table import Table, make_table
+from impc.inverse.problem import Problem
+from impc.inverse.structured_fit import fit_structure
 from impc.jit import keep_caches
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.recordings import Recording
 from impc.model.riccati import solve_lqr
+from impc.model.structure import Structure
 from impc.model.weights import Weights
 from impc.reporting.writer import owned, require_writable, write_files
 from impc.studies.cohort import cluster
@@ -47,7 +50,7 @@ from impc.studies.cohort.sheet import Sheet, column_values, read_sheet
 from impc.studies.cohort.store import Store, open_store
 from impc.studies.cohort.study import read_study
 from impc.studies.effort import Effort
-from impc.studies.fit.settings import FitSettings, fit_settings, require_used
+from impc.studies.fit.settings import FitSettings, fit_settings, fit_structures, require_used
 from impc.studies.fit.subject import fit_problem
 from impc.studies.selection.subsets import largest_subsets
 from plants import seated_balance_plant
@@ -329,6 +332,25 @@ def caches_without_a_home(folder: Path) -> str:
         return f"impc: note: {keep_caches()}"
 
 
+def running_away() -> Plant:
+    """State p grows by itself, q does not and knows nothing of it."""
+    system = control.ss(
+        np.diag([3.0, 0.5]), [[1.0, 1.0], [0.0, 0.0]], [[1.0, 0.0]], 0, 1, states=["p", "q"],
+        inputs=["u", "push"],
+    )  # fmt: skip
+    return Plant(system, ["u"])
+
+
+def held_by_nobody(_: Path) -> None:
+    """A push far beyond the limit: whatever the prices, the plant runs away."""
+    plant = running_away()
+    structure = Structure(plant, ["p"])
+    limits = Bounds(plant, u_min=-1, u_max=1)
+    law = Controller(plant, structure.weights(np.zeros(1)), limits, 3)
+    trial = Recording(plant, np.zeros((900, 1)), np.full(900, 50.0))
+    fit_structure(Problem(plant, limits, 3, [trial]), structure, law.K, law.S)
+
+
 def too_many_subsets(_: Path) -> None:
     largest_subsets([np.eye(40)], 2.0)
 
@@ -388,6 +410,12 @@ PROVOKED: dict[str, Callable[[Path], object]] = {
     "sample ...: ...; what follows is NaN": beyond_feasibility,
     "method: got ...; choose one of ...": lambda _: fit_settings({"methods": ["best"]}),
     "[fit] ...: is not a setting; known: ...": lambda _: fit_settings({"horzon": 20}),
+    "[fit.structure] ...: is not a setting; known: ...": lambda _: fit_settings(
+        {"structure": {"q": "diagonal"}}
+    ),
+    "[fit] structures: has '...' twice; name each by itself": lambda _: fit_structures(
+        running_away(), fit_settings({"structure": {}, "structures": [{}]})
+    ),
     "is still '?'; fill in the column's unit": damaged("unit not filled in"),
     "is still '?'; fill in its name in the file": asked_for('column = "trunk"', 'column = "?"'),
     "is still '?'; fill it in, or take the line out": lambda _: fit_settings({"u_max": "?"}),
@@ -440,6 +468,16 @@ PROVOKED: dict[str, Callable[[Path], object]] = {
         control.ss([[2, 0], [0, 0.5]], [[0], [1]], np.eye(2), 0, 0.1)
     ),
     "all its inputs are recorded": everything_recorded,
+    "feature '...': expected ...; combine ... with numbers, + and -": lambda _: Structure(
+        running_away(), ["sin(x)"]
+    ),
+    "different prices of ... make the same weights; leave one out": lambda _: Structure(
+        running_away(), ["p", "2 p"]
+    ),
+    "leaves the mode ..., which does not decay by itself, without a price; price one of ...": (
+        lambda _: Structure(running_away(), ["q"])
+    ),
+    "none of its regulators can be simulated on the recordings": held_by_nobody,
     "have no stabilising Riccati solution (...)": lambda _: solve_lqr(
         cart(1.0), Weights(np.zeros((1, 1)), 1)
     ),

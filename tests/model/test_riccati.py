@@ -13,10 +13,11 @@ from impc.model.riccati import (
     gain_gradients,
     lyapunov_series,
     metric_gradients,
+    regulator_changes,
     solve_lqr,
 )
 from impc.model.weights import Weights
-from tests.support import random_plant, random_weights
+from tests.support import extrapolated_slope, random_plant, random_weights
 
 
 def continuous_plant(rng: np.random.Generator) -> Plant:
@@ -99,3 +100,22 @@ def test_a_mode_without_weight_is_an_error() -> None:
 def test_sizes_are_compared(example_plant: Plant) -> None:
     with pytest.raises(InputError, match="weights: has 3 states, what stands before it 2"):
         solve_lqr(example_plant, Weights(np.eye(3), 1))
+
+
+def test_changes_of_a_regulator_along_weights_and_plant() -> None:
+    """Forward differential of gain and metric against extrapolated differences."""
+    rng = np.random.default_rng(3)
+    plant, weights = random_plant(rng, 4, 2, 1.2), Weights(random_weights(rng, 4), np.eye(2))
+    dQ, dR = random_weights(rng, 4), random_weights(rng, 2)
+    dA, dB = rng.normal(size=(4, 4)), rng.normal(size=(4, 2))
+
+    def regulator(step: float) -> np.ndarray:
+        moved = control.ss(plant.A + step * dA, plant.B + step * dB, plant.C, 0, plant.dt)
+        there = Weights(weights.Q + step * dQ, weights.R + step * dR)
+        found = solve_lqr(Plant(moved), there)
+        return np.concatenate([found.K.ravel(), found.S.ravel()])
+
+    found = regulator_changes(solve_lqr(plant, weights), *(part[None] for part in (dQ, dR, dA, dB)))
+    exact = np.concatenate([part[0].ravel() for part in found])
+    # Ridders' table leaves 1e-10 here.
+    np.testing.assert_allclose(exact, extrapolated_slope(regulator, 1e-3), rtol=1e-7, atol=1e-8)

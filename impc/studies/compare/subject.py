@@ -25,8 +25,9 @@ if TYPE_CHECKING:
 
 __all__ = ["compare_recordings", "compared_methods", "stages"]
 
-# Needs states to be named; and what is compared in its two parts.
-_LEFT_OUT = ("preliminary", "inverse_lqr")
+# Needs states to be named; what is compared in its two parts; and what needs a structure, which has
+# a table of its own in `impc fit`.
+_LEFT_OUT = ("preliminary", "inverse_lqr", "structured")
 
 
 def compared_methods() -> tuple[str, ...]:

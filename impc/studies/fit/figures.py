@@ -20,6 +20,7 @@ from impc.reporting.style import (
     new_figure,
 )
 from impc.studies.fit.sentences import trial_name
+from impc.studies.fit.structures import price_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -53,6 +54,8 @@ def fit_figures(result: FitResult) -> dict[str, bytes]:
         figures["residuals"] = _residuals(result)
         figures["intent"] = _intent(result)
         figures["methods"] = _methods(result)
+        if result.structures and result.structures[0].ratios:
+            figures["structured-weights"] = price_figure(result)
         return drawn(figures)
 
 

@@ -30,6 +30,7 @@ from impc.studies.fit.sentences import (
     findings,
     trial_name,
 )
+from impc.studies.fit.structures import structure_section
 from impc.studies.fit.tables import (
     alternatives_table,
     eigenvalues_table,
@@ -88,6 +89,7 @@ def fit_report(result: FitResult, provenance: Provenance) -> Report:
     subject = str(result.given.recordings[0].label.subject) or "a subject"
     converged = result.fitted.converged
     found = [
+        *([structure_section(result)] if result.structures else []),
         Section("1. Recorded and simulated", _trajectories(result), "Trajectories", together=True),
         Section("2. What is left", (_LEFT, _RESIDUALS), "What is left"),
         Section(

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from impc.assess.intent_rules import Intent
     from impc.assess.judged import MethodFit
     from impc.assess.printed_gain import GainEstimate
+    from impc.assess.structures import StructureFit
     from impc.assess.variance_accounted_for import TrialAgreement
     from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
@@ -88,6 +89,8 @@ class FitResult:
         the loop with it does not reach the end.
     seconds : float
         Time of the whole fit, s.
+    structures : tuple of StructureFit
+        Those that were asked for, that of [fit.structure] first.
     """
 
     settings: FitSettings
@@ -104,6 +107,7 @@ class FitResult:
     diagnostics: ResidualDiagnostics
     terminal_set_difference: float
     seconds: float
+    structures: tuple[StructureFit, ...] = ()
 
     @property
     def reported_P(self) -> Array:  # noqa: N802

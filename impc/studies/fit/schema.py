@@ -9,6 +9,8 @@
     intervals.<number>                       of that gain and of the parameters
     warnings, residuals                      sentences; the tests behind them
     intent                                   eigenvalues (ascending), dominant, sentence, readings
+    structures                               of each that was named: prices and ratios with
+                                             intervals, rank, directions, test, vaf, aic
     identifiability                          rank, free, chosen, singular_values
     parameters.<name>                        nominal, value, deviation, determined
     trials                                   label, vaf, whiteness, x0, held_out_vaf, findings
@@ -26,6 +28,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from impc.assess.intent_rules import dominant_sentence
+from impc.studies.fit.structures import structure_data
 from impc.studies.methods_table import methods_data
 
 if TYPE_CHECKING:
@@ -38,7 +41,8 @@ __all__ = ["fit_data"]
 
 def fit_data(result: FitResult, provenance: Provenance) -> dict[str, Any]:
     """Content of result.json."""
-    return _controller(result) | _found(result) | _made(result, provenance)
+    within = {"structures": structure_data(result)}
+    return _controller(result) | _found(result) | within | _made(result, provenance)
 
 
 def _controller(result: FitResult) -> dict[str, Any]:

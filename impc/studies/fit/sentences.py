@@ -9,6 +9,7 @@ import numpy as np
 from impc.assess.covariance import DETERMINED, TOLD
 from impc.assess.intent_rules import dominant_sentence
 from impc.reporting.rendering import number
+from impc.studies.fit.structures import structure_sentences
 
 if TYPE_CHECKING:
     from impc.assess.judged import MethodFit
@@ -22,8 +23,12 @@ _NAMED = 0.15
 
 def findings(result: FitResult) -> tuple[str, ...]:
     """The first lines of the page."""
+    within = structure_sentences(result)
+    refused = bool(within) and result.structures[0].refused
     return (
+        *(within if refused else ()),
         *result.warnings,
+        *(() if refused else within),
         *_agreement(result),
         *_saturation(result),
         *_against_inverse_lqr(result),

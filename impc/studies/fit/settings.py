@@ -13,6 +13,7 @@ from impc.errors import InputError, brief
 from impc.files.configuration import FILL_IN
 from impc.inverse.methods import method_named
 from impc.model.bounds import Bounds
+from impc.model.structure import Structure
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
@@ -21,7 +22,16 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
     from impc.model.recordings import Recording
 
-__all__ = ["BESIDE", "FitSettings", "fit_bounds", "fit_settings", "read_settings", "require_used"]
+__all__ = [
+    "BESIDE",
+    "FitSettings",
+    "StructureSettings",
+    "fit_bounds",
+    "fit_settings",
+    "fit_structures",
+    "read_settings",
+    "require_used",
+]
 
 # A recorded angle is differentiated over this time, by a parabola: noise of 1 % of the largest
 # angle at 100 Hz then gives a rate of a few per cent of the largest.
@@ -39,13 +49,42 @@ _RANGES: dict[str, tuple[float, float]] = {
 # A limit of an input is squared and divided by: beyond these the square is no number any more.
 _LIMITS = (1e-100, 1e100)
 # Settings that ask for assessments which not every command makes.
-_OF_SOME = ("feedback_states", "horizons", "methods", "profiles", "replicates", "unknown_limit")
+_OF_SOME = (
+    "feedback_states",
+    "horizons",
+    "methods",
+    "profiles",
+    "replicates",
+    "structure",
+    "structures",
+    "unknown_limit",
+)
 _PAGES = {"fit": "docs/fitting.md", "select": "docs/selection.md"}
 
 #: Methods that a fit shows beside inverse MPC, which comes last (docs/fitting.md).
 BESIDE = ("feedback_gain", "inverse_lqr", "inverse_lqr_output", "clipped_lqr")
 
 T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class StructureSettings:
+    """What may be costed, by name (`impc.model.structure`).
+
+    Attributes
+    ----------
+    Q, R : str or list of str
+        "diagonal", "full", for Q "outputs", or features with a price each.
+    over : list of str or None
+        Features that "diagonal" or "full" is over; all states by default.
+    name : str or None
+        In tables and sentences.
+    """
+
+    Q: str | list[str] = "diagonal"
+    R: str | list[str] = "diagonal"
+    over: list[str] | None = None
+    name: str | None = None
 
 
 @dataclass(frozen=True)
@@ -96,6 +135,10 @@ class FitSettings:
         Other horizons, in samples, to compare with; and the fit without limit beside them.
     methods : list of str
         Methods that are shown beside inverse MPC, by their names in `impc.inverse.methods`.
+    structure : StructureSettings or None
+        What may be costed: the table [fit.structure]. None: any weights, and no word on it.
+    structures : list of StructureSettings
+        Others, to compare it with.
 
     Examples
     --------
@@ -122,6 +165,8 @@ class FitSettings:
     unknown_limit: bool = False
     horizons: list[int] = field(default_factory=list)
     methods: list[str] = field(default_factory=lambda: list(BESIDE))
+    structure: StructureSettings | None = None
+    structures: list[StructureSettings] = field(default_factory=list)
 
 
 def require_used(settings: FitSettings, used: Collection[str], command: str) -> None:
@@ -181,6 +226,7 @@ def fit_settings(table: Mapping[str, Any]) -> FitSettings:
             raise InputError(
                 f"[fit] {name}", f"is still {FILL_IN!r}", "fill it in, or take the line out"
             )
+    _require_structures(table)
     settings = read_settings("fit", FitSettings, table)
     for name, (least, most) in _RANGES.items():
         _require_between(name, getattr(settings, name), least, most)
@@ -216,6 +262,38 @@ def _require_distinct(settings: FitSettings) -> None:
         twice = [item for index, item in enumerate(given) if item in given[:index]]
         if twice:
             raise InputError(f"[fit] {name}", f"names {twice[0]} twice", "name each once")
+
+
+def _require_structures(table: Mapping[str, Any]) -> None:
+    """Every key of the tables of structures is known: msgspec passes over those that are not."""
+    known = [item.name for item in fields(StructureSettings)]
+    others = table.get("structures", [])
+    given = [table.get("structure"), *(others if isinstance(others, list) else [])]
+    for item in given:
+        for key in item if isinstance(item, dict) else ():
+            if key not in known:
+                raise InputError(
+                    f"[fit.structure] {key}", "is not a setting", f"known: {', '.join(known)}"
+                )
+
+
+def fit_structures(plant: Plant, settings: FitSettings) -> tuple[Structure, ...]:
+    """Structures of the weights that the settings name, that of [fit.structure] first.
+
+    Raises
+    ------
+    InputError, WeightsError
+        When a feature cannot be read, nothing prices a mode that does not decay, or two structures
+        have one name.
+    """
+    first = [] if settings.structure is None else [settings.structure]
+    found: list[Structure] = []
+    for item in (*first, *settings.structures):
+        one = Structure(plant, item.Q, item.R, over=item.over, name=item.name)
+        if one.name in [other.name for other in found]:
+            raise InputError("[fit] structures", f"has {one.name!r} twice", "name each by itself")
+        found.append(one)
+    return tuple(found)
 
 
 def fit_bounds(plant: Plant, settings: FitSettings, recordings: Sequence[Recording]) -> Bounds:

@@ -25,18 +25,20 @@ from impc.assess.intent_draws import drawn_gains
 from impc.assess.intent_rules import intent
 from impc.assess.judged import judge
 from impc.assess.printed_gain import gain_estimate
+from impc.assess.structures import assess_structure, no_structure
 from impc.assess.variance_accounted_for import agreement
 from impc.assess.weights_ranges import weights_summary_or_reason
 from impc.checking import checked, replace
 from impc.control.closed_loop import simulate
-from impc.errors import DataError, SolverError
+from impc.errors import DataError, SolverError, WeightsError
 from impc.inverse.estimates import Estimate
 from impc.inverse.groundwork import NaturalUnits, Remember, afresh
 from impc.inverse.methods import estimate_all
 from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.problem import Problem, controller_for, scenarios
+from impc.inverse.structured_fit import fit_structured
 from impc.studies.fit.result import FitResult, FittedParameter
-from impc.studies.fit.settings import FitSettings, fit_bounds
+from impc.studies.fit.settings import FitSettings, fit_bounds, fit_structures
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -44,6 +46,7 @@ if TYPE_CHECKING:
     from impc.assess.judged import MethodFit
     from impc.assess.printed_gain import GainEstimate
     from impc.assess.resampling import Replicate
+    from impc.assess.structures import StructureFit
     from impc.assess.variance_accounted_for import TrialAgreement
     from impc.control.closed_loop import Simulation
     from impc.model.bounds import Bounds
@@ -81,7 +84,8 @@ def stages(problem: Problem, settings: FitSettings) -> int:
     """Number of stages that `fit_recordings` reports."""
     trials = len(problem.recordings)
     left_out = trials if _leaves_out(trials, settings) else 0
-    return 1 + len(_beside(settings)) + left_out + count_stages(problem, settings)
+    structures = (settings.structure is not None) + len(settings.structures)
+    return 1 + len(_beside(settings)) + left_out + structures + count_stages(problem, settings)
 
 
 def _beside(settings: FitSettings) -> tuple[str, ...]:
@@ -139,6 +143,7 @@ def fit_problem(
         output_scale=scale,
         unknown_start=True,
         family=family,
+        structure=next(iter(fit_structures(plant, settings)), None),
     )
 
 
@@ -204,6 +209,7 @@ def fit_recordings(
             methods[-1] = replace(methods[-1], held_out=shares)
         weights_found = whole_set.result()
         progress.done("set of weights")
+    structures = _structures(problem, settings, fitted, progress)
     certainty = assess(
         problem, fitted, estimate, weights_found, settings, progress.done, progress.replicate
     )
@@ -222,7 +228,30 @@ def fit_recordings(
         residual_diagnostics(fitted.problem, K, np.array(fitted.metric)),
         _terminal_set_difference(methods[-1]),
         time.perf_counter() - started,
+        structures,
     )
+
+
+def _structures(
+    problem: Problem, settings: FitSettings, fitted: Estimate, progress: FitProgress
+) -> tuple[StructureFit, ...]:
+    """Every structure that the settings name, fitted from the weights that fit at all."""
+    found, held_out = [], _leaves_out(len(problem.recordings), settings)
+    for index, structure in enumerate(fit_structures(problem.plant, settings)):
+        stage = f"structure {index + 1}"
+        fit = functools.partial(fit_structured, problem, structure, fitted)
+        try:
+            one = progress.estimate(stage, fit)
+        except (WeightsError, SolverError) as error:
+            found.append(no_structure(structure, len(problem.plant.outputs), str(error)))
+        else:
+            found.append(
+                assess_structure(
+                    problem, structure, one, fitted, settings.settle, held_out=held_out
+                )
+            )
+        progress.done(stage)
+    return tuple(found)
 
 
 def _agreements(

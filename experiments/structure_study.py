@@ -1,0 +1,281 @@
+"""Structured weights on simulated subjects: coverage, level and power of the test, global misfit.
+
+The seat: prices of the four body states, log-uniform within a factor of four of (6e3, 9e3, 6e2,
+4e2), three trials of 30 s under the ternary torque, no limit, noise on the angles. Carts: two of
+`experiments.printed_intervals` with prices of four states and two inputs, at their limits for some
+percent of the time; there a cross term shows in the gain. Each line that is written is one subject,
+so that a run can be ended at any time and be summed up:
+
+    python -m experiments.structure_study run seat --vaf 90 --subjects 200 --out seat.jsonl
+    python -m experiments.structure_study run carts --cross 0.5 --subjects 400 --out carts.jsonl
+    python -m experiments.structure_study sum seat.jsonl carts.jsonl
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy.signal
+
+import plants
+from experiments.printed_intervals import carts
+from impc.assess.price_profiles import PriceProfiles
+from impc.assess.structure_test import structure_test
+from impc.assess.structured_weights import price_covariance, tangent
+from impc.control.closed_loop import require_complete, scenario, simulate
+from impc.control.controller import Controller
+from impc.inverse.noisy_fit import fit_controller
+from impc.inverse.structured_fit import fit_structure
+from impc.inverse.structured_search import search_from
+from impc.model.bounds import Bounds
+from impc.model.plant import Plant
+from impc.model.recordings import Recording
+from impc.model.structure import Structure
+from impc.model.weights import Weights
+from impc.studies.fit.settings import FitSettings
+from impc.studies.fit.subject import fit_problem
+
+if TYPE_CHECKING:
+    from impc.arrays import Array
+    from impc.inverse.problem import Problem
+
+__all__ = ["Person", "Score", "cart_person", "score", "seat_person"]
+
+_BODY = ("theta1", "theta2", "theta1_rate", "theta2_rate")
+_TYPICAL = np.log([6e3, 9e3, 6e2, 4e2])
+_BEFORE = 500
+# Misfits that differ by less are those of one end: half a unit of chi-squared's distance.
+_GLOBAL = 0.5
+
+
+@dataclass(frozen=True)
+class Person:
+    """A simulated subject.
+
+    Attributes
+    ----------
+    structure : Structure
+        That is fitted.
+    prices : Array
+        Its true unknowns (count,).
+    problem : Problem
+    """
+
+    structure: Structure
+    prices: Array
+    problem: Problem
+
+
+@dataclass(frozen=True)
+class Score:
+    """A fit against its truth.
+
+    Attributes
+    ----------
+    study : str
+        Plant, VAF, colour of the noise, cross term.
+    seed : int
+    holds, normal : list of bool
+        Whether the profile and the normal interval of each price hold the truth.
+    one_sided : list of bool
+        Whether the profile has no lower end.
+    errors : list of float or None
+        Of the logarithms, over their deviations; None for a price of zero.
+    excess : float
+        How far the misfit is above that of a search from the truth, in units of chi-squared.
+    probability, freedom : float and int
+        Of the test of the structure.
+    power : float
+        That the test foresees for the worst seen cross term.
+    """
+
+    study: str
+    seed: int
+    holds: list[bool]
+    normal: list[bool]
+    one_sided: list[bool]
+    errors: list[float | None]
+    excess: float
+    probability: float
+    freedom: int
+    power: float
+
+
+def seat_person(seed: int, vaf: float, root: float) -> Person:
+    """A seated subject whose true controller has a VAF of `vaf` %, noise of that root."""
+    rng = np.random.default_rng([seed, round(vaf), round(100 * root)])
+    plant = Plant(plants.seated_balance_plant(), ["command"])
+    structure = Structure(plant, "diagonal", over=_BODY)
+    prices = _TYPICAL + rng.uniform(-np.log(4), np.log(4), 4)
+    controller = Controller(plant, structure.weights(prices), Bounds(plant), 20, terminal_set=False)
+    trials = []
+    for phase in (None, 1, 2):
+        torque = plants.ternary_torque(duration=30.0, rate=100, seed=phase)
+        trials.append(_recorded(controller, torque, rng, vaf, root))
+    return Person(structure, prices, fit_problem(plant, trials, FitSettings()))
+
+
+def cart_person(seed: int, vaf: float, root: float, cross: float) -> Person:
+    """Two carts; the prices of the positions have `cross` of their geometric mean together."""
+    rng = np.random.default_rng([seed, round(vaf), round(100 * root), round(100 * cross)])
+    plant = carts(2)
+    structure = Structure(plant, "diagonal")
+    prices = np.log([4.0, 5.0, 1.0, 1.0, 1.0]) + rng.uniform(-np.log(2), np.log(2), 5)
+    weights = structure.weights(prices)
+    Q = np.array(weights.Q)
+    Q[0, 1] = Q[1, 0] = cross * np.sqrt(Q[0, 0] * Q[1, 1])
+    controller = Controller(
+        plant, Weights(Q, weights.R), Bounds(plant, u_min=-1, u_max=1), 8, terminal_set=False
+    )
+    trials = []
+    for _ in range(2):
+        push = np.repeat(rng.choice([-0.8, 0.0, 0.8], (80, 2)), 10, axis=0)
+        trials.append(_recorded(controller, push, rng, vaf, root))
+    settings = FitSettings(horizon=8, u_max=1.0)
+    return Person(structure, prices, fit_problem(plant, trials, settings))
+
+
+def _recorded(
+    controller: Controller, push: Array, rng: np.random.Generator, vaf: float, root: float
+) -> Recording:
+    plant, samples = controller.plant, len(push)
+    run = simulate(controller, scenario(plant, np.zeros(plant.n), disturbance=push))
+    clean = (require_complete(controller, run).x @ plant.C.T)[:samples]
+    white = rng.standard_normal((samples + _BEFORE, clean.shape[1]))
+    noise = scipy.signal.lfilter([np.sqrt(1 - root**2)], [1.0, -root], white, axis=0)[_BEFORE:]
+    size = np.sqrt((100 - vaf) / vaf * np.mean(clean**2, axis=0))
+    return Recording(plant, clean + size * noise, push)
+
+
+def score(person: Person, study: str, seed: int, *, intervals: bool = True) -> Score:
+    """Fit a person from the default start, and compare.
+
+    Parameters
+    ----------
+    person : Person
+    study : str
+        Its name in what is written.
+    seed : int
+    intervals : bool
+        Whether the intervals are made too; the test alone takes a third of the time.
+    """
+    problem, structure = person.problem, person.structure
+    near = fit_controller(problem)
+    end = fit_structure(near.problem, structure, np.array(near.gain), np.array(near.metric))
+    samples = sum(trial.outputs.size for trial in problem.recordings)
+    at = tangent(structure, end.problem, np.array(end.prices))
+    found, tested = price_covariance(at), structure_test(at)
+    prices = np.array(end.prices)
+    errors = [
+        float((prices[i] - person.prices[i]) / found.each[i]) if np.isfinite(prices[i]) else None
+        for i in range(structure.count)
+    ]
+    made, excess = [], float("nan")
+    if intervals:
+        best = search_from(near.problem, structure, person.prices)
+        excess = samples * (end.misfit**2 - best.misfit**2) / best.misfit**2
+        profiles = PriceProfiles(at, found)
+        rows = np.eye(structure.count)
+        made = [
+            profiles.interval(rows[i]) if np.isfinite(prices[i]) else profiles.zero(i)
+            for i in range(structure.count)
+        ]
+    powers = [item.power for item in tested.powers]
+    return Score(
+        study,
+        seed,
+        [item.holds(float(true)) for item, true in zip(made, person.prices, strict=False)],
+        [error is None or abs(error) <= 1.96 for error in errors],
+        [item.low == -np.inf for item in made],
+        errors,
+        excess,
+        tested.probability,
+        tested.freedom,
+        max(powers, default=0.0),
+    )
+
+
+def _summed(scores: list[Score]) -> str:
+    """One row of the table."""
+    count = len(scores)
+    holds = [item for one in scores for item in one.holds]
+    sided = [item for one in scores for item in one.one_sided]
+    normal = [item for one in scores for item in one.normal]
+    refused = [one.probability < 0.05 for one in scores]
+    reached = [one.excess < _GLOBAL for one in scores if np.isfinite(one.excess)]
+    whole = [one.holds for one in scores if one.holds]
+    each = [np.mean([one[i] for one in whole]) for i in range(len(whole[0]) if whole else 0)]
+    return (
+        f"| {scores[0].study} | {count} | {_share(holds)} ({_list(each)}) | {_share(sided)} | "
+        f"{_share(normal)} | {_share(refused)} | {_share(reached)} | "
+        f"{100 * np.median([one.power for one in scores]):.0f} |"
+    )
+
+
+def _share(items: list[bool]) -> str:
+    if not items:
+        return "-"
+    share = float(np.mean(items))
+    error = 100 * np.sqrt(share * (1 - share) / len(items))
+    return f"{100 * share:.1f} ± {error:.1f}"
+
+
+def _list(shares: list[np.floating]) -> str:
+    return ", ".join(f"{100 * float(item):.0f}" for item in shares)
+
+
+def _run(given: argparse.Namespace) -> None:
+    study = f"{given.plant}, VAF {given.vaf:g}, root {given.root:g}, cross {given.cross:g}"
+    Path(given.out).parent.mkdir(parents=True, exist_ok=True)
+    with Path(given.out).open("a", encoding="utf-8") as file:
+        for seed in range(given.first, given.first + given.subjects):
+            if given.plant == "seat":
+                person = seat_person(seed, given.vaf, given.root)
+            else:
+                person = cart_person(seed, given.vaf, given.root, given.cross)
+            found = score(person, study, seed, intervals=not given.test_only)
+            file.write(json.dumps(asdict(found)) + "\n")
+            file.flush()
+
+
+def main() -> None:
+    """Run a study, or sum up what runs have written."""
+    parser = argparse.ArgumentParser(description="Structured weights on simulated subjects.")
+    which = parser.add_subparsers(required=True)
+    run = which.add_parser("run")
+    run.add_argument("plant", choices=("seat", "carts"))
+    run.add_argument("--vaf", type=float, default=90.0)
+    run.add_argument("--root", type=float, default=0.0)
+    run.add_argument("--cross", type=float, default=0.0)
+    run.add_argument("--subjects", type=int, default=200)
+    run.add_argument("--first", type=int, default=0)
+    run.add_argument("--test-only", action="store_true")
+    run.add_argument("--out", required=True)
+    run.set_defaults(run=_run)
+    summed = which.add_parser("sum")
+    summed.add_argument("files", nargs="+")
+    summed.set_defaults(run=_sum)
+    given = parser.parse_args()
+    given.run(given)
+
+
+def _sum(given: argparse.Namespace) -> None:
+    print("| study | subjects | profile intervals hold % (each) | one-sided % | normal ones hold % "
+          "| refused at 5 % | global misfit % | power foreseen % |")  # fmt: skip
+    print("|---|---|---|---|---|---|---|---|")
+    by_study: dict[str, list[Score]] = {}
+    for name in given.files:
+        for line in Path(name).read_text(encoding="utf-8").splitlines():
+            one = Score(**json.loads(line))
+            by_study.setdefault(one.study, []).append(one)
+    for scores in by_study.values():
+        print(_summed(scores))
+
+
+if __name__ == "__main__":
+    main()

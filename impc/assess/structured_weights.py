@@ -1,0 +1,260 @@
+"""How far the prices of a structure are told: deviations for any colour of the residuals.
+
+As `covariance` has it for a gain: with J_t the derivative of the outputs at sample t with respect
+to the unknowns, once initial states and physical parameters have taken what they can,
+
+    cov = H^-1 cov( sum_t J_t' e_t ) H^-1,      H = sum_t J_t' J_t,
+
+of the logarithms of prices, and of the correlations where products of features have prices too
+(`Structure.reported`). A physical parameter moves the gain too, because the weights stay. A price
+of zero stands at its limit and is left out; `price_profiles` gives its upper end
+(docs/structures.md).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.arrays import Array, BoolArray, Frozen, frozen
+from impc.assess.covariance import DETERMINED, by_trial
+from impc.assess.long_run_covariance import (
+    ResidualNoise,
+    residual_noise,
+    spread_of_sum,
+    white_noise,
+)
+from impc.inverse.consistent_pairs import metric_changes, scaled_changes
+from impc.inverse.residuals import evaluate
+from impc.inverse.solution_set import natural_coordinates
+from impc.inverse.structured_search import regulator_slopes
+from impc.inverse.trial_span import trial_span
+from impc.model.riccati import solve_lqr
+
+if TYPE_CHECKING:
+    from impc.inverse.problem import Problem
+    from impc.inverse.residuals import Evaluation
+    from impc.model.riccati import LqrSolution
+    from impc.model.structure import Structure
+
+__all__ = ["TOLD_FACTOR", "PriceCovariance", "Tangent", "price_covariance", "tangent"]
+
+#: A combination of logarithms is told when its interval of 95 % ends within this factor.
+TOLD_FACTOR = 10.0
+_TWO_SIDED = 1.959964
+# Of an unknown: a smaller share in a direction without a value is rounding's.
+_SHARE = 1e-3
+
+
+@dataclass(frozen=True)
+class Tangent(Frozen):
+    """The residual of a structured fit, and where it can move.
+
+    Attributes
+    ----------
+    structure : Structure
+    problem : Problem
+        At the initial states and the parameters.
+    solution : LqrSolution
+        The regulator of the weights.
+    prices : Array
+        Unknowns (count,); minus infinity is a price of zero.
+    residual : Array
+        (r,).
+    found : Evaluation
+    on_prices : Array
+        Derivative with respect to the unknowns (r, count), or to a price itself where it is zero.
+    on_parameters : Array
+        With respect to the parameters, the weights held (r, k).
+    """
+
+    structure: Structure
+    problem: Problem
+    solution: LqrSolution
+    prices: Array
+    residual: Array
+    found: Evaluation
+    on_prices: Array
+    on_parameters: Array
+
+    @property
+    def moving(self) -> BoolArray:
+        """Unknowns that are not prices of zero (count,)."""
+        return np.isfinite(self.prices)
+
+    @property
+    def noise(self) -> float:
+        """Root-mean-square of the residual."""
+        return float(np.sqrt(np.mean(self.residual**2)))
+
+    def without_nuisance(self, columns: Array, *beside: Array) -> Array:
+        """What initial states, parameters and others cannot make up of columns.
+
+        Parameters
+        ----------
+        columns : Array
+            (r, a).
+        *beside : Array
+            Others (r, b).
+
+        Returns
+        -------
+        Array
+            (r, a).
+        """
+        sizes = [trial.outputs.size for trial in self.problem.recordings]
+        shared = np.hstack([self.on_parameters, *beside])
+        return trial_span(self.found.dx0, sizes, shared).without(columns)
+
+    def gain_columns(self) -> tuple[Array, Array]:
+        """Derivatives with respect to gain and metric.
+
+        Returns
+        -------
+        Array
+            Along G^-1 K T, the metric moving with it, (r, mn).
+        Array
+            Along what is left for the metric alone (r, b).
+        """
+        gain, metric = np.array(self.solution.K), np.array(self.solution.S)
+        T, G = natural_coordinates(self.problem.plant, gain)
+        on_gain = self.found.dK.reshape(len(self.residual), -1) @ np.kron(G, np.linalg.inv(T).T)
+        with_gain, alone = metric_changes(self.problem.plant, gain, metric, T, G)
+        on_metric = self.found.dS.reshape(len(self.residual), -1)
+        tied, own = (
+            on_metric @ scaled_changes(metric, part).reshape(len(part), -1).T
+            for part in (with_gain, alone)
+        )
+        return np.asarray(on_gain + tied), np.asarray(own)
+
+    def natural(self, gains: Array) -> Array:
+        """G^-1 K T, (..., m, n), of gains (..., m, n)."""
+        T, G = natural_coordinates(self.problem.plant, np.array(self.solution.K))
+        return np.asarray(np.linalg.solve(G, gains @ T))
+
+
+def tangent(structure: Structure, problem: Problem, prices: Array) -> Tangent:
+    """Residual and derivatives at unknowns `prices` (count,) and a problem's other unknowns."""
+    solution = solve_lqr(problem.plant, structure.weights(prices))
+    K, S = np.array(solution.K), np.array(solution.S)
+    found = evaluate(problem, K, S)
+    dK, dS = regulator_slopes(problem, structure, prices, solution)
+    seen = found.dK.reshape(len(found.residual), -1) @ dK.reshape(len(dK), -1).T
+    seen += found.dS.reshape(len(seen), -1) @ scaled_changes(S, dS).reshape(len(dS), -1).T
+    count = structure.count
+    return Tangent(
+        structure,
+        problem,
+        solution,
+        frozen(prices),
+        frozen(found.residual),
+        found,
+        frozen(seen[:, :count]),
+        frozen(found.dparameters + seen[:, count:]),
+    )
+
+
+@dataclass(frozen=True)
+class PriceCovariance(Frozen):
+    """What the recordings say of the unknowns of a structure, to first order.
+
+    Attributes
+    ----------
+    structure : Structure
+    values : Array
+        As told: logarithms of prices, and correlations (count,); minus infinity for a price of 0.
+    singular_values : Array
+        Of the residual's derivative with respect to those that move, once initial states and
+        parameters have taken what they can; largest first (a,).
+    directions : Array
+        Right singular vectors over all unknowns, one a row (a, count).
+    deviations : Array
+        Standard deviation along each (a,); infinite below 1e-6 of the largest singular value.
+    covariance : Array
+        Over all unknowns (count, count), without the directions that have no deviation.
+    each : Array
+        Standard deviation of each unknown (count,); infinite where a direction without a value
+        takes part, and for a price of zero.
+    white : Array
+        The covariance as if the residuals were white (count, count).
+    noise : ResidualNoise
+        The colour of the residuals.
+    """
+
+    structure: Structure
+    values: Array
+    singular_values: Array
+    directions: Array
+    deviations: Array
+    covariance: Array
+    each: Array
+    white: Array
+    noise: ResidualNoise
+
+    @property
+    def rank(self) -> int:
+        """Number of directions above rounding."""
+        return int(np.count_nonzero(np.isfinite(self.deviations)))
+
+    @property
+    def told(self) -> BoolArray:
+        """Which directions the recordings tell to a factor of `TOLD_FACTOR` at 95 % (a,)."""
+        return np.asarray(_TWO_SIDED * self.deviations < np.log(TOLD_FACTOR))
+
+    def spread(self, combination: Array) -> tuple[float, float]:
+        """Deviation of a combination of unknowns (count,), and over that for white residuals."""
+        own, plain = (
+            float(np.sqrt(max(float(combination @ matrix @ combination), 0.0)))
+            for matrix in (self.covariance, self.white)
+        )
+        blind = self.directions[~np.isfinite(self.deviations)] @ combination
+        if np.linalg.norm(blind) > _SHARE * np.linalg.norm(combination) or plain == 0:
+            return np.inf, 1.0
+        return own, own / plain
+
+
+def price_covariance(at: Tangent) -> PriceCovariance:
+    """Covariance of the unknowns of a structured fit."""
+    values, chain = at.structure.reported(at.prices)
+    moving = at.moving
+    slopes = np.linalg.inv(chain[np.ix_(moving, moving)])
+    seen = at.without_nuisance(at.on_prices[:, moving]) @ slopes
+    _, sizes, rows = np.linalg.svd(seen, full_matrices=False)
+    usable = sizes > DETERMINED * np.max(sizes, initial=0.0)
+    residuals = by_trial(at.problem, np.array(at.residual))
+    lost = int(np.count_nonzero(usable)) + fitted_beside(at)
+    colour = residual_noise(residuals, lost)
+    along = by_trial(at.problem, seen @ rows[usable].T / sizes[usable] ** 2)
+    spread, plain = (spread_of_sum(kind, along) for kind in (colour, white_noise(residuals, lost)))
+    deviations = np.full(len(sizes), np.inf)
+    deviations[usable] = _roots(spread)
+    directions = np.zeros((len(sizes), at.structure.count))
+    directions[:, moving] = rows
+    back = directions[usable]
+    covariance = back.T @ spread @ back
+    each = _roots(covariance)
+    blind = np.linalg.norm(directions[~usable], axis=0) > _SHARE
+    each[blind | ~moving] = np.inf
+    return PriceCovariance(
+        at.structure,
+        frozen(values),
+        frozen(sizes),
+        frozen(directions),
+        frozen(deviations),
+        frozen(covariance),
+        frozen(each),
+        frozen(back.T @ plain @ back),
+        colour,
+    )
+
+
+def _roots(covariance: Array) -> Array:
+    return np.asarray(np.sqrt(np.maximum(np.diag(covariance), 0.0)))
+
+
+def fitted_beside(at: Tangent) -> int:
+    """Count of the numbers that were fitted beside the unknowns: initial states, parameters."""
+    sizes = [trial.outputs.size for trial in at.problem.recordings]
+    return trial_span(at.found.dx0, sizes, np.array(at.on_parameters)).rank

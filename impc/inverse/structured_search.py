@@ -1,0 +1,367 @@
+"""The search for the unknowns of a structure: prices, initial states, physical parameters.
+
+    minimise |Y_sim(z) - Y|^2 over z = (unknowns of the structure | x0 of each trial | parameters)
+
+by trust-region least squares with exact derivatives: unknowns -> (Q, R) -> Riccati -> (K, S) ->
+residual. A change of a parameter moves the gain too, because the weights stay. The unknowns are
+logarithms, so a price that the recordings want to be zero slides down without end. Such a price is
+set to zero and the search goes on without it; the answer stands when the misfit is no larger.
+
+Noise leaves combinations of unknowns all but free. They keep a weak prior while the search looks
+for its basin; at its end what the recordings tell to a factor of e^3 is fitted without
+(docs/structures.md).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy.linalg
+import scipy.optimize
+
+from impc.arrays import Array, frozen
+from impc.checking import replace
+from impc.errors import WeightsError
+from impc.inverse.arrow import Tolerances
+from impc.inverse.consistent_pairs import scaled_changes
+from impc.inverse.coordinates import PARAMETER_UNIT, Compressed, Coordinates, Point
+from impc.inverse.many_trials import has_many_trials, search_many
+from impc.inverse.problem import recorded_size
+from impc.inverse.residuals import unusable
+from impc.model.plant_family import plant_differential
+from impc.model.riccati import LqrSolution, regulator_changes, solve_lqr
+
+if TYPE_CHECKING:
+    from impc.arrays import BoolArray
+    from impc.inverse.problem import Problem
+    from impc.model.structure import Structure
+
+__all__ = ["PriceCoordinates", "StructuredEnd", "regulator_slopes", "search_from"]
+
+# Logarithm of a price: a factor of 150 about the start, while the basin is looked for.
+_SPREAD = 5.0
+# A combination with a larger deviation keeps that prior to the end.
+_FREE = 3.0
+_ROUNDS = 8
+# As in `gain_search`: a noisy search ends when the misfit falls by less than 1e-6 of itself, the
+# rounds when one lowers it by less than 1e-3.
+_NOISY_TOLERANCE, _SETTLED = 1e-6, 1e-3
+# Least share of the misfit of exact recordings, up to which they are explained (`gain_search`).
+_EXACT = 1e-9
+# A price whose logarithm has a deviation beyond this is tried at zero.
+_NEARLY_ZERO = 2.0
+_EVALUATIONS = 60
+# Of the last search, in misfit: 2e-4 of chi-squared on 18000 samples.
+_FINE = 1e-8
+_ENDLESS = 1e6
+
+
+def regulator_slopes(
+    problem: Problem, structure: Structure, z: Array, solution: LqrSolution
+) -> tuple[Array, Array]:
+    """Change of K (q, m, n) and S (q, m, m) with the unknowns (count,), then with the parameters.
+
+    Parameters
+    ----------
+    problem : Problem
+        At the parameters.
+    structure : Structure
+    z : Array
+        Unknowns (count,).
+    solution : LqrSolution
+        Of their weights.
+    """
+    plant = problem.plant
+    dQ, dR = structure.changes(z)
+    moved = len(problem.logarithms)
+    dA, dB = np.zeros((len(dQ), *plant.A.shape)), np.zeros((len(dQ), *plant.B.shape))
+    if problem.family is not None and moved:
+        differential = plant_differential(problem.family, problem.logarithms)
+        dA = np.concatenate([dA, np.moveaxis(differential.A, -1, 0)])
+        dB = np.concatenate([dB, np.moveaxis(differential.B, -1, 0)])
+        dQ = np.concatenate([dQ, np.zeros((moved, *dQ.shape[1:]))])
+        dR = np.concatenate([dR, np.zeros((moved, *dR.shape[1:]))])
+    return regulator_changes(solution, dQ, dR, dA, dB)
+
+
+class PriceCoordinates(Coordinates):
+    """The unknowns of a structure in the place of gain and metric; z is the way from the start.
+
+    Parameters
+    ----------
+    problem : Problem
+    structure : Structure
+    prices : Array
+        Unknowns where the search begins (count,); those at minus infinity stay there.
+    """
+
+    def __init__(self, problem: Problem, structure: Structure, prices: Array) -> None:
+        first = solve_lqr(problem.plant, structure.weights(prices))
+        super().__init__(problem, np.array(first.K), np.array(first.S))
+        self.structure, self.prices = structure, np.array(prices)
+        self.moving: BoolArray = np.isfinite(self.prices)
+        count = int(np.count_nonzero(self.moving))
+        starts, parameters = np.diff(self.ends)[1:]
+        self.ends = np.cumsum([count, 0, starts, parameters])
+        self.start = np.zeros(int(self.ends[-1]))
+        self.solved: tuple[bytes, LqrSolution] = (self.start.tobytes(), first)
+
+    def placed(self, there: Problem) -> Array:
+        """z (q,) of the prices of the start and the initial states and parameters of a problem."""
+        z = self.start.copy()
+        first, last = int(self.ends[1]), int(self.ends[2])
+        if last > first:
+            away = np.asarray(there.starts) - np.asarray(self.problem.starts)
+            z[first:last] = np.linalg.solve(self.start_unit, away.T).T.ravel()
+        z[last:] = (there.logarithms - self.problem.logarithms) / PARAMETER_UNIT
+        return z
+
+    def unknowns(self, z: Array) -> Array:
+        """Unknowns of the structure at z (q,): (count,)."""
+        found = self.prices.copy()
+        found[self.moving] += z[: self.ends[0]]
+        return found
+
+    def unpack(self, z: Array) -> Point:
+        """The values at z (q,).
+
+        Raises
+        ------
+        WeightsError
+            When the weights there have no regulator.
+        """
+        _, _, starts, parameters = np.split(z, self.ends[:-1])
+        problem = self.problem_at(starts, parameters)
+        if self.solved[0] != z.tobytes():
+            weights = self.structure.weights(self.unknowns(z))
+            self.solved = (z.tobytes(), solve_lqr(problem.plant, weights))
+        found = self.solved[1]
+        return Point(np.array(found.K), np.array(found.S), problem)
+
+    def at(self, z: Array) -> Compressed:
+        """Residual and derivative at z (q,), a large residual where there is no regulator."""
+        try:
+            return super().at(z)
+        except WeightsError as error:
+            self.refused.append(str(error))
+            nothing = np.zeros((len(z), self.m, self.n)), np.zeros((len(z), self.m, self.m))
+            found = self._compress(unusable(self.problem, str(error)), *nothing)
+            self.last = (z.tobytes(), found)
+            return found
+
+    def changes(self, here: Point, z: Array) -> tuple[Array, Array]:
+        """Change of K (q, m, n), and of S scaled to trace m (q, m, m), with each of z (q,)."""
+        slopes = regulator_slopes(here.problem, self.structure, self.unknowns(z), self.solved[1])
+        count = self.structure.count
+        dK, dS = np.zeros((len(z), self.m, self.n)), np.zeros((len(z), self.m, self.m))
+        for whole, part in zip((dK, dS), slopes, strict=True):
+            whole[: self.ends[0]] = part[:count][self.moving]
+            whole[self.ends[2] :] = PARAMETER_UNIT * part[count:]
+        return dK, scaled_changes(here.S, dS)
+
+    def deviations(self, z: Array, noise: float) -> tuple[Array, Array]:
+        """How far the unknowns that move (a,) are told, once all else has taken what it can.
+
+        Parameters
+        ----------
+        z : Array
+            (q,).
+        noise : float
+            Root-mean-square of the residual.
+
+        Returns
+        -------
+        Array
+            Right singular vectors, one a row (a, a).
+        Array
+            Standard deviation along each (a,).
+        """
+        _, values, rows = np.linalg.svd(self.without_nuisance(z), full_matrices=False)
+        return rows, noise / np.maximum(values, 1e-300)
+
+
+@dataclass(frozen=True)
+class StructuredEnd:
+    """Where a search ended.
+
+    Attributes
+    ----------
+    prices : Array
+        Unknowns of the structure (count,); minus infinity is a price of zero.
+    K, S : Array
+        (m, n) and (m, m).
+    problem : Problem
+        At the initial states and the parameters.
+    misfit : float
+        2-norm of the residual.
+    evaluations : int
+        Simulations with derivatives.
+    settled : bool
+        Whether it ended by itself.
+    """
+
+    prices: Array
+    K: Array
+    S: Array
+    problem: Problem
+    misfit: float
+    evaluations: int
+    settled: bool
+
+
+def search_from(
+    problem: Problem, structure: Structure, prices: Array, *, max_evaluations: int = 120
+) -> StructuredEnd:
+    """One search from given unknowns, in rounds, each with the noise that the last one left.
+
+    Parameters
+    ----------
+    problem : Problem
+    structure : Structure
+    prices : Array
+        Unknowns to start from (count,).
+    max_evaluations : int
+        Simulations with derivatives, at most.
+
+    Raises
+    ------
+    WeightsError
+        When the start has no regulator.
+    """
+    space = PriceCoordinates(problem, structure, prices)
+    z, spent, settled = _rounds(space, max_evaluations)
+    here = _Place(problem, structure, space.unknowns(z), space.unpack(z).problem)
+    return _with_zeros(_polished(here, spent, settled), here, max_evaluations)
+
+
+@dataclass(frozen=True)
+class _Place:
+    """A point of a search: unknowns, and a problem at initial states and parameters."""
+
+    posed: Problem
+    structure: Structure
+    prices: Array
+    there: Problem
+
+    def space(self) -> tuple[PriceCoordinates, Array]:
+        """Coordinates that begin at these prices, the prior about what was posed; and z here."""
+        space = PriceCoordinates(self.posed, self.structure, self.prices)
+        return space, space.placed(self.there)
+
+
+def _rounds(space: PriceCoordinates, budget: int) -> tuple[Array, int, bool]:
+    z, spent, misfit = space.start, 0, _misfit(space, space.start)
+    for _ in range(_ROUNDS):
+        noise = misfit / np.sqrt(_samples(space.problem))
+        weights = np.full(len(z), noise)
+        weights[: space.ends[0]] /= _SPREAD
+        z, more = _descend(space, z, np.eye(len(z)), weights, _NOISY_TOLERANCE, budget - spent)
+        spent += more
+        before, misfit = misfit, _misfit(space, z)
+        exact = misfit <= _EXACT * recorded_size(space.problem)
+        if exact or misfit > (1 - _SETTLED) * before:
+            return z, spent, True
+        if spent >= budget:
+            break
+    return z, spent, False
+
+
+def _polished(place: _Place, spent: int, settled: bool) -> StructuredEnd:
+    """Without the prior along what the recordings tell of the prices."""
+    space, z = place.space()
+    noise = _misfit(space, z) / np.sqrt(_samples(space.problem))
+    rows, deviations = space.deviations(z, noise)
+    count = int(space.ends[0])
+    told = rows[deviations < _FREE]
+    along = scipy.linalg.block_diag(told.T, np.eye(len(z) - count))
+    weights = np.full(along.shape[1], noise)
+    weights[: len(told)] = 0.0
+    z, more = _descend(space, z, along, weights, _FINE, _EVALUATIONS)
+    here = space.unpack(z)
+    return StructuredEnd(
+        frozen(space.unknowns(z)),
+        frozen(here.K),
+        frozen(here.S),
+        here.problem,
+        _misfit(space, z),
+        spent + more,
+        settled,
+    )
+
+
+def _descend(
+    space: PriceCoordinates,
+    z: Array,
+    along: Array,
+    weights: Array,
+    tolerance: float,
+    budget: int,
+) -> tuple[Array, int]:
+    """Least squares from z along given columns, with a prior about the space's start."""
+    if has_many_trials(space):
+        first, last = int(space.ends[1]), int(space.ends[2])
+        rows = np.delete(np.arange(len(z)), slice(first, last))
+        told = along.shape[1] - (len(z) - first)
+        columns = np.delete(np.arange(along.shape[1]), slice(told, told + last - first))
+        shared = weights[columns], float(weights[told])
+        ends = Tolerances(tolerance, 1e-12, 1e-15, max(budget, 1))
+        return search_many(space, z, along[np.ix_(rows, columns)], shared, ends)
+    prior = weights[:, None] * along.T
+
+    def residual(step: Array) -> Array:
+        there = z + along @ step
+        return np.concatenate([space.at(there).residual, prior @ (there - space.start)])
+
+    def derivative(step: Array) -> Array:
+        return np.vstack([space.at(z + along @ step).jacobian @ along, np.diag(weights)])
+
+    found = scipy.optimize.least_squares(
+        residual, np.zeros(along.shape[1]), jac=derivative, ftol=tolerance, xtol=1e-12,
+        gtol=1e-15, max_nfev=max(budget, 1),
+    )  # fmt: skip
+    return np.asarray(z + along @ found.x), int(found.nfev)
+
+
+def _with_zeros(end: StructuredEnd, place: _Place, budget: int) -> StructuredEnd:
+    """The same with prices of zero where the recordings want none smaller than any number."""
+    tried: set[int] = set()
+    while end.evaluations < budget:
+        here = replace(place, prices=np.array(end.prices), there=end.problem)
+        index = _widest(here, end.misfit, tried)
+        if index is None:
+            break
+        tried.add(index)
+        prices = np.array(end.prices)
+        prices[index] = -np.inf
+        try:
+            without = _polished(replace(here, prices=prices), end.evaluations, end.settled)
+        except WeightsError:  # the loop stands on that price
+            continue
+        if without.misfit <= end.misfit * (1 + _NOISY_TOLERANCE):
+            end = without
+    return end
+
+
+def _widest(place: _Place, misfit: float, tried: set[int]) -> int | None:
+    """The price of a state with the widest deviation, if it is wide and was not tried."""
+    structure = place.structure
+    if structure.coupled:
+        return None
+    space, z = place.space()
+    rows, along = space.deviations(z, misfit / np.sqrt(_samples(space.problem)))
+    own = np.full(structure.count, -np.inf)
+    own[space.moving] = np.sqrt((rows**2).T @ np.minimum(along, _ENDLESS) ** 2)
+    own[len(structure.labels) :] = -np.inf
+    own[list(tried)] = -np.inf
+    index = int(np.argmax(own))
+    return index if own[index] > _NEARLY_ZERO else None
+
+
+def _misfit(space: PriceCoordinates, z: Array) -> float:
+    return float(np.linalg.norm(space.at(z).residual))
+
+
+def _samples(problem: Problem) -> int:
+    return sum(trial.outputs.size for trial in problem.recordings)

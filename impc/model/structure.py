@@ -1,0 +1,403 @@
+"""What may be costed: weights that are made of a few named prices.
+
+    Q = F' W F,   R = G' V G,     rows of F (k, n) and G (l, m) given, W, V made of the unknowns z
+
+Each row is a feature of the states or of the inputs, a linear combination by name. Where features
+are priced one by one, W = diag(exp(z)); a price of zero is z = -inf. Where their products have
+prices too, W = L L' with L = diag(exp(z_1 .. z_k)) C and C lower triangular, ones on its diagonal.
+The entries below it are the other unknowns, which do not depend on units. The first price of the
+inputs is one, for scale (docs/structures.md).
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+import scipy.linalg
+
+from impc.arrays import Array, frozen
+from impc.checking import Value, checked
+from impc.errors import InputError, WeightsError
+from impc.model.weights import Weights
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from impc.model.plant import Plant
+
+__all__ = ["Structure", "linear_combination"]
+
+_WORDS = ("diagonal", "full", "outputs")
+_NUMBER = re.compile(r"(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
+# Features whose prices differ by less than this, of their own size, make the same weights.
+_SAME = 1e-9
+# A mode that is nearer to the limit of stability than this does not decay.
+_DECAYS = 1e-9
+
+
+@dataclass(frozen=True, init=False)
+class Structure(Value):
+    """Which states and inputs have a price, and which prices are unknown.
+
+    Parameters
+    ----------
+    plant : Plant
+        Whose states and inputs are meant.
+    Q : "diagonal", "full", "outputs", or sequence of str
+        A price for each feature; prices of all products of two features; a price for each output;
+        or the features themselves, as in ``["theta1", "theta2 - theta1"]``, each with a price.
+    R : "diagonal", "full", or sequence of str
+        The same for the inputs. With one input there is nothing to choose.
+    over : sequence of str, optional
+        The features that ``Q = "diagonal"`` or ``"full"`` are over; all states by default.
+    name : str, optional
+        What it is called in tables and sentences.
+
+    Attributes
+    ----------
+    name : str
+        What it is called.
+    labels : tuple of str
+        Of the features of the states (k,).
+    features : Array
+        One a row (k, n).
+    coupled : bool
+        Whether their products have prices too.
+    input_labels, input_features, input_coupled
+        The same of the inputs: (l,) and (l, m).
+
+    Raises
+    ------
+    InputError
+        When a feature cannot be read, or prices of different features make the same weights.
+    WeightsError
+        When no feature sees a mode that does not decay by itself, or one sees no input.
+
+    Examples
+    --------
+    >>> import control
+    >>> import impc
+    >>> system = control.ss([[2, -1], [1, 0.2]], [[1], [0]], [[1, 0]], 0, 1, states=["p", "v"])
+    >>> shape = impc.Structure(impc.Plant(system), ["p", "v - p"])
+    >>> shape.count, shape.unknowns
+    (2, ('p', 'v - p'))
+    >>> shape.weights([0.0, 0.0]).Q
+    array([[ 2., -1.],
+           [-1.,  1.]])
+    """
+
+    _rules: ClassVar[Mapping[str, Any]] = {"features": "* n", "input_features": "* m"}
+
+    name: str
+    labels: tuple[str, ...]
+    features: Array
+    coupled: bool
+    input_labels: tuple[str, ...]
+    input_features: Array
+    input_coupled: bool
+
+    @checked
+    def __init__(
+        self,
+        plant: Plant,
+        Q: Any = "diagonal",
+        R: Any = "diagonal",
+        *,
+        over: Sequence[str] | None = None,
+        name: str | None = None,
+    ) -> None:
+        labels, features = _features(plant, "Q", Q, over)
+        input_labels, input_features = _inputs(plant, R)
+        self._fill(
+            name=name or _default_name(Q, over, labels),
+            labels=labels,
+            features=frozen(features),
+            coupled=Q == "full",
+            input_labels=input_labels,
+            input_features=frozen(input_features),
+            input_coupled=R == "full" and plant.m > 1,
+        )
+        _require_different("Q", labels, features, coupled=self.coupled)
+        _require_different("R", input_labels, input_features, coupled=self.input_coupled)
+        _require_detectable(plant, features)
+
+    @property
+    def count(self) -> int:
+        """Number of unknowns."""
+        return len(self.unknowns)
+
+    @property
+    def unknowns(self) -> tuple[str, ...]:
+        """Their names (count,): prices of features, then of pairs; the states' first."""
+        inputs = _names(self.input_labels, coupled=self.input_coupled)
+        return (*_names(self.labels, coupled=self.coupled), *inputs[1:])
+
+    @property
+    def is_price(self) -> np.ndarray[Any, np.dtype[np.bool_]]:
+        """Which unknowns are logarithms of prices, not entries of C (count,)."""
+        k, rest = len(self.labels), len(self.input_labels) - 1
+        each = (k, self._split - k, rest, self.count - self._split - rest)
+        return np.repeat([True, False, True, False], each)
+
+    def weights(self, z: Array) -> Weights:
+        """The weights at the unknowns z (count,); minus infinity is a price of zero.
+
+        Raises
+        ------
+        WeightsError
+            When a price is no number any more.
+        """
+        with np.errstate(over="ignore", invalid="ignore"):
+            states, inputs = self._factors(np.asarray(z, dtype=np.float64))
+            Q, R = states.T @ states, inputs.T @ inputs
+        if not (np.all(np.isfinite(Q)) and np.all(np.isfinite(R))):
+            raise WeightsError("Q, R", "a price is beyond all numbers", "start elsewhere")
+        return Weights(Q, R)
+
+    def changes(self, z: Array) -> tuple[Array, Array]:
+        """Change of Q (count, n, n) and R (count, m, m) with each unknown, at z (count,).
+
+        Where a price is zero, with the price itself: its logarithm moves nothing.
+        """
+        z = np.asarray(z, dtype=np.float64)
+        own, beside = z[: self._split], np.concatenate([[0.0], z[self._split :]])
+        dQ = _changes(self.features, own, coupled=self.coupled)
+        dR = _changes(self.input_features, beside, coupled=self.input_coupled)[1:]
+        n, m = self.features.shape[1], self.input_features.shape[1]
+        return (
+            np.concatenate([dQ, np.zeros((len(dR), n, n))]),
+            np.concatenate([np.zeros((len(dQ), m, m)), dR]),
+        )
+
+    def reported(self, z: Array) -> tuple[Array, Array]:
+        """The unknowns as they are told.
+
+        Logarithms of the prices of features, W_ii; where they are coupled, of each pair the
+        correlation W_ij / sqrt(W_ii W_jj), between -1 and 1.
+
+        Parameters
+        ----------
+        z : Array
+            (count,).
+
+        Returns
+        -------
+        Array
+            (count,).
+        Array
+            Their derivative with respect to z (count, count).
+        """
+        z = np.asarray(z, dtype=np.float64)
+        beside = np.concatenate([[0.0], z[self._split :]])
+        first, along = _told(len(self.labels), z[: self._split], coupled=self.coupled)
+        rest, slope = _told(len(self.input_labels), beside, coupled=self.input_coupled)
+        both = scipy.linalg.block_diag(along, slope[1:, 1:])
+        return np.concatenate([first, rest[1:]]), np.asarray(both)
+
+    @property
+    def _split(self) -> int:
+        """How many of the unknowns are those of Q."""
+        return len(_names(self.labels, coupled=self.coupled))
+
+    def _factors(self, z: Array) -> tuple[Array, Array]:
+        beside = np.concatenate([[0.0], z[self._split :]])
+        return (
+            _factor(len(self.labels), z[: self._split], coupled=self.coupled).T @ self.features,
+            _factor(len(self.input_labels), beside, coupled=self.input_coupled).T
+            @ self.input_features,
+        )
+
+
+def linear_combination(text: str, names: Sequence[str]) -> Array:
+    """Coefficients (n,) of a text such as ``theta2 - 0.5 theta1`` over `names` (n,).
+
+    Raises
+    ------
+    InputError
+        When something else than signs, numbers and names stands there.
+    """
+    row, at = np.zeros(len(names)), 0
+    longest_first = sorted(range(len(names)), key=lambda index: -len(names[index]))
+    while at < len(text.rstrip()):
+        start = at
+        sign, at = _sign(text, at)
+        if sign == 0 and start > 0:
+            raise _unread(text, at, "+ or -", names)
+        number = _NUMBER.match(text, at)
+        known = [index for index in longest_first if _stands(text, at, names[index])]
+        factor = 1.0
+        if number and not known:
+            factor, at = float(number[0]), _blank(text, number.end())
+            at = _blank(text, at + 1) if text[at : at + 1] == "*" else at
+            known = [index for index in longest_first if _stands(text, at, names[index])]
+        if not known:
+            raise _unread(text, at, "a name", names)
+        row[known[0]] += (sign or 1) * factor
+        at = _blank(text, at + len(names[known[0]]))
+    if not np.any(row):
+        raise InputError(f"feature {text!r}", "is zero", "give a combination of states")
+    return row
+
+
+def _sign(text: str, at: int) -> tuple[int, int]:
+    at = _blank(text, at)
+    found = text[at : at + 1]
+    return {"+": 1, "-": -1}.get(found, 0), _blank(text, at + 1) if found in "+-" else at
+
+
+def _blank(text: str, at: int) -> int:
+    while text[at : at + 1].isspace():
+        at += 1
+    return at
+
+
+def _stands(text: str, at: int, name: str) -> bool:
+    """Whether a name stands there, and no longer word."""
+    after = text[at + len(name) : at + len(name) + 1]
+    return text.startswith(name, at) and not (after.isalnum() or after == "_")
+
+
+def _unread(text: str, at: int, wanted: str, names: Sequence[str]) -> InputError:
+    return InputError(
+        f"feature {text!r}",
+        f"expected {wanted} at {text[at : at + 20]!r}",
+        f"combine {', '.join(names)} with numbers, + and -",
+    )
+
+
+def _features(
+    plant: Plant, which: str, given: Any, over: Sequence[str] | None
+) -> tuple[tuple[str, ...], Array]:
+    if isinstance(given, str) and given not in _WORDS:
+        words = ", ".join(f'"{word}"' for word in _WORDS)
+        raise InputError(which, f"got {given!r}", f"give {words} or a list of features")
+    if given == "outputs":
+        if over is not None:
+            raise InputError("over", "goes with diagonal and full", "leave it out for outputs")
+        return tuple(plant.outputs), np.array(plant.C)
+    if isinstance(given, str):
+        chosen = tuple(plant.states if over is None else over)
+    elif over is None:
+        chosen = _texts(which, given)
+    else:
+        raise InputError("over", "goes with diagonal and full", "leave it out beside a list")
+    if not chosen:
+        raise InputError(which, "names no feature", "name one at least")
+    return chosen, np.array([linear_combination(text, plant.states) for text in chosen])
+
+
+def _inputs(plant: Plant, given: Any) -> tuple[tuple[str, ...], Array]:
+    if isinstance(given, str) and given not in _WORDS[:2]:
+        raise InputError("R", f"got {given!r}", 'give "diagonal", "full" or a list of features')
+    chosen = tuple(plant.controls) if isinstance(given, str) else _texts("R", given)
+    rows = [linear_combination(text, plant.controls) for text in chosen]
+    features = np.array(rows).reshape(-1, plant.m)
+    if np.linalg.matrix_rank(features) < plant.m:
+        raise WeightsError("R", "leaves a combination of the inputs without a price", "add one")
+    return chosen, features
+
+
+def _texts(which: str, given: Any) -> tuple[str, ...]:
+    if not isinstance(given, (list, tuple)) or not all(isinstance(item, str) for item in given):
+        raise InputError(which, f"got {given!r}", "give a list of features by name")
+    return tuple(given)
+
+
+def _default_name(Q: Any, over: Sequence[str] | None, labels: tuple[str, ...]) -> str:
+    if not isinstance(Q, str):
+        return ", ".join(labels)
+    return Q if over is None else f"{Q} over {', '.join(labels)}"
+
+
+def _require_different(
+    which: str, labels: tuple[str, ...], features: Array, *, coupled: bool
+) -> None:
+    """Features whose squares (coupled: which themselves) are linearly dependent have no prices."""
+    unit = features / np.linalg.norm(features, axis=1)[:, None]
+    products = np.array([np.outer(row, row).ravel() for row in unit])
+    values = np.linalg.svd(unit if coupled else products, compute_uv=False)
+    if len(values) < len(labels) or values[-1] < _SAME * values[0]:
+        raise InputError(
+            which,
+            f"different prices of {', '.join(labels)} make the same weights",
+            "leave one out",
+        )
+
+
+def _require_detectable(plant: Plant, features: Array) -> None:
+    """Every mode that does not decay by itself is seen by a feature."""
+    limit = 1 - _DECAYS if plant.discrete else -_DECAYS
+    unit = features / np.linalg.norm(features, axis=1)[:, None]
+    for mode in np.linalg.eigvals(plant.A):
+        if (abs(mode) if plant.discrete else mode.real) < limit:
+            continue
+        pencil = np.vstack([plant.A - mode * np.eye(plant.n), unit])
+        _, values, rows = scipy.linalg.svd(pencil)
+        if values[-1] < _SAME * values[0]:
+            part = np.abs(rows[-1])
+            names = [plant.states[index] for index in np.argsort(-part) if part[index] > 0.1]
+            raise WeightsError(
+                "Q",
+                f"leaves the mode {_number(mode)}, which does not decay by itself, without a price",
+                f"price one of {', '.join(names)}",
+            )
+
+
+def _number(mode: complex) -> str:
+    return f"{mode.real:.4g}" if mode.imag == 0 else f"{mode:.4g}"
+
+
+def _names(labels: tuple[str, ...], *, coupled: bool) -> tuple[str, ...]:
+    pairs = zip(*np.tril_indices(len(labels), -1), strict=True) if coupled else ()
+    return (*labels, *(f"{labels[j]} with {labels[i]}" for i, j in pairs))
+
+
+def _factor(size: int, z: Array, *, coupled: bool) -> Array:
+    """L of W = L L'."""
+    scale = np.diag(np.exp(z[:size] / (1 if coupled else 2)))
+    if not coupled:
+        return np.asarray(scale)
+    C = np.eye(size)
+    C[np.tril_indices(size, -1)] = z[size:]
+    return np.asarray(scale @ C)
+
+
+def _told(size: int, z: Array, *, coupled: bool) -> tuple[Array, Array]:
+    """Logarithms of W_ii and correlations, and their derivative with respect to z."""
+    if not coupled:
+        return z, np.eye(size)
+    L, steps = _factor(size, z, coupled=True), _steps(size, z)
+    W, dW = L @ L.T, steps @ L.T + L @ steps.transpose(0, 2, 1)
+    price, root = np.diag(W), np.sqrt(np.diag(W))
+    d_price = np.einsum("kii->ik", dW) / price[:, None]
+    rows, columns = np.tril_indices(size, -1)
+    size_of = root[rows] * root[columns]
+    pair = W[rows, columns] / size_of
+    d_pair = dW[:, rows, columns].T / size_of[:, None]
+    d_pair -= pair[:, None] * (d_price[rows] + d_price[columns]) / 2
+    return np.concatenate([np.log(price), pair]), np.vstack([d_price, d_pair])
+
+
+def _changes(features: Array, z: Array, *, coupled: bool) -> Array:
+    size = len(features)
+    if not coupled:
+        price = np.where(np.isneginf(z), 1.0, np.exp(z))
+        return np.asarray(np.einsum("k,ki,kj->kij", price, features, features))
+    half = _steps(size, z) @ _factor(size, z, coupled=True).T
+    return np.asarray(features.T @ (half + half.transpose(0, 2, 1)) @ features)
+
+
+def _steps(size: int, z: Array) -> Array:
+    """Derivative of L with respect to z."""
+    L = _factor(size, z, coupled=True)
+    steps = []
+    for index in range(size):
+        steps.append(np.zeros((size, size)))
+        steps[-1][index] = L[index]
+    for row, column in zip(*np.tril_indices(size, -1), strict=True):
+        steps.append(np.zeros((size, size)))
+        steps[-1][row, column] = np.exp(z[row])
+    return np.array(steps)

@@ -1,0 +1,110 @@
+"""A fit with structures: its first sentences, its table, and what result.json keeps."""
+
+from __future__ import annotations
+
+import functools
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+
+from experiments.printed_intervals import carts, with_noise
+from impc.control.controller import Controller
+from impc.errors import InputError
+from impc.inverse.noisy_fit import fit_controller
+from impc.model.bounds import Bounds
+from impc.model.weights import Weights
+from impc.studies.fit.result import FitResult
+from impc.studies.fit.sentences import findings
+from impc.studies.fit.settings import FitSettings, fit_settings, fit_structures
+from impc.studies.fit.structures import structure_data, structure_section, structure_sentences
+from impc.studies.fit.subject import fit_problem, fit_recordings, stages
+
+TABLE: dict[str, Any] = {
+    "horizon": 8,
+    "u_max": 1.0,
+    "methods": [],
+    "held_out": True,
+    "settle": 2.0,
+    "intent_draws": False,
+    "structure": {"Q": ["x[0]", "x[1]", "x[2]", "x[3]"], "name": "one by one"},
+    "structures": [{"Q": "full", "over": ["x[0]", "x[1]"], "name": "positions"}],
+}
+
+
+@functools.cache
+def fitted(cross: float) -> FitResult:
+    """Two carts, two trials of 40 s at a VAF of 98 %, positions priced together by `cross`."""
+    plant = carts(2)
+    Q = np.diag([4.0, 5.0, 1.0, 1.0])
+    Q[0, 1] = Q[1, 0] = cross * np.sqrt(20.0)
+    limits = Bounds(plant, u_min=-1, u_max=1)
+    truth = Controller(plant, Weights(Q, np.eye(2)), limits, 8, terminal_set=False)
+    rng = np.random.default_rng(4)
+    pushes = np.repeat(rng.choice([-0.8, 0.0, 0.8], (2, 40, 2)), 10, axis=1)
+    trials = [with_noise(truth, push, rng, 98.0, 0.0) for push in pushes]
+    settings = fit_settings(TABLE)
+    return fit_recordings(fit_problem(plant, trials, settings), settings)
+
+
+def test_statements_within_a_structure_that_holds() -> None:
+    result = fitted(0.0)
+    lines = structure_sentences(result)
+    assert lines[0].startswith("Within the structure “one by one”, which the recordings do not")
+    ratio = next(item for item in result.structures[0].ratios if item.first == "x[0]")
+    sentence = next(line for line in lines if "costs" in line and "times as much as" in line)
+    assert sentence.startswith("Within it ")
+    assert ratio.interval.low < ratio.interval.value < ratio.interval.high
+    assert any(line.startswith("Of its 5 unknowns the recordings tell 5") for line in lines)
+    assert any("would have been refused with a probability of" in line for line in lines)
+    truth = {"x[0]": 4.0, "x[1]": 5.0, "x[2]": 1.0, "x[3]": 1.0, "force2": 1.0}
+    held = [
+        item.holds(np.log(truth[name]))
+        for name, item in zip(truth, result.structures[0].intervals, strict=True)
+    ]
+    assert sum(held) >= 4  # of 95 % each
+
+
+def test_a_structure_that_does_not_hold_is_refused_first() -> None:
+    result = fitted(0.5)
+    assert result.structures[0].refused
+    first = structure_sentences(result)[0]
+    assert first.startswith("The recordings refuse the structure “one by one”")
+    assert not any("times as much" in line for line in structure_sentences(result))
+    assert findings(result)[0] == first
+
+
+def test_the_section_has_every_structure() -> None:
+    result = fitted(0.0)
+    section = structure_section(result)
+    tables = [block for block in section.blocks if hasattr(block, "rows")]
+    side_by_side = tables[-1].rows
+    assert [row[0] for row in side_by_side] == ["weights of any kind", "one by one", "positions"]
+    assert side_by_side[2][-1] == "refuse it"  # no price on speeds
+    kept = structure_data(result)
+    assert [item["name"] for item in kept] == ["one by one", "positions"]
+    assert kept[0]["rank"] == 5
+    assert len(kept[0]["prices"]) == 5
+    json.dumps([item["refused"] for item in kept])
+
+
+def test_settings_name_structures() -> None:
+    settings = fit_settings(TABLE)
+    found = fit_structures(carts(2), settings)
+    assert [item.name for item in found] == ["one by one", "positions"]
+    assert fit_structures(carts(2), FitSettings()) == ()
+    with pytest.raises(InputError, match=r"^\[fit.structure\] features: is not a setting"):
+        fit_settings({"structures": [{"features": ["x[0]"]}]})
+    with pytest.raises(InputError, match=r"^\[fit\]"):
+        fit_settings({"structure": {"Q": 3}})
+    plain = fit_settings({**TABLE, "structure": None, "structures": []})
+    problem = fitted(0.0).given
+    assert stages(problem, settings) == stages(problem, plain) + 2
+
+
+def test_the_fit_begins_with_what_is_fitted_without_a_structure() -> None:
+    """The structure adds; it changes nothing of the rest."""
+    result = fitted(0.0)
+    again = fit_controller(result.given)
+    np.testing.assert_array_equal(again.gain, result.fitted.gain)
