@@ -22,7 +22,7 @@ from impc.inverse.problem import Problem
 from impc.inverse.residuals import evaluate
 from impc.model.bounds import Bounds
 from impc.model.recordings import Recording
-from impc.studies.fit.figures import shown_trials
+from impc.studies.fit.result import shown_trials
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -15,7 +15,7 @@ import numpy as np
 
 from impc.model.signal_units import UNKNOWN, price_unit
 from impc.reporting.document import TextTable
-from impc.studies.fit.figures import shown_trials
+from impc.studies.fit.result import shown_trials
 from impc.studies.fit.tables import number_units
 from impc.studies.methods_table import methods_numbers
 

@@ -19,7 +19,7 @@ from impc.reporting.style import (
     journal_style,
     new_figure,
 )
-from impc.studies.fit.sentences import trial_name
+from impc.studies.fit.result import MOST_TRIALS, shown_trials, trial_name
 from impc.studies.fit.structures import price_figure
 
 if TYPE_CHECKING:
@@ -29,10 +29,7 @@ if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.studies.fit.result import FitResult
 
-__all__ = ["fit_figures", "shown_trials"]
-
-# Trials that are drawn one by one: 500 made a page of 51 MB and took 6.3 GB.
-_MOST_TRIALS = 24
+__all__ = ["fit_figures"]
 
 _SOFT = "#8C8C8C"
 _LAGS = 1.0  # s of the autocorrelation
@@ -57,13 +54,6 @@ def fit_figures(result: FitResult) -> dict[str, bytes]:
         if result.structures and result.structures[0].ratios:
             figures["structured-weights"] = price_figure(result)
         return drawn(figures)
-
-
-def shown_trials(result: FitResult) -> list[int]:
-    """Trials of a `result` that have a figure: all, or of many those that are explained least."""
-    explained = [float(np.mean(told.vaf)) for told in result.trials]
-    least = sorted(range(len(explained)), key=lambda index: explained[index])
-    return sorted(least[:_MOST_TRIALS])
 
 
 def _trajectories(result: FitResult, index: int) -> Figure:
@@ -132,7 +122,7 @@ def _command(ax: Axes, result: FitResult, index: int, column: int, name: str) ->
 
 def _residuals(result: FitResult) -> Figure:
     plant = result.fitted.problem.plant
-    count, p = min(len(result.given.recordings), _MOST_TRIALS), len(plant.outputs)
+    count, p = min(len(result.given.recordings), MOST_TRIALS), len(plant.outputs)
     figure = new_figure(DOUBLE_COLUMN, 0.4 + 1.3 * p * 1.0)
     axes = np.array(figure.subplots(p, 2, width_ratios=[3, 1], squeeze=False, sharex="col"))
     for column, name in enumerate(plant.outputs):
@@ -142,7 +132,7 @@ def _residuals(result: FitResult) -> Figure:
             for trial, run in zip(result.given.recordings, result.inverse_mpc.runs, strict=True)
         ]
         offset = 6 * max(float(np.std(part)) for part in series)
-        for index, part in enumerate(series[:_MOST_TRIALS]):
+        for index, part in enumerate(series[:MOST_TRIALS]):
             axes[column, 0].plot(
                 np.arange(len(part)) * plant.dt,
                 part - index * offset,

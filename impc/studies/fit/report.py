@@ -23,12 +23,12 @@ from impc.reporting.document import (
 )
 from impc.reporting.rendering import number
 from impc.studies.fit.csv_tables import fit_tables
-from impc.studies.fit.figures import fit_figures, shown_trials
+from impc.studies.fit.figures import fit_figures
+from impc.studies.fit.result import shown_trials, trial_name
 from impc.studies.fit.schema import fit_data
 from impc.studies.fit.sentences import (
     direction_name,
     findings,
-    trial_name,
 )
 from impc.studies.fit.structures import structure_section
 from impc.studies.fit.tables import (

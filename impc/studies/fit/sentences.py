@@ -9,13 +9,14 @@ import numpy as np
 from impc.assess.covariance import DETERMINED, TOLD
 from impc.assess.intent_rules import dominant_sentence
 from impc.reporting.rendering import number
+from impc.studies.fit.result import trial_name
 from impc.studies.fit.structures import structure_sentences
 
 if TYPE_CHECKING:
     from impc.assess.judged import MethodFit
     from impc.studies.fit.result import FitResult
 
-__all__ = ["direction_name", "findings", "limited", "trial_name"]
+__all__ = ["direction_name", "findings", "limited"]
 
 # Parts of a direction below this are not named.
 _NAMED = 0.15
@@ -38,11 +39,6 @@ def findings(result: FitResult) -> tuple[str, ...]:
         _how_sure(result),
         _determined(result),
     )
-
-
-def trial_name(result: FitResult, index: int) -> str:
-    """Label of the trial `index`, its number where it has none."""
-    return str(result.given.recordings[index].label) or f"trial {index + 1}"
 
 
 def limited(result: FitResult) -> bool:
