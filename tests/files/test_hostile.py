@@ -6,6 +6,7 @@ import os
 import tracemalloc
 from typing import TYPE_CHECKING
 
+import h5py
 import numpy as np
 import pytest
 
@@ -14,6 +15,7 @@ from impc.files.configuration import read_configuration
 from impc.files.formats import read_table, write_table
 from impc.files.inspection import draft_configuration, summary
 from impc.files.table import make_table
+from tests.files.samples import hdf5_mat
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -56,3 +58,16 @@ def test_names_of_columns_cannot_write_toml(tmp_path: Path) -> None:
     configuration = read_configuration(path)
     assert configuration.plant == {}
     assert list(configuration.signals) == ["y"]
+
+
+def test_a_million_references_are_not_followed(tmp_path: Path) -> None:
+    """A cell of 8 MB whose million entries are one and the same dataset: 8 GB, were it read."""
+    path = tmp_path / "trial.mat"
+    hdf5_mat(path, {"big": np.arange(1000.0)})
+    with h5py.File(path, "r+") as file:
+        entries = np.full((1, 1_000_000), file["big"].ref, dtype=h5py.ref_dtype)
+        file.create_dataset("cells", data=entries).attrs["MATLAB_class"] = np.bytes_("cell")
+    assert path.stat().st_size > 8_000_000
+    table = read_table(path)  # in a process that may take 1 GB
+    assert list(table.columns) == ["big"]
+    assert "is a cell array" in table.skipped["cells"]
