@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numbers
+from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -42,6 +43,11 @@ class Frozen:
 
     numpy makes arrays that can be written of those that it copies or finds in a pickle.
     """
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Its fields: what was computed from them once is computed again where it is wanted."""
+        named = {item.name for item in fields(self)}  # type: ignore[arg-type]  # a dataclass
+        return {name: value for name, value in vars(self).items() if name in named}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         for name, value in state.items():

@@ -145,6 +145,8 @@ def arrays_of(value: object) -> list[np.ndarray]:
 )  # fmt: skip
 def test_arrays_stay_read_only_in_copies_and_pickles(name: str) -> None:
     value = values()[name]
+    if name == "set":
+        assert value.cones  # of Clarabel's, which have no pickle: they stay behind
     made = [pickle.loads(pickle.dumps(value, protocol)) for protocol in (2, 4, 5)]
     made += [copy.copy(value), copy.deepcopy(value), replace(value)]
     for one in made:

@@ -133,11 +133,10 @@ def _security(cluster: Cluster, address: str) -> Any:
 @contextmanager
 def _reached(address: str) -> Iterator[None]:
     """What Dask raises in the block for a scheduler that is gone, as one line."""
-    from distributed.client import ClosedClientError  # noqa: PLC0415  # in the extra `cohort`
-
+    closed = optional("distributed", f"scheduler {address}").client.ClosedClientError
     try:
         yield
-    except (OSError, ClosedClientError, asyncio.CancelledError):
+    except (OSError, closed, asyncio.CancelledError):
         raise _was_lost(address) from None
 
 
