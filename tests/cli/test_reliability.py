@@ -90,7 +90,8 @@ def test_a_result_names_the_recordings_that_count(study: Path, tmp_path: Path) -
         if name == "before":
             assert found[name]["recordings"]["sub-01_ses-1_task-EC"] == [whole]
             content = path.read_bytes()
-            place = content.index(b".", len(content) // 2) + 1
+            row = content.index(b"\n", len(content) // 2)  # its last number: not the clock
+            place = content.rindex(b".", row + 1, content.index(b"\n", row + 1)) + 1
             digit = b"3" if content[place : place + 1] != b"3" else b"4"
             path.write_bytes(content[:place] + digit + content[place + 1 :])
     same = ("configuration", "plant", "versions")
