@@ -16,7 +16,7 @@ import scipy.optimize
 from impc.arrays import Array, Frozen, finite_array, frozen
 from impc.checking import checked
 from impc.errors import WeightsError
-from impc.inverse.cross_term import inverse_lqr_cross_term
+from impc.inverse.cross_term import inverse_lqr_cross_term, lifted
 from impc.inverse.equivalent_weights import least_condition_weights, weights_margin
 from impc.inverse.solution_set import gain_fibre
 from impc.model.riccati import gain_gradients, is_stable, solve_lqr
@@ -195,7 +195,7 @@ class _FactorSpace(Frozen):
         lift = floor * float(np.trace(scaled.block)) / (plant.n + plant.m)
         factors = [
             np.linalg.cholesky(matrix - lift * np.eye(len(matrix)))
-            for matrix in (_definite(scaled.Q, 2 * lift), _definite(scaled.R, 2 * lift))
+            for matrix in (lifted(scaled.Q, 2 * lift), lifted(scaled.R, 2 * lift))
         ]
         entries = [factor[np.tril_indices(len(factor))] for factor in factors]
         return cls(
@@ -238,14 +238,7 @@ def _default_start(plant: Plant, K: Array) -> Weights:
     found = inverse_lqr_cross_term(plant, K)
     # Q is often singular there. A lift of 1e-4 would undo the start on the seat plant, where the
     # eigenvalues span 1e8: a gain error of 7 % after 300 evaluations, from this one 6e-6.
-    return Weights(_definite(found.Q, 1e-8 * float(np.linalg.norm(found.Q, 2))), found.R)
-
-
-def _definite(matrix: Array, least: float) -> Array:
-    """Raise the eigenvalues to a least one."""
-    values, vectors = np.linalg.eigh(matrix)
-    raised: Array = (vectors * np.maximum(values, least)) @ vectors.T
-    return (raised + raised.T) / 2
+    return Weights(lifted(found.Q, 1e-8 * float(np.linalg.norm(found.Q, 2))), found.R)
 
 
 def _no_weights(status: str) -> InverseLqr:

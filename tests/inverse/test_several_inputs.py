@@ -108,10 +108,15 @@ def test_reported_weights_reproduce_the_recording(path: str, m: int) -> None:
         pytest.param(2, 2, marks=pytest.mark.slow),
         pytest.param(2, 8, marks=pytest.mark.slow),
         pytest.param(3, 1, marks=pytest.mark.full),
+        (2, 96),
+        (3, 70),
     ],
 )
 def test_direct_form_reproduces_the_recording(m: int, seed: int) -> None:
-    """At seeds 2 and 8 it ended with a misfit of 8e-5 and 3e-5, and called that converged."""
+    """At seeds 2 and 8 it ended with a misfit of 8e-5 and 3e-5, and called that converged.
+
+    At the last two its start had an eigenvalue of -1e-9, and it ended with a WeightsError.
+    """
     assert outcomes(by_direct, m, range(seed, seed + 1)) == {}
 
 
