@@ -119,7 +119,20 @@ def inverse_lqr_cross_term(plant: Plant, gain: ArrayLike) -> CrossTerm:
 
 
 def lifted(matrix: Array, least: float) -> Array:
-    """The symmetric `matrix` with its eigenvalues raised to a `least` one."""
+    """A symmetric matrix with its eigenvalues raised to a least one.
+
+    Parameters
+    ----------
+    matrix : Array
+        (k, k).
+    least : float
+        In the unit of its entries.
+
+    Returns
+    -------
+    Array
+        (k, k).
+    """
     values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
     raised: Array = (vectors * np.maximum(values, least)) @ vectors.T
     return (raised + raised.T) / 2
