@@ -10,6 +10,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from impc.assess.expected import Expectation as Expectation
+    from impc.assess.expected import expected_intervals as expected_intervals
     from impc.assess.identified_directions import Identifiability as Identifiability
     from impc.assess.identified_directions import identifiability as identifiability
     from impc.assess.variance_accounted_for import vaf as vaf
@@ -72,6 +74,7 @@ if TYPE_CHECKING:
     __version__: str
 
 _NAMES = {
+    "assess.expected": "Expectation expected_intervals",
     "assess.identified_directions": "Identifiability identifiability",
     "assess.variance_accounted_for": "vaf whiteness",
     "control.closed_loop": "Scenario Simulation Status require_complete scenario"

@@ -37,6 +37,8 @@ ELSEWHERE = {
     "cli/test_folders.py": "cli/options.py",
     "cli/test_main.py": """
         cli/example.py cli/numbers.py studies/example/cases.py studies/example/table.py""",
+    "cli/test_plan.py": """
+        studies/plan/figures.py studies/plan/report.py studies/plan/sentences.py""",
     "cli/test_reliability.py": """
         cli/simulate_reliability.py studies/reliability/analysis.py studies/reliability/figures.py
         studies/reliability/findings.py studies/reliability/report.py
@@ -75,6 +77,8 @@ ELSEWHERE = {
     "inverse/test_structured_fit.py": "inverse/structured_search.py",
     "inverse/test_stationarity.py": "inverse/smoothing.py",
     "model/test_riccati.py": "model/bounds.py model/plant.py model/weights.py",
+    "studies/plan/test_study.py": """
+        studies/plan/designs.py studies/plan/settings.py studies/plan/simulated_fits.py""",
     "studies/cohort/test_store.py": """
         studies/cohort/engine.py studies/cohort/report.py studies/cohort/tables.py
         studies/cohort/unit_task.py""",

@@ -21,6 +21,7 @@ import scipy.optimize
 import scipy.special
 
 from impc.arrays import Array, Frozen, frozen
+from impc.assess.covariance import by_trial
 from impc.assess.long_run_covariance import residual_noise, spread_of_sum, white_noise
 from impc.checking import replace
 from impc.control.closed_loop import simulate, simulate_and_differentiate
@@ -39,7 +40,7 @@ if TYPE_CHECKING:
     from impc.inverse.gain_search import GainFit
     from impc.inverse.problem import Problem
 
-__all__ = ["LimitEstimate", "input_limit", "with_limit"]
+__all__ = ["LimitEstimate", "input_limit", "on_limit", "with_limit"]
 
 _SPREAD = 1.0
 # The limit is searched to this share of itself.
@@ -251,35 +252,42 @@ def _typical_peak(fitted: Estimate, control: int) -> float:
 
 def _colour_factor(fit: GainFit, limit: float, control: int) -> float:
     """Variance of the limit for the colour that the residuals show, over that for white ones."""
-    problem = fit.problem
-    controller = controller_for(problem, np.array(fit.K), np.array(fit.S))
-    rows = bound_rows(controller.bounds, problem.plant)
-    moves = np.abs(rows.F[:, control]) * np.isclose(np.abs(rows.b), limit)
-    along = directions(controller, 1, bounds=moves[:, None])
-    found = evaluate(problem, np.array(fit.K), np.array(fit.S))
+    problem, K, S = fit.problem, np.array(fit.K), np.array(fit.S)
+    found = evaluate(problem, K, S)
     others = found.dK.reshape(len(found.residual), -1)
     basis, _ = np.linalg.qr(others)
-    residuals, columns, first = [], [], 0
-    raw = []
-    for trial, drive in zip(problem.recordings, scenarios(problem), strict=True):
-        _, sensitivity = simulate_and_differentiate(controller, drive, along)
-        seen = problem.plant.C @ sensitivity.x[..., 0][..., None] / problem.output_scale[:, None]
-        raw.append(seen[..., 0].ravel())
-        mine = slice(first, first + trial.outputs.size)
-        residuals.append(found.residual[mine].reshape(trial.outputs.shape))
-        first = mine.stop
-    column = np.concatenate(raw)
+    column = on_limit(problem, K, S, limit, control)
     column = column - basis @ (basis.T @ column)
-    first = 0
-    for trial in problem.recordings:
-        mine = slice(first, first + trial.outputs.size)
-        columns.append(column[mine].reshape(*trial.outputs.shape, 1))
-        first = mine.stop
+    residuals, columns = by_trial(problem, found.residual), by_trial(problem, column[:, None])
     if not np.any(column):
         return 1.0
     coloured = spread_of_sum(residual_noise(residuals), columns)[0, 0]
     white = spread_of_sum(white_noise(residuals), columns)[0, 0]
     return float(max(coloured / white, 1.0)) if white > 0 else 1.0
+
+
+def on_limit(problem: Problem, gain: Array, metric: Array, limit: float, control: int = 0) -> Array:
+    """Derivative of the residual with respect to the symmetric limit of one input (r,).
+
+    Parameters
+    ----------
+    problem : Problem
+    gain, metric : Array
+        K (m, n) and S (m, m).
+    limit : float
+        Where the bounds of the input stand, in its unit.
+    control : int
+        Index of the input.
+    """
+    controller = controller_for(problem, gain, metric)
+    rows = bound_rows(controller.bounds, problem.plant)
+    moves = np.abs(rows.F[:, control]) * np.isclose(np.abs(rows.b), limit)
+    along = directions(controller, 1, bounds=moves[:, None])
+    seen = [
+        simulate_and_differentiate(controller, drive, along)[1].x[..., 0] @ problem.plant.C.T
+        for drive in scenarios(problem)
+    ]
+    return np.concatenate([(part / problem.output_scale).ravel() for part in seen])
 
 
 def _crossing(

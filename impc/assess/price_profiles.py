@@ -74,8 +74,8 @@ class PriceProfiles:
 
     def __init__(self, at: Tangent, covariance: PriceCovariance) -> None:
         self.at, self.covariance, self.near = at, covariance, NearFit(at)
-        freedom = max(len(at.residual) - covariance.rank, 1)
-        self.variance = float(at.residual @ at.residual) / freedom
+        samples = len(at.residual)
+        self.variance = at.noise**2 * samples / max(samples - covariance.rank, 1)
         self.base = self.near.least(np.array(at.prices), np.eye(int(np.sum(at.moving))))[0]
 
     def interval(self, combination: Array, level: float = LEVEL) -> PriceInterval:

@@ -34,10 +34,14 @@ from impc.inverse.trial_span import trial_span
 from impc.model.riccati import solve_lqr
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from impc.inverse.problem import Problem
     from impc.inverse.residuals import Evaluation
     from impc.model.riccati import LqrSolution
     from impc.model.structure import Structure
+
+    NoiseModel = Callable[[list[Array], int], ResidualNoise]
 
 __all__ = ["TOLD_FACTOR", "PriceCovariance", "Tangent", "price_covariance", "tangent"]
 
@@ -68,6 +72,8 @@ class Tangent(Frozen):
         Derivative with respect to the unknowns (r, count), or to a price itself where it is zero.
     on_parameters : Array
         With respect to the parameters, the weights held (r, k).
+    noise : float
+        Root-mean-square of the noise: of the residual, where recordings were made.
     """
 
     structure: Structure
@@ -78,16 +84,12 @@ class Tangent(Frozen):
     found: Evaluation
     on_prices: Array
     on_parameters: Array
+    noise: float
 
     @property
     def moving(self) -> BoolArray:
         """Unknowns that are not prices of zero (count,)."""
         return np.isfinite(self.prices)
-
-    @property
-    def noise(self) -> float:
-        """Root-mean-square of the residual."""
-        return float(np.sqrt(np.mean(self.residual**2)))
 
     def without_nuisance(self, columns: Array, *beside: Array) -> Array:
         """What initial states, parameters and others cannot make up of columns.
@@ -153,6 +155,7 @@ def tangent(structure: Structure, problem: Problem, prices: Array) -> Tangent:
         found,
         frozen(seen[:, :count]),
         frozen(found.dparameters + seen[:, count:]),
+        float(np.sqrt(np.mean(found.residual**2))),
     )
 
 
@@ -215,8 +218,18 @@ class PriceCovariance(Frozen):
         return own, own / plain
 
 
-def price_covariance(at: Tangent) -> PriceCovariance:
-    """Covariance of the unknowns of a structured fit."""
+def price_covariance(
+    at: Tangent, noise: NoiseModel = residual_noise, white: NoiseModel = white_noise
+) -> PriceCovariance:
+    """Covariance of the unknowns of a structured fit.
+
+    Parameters
+    ----------
+    at : Tangent
+    noise, white : callable
+        How the noise is estimated from the residuals, (samples, p) for each trial, and the count
+        of numbers fitted: with its colour, and as if it had none.
+    """
     values, chain = at.structure.reported(at.prices)
     moving = at.moving
     slopes = np.linalg.inv(chain[np.ix_(moving, moving)])
@@ -225,9 +238,9 @@ def price_covariance(at: Tangent) -> PriceCovariance:
     usable = sizes > DETERMINED * np.max(sizes, initial=0.0)
     residuals = by_trial(at.problem, np.array(at.residual))
     lost = int(np.count_nonzero(usable)) + fitted_beside(at)
-    colour = residual_noise(residuals, lost)
+    colour = noise(residuals, lost)
     along = by_trial(at.problem, seen @ rows[usable].T / sizes[usable] ** 2)
-    spread, plain = (spread_of_sum(kind, along) for kind in (colour, white_noise(residuals, lost)))
+    spread, plain = (spread_of_sum(kind, along) for kind in (colour, white(residuals, lost)))
     deviations = np.full(len(sizes), np.inf)
     deviations[usable] = _roots(spread)
     directions = np.zeros((len(sizes), at.structure.count))

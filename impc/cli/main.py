@@ -23,6 +23,7 @@ _COMMANDS = {
     "fit": "impc.cli.fit",
     "inspect": "impc.cli.inspect",
     "key-parameters": "impc.cli.key_parameters",
+    "plan": "impc.cli.plan",
     "reliability": "impc.cli.reliability",
     "select": "impc.cli.select",
     "simulate": "impc.cli.simulate",

@@ -1,8 +1,8 @@
 """What the columns of a recording mean: a short TOML file, checked at the door.
 
 [recording] says time or rate, label and cut; [signals.NAME], one table a signal of the plant, says
-column, unit, stop, offset and sign; [plant] and [fit] are arguments of the plant and settings of
-the fit, and not interpreted here.
+column, unit, stop, offset and sign; [plant], [fit] and [plan] are arguments of the plant and
+settings of the fit and of a plan, and not interpreted here.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ FILL_IN = "?"
 
 _LARGEST = 1_000_000
 _LABELS = ("subject", "visit", "condition", "trial")
-_TABLES = ("recording", "signals", "plant", "fit")
+_TABLES = ("recording", "signals", "plant", "fit", "plan")
 _STUDY = ("study", "model", "select")
 
 
@@ -112,6 +112,8 @@ class Configuration(msgspec.Struct, frozen=True):
         Arguments of the plant's function; not interpreted here.
     fit : dict
         Settings of the fit; not interpreted here.
+    plan : dict
+        Of an experiment that is planned; not interpreted here.
     study, model, select : dict
         Tables of a study; not interpreted here.
     """
@@ -120,6 +122,7 @@ class Configuration(msgspec.Struct, frozen=True):
     signals: dict[str, SignalTable]
     plant: dict[str, Any] = {}
     fit: dict[str, Any] = {}
+    plan: dict[str, Any] = {}
     study: dict[str, Any] = {}
     model: dict[str, Any] = {}
     select: dict[str, Any] = {}
@@ -165,11 +168,12 @@ def read_configuration(path: Path | str, *more: str) -> Configuration:
     for name, table in tables["signals"].items():
         signals[name] = _convert(source, f"signals.{brief(name, 80)}", table, SignalTable)
         _check_signal(source, f"signals.{brief(name, 80)}", signals[name])
-    if not signals:
+    # A plan needs none: nothing is recorded yet.
+    if not signals and not tables["plan"]:
         raise InputError(
             f"{source}: signals", "names no signal", "write a table [signals.NAME] for each"
         )
-    return Configuration(recording, signals, *(tables[name] for name in ("plant", "fit", *_STUDY)))
+    return Configuration(recording, signals, *(tables[name] for name in (*_TABLES[2:], *_STUDY)))
 
 
 _Struct = TypeVar("_Struct", bound=msgspec.Struct)

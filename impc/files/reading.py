@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from impc.files.units import Unit
     from impc.model.plant import Plant
 
-__all__ = ["read_recordings", "recording_of"]
+__all__ = ["disturbances_of", "read_recordings", "recording_of"]
 
 # Samples for each state of the plant below which nothing can be fitted.
 _SAMPLES_A_STATE = 5
@@ -135,6 +135,38 @@ def recording_of(table: Table, configuration: Configuration, plant: Plant) -> Re
     return Recording(
         plant, outputs, disturbance, np.zeros(plant.n), label=label, findings=tuple(findings)
     )
+
+
+def disturbances_of(table: Table, configuration: Configuration, plant: Plant) -> Array:
+    """Perturbations of one table on the plant's clock (samples, d), in SI base units.
+
+    Parameters
+    ----------
+    table : Table
+    configuration : Configuration
+        Names a column for each disturbance.
+    plant : Plant
+
+    Raises
+    ------
+    InputError
+        When a disturbance has no column.
+    DataError
+        When a check fails.
+    """
+    entry, columns = configuration.recording, []
+    clock = read_clock(table, entry)
+    measurable.comparable_rates(table.source, clock.period, plant.dt)
+    for name in plant.disturbances:
+        if name not in configuration.signals:
+            raise InputError(f"signals.{name}", "is missing", "name the column of the file")
+        signal = configuration.signals[name]
+        _require_kind(name, signal.unit, plant.unit(name))
+        channel = _channel(table, clock, name, signal)
+        _checked(table, channel, signal, entry, response=False)
+        even = on_even_instants(clock, channel.values * channel.unit.factor)
+        columns.append(held_means(even, clock.period, plant.dt))
+    return np.column_stack(columns)
 
 
 def _require_names(configuration: Configuration, plant: Plant) -> None:

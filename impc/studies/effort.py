@@ -18,11 +18,12 @@ if TYPE_CHECKING:
     from impc.inverse.problem import Problem
     from impc.studies.fit.settings import FitSettings
 
-__all__ = ["Effort", "fit_effort"]
+__all__ = ["SECONDS_A_SAMPLE", "Effort", "fit_effort"]
 
-# Seconds for each sample, state and sample of the horizon; and for each number of the derivatives
-# of the rows, which are built again for each simulation.
-_A_SAMPLE, _A_NUMBER = 5.4e-3 / (3000 * 10 * 20), 1e-8
+#: Seconds for each sample, state and sample of the horizon.
+SECONDS_A_SAMPLE = 5.4e-3 / (3000 * 10 * 20)
+# For each number of the derivatives of the rows, which are built again for each simulation.
+_A_NUMBER = 1e-8
 # What a simulation takes however short the trial is: the calls around the compiled loop.
 _A_TRIAL = 1e-3
 # Simulations of all trials: of a fit (4 s of three trials of 15 ms), of a replicate (0.6 s of it),
@@ -64,7 +65,9 @@ def fit_effort(problem: Problem, settings: FitSettings) -> Effort:
     derivatives = rows * horizon * m * along
     numbers = derivatives + 4 * rows * horizon * m + rows**2
     numbers += 2 * longest * (n + m) * along + 2 * samples * len(plant.outputs) * along
-    once = samples * n * horizon * _A_SAMPLE + derivatives * _A_NUMBER + len(trials) * _A_TRIAL
+    once = (
+        samples * n * horizon * SECONDS_A_SAMPLE + derivatives * _A_NUMBER + len(trials) * _A_TRIAL
+    )
     left_out = len(trials) if settings.held_out and len(trials) > 1 else 0
     fits = 2 + left_out + len(settings.horizons) + m * settings.unknown_limit
     simulations = _FIT * fits + _REPLICATE * settings.replicates + _PROFILE * len(settings.profiles)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import re
 import resource
@@ -102,6 +103,35 @@ def asked_for(before: str, after: str, **units: str) -> Callable[[Path], None]:
 def old_result(folder: Path) -> None:
     (folder / "result.json").write_text('{"K": [[1.0]], "versions": {}}')
     read_result(folder)
+
+
+def planned(**changed: Any) -> Callable[[Path], str]:
+    """`impc plan` with these keys changed."""
+    table = {
+        "prices": {"theta1": 6e3},
+        "noise": {"theta1": 0.001, "theta2": 0.001},
+        "perturbed": ["perturbation"],
+        "dwell": [0.5],
+        "duration": 5.0,
+        "draws": 1,
+        "trials": 1,
+    } | changed
+
+    def said(folder: Path) -> str:
+        text = (
+            "[plant]\nmass = 79.7\nheight = 1.66\n[fit]\nu_max = 6.0\n"
+            '[fit.structure]\nQ = ["theta1"]\n[plan]\n'
+        )
+        for name, value in table.items():
+            written = json.dumps(value)
+            if isinstance(value, dict):
+                inner = ", ".join(f"{key} = {item}" for key, item in value.items())
+                written = f"{{ {inner} }}"
+            text += f"{name} = {written}\n"
+        (folder / "plan.toml").write_text(text)
+        return command("plan", str(folder / "plan.toml"), "--plant", "seated-balance")
+
+    return said
 
 
 def cart(growth: float = 1.1) -> Plant:
@@ -415,6 +445,11 @@ PROVOKED: dict[str, Callable[[Path], object]] = {
     ),
     "[fit] structures: has '...' twice; name each by itself": lambda _: fit_structures(
         running_away(), fit_settings({"structure": {}, "structures": [{}]})
+    ),
+    "[plan] prices: lacks '...'; presume a price for each feature": planned(prices={}),
+    "[plan] perturbed: names no input of the plant; known: ...": planned(perturbed=[]),
+    "[plan]: the person falls in ... % of the trials or more, whatever the perturbation": planned(
+        amplitude=[90.0]
     ),
     "is still '?'; fill in the column's unit": damaged("unit not filled in"),
     "is still '?'; fill in its name in the file": asked_for('column = "trunk"', 'column = "?"'),

@@ -59,7 +59,7 @@ _OF_SOME = (
     "structures",
     "unknown_limit",
 )
-_PAGES = {"fit": "docs/fitting.md", "select": "docs/selection.md"}
+_PAGES = {"fit": "docs/fitting.md", "plan": "docs/planning.md", "select": "docs/selection.md"}
 
 #: Methods that a fit shows beside inverse MPC, which comes last (docs/fitting.md).
 BESIDE = ("feedback_gain", "inverse_lqr", "inverse_lqr_output", "clipped_lqr")

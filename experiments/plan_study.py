@@ -1,0 +1,128 @@
+"""Does a plan come true? Fits of simulated recordings beside the deviations that were foreseen.
+
+    python -m experiments.plan_study cart --fits 100
+    python -m experiments.plan_study seat --fits 100
+
+Every experiment of a small grid is planned and fitted with fresh noise, so that the best amplitude
+of the plan can be compared with the best one of the fits (docs/planning.md). The cart is at its
+limit for up to a fifth of the time; the seat has three trials of 30 s, coloured noise and no limit.
+"""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING
+
+import numpy as np
+from tqdm import tqdm
+
+import plants
+from experiments.printed_intervals import carts
+from impc.control.controller import Controller
+from impc.model.bounds import Bounds
+from impc.model.plant import Plant
+from impc.model.structure import Structure
+from impc.studies.plan.designs import Design, Person, designs, held_trials, problem_of, try_design
+from impc.studies.plan.simulated_fits import simulated_fits
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from impc.arrays import Array
+    from impc.studies.plan.designs import Perturbation
+
+__all__ = ["cart", "compare", "seat"]
+
+_BODY = ("theta1", "theta2", "theta1_rate", "theta2_rate")
+
+
+def cart() -> tuple[Person, Perturbation, tuple[Design, ...], int]:
+    """A cart pushed at random for 40 s, with white noise."""
+    plant = carts(1)
+    structure = Structure(plant, "diagonal")
+    prices = np.log([4.0, 1.0])
+    law = Controller(
+        plant, structure.weights(prices), Bounds(plant, u_min=-1, u_max=1), 8, terminal_set=False
+    )
+    person = Person(law, structure, prices, np.array([0.03]), 0.0, np.array([np.inf]))
+
+    def push(amplitude: float, dwell: float, number: int) -> Array:
+        levels = np.random.default_rng([5, number]).choice([-amplitude, 0, amplitude], (400, 1))
+        return np.repeat(levels, round(dwell / plant.dt), axis=0)[:400]
+
+    return person, push, designs([0.3, 0.6, 0.8], [0.5, 2.0]), 2
+
+
+def seat() -> tuple[Person, Perturbation, tuple[Design, ...], int]:
+    """The seated person of docs/structures.md, with noise correlated over 50 ms."""
+    plant = Plant(plants.seated_balance_plant(), ["command"])
+    structure = Structure(plant, "diagonal", over=_BODY)
+    prices = np.log([6e3, 9e3, 6e2, 4e2])
+    law = Controller(plant, structure.weights(prices), Bounds(plant), 20, terminal_set=False)
+    noise, stops = np.radians([0.05, 0.05]), np.array([np.inf, np.inf])
+    person = Person(law, structure, prices, noise, float(np.exp(-0.01 / 0.05)), stops)
+
+    def torque(amplitude: float, dwell: float, number: int) -> Array:
+        return plants.ternary_torque(amplitude, dwell, 30.0, 100.0, seed=number)[:, None]
+
+    return person, torque, designs([3.0, 6.0], [0.125, 0.25]), 3
+
+
+_PEOPLE: dict[str, Callable[[], tuple[Person, Perturbation, tuple[Design, ...], int]]] = {
+    "cart": cart,
+    "seat": seat,
+}
+
+
+def compare(name: str, fits: int) -> list[tuple[Design, Array, Array, Array, Array]]:
+    """Experiment, then deviations of prices, foreseen and seen, and of told gains, both.
+
+    Gains are along the directions that the plan calls told.
+    """
+    person, perturbation, grid, trials = _PEOPLE[name]()
+    found = []
+    for design in tqdm(grid, disable=None):
+        told = try_design(person, design, perturbation, trials=trials, draws=trials)
+        if told.expected is None:
+            continue
+        kept = held_trials(person, design, perturbation, trials)
+        seen = simulated_fits(person, problem_of(person, kept), fits, 1)
+        gain = told.expected.gain
+        steps = np.array([gain.along(K - person.controller.K) for K in seen.gains])[:, gain.told]
+        found.append(
+            (
+                design,
+                told.expected.deviations,
+                np.std(seen.prices, axis=0),
+                gain.deviations[gain.told],
+                np.std(steps, axis=0),
+            )
+        )
+    return found
+
+
+def main() -> None:
+    """Print a row an experiment."""
+    parser = argparse.ArgumentParser(description="Plans beside fits of simulated recordings.")
+    parser.add_argument("person", choices=tuple(_PEOPLE))
+    parser.add_argument("--fits", type=int, default=100)
+    given = parser.parse_args()
+    found = compare(given.person, given.fits)
+    print("| amplitude | dwell (s) | prices, foreseen | seen / foreseen | gains, seen / foreseen |")
+    print("|---|---|---|---|---|")
+    for design, foreseen, seen, gains, gains_seen in found:
+        print(
+            f"| {design.amplitude:g} | {design.dwell:g} | {_list(foreseen)} | "
+            f"{_list(seen / foreseen)} | {_list(gains_seen / gains)} |"
+        )
+    planned = min(found, key=lambda row: float(np.mean(row[1] ** 2)))[0]
+    best = min(found, key=lambda row: float(np.mean(row[2] ** 2)))[0]
+    print(f"\nbest by the plan: {planned}; by the fits: {best}")
+
+
+def _list(values: Array) -> str:
+    return ", ".join(f"{value:.3g}" for value in values)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,196 @@
+"""What recordings would tell that nobody has made yet: intervals before anyone is measured.
+
+A presumed subject is simulated, and the recordings are taken as they come out without noise. At the
+truth the residual is then zero, and the derivatives of the outputs are those of the recordings to
+come. With noise of known size and colour, e_t in the recorder, they give the deviations of gain
+and prices as `covariance` and `structured_weights` have them, and the misfit that grows away from
+the truth gives the ends of profiles:
+
+    D(v) = (m^2(v) - m^2(v*)) / (s^2 f),      m(v*) = 0
+
+which is the profile of the recordings on average, up to the count of what is fitted
+(docs/planning.md).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy.special
+
+from impc.arrays import Array, Frozen, finite_array, frozen
+from impc.assess.covariance import GainCovariance, by_trial, gain_covariance
+from impc.assess.input_limits import on_limit
+from impc.assess.intervals import LEVEL
+from impc.assess.long_run_covariance import ResidualNoise, spread_of_sum
+from impc.assess.price_profiles import PriceInterval, PriceProfiles
+from impc.assess.structured_weights import PriceCovariance, price_covariance, tangent
+from impc.checking import checked, replace
+from impc.errors import InputError
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from impc.assess.structured_weights import Tangent
+    from impc.inverse.problem import Problem
+
+__all__ = ["Expectation", "expected_intervals"]
+
+# A root nearer to one is a drift, not noise.
+_LARGEST_ROOT = 0.999
+# Of all outputs: a limit that moves them by less is never met.
+_UNSEEN = 1e-12
+
+
+@dataclass(frozen=True)
+class Expectation(Frozen):
+    """What the recordings of a problem would tell.
+
+    Attributes
+    ----------
+    prices : PriceCovariance
+        Of the unknowns of the structure, to first order.
+    intervals : tuple of PriceInterval
+        Of each unknown, by its profile; by its deviation where products of features have prices.
+    gain : GainCovariance
+        Of a gain that is fitted without a structure.
+    limits : Array
+        Standard deviation of the logarithm of the limit of each input (m,), with a free gain;
+        infinite where it is never met, or the input has none.
+
+    Examples
+    --------
+    A regulator that is never at its limit tells nothing of it.
+
+    >>> import control
+    >>> import numpy as np
+    >>> import impc
+    >>> plant = impc.Plant(control.ss([[0.9]], [[1]], [[1]], 0, 1))
+    >>> bounds, structure = impc.Bounds(plant, u_max=9), impc.Structure(plant, "diagonal")
+    >>> law = impc.Controller(plant, structure.weights([0.0]), bounds, horizon=3)
+    >>> trial = impc.Recording(plant, law.simulate([1.0], steps=30).x)
+    >>> problem = impc.Problem(plant, bounds, 3, [trial], structure=structure)
+    >>> impc.expected_intervals(problem, [0.0], 0.01).limits
+    array([inf])
+    """
+
+    prices: PriceCovariance
+    intervals: tuple[PriceInterval, ...]
+    gain: GainCovariance
+    limits: Array
+
+    @property
+    def deviations(self) -> Array:
+        """Standard deviation of each unknown of the structure (count,), to first order."""
+        return np.asarray(self.prices.each)
+
+    @property
+    def log_determinant(self) -> float:
+        """Of the covariance of the unknowns, infinite if one is not told: least where D-optimal."""
+        if not np.all(np.isfinite(self.prices.deviations)):
+            return np.inf
+        return 2 * float(np.sum(np.log(self.prices.deviations)))
+
+    @property
+    def mean_variance(self) -> float:
+        """Of the unknowns: the least is A-optimal."""
+        return float(np.mean(self.deviations**2))
+
+
+@checked
+def expected_intervals(
+    problem: Problem,
+    prices: ArrayLike,
+    deviation: ArrayLike,
+    *,
+    root: float = 0.0,
+    level: float = LEVEL,
+) -> Expectation:
+    """Intervals that a fit of such recordings would have.
+
+    Parameters
+    ----------
+    problem : Problem
+        Its recordings are those of the presumed subject, without noise; with a structure.
+    prices : array_like
+        The subject's unknowns of that structure (count,), logarithms of prices.
+    deviation : array_like
+        Standard deviation of the noise in the recorder, in the outputs' units, one or (p,).
+    root : float
+        Of first-order noise: its correlation from one sample to the next, 0 for white.
+    level : float
+        Of the intervals.
+
+    Raises
+    ------
+    InputError
+        When the problem has no structure, a deviation is not positive, or a root is not in [0, 1).
+
+    Examples
+    --------
+    >>> import control
+    >>> import numpy as np
+    >>> import impc
+    >>> plant = impc.Plant(control.ss([[1.1]], [[1]], [[1]], 0, 1))
+    >>> bounds = impc.Bounds(plant, u_min=-0.5, u_max=0.5)
+    >>> structure = impc.Structure(plant, "diagonal")
+    >>> law = impc.Controller(plant, structure.weights([0.0]), bounds, horizon=3)
+    >>> trial = impc.Recording(plant, law.simulate([1.0], steps=30).x)
+    >>> problem = impc.Problem(plant, bounds, 3, [trial], structure=structure)
+    >>> found = impc.expected_intervals(problem, [0.0], 0.01)
+    >>> round(float(found.deviations[0]), 2)
+    0.07
+    """
+    structure, p = problem.structure, len(problem.plant.outputs)
+    if structure is None:
+        raise InputError("structure", "the problem has none", "give Problem(..., structure=...)")
+    size = np.broadcast_to(np.asarray(deviation, dtype=np.float64), p)
+    if not np.all(np.isfinite(size) & (size > 0)):
+        raise InputError("deviation", f"got {size}", "give a positive noise for each output")
+    if not 0 <= root <= _LARGEST_ROOT:
+        raise InputError("root", f"got {root:g}", f"give 0 or more, at most {_LARGEST_ROOT}")
+    coloured = ResidualNoise(frozen(np.full(p, root)), frozen((1 - root**2) * np.eye(p)[None]))
+    plain = ResidualNoise(frozen(np.zeros(p)), frozen(np.eye(p)[None]))
+    # In units of the noise, so that its variance is one.
+    scaled = replace(problem, output_scale=size)
+    unknowns = finite_array("prices", prices, (structure.count,))
+    at = replace(tangent(structure, scaled, unknowns), noise=1.0)
+    found = price_covariance(at, lambda _trials, _lost: coloured, lambda _trials, _lost: plain)
+    K, S = np.array(at.solution.K), np.array(at.solution.S)
+    return Expectation(
+        found,
+        _intervals(at, found, level),
+        gain_covariance(scaled, K, S, lambda _trials, _lost: coloured),
+        frozen(_limits(at, coloured)),
+    )
+
+
+def _intervals(at: Tangent, found: PriceCovariance, level: float) -> tuple[PriceInterval, ...]:
+    rows = np.eye(at.structure.count)
+    if not at.structure.coupled:
+        profiles = PriceProfiles(at, found)
+        return tuple(profiles.interval(row, level) for row in rows)
+    ends = -scipy.special.ndtri((1 - level) / 2) * np.asarray(found.each)
+    values = np.asarray(found.values)
+    return tuple(
+        PriceInterval(float(value), float(value - end), float(value + end), level)
+        for value, end in zip(values, ends, strict=True)
+    )
+
+
+def _limits(at: Tangent, colour: ResidualNoise) -> Array:
+    """Deviations of the logarithms, everything else being fitted, the gain without a structure."""
+    problem, found = at.problem, np.full(at.problem.plant.m, np.inf)
+    K, S = np.array(at.solution.K), np.array(at.solution.S)
+    for control, limit in enumerate(np.array(problem.bounds.u_max)):
+        if not np.isfinite(limit):
+            continue
+        column = limit * on_limit(problem, K, S, limit, control)
+        seen = at.without_nuisance(column[:, None], *at.gain_columns())
+        size = float(seen[:, 0] @ seen[:, 0])
+        if size > _UNSEEN * len(column):
+            spread = spread_of_sum(colour, by_trial(problem, seen / size))
+            found[control] = np.sqrt(spread[0, 0])
+    return found

@@ -1,0 +1,144 @@
+"""`impc plan`: what an experiment would tell, before anyone is measured."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from impc.cli.options import out_option, yes_option
+from impc.cli.output import print_files
+from impc.cli.plant import KNOWN, find_plant
+from impc.cli.progress import progress
+from impc.cli.seat import TORQUE
+
+if TYPE_CHECKING:
+    from impc.arrays import Array
+    from impc.files.configuration import Configuration
+    from impc.files.plant_sources import PlantSource
+    from impc.model.plant import Plant
+    from impc.studies.fit.settings import FitSettings
+    from impc.studies.plan.designs import Person, Perturbation
+    from impc.studies.plan.settings import PlanSettings
+
+__all__ = ["command"]
+
+_FEWER = "lower fits, draws, amplitude or dwell in [plan]"
+
+
+@click.command("plan")
+@click.argument("config", metavar="CONFIG", type=click.Path(path_type=Path))
+@click.option(
+    "--plant", "plant_name", required=True, help=f"{', '.join(KNOWN)}; or as for `impc fit`."
+)
+@out_option("plan", "report.html, result.json, a table and the figures")
+@yes_option
+def command(config: Path, plant_name: str, out: Path, yes: bool) -> None:
+    """Choose an experiment for a person whom you presume, from the [plan] table of CONFIG.
+
+    The file may be the one that `impc fit` reads later: [plant] and [fit] mean the same there.
+    """
+    # Imported here: the libraries take seconds to load, and --help needs none.
+    from impc.cli.consent import require_consent  # noqa: PLC0415
+    from impc.files.configuration import read_configuration  # noqa: PLC0415
+    from impc.files.inputs import gather_inputs  # noqa: PLC0415
+    from impc.reporting.provenance import Provenance  # noqa: PLC0415
+    from impc.reporting.writer import require_writable, write_files  # noqa: PLC0415
+    from impc.studies.fit.settings import fit_settings  # noqa: PLC0415
+    from impc.studies.plan.report import plan_report  # noqa: PLC0415
+    from impc.studies.plan.sentences import plan_sentences  # noqa: PLC0415
+    from impc.studies.plan.settings import plan_settings  # noqa: PLC0415
+    from impc.studies.plan.study import make_plan, plan_effort, steps_of  # noqa: PLC0415
+
+    require_writable(out)
+    configuration = read_configuration(config)
+    settings = plan_settings(configuration.plan)
+    source = find_plant(plant_name, configuration.plant)
+    person = _person(configuration, settings, fit_settings(configuration.fit), source)
+    recorded = [config.parent / name for name in settings.files]
+    perturbation = _perturbation(person.controller.plant, configuration, settings, recorded)
+    require_consent(plan_effort(person, settings), yes, _FEWER)
+    with progress(steps_of(settings), "step") as done:
+        plan = make_plan(person, settings, perturbation, done)
+    line = f"impc plan {config.name} --plant {plant_name}"
+    inputs = gather_inputs(recorded, config, source.name, source.arguments)
+    names = tuple(path.name for path in recorded)
+    report = plan_report(plan, Provenance(source.name, line, dict(source.arguments), names, inputs))
+    written = write_files(out, report.files())
+    for sentence in plan_sentences(plan):
+        click.echo(sentence)
+    print_files(out, written)
+
+
+def _person(
+    configuration: Configuration, settings: PlanSettings, fit: FitSettings, source: PlantSource
+) -> Person:
+    import numpy as np  # noqa: PLC0415
+
+    from impc.control.controller import Controller  # noqa: PLC0415
+    from impc.errors import InputError  # noqa: PLC0415
+    from impc.files.plant_sources import make_plant, plant_family_of  # noqa: PLC0415
+    from impc.studies.fit.settings import fit_bounds  # noqa: PLC0415
+    from impc.studies.plan.designs import Person  # noqa: PLC0415
+    from impc.studies.plan.settings import (  # noqa: PLC0415
+        mechanical_stops,
+        noise_deviations,
+        presumed_prices,
+    )
+
+    recorded = tuple(settings.perturbed or configuration.signals)
+    plant = make_plant(source, recorded)
+    if not plant.disturbances:
+        known = ", ".join(plant.controls)
+        raise InputError("[plan] perturbed", "names no input of the plant", f"known: {known}")
+    if "data" in fit.bounded_states.values():
+        raise InputError("[fit] bounded_states", 'is "data"', "give numbers: there are no data yet")
+    structure, prices = presumed_prices(plant, settings, fit)
+    bounds = fit_bounds(plant, fit, ())
+    controller = Controller(
+        plant, structure.weights(prices), bounds, fit.horizon, terminal_set=fit.terminal_set
+    )
+    tau = settings.correlation
+    return Person(
+        controller,
+        structure,
+        prices,
+        noise_deviations(plant, settings),
+        float(np.exp(-plant.dt / tau)) if tau > 0 else 0.0,
+        mechanical_stops(plant, settings, configuration.signals),
+        plant_family_of(source, recorded, fit.free),
+    )
+
+
+def _perturbation(
+    plant: Plant, configuration: Configuration, settings: PlanSettings, files: list[Path]
+) -> Perturbation:
+    """Ternary, one sequence a disturbance, or what was recorded, one file after the other."""
+    import numpy as np  # noqa: PLC0415
+
+    from impc.files.formats import read_table  # noqa: PLC0415
+    from impc.files.plant_sources import import_function  # noqa: PLC0415
+    from impc.files.reading import disturbances_of  # noqa: PLC0415
+
+    if files:
+        found = [disturbances_of(read_table(path), configuration, plant) for path in files]
+        return lambda amplitude, _dwell, number: amplitude * found[number % len(found)]
+    torque: Any = import_function(TORQUE)
+
+    def ternary(amplitude: float, dwell: float, number: int) -> Array:
+        count = len(plant.disturbances)
+        return np.column_stack(
+            [
+                torque(
+                    amplitude,
+                    dwell,
+                    settings.duration,
+                    1 / plant.dt,
+                    seed=settings.seed + number * count + index,
+                )
+                for index in range(count)
+            ]
+        )
+
+    return ternary

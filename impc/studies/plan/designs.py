@@ -1,0 +1,273 @@
+"""The experiments to choose from, each tried on the presumed person.
+
+Every experiment sees the same draws of the perturbation, scaled and held as it says, so that what
+differs between two is the experiment. A person falls when no input keeps the bounds, when the
+motion grows without end, or when an output passes its mechanical stop.
+See docs/planning.md.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.arrays import Array, Frozen, frozen
+from impc.assess.expected import Expectation, expected_intervals
+from impc.assess.variance_accounted_for import saturated_share
+from impc.control.closed_loop import scenario, simulate
+from impc.errors import SolverError
+from impc.inverse.problem import Problem
+from impc.model.recordings import Recording
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from impc.control.controller import Controller
+    from impc.model.plant_family import PlantFamily
+    from impc.model.structure import Structure
+
+
+__all__ = [
+    "Design",
+    "Outcome",
+    "Person",
+    "Perturbation",
+    "best_of",
+    "designs",
+    "held_trials",
+    "problem_of",
+    "try_design",
+]
+
+
+#: (amplitude, dwell, number of the draw) -> disturbance (samples, d).
+Perturbation = Callable[[float, float, int], Array]
+
+# Of the largest motion: what may be left of it after a rest that is as long as the trial.
+_CALM = 0.5
+
+
+@dataclass(frozen=True)
+class Person(Frozen):
+    """The presumed person, and how they would be recorded.
+
+    Attributes
+    ----------
+    controller : Controller
+    structure : Structure
+        Of the weights.
+    prices : Array
+        Its unknowns (count,), logarithms.
+    deviation : Array
+        Of the noise in the recorder (p,), in the outputs' units.
+    root : float
+        Its correlation from one sample to the next.
+    stops : Array
+        Largest magnitude of each output (p,), infinite where there is no stop.
+    family : PlantFamily or None
+        With the physical parameters that a fit would have to find too.
+    """
+
+    controller: Controller
+    structure: Structure
+    prices: Array
+    deviation: Array
+    root: float
+    stops: Array
+    family: PlantFamily | None = None
+
+
+@dataclass(frozen=True)
+class Design:
+    """One experiment.
+
+    Attributes
+    ----------
+    amplitude : float
+        Of the perturbation, in the disturbance's unit; a factor for one from a file.
+    dwell : float
+        For how long each value is kept, s; NaN for one from a file.
+    """
+
+    amplitude: float
+    dwell: float
+
+
+@dataclass(frozen=True)
+class Trial(Frozen):
+    """A simulated trial that does not end in a fall.
+
+    Attributes
+    ----------
+    push : Array
+        Disturbance (samples, d).
+    outputs : Array
+        Without noise (samples, p).
+    inputs : Array
+        (samples, m).
+    """
+
+    push: Array
+    outputs: Array
+    inputs: Array
+
+
+@dataclass(frozen=True)
+class Outcome(Frozen):
+    """What an experiment would give.
+
+    Attributes
+    ----------
+    design : Design
+    falls : float
+        Share of the trials that end in a fall.
+    at_limit : float
+        Share of the samples at which an input stands on a bound, in trials without a fall.
+    peaks : Array
+        Largest magnitude of each output in these (p,).
+    vaf : Array
+        What a fit without an error would explain of each output, % (p,).
+    expected : Expectation or None
+        Of so many trials as a person does; None where too few trials end without a fall.
+    """
+
+    design: Design
+    falls: float
+    at_limit: float
+    peaks: Array
+    vaf: Array
+    expected: Expectation | None
+
+
+def designs(amplitudes: Sequence[float], dwells: Sequence[float]) -> tuple[Design, ...]:
+    """All pairs, amplitudes within dwells."""
+    return tuple(Design(a, d) for d, a in itertools.product(dwells, amplitudes))
+
+
+def try_design(
+    person: Person, design: Design, perturbation: Perturbation, *, trials: int, draws: int
+) -> Outcome:
+    """Simulate one experiment, and tell what its recordings would.
+
+    Parameters
+    ----------
+    person : Person
+    design : Design
+    perturbation : callable
+        (amplitude, dwell, number of the draw) -> disturbance (samples, d).
+    trials : int
+        Of the person.
+    draws : int
+        Trials that are simulated, at least so many as are recorded.
+    """
+    plant, limits = person.controller.plant, person.controller.bounds
+    kept = held_trials(person, design, perturbation, max(draws, trials))
+    falls = 1 - len(kept) / max(draws, trials)
+    if len(kept) < trials:
+        nothing = frozen(np.full(len(plant.outputs), np.nan))
+        return Outcome(design, falls, float("nan"), nothing, nothing, None)
+    outputs = np.concatenate([trial.outputs for trial in kept])
+    power = np.mean(outputs**2, axis=0)
+    sides = np.array(limits.u_min), np.array(limits.u_max)
+    told = _expected(person, problem_of(person, kept[:trials]))
+    return Outcome(
+        design,
+        falls,
+        float(np.mean([saturated_share(np.array(trial.inputs), *sides) for trial in kept])),
+        frozen(np.max(np.abs(outputs), axis=0)),
+        frozen(100 * power / (power + person.deviation**2)),
+        told,
+    )
+
+
+def held_trials(
+    person: Person, design: Design, perturbation: Perturbation, draws: int
+) -> list[Trial]:
+    """Those of so many simulated trials that do not end in a fall.
+
+    Parameters
+    ----------
+    person : Person
+    design : Design
+    perturbation : callable
+        As for `try_design`.
+    draws : int
+        Trials that are simulated.
+    """
+    pushes = [perturbation(design.amplitude, design.dwell, number) for number in range(draws)]
+    found = [_held(person, push) for push in pushes]
+    return [trial for trial in found if trial is not None]
+
+
+def _held(person: Person, push: Array) -> Trial | None:
+    """The trial, or None for a fall: the perturbation, and a rest as long."""
+    plant, samples = person.controller.plant, len(push)
+    alone = np.vstack([push, np.zeros_like(push)])
+    run = simulate(person.controller, scenario(plant, np.zeros(plant.n), disturbance=alone))
+    if not run.complete:
+        return None
+    motion = np.abs(run.x @ plant.C.T)
+    peaks, end = np.max(motion[:samples], axis=0), np.max(motion[-samples // 10 :], axis=0)
+    if np.any(peaks > person.stops) or np.any(end > _CALM * peaks):
+        return None
+    return Trial(
+        frozen(push), frozen((run.x @ plant.C.T)[:samples]), frozen(np.array(run.u)[:samples])
+    )
+
+
+def problem_of(person: Person, trials: Sequence[Trial]) -> Problem:
+    """The inverse problem of simulated trials."""
+    controller, plant = person.controller, person.controller.plant
+    recordings = [
+        Recording(plant, trial.outputs, trial.push, np.zeros(plant.n)) for trial in trials
+    ]
+    return Problem(
+        plant,
+        controller.bounds,
+        controller.horizon,
+        recordings,
+        terminal_set=controller.terminal is not None,
+        unknown_start=True,
+        family=person.family,
+        structure=person.structure,
+    )
+
+
+def _expected(person: Person, problem: Problem) -> Expectation:
+    return expected_intervals(
+        problem, np.array(person.prices), np.array(person.deviation), root=person.root
+    )
+
+
+def best_of(outcomes: Sequence[Outcome], falls: float) -> tuple[Outcome, Outcome]:
+    """The A-optimal experiment and the D-optimal one.
+
+    Parameters
+    ----------
+    outcomes : sequence of Outcome
+    falls : float
+        Largest share of the trials that may end in a fall.
+
+    Raises
+    ------
+    SolverError
+        When the person falls too often in every one of them.
+    """
+    held = [item for item in outcomes if item.expected is not None and item.falls <= falls]
+    if not held:
+        least = min(item.falls for item in outcomes)
+        raise SolverError(
+            "[plan]",
+            f"the person falls in {100 * least:.0f} % of the trials or more, whatever the "
+            "perturbation",
+            "lower amplitude, or raise u_max or falls",
+        )
+    told = [(item, item.expected) for item in held if item.expected is not None]
+    return (
+        min(told, key=lambda pair: pair[1].mean_variance)[0],
+        min(told, key=lambda pair: pair[1].log_determinant)[0],
+    )

@@ -1,0 +1,109 @@
+"""Figures of a plan: how far each price would be told, and what the perturbation does.
+
+See docs/planning.md.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.reporting.style import BLUE, DOUBLE_COLUMN, GREEN, INK, VERMILLION, new_figure
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from impc.studies.plan.designs import Outcome
+    from impc.studies.plan.study import Plan
+
+__all__ = ["experiments_figure", "prices_figure"]
+
+_LINES = ((BLUE, "o", "-"), (VERMILLION, "s", "--"), (GREEN, "^", ":"), (INK, "D", "-."))
+_TWO_SIDED = 1.959964
+# Beyond this factor a price is not told, whatever its interval.
+_LARGEST = 100.0
+_COLUMNS = 3
+
+
+def prices_figure(plan: Plan) -> Figure:
+    """Half an interval of 95 % of each price, as a factor, over the amplitude."""
+    names = plan.person.structure.unknowns
+    rows = math.ceil(len(names) / _COLUMNS)
+    figure = new_figure(DOUBLE_COLUMN, 0.5 + 2.0 * rows)
+    axes = np.atleast_1d(figure.subplots(rows, min(_COLUMNS, len(names)), sharex=True)).ravel()
+    for index, (ax, name) in enumerate(zip(axes, names, strict=False)):
+        _lines(ax, plan, functools.partial(_factor, index))
+        ax.set_yscale("log")
+        ax.set_ylabel(f"price of {name} (-)")
+        ax.grid(visible=True, which="both", axis="y", linewidth=0.4, alpha=0.5)
+        ax.yaxis.set_major_formatter("{x:g}")
+        ax.yaxis.set_minor_formatter("{x:g}")
+        ax.tick_params(axis="y", which="minor", labelsize=6)
+        _axis(ax, plan)
+    for ax in axes[len(names) :]:
+        ax.set_visible(False)
+    if len(plan.outcomes) > len(plan.settings.amplitude):
+        axes[0].legend()
+    return figure
+
+
+def experiments_figure(plan: Plan) -> Figure:
+    """Share of the time at the limit, and of the trials that end in a fall."""
+    figure = new_figure(DOUBLE_COLUMN, 2.4)
+    at_limit, falls = figure.subplots(1, 2, sharex=True)
+    _lines(at_limit, plan, lambda item: 100 * item.at_limit)
+    _lines(falls, plan, lambda item: 100 * item.falls)
+    at_limit.set_ylabel("time at the limit (%)")
+    falls.set_ylabel("trials that end in a fall (%)")
+    falls.axhline(plan.settings.falls, color=INK, linewidth=0.8, linestyle=":")
+    for ax in (at_limit, falls):
+        ax.set_ylim(bottom=-1)
+        _axis(ax, plan)
+    if len(plan.outcomes) > len(plan.settings.amplitude):
+        at_limit.legend()
+    return figure
+
+
+def _factor(index: int, item: Outcome) -> float:
+    if item.expected is None:
+        return math.nan
+    half = _TWO_SIDED * float(item.expected.deviations[index])
+    return math.exp(half) if half < math.log(_LARGEST) else math.nan
+
+
+def _lines(ax: Axes, plan: Plan, value: Callable[[Outcome], float]) -> None:
+    """One line a dwell; a ring about the best experiment."""
+    dwells = sorted({item.design.dwell for item in plan.outcomes})
+    for place, dwell in enumerate(dwells):
+        mine = [
+            item
+            for item in plan.outcomes
+            if item.design.dwell == dwell or (math.isnan(dwell) and math.isnan(item.design.dwell))
+        ]
+        color, marker, line = _LINES[place % len(_LINES)]
+        ax.plot(
+            [item.design.amplitude for item in mine],
+            [value(item) for item in mine],
+            color=color,
+            marker=marker,
+            linestyle=line,
+            label="as recorded" if math.isnan(dwell) else f"held for {dwell:g} s",
+        )
+    best = plan.best
+    ax.plot(
+        best.design.amplitude, value(best), marker="o", markersize=11, color=INK, fillstyle="none"
+    )
+
+
+def _axis(ax: Axes, plan: Plan) -> None:
+    plant = plan.person.controller.plant
+    name = plant.disturbances[0]
+    label = "factor (-)" if plan.settings.files else f"amplitude ({plant.unit(name)})"
+    ax.set_xlabel(label)
+    ax.margins(x=0.08)

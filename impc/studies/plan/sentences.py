@@ -1,0 +1,154 @@
+"""What a plan says in sentences.
+
+See docs/planning.md.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.reporting.rendering import number
+from impc.reporting.shown_units import shown_unit
+from impc.studies.plan.simulated_fits import spread
+
+if TYPE_CHECKING:
+    from impc.assess.price_profiles import PriceInterval
+    from impc.studies.plan.designs import Design, Outcome
+    from impc.studies.plan.study import Plan
+
+__all__ = ["design_name", "plan_sentences", "told_as"]
+
+# Wider than this, from end to end of an interval, a price is not called told.
+_WIDE = math.log(100)
+# Nearer to one on both sides, an interval is told in percent.
+_NARROW = 1.5
+
+
+def design_name(plan: Plan, design: Design) -> str:
+    """An experiment in words: "5 N m, each value held for 0.25 s"."""
+    if math.isnan(design.dwell):
+        return f"the recorded perturbation times {design.amplitude:g}"
+    plant = plan.person.controller.plant
+    unit = plant.unit(plant.disturbances[0])
+    return f"{design.amplitude:g} {unit}, each value held for {design.dwell:g} s"
+
+
+def told_as(item: PriceInterval) -> str:
+    """An interval about the presumed value: "-7 to +8 %", "0.4 to 2.1 times", "0 to 3 times"."""
+    if math.isinf(item.high):
+        least = math.exp(item.low - item.value)
+        return "not at all" if least == 0 else f"{number(least, 2)} times and more"
+    low, high = (math.exp(end - item.value) for end in (item.low, item.high))
+    if low > 1 / _NARROW and high < _NARROW:
+        return f"{100 * (low - 1):+.2g} to {100 * (high - 1):+.2g} %"
+    return f"{number(low, 2)} to {number(high, 2)} times"
+
+
+def plan_sentences(plan: Plan) -> tuple[str, ...]:
+    """The answer first, then what stands behind it."""
+    best, settings = plan.best, plan.settings
+    count = len(plan.outcomes)
+    which = "The experiment" if count == 1 else f"The best of {count} experiments"
+    trials = "trial" if settings.trials == 1 else "trials"
+    return (
+        f"{which}, {settings.trials} {trials} of {_length(plan)}: "
+        f"{design_name(plan, best.design)}.",
+        _prices(plan),
+        _limits(plan),
+        _how_it_goes(plan, best),
+        *_groups(plan),
+        *_seen(plan),
+        "Reckoned for the presumed person, who senses without error, and for noise in the recorder "
+        "alone: noise that goes round the loop, or a body unlike the plant, makes all of it worse.",
+    )
+
+
+def _length(plan: Plan) -> str:
+    return "their recorded length" if plan.settings.files else f"{plan.settings.duration:g} s"
+
+
+def _prices(plan: Plan) -> str:
+    expected = plan.best.expected
+    if expected is None:
+        return "Nothing is told."
+    parts = [
+        f"{name} {told_as(item)}"
+        for name, item in zip(plan.person.structure.unknowns, expected.intervals, strict=True)
+    ]
+    wide = [
+        name
+        for name, item in zip(plan.person.structure.unknowns, expected.intervals, strict=True)
+        if item.high - item.low > _WIDE
+    ]
+    text = f"Beside the presumed price, an interval of 95 % would be for {'; for '.join(parts)}."
+    if wide:
+        text += f" That says next to nothing of {', '.join(wide)}."
+    return text
+
+
+def _limits(plan: Plan) -> str:
+    expected, controller = plan.best.expected, plan.person.controller
+    if expected is None or not np.any(np.isfinite(controller.bounds.u_max)):
+        return "The presumed person has no limit of the command."
+    lines = []
+    for name, deviation in zip(controller.plant.controls, expected.limits, strict=True):
+        if np.isfinite(deviation):
+            lines.append(f"the limit of {name} to ±{number(196 * float(deviation), 2)} %")
+        else:
+            lines.append(f"nothing on the limit of {name}, which is never met")
+    return f"It would tell {'; '.join(lines)}."
+
+
+def _how_it_goes(plan: Plan, best: Outcome) -> str:
+    plant = plan.person.controller.plant
+    peaks = []
+    for name, value in zip(plant.outputs, best.peaks, strict=True):
+        factor, unit = shown_unit(plant, name)
+        peaks.append(f"{name} {number(factor * float(value), 2)} {unit}")
+    return (
+        f"The person falls in {100 * best.falls:.0f} % of {plan.settings.draws} simulated trials "
+        f"and stands at the limit for {100 * best.at_limit:.1f} % of the time; the largest motion: "
+        f"{', '.join(peaks)}. The noise leaves a VAF of at most {np.min(best.vaf):.1f} %."
+    )
+
+
+def _groups(plan: Plan) -> tuple[str, ...]:
+    found = [item for item in plan.groups if math.isfinite(item.needed)]
+    if not found:
+        return ()
+    settings = plan.settings
+    least = min(found, key=lambda item: item.needed)
+    most = max(found, key=lambda item: item.needed)
+    text = (
+        f"A difference of {settings.difference:g} % between two groups, whose persons differ by "
+        f"{settings.between:g} % themselves, shows with a probability of 80 % from "
+        f"{least.needed:.0f} persons a group on"
+    )
+    if most.needed == least.needed:
+        return (f"{text} in any of these prices.",)
+    other = f"from {most.needed:.0f} on in that of {most.feature}"
+    return (f"{text} in the price of {least.feature}, {other}.",)
+
+
+def _seen(plan: Plan) -> tuple[str, ...]:
+    fits, expected = plan.simulated, plan.best.expected
+    if fits is None or expected is None or len(fits.prices) == 0:
+        return ()
+    held = fits.inside(expected)
+    names = plan.person.structure.unknowns
+    worst = int(np.argmin(held))
+    ratios = [
+        float(one / two)
+        for one, two in zip(spread(fits.prices), expected.deviations, strict=True)
+        if np.isfinite(one) and np.isfinite(two)
+    ]
+    text = (
+        f"Of {len(fits.prices)} fits of simulated recordings {100 * np.mean(held):.0f} % of the "
+        f"prices lay in these intervals ({100 * held[worst]:.0f} % of {names[worst]})"
+    )
+    if ratios:
+        text += f", and they scattered {min(ratios):.2f} to {max(ratios):.2f} times as foreseen"
+    return (f"{text}; {fits.failed} fits failed.",)

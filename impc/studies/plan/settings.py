@@ -1,0 +1,229 @@
+"""Settings of a plan, as the [plan] table of a configuration gives them (docs/planning.md)."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from impc.errors import InputError, brief
+from impc.files.units import si_unit
+from impc.model.signal_units import UNKNOWN
+from impc.model.structure import Structure
+from impc.studies.fit.settings import read_settings
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from impc.arrays import Array
+    from impc.files.configuration import SignalTable
+    from impc.model.plant import Plant
+    from impc.studies.fit.settings import FitSettings
+
+__all__ = [
+    "PlanSettings",
+    "mechanical_stops",
+    "noise_deviations",
+    "plan_settings",
+    "presumed_prices",
+]
+
+# Least and most of each number; the most is far beyond any use.
+_RANGES: dict[str, tuple[float, float]] = {
+    "amplitude": (1e-100, 1e100),
+    "dwell": (1e-4, 1e4),
+    "duration": (0.1, 1e4),
+    "trials": (1, 100),
+    "draws": (1, 1000),
+    "falls": (0, 100),
+    "correlation": (0, 100),
+    "between": (0, 1000),
+    "groups": (2, 100_000),
+    "difference": (0.1, 1e4),
+    "fits": (0, 10_000),
+    "seed": (0, 2**31),
+}
+_FEWEST_FITS = 20
+_NUMBER = re.compile(r"\s*([0-9.eE+-]+)\s*(.*\S)\s*")
+
+
+@dataclass(frozen=True)
+class PlanSettings:
+    """The presumed person, the experiments to choose from, and what is asked of them.
+
+    Attributes
+    ----------
+    prices : dict of str to float
+        Presumed price of each feature of the structure, with the first input's at one; without
+        [fit.structure] its keys are the features.
+    noise : dict of str to float or str
+        Standard deviation of the noise in the recorder, for each output: in the plant's unit, or
+        with one, as in "0.1 deg".
+    correlation : float
+        Time in s over which this noise falls to 1/e of its correlation; 0 for white noise.
+    stops : dict of str to float or str
+        Largest magnitude of outputs beyond which a person falls, written as `noise` is; by default
+        the limits of [signals].
+    perturbed : list of str
+        Inputs of the plant that perturb the person; by default those that [signals] names.
+    amplitude : list of float
+        Of the perturbation, in the disturbance's unit; with `files` a factor.
+    dwell : list of float
+        For how long the ternary perturbation keeps each value, s.
+    duration : float
+        Of a trial, s.
+    trials : int
+        Of a person.
+    files : list of str
+        Recordings of perturbations in the place of the ternary one, beside the configuration.
+    draws : int
+        Trials that are simulated of each experiment to see how often the person falls.
+    falls : float
+        Largest share of them that may end in a fall, %.
+    groups : list of int
+        Persons in each of two groups that are to be told apart.
+    difference : float
+        By which a price differs between the groups, %.
+    between : float
+        Standard deviation of the logarithm of a price within a group, %.
+    fits : int
+        Fits of simulated recordings of the best experiment, to compare with; 0 for none.
+    seed : int
+        All that is drawn follows from it.
+    """
+
+    prices: dict[str, float]
+    noise: dict[str, float | str]
+    correlation: float = 0.0
+    stops: dict[str, float | str] = field(default_factory=dict)
+    perturbed: list[str] = field(default_factory=list)
+    amplitude: list[float] = field(default_factory=lambda: [2.5, 5.0, 10.0])
+    dwell: list[float] = field(default_factory=lambda: [0.125, 0.25, 0.5])
+    duration: float = 30.0
+    trials: int = 3
+    files: list[str] = field(default_factory=list)
+    draws: int = 20
+    falls: float = 5.0
+    groups: list[int] = field(default_factory=lambda: [10, 20])
+    difference: float = 50.0
+    between: float = 30.0
+    fits: int = 0
+    seed: int = 0
+
+
+def plan_settings(table: Mapping[str, Any]) -> PlanSettings:
+    """Read the [plan] table of a configuration.
+
+    Raises
+    ------
+    InputError
+        When a key is unknown or a value is of the wrong kind or out of range.
+    """
+    settings = read_settings("plan", PlanSettings, table)
+    for name, (least, most) in _RANGES.items():
+        value = getattr(settings, name)
+        values = value if isinstance(value, list) else [value]
+        if not values:
+            raise InputError(f"[plan] {name}", "is empty", "give one number or more")
+        for item in values:
+            if not least <= item <= most:
+                remedy = f"give at least {least:.6g}, at most {most:.6g}"
+                raise InputError(f"[plan] {name}", f"got {brief(item)}", remedy)
+    if 0 < settings.fits < _FEWEST_FITS:
+        raise InputError("[plan] fits", f"got {settings.fits}", f"give 0 or {_FEWEST_FITS} or more")
+    return settings
+
+
+def presumed_prices(
+    plant: Plant, settings: PlanSettings, fit: FitSettings
+) -> tuple[Structure, Array]:
+    """The structure of the presumed person, and its unknowns (count,).
+
+    Raises
+    ------
+    InputError, WeightsError
+        When a price is missing, unknown or not positive, or the structure is not one of a price
+        for each feature.
+    """
+    given = settings.prices
+    item = fit.structure
+    if item is None:
+        structure = Structure(plant, list(given))
+    else:
+        structure = Structure(plant, item.Q, item.R, over=item.over, name=item.name)
+    if structure.coupled or structure.input_coupled:
+        raise InputError("[fit.structure]", "prices products too", "plan with a diagonal structure")
+    for name in structure.unknowns:
+        if name not in given:
+            raise InputError("[plan] prices", f"lacks {name!r}", "presume a price for each feature")
+    for name, price in given.items():
+        if name not in structure.unknowns:
+            known = ", ".join(structure.unknowns)
+            raise InputError(f"[plan] prices {name}", "is not a feature", f"known: {known}")
+        if not 1e-100 < price < 1e100:
+            raise InputError(f"[plan] prices {name}", f"got {price:g}", "give a positive number")
+    return structure, np.log([given[name] for name in structure.unknowns])
+
+
+def noise_deviations(plant: Plant, settings: PlanSettings) -> Array:
+    """Standard deviation of the noise of each output (p,), in the plant's units.
+
+    Raises
+    ------
+    InputError
+        When an output is missing or unknown, or its noise is not positive or of another kind.
+    """
+    found = _of_outputs(plant, "noise", settings.noise)
+    for name in plant.outputs:
+        if name not in found:
+            raise InputError("[plan] noise", f"lacks {name}", "give one for each output")
+    return np.array([found[name] for name in plant.outputs])
+
+
+def mechanical_stops(
+    plant: Plant, settings: PlanSettings, signals: Mapping[str, SignalTable]
+) -> Array:
+    """Largest magnitude of each output (p,), in the plant's units; infinite without a stop.
+
+    Raises
+    ------
+    InputError
+        When an output is unknown, or its stop is not positive or of another kind.
+    """
+    told = {
+        name: entry.limit * si_unit(entry.unit).factor
+        for name, entry in signals.items()
+        if entry.limit is not None
+    }
+    told |= _of_outputs(plant, "stops", settings.stops)
+    return np.array([told.get(name, np.inf) for name in plant.outputs])
+
+
+def _of_outputs(plant: Plant, key: str, given: Mapping[str, float | str]) -> dict[str, float]:
+    found = {}
+    for name, written in given.items():
+        if name not in plant.outputs:
+            known = ", ".join(plant.outputs)
+            raise InputError(f"[plan] {key} {name}", "is not an output", f"known: {known}")
+        found[name] = _in_units(f"[plan] {key} {name}", plant.unit(name), written)
+        if not 1e-100 < found[name] < 1e100:
+            raise InputError(f"[plan] {key} {name}", f"got {written}", "give a positive number")
+    return found
+
+
+def _in_units(place: str, expected: str, given: float | str) -> float:
+    if not isinstance(given, str):
+        return given
+    parts = _NUMBER.fullmatch(given)
+    try:
+        size = float(parts[1]) if parts else None
+    except ValueError:
+        size = None
+    if parts is None or size is None:
+        raise InputError(place, f"got {brief(given)}", 'write as in "0.1 deg"')
+    unit = si_unit(parts[2])
+    if expected != UNKNOWN and si_unit(expected).base not in (unit.base, "dimensionless"):
+        raise InputError(place, f"is in {parts[2]}, the plant's in {expected}", "correct it")
+    return size * unit.factor

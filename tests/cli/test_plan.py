@@ -1,0 +1,135 @@
+"""`impc plan` from its file to its page, as its users type it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from click.testing import CliRunner, Result
+
+from impc.cli.main import main
+from impc.files.formats import write_table
+from impc.files.results import read_result
+from impc.files.table import make_table
+
+PLAN = """
+[plant]
+mass = 79.7
+height = 1.66
+
+[fit]
+u_max = 6.0
+
+[fit.structure]
+Q = "diagonal"
+over = ["theta1", "theta2", "theta1_rate", "theta2_rate"]
+
+[plan]
+prices = { theta1 = 6e3, theta2 = 9e3, theta1_rate = 6e2, theta2_rate = 4e2 }
+noise = { theta1 = "0.05 deg", theta2 = "0.05 deg" }
+correlation = 0.02
+stops = { theta1 = "12 deg" }
+perturbed = ["perturbation"]
+amplitude = [2, 4]
+dwell = [0.25]
+duration = 8.0
+trials = 1
+draws = 2
+"""
+
+
+def run(*arguments: str) -> Result:
+    return CliRunner().invoke(main, list(arguments))
+
+
+def planned(folder: Path, text: str, name: str = "out") -> Result:
+    (folder / "plan.toml").write_text(text, encoding="utf-8")
+    out = str(folder / name)
+    return run("plan", str(folder / "plan.toml"), "--plant", "seated-balance", "--out", out)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("plan")
+    done = planned(folder, PLAN)
+    assert done.exit_code == 0, done.output
+    assert "The best of 2 experiments, 1 trial of 8 s: 4 N m" in done.output
+    return folder
+
+
+def test_the_page_the_table_and_the_numbers_say_the_same(folder: Path) -> None:
+    found = json.loads((folder / "out" / "result.json").read_text(encoding="utf-8"))
+    table = pd.read_csv(folder / "out" / "experiments.csv")
+    page = (folder / "out" / "report.html").read_text(encoding="utf-8")
+    assert table["amplitude"].tolist() == [2, 4]
+    assert found["best"] == {"amplitude": 4, "dwell": 0.25}
+    for row, one in zip(found["experiments"], table.to_dict("records"), strict=True):
+        assert row["theta1 deviation"] == pytest.approx(one["theta1 deviation"])
+    # Twice the torque in a body that nothing stops: half the deviation.
+    assert table["theta1 deviation"][1] == pytest.approx(table["theta1 deviation"][0] / 2, rel=1e-6)
+    for sentence in found["sentences"]:
+        assert sentence.replace("+", "&#43;") in page
+    assert read_result(folder / "out").content["best"] == found["best"]
+    for name in ("prices", "experiments"):
+        assert (folder / "out" / f"{name}.png").stat().st_size > 10_000
+
+
+def test_a_perturbation_from_a_file_is_scaled(folder: Path) -> None:
+    time = np.arange(800) / 100
+    push = np.where(np.floor(time * 4) % 3 == 0, 2.0, -1.0)
+    write_table(folder / "push.csv", make_table("push", {"time": time, "motor": push}))
+    signals = (
+        '\n[recording]\ntime = "time"\n[signals.perturbation]\ncolumn = "motor"\nunit = "N*m"\n'
+    )
+    text = PLAN.replace("dwell = [0.25]", 'files = ["push.csv"]').replace(
+        "amplitude = [2, 4]", "amplitude = [1, 2]"
+    )
+    done = planned(folder, text + signals, "file")
+    assert done.exit_code == 0, done.output
+    assert "the recorded perturbation times 2" in done.output
+    found = json.loads((folder / "file" / "result.json").read_text(encoding="utf-8"))
+    assert [row["amplitude"] for row in found["experiments"]] == [1, 2]
+    assert found["experiments"][0]["dwell"] is None
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (('perturbed = ["perturbation"]', ""), "[plan] perturbed: names no input of the plant"),
+        (("amplitude = [2, 4]", "amplitude = [90]"), "falls in 100 % of the trials or more"),
+        (('"0.05 deg", theta2', '"0.05 kg", theta2'), "noise theta1: is in kg"),
+        (('"0.05 deg", theta2', '"deg", theta2'), "noise theta1: got deg"),
+        (("theta1 = 6e3, ", ""), "[plan] prices: lacks 'theta1'"),
+        (("theta1 = 6e3", "theta1 = 0"), "prices theta1: got 0"),
+        (("theta1 = 6e3", "angle = 1, theta1 = 6e3"), "prices angle: is not a feature"),
+        (("u_max = 6.0", 'bounded_states = { theta1 = "data" }'), 'bounded_states: is "data"'),
+        (("[plan]", "[plann]"), "plann: is not known"),
+    ],
+)
+def test_a_plan_that_cannot_be_made_is_refused_in_one_line(
+    tmp_path: Path, change: tuple[str, str], message: str
+) -> None:
+    done = planned(tmp_path, PLAN.replace(*change))
+    assert done.exit_code == 2
+    assert message in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert not (tmp_path / "out" / "report.html").exists()
+
+
+def test_the_file_of_a_plan_is_one_that_a_fit_reads(tmp_path: Path) -> None:
+    """[plan] stands beside the tables of `impc fit`, which passes over it."""
+    signals = (
+        "\n[recording]\nrate = 100\n"
+        '[signals.theta1]\ncolumn = "a"\nunit = "deg"\n'
+        '[signals.theta2]\ncolumn = "b"\nunit = "deg"\n'
+    )
+    (tmp_path / "both.toml").write_text(PLAN + signals, encoding="utf-8")
+    (tmp_path / "none.csv").write_text("a,b\n1,2\n", encoding="utf-8")
+    done = run(
+        "fit", str(tmp_path / "none.csv"), "--plant", "seated-balance",
+        "--config", str(tmp_path / "both.toml"), "--out", str(tmp_path / "fit"),
+    )  # fmt: skip
+    assert "none.csv" in done.stderr  # read, and too short

@@ -1,0 +1,159 @@
+"""Plans: the grid, the person who falls, groups, and fits of simulated recordings."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import scipy.stats
+
+from experiments.printed_intervals import carts
+from impc.arrays import Array
+from impc.checking import replace
+from impc.control.controller import Controller
+from impc.errors import InputError, SolverError
+from impc.model.bounds import Bounds
+from impc.model.structure import Structure
+from impc.studies.fit.settings import FitSettings, StructureSettings
+from impc.studies.plan.designs import Design, Person, held_trials, problem_of, try_design
+from impc.studies.plan.settings import (
+    PlanSettings,
+    mechanical_stops,
+    noise_deviations,
+    plan_settings,
+    presumed_prices,
+)
+from impc.studies.plan.simulated_fits import recorded_noise, simulated_fits, spread
+from impc.studies.plan.study import make_plan, steps_of
+
+PRICES = {"x[0]": 4.0, "x[1]": 1.0}
+SETTINGS = PlanSettings(
+    prices=PRICES,
+    noise={"position1": 0.03},
+    amplitude=[0.4, 0.8, 3.0],
+    dwell=[1.0, 2.0],
+    trials=1,
+    draws=4,
+    falls=0.0,
+)
+
+
+def person() -> Person:
+    """A cart with a limit of one."""
+    plant = carts(1)
+    structure = Structure(plant, list(plant.states))
+    prices = np.log(list(PRICES.values()))
+    bounds = Bounds(plant, u_min=-1, u_max=1)
+    law = Controller(plant, structure.weights(prices), bounds, 8, terminal_set=False)
+    return Person(law, structure, prices, np.array([0.03]), 0.0, np.array([np.inf]))
+
+
+def perturbation(amplitude: float, dwell: float, number: int) -> Array:
+    levels = np.random.default_rng([7, number]).choice([-amplitude, 0, amplitude], (40, 1))
+    return np.repeat(levels, round(10 * dwell), axis=0)[:200]
+
+
+def test_the_best_experiment_is_the_one_that_tells_most_without_a_fall() -> None:
+    told = list[str]()
+    plan = make_plan(person(), SETTINGS, perturbation, told.append)
+    assert len(told) == steps_of(SETTINGS) == 6
+    falls = {(item.design.amplitude, item.design.dwell): item.falls for item in plan.outcomes}
+    # A push of 3 against a force of 1: nobody holds that for two seconds.
+    assert falls[3.0, 2.0] > 0
+    assert falls[0.4, 1.0] == 0
+    held = [item for item in plan.outcomes if item.falls == 0]
+    variances = [float(np.mean(item.expected.deviations**2)) for item in held if item.expected]
+    assert plan.best.expected is not None
+    assert float(np.mean(plan.best.expected.deviations**2)) == min(variances)
+    assert plan.best.design.amplitude == 0.8
+
+
+def test_who_falls_in_every_experiment_is_told_so() -> None:
+    settings = replace(SETTINGS, amplitude=[20.0])
+    with pytest.raises(SolverError, match="falls in 100 % of the trials"):
+        make_plan(person(), settings, perturbation)
+
+
+def test_a_stop_that_is_passed_is_a_fall() -> None:
+    free = try_design(person(), Design(0.8, 1.0), perturbation, trials=1, draws=4)
+    peak = float(free.peaks[0])
+    stopped = replace(person(), stops=np.array([0.999 * peak]))
+    assert free.falls == 0
+    found = try_design(stopped, Design(0.8, 1.0), perturbation, trials=1, draws=4)
+    assert found.falls == 0.25
+
+
+def test_power_is_that_of_the_noncentral_t() -> None:
+    plan = make_plan(person(), replace(SETTINGS, amplitude=[0.8], dwell=[2.0]), perturbation)
+    assert plan.best.expected is not None
+    for item, own in zip(plan.groups, plan.best.expected.deviations, strict=True):
+        size, deviation = 10, math.hypot(float(own), 0.3)
+        assert item.deviation == pytest.approx(deviation)
+        away = math.log(1.5) / deviation * math.sqrt(size / 2)
+        edge = float(scipy.stats.t.ppf(0.975, 2 * size - 2))
+        power = scipy.stats.nct.sf(edge, 2 * size - 2, away) + scipy.stats.nct.cdf(
+            -edge, 2 * size - 2, away
+        )
+        assert item.powers[0] == pytest.approx(power, rel=1e-6)
+
+
+def test_fits_scatter_as_foreseen() -> None:
+    """Thirty fits: a deviation of 13 % of their own; the noise is that of the recordings."""
+    someone = replace(person(), root=0.5, deviation=np.array([0.02]))
+    kept = held_trials(someone, Design(0.8, 2.0), perturbation, 2)
+    problem = problem_of(someone, kept[:1])
+    told = try_design(someone, Design(0.8, 2.0), perturbation, trials=1, draws=2)
+    assert told.expected is not None
+    fits = simulated_fits(someone, problem, 30, 1)
+    assert fits.failed == 0
+    ratios = np.std(fits.prices, axis=0) / told.expected.deviations
+    assert np.all((ratios > 0.65) & (ratios < 1.35)), ratios
+    gains = np.std(fits.gains, axis=0) / told.expected.gain.entries
+    assert np.all((gains > 0.65) & (gains < 1.35)), gains
+    assert np.all(fits.inside(told.expected) > 0.8)
+
+
+def test_noise_has_the_deviation_and_the_colour_that_were_asked_for() -> None:
+    someone = replace(person(), root=0.8)
+    noise = recorded_noise(someone, 40_000, np.random.default_rng(2))[:, 0]
+    assert np.std(noise) == pytest.approx(0.03, rel=0.03)
+    assert np.corrcoef(noise[1:], noise[:-1])[0, 1] == pytest.approx(0.8, abs=0.01)
+
+
+def test_spread_is_the_deviation_of_normal_numbers() -> None:
+    values = np.random.default_rng(5).standard_normal((20_000, 2)) * [1.0, 3.0]
+    assert spread(values) == pytest.approx([1.0, 3.0], rel=0.03)
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ({"prices": PRICES, "noise": {}, "amplitude": []}, "amplitude: is empty"),
+        ({"prices": PRICES, "noise": {}, "amplitude": [-1.0]}, "amplitude: got -1"),
+        ({"prices": PRICES, "noise": {}, "trials": 0}, "trials: got 0"),
+        ({"prices": PRICES, "noise": {}, "fits": 3}, "fits: got 3"),
+        ({"prices": PRICES, "noise": {}, "trails": 3}, "trails: is not a setting"),
+        ({"noise": {}}, "prices"),
+    ],
+)
+def test_settings_are_checked(table: dict[str, object], message: str) -> None:
+    with pytest.raises(InputError, match=message.replace("[", r"\[")):
+        plan_settings(table)
+
+
+def test_prices_and_noise_go_by_their_names() -> None:
+    plant = carts(1)
+    given = replace(SETTINGS, prices={"x[1]": 1.0, "x[0]": 4.0})
+    structure, prices = presumed_prices(plant, given, FitSettings())
+    assert dict(zip(structure.unknowns, np.exp(prices), strict=True)) == pytest.approx(PRICES)
+    shape = FitSettings(structure=StructureSettings(["x[0]", "x[1]", "x[0] - x[1]"]))
+    with pytest.raises(InputError, match="lacks 'x\\[0\\] - x\\[1\\]'"):
+        presumed_prices(plant, given, shape)
+    with pytest.raises(InputError, match="products"):
+        presumed_prices(plant, given, FitSettings(structure=StructureSettings("full")))
+    with pytest.raises(InputError, match="lacks position1"):
+        noise_deviations(plant, replace(SETTINGS, noise={}))
+    with pytest.raises(InputError, match="is not an output"):
+        mechanical_stops(plant, replace(SETTINGS, stops={"angle": 1.0}), {})
+    assert mechanical_stops(plant, SETTINGS, {})[0] == np.inf
