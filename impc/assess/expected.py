@@ -55,7 +55,7 @@ class Expectation(Frozen):
     intervals : tuple of PriceInterval
         Of each unknown, by its profile; by its deviation where products of features have prices.
     gain : GainCovariance
-        Of a gain that is fitted without a structure.
+        Of a gain that is fitted without a structure, to second order as a fit prints it.
     limits : Array
         Standard deviation of the logarithm of the limit of each input (m,), with a free gain;
         infinite where it is never met, or the input has none.
@@ -162,7 +162,7 @@ def expected_intervals(
     return Expectation(
         found,
         _intervals(at, found, level),
-        gain_covariance(scaled, K, S, lambda _trials, _lost: coloured),
+        gain_covariance(scaled, K, S, lambda _trials, _lost: coloured, curvature=True),
         frozen(_limits(at, coloured)),
     )
 

@@ -69,6 +69,8 @@ def fit_effort(problem: Problem, settings: FitSettings) -> Effort:
         samples * n * horizon * SECONDS_A_SAMPLE + derivatives * _A_NUMBER + len(trials) * _A_TRIAL
     )
     left_out = len(trials) if settings.held_out and len(trials) > 1 else 0
+    structures = (settings.structure is not None) + len(settings.structures)
     fits = 2 + left_out + len(settings.horizons) + m * settings.unknown_limit
+    fits += structures * (1 + left_out)
     simulations = _FIT * fits + _REPLICATE * settings.replicates + _PROFILE * len(settings.profiles)
     return Effort(simulations * once, 8e-9 * numbers)

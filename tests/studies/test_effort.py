@@ -27,7 +27,7 @@ from impc.model.recordings import Recording
 from impc.model.riccati import solve_lqr
 from impc.model.weights import Weights
 from impc.studies.effort import Effort, fit_effort
-from impc.studies.fit.settings import FitSettings
+from impc.studies.fit.settings import FitSettings, StructureSettings
 from impc.studies.selection.analysis import select_study
 from impc.studies.selection.effort import key_evaluations, select_evaluations, selection_effort
 from impc.studies.selection.key_parameters import key_parameters
@@ -45,6 +45,16 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from impc.arrays import Array, IntArray
+
+
+def test_each_structure_is_a_fit_more_and_one_for_each_trial_left_out() -> None:
+    plant = random_plant(np.random.default_rng(5), 4, 1, 0.95)
+    trial = Recording(plant, np.ones((50, 4)))
+    problem = Problem(plant, Bounds(plant), 10, (trial, trial, trial), terminal_set=False)
+    plain, one = FitSettings(), FitSettings(structure=StructureSettings())
+    # Two fits and three without a trial; then four more.
+    told = [fit_effort(problem, settings).seconds for settings in (plain, one)]
+    assert told[1] == pytest.approx(told[0] * 9 / 5)
 
 
 @pytest.mark.parametrize(("n", "m", "horizon"), [(2, 1, 300), (4, 2, 100), (8, 1, 150)])

@@ -1,0 +1,176 @@
+"""What people following a blurred target want: structures of their weights, blur by blur.
+
+Three statements on the cost, beside the command: the error alone; error and velocity of the cursor;
+error, velocity and effort, the acceleration of the hand. Each is fitted with delay and lag, tested,
+and judged on trials left out (docs/structures.md). The price of velocity is told over that of the
+error, in s^2, with its profile's interval.
+
+    python -m experiments.cursor_structures --out results/cursor-structures
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from experiments.cursor_data import Condition, data_file, read_conditions
+from experiments.cursor_tracking import condition_problem
+from impc.assess.price_profiles import PriceProfiles
+from impc.assess.structured_weights import tangent
+from impc.assess.structures import StructureFit, assess_structure
+from impc.errors import SolverError, WeightsError
+from impc.inverse.noisy_fit import fit_controller
+from impc.inverse.structured_fit import fit_structured
+from impc.model.structure import Structure
+from impc.reporting.rendering import plain
+from impc.reporting.writer import write_files
+
+__all__ = ["STRUCTURES", "StructureRow", "structure_rows"]
+
+#: Name -> features of the state that have a price.
+STRUCTURES = {
+    "error": ["error"],
+    "error, velocity": ["error", "velocity"],
+    "error, velocity, effort": ["error", "velocity", "acceleration"],
+}
+
+
+@dataclass(frozen=True)
+class StructureRow:
+    """One structure at one blur.
+
+    Attributes
+    ----------
+    blur : float
+        px.
+    structure : str
+        A key of `STRUCTURES`.
+    reason : str
+        Why there is no fit; empty otherwise.
+    refused : bool
+    probability : float
+        Of residuals as far from the structure as these, if it holds.
+    freedom : int
+        Directions of the gain that the test looks at.
+    vaf, held_out : float
+        Of all trials, and mean over trials left out, %.
+    aic : float
+        Akaike's criterion; less is better.
+    prices : list of float
+        At R = 1.
+    velocity, low, high : float
+        Price of velocity over that of the error and its interval of 95 %, s^2; NaN without one.
+    """
+
+    blur: float
+    structure: str
+    reason: str
+    refused: bool
+    probability: float
+    freedom: int
+    vaf: float
+    held_out: float
+    aic: float
+    prices: list[float]
+    velocity: float
+    low: float
+    high: float
+
+
+def structure_rows(condition: Condition) -> list[StructureRow]:
+    """Every structure on the trials of a condition."""
+    problem = condition_problem(condition)
+    near = fit_controller(problem)
+    rows = []
+    for name, features in STRUCTURES.items():
+        structure = Structure(problem.plant, features, name=name)
+        try:
+            found = fit_structured(problem, structure, near)
+            fit = assess_structure(problem, structure, found, near, 1.0, held_out=True)
+        except (SolverError, WeightsError) as error:
+            nothing = float("nan")
+            rows.append(
+                StructureRow(
+                    condition.blur, name, str(error), True, nothing, 0, nothing, nothing, nothing,
+                    [], nothing, nothing, nothing,
+                )
+            )  # fmt: skip
+            continue
+        rows.append(_row(condition.blur, name, fit))
+    return rows
+
+
+def _row(blur: float, name: str, fit: StructureFit) -> StructureRow:
+    assert fit.test is not None
+    assert fit.estimate is not None
+    return StructureRow(
+        blur,
+        name,
+        "",
+        fit.refused,
+        fit.test.probability,
+        fit.test.freedom,
+        float(fit.vaf[0]),
+        float(fit.held_out[0]),
+        fit.aic,
+        np.exp(np.array(fit.estimate.prices)).tolist(),
+        *_velocity(fit),
+    )
+
+
+def _velocity(fit: StructureFit) -> tuple[float, float, float]:
+    """Price of velocity over that of the error, with the ends of its interval."""
+    estimate, covariance = fit.estimate, fit.covariance
+    if estimate is None or covariance is None or "velocity" not in fit.structure.labels:
+        return (float("nan"),) * 3
+    at = tangent(fit.structure, estimate.problem, np.array(estimate.prices))
+    profiles, row = PriceProfiles(at, covariance), np.zeros(fit.structure.count)
+    error, velocity = (fit.structure.labels.index(name) for name in ("error", "velocity"))
+    prices = np.array(estimate.prices)
+    if not np.isfinite(prices[velocity]):
+        high = profiles.zero(velocity).high - prices[error]
+        return 0.0, 0.0, float(np.exp(high))
+    row[velocity], row[error] = 1.0, -1.0
+    found = profiles.interval(row)
+    return tuple(float(np.exp(end)) for end in (found.value, found.low, found.high))  # type: ignore[return-value]
+
+
+def _table(rows: list[StructureRow]) -> str:
+    lines = [
+        "| blur, px | structure | refused at 5 % | p | VAF, % | left out, % | criterion | velocity "
+        "over error, s^2 (95 %) |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for row in rows:
+        ratio = "-"
+        if np.isfinite(row.velocity):
+            ratio = f"{row.velocity:.2g} ({row.low:.2g} to {row.high:.2g})"
+        word = row.reason or ("refused" if row.refused else "no")
+        lines.append(
+            f"| {row.blur:g} | {row.structure} | {word} | {row.probability:.2g} | {row.vaf:.1f} | "
+            f"{row.held_out:.1f} | {row.aic:.0f} | {ratio} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    """Write the table and its numbers."""
+    parser = argparse.ArgumentParser(description="Structures of the weights of target tracking.")
+    parser.add_argument("--out", type=Path, default=Path("results/cursor-structures"))
+    out: Path = parser.parse_args().out
+    rows = list[StructureRow]()
+    for condition in tqdm(read_conditions(data_file()), disable=None):
+        rows += structure_rows(condition)
+        table = _table(rows)
+        numbers = json.dumps([plain(asdict(row)) for row in rows], indent=1) + "\n"
+        write_files(out, {"table.md": table.encode(), "result.json": numbers.encode()})
+    print(_table(rows))
+
+
+if __name__ == "__main__":
+    main()
