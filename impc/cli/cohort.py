@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 __all__ = ["command"]
 
 # Of the settings that ask for more, those that a worker takes.
-_USED = ("replicates",)
+_USED = ("replicates", "structure")
 
 
 @click.command("cohort")

@@ -3,6 +3,7 @@
     two groups     Welch's t on the subjects' means over their visits, Hedges' g
     two visits     paired t on subjects who have both, d_z = mean / SD of the differences
     both           Welch's t on the subjects' changes per visit: whether groups change differently
+    all visits     a mixed model of prices within a structure: group, visit, a mean for each subject
     reliability    ICC(A,1) between visits
 
 Several measures are tested at once: beside each p stands Holm's, over the measures of one question.
@@ -11,15 +12,17 @@ Several measures are tested at once: beside each p stands Holm's, over the measu
 from __future__ import annotations
 
 import itertools
+import warnings
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.stats
+from statsmodels.regression.mixed_linear_model import MixedLM
 from statsmodels.stats.multitest import multipletests
 
 from impc.checking import replace
-from impc.errors import DataError
+from impc.errors import DataError, one_line
 from impc.studies.reliability.icc import icc
 
 if TYPE_CHECKING:
@@ -32,6 +35,7 @@ if TYPE_CHECKING:
 __all__ = ["Comparison", "compare_cohort", "measures_of"]
 
 _FEWEST = 3
+_PRICE = "log_price."
 
 
 @dataclass(frozen=True)
@@ -41,7 +45,7 @@ class Comparison:
     Attributes
     ----------
     question : str
-        "group", "visit", "change" or "reliability".
+        "group", "visit", "change", "mixed" or "reliability".
     measure, condition : str
         Of which, by name.
     first, second : str
@@ -78,17 +82,19 @@ class Comparison:
 def measures_of(units: pd.DataFrame) -> tuple[str, ...]:
     """Columns of the table `units` that are compared: few, chosen before the data are seen.
 
-    Gains on recorded outputs and their rates, prices of recorded outputs in the analytic centre,
-    and VAF. Gains on states of a delay or a muscle, one by one, say little, and every measure makes
-    Holm's correction harder on the others. All gains where no state has an output's name.
+    Logarithms of prices within a structure, or without one prices of recorded outputs in the
+    analytic centre; gains on recorded outputs and their rates; and VAF. Gains on states of a delay
+    or a muscle, one by one, say little, and every measure makes Holm's correction harder on the
+    others. All gains where no state has an output's name.
     """
     outputs = [name.removeprefix("vaf.") for name in units.columns if name.startswith("vaf.")]
     shown = {*outputs, *(f"{name}_rate" for name in outputs)}
     gains = [name for name in units.columns if name.startswith("K.")]
     named = [name for name in gains if name.split(".", 2)[2] in shown]
-    prices = [f"centre_price.{name}" for name in outputs]
+    priced = [name for name in units.columns if name.startswith(_PRICE)]
+    centre = [name for name in units.columns if name in {f"centre_price.{o}" for o in outputs}]
     shares = [name for name in units.columns if name.startswith("vaf.")]
-    return (*(named or gains), *(name for name in prices if name in units.columns), *shares)
+    return (*priced, *(named or gains), *(() if priced else centre), *shares)
 
 
 def compare_cohort(
@@ -120,6 +126,8 @@ def compare_cohort(
             found += _holm([_groups(part, name, told, one, other) for name in chosen])
             if len(visits) > 1:
                 found += _holm([_interaction(part, name, told, one, other) for name in chosen])
+                priced = [name for name in chosen if name.startswith(_PRICE)]
+                found += _holm([_mixed(part, name, told, one, other) for name in priced])
         for one, other in itertools.combinations(visits, 2):
             found += _holm([_visits(part, name, told, one, other) for name in chosen])
         if len(visits) > 1:
@@ -175,6 +183,37 @@ def _interaction(
             slopes[group].append(float(np.polyfit(visits, rows[measure], 1)[0]))
     a, b = np.array(slopes[one]), np.array(slopes[other])
     return _welch("change", measure, condition, one, other, a, b)
+
+
+def _mixed(part: pd.DataFrame, measure: str, condition: str, one: str, other: str) -> Comparison:
+    """Group effect with a mean for each visit and each subject, by restricted likelihood.
+
+    The effect lies between subjects: its t has so many degrees of freedom as there are subjects
+    less the two groups, which is exact where every subject has all visits.
+    """
+    rows = part[part["group"].isin([one, other])].dropna(subset=[measure])
+    each = rows.groupby("group")["subject"].nunique()
+    n = int(each.sum())
+    if min(each.get(one, 0), each.get(other, 0)) < _FEWEST:
+        return _nothing("mixed", measure, condition, one, other, n)
+    visits = list(dict.fromkeys(rows["visit"]))[1:]
+    second = np.asarray(rows["group"] == other, dtype=np.float64)
+    design = [np.ones(len(rows)), second, *(np.asarray(rows["visit"] == v, float) for v in visits)]
+    with warnings.catch_warnings(record=True) as raised:
+        warnings.simplefilter("always")
+        model = MixedLM(np.asarray(rows[measure], float), np.transpose(design), rows["subject"])
+        fitted = model.fit(reml=True)
+    effect, error = float(fitted.params[1]), float(fitted.bse[1])
+    if not (np.isfinite(error) and error > 0) or not fitted.converged:
+        why = "; ".join(str(item.message) for item in raised[:1]) or "no deviation"
+        found = _nothing("mixed", measure, condition, one, other, n)
+        return replace(found, note=f"the mixed model did not converge ({one_line(why)[:60]})")
+    reach = float(scipy.stats.t.ppf(0.975, n - 2)) * error
+    p = 2 * float(scipy.stats.t.sf(abs(effect) / error, n - 2))
+    return Comparison(
+        "mixed", measure, condition, one, other, effect, effect - reach, effect + reach, np.nan, p,
+        np.nan, n,
+    )  # fmt: skip
 
 
 def _reliability(part: pd.DataFrame, measure: str, condition: str) -> Comparison:

@@ -78,4 +78,6 @@ def subject_figure(fit: dict[str, Any]) -> Figure:
 def _unit(name: str) -> str:
     if name.startswith(("vaf.", "held_out_vaf.")):
         return "%"
+    if name.startswith("log_price."):
+        return "-"
     return "SI units"

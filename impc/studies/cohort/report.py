@@ -32,6 +32,7 @@ _QUESTIONS = {
     "group": ("Between groups", "Hedges' g"),
     "visit": ("Between visits", "d_z"),
     "change": ("Do groups change differently from visit to visit?", "Hedges' g"),
+    "mixed": ("Between groups, over all visits: mixed model of the prices", ""),
     "reliability": ("Reliability between visits, ICC(A,1)", ""),
 }
 _GROUPS = Picture(
@@ -77,7 +78,7 @@ def write_report(study: Study, store: Store, failures: Failures, command: str) -
         "impc cohort",
         f"Groups and visits of {len(subjects)} subjects",
         (
-            Lines([*_findings(compared), *_limits(units)]),
+            Lines([*_findings(compared), *_structure_lines(units), *_limits(units)]),
             _summary(study, tables, subjects, failures),
         ),
         [
@@ -119,7 +120,37 @@ def _subjects(subjects: dict[str, list[Unit]], units: pd.DataFrame) -> list[Bloc
         for name in subjects
     ]
     table = _unit_table(units)
-    return [Markup(", ").join(links), *(() if table is None else (table,))]
+    return [
+        Markup(", ").join(links),
+        *(() if table is None else (table,)),
+        *_structure_table(units),
+    ]
+
+
+def _structure_table(units: pd.DataFrame) -> list[TextTable]:
+    """Prices of every unit within the structure, and whether it holds there."""
+    priced = [name for name in units.columns if name.startswith("log_price.")]
+    if not priced:
+        return []
+    rows = []
+    for _, row in units.iterrows():
+        cells = []
+        for name in priced:
+            low, high = (_price(row[name.replace("log_price", f"log_price_{end}")])
+                         for end in ("low", "high"))  # fmt: skip
+            cells.append(f"{_price(row[name])} ({low} to {high})")
+        word = "refused" if row["structure_refused"] else "holds"
+        rows.append((str(row["unit"]), str(row["group"]), word, *cells))
+    heads = ("unit", "group", "structure", *(name.removeprefix("log_price.") for name in priced))
+    caption = (
+        "Prices within the structure, with one for the first command, and their intervals of 95 %; "
+        "`holds`: the recordings do not refuse it."
+    )
+    return [TextTable(caption, heads, rows)]
+
+
+def _price(logarithm: float) -> str:
+    return "0" if np.isnan(logarithm) else number(float(np.exp(logarithm)), 3)
 
 
 def _run(command: str) -> list[Block]:
@@ -160,11 +191,49 @@ def _findings(compared: tuple[Comparison, ...]) -> list[str]:
             what = f"{item.first} and {item.second}" if item.first else "groups over visits"
             effect = f", effect {item.effect:+.2f}" if np.isfinite(item.effect) else ""
             where = f"{item.condition}: " if item.condition else ""
-            lines.append(
-                f"{where}{measure_words(item.measure)} differs between {what} "
-                f"(p = {item.p_holm:.2g} after Holm{effect})."
-            )
+            told = f"p = {item.p_holm:.2g} after Holm{effect}"
+            lines.append(where + (_times(item, told) or f"{_differs(item, what)} ({told})."))
     return lines or ["No difference between groups or visits stands after Holm's correction."]
+
+
+def _differs(item: Comparison, what: str) -> str:
+    return f"{measure_words(item.measure)} differs between {what}"
+
+
+def _times(item: Comparison, told: str) -> str:
+    """A difference of logarithms as a factor; empty for other measures and questions."""
+    if not item.measure.startswith("log_price.") or item.question not in (
+        "group",
+        "visit",
+        "mixed",
+    ):
+        return ""
+    factor, low, high = (f"{np.exp(x):.2g}" for x in (item.estimate, item.low, item.high))
+    over = " over all visits" if item.question == "mixed" else ""
+    return (
+        f"the price of {item.measure.removeprefix('log_price.')} is {factor} times as high in "
+        f"{item.second} as in {item.first}{over} (95 %: {low} to {high}; {told})."
+    )
+
+
+def _structure_lines(units: pd.DataFrame) -> list[str]:
+    """Whether the structure holds, unit by unit."""
+    if "structure_refused" not in units.columns:
+        return []
+    refused = int(np.sum(units["structure_refused"]))
+    priced = [name for name in units.columns if name.startswith("log_price.")]
+    absent = np.isnan(units[priced].to_numpy()) & np.isfinite(units[["structure_p"]].to_numpy())
+    zero = int(np.sum(np.any(absent, axis=1)))
+    lines = [
+        f"The structure of the weights is refused by the recordings of {refused} of {len(units)} "
+        "units; at 5 % one in twenty would be by chance."
+    ]
+    if zero:
+        lines.append(
+            f"{zero} units want a price of zero somewhere: it has no logarithm, and they are not "
+            "in the comparison of that price."
+        )
+    return lines
 
 
 def _limits(units: pd.DataFrame) -> list[str]:

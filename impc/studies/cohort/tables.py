@@ -1,6 +1,7 @@
 """Tables of a cohort, made from the folder: what pandas, R and MATLAB read.
 
-    units.csv       a row a unit: labels, VAF, gain, its deviations, dominant direction, parameters
+    units.csv       a row a unit: labels, VAF, gain, its deviations, dominant direction, parameters,
+                    logarithms of the prices within a structure
     replicates.csv  a row a replicate: labels, number, gain, parameters
     intervals.csv   a row an entry of the gain or a parameter: percentiles of the replicates, empty
                     where the recordings do not tell the entry by itself
@@ -19,6 +20,7 @@ import pandas as pd
 from impc.arrays import percentiles
 from impc.assess.assessments import ASSESSMENTS
 from impc.reporting.csv_text import csv_bytes
+from impc.studies.cohort.unit_structure import structure_row
 
 if TYPE_CHECKING:
     from impc.studies.cohort.store import Store
@@ -85,7 +87,7 @@ def _unit_row(fit: dict[str, Any]) -> dict[str, Any]:
     if _CENTRE in fit["readings"]:
         row |= _states(fit, "centre_price", np.diag(fit["readings"][_CENTRE]["Q"]))
     row |= fit["parameters"]
-    return row
+    return row | structure_row(fit)
 
 
 def _gain(fit: dict[str, Any], name: str, values: Any) -> dict[str, float]:

@@ -33,6 +33,7 @@ from impc.model.weights import Weights
 from impc.reporting.rendering import plain
 from impc.reporting.shown_units import shown_unit
 from impc.studies.cohort.unit_digest import require_same_inputs, unit_digest
+from impc.studies.cohort.unit_structure import unit_structure
 from impc.studies.fit.settings import fit_settings
 from impc.studies.fit.subject import fit_problem, state_sizes
 
@@ -176,6 +177,7 @@ def _described(problem: Problem, fitted: Estimate, settings: FitSettings) -> dic
         "logarithms": estimate.problem.logarithms,
         "findings": [trial.findings for trial in problem.recordings],
         "trajectory": _trajectory(fit),
+        "structure": unit_structure(problem, fitted, settings),
     }
 
 

@@ -12,6 +12,7 @@ _WORDS = {
     "price": "price of {0}",
     "centre_price": "price of {0}, analytic centre",
     "largest_input": "largest {0}",
+    "log_price": "logarithm of the price of {0}",
 }
 
 

@@ -1,0 +1,82 @@
+"""Prices of a unit within the structure of [fit.structure], and whether the unit refuses it.
+
+Groups are compared in these prices: unlike those of any weights they need no convention
+(docs/structures.md, docs/cohorts.md).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from impc.assess.structures import assess_structure
+from impc.errors import SolverError, WeightsError
+from impc.inverse.structured_fit import fit_structured
+from impc.studies.fit.settings import fit_structures
+
+if TYPE_CHECKING:
+    from impc.inverse.estimates import Estimate
+    from impc.inverse.problem import Problem
+    from impc.studies.fit.settings import FitSettings
+
+__all__ = ["structure_row", "unit_structure"]
+
+
+def unit_structure(
+    problem: Problem, fitted: Estimate, settings: FitSettings
+) -> dict[str, Any] | None:
+    """What a unit says within the structure, for its result; None where none is asked for.
+
+    Logarithms of prices with ends of 95 %; minus infinity, for a price that is or may be zero,
+    becomes null when it is written.
+
+    Parameters
+    ----------
+    problem : Problem
+        As it was posed.
+    fitted : Estimate
+        Of weights of any kind.
+    settings : FitSettings
+
+    Raises
+    ------
+    InputError, WeightsError
+        When the structure does not suit the plant.
+    """
+    if settings.structure is None:
+        return None
+    structure = fit_structures(problem.plant, settings)[0]
+    told: dict[str, Any] = {"name": structure.name, "unknowns": structure.unknowns}
+    try:
+        found = fit_structured(problem, structure, fitted)
+        fit = assess_structure(problem, structure, found, fitted, settings.settle, held_out=False)
+    except (SolverError, WeightsError) as error:
+        nothing = [np.nan] * structure.count
+        ends = dict.fromkeys(("log_price", "low", "high"), nothing)
+        return told | ends | {"refused": True, "p": np.nan, "reason": str(error)}
+    return told | {
+        "log_price": [item.value for item in fit.intervals],
+        "low": [item.low for item in fit.intervals],
+        "high": [item.high for item in fit.intervals],
+        "refused": fit.refused,
+        "p": np.nan if fit.test is None else fit.test.probability,
+        "reason": "",
+    }
+
+
+def structure_row(fit: dict[str, Any]) -> dict[str, Any]:
+    """The columns of units.csv, from the content of a `fit`; none without a structure."""
+    found = fit.get("structure")
+    if found is None:
+        return {}
+    row: dict[str, Any] = {}
+    for name in ("log_price", "low", "high"):
+        head = name if name == "log_price" else f"log_price_{name}"
+        for unknown, value in zip(found["unknowns"], found[name], strict=True):
+            row[f"{head}.{unknown}"] = np.nan if value is None else float(value)
+    p = found["p"]
+    return row | {
+        "structure_refused": bool(found["refused"]),
+        "structure_p": np.nan if p is None else float(p),
+    }

@@ -1,0 +1,119 @@
+"""A cohort in structured weights: prices of every unit, groups compared in their logarithms."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import scipy.stats
+
+from impc.checking import replace
+from impc.files.plant_sources import plant_source
+from impc.studies.cohort.comparison import compare_cohort, measures_of
+from impc.studies.cohort.engine import Failures
+from impc.studies.cohort.report import write_report
+from impc.studies.cohort.store import Store
+from impc.studies.cohort.study import Study, read_study
+from impc.studies.cohort.tables import cohort_tables
+from impc.studies.cohort.tasks import study_tasks
+from impc.studies.cohort.unit_structure import structure_row
+from impc.studies.cohort.unit_task import fit_unit
+from tests.studies.cohort.carts import write_study
+
+STRUCTURE = '[fit.structure]\nQ = ["x[0]", "x[1]"]\n'
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory: pytest.TempPathFactory) -> tuple[Study, Store]:
+    """Six subjects, two visits; the position costs group a 4 and group b 8."""
+    folder = tmp_path_factory.mktemp("structured")
+    path = write_study(folder, 6, visits=2)
+    path.write_text(path.read_text() + STRUCTURE)
+    study = read_study(path)
+    source = plant_source("tests.studies.cohort.carts:cart_plant", {})
+    tasks, failed = study_tasks(replace(study, plant=source.name), source)
+    assert failed == {}
+    store = Store(folder / "out", {name: task.digest for name, task in tasks.items()})
+    for name, task in tasks.items():
+        store.keep_fit(name, fit_unit(task))
+    return study, store
+
+
+def test_prices_hold_the_truth_and_the_groups_differ(fitted: tuple[Study, Store]) -> None:
+    units = cohort_tables(*fitted)["units"]
+    price = units["log_price.x[0]"]
+    truth = np.where(units["group"] == "a", np.log(4.0), np.log(8.0))
+    low, high = units["log_price_low.x[0]"], units["log_price_high.x[0]"]
+    # Subjects differ by 10 % and one interval in twenty misses: 12 of them, seed 0.
+    assert np.sum((low - 0.2 < truth) & (truth < high + 0.2)) == len(units) == 12
+    assert np.sum(units["structure_refused"]) <= 2
+    assert measures_of(units)[:2] == ("log_price.x[0]", "log_price.x[1]")
+    found = {
+        item.question: item for item in compare_cohort(units) if item.measure == "log_price.x[0]"
+    }
+    assert set(found) == {"group", "visit", "change", "mixed", "reliability"}
+    for question in ("group", "mixed"):
+        assert found[question].low < np.log(2.0) < found[question].high
+        assert found[question].p < 0.01
+    assert price.notna().all()
+
+
+def test_the_page_says_it_as_a_factor(fitted: tuple[Study, Store]) -> None:
+    study, store = fitted
+    write_report(study, store, Failures({}, {}), "impc cohort study.toml")
+    page = (store.folder / "report.html").read_text(encoding="utf-8")
+    assert "times as high in b as in a" in page
+    assert "The structure of the weights is refused by the recordings of" in page
+    assert "Prices within the structure" in page
+
+
+def made_up(subjects: int, visits: int) -> pd.DataFrame:
+    rng = np.random.default_rng(4)
+    rows = []
+    for number in range(subjects):
+        own = rng.standard_normal()
+        for visit in range(visits):
+            score = own + 0.4 * visit + 0.7 * (number % 2) + 0.5 * rng.standard_normal()
+            rows.append((str(number), str(visit), "", "ab"[number % 2], score))
+    return pd.DataFrame(rows, columns=["subject", "visit", "condition", "group", "log_price.x"])
+
+
+def test_the_mixed_model_of_whole_tables_is_students_t_on_subject_means() -> None:
+    units = made_up(14, 3)
+    (found,) = (item for item in compare_cohort(units) if item.question == "mixed")
+    means = units.groupby(["group", "subject"])["log_price.x"].mean()
+    test: Any = scipy.stats.ttest_ind(means["b"], means["a"], equal_var=True)
+    assert found.estimate == pytest.approx(means["b"].mean() - means["a"].mean(), abs=1e-6)
+    assert found.p == pytest.approx(test.pvalue, rel=1e-3)
+    interval = test.confidence_interval(0.95)
+    assert (found.low, found.high) == pytest.approx((interval.low, interval.high), abs=1e-3)
+
+
+def test_too_few_subjects_have_no_mixed_model() -> None:
+    (found,) = (item for item in compare_cohort(made_up(4, 2)) if item.question == "mixed")
+    assert found.note == "too few subjects (4)"
+    assert np.isnan(found.p)
+
+
+def test_a_unit_without_a_structure_has_no_columns_for_it() -> None:
+    assert structure_row({"structure": None}) == {}
+    told = {
+        "name": "x", "unknowns": ["a"], "log_price": [None], "low": [None], "high": [1.0],
+        "refused": False, "p": 0.4, "reason": "",
+    }  # fmt: skip
+    row = structure_row({"structure": told})
+    assert np.isnan(row["log_price.a"])
+    assert row["log_price_high.a"] == 1.0
+
+
+def test_a_structure_that_loses_its_plant_names_why(tmp_path: Path) -> None:
+    """No feature sees the mode that does not decay: the unit fails with the structure's reason."""
+    path = write_study(tmp_path, 2)
+    path.write_text(path.read_text() + '[fit.structure]\nQ = ["x[2]"]\n')
+    study = read_study(path)
+    source = plant_source("tests.studies.cohort.carts:cart_plant", {})
+    tasks, _ = study_tasks(replace(study, plant=source.name), source)
+    assert "expected a name" in fit_unit(next(iter(tasks.values())))["reason"]
