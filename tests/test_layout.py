@@ -51,8 +51,9 @@ ELSEWHERE = {
     "files/test_digests.py": "studies/cohort/unit_digest.py",
     "files/test_faults.py": "files/writing.py",
     "files/test_formats.py": """
-        files/c3d_analog.py files/delimited.py files/matlab73.py files/table.py files/tdms.py
-        files/thousands.py""",
+        files/c3d_analog.py files/delimited.py files/headings.py files/matlab73.py
+        files/table.py files/tdms.py files/thousands.py""",
+    "files/test_spreadsheet.py": "files/workbook.py",
     "files/test_inspection.py": "cli/inspect.py",
     "files/test_matlab.py": "files/matlab_tags.py",
     "files/test_names.py": "reporting/csv_text.py",

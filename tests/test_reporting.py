@@ -244,7 +244,8 @@ def test_every_block_is_escaped_and_there() -> None:
 
 def test_a_report_is_its_files() -> None:
     files = every_block().files()
-    assert list(files) == ["report.html", "result.json", "numbers.csv", "tables.mat", f"{EVIL}.png"]
+    assert list(files) == ["report.html", "result.json", "numbers.csv", "tables.mat", "tables.xlsx",
+                           f"{EVIL}.png"]  # fmt: skip
     found = json.loads(files["result.json"])
     assert list(found) == ["schema", *every_block().provenance.data(), "a"]
     assert found["a"] == [1.0, None]

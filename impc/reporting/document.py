@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 
 from impc.files.columns import in_columns
 from impc.files.results import SCHEMA
+from impc.files.workbook import MOST_ROWS, workbook_bytes
 from impc.reporting.csv_text import csv_bytes
 from impc.reporting.matlab_tables import matlab_tables
 from impc.reporting.provenance import Provenance
@@ -197,7 +198,7 @@ class Report:
     figures : mapping of str to bytes
         By the name of the file.
     tables : mapping of str to TextTable
-        Written as CSV under these names, and together as tables.mat.
+        Written as CSV under these names, and together as tables.xlsx and tables.mat.
     data : mapping
         Content of result.json, beside what every one has (docs/results.md).
     provenance : Provenance
@@ -227,13 +228,27 @@ class Report:
         """The picture `name` as the address of an <img> that needs no other file."""
         return "data:image/png;base64," + base64.b64encode(self.figures[f"{name}.png"]).decode()
 
+    def _together(self) -> dict[str, bytes]:
+        """All tables in one file; a sheet of Excel holds so many rows and no more."""
+        if not self.tables:
+            return {}
+        sheets = {
+            name: (table.heads, table.rows)
+            for name, table in self.tables.items()
+            if len(table.rows) < MOST_ROWS
+        }
+        return {
+            "tables.mat": matlab_tables(self.tables),
+            **({"tables.xlsx": workbook_bytes(sheets)} if sheets else {}),
+        }
+
     def files(self) -> dict[str, bytes]:
         """Page, result.json, tables and figures by name."""
         return {
             "report.html": self.page().encode(),
             "result.json": json_bytes({"schema": SCHEMA, **self.provenance.data(), **self.data}),
             **{f"{name}.csv": table.csv() for name, table in self.tables.items()},
-            **({"tables.mat": matlab_tables(self.tables)} if self.tables else {}),
+            **self._together(),
             **self.figures,
         }
 
