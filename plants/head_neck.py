@@ -195,7 +195,9 @@ def head_neck_plant(values: NDArray[np.float64], axis: Axis = "yaw", delay_order
         finite_number(item.name, float(value), f"give it in {item.unit}")
     A, B, C = (item.full() for item in head_neck_matrices(axis, delay_order)(given))
     names: dict[str, Any] = {"inputs": ["reference"], "outputs": ["head"]}
-    return with_units(control.ss(A, B, C, 0, **names), {"reference": "rad", "head": "rad"})
+    words = {"reference": "angle of the target", "head": "angle of the head"}
+    units = dict.fromkeys(words, "rad")
+    return with_units(control.ss(A, B, C, 0, **names), units, words)
 
 
 def step_reference(

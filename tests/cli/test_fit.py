@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 import os
 import re
@@ -133,11 +134,16 @@ def test_result_json_is_the_fit(fitted: tuple[Result, Path], subject: Path, quic
 def test_the_page_says_what_the_numbers_say(fitted: tuple[Result, Path]) -> None:
     found = json.loads((fitted[1] / "result.json").read_text())
     page = (fitted[1] / "report.html").read_text()
-    assert f"{found['vaf']['theta1']:.2f} % of theta1" in page
+    assert f"{found['vaf']['theta1']:.2f} % of theta1 (tilt of seat and lower body)" in page
+    assert page.index('class="verdict"') < page.index("<li>") < page.index("<figure")
+    assert page.count("<h1") == 1
+    assert '<dt id="word-vaf">VAF</dt>' in page
+    assert "Velocity of theta1, in rad/s." in page
+    assert found["weights_rule"] in html.unescape(page)
     assert f"by up to {found['intent']['widest_angle']:.0f} degrees" in page
     assert "inverse LQR, output penalty (3.16)" in page
     assert not re.search("https?:", page)
-    assert page.count("<img") == 6
+    assert page.count("<img") == len(list(fitted[1].glob("*.png"))) == 8
     assert len(page) < 4_000_000
     assert "Nothing found." in page
     for name in ("residuals.pdf", "intent.png", "methods.pdf", "trajectories-trial-3.pdf"):
