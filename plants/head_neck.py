@@ -291,6 +291,7 @@ def head_neck_model(axis: Axis = "yaw", delay_order: int = 5) -> dict[str, Any]:
         "high": [item.high for item in HEAD_NECK_PARAMETERS],
         "typical": [float(value) for value in TABLE_4_3["nominal"] if value is not None],
         "pathways": [item.pathway for item in HEAD_NECK_PARAMETERS],
+        "meanings": [item.meaning for item in HEAD_NECK_PARAMETERS],
         "units": [item.unit for item in HEAD_NECK_PARAMETERS],
         "inputs": ["reference"],
         "outputs": ["head"],

@@ -41,8 +41,9 @@ from impc.studies.fit.tables import (
     set_sentences,
     statements_table,
 )
-from impc.studies.fit.verdict import abstract, signal_words, verdict
+from impc.studies.fit.verdict import abstract, verdict
 from impc.studies.methods_table import column_terms, methods_table
+from impc.studies.signal_words import signal_words
 
 if TYPE_CHECKING:
     from impc.arrays import Array

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
     from impc.studies.fit.result import FitResult
 
-__all__ = ["abstract", "signal_words", "verdict"]
+__all__ = ["abstract", "verdict"]
 
 # % of an output below which a fit explains less than it leaves.
 _LITTLE = 50.0
@@ -73,16 +73,6 @@ def abstract(result: FitResult) -> tuple[str, ...]:
         *_at_the_bound(result),
         _gain(result),
         _weights(result),
-    )
-
-
-def signal_words(plant: Plant) -> tuple[tuple[str, str], ...]:
-    """Each signal of a `plant` that has words, with them and its unit: the glossary's beginning."""
-    names = dict.fromkeys((*plant.outputs, *plant.states, *plant.controls, *plant.disturbances))
-    return tuple(
-        (name, f"{words[0].upper()}{words[1:]}, in {plant.unit(name)}.")
-        for name in names
-        if (words := plant.word(name))
     )
 
 

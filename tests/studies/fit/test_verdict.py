@@ -21,7 +21,8 @@ from impc.model.weights import Weights
 from impc.studies.fit.interval_figures import gain_figure, shown_statements, statements_figure
 from impc.studies.fit.settings import FitSettings
 from impc.studies.fit.subject import fit_problem, fit_recordings
-from impc.studies.fit.verdict import abstract, signal_words, verdict
+from impc.studies.fit.verdict import abstract, verdict
+from impc.studies.signal_words import signal_words
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
