@@ -41,6 +41,7 @@ from impc.studies.fit.tables import (
     set_sentences,
     statements_table,
 )
+from impc.studies.fit.truth import truth_sentence, truth_table
 from impc.studies.fit.verdict import abstract, verdict
 from impc.studies.methods_table import column_terms, methods_table
 from impc.studies.signal_words import signal_words
@@ -95,8 +96,17 @@ _INTENT = Picture(
 )
 
 
-def fit_report(result: FitResult, provenance: Provenance) -> Report:
-    """Page, result.json, tables and figures."""
+def fit_report(result: FitResult, provenance: Provenance, truth: Array | None = None) -> Report:
+    """Page, result.json, tables and figures.
+
+    Parameters
+    ----------
+    result : FitResult
+    provenance : Provenance
+    truth : Array, optional
+        Gain (m, n) of a simulated subject: the page then compares with it.
+    """
+    told = () if truth is None else (Note("Truth.", truth_sentence(result, truth)),)
     subject = str(result.given.recordings[0].label.subject) or "a subject"
     return Report(
         f"impc fit: {subject}",
@@ -104,11 +114,12 @@ def fit_report(result: FitResult, provenance: Provenance) -> Report:
         (
             Verdict(verdict(result)),
             *(Note("Warning.", line.removeprefix("Warning: ")) for line in result.warnings),
+            *told,
             Lines(abstract(result)),
             Details("What stands behind these sentences", (Lines(remarks(result)),)),
         ),
         [
-            Section("1. The gain, and how sure it is", _gain(result), "Gain", together=True),
+            Section("1. The gain, and how sure it is", _gain(result, truth), "Gain", together=True),
             *([structure_section(result)] if result.structures else []),
             Section("2. What may be said of the weights", _statements(result), "Weights"),
             Section("3. Inverse LQR on the same recordings", _methods(result), "Inverse LQR"),
@@ -120,19 +131,20 @@ def fit_report(result: FitResult, provenance: Provenance) -> Report:
         ],
         figures=fit_figures(result),
         tables=fit_tables(result),
-        data=fit_data(result, provenance),
+        data={**fit_data(result, provenance), "truth": None if truth is None else {"K": truth}},
         provenance=provenance,
         words=signal_words(result.given.plant),
     )
 
 
-def _gain(result: FitResult) -> list[Block]:
+def _gain(result: FitResult, truth: Array | None) -> list[Block]:
     limits, others = limit_sentences(result.certainty), alternatives_table(result.certainty)
     parameters = _parameters(result)
     blocks: list[Block] = [
         _GAIN,
         Details("Every number with its intervals", (intervals_table(result),)),
     ]
+    blocks += [] if truth is None else [Details("The true gain", (truth_table(result, truth),))]
     blocks += [] if parameters is None else [parameters]
     blocks += [Details("Combinations of entries: directions of the gain", (_directions(result),))]
     if limits or others is not None:

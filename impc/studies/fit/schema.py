@@ -17,6 +17,7 @@
     parameters.<name>                        nominal, value, deviation, determined
     trials                                   label, vaf, whiteness, x0, held_out_vaf, findings
     methods.<name>                           as in every result (docs/results.md)
+    truth                                    K of a truth.json beside the recordings, or null
     plant, settings, files, versions, made
 
 Matrices are lists of rows, in SI units. What is not a number, or not determined, is null.

@@ -20,7 +20,7 @@ from impc.model.recordings import Recording
 from impc.model.weights import Weights
 from impc.studies.fit.interval_figures import gain_figure, shown_statements, statements_figure
 from impc.studies.fit.settings import FitSettings
-from impc.studies.fit.subject import fit_problem, fit_recordings
+from impc.studies.fit.subject import fit_problem, fit_recordings, stages
 from impc.studies.fit.verdict import abstract, verdict
 from impc.studies.signal_words import signal_words
 
@@ -50,7 +50,11 @@ def fitted(limit: float) -> FitResult:
     moved = law.simulate([0.0, 0.0], disturbance=push, steps=len(push))
     outputs = moved.x[: len(push), :1] + 0.005 * rng.standard_normal((len(push), 1))
     settings = FitSettings(u_max=limit, horizon=5, methods=["inverse_lqr_output"])
-    return fit_recordings(fit_problem(plant, [Recording(plant, outputs, push)], settings), settings)
+    heard: list[str] = []
+    problem = fit_problem(plant, [Recording(plant, outputs, push)], settings)
+    result = fit_recordings(problem, settings, heard.append)
+    assert len(heard) == stages(problem, settings)
+    return result
 
 
 def loop(found: bool) -> LoopNoise:
