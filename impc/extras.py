@@ -19,6 +19,7 @@ EXTRAS = {
     "c3d": "c3d",
     "distributed": "cohort",
     "nptdms": "tdms",
+    "python_calamine": "excel",
     "pytope": "polytope",
 }
 

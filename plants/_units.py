@@ -1,4 +1,4 @@
-"""Units of signals, beside a `control.StateSpace` that has no place for them (docs/units.md)."""
+"""Units of signals and what they are, beside a `control.StateSpace` that has no place for them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from typing import Any
 __all__ = ["with_units"]
 
 
-def with_units(system: Any, units: dict[str, str]) -> Any:
-    """Return the `system` with `units`, SI units by the name of a signal (docs/units.md)."""
+def with_units(system: Any, units: dict[str, str], words: dict[str, str] | None = None) -> Any:
+    """Return the `system` with `units` and `words` by the names of signals (docs/units.md)."""
     system.units = units
+    system.words = words or {}
     return system

@@ -92,4 +92,12 @@ def cursor_plant(
         inputs=["command", "target_rate"],
         outputs=["error"],
     )
-    return with_units(system, units)
+    words = {
+        "error": "distance of the cursor from the target",
+        "velocity": "velocity of the cursor",
+        **{name: f"stage {k} of the delay of the nerves" for k, name in enumerate(delays, 1)},
+        "acceleration": "acceleration of the cursor",
+        "command": "acceleration that the person asks for",
+        "target_rate": "velocity of the target",
+    }
+    return with_units(system, units, words)

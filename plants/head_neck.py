@@ -195,7 +195,9 @@ def head_neck_plant(values: NDArray[np.float64], axis: Axis = "yaw", delay_order
         finite_number(item.name, float(value), f"give it in {item.unit}")
     A, B, C = (item.full() for item in head_neck_matrices(axis, delay_order)(given))
     names: dict[str, Any] = {"inputs": ["reference"], "outputs": ["head"]}
-    return with_units(control.ss(A, B, C, 0, **names), {"reference": "rad", "head": "rad"})
+    words = {"reference": "angle of the target", "head": "angle of the head"}
+    units = dict.fromkeys(words, "rad")
+    return with_units(control.ss(A, B, C, 0, **names), units, words)
 
 
 def step_reference(
@@ -289,6 +291,7 @@ def head_neck_model(axis: Axis = "yaw", delay_order: int = 5) -> dict[str, Any]:
         "high": [item.high for item in HEAD_NECK_PARAMETERS],
         "typical": [float(value) for value in TABLE_4_3["nominal"] if value is not None],
         "pathways": [item.pathway for item in HEAD_NECK_PARAMETERS],
+        "meanings": [item.meaning for item in HEAD_NECK_PARAMETERS],
         "units": [item.unit for item in HEAD_NECK_PARAMETERS],
         "inputs": ["reference"],
         "outputs": ["head"],

@@ -39,7 +39,8 @@ sys.meta_path[sys.meta_path.index(PathFinder)] = Plain
 
 
 def names(requirements: list[str]) -> set[str]:
-    return {re.split(r"[\[<>=]", requirement)[0] for requirement in requirements}
+    """Of packages, as they are imported."""
+    return {re.split(r"[\[<>=]", line)[0].replace("-", "_") for line in requirements}
 
 
 def imports(tree: ast.AST) -> Iterator[str]:
@@ -107,6 +108,10 @@ def test_every_module_loads_without_the_extras(tmp_path: Path) -> None:
             "t.tdms: needs the package nptdms; install it: pip install 'impc[tdms]'",
         ),
         (
+            "from impc.files.formats import read_table; read_table(Path('t.xlsx'))",
+            "t.xlsx: needs the package python_calamine; install it: pip install 'impc[excel]'",
+        ),
+        (
             "from impc.files.formats import encode_table as encode\n"
             "from impc.files.table import make_table\n"
             "encode('.c3d', make_table('t', {'x': [1.0, 2.0]}, rate=10.0))",
@@ -121,6 +126,7 @@ def test_every_module_loads_without_the_extras(tmp_path: Path) -> None:
     ],
 )
 def test_one_line_says_how_to_get_it(call: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "t.xlsx").write_bytes(b"PK\x03\x04")
     (tmp_path / "t.tdms").write_bytes(b"TDSm" + bytes(24))
     done = plain(
         "from pathlib import Path\nfrom impc.errors import ImpcError\n"
@@ -142,4 +148,4 @@ def test_a_subject_is_simulated_in_the_formats_that_are_there(tmp_path: Path) ->
         "without c3d, tdms; to write them too: pip install 'impc[formats]'\n"
     )
     written = {path.name for path in (tmp_path / "s").iterdir() if "trial" in path.name}
-    assert written == {"trial_1.csv", "trial_1.tsv", "trial_1.mat", "trial_1_v73.mat"}
+    assert written == {f"trial_1{end}" for end in (".csv", ".tsv", ".xlsx", ".mat", "_v73.mat")}

@@ -19,7 +19,7 @@ ELSEWHERE = {
     "test_reporting.py": """
         reporting/lock.py reporting/provenance.py reporting/rendering.py reporting/style.py
         reporting/writer.py studies/example/figures.py reporting/document.py files/columns.py
-        studies/example/report.py studies/example/result.py""",
+        reporting/glossary.py studies/example/report.py studies/example/result.py""",
     "assess/test_all_intervals.py": "assess/judged.py assess/other_models.py",
     "assess/test_bounded_weights.py": "assess/intent_statements.py",
     "assess/test_covariance.py": "assess/long_run_covariance.py assess/printed_gain.py",
@@ -53,8 +53,9 @@ ELSEWHERE = {
     "files/test_digests.py": "studies/cohort/unit_digest.py",
     "files/test_faults.py": "files/writing.py",
     "files/test_formats.py": """
-        files/c3d_analog.py files/delimited.py files/matlab73.py files/table.py files/tdms.py
-        files/thousands.py""",
+        files/c3d_analog.py files/delimited.py files/headings.py files/matlab73.py
+        files/table.py files/tdms.py files/thousands.py""",
+    "files/test_spreadsheet.py": "files/workbook.py",
     "files/test_inspection.py": "cli/inspect.py",
     "files/test_matlab.py": "files/matlab_tags.py",
     "files/test_names.py": "reporting/csv_text.py",
@@ -87,6 +88,7 @@ ELSEWHERE = {
         studies/cohort/sheet.py studies/cohort/tasks.py""",
     "studies/compare/test_subject.py": """
         cli/compare.py inverse/estimates.py inverse/methods.py studies/compare/report.py""",
+    "studies/fit/test_verdict.py": "studies/fit/interval_figures.py studies/signal_words.py",
     "studies/fit/test_subject.py": """
         inverse/delayed_feedback.py assess/held_out.py assess/intent_rules.py studies/fit/memory.py
         studies/fit/result.py""",

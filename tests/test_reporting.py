@@ -20,6 +20,7 @@ from impc.model.plant import Plant
 from impc.model.riccati import solve_lqr
 from impc.model.weights import Weights
 from impc.reporting.document import (
+    Details,
     Heading,
     Lines,
     Note,
@@ -28,6 +29,7 @@ from impc.reporting.document import (
     Section,
     Terms,
     TextTable,
+    Verdict,
     json_bytes,
 )
 from impc.reporting.provenance import Provenance
@@ -217,6 +219,8 @@ def every_block() -> Report:
         Picture(EVIL, EVIL, EVIL),
         Heading(EVIL),
         Note(EVIL, EVIL),
+        Verdict(EVIL),
+        Details(EVIL, (EVIL,)),
     )
     return Report(
         EVIL, EVIL, blocks, [Section(EVIL, blocks, contents="In short"), Section("2", ())],
@@ -236,15 +240,38 @@ def test_every_block_is_escaped_and_there() -> None:
     shown = Texts()
     shown.feed(page)
     # Title, first heading and section; in each of two places: 2 paragraphs, 2 lines, 3 of the
-    # terms, caption, head and 2 cells, caption of the figure, heading, 2 of the note.
-    assert sum(text.count(EVIL) for text in shown.found) == 3 + 2 * 15
+    # terms, caption, head and 2 cells, caption of the figure, heading, 2 of the note, the verdict,
+    # what is folded and its summary.
+    assert sum(text.count(EVIL) for text in shown.found) == 3 + 2 * 18
     assert 'href="#in-short"' in page
     assert 'id="in-short"' in page
 
 
+def test_the_page_ends_with_the_words_that_it_uses() -> None:
+    """Each is linked where it stands first; words of a word are there too; Markup is left alone."""
+    blocks = (
+        "The VAF is 99 %, its VAF too.",
+        Markup("<code>LQR</code>"),
+        Lines(["Condition numbers: <kappa>"]),
+    )
+    folded = Section("One", blocks, contents="One", folded=True)
+    page = Report("a", "A", (), [folded], words=[("theta1", "Tilt <of> a seat.")]).page()
+    assert re.findall(r'<dt id="word-([a-z0-9-]+)">', page) == [
+        "theta1", "condition-number", "eigenvalue", "kappa", "lqr", "price", "vaf", "weights"
+    ]  # fmt: skip
+    assert "Tilt &lt;of&gt; a seat." in page
+    assert page.count('href="#word-vaf"') == 1
+    assert '<a class="word" href="#word-condition-number">Condition numbers</a>' in page
+    assert "<code>LQR</code>" in page
+    assert '<details class="section"><summary><h2 id="one">One</h2></summary>' in page
+    assert page.count("<details") == page.count("</details>") == 1
+    assert '<a href="#words">Words</a>' in page
+
+
 def test_a_report_is_its_files() -> None:
     files = every_block().files()
-    assert list(files) == ["report.html", "result.json", "numbers.csv", "tables.mat", f"{EVIL}.png"]
+    assert list(files) == ["report.html", "result.json", "numbers.csv", "tables.mat", "tables.xlsx",
+                           f"{EVIL}.png"]  # fmt: skip
     found = json.loads(files["result.json"])
     assert list(found) == ["schema", *every_block().provenance.data(), "a"]
     assert found["a"] == [1.0, None]

@@ -39,18 +39,25 @@ def command(files: tuple[Path, ...], plant_name: str, config: Path, out: Path, y
         fit_recordings,
         stages,
     )
+    from impc.studies.fit.truth import read_truth, truth_sentence  # noqa: PLC0415
 
     require_writable(out)
     subject = read_subject("fit", files, plant_name, config)
     problem, settings = subject.problem, subject.settings
     require_consent(fit_effort(problem, settings), yes)
     memory = open_memory(out, problem, settings, "fit", subject.inputs.digest)
-    with progress(stages(problem, settings), "stage", lambda _: memory.kept()) as done:
+    truth = read_truth(files, problem.plant)
+    # One more: the page with its figures takes ten seconds.
+    with progress(stages(problem, settings) + 1, "stage", lambda _: memory.kept()) as done:
         told = FitProgress(done, memory.estimate, memory.replicate)
         result = fit_recordings(problem, settings, told)
-    written = write_files(out, fit_report(result, subject.provenance).files())
+        content = fit_report(result, subject.provenance, truth).files()
+        done("page")
+    written = write_files(out, content)
     memory.forget()
     _print(result)
+    if truth is not None:
+        click.echo(truth_sentence(result, truth))
     print_files(out, written)
 
 
@@ -58,9 +65,10 @@ def _print(result: FitResult) -> None:
     """The table of methods and the intent, as the page has them."""
     from impc.assess.intent_rules import dominant_sentence  # noqa: PLC0415
     from impc.studies.fit.structures import structure_sentences  # noqa: PLC0415
+    from impc.studies.fit.verdict import verdict  # noqa: PLC0415
     from impc.studies.methods_table import methods_table  # noqa: PLC0415
 
-    for line in (*structure_sentences(result), *result.warnings):
+    for line in dict.fromkeys((verdict(result), *structure_sentences(result), *result.warnings)):
         click.echo(line)
     plant = result.fitted.problem.plant
     click.echo(methods_table(result.methods).text())

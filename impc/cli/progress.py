@@ -1,10 +1,12 @@
-"""One bar for all that takes long."""
+"""One bar for all that takes long; lines where no bar can be drawn, as in a pipe or a log."""
 
 from __future__ import annotations
 
 import sys
+import threading
+import time
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
@@ -12,6 +14,11 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
 __all__ = ["progress"]
+
+# Seconds between two lines, and from the start to the first: what is quick says nothing.
+_PAUSE = 10.0
+# The clock of a bar goes on while a step takes long, in seconds.
+_TICK = 1.0
 
 
 @contextmanager
@@ -37,16 +44,26 @@ def progress(
         When the block is interrupted, with what `kept` says.
     """
     count = begun  # the bar's own stands still where there is no bar
+    began = said = time.monotonic()
     # disable=None: no bar where stderr is a file.
-    with tqdm(
-        total=total, initial=begun, unit=unit, file=sys.stderr, disable=None, leave=False
-    ) as bar:
+    with (
+        tqdm(
+            total=total, initial=begun, unit=unit, file=sys.stderr, disable=None, leave=False
+        ) as bar,
+        _ticking(bar),
+    ):
 
         def done(name: str) -> None:
-            nonlocal count
+            nonlocal count, said
             count += 1
             bar.set_postfix_str(name, refresh=False)
             bar.update()
+            now = time.monotonic()
+            if bar.disable and now - said >= _PAUSE:
+                said = now
+                left = (now - began) * (total - count) / (count - begun)
+                line = f"{count} of {total} {unit}s ({name}), about {left:.0f} s left"
+                print(line, file=sys.stderr, flush=True)
 
         try:
             yield done
@@ -54,3 +71,24 @@ def progress(
             if kept is None:
                 raise
             raise KeyboardInterrupt(kept(count)) from None
+
+
+@contextmanager
+def _ticking(bar: tqdm[Any]) -> Iterator[None]:
+    """Draw a bar anew each second, so that nobody takes a long step for a stop."""
+    if bar.disable:
+        yield
+        return
+    over = threading.Event()
+
+    def tick() -> None:
+        while not over.wait(_TICK):
+            bar.refresh()
+
+    thread = threading.Thread(target=tick, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()

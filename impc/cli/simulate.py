@@ -25,7 +25,14 @@ if TYPE_CHECKING:
 
 __all__ = ["command"]
 
-_ENDINGS = {"csv": ".csv", "tsv": ".tsv", "mat": ".mat", "tdms": ".tdms", "c3d": ".c3d"}
+_ENDINGS = {
+    "csv": ".csv",
+    "tsv": ".tsv",
+    "xlsx": ".xlsx",
+    "mat": ".mat",
+    "tdms": ".tdms",
+    "c3d": ".c3d",
+}
 _FORMATS = (*_ENDINGS, "mat73")
 # What a plain installation cannot write.
 _LIBRARIES = {"tdms": "nptdms", "c3d": "c3d"}
@@ -73,7 +80,7 @@ def command() -> None:
 @click.option(
     "--formats",
     show_default="all that are installed",
-    help="Which of csv, tsv, mat, mat73, tdms and c3d, with commas between.",
+    help="Which of csv, tsv, xlsx, mat, mat73, tdms and c3d, with commas between.",
 )
 def seated_balance(out: Path, formats: str | None, **given: Any) -> None:
     """A person on a seat that tilts sideways, holding it by a constrained controller.

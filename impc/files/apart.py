@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from impc.arrays import Array
 
-__all__ = ["match_apart", "matrices_apart", "read_apart"]
+__all__ = ["cells_apart", "match_apart", "matrices_apart", "read_apart"]
 
 # Seconds of computing that a file may take: measured, 1.5 s for 100 MB of HDF5 and 6 s for a C3D
 # of 10 MB (60 000 frames), which is the slowest.
@@ -39,6 +39,8 @@ _SECONDS, _SECONDS_A_MEGABYTE = 10, 2
 # Bytes that reading may take beside what the process begins with (0.1 GB): a reader holds the
 # file's arrays up to three times.
 _ROOM, _ROOM_A_BYTE = 800_000_000, 3
+# What aborts where it is given no more memory, as libraries in Rust do.
+_ABORTS = ("spreadsheet", "cells")
 # Where the system bounds no address space, the size is looked at this often, in seconds.
 _LOOK = 0.02
 _BOUNDED = sys.platform == "linux"
@@ -120,6 +122,28 @@ def matrices_apart(path: Path, largest: int) -> dict[str, Any]:
         for (name, shape), array in zip(shapes.items(), arrays, strict=True)
     }
     return {**matrices, **reply["texts"]}
+
+
+def cells_apart(path: Path, largest: int) -> list[list[str]]:
+    """The rows of the first sheet of a workbook, cells as texts.
+
+    Parameters
+    ----------
+    path : Path
+        Of the file, .xlsx or .ods.
+    largest : int
+        The most bytes that it may unpack to.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read, as in `read_apart`.
+    """
+    reply, _ = _asked(_request("cells", path, largest))
+    if "refused" in reply:
+        raise InputError(*reply["refused"])
+    rows: list[list[str]] = reply["texts"]["cells"]
+    return rows
 
 
 def match_apart(subject: str, pattern: str, text: str) -> dict[str, str | None] | None:
@@ -283,7 +307,8 @@ def _why(status: int, request: dict[str, Any]) -> tuple[str, str]:
     again = "copy or export it again"
     if status == -getattr(signal, "SIGXCPU", 0) or status == 1:
         return f"takes longer than {request['seconds']} s to read: it is damaged", again
-    if status == -getattr(signal, "SIGKILL", 9):
+    aborted = status == -getattr(signal, "SIGABRT", 6) and request["do"] in _ABORTS
+    if aborted or status == -getattr(signal, "SIGKILL", 9):
         return _too_large(request)
     name = signal.Signals(-status).name if status < 0 else f"status {status}"
     return f"is damaged and ends the process that reads it ({name})", again

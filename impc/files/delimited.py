@@ -9,16 +9,15 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from impc.errors import DataError
+from impc.files.headings import are_units, named_columns, written_heading
 from impc.files.table import make_table
 from impc.files.thousands import require_no_thousands
-from impc.files.units import is_unit
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -29,7 +28,7 @@ if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.files.table import Table
 
-__all__ = ["encode_delimited", "read_delimited", "split_heading"]
+__all__ = ["encode_delimited", "is_number", "read_delimited"]
 
 _DELIMITERS = {".csv": ",;\t", ".tsv": "\t", ".txt": "\t;, "}
 _NAMES = {",": "commas", ";": "semicolons", "\t": "tabs", " ": "blanks", "|": "bars", ":": "colons"}
@@ -40,7 +39,6 @@ _NUMBER = re.compile(
 )
 _LONGEST = 50_000  # characters of a line: 2000 columns of 24
 _HEAD = 100  # lines in which the first row of numbers must stand
-_HEADING = re.compile(r"(.*\S)\s*[(\[]([^()\[\]]*)[)\]]")
 
 
 @dataclass(frozen=True)
@@ -92,21 +90,10 @@ def encode_delimited(table: Table, suffix: str) -> bytes:
     delimiter = "," if suffix == ".csv" else "\t"
     text = io.StringIO()
     writer = csv.writer(text, delimiter=delimiter, lineterminator="\n")
-    heads = [
-        f"{name} ({table.units[name]})" if table.units.get(name) else name for name in table.columns
-    ]
-    writer.writerow(heads)
+    writer.writerow(written_heading(name, table.units.get(name)) for name in table.columns)
     columns = [values.tolist() for values in table.columns.values()]
     writer.writerows([repr(value) for value in row] for row in zip(*columns, strict=True))
     return text.getvalue().encode()
-
-
-def split_heading(heading: str) -> tuple[str, str]:
-    """Name and unit of a heading such as ``angle (deg)``; the unit is empty when it has none."""
-    found = _HEADING.fullmatch(heading.strip())
-    if found and is_unit(found[2]):
-        return found[1], found[2].strip()
-    return heading.strip(), ""
 
 
 def _lines(source: str, content: bytes) -> list[tuple[int, str]]:
@@ -163,10 +150,10 @@ def _share_of_numbers(
     if decimal == delimiter:
         return 0.0, None
     rows = [_fields(line, delimiter) for line in head]
-    kinds = [[not item or _is_number(item, decimal) for item in row] for row in rows]
+    kinds = [[not item or is_number(item, decimal) for item in row] for row in rows]
     alone = 1 if delimiter == "\n" else 2
     for index, (row, numbers) in enumerate(zip(rows, kinds, strict=True)):
-        some = any(_is_number(item, decimal) for item in row)
+        some = any(is_number(item, decimal) for item in row)
         if some and len(row) >= alone and sum(numbers) >= len(row) / 2:
             below = [kind for line in kinds[index:] for kind in line]
             share = sum(below) / len(below)
@@ -182,7 +169,8 @@ def _fields(line: str, delimiter: str) -> list[str]:
     return [item.strip() for item in next(csv.reader([line], delimiter=delimiter))]
 
 
-def _is_number(text: str, decimal: str) -> bool:
+def is_number(text: str, decimal: str) -> bool:
+    """Whether the `text` of a field is a number with this `decimal` sign, or stands for none."""
     other = "," if decimal == "." else "."
     return text in _MISSING[1:] or (_NUMBER.fullmatch(text) is not None and other not in text)
 
@@ -215,8 +203,8 @@ def _headings(
         return [f"column_{index + 1}" for index in range(layout.width)], {}
     row_of_units = [""] * layout.width
     last = rows[-1]
-    if len(rows) > 1 and len(last) == len(rows[-2]) == layout.width and _are_units(last):
-        row_of_units = [item.strip("()[] ") for item in last]
+    if len(rows) > 1 and len(last) == len(rows[-2]) == layout.width and are_units(last):
+        row_of_units = last
         last = rows[-2]
     if len(last) != layout.width:
         raise DataError(
@@ -225,31 +213,7 @@ def _headings(
             f"{layout.width} values",
             "export with a point as decimal sign, or with semicolons between columns",
         )
-    split = [split_heading(item) for item in last]
-    names = [name for name, _ in split]
-    repeated = _repeated(names)
-    if repeated is not None:
-        names = list(last)  # angle (deg) beside angle (rad)
-        repeated = _repeated(names)
-    if repeated is not None:
-        raise DataError(source, f"names two columns {repeated!r}", "give each its own name")
-    units = {
-        name: below or own
-        for name, (_, own), below in zip(names, split, row_of_units, strict=True)
-        if name and (below or own)
-    }
-    return names, units
-
-
-def _repeated(names: Sequence[str]) -> str | None:
-    """The first name that comes again; columns without a name do not count."""
-    times = Counter(names)
-    return next((name for name in names if name and times[name] > 1), None)
-
-
-def _are_units(row: Sequence[str]) -> bool:
-    plain = [item.strip("()[] ") for item in row]
-    return any(plain) and all(not item or is_unit(item) for item in plain)
+    return named_columns(source, last, row_of_units)
 
 
 def _frame(source: str, body: Sequence[tuple[int, str]], layout: _Layout) -> pd.DataFrame:
@@ -286,7 +250,7 @@ def _column(
     text = np.asarray(numbers.isna() & values.notna())
     if decimal == "," and values.dtype.kind not in "fiu":
         # Beside a word the rest is text to pandas: 2,5 is a number, and 1.000 is none.
-        text = np.array([not _is_number(str(item).strip(), ",") for item in values])
+        text = np.array([not is_number(str(item).strip(), ",") for item in values])
         text &= np.asarray(values.notna())
     if not text.any():
         return np.asarray(numbers, dtype=np.float64)

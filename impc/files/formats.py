@@ -17,6 +17,7 @@ from impc.files.matlab import encode_matlab
 from impc.files.matlab73 import HDF5_SIGNATURE, matlab73_bytes
 from impc.files.names import LARGEST, damaged, require_ordinary
 from impc.files.tdms import encode_tdms
+from impc.files.workbook import encode_workbook
 from impc.files.writing import unwritable
 
 if TYPE_CHECKING:
@@ -57,7 +58,7 @@ class Format:
 # First bytes of what else may carry one of the endings, and what it is.
 _SIGNATURES = {
     b"PK\x03\x04": "a zip archive or an Excel workbook",
-    b"\xd0\xcf\x11\xe0": "an old Excel workbook",
+    b"\xd0\xcf\x11\xe0": "an Excel workbook that is old or locked by a password",
     b"MATLAB ": "a MATLAB file",
     b"TDSm": "a TDMS file",
     b"TDSh": "a TDMS index",
@@ -214,6 +215,20 @@ def _delimited(ending: str) -> Format:
     )
 
 
+def _spreadsheet(encode: Callable[[Table], bytes]) -> Format:
+    return Format(
+        functools.partial(read_apart, "spreadsheet"),
+        encode,
+        lambda head: head.startswith(b"PK\x03\x04"),
+    )
+
+
+def _no_ods(table: Table) -> bytes:
+    raise OutputError(
+        table.source, "cannot be written as .ods", "write .xlsx, which opens there too"
+    )
+
+
 def _write(path: Path, content: bytes) -> None:
     try:
         with tempfile.TemporaryDirectory(prefix=".impc-", dir=path.parent) as staging:
@@ -229,6 +244,8 @@ FORMATS: dict[str, Format] = {
     ".csv": _delimited(".csv"),
     ".tsv": _delimited(".tsv"),
     ".txt": _delimited(".txt"),
+    ".xlsx": _spreadsheet(encode_workbook),
+    ".ods": _spreadsheet(_no_ods),
     ".mat": Format(_read_matlab, encode_matlab, lambda _: True),
     ".tdms": Format(
         functools.partial(read_apart, "tdms"), encode_tdms, lambda head: head.startswith(b"TDSm")

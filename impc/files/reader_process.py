@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 from impc.errors import ImpcError, brief
 from impc.files.names import damaged
+from impc.files.units import is_unit
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -38,6 +39,8 @@ READERS = {
     "matlab73": ("impc.files.matlab73", "read_matlab73", "h5py"),
     "tdms": ("impc.files.tdms", "read_tdms", "nptdms"),
     "c3d": ("impc.files.c3d_analog", "read_c3d", "c3d"),
+    "spreadsheet": ("impc.files.spreadsheet", "read_spreadsheet", "python_calamine"),
+    "cells": ("impc.files.spreadsheet", "read_cells", "python_calamine"),
 }
 # Address space that a process may keep beyond what it began with: more has leaked.
 _LEAK = 100_000_000
@@ -68,6 +71,8 @@ def _prepare(request: dict[str, Any]) -> None:
     for module in READERS.get(request["do"], ())[::2]:
         with contextlib.suppress(ImportError):  # the reader says so
             import_module(module)
+    if request["do"] == "spreadsheet":
+        is_unit("deg")  # its headings have units: pint's registry is no leak
 
 
 def _limit(request: dict[str, Any]) -> None:

@@ -115,6 +115,11 @@ class Estimate(Frozen):
     seconds: float
     prices: Array | None = None
 
+    def __str__(self) -> str:
+        ended = f" {self.reason}." if self.reason else ""
+        gain = "" if self.K is None else f" K = {np.array2string(self.K, precision=4)}"
+        return f"{self.method}: {self.status.sentence}{ended} Misfit {self.misfit:.3g}.{gain}"
+
     @property
     def gain(self) -> Array:
         """K (m, n).

@@ -41,6 +41,9 @@ class Plant(Value):
     units : mapping of str to str, optional
         Unit of each signal by its name, as in "rad/s"; "1" where it has none. By default those of
         `system.units`, which a function that makes a plant may set; what neither says is unknown.
+    words : mapping of str to str, optional
+        What each signal is in words, by its name, for pages: "tilt of the seat". By default those
+        of `system.words`.
 
     Attributes
     ----------
@@ -52,13 +55,15 @@ class Plant(Value):
         Names of the signals, in the order of the arrays.
     units : tuple of (str, str)
         Names of signals with their units; `unit` finds one.
+    words : tuple of (str, str)
+        Names of signals with what they are; `word` finds one.
 
     Raises
     ------
     PlantError
         When the matrices are missing or not finite, when an output depends directly on an input,
-        when a control is not among the inputs, a unit is of no signal, or when (A, B) is not
-        stabilisable.
+        when a control is not among the inputs, a unit or words are of no signal, or when (A, B) is
+        not stabilisable.
 
     Examples
     --------
@@ -88,6 +93,7 @@ class Plant(Value):
     disturbances: tuple[str, ...]
     outputs: tuple[str, ...]
     units: tuple[tuple[str, str], ...]
+    words: tuple[tuple[str, str], ...]
 
     @checked
     def __init__(
@@ -95,6 +101,7 @@ class Plant(Value):
         system: Any,
         controls: Sequence[str] | None = None,
         units: Mapping[str, Any] | None = None,
+        words: Mapping[str, Any] | None = None,
     ) -> None:
         if isinstance(system, Plant):
             self._fill(**vars(system))
@@ -118,7 +125,8 @@ class Plant(Value):
             controls=chosen,
             disturbances=rest,
             outputs=tuple(system.output_labels),
-            units=_units(system, getattr(system, "units", {}) if units is None else units),
+            units=_texts(system, "units", units, 'unit, as in {"angle": "rad"}'),
+            words=_texts(system, "words", words, 'few words, as in {"angle": "tilt of the seat"}'),
         )
         _require_stabilisable(self)
 
@@ -135,6 +143,10 @@ class Plant(Value):
     def unit(self, name: str) -> str:
         """The unit of a signal by its `name`; "SI" where it is not known."""
         return dict(self.units).get(name, UNKNOWN)
+
+    def word(self, name: str) -> str:
+        """What a signal is, in words, by its `name`; empty where the plant does not say."""
+        return dict(self.words).get(name, "")
 
     @property
     def discrete(self) -> bool:
@@ -189,15 +201,17 @@ def _matrices(system: Any) -> dict[str, Array]:
     return matrices
 
 
-def _units(system: Any, given: Any) -> tuple[tuple[str, str], ...]:
+def _texts(system: Any, kind: str, given: Any, such: str) -> tuple[tuple[str, str], ...]:
+    """A text for each of some signals, by name: what is given, or the system's own."""
+    given = getattr(system, kind, {}) if given is None else given
     known = {*system.state_labels, *system.input_labels, *system.output_labels}
-    pairs = tuple(given.items()) if isinstance(given, Mapping) else (("units", given),)
-    for name, unit in pairs:
-        if name not in known or not isinstance(unit, str) or not unit.isprintable():
+    pairs = tuple(given.items()) if isinstance(given, Mapping) else ((kind, given),)
+    for name, text in pairs:
+        if name not in known or not isinstance(text, str) or not text.isprintable():
             raise PlantError(
-                "plant.units",
-                f"names {brief(name)} with {brief(unit)}",
-                'give a text by the name of a signal, as in {"angle": "rad"}',
+                f"plant.{kind}",
+                f"names {brief(name)} with {brief(text)}",
+                f"give by the name of a signal a {such}",
             )
     return pairs
 

@@ -14,13 +14,16 @@ from typing import Any, TypeVar
 
 from impc.files.columns import in_columns
 from impc.files.results import SCHEMA
+from impc.files.workbook import MOST_ROWS, workbook_bytes
 from impc.reporting.csv_text import csv_bytes
+from impc.reporting.glossary import Glossary, used_words
 from impc.reporting.matlab_tables import matlab_tables
 from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import plain, render_template
 
 __all__ = [
     "Block",
+    "Details",
     "Heading",
     "Lines",
     "Note",
@@ -29,6 +32,7 @@ __all__ = [
     "Section",
     "Terms",
     "TextTable",
+    "Verdict",
     "json_bytes",
     "table_of",
 ]
@@ -93,11 +97,14 @@ class Picture:
         In place of the picture for those who do not see it.
     caption : str
         Below it.
+    narrow : bool
+        Whether its words can be read at the width of a phone.
     """
 
     name: str
     alternative: str
     caption: str
+    narrow: bool = False
 
 
 @dataclass(frozen=True)
@@ -155,8 +162,36 @@ class Note:
     text: str
 
 
+@dataclass(frozen=True)
+class Verdict:
+    """The one sentence that answers what the page was made for.
+
+    Attributes
+    ----------
+    text : str
+        The sentence.
+    """
+
+    text: str
+
+
+@dataclass(frozen=True)
+class Details:
+    """What is folded until a reader asks for it.
+
+    Attributes
+    ----------
+    summary : str
+        What is inside, always shown.
+    blocks : sequence of Block
+    """
+
+    summary: str
+    blocks: Sequence[Block]
+
+
 #: What a section is made of; a str is a paragraph.
-Block = str | TextTable | Picture | Lines | Terms | Heading | Note
+Block = str | TextTable | Picture | Lines | Terms | Heading | Note | Verdict | Details
 
 
 @dataclass(frozen=True)
@@ -173,12 +208,15 @@ class Section:
         Its name in the table of contents; without one it is not there.
     together : bool
         Whether it stays on the page of what is before it when it is printed.
+    folded : bool
+        Whether its blocks show only when a reader opens it.
     """
 
     title: str
     blocks: Sequence[Block]
     contents: str = ""
     together: bool = False
+    folded: bool = False
 
 
 @dataclass(frozen=True)
@@ -197,11 +235,13 @@ class Report:
     figures : mapping of str to bytes
         By the name of the file.
     tables : mapping of str to TextTable
-        Written as CSV under these names, and together as tables.mat.
+        Written as CSV under these names, and together as tables.xlsx and tables.mat.
     data : mapping
         Content of result.json, beside what every one has (docs/results.md).
     provenance : Provenance
         Where the result comes from.
+    words : sequence of (str, str)
+        What the page is about, signals and parameters: with these its glossary begins.
     template : str
         page.html, or one that extends it, by its path in this package.
     values : mapping
@@ -216,16 +256,33 @@ class Report:
     tables: Mapping[str, TextTable] = field(default_factory=dict)
     data: Mapping[str, Any] = field(default_factory=dict)
     provenance: Provenance = field(default_factory=Provenance)
+    words: Sequence[tuple[str, str]] = ()
     template: str = "page.html"
     values: Mapping[str, Any] = field(default_factory=dict)
 
     def page(self) -> str:
-        """The page as one HTML text that needs no other file."""
-        return render_template(self.template, report=self, **self.values)
+        """The page as one HTML text that needs no other file; it ends with its glossary."""
+        bare = render_template(self.template, report=self, glossary=Glossary(), **self.values)
+        found = Glossary((*self.words, *used_words(bare)))
+        return render_template(self.template, report=self, glossary=found, **self.values)
 
     def source(self, name: str) -> str:
         """The picture `name` as the address of an <img> that needs no other file."""
         return "data:image/png;base64," + base64.b64encode(self.figures[f"{name}.png"]).decode()
+
+    def _together(self) -> dict[str, bytes]:
+        """All tables in one file; a sheet of Excel holds so many rows and no more."""
+        if not self.tables:
+            return {}
+        sheets = {
+            name: (table.heads, table.rows)
+            for name, table in self.tables.items()
+            if len(table.rows) < MOST_ROWS
+        }
+        return {
+            "tables.mat": matlab_tables(self.tables),
+            **({"tables.xlsx": workbook_bytes(sheets)} if sheets else {}),
+        }
 
     def files(self) -> dict[str, bytes]:
         """Page, result.json, tables and figures by name."""
@@ -233,7 +290,7 @@ class Report:
             "report.html": self.page().encode(),
             "result.json": json_bytes({"schema": SCHEMA, **self.provenance.data(), **self.data}),
             **{f"{name}.csv": table.csv() for name, table in self.tables.items()},
-            **({"tables.mat": matlab_tables(self.tables)} if self.tables else {}),
+            **self._together(),
             **self.figures,
         }
 

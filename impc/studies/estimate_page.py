@@ -16,13 +16,14 @@ from impc.checking import checked
 from impc.errors import InputError
 from impc.inverse.estimates import Estimate
 from impc.inverse.methods import METHODS
-from impc.reporting.document import Lines, Picture, Report, Section, TextTable
+from impc.reporting.document import Lines, Picture, Report, Section, TextTable, Verdict
 from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import number
 from impc.reporting.shown_units import axis_label, shown_unit
 from impc.reporting.style import BLUE, DOUBLE_COLUMN, INK, drawn, journal_style, new_figure
 from impc.reporting.writer import owned, write_files
 from impc.studies.methods_table import column_terms, methods_data, methods_table
+from impc.studies.signal_words import signal_words
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -102,7 +103,7 @@ def _document(fit: MethodFit) -> Report:
     return Report(
         f"impc: {method.label}",
         f"Estimate: {method.label}",
-        (method.sentence, Lines(_findings(fit))),
+        (Verdict(fit.estimate.status.sentence), method.sentence, Lines(_findings(fit))),
         [
             Section(
                 "1. Recorded and simulated",
@@ -126,6 +127,7 @@ def _document(fit: MethodFit) -> Report:
             "logarithms": estimate.problem.logarithms,
         },
         provenance=provenance,
+        words=signal_words(estimate.problem.plant),
     )
 
 
@@ -135,7 +137,7 @@ def _findings(fit: MethodFit) -> list[str]:
         f"{number(float(value), 5)} % of {name}"
         for name, value in zip(outputs, fit.vaf, strict=True)
     )
-    lines = [estimate.status.sentence, f"Variance accounted for (3.24): {shares}."]
+    lines = [f"Variance accounted for (3.24): {shares}."]
     if np.any(np.isfinite(estimate.problem.bounds.u_max)):
         lines.append(
             "No input exceeds its bound."

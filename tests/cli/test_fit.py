@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 import os
 import re
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import openpyxl
 import pandas as pd
 import pytest
 import scipy.io
@@ -71,7 +73,7 @@ def fitted(subject: Path, quick: Path) -> tuple[Result, Path]:
 def test_the_subject_is_written_in_every_format(subject: Path) -> None:
     names = {path.name for path in subject.iterdir() if path.is_file()}
     for number in (1, 2, 3):
-        for ending in (".csv", ".tsv", ".mat", "_v73.mat", ".tdms", ".c3d"):
+        for ending in (".csv", ".tsv", ".xlsx", ".mat", "_v73.mat", ".tdms", ".c3d"):
             assert f"trial_{number}{ending}" in names
     truth = json.loads((subject / "truth.json").read_text())
     assert np.array(truth["K"]).shape == (1, 10)
@@ -80,7 +82,7 @@ def test_the_subject_is_written_in_every_format(subject: Path) -> None:
         plant_source("plants:seated_balance_for", configuration.plant), tuple(configuration.signals)
     )
     first = read_recordings([subject / "trial_1.csv"], configuration, plant)[0]
-    for ending in (".tsv", ".mat", "_v73.mat", ".tdms", ".c3d"):
+    for ending in (".tsv", ".xlsx", ".mat", "_v73.mat", ".tdms", ".c3d"):
         other = read_recordings([subject / f"trial_1{ending}"], configuration, plant)[0]
         np.testing.assert_allclose(other.outputs, first.outputs, atol=1e-7)
         np.testing.assert_allclose(other.disturbance, first.disturbance, atol=1e-6)
@@ -132,11 +134,16 @@ def test_result_json_is_the_fit(fitted: tuple[Result, Path], subject: Path, quic
 def test_the_page_says_what_the_numbers_say(fitted: tuple[Result, Path]) -> None:
     found = json.loads((fitted[1] / "result.json").read_text())
     page = (fitted[1] / "report.html").read_text()
-    assert f"{found['vaf']['theta1']:.2f} % of theta1" in page
+    assert f"{found['vaf']['theta1']:.2f} % of theta1 (tilt of seat and lower body)" in page
+    assert page.index('class="verdict"') < page.index("<li>") < page.index("<figure")
+    assert page.count("<h1") == 1
+    assert '<dt id="word-vaf">VAF</dt>' in page
+    assert "Velocity of theta1, in rad/s." in page
+    assert found["weights_rule"] in html.unescape(page)
     assert f"by up to {found['intent']['widest_angle']:.0f} degrees" in page
     assert "inverse LQR, output penalty (3.16)" in page
     assert not re.search("https?:", page)
-    assert page.count("<img") == 6
+    assert page.count("<img") == len(list(fitted[1].glob("*.png"))) == 8
     assert len(page) < 4_000_000
     assert "Nothing found." in page
     for name in ("residuals.pdf", "intent.png", "methods.pdf", "trajectories-trial-3.pdf"):
@@ -166,6 +173,14 @@ def test_the_tables_are_those_of_result_json(fitted: tuple[Result, Path]) -> Non
     assert share == pytest.approx(found["trials"][1]["vaf"][0])
     assert abs(sway.command_simulated).max() <= 6 * (1 + 1e-9)
     load: Any = scipy.io.loadmat
+    workbook = openpyxl.load_workbook(fitted[1] / "tables.xlsx", read_only=True)
+    for name, table in tables.items():
+        heads, *rows = workbook[name].iter_rows(values_only=True)
+        assert list(heads) == list(table.columns)
+        assert len(rows) == len(table)
+    heads, *rows = workbook["trajectories"].iter_rows(values_only=True)
+    sheet = pd.DataFrame(rows, columns=heads)
+    np.testing.assert_array_equal(sheet.theta1_simulated, tables["trajectories"].theta1_simulated)
     kept = load(fitted[1] / "tables.mat")
     for name, table in tables.items():
         assert list(kept[name].dtype.names) == list(table.columns)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from impc.cli.progress import progress
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
 
 
 def interrupted(*given: Any) -> None:
@@ -26,3 +29,22 @@ def test_without_anything_kept_nothing_is_said() -> None:
     with pytest.raises(KeyboardInterrupt) as caught:
         interrupted(2, "step")
     assert caught.value.args == ()
+
+
+def test_lines_stand_in_a_pipe_every_ten_seconds(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The clock is made: a step takes four seconds."""
+
+    def clock() -> Iterator[float]:
+        yield from range(0, 1000, 4)
+
+    times = clock()
+    monkeypatch.setattr("impc.cli.progress.time.monotonic", lambda: next(times))
+    with progress(8, "stage", begun=1) as done:
+        for step in range(2, 9):
+            done(f"step {step}")
+    assert capsys.readouterr().err.splitlines() == [
+        "4 of 8 stages (step 4), about 16 s left",
+        "7 of 8 stages (step 7), about 4 s left",
+    ]

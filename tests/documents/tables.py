@@ -93,7 +93,7 @@ NOT_RUN = {
 
 # A trial of 4 s instead of 30 s; a fit with six states instead of ten, over 4 samples instead of
 # 20, and not once more for every trial: a tenth of the time.
-_SUBJECT = "impc simulate seated-balance --out {0} --duration 4 --formats csv"
+_SUBJECT = "impc simulate seated-balance --out {0} --duration 4 --formats csv,xlsx"
 _EASIER = (
     "edit {0}/subject.toml [plant] '[plant]\ndelay_order = 1'",
     "edit {0}/subject.toml 'horizon = 20' 'held_out = false\nintent_draws = false\nhorizon = 4'",
@@ -105,6 +105,21 @@ _SHORT = "shorter trials, and a smaller fit of them"
 #: (page, line) -> what is run instead.
 SMALLER = {
     ("README.md", "impc simulate seated-balance --out results/subject"): Smaller(_SEAT, _SHORT),
+    (
+        "README.md",
+        "impc fit results/subject/trial_1.xlsx results/subject/trial_2.xlsx"
+        " results/subject/trial_3.xlsx --plant seated-balance --config excel.toml"
+        " --out results/excel",
+    ): Smaller(
+        (
+            "edit excel.toml [plant] '[plant]\ndelay_order = 1'",
+            "edit excel.toml 'horizon = 20' 'held_out = false\nintent_draws = false\nhorizon = 4'",
+            "edit excel.toml 'u_max = \"?\"' 'u_max = 6.0'",
+            "impc fit results/subject/trial_1.xlsx results/subject/trial_2.xlsx"
+            " --plant seated-balance --config excel.toml --out results/excel",
+        ),
+        _SHORT,
+    ),
     (
         "README.md",
         "impc fit lab_1.csv --plant seated-balance --config lab.toml --out results/lab",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import datetime
 import json
 import os
 import re
@@ -16,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import control
 import distributed
 import numpy as np
+import openpyxl
 import pytest
 import scipy.io
 from click.testing import CliRunner
@@ -57,10 +59,11 @@ from impc.studies.selection.subsets import largest_subsets
 from plants import seated_balance_plant
 from tests.documents.blocks import PAGES
 from tests.files.damaged import DAMAGED, PLANT
+from tests.files.hostile_files import HOSTILE
 from tests.files.samples import csv_text, hdf5_mat, pushed_seat, settings
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
 PAGE = PAGES["docs/troubleshooting.md"].read_text(encoding="utf-8")
 MESSAGES = re.findall(r"\*\*`([^`]+)`\*\*", PAGE)
@@ -289,6 +292,23 @@ def thousands(folder: Path) -> None:
     read_table(folder / "t.csv")
 
 
+def workbook(*rows: Sequence[Any]) -> Callable[[Path], Table]:
+    def read(folder: Path) -> Table:
+        made = openpyxl.Workbook()
+        for row in rows:
+            made.active.append(row)
+        made.save(folder / "t.xlsx")
+        return read_table(folder / "t.xlsx")
+
+    return read
+
+
+def locked_workbook(folder: Path) -> None:
+    """As Excel encrypts: a compound file, whatever its ending."""
+    (folder / "t.xlsx").write_bytes(b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1" + bytes(504))
+    read_table(folder / "t.xlsx")
+
+
 def a_pipe(folder: Path) -> None:
     os.mkfifo(folder / "t.csv")
     read_table(folder / "t.csv")
@@ -412,8 +432,21 @@ def beyond_feasibility(_: Path) -> str:
 
 PROVOKED: dict[str, Callable[[Path], object]] = {
     "does not exist; check the path": damaged("missing file"),
-    "has the ending '...', and not .csv, .tsv, .txt, .mat, .tdms, .c3d": damaged("excel workbook"),
+    "has the ending '...', and not .csv, .tsv, .txt, .xlsx, .ods, .mat, .tdms, .c3d": damaged(
+        "old excel workbook"
+    ),
     "ends in ... and is a zip archive or an Excel workbook": damaged("excel workbook called csv"),
+    "ends in ... and is an Excel workbook that is old or locked by a password": locked_workbook,
+    "cannot be written as .ods": lambda _: encode_table(
+        ".ods", make_table("t", {"x": np.arange(2.0)})
+    ),
+    "is too large once it is unpacked (...)": lambda folder: read_table(
+        HOSTILE["zip bomb"].make(folder)
+    ),
+    "has no rows of numbers in the first ... rows of a sheet": workbook(["a"], ["b"]),
+    "column '...' has ... and ...; save it as numbers, all of one kind": workbook(
+        ["x", "y"], [1, 2], [2, datetime.date(2026, 1, 1)]
+    ),
     "has no rows of numbers divided by": damaged("csv of a header alone"),
     "line ... names ... columns, and the rows below have ... values": damaged(
         "decimal commas between commas"

@@ -83,7 +83,12 @@ def _sparse_mat_of_two_gigabytes(folder: Path) -> Made:
     return _sparse(folder / "trial.mat"), settings()
 
 
-@_damage("has the ending '.xlsx'")
+@_damage("has the ending '.xls'")
+def _old_excel_workbook(folder: Path) -> Made:
+    return written(folder, b"\xd0\xcf\x11\xe0" + bytes(100), "trial.xls"), settings()
+
+
+@_damage("is damaged and cannot be read (File is not a zip file)")
 def _excel_workbook(folder: Path) -> Made:
     return written(folder, b"PK\x03\x04" + bytes(100), "trial.xlsx"), settings()
 

@@ -5,8 +5,11 @@
 
 from __future__ import annotations
 
+import copy
+import io
 import itertools
 import struct
+import zipfile
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +19,7 @@ import h5py
 import numpy as np
 
 from tests.files.damage import written, written_by_impc
-from tests.files.samples import hdf5_mat, mat5_array, mat5_element, mat5_file
+from tests.files.samples import hdf5_mat, mat5_array, mat5_element, mat5_file, ods_file
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -296,6 +299,88 @@ def _c3d_of_frames_that_are_not_there(folder: Path) -> Path:
     content = bytearray(path.read_bytes())
     content[8:10] = b"\xff\xff"  # the last frame
     path.write_bytes(content)
+    return path
+
+
+# Workbooks ------------------------------------------------------------------------------------
+
+
+def _with_sheet(folder: Path, sheet: str) -> Path:
+    """A workbook of impc with another text for its sheet."""
+    path = written_by_impc(folder, "trial.xlsx")
+    with zipfile.ZipFile(path) as archive:
+        files = {name: archive.read(name) for name in archive.namelist()}
+    files["xl/worksheets/sheet1.xml"] = sheet.encode()
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in files.items():
+            archive.writestr(name, content)
+    return path
+
+
+_SHEET = (
+    '<worksheet xmlns="http://schemas.openxmlformats.org/spreadsheetml/2006/main">{}</worksheet>'
+)
+
+
+@_hostile("is too large once it is unpacked (1.2 GB)")
+def _zip_bomb(folder: Path) -> Path:
+    # 60 names of the same 20 MB of blanks.
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("a", b" " * 20_000_000)
+        first = archive.getinfo("a")
+        for index in range(59):
+            other = copy.copy(first)
+            other.filename = f"b{index}"
+            archive.filelist.append(other)
+    return written(folder, packed.getvalue(), "trial.xlsx")
+
+
+@_hostile("is damaged and cannot be read")
+def _zip_that_says_too_little(folder: Path) -> Path:
+    path = _with_sheet(folder, _SHEET.format(" " * 50_000_000))
+    content = path.read_bytes()
+    size = struct.pack("<I", len(_SHEET.format("")) + 50_000_000)
+    assert content.count(size) == 2  # before the file, and in the directory
+    return written(folder, content.replace(size, struct.pack("<I", 100)), "trial.xlsx")
+
+
+@_hostile("GB to read")
+def _cell_at_the_end_of_the_sheet(folder: Path) -> Path:
+    row = '<row r="{}"><c r="{}"><v>1</v></c></row>'
+    cells = row.format(1, "A1") + row.format(1_048_576, "XFD1048576")
+    return _with_sheet(folder, _SHEET.format(f"<sheetData>{cells}</sheetData>"))
+
+
+# An entity stands for nothing: the cell is empty.
+@_hostile("has no rows of numbers")
+def _entities_of_entities(folder: Path) -> Path:
+    entities = ['<!ENTITY e0 "111">']
+    entities += [f'<!ENTITY e{level + 1} "{f"&e{level};" * 10}">' for level in range(12)]
+    cells = "<sheetData><row><c><v>&e12;</v></c></row></sheetData>"
+    return _with_sheet(folder, f"<!DOCTYPE w [{''.join(entities)}]>" + _SHEET.format(cells))
+
+
+@_hostile("has no rows of numbers")
+def _entity_that_names_a_file(folder: Path) -> Path:
+    cells = "<sheetData><row><c><v>&e;</v></c></row></sheetData>"
+    declared = '<!DOCTYPE w [<!ENTITY e SYSTEM "file:///etc/passwd">]>'
+    return _with_sheet(folder, declared + _SHEET.format(cells))
+
+
+@_hostile("Cell limit exceeded")
+def _cells_repeated_without_end(folder: Path) -> Path:
+    path = folder / "trial.ods"
+    ods_file(path, {"a": [[1.0, 2.0]]})
+    with zipfile.ZipFile(path) as archive:
+        files = {name: archive.read(name).decode() for name in archive.namelist()}
+    many = files["content.xml"]
+    for what, part in (("row", "rows"), ("cell", "columns")):
+        again = f'<table:table-{what} table:number-{part}-repeated="1000000000"'
+        many = many.replace(f"<table:table-{what}", again, 1)
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in {**files, "content.xml": many}.items():
+            archive.writestr(name, content)
     return path
 
 

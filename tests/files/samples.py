@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import io
 import struct
+import zipfile
 from typing import TYPE_CHECKING, Any
+from xml.sax.saxutils import escape
 
 import h5py
 import numpy as np
@@ -12,7 +14,7 @@ import scipy.io
 import scipy.signal
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping, Sequence
     from pathlib import Path
 
     from impc.arrays import Array
@@ -24,6 +26,7 @@ __all__ = [
     "mat5_array",
     "mat5_element",
     "mat5_file",
+    "ods_file",
     "opaque_variable",
     "pushed_seat",
     "save_mat",
@@ -132,3 +135,36 @@ def mat5_element(kind: int, content: bytes, padded: bool = True) -> bytes:
     """One element of a v5 file: its type, its length, its bytes, filled up to eight."""
     end = bytes(-len(content) % 8) if padded else b""
     return struct.pack("<II", kind, len(content)) + content + end
+
+
+def ods_file(path: Path, sheets: Mapping[str, Iterable[Sequence[float | str]]]) -> None:
+    """A workbook of OpenDocument 1.3, as LibreOffice packs it: the type first, unpacked."""
+    kind = "application/vnd.oasis.opendocument.spreadsheet"
+    names = " ".join(
+        f'xmlns:{short}="urn:oasis:names:tc:opendocument:xmlns:{short}:1.0"'
+        for short in ("office", "table", "text")
+    )
+
+    def cell(value: float | str) -> str:
+        if isinstance(value, str):
+            text = f"<text:p>{escape(value)}</text:p>"
+            return f'<table:table-cell office:value-type="string">{text}</table:table-cell>'
+        return f'<table:table-cell office:value-type="float" office:value="{float(value)!r}"/>'
+
+    tables = "".join(
+        f'<table:table table:name="{name}">'
+        + "".join(f"<table:table-row>{''.join(map(cell, row))}</table:table-row>" for row in rows)
+        + "</table:table>"
+        for name, rows in sheets.items()
+    )
+    body = f"<office:body><office:spreadsheet>{tables}</office:spreadsheet></office:body>"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("mimetype", kind, zipfile.ZIP_STORED)
+        archive.writestr(
+            "content.xml", f"<office:document-content {names}>{body}</office:document-content>"
+        )
+        manifest = "urn:oasis:names:tc:opendocument:xmlns:manifest:1.0"
+        entry = f'<m:file-entry m:full-path="/" m:media-type="{kind}"/>'
+        archive.writestr(
+            "META-INF/manifest.xml", f'<m:manifest xmlns:m="{manifest}">{entry}</m:manifest>'
+        )

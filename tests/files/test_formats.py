@@ -16,8 +16,8 @@ import scipy.io
 from nptdms import ChannelObject, TdmsFile, TdmsWriter
 
 from impc.errors import DataError, OutputError
-from impc.files.delimited import split_heading
 from impc.files.formats import read_table, write_matlab73, write_table
+from impc.files.headings import split_heading
 from impc.files.table import Table, make_table
 from tests.files.samples import csv_text, hdf5_mat, opaque_variable, pushed_seat, save_mat
 
@@ -295,7 +295,7 @@ def test_c3d_by_c3d(tmp_path: Path) -> None:
 # Written by impc ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("ending", [".csv", ".tsv", ".txt", ".mat", ".tdms", ".c3d"])
+@pytest.mark.parametrize("ending", [".csv", ".tsv", ".txt", ".xlsx", ".mat", ".tdms", ".c3d"])
 def test_written_and_read_again(tmp_path: Path, ending: str) -> None:
     path = tmp_path / f"trial{ending}"
     units = {"seat": "deg", "push": "N*m"}
@@ -350,7 +350,7 @@ def read_or_reason(path: Path) -> Table | str:
         return str(error)
 
 
-@pytest.mark.parametrize("ending", [".csv", ".mat", ".tdms", ".c3d"])
+@pytest.mark.parametrize("ending", [".csv", ".xlsx", ".mat", ".tdms", ".c3d"])
 def test_files_cut_anywhere_give_no_wrong_number(tmp_path: Path, ending: str) -> None:
     path = tmp_path / f"trial{ending}"
     write_table(path, make_table("trial", SEAT, {"seat": "deg"}, 100.0))
@@ -372,7 +372,7 @@ def test_files_cut_anywhere_give_no_wrong_number(tmp_path: Path, ending: str) ->
     assert refused > (25 if ending == ".csv" else 55)
 
 
-@pytest.mark.parametrize("ending", [".csv", ".mat", ".tdms", ".c3d"])
+@pytest.mark.parametrize("ending", [".csv", ".xlsx", ".mat", ".tdms", ".c3d"])
 def test_files_with_wrong_bytes_end_in_one_line(tmp_path: Path, ending: str) -> None:
     rng = np.random.default_rng(5)  # seed 5
     path = tmp_path / f"trial{ending}"

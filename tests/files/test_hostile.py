@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def test_a_sparse_file_of_two_gigabytes_is_refused_unread(tmp_path: Path) -> None:
-    for ending in (".csv", ".mat", ".tdms", ".c3d"):
+    for ending in (".csv", ".xlsx", ".ods", ".mat", ".tdms", ".c3d"):
         path = tmp_path / f"trial{ending}"
         with path.open("wb") as file:
             file.truncate(2_000_000_000)

@@ -18,7 +18,7 @@ from impc.files.plant_sources import make_plant, plant_source
 from impc.files.reading import recording_of
 from impc.files.table import make_table
 from impc.model.plant import Plant
-from tests.files.samples import csv_text, hdf5_mat, pushed_seat, save_mat
+from tests.files.samples import csv_text, hdf5_mat, ods_file, pushed_seat, save_mat
 from tests.fuzz.mutation import EDGES, mutated_bytes, mutated_text
 
 if TYPE_CHECKING:
@@ -154,11 +154,13 @@ def _sound_files(folder: Path) -> dict[str, list[bytes]]:
     columns = pushed_seat(60)
     table = make_table("sound", columns, {"seat": "deg", "push": "N*m"}, 100.0)
     found: dict[str, list[bytes]] = {}
-    for suffix in (".csv", ".tsv", ".txt", ".tdms", ".c3d"):
+    for suffix in (".csv", ".tsv", ".txt", ".xlsx", ".tdms", ".c3d"):
         path = folder / f"sound{suffix}"
         write_table(path, table)
         found[suffix] = [path.read_bytes()]
     found[".csv"].append(csv_text(columns, ";", ",").encode())
+    ods_file(folder / "sound.ods", {"a": [list(columns), *zip(*columns.values(), strict=True)]})
+    found[".ods"] = [(folder / "sound.ods").read_bytes()]
     path = folder / "sound.mat"
     more = {"c": np.array(["x", 1.0], dtype=object), "t": "text", "s": {"a": np.arange(60)}}
     found[".mat"] = []

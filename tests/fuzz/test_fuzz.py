@@ -13,7 +13,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 # Cases of each target, about two seconds.
-_CASES = {".csv": 120, ".tsv": 60, ".txt": 60, ".mat": 400, ".tdms": 300, ".c3d": 150}
+_CASES = {".csv": 120, ".tsv": 60, ".txt": 60, ".mat": 400, ".tdms": 300, ".c3d": 150,
+          ".xlsx": 120}  # fmt: skip
 
 
 @pytest.mark.parametrize("target", TARGETS)

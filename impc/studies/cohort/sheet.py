@@ -1,4 +1,4 @@
-"""A small table of a study, recordings or participants: CSV with commas or semicolons, or TSV."""
+"""A small table of a study, recordings or participants: .csv, .tsv, .xlsx or .ods."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from impc.errors import InputError
+from impc.files.apart import cells_apart
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -57,13 +58,8 @@ def read_sheet(path: Path) -> Sheet:
         than there are columns, or there is no row.
     """
     where = f"table {path.name}"
-    text = _text(where, path)
-    first = text.partition("\n")[0]
-    delimiter = "\t" if "\t" in first else ";" if ";" in first else ","
-    try:
-        lines = [line for line in csv.reader(text.splitlines(), delimiter=delimiter) if any(line)]
-    except csv.Error as error:
-        raise InputError(where, f"cannot be read ({error})", "save it again as CSV") from None
+    workbook = path.suffix.lower() in (".xlsx", ".ods")
+    lines = _cells(where, path) if workbook else _divided(where, _text(where, path))
     if len(lines) < 2:
         raise InputError(where, "has no rows", "write a head and a row for each")
     heads = tuple(cell.strip() for cell in lines[0])
@@ -83,12 +79,23 @@ def read_sheet(path: Path) -> Sheet:
     return Sheet(path.name, heads, tuple(rows))
 
 
-def _text(where: str, path: Path) -> str:
+def _cells(where: str, path: Path) -> list[list[str]]:
+    _require_file(where, path)
+    return [row for row in cells_apart(path, _LARGEST) if any(row)]
+
+
+def _divided(where: str, text: str) -> list[list[str]]:
+    first = text.partition("\n")[0]
+    delimiter = "\t" if "\t" in first else ";" if ";" in first else ","
     try:
-        if path.exists() and not path.is_file():
-            raise InputError(where, "is no ordinary file", "check the path")
-        if path.stat().st_size > _LARGEST:
-            raise InputError(where, f"has more than {_LARGEST // 1_000_000} MB", "check the path")
+        return [line for line in csv.reader(text.splitlines(), delimiter=delimiter) if any(line)]
+    except csv.Error as error:
+        raise InputError(where, f"cannot be read ({error})", "save it again as CSV") from None
+
+
+def _text(where: str, path: Path) -> str:
+    _require_file(where, path)
+    try:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "it is not UTF-8 text"
@@ -96,6 +103,16 @@ def _text(where: str, path: Path) -> str:
     if "\0" in text:
         raise InputError(where, "has a NUL in it", "save it again as UTF-8 text")
     return text
+
+
+def _require_file(where: str, path: Path) -> None:
+    try:
+        if path.exists() and not path.is_file():
+            raise InputError(where, "is no ordinary file", "check the path")
+        if path.stat().st_size > _LARGEST:
+            raise InputError(where, f"has more than {_LARGEST // 1_000_000} MB", "check the path")
+    except OSError as error:
+        raise InputError(where, f"cannot be read ({error.strerror})", "check it") from None
 
 
 def column_values(sheet: Sheet, name: str) -> list[float | str | None]:

@@ -9,11 +9,20 @@ from markupsafe import Markup
 
 from impc.assess.assessments import ASSESSMENTS
 from impc.inverse.methods import METHODS
-from impc.reporting.document import Lines, Picture, Report, Section, Terms, TextTable
+from impc.reporting.document import (
+    Lines,
+    Picture,
+    Report,
+    Section,
+    Terms,
+    TextTable,
+    Verdict,
+)
 from impc.reporting.rendering import number
 from impc.reporting.shown_units import axis_label
 from impc.reporting.style import BLUE, DOUBLE_COLUMN, INK, drawn, journal_style, new_figure
 from impc.studies.methods_table import column_terms, methods_data, methods_numbers, methods_table
+from impc.studies.signal_words import signal_words
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -49,14 +58,17 @@ def compare_report(
     sections = [
         Section(
             "1. All methods on the same recordings",
-            (methods_table(compared), _PICTURE),
+            (_PICTURE, methods_table(compared)),
+            "Methods",
             together=True,
         ),
-        Section("2. Weights", (_weights(problem, compared),)),
         Section(
-            "3. What each method does, and what each column says",
+            "2. What each method does, and what each column says",
             (Terms([(one.label, (one.sentence,)) for one in methods]), column_terms()),
+            "Columns",
+            folded=True,
         ),
+        Section("3. Weights", (_weights(problem, compared),), "Weights", folded=True),
         Section(
             "4. Versions",
             (
@@ -69,34 +81,44 @@ def compare_report(
                     ]
                 ),
             ),
+            folded=True,
         ),
     ]
     return Report(
         f"impc compare: {subject}",
         f"Methods for the weights behind the recordings of {subject}",
-        (Lines(_findings(compared)),),
+        (Verdict(_verdict(compared)), Lines(_findings(compared))),
         sections,
         figures=figures,
         tables={"methods": methods_numbers(compared)},
         data=_data(problem, compared),
         provenance=provenance,
+        words=signal_words(problem.plant),
+    )
+
+
+def _usable(compared: Sequence[MethodFit]) -> list[MethodFit]:
+    return [item for item in compared if not np.any(np.isnan(item.vaf))]
+
+
+def _verdict(compared: Sequence[MethodFit]) -> str:
+    usable = _usable(compared)
+    held = [item for item in usable if len(item.held_out) and not np.any(np.isnan(item.held_out))]
+    ranked = sorted(held or usable, key=lambda item: -float(np.mean(_score(item))))
+    if not ranked:
+        return "No method explains these recordings to their end."
+    best = ranked[0]
+    where = "trials that it has not seen" if held else "the trials that it was fitted to"
+    kept = "keeps" if best.keeps_bounds else "exceeds"
+    return (
+        f"Best on {where}: {METHODS[best.name].label}, {np.mean(_score(best)):.2f} % on average "
+        f"over the outputs; it {kept} the subject's bounds."
     )
 
 
 def _findings(compared: Sequence[MethodFit]) -> list[str]:
-    usable = [item for item in compared if not np.any(np.isnan(item.vaf))]
-    held = [item for item in usable if len(item.held_out) and not np.any(np.isnan(item.held_out))]
-    ranked = sorted(held or usable, key=lambda item: -float(np.mean(_score(item))))
-    lines = []
-    if ranked:
-        best = ranked[0]
-        where = "trials that it has not seen" if held else "the trials that it was fitted to"
-        lines.append(
-            f"Best on {where}: {METHODS[best.name].label}, {np.mean(_score(best)):.2f} % on "
-            "average over the outputs."
-        )
-    keeping = [METHODS[item.name].label for item in usable if item.keeps_bounds]
-    lines.append(f"Keep the subject's bounds: {', '.join(keeping) or 'none'}.")
+    keeping = [METHODS[item.name].label for item in _usable(compared) if item.keeps_bounds]
+    lines = [f"Keep the subject's bounds: {', '.join(keeping) or 'none'}."]
     lines += [
         f"{METHODS[item.name].label}: {item.estimate.reason}."
         for item in compared

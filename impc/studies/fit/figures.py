@@ -19,6 +19,11 @@ from impc.reporting.style import (
     journal_style,
     new_figure,
 )
+from impc.studies.fit.interval_figures import (
+    gain_figure,
+    shown_statements,
+    statements_figure,
+)
 from impc.studies.fit.result import MOST_TRIALS, shown_trials, trial_name
 from impc.studies.fit.structures import price_figure
 
@@ -48,6 +53,9 @@ def fit_figures(result: FitResult) -> dict[str, bytes]:
             f"trajectories-trial-{index + 1}": _trajectories(result, index)
             for index in shown_trials(result)
         }
+        figures["gain"] = gain_figure(result)
+        if shown_statements(result):
+            figures["statements"] = statements_figure(result)
         figures["residuals"] = _residuals(result)
         figures["intent"] = _intent(result)
         figures["methods"] = _methods(result)

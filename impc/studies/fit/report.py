@@ -11,6 +11,7 @@ from markupsafe import Markup
 from impc.assess.covariance import TOLD
 from impc.reporting.document import (
     Block,
+    Details,
     Heading,
     Lines,
     Note,
@@ -19,17 +20,16 @@ from impc.reporting.document import (
     Section,
     Terms,
     TextTable,
+    Verdict,
     table_of,
 )
 from impc.reporting.rendering import number
 from impc.studies.fit.csv_tables import fit_tables
 from impc.studies.fit.figures import fit_figures
+from impc.studies.fit.interval_figures import shown_statements
 from impc.studies.fit.result import shown_trials, trial_name
 from impc.studies.fit.schema import fit_data
-from impc.studies.fit.sentences import (
-    direction_name,
-    findings,
-)
+from impc.studies.fit.sentences import direction_name, remarks
 from impc.studies.fit.structures import structure_section
 from impc.studies.fit.tables import (
     alternatives_table,
@@ -41,7 +41,10 @@ from impc.studies.fit.tables import (
     set_sentences,
     statements_table,
 )
+from impc.studies.fit.truth import truth_sentence, truth_table
+from impc.studies.fit.verdict import abstract, verdict
 from impc.studies.methods_table import column_terms, methods_table
+from impc.studies.signal_words import signal_words
 
 if TYPE_CHECKING:
     from impc.arrays import Array
@@ -50,15 +53,24 @@ if TYPE_CHECKING:
 
 __all__ = ["fit_report"]
 
-_NOT_AT_REST = Note(
-    "Not at rest.",
-    "The search for weights ended before it converged: a longer or less noisy recording may change "
-    "them.",
+_GAIN = Picture(
+    "gain",
+    "Every entry of the gain with its interval, one row a state",
+    "Entries of the gain, each as the command that it gives at the state's typical size, with 95 % "
+    "intervals. Grey: not told by itself. An arrow: it goes on.",
+    narrow=True,
+)
+_STATEMENTS = Picture(
+    "statements",
+    "Statements on what costs more, each with its range over all weights with this gain",
+    "A statement holds for all weights with this gain where its bar stays on one side of zero. "
+    "In colour and bold: it may be made of the subject, at 95 %.",
+    narrow=True,
 )
 _LEFT = (
     "What the controller does not explain. A residual that is coloured (a small p-value above, a "
     "curve outside the grey band) is the rule with people: they also move for reasons of their "
-    "own. The standard deviations below allow for that colour."
+    "own. The intervals of the gain allow for that colour."
 )
 _RESIDUALS = Picture(
     "residuals",
@@ -72,9 +84,9 @@ _METHODS = Picture(
     "more than the subject has; one whose curve ends has fallen.",
 )
 _SAME_GAIN = (
-    "All weights in this table have exactly the fitted gain, so the same behaviour under the same "
-    "bounds. Which of them is reported is a convention. What holds for all of them may be said of "
-    "the subject; what differs between them may not."
+    "Many weights have exactly the fitted gain, so the same behaviour under the same bounds. Which "
+    "of them is reported is a convention. What holds for all of them may be said of the subject; "
+    "what differs between them may not."
 )
 _INTENT = Picture(
     "intent",
@@ -84,34 +96,80 @@ _INTENT = Picture(
 )
 
 
-def fit_report(result: FitResult, provenance: Provenance) -> Report:
-    """Page, result.json, tables and figures."""
+def fit_report(result: FitResult, provenance: Provenance, truth: Array | None = None) -> Report:
+    """Page, result.json, tables and figures.
+
+    Parameters
+    ----------
+    result : FitResult
+    provenance : Provenance
+    truth : Array, optional
+        Gain (m, n) of a simulated subject: the page then compares with it.
+    """
+    told = () if truth is None else (Note("Truth.", truth_sentence(result, truth)),)
     subject = str(result.given.recordings[0].label.subject) or "a subject"
-    converged = result.fitted.converged
-    found = [
-        *([structure_section(result)] if result.structures else []),
-        Section("1. Recorded and simulated", _trajectories(result), "Trajectories", together=True),
-        Section("2. What is left", (_LEFT, _RESIDUALS), "What is left"),
-        Section(
-            "3. Inverse LQR on the same recordings",
-            (methods_table(result.methods), column_terms(), _METHODS),
-            "Inverse LQR beside it",
-        ),
-        Section("4. Intent: what the weights say, and what they do not", _intent(result), "Intent"),
-        Section("5. The gain, and how sure it is", _gain(result), "Gain"),
-        Section("6. Checks of the recordings", (_checks(result),), "Checks"),
-        Section("7. Settings and versions", _made(result, provenance), "Settings"),
-    ]
     return Report(
         f"impc fit: {subject}",
         f"The controller behind the recordings of {subject}",
-        (Lines(findings(result)), *(() if converged else (_NOT_AT_REST,))),
-        found,
+        (
+            Verdict(verdict(result)),
+            *(Note("Warning.", line.removeprefix("Warning: ")) for line in result.warnings),
+            *told,
+            Lines(abstract(result)),
+            Details("What stands behind these sentences", (Lines(remarks(result)),)),
+        ),
+        [
+            Section("1. The gain, and how sure it is", _gain(result, truth), "Gain", together=True),
+            *([structure_section(result)] if result.structures else []),
+            Section("2. What may be said of the weights", _statements(result), "Weights"),
+            Section("3. Inverse LQR on the same recordings", _methods(result), "Inverse LQR"),
+            Section("4. Recorded and simulated", _trajectories(result), "Trajectories"),
+            Section("5. What is left", (_LEFT, _RESIDUALS), "What is left", folded=True),
+            Section("6. All weights with this gain", _intent(result), "Intent", folded=True),
+            Section("7. Checks of the recordings", (_checks(result),), "Checks", folded=True),
+            Section("8. Settings and versions", _made(result, provenance), "Settings", folded=True),
+        ],
         figures=fit_figures(result),
         tables=fit_tables(result),
-        data=fit_data(result, provenance),
+        data={**fit_data(result, provenance), "truth": None if truth is None else {"K": truth}},
         provenance=provenance,
+        words=signal_words(result.given.plant),
     )
+
+
+def _gain(result: FitResult, truth: Array | None) -> list[Block]:
+    limits, others = limit_sentences(result.certainty), alternatives_table(result.certainty)
+    parameters = _parameters(result)
+    blocks: list[Block] = [
+        _GAIN,
+        Details("Every number with its intervals", (intervals_table(result),)),
+    ]
+    blocks += [] if truth is None else [Details("The true gain", (truth_table(result, truth),))]
+    blocks += [] if parameters is None else [parameters]
+    blocks += [Details("Combinations of entries: directions of the gain", (_directions(result),))]
+    if limits or others is not None:
+        blocks += [Heading("Limit and horizon"), *limits, *(() if others is None else (others,))]
+    return blocks
+
+
+def _statements(result: FitResult) -> list[Block]:
+    summary, reason = result.certainty.weights, result.certainty.weights_reason
+    blocks: list[Block] = [_SAME_GAIN]
+    if summary is None:
+        return [*blocks, f"Not available: {reason}"]
+    prices = prices_table(summary)
+    inside = (statements_table(summary), *(() if prices is None else (prices,)))
+    if shown_statements(result):
+        blocks.append(_STATEMENTS)
+    return [*blocks, Details("Every statement and price with its range", inside)]
+
+
+def _methods(result: FitResult) -> list[Block]:
+    return [
+        _METHODS,
+        methods_table(result.methods),
+        Details("What each column says", (column_terms(),)),
+    ]
 
 
 def _trajectories(result: FitResult) -> list[Block]:
@@ -121,48 +179,35 @@ def _trajectories(result: FitResult) -> list[Block]:
         blocks.append(
             f"The {len(shown)} trials that are explained least, of {trials}; the table has all."
         )
-    for index in shown:
-        name = trial_name(result, index)
-        blocks.append(
-            Picture(
-                f"trajectories-trial-{index + 1}",
-                f"Recorded and simulated outputs, command and disturbance over time, {name}",
-                f"Counterpart of figure 3.7, {name}. Grey: recorded. Dashed: simulated from the "
-                "disturbance alone. Dotted lines: bound of the command; shaded: it stands there.",
-            )
+    pictures = [
+        Picture(
+            f"trajectories-trial-{index + 1}",
+            f"Recorded and simulated outputs, command and disturbance over time, "
+            f"{trial_name(result, index)}",
+            f"Counterpart of figure 3.7, {trial_name(result, index)}. Grey: recorded. Dashed: "
+            "simulated from the disturbance alone. Dotted lines: bound of the command; shaded: it "
+            "stands there.",
         )
-    return blocks
+        for index in shown
+    ]
+    others = [Details("The other trials", pictures[1:])] if len(pictures) > 1 else []
+    return [*blocks, *pictures[:1], *others]
 
 
 def _intent(result: FitResult) -> list[Block]:
-    plant, certainty = result.fitted.problem.plant, result.certainty
-    reason = certainty.weights_reason
+    plant, summary = result.fitted.problem.plant, result.certainty.weights
     missing = [f"Not available: {line}" for line in result.intent.missing]
-    blocks: list[Block] = [_SAME_GAIN, _readings(result), *missing, _INTENT]
-    blocks.append(Heading("All weights with this gain"))
-    if certainty.weights is not None:
-        blocks += set_sentences(certainty.weights)
-    blocks += [f"Not available: {reason}"] if reason else []
-    if certainty.weights is not None:
-        summary = certainty.weights
-        prices = prices_table(summary)
-        blocks += [statements_table(summary), *(() if prices is None else (prices,))]
-        blocks += [entries_table(summary), eigenvalues_table(summary)]
+    blocks: list[Block] = [_readings(result), *missing, _INTENT]
+    if summary is not None:
+        blocks += set_sentences(summary)
+        ranges = (entries_table(summary), eigenvalues_table(summary))
+        blocks.append(Details("Ranges of entries and eigenvalues of Q", ranges))
     Q, P = result.intent.reported.weights.Q, result.reported_P
-    blocks.append(Heading("The reported weights"))
-    blocks.append(_matrix("Q, the prices of the states, at R = 1", Q, plant.states))
-    blocks.append(_matrix("P, the terminal weight", P, plant.states))
-    return blocks
-
-
-def _gain(result: FitResult) -> list[Block]:
-    limits, others = limit_sentences(result.certainty), alternatives_table(result.certainty)
-    parameters = _parameters(result)
-    blocks: list[Block] = [intervals_table(result), _directions(result)]
-    blocks += [] if parameters is None else [parameters]
-    if limits or others is not None:
-        blocks += [Heading("Limit and horizon"), *limits, *(() if others is None else (others,))]
-    return blocks
+    matrices = (
+        _matrix("Q, the prices of the states, at R = 1", Q, plant.states),
+        _matrix("P, the terminal weight", P, plant.states),
+    )
+    return [*blocks, Details("The reported weights", matrices)]
 
 
 def _checks(result: FitResult) -> Terms:

@@ -4,6 +4,8 @@
     states, controls, outputs, disturbances  names, in the order of every array below
     units.<signal>                           where the plant says them
     K, S, Q, R, P, horizon, bounds           the controller of the weights, at R[0][0] = 1
+    weights_rule                             which of all weights with this gain Q and R are; those
+                                             of methods.inverse_mpc are where the search ended
     estimate                                 the gain that the recordings tell, without weights: K,
                                              deviations, directions, and which of them are told
     intervals.<number>                       of that gain and of the parameters
@@ -15,6 +17,7 @@
     parameters.<name>                        nominal, value, deviation, determined
     trials                                   label, vaf, whiteness, x0, held_out_vaf, findings
     methods.<name>                           as in every result (docs/results.md)
+    truth                                    K of a truth.json beside the recordings, or null
     plant, settings, files, versions, made
 
 Matrices are lists of rows, in SI units. What is not a number, or not determined, is null.
@@ -66,6 +69,7 @@ def _controller(result: FitResult) -> dict[str, Any]:
         "S": fitted.metric * scale,
         "Q": weights.Q,
         "R": weights.R,
+        "weights_rule": result.intent.reported.rule,
         "P": result.reported_P,
         "horizon": result.fitted.problem.horizon,
         "bounds": {name: getattr(bounds, name) for name in ("x_min", "x_max", "u_min", "u_max")},

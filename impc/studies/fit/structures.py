@@ -11,9 +11,9 @@ from impc.assess.long_run_covariance import residual_noise
 from impc.assess.other_models import residuals_of
 from impc.assess.structured_weights import TOLD_FACTOR
 from impc.assess.structures import criterion_of
-from impc.reporting.document import Block, Heading, Picture, Section, TextTable, table_of
+from impc.reporting.document import Block, Details, Heading, Picture, Section, TextTable, table_of
 from impc.reporting.rendering import number
-from impc.reporting.style import BLUE, DOUBLE_COLUMN, INK, VERMILLION, new_figure
+from impc.reporting.style import BLUE, INK, VERMILLION, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -33,6 +33,7 @@ __all__ = [
 _TWO_SIDED = 1.959964
 # A test that refuses a departure less often than this has not looked.
 _BLIND = 0.1
+_WIDTH = 4.2  # inches, so that its words can be read on a phone
 # Parts of a combination below this are not named.
 _NAMED = 0.15
 # docs/structures.md, What was measured.
@@ -45,6 +46,7 @@ _PICTURE = Picture(
     "Prices of the features with their intervals, one row each, on a logarithmic axis",
     "Prices within the structure, at a price of one for the first input, with intervals of 95 % "
     "for the colour of the residuals. An arrow: no lower end, the price may be zero.",
+    narrow=True,
 )
 
 
@@ -68,12 +70,14 @@ def structure_section(result: FitResult) -> Section:
     found = result.structures[0]
     blocks: list[Block] = []
     if found.estimate is not None:
-        blocks += [_price_table(found)]
-        blocks += [_PICTURE] if found.ratios else []
-        blocks += [_ratio_table(found)] if found.ratios else []
-        blocks += [_combination_table(found)]
         powers = _power_table(found)
-        blocks += [] if powers is None else [powers]
+        inside = [
+            *([_ratio_table(found)] if found.ratios else []),
+            _combination_table(found),
+            *([] if powers is None else [powers]),
+        ]
+        blocks += [*([_PICTURE] if found.ratios else []), _price_table(found)]
+        blocks.append(Details("Ratios and combinations of prices", inside))
     blocks += [Heading("Structures side by side"), _comparison(result)]
     return Section(f"Within the structure: {found.structure.name}", blocks, "Structure")
 
@@ -87,7 +91,7 @@ def price_figure(result: FitResult) -> Figure:
     """Prices of the first structure with their intervals."""
     found = result.structures[0]
     labels = found.structure.unknowns
-    figure = new_figure(DOUBLE_COLUMN, 0.9 + 0.32 * len(labels))
+    figure = new_figure(_WIDTH, 0.9 + 0.28 * len(labels))
     ax = figure.subplots()
     ends = [end for item in found.intervals for end in (item.low, item.value, item.high)]
     finite = [end for end in ends if np.isfinite(end)]

@@ -148,7 +148,9 @@ def fit_problem(
 
 
 def fit_recordings(
-    problem: Problem, settings: FitSettings, progress: FitProgress | None = None
+    problem: Problem,
+    settings: FitSettings,
+    progress: FitProgress | Callable[[str], None] | None = None,
 ) -> FitResult:
     """Fit a subject.
 
@@ -157,7 +159,8 @@ def fit_recordings(
     problem : Problem
         Of `fit_problem`.
     settings : FitSettings
-    progress : FitProgress, optional
+    progress : FitProgress or callable, optional
+        A callable is told the name of each stage when it is done: `progress=print`.
 
     Raises
     ------
@@ -181,7 +184,8 @@ def fit_recordings(
     >>> bool(abs(found.estimate.K - law.K).max() < 0.1)
     True
     """
-    progress = progress or FitProgress()
+    if not isinstance(progress, FitProgress):
+        progress = FitProgress() if progress is None else FitProgress(progress)
     started = time.perf_counter()
     ground = NaturalUnits(problem, progress.estimate, settings.feedback_states)
     fitted = ground.fitted

@@ -26,6 +26,7 @@ __all__ = [
     "entries_table",
     "intervals_table",
     "limit_sentences",
+    "number_name",
     "number_units",
     "prices_table",
     "set_sentences",
@@ -59,7 +60,7 @@ def intervals_table(result: FitResult) -> TextTable:
             cells.append("-" if item is None else _told(item))
         shown = "not determined" if value is None else number(value, 4)
         theirs = number(float(of_weights[name]), 4) if name in of_weights else "-"
-        rows.append((name, units.get(name, UNKNOWN), shown, *cells, theirs))
+        rows.append((number_name(plant, name), units.get(name, UNKNOWN), shown, *cells, theirs))
     level = certainty.intervals[0].level
     caption = (
         f"What the recordings tell, with intervals of {100 * level:.0f} %. Where residuals are "
@@ -73,6 +74,18 @@ def intervals_table(result: FitResult) -> TextTable:
     shown_methods = [_METHODS[method] for method in methods]
     heads = ("number", "unit", "value", *shown_methods, "gain of the weights")
     return TextTable(caption, heads, rows)
+
+
+def number_name(plant: Plant, name: str) -> str:
+    """What a reader calls a number of a fit by its `name` in files, such as K.command.theta1."""
+    kind, _, rest = name.partition(".")
+    if name not in number_units(plant):
+        return name
+    if kind == "u_max":
+        return f"limit of {rest}"
+    control = next(one for one in plant.controls if rest.startswith(f"{one}."))
+    state = rest.removeprefix(f"{control}.")
+    return f"gain of {state}" if plant.m == 1 else f"gain of {state} to {control}"
 
 
 def number_units(plant: Plant) -> dict[str, str]:

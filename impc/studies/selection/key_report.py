@@ -6,12 +6,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from impc.reporting.document import Lines, Picture, Report, TextTable
+from impc.reporting.document import (
+    Details,
+    Lines,
+    Picture,
+    Report,
+    Section,
+    TextTable,
+    Verdict,
+)
 from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import number
 from impc.reporting.style import BLUE, DOUBLE_COLUMN, INK, drawn, journal_style, new_figure
 from impc.studies.selection.key_parameters import between_visits
-from impc.studies.selection.report import names_of, results_section
+from impc.studies.selection.report import command_section, names_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -36,24 +44,35 @@ def key_report(
         f"{len(found.selection.subsets)} subsets of {found.selection.size} parameters are "
         f"estimated well enough for every subject and visit (variance at most "
         f"{found.selection.bound:g}).",
-        f"Chosen: {chosen}.",
+        "A subset is kept when it also explains the recordings and is reliable between visits.",
     ]
     caption = (
         "Counterpart of figure 5.3: subsets in the space of reliability and goodness of fit; "
         "filled ones pass all filters."
     )
-    tables = [candidates, _estimate_table(model, found), _sweep_table(model, found)]
     with journal_style():
         figures = drawn({"solution-space": _solution_figure(model, found)})
     return Report(
         "impc: Key parameters",
         "Key parameters",
-        (Lines(findings),),
-        [results_section(tables, Picture("solution-space", caption, caption), command)],
+        (Verdict(f"Key parameters: {chosen}."), Lines(findings)),
+        [
+            Section("1. Estimates", (_estimate_table(model, found),), "Estimates", together=True),
+            Section(
+                "2. Subsets and filters",
+                (
+                    Picture("solution-space", caption, caption),
+                    Details("Every subset", (candidates, _sweep_table(model, found))),
+                ),
+                "Subsets",
+            ),
+            command_section(command),
+        ],
         figures=figures,
         tables={"candidates": candidates},
         data=_data(model, found),
         provenance=Provenance(command=command, inputs=inputs),
+        words=model.words,
     )
 
 

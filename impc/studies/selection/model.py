@@ -52,8 +52,8 @@ class ParametricModel(Frozen):
         (k,).
     low, high, typical : Array
         Bounds and typical values (k,), in the parameters' units.
-    pathways, units : tuple of str
-        What each belongs to, and its unit (k,).
+    pathways, units, meanings : tuple of str
+        What each belongs to, its unit, and what it is in words (k,).
     simulate : callable
         (theta (k,), input (samples, d)) -> outputs (samples, p).
     jacobian : callable or None
@@ -69,6 +69,18 @@ class ParametricModel(Frozen):
     units: tuple[str, ...]
     simulate: Callable[[Array, Array], Array]
     jacobian: Callable[[Array, Array, IntArray], tuple[Array, Array]] | None = None
+    meanings: tuple[str, ...] = ()
+
+    @property
+    def words(self) -> tuple[tuple[str, str], ...]:
+        """Each parameter that has a meaning, with it, its pathway and unit: for a glossary."""
+        return tuple(
+            (name, f"{meaning[0].upper()}{meaning[1:]}{f' ({path})' * bool(path)}, in {unit}.")
+            for name, meaning, path, unit in zip(
+                self.names, self.meanings, self.pathways, self.units, strict=True
+            )
+            if meaning
+        )
 
     @property
     def size(self) -> int:
@@ -90,6 +102,7 @@ def parametric_model(
     *,
     pathways: Sequence[str] | None = None,
     units: Sequence[str] | None = None,
+    meanings: Sequence[str] | None = None,
     jacobian: Callable[[Array, Array, IntArray], tuple[Array, Array]] | None = None,
 ) -> ParametricModel:
     """Check and freeze a model.
@@ -102,7 +115,7 @@ def parametric_model(
         Bounds and typical values (k,), in their units.
     simulate : callable
         (theta (k,), input (samples, d)) -> outputs (samples, p).
-    pathways, units : sequence of str, optional
+    pathways, units, meanings : sequence of str, optional
         Of each parameter; empty by default.
     jacobian : callable, optional
         (theta, input, free) -> outputs and their derivative (samples, p, f) with respect to the f
@@ -126,9 +139,10 @@ def parametric_model(
             )
     groups = tuple(pathways) if pathways is not None else ("",) * count
     measured = tuple(units) if units is not None else ("",) * count
+    words = tuple(meanings) if meanings is not None else ("",) * count
     return ParametricModel(
         tuple(names), frozen(low), frozen(high), frozen(typical), groups, measured, simulate,
-        jacobian,
+        jacobian, words,
     )  # fmt: skip
 
 

@@ -3,7 +3,7 @@
 The function named returns a mapping (or a `ParametricModel`):
 
     names, low, high, typical       of the parameters
-    pathways, units                 optional
+    pathways, units, meanings       optional
     inputs, outputs, rate           signals of a recording by name, samples per second
     simulate                        (theta, input (samples, d)) -> outputs (samples, p), or
     matrices                        a CasADi function theta -> A, B, C, continuous: its
@@ -91,6 +91,7 @@ def model_source(name: str, arguments: Mapping[str, Any]) -> ModelSource:
         simulate,
         pathways=told.get("pathways"),
         units=told.get("units"),
+        meanings=told.get("meanings"),
         jacobian=jacobian,
     )
     return ModelSource(

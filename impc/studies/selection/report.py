@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from markupsafe import Markup
 
-from impc.reporting.document import Lines, Picture, Report, Section, TextTable
+from impc.reporting.document import Lines, Picture, Report, Section, TextTable, Verdict
 from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import number
 from impc.reporting.style import BLUE, DOUBLE_COLUMN, INK, drawn, journal_style, new_figure
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Sequence
 
     from matplotlib.figure import Figure
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from impc.studies.selection.analysis import StudySelection
     from impc.studies.selection.model import ParametricModel
 
-__all__ = ["names_of", "results_section", "selection_report", "selection_table"]
+__all__ = ["command_section", "names_of", "selection_report", "selection_table"]
 
 
 def selection_report(
@@ -48,19 +48,36 @@ def selection_report(
     return Report(
         "impc: Sensitive parameters",
         "Sensitive parameters",
-        (Lines(_findings(model, found)),),
-        [results_section(tables.values(), picture, command)],
+        (Verdict(_verdict(model, found)), Lines(_findings(model, found))),
+        [
+            Section("1. Estimates", (picture, tables["intervals"], tables["doubt"]), "Estimates"),
+            Section("2. Methods of selection", (tables["methods"], tables["agreement"]), "Methods"),
+            Section(
+                "3. Subsets, directions and bias",
+                [tables[name] for name in ("sweep", "identifiability", "bias")],
+                "Subsets",
+                folded=True,
+            ),
+            command_section(command),
+        ],
         figures=figures,
         tables=tables,
         data=_data(model, found),
         provenance=Provenance(command=command, inputs=inputs),
+        words=model.words,
     )
 
 
-def results_section(tables: Iterable[TextTable], picture: Picture, command: str) -> Section:
-    """The one section of a selection, which ends with its `command`."""
-    ending = Markup("<code>{}</code>").format(command)
-    return Section("Results", (*tables, picture, ending), together=True)
+def command_section(command: str) -> Section:
+    """The last section of a selection: the `command` that made it."""
+    return Section("Made by", (Markup("<code>{}</code>").format(command),), folded=True)
+
+
+def _verdict(model: ParametricModel, found: StudySelection) -> str:
+    return (
+        f"The recordings tell {len(found.free)} of the {model.size} parameters well enough at "
+        f"once: {names_of(model, found.free)}."
+    )
 
 
 def selection_table(model: ParametricModel, found: StudySelection) -> TextTable:
@@ -105,7 +122,6 @@ def _findings(model: ParametricModel, found: StudySelection) -> list[str]:
         lines.append(
             f"Scaling {', '.join(names)} together changes the outputs by less than their noise."
         )
-    lines.append(f"Selected by information: {names_of(model, found.free)}.")
     lines.append(f"Selected by LASSO: {names_of(model, found.lasso) or 'none'}.")
     both = sorted(set(found.free) & set(found.lasso))
     lines.append(f"In common: {names_of(model, both) or 'none'}.")

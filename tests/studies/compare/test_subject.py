@@ -147,7 +147,8 @@ def test_the_command(tmp_path: Path) -> None:
     assert done.exit_code == 0, done.stderr
     names = {path.name for path in out.iterdir()}
     pictures = {"comparison.png", "comparison.pdf"}
-    assert names == {"report.html", "result.json", "methods.csv", "tables.mat", ".impc", *pictures}
+    tables = {"methods.csv", "tables.mat", "tables.xlsx"}
+    assert names == {"report.html", "result.json", ".impc", *tables, *pictures}
     found = json.loads((out / "result.json").read_text())["methods"]
     assert list(found) == list(compared_methods())
     with (out / "methods.csv").open() as stream:

@@ -16,10 +16,10 @@ from impc.inverse.noisy_fit import fit_controller
 from impc.model.bounds import Bounds
 from impc.model.weights import Weights
 from impc.studies.fit.result import FitResult
-from impc.studies.fit.sentences import findings
 from impc.studies.fit.settings import FitSettings, fit_settings, fit_structures
 from impc.studies.fit.structures import structure_data, structure_section, structure_sentences
 from impc.studies.fit.subject import fit_problem, fit_recordings, stages
+from impc.studies.fit.verdict import verdict
 
 TABLE: dict[str, Any] = {
     "horizon": 8,
@@ -72,7 +72,7 @@ def test_a_structure_that_does_not_hold_is_refused_first() -> None:
     first = structure_sentences(result)[0]
     assert first.startswith("The recordings refuse the structure “one by one”")
     assert not any("times as much" in line for line in structure_sentences(result))
-    assert findings(result)[0] == first
+    assert verdict(result) == first
 
 
 def test_the_section_has_every_structure() -> None:

@@ -1,0 +1,99 @@
+"""A fit beside the truth of a simulated subject: truth.json, which lies beside its recordings."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.assess.intervals import entry_names
+from impc.files.names import LARGEST
+from impc.reporting.document import TextTable
+from impc.reporting.rendering import number
+from impc.studies.fit.tables import number_name
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from pathlib import Path
+
+    from impc.arrays import Array
+    from impc.assess.intervals import Interval
+    from impc.model.plant import Plant
+    from impc.studies.fit.result import FitResult
+
+__all__ = ["read_truth", "truth_sentence", "truth_table"]
+
+
+def read_truth(recordings: Iterable[Path], plant: Plant) -> Array | None:
+    """The gain (m, n) of the truth.json that lies beside the `recordings`, of a plant's states.
+
+    Returns
+    -------
+    Array or None
+        None where there is no such file, they lie in several folders, or it is of another plant.
+    """
+    folders = {path.absolute().parent for path in recordings}
+    path = folders.pop() / "truth.json" if len(folders) == 1 else None
+    if path is None or not path.is_file() or path.stat().st_size > LARGEST:
+        return None
+    try:
+        told = json.loads(path.read_text(encoding="utf-8"))
+        states, gain = tuple(told["states"]), np.array(told["K"], dtype=np.float64)
+    except (OSError, ValueError, KeyError, TypeError):  # a file of somebody else's
+        return None
+    return gain if states == plant.states and gain.shape == (plant.m, plant.n) else None
+
+
+def truth_sentence(result: FitResult, truth: Array) -> str:
+    """How many entries of the gain lie inside their intervals, and which is farthest off."""
+    pairs = _pairs(result, truth)
+    level = pairs[0][0].level
+    off = [pair for pair in pairs if not _inside(*pair)]
+    text = (
+        f"The recordings are simulated: {len(pairs) - len(off)} of the {len(pairs)} entries of "
+        f"their true gain lie inside their {100 * level:.0f} % intervals"
+    )
+    if not off:
+        return f"{text}."
+    item, value = max(off, key=lambda pair: _distance(*pair))
+    name = number_name(result.given.plant, item.name)
+    return (
+        f"{text}; farthest off is the {name}, {number(item.low, 4)} to {number(item.high, 4)} "
+        f"where the truth is {number(value, 4)}."
+    )
+
+
+def truth_table(result: FitResult, truth: Array) -> TextTable:
+    """Every entry of the gain with its interval beside the truth (m, n)."""
+    rows = [
+        (
+            number_name(result.given.plant, item.name),
+            number(np.nan if item.value is None else item.value, 4),
+            f"{number(item.low, 4)} to {number(item.high, 4)}",
+            number(value, 4),
+            "inside" if _inside(item, value) else "outside",
+        )
+        for item, value in _pairs(result, truth)
+    ]
+    caption = "The truth that lies beside the recordings (truth.json), and what the fit says of it."
+    return TextTable(caption, ("number", "estimate", "interval", "truth", ""), rows)
+
+
+def _pairs(result: FitResult, truth: Array) -> list[tuple[Interval, float]]:
+    """The interval of each entry, that for the residuals' colour, with its true value."""
+    first: dict[str, Interval] = {}
+    for item in result.certainty.intervals:
+        first.setdefault(item.name, item)
+    values = zip(entry_names(result.given.plant), truth.ravel(), strict=True)
+    return [(first[name], float(value)) for name, value in values]
+
+
+def _inside(item: Interval, value: float) -> bool:
+    return item.low <= value <= item.high
+
+
+def _distance(item: Interval, value: float) -> float:
+    """From the middle of the interval, in its halves."""
+    half = (item.high - item.low) / 2
+    return abs(value - (item.low + item.high) / 2) / half if half else np.inf

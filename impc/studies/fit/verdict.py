@@ -1,0 +1,160 @@
+"""What the page of a fit says first: one sentence, and a few that may be copied into a paper."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.reporting.rendering import number
+from impc.studies.fit.sentences import limited
+from impc.studies.fit.structures import structure_sentences
+
+if TYPE_CHECKING:
+    from impc.model.plant import Plant
+    from impc.studies.fit.result import FitResult
+
+__all__ = ["abstract", "verdict"]
+
+# % of an output below which a fit explains less than it leaves.
+_LITTLE = 50.0
+
+
+def verdict(result: FitResult) -> str:
+    """The one sentence that says what may be made of the fit; what forbids most comes first."""
+    found, within = result.diagnostics, structure_sentences(result)
+    saturated = any(item.saturated for item in result.trials)
+    cases = (
+        (bool(within) and result.structures[0].refused, next(iter(within), "")),
+        (
+            not result.fitted.converged,
+            "The search ended before it converged: a longer or less noisy recording is needed.",
+        ),
+        (
+            bool(np.any(result.inverse_mpc.vaf < _LITTLE)),
+            "The controller explains less than half of a recorded signal: it is another's.",
+        ),
+        (
+            saturated and found.loop is not None and found.loop.found,
+            "The controller agrees with the recordings, but what it leaves looks like noise inside "
+            "the loop: do not rely on its gain or its weights.",
+        ),
+        (
+            found.structure is not None and found.structure.found,
+            "The controller agrees with the recordings, but the body or the controller that moved "
+            "is not that of the model: its intervals do not hold that error.",
+        ),
+        (
+            not limited(result),
+            "No limit of the command was given: this is inverse LQR, and says nothing of how the "
+            "subject uses what strength there is.",
+        ),
+        (
+            not saturated,
+            "The command never reaches its bound: these recordings cannot tell inverse MPC from "
+            "inverse LQR.",
+        ),
+        (bool(within), next(iter(within), "")),
+        (
+            True,
+            "Inverse MPC explains the recordings inside the bound: the gain is the subject's, as "
+            "far as its intervals say; the weights are a choice, but for what holds for all of "
+            "them.",
+        ),
+    )
+    return next(sentence for holds, sentence in cases if holds)
+
+
+def abstract(result: FitResult) -> tuple[str, ...]:
+    """Three to five plain sentences with numbers."""
+    return (
+        _what_was_done(result),
+        _agreement(result),
+        *_at_the_bound(result),
+        _gain(result),
+        _weights(result),
+    )
+
+
+def _what_was_done(result: FitResult) -> str:
+    problem = result.fitted.problem
+    plant, horizon = problem.plant, problem.horizon
+    trials = result.given.recordings
+    seconds = sum(trial.samples for trial in trials) * plant.dt
+    limits = [
+        f"{number(float(most))} {plant.unit(name)} of {_named(plant, name)}"
+        for name, most in zip(plant.controls, result.given.bounds.u_max, strict=True)
+        if np.isfinite(most)
+    ]
+    bounded = f"limited to {' and '.join(limits)}" if limits else "without a limit"
+    count = "one trial" if len(trials) == 1 else f"{len(trials)} trials"
+    return (
+        f"A model predictive controller (MPC) that looks {horizon * plant.dt:.3g} s ahead "
+        f"({horizon} samples), {bounded}, was fitted to {count}, {seconds:.3g} s in all."
+    )
+
+
+def _named(plant: Plant, name: str) -> str:
+    words = plant.word(name)
+    return f"{name} ({words})" if words else name
+
+
+def _agreement(result: FitResult) -> str:
+    plant = result.fitted.problem.plant
+    parts = [
+        f"{value:.2f} % of {_named(plant, name)}"
+        for name, value in zip(plant.outputs, result.inverse_mpc.vaf, strict=True)
+    ]
+    text = f"It accounts for {' and '.join(parts)} (VAF)"
+    if result.held_out:
+        held = np.mean([item.vaf for item in result.held_out], axis=0)
+        text += (
+            f"; in trials that the fit has not seen, for "
+            f"{' and '.join(f'{value:.2f} %' for value in held)}"
+        )
+    return f"{text}."
+
+
+def _at_the_bound(result: FitResult) -> list[str]:
+    """How often the command stands at its bound, and what inverse LQR needs instead."""
+    share = 100 * float(np.mean([item.saturated for item in result.trials]))
+    text = f"The command stands at its bound for {share:.1f} % of the time"
+    methods = {item.name: item for item in result.methods}
+    other, own = methods.get("inverse_lqr_output"), result.inverse_mpc
+    if other is None or other.estimate.K is None or np.any(np.isnan(other.vaf)):
+        return [f"{text}."] if limited(result) else []
+    gain = float(np.mean(own.vaf - other.vaf))
+    sign = "more" if gain >= 0 else "less"
+    plant = result.given.plant
+    largest = f"{number(float(other.largest_input[0]))} {plant.unit(plant.controls[0])}"
+    than = f"inverse MPC accounts for {abs(gain):.2f} points {sign} than inverse LQR on the outputs"
+    if not limited(result):
+        return [f"{than[0].upper()}{than[1:]} (largest command {largest})."]
+    kept = "keeps the bound too" if other.keeps_bounds else "exceeds the bound"
+    return [f"{text}; {than}, which {kept} (largest command {largest})."]
+
+
+def _gain(result: FitResult) -> str:
+    told = result.estimate.covariance.told_entries
+    count, total = int(np.count_nonzero(told)), int(np.size(told))
+    if count == total:
+        return f"The recordings tell each of the {total} entries of the gain by itself."
+    return (
+        f"Of the {total} entries of the gain the recordings tell {count} by themselves; of the "
+        "others only combinations."
+    )
+
+
+def _weights(result: FitResult) -> str:
+    text = (
+        "Other weights with exactly the same behaviour turn the dominant cost by up to "
+        f"{result.widest_angle:.0f} degrees"
+    )
+    summary = result.certainty.weights
+    if summary is None or not summary.drawn:
+        return f"{text}: which weights are reported is a convention."
+    made = sum(item.made for item in summary.statements)
+    return (
+        f"{text}; {made} of {len(summary.statements)} statements on what costs more hold for all "
+        "of them, at 95 %."
+    )

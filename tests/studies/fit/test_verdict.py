@@ -1,0 +1,125 @@
+"""The first sentence of a fit's page: what forbids most comes first."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import TYPE_CHECKING
+
+import control
+import numpy as np
+import pytest
+
+from impc.assess.diagnostics import ResidualDiagnostics
+from impc.assess.loop_noise import LoopNoise
+from impc.assess.residual_structure import ResidualStructure
+from impc.checking import replace
+from impc.control.controller import Controller
+from impc.model.bounds import Bounds
+from impc.model.plant import Plant
+from impc.model.recordings import Recording
+from impc.model.weights import Weights
+from impc.studies.fit.interval_figures import gain_figure, shown_statements, statements_figure
+from impc.studies.fit.settings import FitSettings
+from impc.studies.fit.subject import fit_problem, fit_recordings, stages
+from impc.studies.fit.verdict import abstract, verdict
+from impc.studies.signal_words import signal_words
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from impc.arrays import Array
+    from impc.studies.fit.result import FitResult
+
+SEED = 20264
+
+
+@cache
+def fitted(limit: float) -> FitResult:
+    """A cart that is pushed, with a little noise in its recorder; the command stops at a limit."""
+    cart = control.c2d(control.ss([[0, 1], [0, 0]], [[0, 0], [1, 1]], [[1, 0]], [[0, 0]]), 0.1)
+    cart = control.ss(
+        cart.A, cart.B, cart.C, cart.D, 0.1, states=["place", "speed"], inputs=["pull", "push"],
+        outputs=["place"],
+    )  # fmt: skip
+    units = {"place": "m", "speed": "m/s", "pull": "m/s^2", "push": "m/s^2"}
+    words = {"place": "place of the cart", "pull": "pull of the rope"}
+    plant = Plant(cart, ["pull"], units, words)
+    law = Controller(plant, Weights([[4, 0], [0, 1]], 1), Bounds(plant, u_max=1.0, u_min=-1.0), 5)
+    rng = np.random.default_rng(SEED)
+    push = 1.2 * np.repeat(rng.choice([-1.0, 0.0, 1.0], 30), 5)[:, None]
+    moved = law.simulate([0.0, 0.0], disturbance=push, steps=len(push))
+    outputs = moved.x[: len(push), :1] + 0.005 * rng.standard_normal((len(push), 1))
+    settings = FitSettings(u_max=limit, horizon=5, methods=["inverse_lqr_output"])
+    heard: list[str] = []
+    problem = fit_problem(plant, [Recording(plant, outputs, push)], settings)
+    result = fit_recordings(problem, settings, heard.append)
+    assert len(heard) == stages(problem, settings)
+    return result
+
+
+def loop(found: bool) -> LoopNoise:
+    return LoopNoise(np.array([0.5]), 50.0 if found else 0.0, 9.0, 0.0)
+
+
+def test_a_fit_that_nothing_speaks_against() -> None:
+    result = replace(fitted(1.0), diagnostics=ResidualDiagnostics(None, None))
+    assert verdict(result).startswith("Inverse MPC explains the recordings inside the bound")
+    lines = abstract(result)
+    assert 3 <= len(lines) <= 5
+    assert (
+        "looks 0.5 s ahead (5 samples), limited to 1 m/s^2 of pull (pull of the rope)" in lines[0]
+    )
+    assert f"{result.inverse_mpc.vaf[0]:.2f} % of place (place of the cart) (VAF)" in lines[1]
+    share = 100 * result.trials[0].saturated
+    assert share > 5
+    assert f"at its bound for {share:.1f} % of the time" in lines[2]
+    assert signal_words(result.given.plant) == (
+        ("place", "Place of the cart, in m."), ("pull", "Pull of the rope, in m/s^2.")
+    )  # fmt: skip
+
+
+def test_noise_in_the_loop_and_another_body_are_said_first() -> None:
+    plain = fitted(1.0)
+    structure = ResidualStructure(1e-4, 1e-4, 0.3)
+    inside = replace(plain, diagnostics=ResidualDiagnostics(loop(True), structure))
+    assert "noise inside the loop: do not rely on its gain" in verdict(inside)
+    other = replace(plain, diagnostics=ResidualDiagnostics(loop(False), structure))
+    assert "is not that of the model" in verdict(other)
+
+
+def test_no_limit_and_a_limit_that_is_not_reached() -> None:
+    clear = ResidualDiagnostics(None, None)
+    assert "No limit of the command was given" in verdict(
+        replace(fitted(np.inf), diagnostics=clear)
+    )
+    assert "without a limit" in abstract(fitted(np.inf))[0]
+    assert "never reaches its bound" in verdict(replace(fitted(50.0), diagnostics=clear))
+
+
+def bars(ax: Axes) -> list[Array]:
+    """Both ends of each line, from below to above on the page."""
+    found = [np.asarray(line.get_xdata(), dtype=np.float64) for line in ax.lines]
+    return [ends for ends in found if len(ends) == 2]
+
+
+def test_bars_are_the_intervals() -> None:
+    result = fitted(1.0)
+    (ax,) = gain_figure(result).axes
+    sizes = dict(zip(result.given.plant.states, result.intent.sizes, strict=True))
+    first = {item.name: item for item in reversed(result.certainty.intervals)}
+    for bar, (name, size) in zip(bars(ax), sizes.items(), strict=False):
+        item = first[f"K.pull.{name}"]
+        np.testing.assert_allclose(bar, [size * item.low, size * item.high])
+    assert [label.get_text() for label in ax.get_yticklabels()] == ["place", "speed"]
+    shown = shown_statements(result)
+    (ax,) = statements_figure(result).axes
+    ends = np.array([[item.low, item.high] for item in shown])
+    np.testing.assert_allclose(bars(ax)[: len(shown)], ends)
+
+
+@pytest.mark.parametrize("vaf", [40.0, 60.0])
+def test_little_is_called_little(vaf: float) -> None:
+    plain = replace(fitted(1.0), diagnostics=ResidualDiagnostics(None, None))
+    poor = replace(plain.inverse_mpc, vaf=np.array([vaf]))
+    result = replace(plain, methods=(*plain.methods[:-1], poor))
+    assert verdict(result).startswith("The controller explains less than half") == (vaf < 50)
