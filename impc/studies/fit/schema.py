@@ -3,6 +3,7 @@
     vaf.<output>, held_out_vaf.<output>      %, all trials; the mean of the trials left out
     states, controls, outputs, disturbances  names, in the order of every array below
     units.<signal>                           where the plant says them
+    solver                                   what solved the quadratic programs
     K, S, Q, R, P, horizon, bounds           the controller of the weights, at R[0][0] = 1
     estimate                                 the gain that the recordings tell, without weights: K,
                                              deviations, directions, and which of them are told
@@ -68,6 +69,7 @@ def _controller(result: FitResult) -> dict[str, Any]:
         "R": weights.R,
         "P": result.reported_P,
         "horizon": result.fitted.problem.horizon,
+        "solver": result.fitted.problem.solver,
         "bounds": {name: getattr(bounds, name) for name in ("x_min", "x_max", "u_min", "u_max")},
     }
 
