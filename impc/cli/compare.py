@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import click
 
 from impc.checking import replace
-from impc.cli.options import out_option, subject_arguments, yes_option
+from impc.cli.options import out_option, solver_option, subject_arguments, yes_option
 from impc.cli.output import print_files
 from impc.cli.progress import progress
 
@@ -21,8 +21,16 @@ __all__ = ["command"]
 @click.command("compare")
 @subject_arguments("What the columns mean, and settings, as for `impc fit`.")
 @out_option("compare", "report.html, result.json, tables and the figure")
+@solver_option
 @yes_option
-def command(files: tuple[Path, ...], plant_name: str, config: Path, out: Path, yes: bool) -> None:
+def command(
+    files: tuple[Path, ...],
+    plant_name: str,
+    config: Path,
+    out: Path,
+    solver: str | None,
+    yes: bool,
+) -> None:
     """Compare feedback gain, inverse LQR, inverse KKT and inverse MPC, one file a trial.
 
     Each method is fitted to all trials and to all but each one. What is done when you interrupt it
@@ -40,7 +48,7 @@ def command(files: tuple[Path, ...], plant_name: str, config: Path, out: Path, y
     from impc.studies.methods_table import methods_table  # noqa: PLC0415
 
     require_writable(out)
-    subject = read_subject("compare", files, plant_name, config)
+    subject = read_subject("compare", files, plant_name, config, solver)
     problem, settings = subject.problem, subject.settings
     require_used(settings, (), "compare")
     require_consent(fit_effort(problem, settings), yes)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from impc.cli.options import out_option
+from impc.cli.options import out_option, solver_option
 from impc.cli.output import print_files
 from impc.cli.plant import load_plant
 from impc.cli.progress import progress
@@ -32,21 +32,24 @@ _EXAMPLE_PLANT = "plants:yalmip_example"
     help="Initial state: A (1, 3), B (2, 3), C (2, 1).",
 )
 @out_option("example", "report.html, result.json and the figures")
-def command(case: str, out: Path) -> None:
+@solver_option
+def command(case: str, out: Path, solver: str | None) -> None:
     """Run the simulation example of section 3.4 of the dissertation.
 
     The dissertation's own matrices, initial state and bound are lost; a plant that shows
     everything its text says stands in for them.
     """
     # Imported here: the libraries take seconds to load, and --help and --version need none.
+    from impc.control.named_solver import COMPILED, require_solver  # noqa: PLC0415
     from impc.reporting.provenance import Provenance  # noqa: PLC0415
     from impc.reporting.writer import require_writable, write_files  # noqa: PLC0415
     from impc.studies.example.cases import CASES, LOST  # noqa: PLC0415
     from impc.studies.example.report import example_report  # noqa: PLC0415
 
     require_writable(out)
+    chosen = require_solver(COMPILED if solver is None else solver)
     plant = load_plant(_EXAMPLE_PLANT)
-    cases = _run(plant, tuple(CASES) if case == "all" else (case,))
+    cases = _run(plant, tuple(CASES) if case == "all" else (case,), chosen)
     written = write_files(out, example_report(cases, Provenance(_EXAMPLE_PLANT)).files())
     click.echo(click.wrap_text(LOST, width=100))
     for result in cases:
@@ -54,13 +57,13 @@ def command(case: str, out: Path) -> None:
     print_files(out, written)
 
 
-def _run(plant: Plant, names: Sequence[str]) -> list[CaseResult]:
+def _run(plant: Plant, names: Sequence[str], solver: str) -> list[CaseResult]:
     from impc.studies.example.cases import run_case  # noqa: PLC0415
     from impc.studies.example.table import METHODS  # noqa: PLC0415
 
     total = len(names) * (len(METHODS) - 1)  # the truth is no method
     with progress(total, "method") as step:
-        return [run_case(plant, name, progress=step) for name in names]
+        return [run_case(plant, name, solver=solver, progress=step) for name in names]
 
 
 def _print_case(result: CaseResult) -> None:

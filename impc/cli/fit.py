@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from impc.cli.options import out_option, subject_arguments, yes_option
+from impc.cli.options import out_option, solver_option, subject_arguments, yes_option
 from impc.cli.output import print_files
 from impc.cli.progress import progress
 
@@ -21,8 +21,16 @@ __all__ = ["command"]
 @click.command("fit")
 @subject_arguments("What the columns mean, and settings; `impc inspect FILE` writes one.")
 @out_option("fit", "report.html, result.json, tables and the figures")
+@solver_option
 @yes_option
-def command(files: tuple[Path, ...], plant_name: str, config: Path, out: Path, yes: bool) -> None:
+def command(
+    files: tuple[Path, ...],
+    plant_name: str,
+    config: Path,
+    out: Path,
+    solver: str | None,
+    yes: bool,
+) -> None:
     """Fit the controller behind the trials of one subject, one file a trial.
 
     What is done when you interrupt it is kept in the folder: the same command goes on from there.
@@ -42,7 +50,7 @@ def command(files: tuple[Path, ...], plant_name: str, config: Path, out: Path, y
     from impc.studies.fit.truth import read_truth, truth_sentence  # noqa: PLC0415
 
     require_writable(out)
-    subject = read_subject("fit", files, plant_name, config)
+    subject = read_subject("fit", files, plant_name, config, solver)
     problem, settings = subject.problem, subject.settings
     require_consent(fit_effort(problem, settings), yes)
     memory = open_memory(out, problem, settings, "fit", subject.inputs.digest)

@@ -19,6 +19,7 @@ __all__ = [
     "out_option",
     "scheduler_options",
     "seed_option",
+    "solver_option",
     "subject_arguments",
     "yes_option",
 ]
@@ -31,6 +32,13 @@ seed_option = click.option(
     type=click.IntRange(0, LARGEST_SEED),
     default=0,
     help="All numbers drawn follow from it.",
+)
+
+#: --solver; the names are those of `impc.control.named_solver`, which is not loaded for --help.
+solver_option = click.option(
+    "--solver",
+    help="What solves the controller's quadratic programs: compiled (the package's own, and the "
+    "default), or daqp, qpoases or ipopt of CasADi.",
 )
 
 #: --yes of what may take hours, see `impc.cli.consent`.

@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from impc.checking import replace
 from impc.cli.plant import find_plant
+from impc.control.named_solver import require_solver
 from impc.files.configuration import read_configuration
 from impc.files.inputs import gather_inputs
 from impc.files.plant_sources import make_plant, plant_family_of
@@ -59,7 +61,13 @@ class Subject:
         return Provenance(source.name, self.command, arguments, self.files, self.inputs)
 
 
-def read_subject(command: str, files: Sequence[Path], plant_name: str, config: Path) -> Subject:
+def read_subject(
+    command: str,
+    files: Sequence[Path],
+    plant_name: str,
+    config: Path,
+    solver: str | None = None,
+) -> Subject:
     """Read recordings, one file a trial.
 
     Parameters
@@ -72,6 +80,8 @@ def read_subject(command: str, files: Sequence[Path], plant_name: str, config: P
         Short name, import path or file of the plant.
     config : Path
         The configuration.
+    solver : str, optional
+        In place of the one that the configuration names.
 
     Raises
     ------
@@ -80,6 +90,8 @@ def read_subject(command: str, files: Sequence[Path], plant_name: str, config: P
     """
     configuration = read_configuration(config)
     settings = fit_settings(configuration.fit)
+    if solver is not None:
+        settings = replace(settings, solver=require_solver(solver))
     source = find_plant(plant_name, configuration.plant)
     recorded = tuple(configuration.signals)
     plant = make_plant(source, recorded)
@@ -88,5 +100,6 @@ def read_subject(command: str, files: Sequence[Path], plant_name: str, config: P
     inputs = gather_inputs(files, config, source.name, source.arguments)
     names = tuple(path.name for path in files)
     line = f"impc {command} {' '.join(names)} --plant {plant_name} --config {config.name}"
+    line += "" if solver is None else f" --solver {solver}"
     problem = fit_problem(plant, recordings, settings, family)
     return Subject(problem, settings, source, inputs, line, names)

@@ -22,6 +22,7 @@ from impc.checking import checked
 from impc.control.closed_loop import Simulation, Status
 from impc.control.constraint_rows import build_rows
 from impc.control.infeasibility import excluded_row
+from impc.control.named_solver import plugin, silent
 from impc.errors import InputError
 
 if TYPE_CHECKING:
@@ -33,38 +34,15 @@ if TYPE_CHECKING:
 
 __all__ = ["SOLVERS", "MpcSolver", "MpcStep", "build_mpc", "simulate_mpc", "solve_mpc"]
 
-# Each is asked for the accuracy that it can deliver: active-set methods end at round-off, the
-# interior-point method of IPOPT at its tolerance, which is tightened from 1e-8.
-_QUADRATIC: dict[str, dict[str, Any]] = {
-    "daqp": {"error_on_fail": False},
-    "qpoases": {"printLevel": "none", "error_on_fail": False, "sparse": False},
-}
 # Slacks enter the cost linearly, so the Hessian is singular, which DAQP does not take; its proximal
 # iterations called feasible programs infeasible. Its slacks get a quadratic cost of this share of
 # their price instead: a relative excess s changes the price by 1e-8 s.
 _DAQP_SLACK = 1e-8
-_IPOPT: dict[str, Any] = {
-    "print_time": False,
-    "error_on_fail": False,
-    "ipopt": {
-        "print_level": 0,
-        "sb": "yes",
-        "tol": 1e-12,
-        "compl_inf_tol": 1e-12,
-        "constr_viol_tol": 1e-12,
-        "acceptable_tol": 1e-11,
-        "bound_relax_factor": 0.0,
-        "hessian_constant": "yes",
-        "jac_c_constant": "yes",
-        "jac_d_constant": "yes",
-    },
-}
-
 # A row that is exceeded by this share of its bound is not kept, whatever the solver's flag says.
 _EXCEEDED = 1e-6
 
 #: Names of the solvers that `build_mpc` takes.
-SOLVERS = (*_QUADRATIC, "ipopt")
+SOLVERS = ("daqp", "qpoases", "ipopt")
 
 
 @dataclass(frozen=True)
@@ -161,10 +139,9 @@ def build_mpc(controller: Controller, solver: str = "daqp") -> MpcSolver:
             - ca.mtimes(ca.DM(placed / rows.b[:, None]), slack)
         ),
     }
-    if solver == "ipopt":
-        function = ca.nlpsol("mpc", "ipopt", program, _IPOPT)
-    else:
-        function = ca.qpsol("mpc", solver, program, _QUADRATIC[solver])
+    name, options = plugin(solver)
+    with silent():
+        function = ca.qpsol("mpc", name, program, options)
     return MpcSolver(controller, rows, solver, function, soft)
 
 
@@ -190,13 +167,14 @@ def solve_mpc(mpc: MpcSolver, x: ArrayLike) -> MpcStep:
     controller, rows = mpc.controller, mpc.rows
     state = finite_array("x", x, (controller.plant.n,))
     width, slacks = rows.M.shape[1], int(mpc.soft.sum())
-    answer = mpc.function(
-        p=state,
-        lbx=np.r_[np.full(width, -np.inf), np.zeros(slacks)],
-        ubx=np.inf,
-        lbg=-np.inf,
-        ubg=1,
-    )
+    with silent():  # the first call builds the solver
+        answer = mpc.function(
+            p=state,
+            lbx=np.r_[np.full(width, -np.inf), np.zeros(slacks)],
+            ubx=np.inf,
+            lbg=-np.inf,
+            ubg=1,
+        )
     solved = bool(mpc.function.stats()["success"])
     decision = np.asarray(answer["x"]).ravel()
     v = decision[:width] if solved else np.zeros(width)

@@ -23,9 +23,10 @@ import numpy as np
 
 from impc.arrays import Array, Frozen, as_numbers, finite_array, frozen
 from impc.checking import Value, checked
-from impc.control.compiled_loop import LoopMatrices, run
+from impc.control.compiled_loop import LoopMatrices, answer_with, run
 from impc.control.constraint_rows import RowDirections, build_rows, differentiate_rows, directions
-from impc.control.infeasibility import proves_infeasible
+from impc.control.infeasibility import excluded_row, proves_infeasible
+from impc.control.named_solver import COMPILED, Program, active_set, build_program
 from impc.control.saturated import differentiate_plan, solve_saturated
 from impc.errors import DataError, InfeasibleError, SolverError
 from impc.model.bounds import bound_rows
@@ -211,6 +212,8 @@ class PreparedLoop:
         Derivatives of plant, gain and metric.
     unit : Array
         The nearer bound of each input (m,): what its error is measured by.
+    program : Program or None
+        For the controller's solver, where that is one of CasADi's.
     """
 
     controller: Controller
@@ -220,6 +223,7 @@ class PreparedLoop:
     matrices: LoopMatrices
     matrix_directions: LoopMatrices
     unit: Array
+    program: Program | None
 
 
 @checked(x0="n", steps=(1, 10_000_000))
@@ -313,6 +317,7 @@ def prepare_loop(controller: Controller, along: Directions) -> PreparedLoop:
         _writable(plant.A, plant.B, plant.E, controller.K, inverse),
         _writable(along.A, along.B, along.E, along.K, along.S),
         np.minimum(-controller.bounds.u_min, controller.bounds.u_max),
+        None if controller.solver == COMPILED else build_program(controller.solver, rows),
     )
 
 
@@ -348,12 +353,20 @@ def run_loop(prepared: PreparedLoop, given: Scenario) -> tuple[Simulation, Sensi
             du,
             status,
             multipliers,
-            plan is not None,
+            prepared.program is not None or plan is not None,
         )
         weakly_active += weak
         t = int(np.count_nonzero(status <= Status.SOFTENED))
         if t == steps or status[t] == Status.DIVERGED:
             break
+        if prepared.program is not None:
+            status[t], weak, failed_row = _ask_solver(
+                prepared, prepared.program, x[t], dx[t], u[t], du[t]
+            )
+            weakly_active += weak
+            if status[t] > Status.SOFTENED:
+                break
+            continue
         asked = plan is None  # the rows, which did not tell
         if asked and status[t] == Status.INFEASIBLE:
             if proves_infeasible(prepared.controller, prepared.rows, multipliers, x[t]):
@@ -370,6 +383,36 @@ def run_loop(prepared: PreparedLoop, given: Scenario) -> tuple[Simulation, Sensi
         else:
             plan = None
     return Simulation(x, u, status, weakly_active, failed_row), Sensitivity(dx, du)
+
+
+def _ask_solver(
+    prepared: PreparedLoop, program: Program, x: Array, dx: Array, u: Array, du: Array
+) -> tuple[Status, bool, int]:
+    """Write the input of one sample, and its derivative, that the controller's solver finds."""
+    controller, rows = prepared.controller, prepared.rows
+    found = active_set(program, rows.b - rows.T @ x)
+    if found is not None:
+        v = np.empty(rows.M.shape[1])
+        status, weak = answer_with(
+            prepared.matrices,
+            prepared.matrix_directions,
+            rows,
+            prepared.row_directions,
+            prepared.unit,
+            found.tight,
+            found.given_up,
+            x,
+            dx,
+            u,
+            du,
+            np.empty(len(rows.b)),
+            v,
+        )
+        w = (v.reshape(-1, len(u)) @ np.linalg.cholesky(controller.S)).ravel()
+        if status <= Status.SOFTENED and np.max(np.abs(w - found.w)) <= found.agrees:
+            return Status(status), weak, -1
+    row = excluded_row(controller, rows, x)
+    return Status.INFEASIBLE if row >= 0 else Status.UNSOLVED, False, row
 
 
 def _only_inputs_are_bounded(controller: Controller) -> bool:

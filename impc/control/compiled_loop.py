@@ -32,7 +32,15 @@ from impc.arrays import Buffer
 from impc.control.constraint_rows import RowDirections, Rows
 from impc.jit import njit
 
-__all__ = ["CONVERGED", "INCONSISTENT", "UNSOLVED", "LoopMatrices", "run", "solve_dual"]
+__all__ = [
+    "CONVERGED",
+    "INCONSISTENT",
+    "UNSOLVED",
+    "LoopMatrices",
+    "answer_with",
+    "run",
+    "solve_dual",
+]
 
 #: What `solve_dual` says first: an answer, rows that exclude each other, none within its steps.
 CONVERGED, INCONSISTENT, UNSOLVED = 0, 1, 2
@@ -338,16 +346,9 @@ def run(
         Number of samples at which the active set is about to change; the row that proved the last
         problem inconsistent, or -1.
     """
-    count, width = rows.M.shape
-    room = min(count, width) + 1
-    slack, kept = np.empty(count), _KEPT * rows.b
-    v, dv0 = np.zeros(width), np.zeros(du.shape[1:])
-    free, factor = np.empty(room, dtype=np.int64), np.empty((room, room))
-    basis, rounding = np.empty((room, width)), np.empty(width)
-    # One column of T and M after the other: sums over columns then run over all rows at once.
-    T, M = np.ascontiguousarray(rows.T.T), np.ascontiguousarray(rows.M.T)
-    plant_moves = bool(np.any(dloop.A) or np.any(dloop.B) or np.any(dloop.E))
-    work = _Workspace(slack, kept, free, factor, basis, v, rounding, dv0, T, M)
+    count, plant_moves = len(rows.b), bool(np.any(dloop.A) or np.any(dloop.B) or np.any(dloop.E))
+    work = _workspace(rows, du.shape[1], du.shape[2])
+    slack, kept, v, dv0, T = work.slack, work.kept, work.v, work.dv0, work.T
     weakly_active = 0
     for t in range(first, len(u)):
         if status[t] > _SOFTENED:
@@ -407,6 +408,18 @@ class _Workspace(NamedTuple):
 
 
 @njit(cache=True)
+def _workspace(rows: Rows, m: int, p: int) -> _Workspace:
+    count, width = rows.M.shape
+    room = min(count, width) + 1
+    # One column of T and M after the other: sums over columns then run over all rows at once.
+    T, M = np.ascontiguousarray(rows.T.T), np.ascontiguousarray(rows.M.T)
+    free, factor = np.empty(room, dtype=np.int64), np.empty((room, room))
+    basis, rounding = np.empty((room, width)), np.empty(width)
+    v, dv0 = np.zeros(width), np.zeros((m, p))
+    return _Workspace(np.empty(count), _KEPT * rows.b, free, factor, basis, v, rounding, dv0, T, M)
+
+
+@njit(cache=True)
 def _solve(
     loop: LoopMatrices,
     dloop: LoopMatrices,
@@ -427,16 +440,91 @@ def _solve(
         return _INFEASIBLE, False, active
     if code == UNSOLVED:
         return _UNSOLVED, False, -1
+    status, near = _answer(loop, dloop, rows, drows, unit, work, x, dx, lam, active)
+    return status, near, -1
+
+
+@njit(cache=True)
+def _answer(
+    loop: LoopMatrices,
+    dloop: LoopMatrices,
+    rows: Rows,
+    drows: RowDirections,
+    unit: Buffer,
+    work: _Workspace,
+    x: Buffer,
+    dx: Buffer,
+    lam: Buffer,
+    active: int,
+) -> tuple[int, bool]:
+    """Write v and dv0 from the multipliers; return the status and whether the rows are weak."""
     _recover(rows, lam, work)
     soft, near, told = _check(loop.K, rows, lam, work, active, x, unit)
     if not told:
         _tighten(rows, work, active)
         soft, near, told = _check(loop.K, rows, lam, work, active, x, unit)
     if not told:
-        return _UNSOLVED, False, -1
+        return _UNSOLVED, False
     if dx.shape[1]:
         _differentiate(loop, dloop, rows, drows, lam, work, active, x, dx)
-    return (_SOFTENED if soft else _ACTIVE), near, -1
+    return (_SOFTENED if soft else _ACTIVE), near
+
+
+@njit(cache=True, nogil=True)
+def answer_with(
+    loop: LoopMatrices,
+    dloop: LoopMatrices,
+    rows: Rows,
+    drows: RowDirections,
+    unit: Buffer,
+    tight: Buffer,
+    given_up: Buffer,
+    x: Buffer,
+    dx: Buffer,
+    u: Buffer,
+    du: Buffer,
+    lam: Buffer,
+    v: Buffer,
+) -> tuple[int, bool]:
+    """Input of one sample and its derivative, where another solver has found the active set.
+
+    Parameters
+    ----------
+    loop, dloop, rows, drows, unit, x, dx
+        As in `run`, of this sample.
+    tight : Buffer
+        Rows that hold with equality, linearly independent, (a,).
+    given_up : Buffer of bool
+        Soft rows that are exceeded (r,).
+    u, du, lam, v : Buffer
+        Written: input (m,) and its derivative (m, p), multipliers (r,), all of v (N m,).
+
+    Returns
+    -------
+    status, weak : int, bool
+        ACTIVE or SOFTENED when the answer keeps what `_check` asks for, UNSOLVED otherwise.
+    """
+    work, active = _workspace(rows, du.shape[0], du.shape[1]), len(tight)
+    if active >= len(work.free):
+        return _UNSOLVED, False
+    _fill_slack(work.T, rows.b, x, work.slack)
+    for i in range(active):
+        work.free[i] = tight[i]
+        new = _append_row(rows.W, tight[i], i, work.factor, work.basis)
+        if not new > _DEPENDENT * np.sqrt(rows.gram[tight[i], tight[i]]):
+            return _UNSOLVED, False
+        _accept_row(i, new, work.factor, work.basis)
+    for r in range(len(lam)):
+        lam[r] = rows.limit[r] if given_up[r] else 0.0
+    _refine(rows.gram, work.slack, rows.limit, given_up, lam, work.free, active, work.factor)
+    for i in range(active):
+        if lam[tight[i]] > rows.limit[tight[i]]:
+            return _UNSOLVED, False
+    status, near = _answer(loop, dloop, rows, drows, unit, work, x, dx, lam, active)
+    v[:] = work.v
+    if status != _UNSOLVED:
+        _apply(loop, dloop, work.v, work.dv0, x, dx, u, du)
+    return status, near
 
 
 @njit(cache=True, inline="always")

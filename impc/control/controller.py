@@ -19,6 +19,7 @@ import numpy as np
 from impc.arrays import Array, finite_array, frozen, symmetric_matrix
 from impc.checking import Value, checked, replace
 from impc.control.closed_loop import Status, scenario, simulate
+from impc.control.named_solver import COMPILED, require_solver
 from impc.control.terminal_set import maximal_invariant_set
 from impc.errors import InputError
 from impc.model.riccati import is_stable, solve_lqr
@@ -57,8 +58,8 @@ class Controller(Value):
         N >= 1, in samples.
     terminal_set : bool
         Whether x_N must lie in the maximal invariant set of the regulator under the bounds.
-    softening : float, optional
-        See the attribute.
+    softening, solver : optional
+        See the attributes.
 
     Attributes
     ----------
@@ -78,12 +79,15 @@ class Controller(Value):
         E x <= b by s costs ``softening * U^2 * s / b`` with U the least finite input bound (1
         where there is none). The penalty is exact: while it is larger than the multipliers the
         answer is that of the hard problem whenever there is one. Input bounds are always hard.
+    solver : str
+        Which method finds the input where the gain breaks a bound: "compiled", the package's own,
+        or one of CasADi's by its name (`impc.control.named_solver.SOLVERS`).
 
     Raises
     ------
     PlantError, WeightsError, InputError
         When the plant is continuous, no stabilising Riccati solution exists, or the horizon is
-        not a positive whole number.
+        not a positive whole number, or there is no such solver.
 
     Examples
     --------
@@ -109,6 +113,7 @@ class Controller(Value):
     horizon: int
     terminal: TerminalSet | None
     softening: float | None
+    solver: str
 
     @checked(horizon=(1, LONGEST_HORIZON))
     def __init__(
@@ -120,6 +125,7 @@ class Controller(Value):
         *,
         terminal_set: bool = True,
         softening: float | None = None,
+        solver: str = COMPILED,
     ) -> None:
         solution = solve_lqr(plant.require_discrete(), weights)
         made = Controller.from_gain(
@@ -130,6 +136,7 @@ class Controller(Value):
             metric=solution.S,
             terminal_set=terminal_set,
             softening=softening,
+            solver=solver,
         )
         self._fill(**vars(made))
 
@@ -146,6 +153,7 @@ class Controller(Value):
         terminal_set: bool = True,
         softening: float | None = None,
         near: TerminalSet | None = None,
+        solver: str = COMPILED,
     ) -> Controller:
         """Controller that stays near u = -Kx; with a terminal set the gain must stabilise.
 
@@ -160,7 +168,7 @@ class Controller(Value):
             N >= 1, in samples.
         metric : array_like, optional
             S (m, m), positive definite; the identity by default, which is no choice for one input.
-        terminal_set, softening
+        terminal_set, softening, solver
             As in the constructor.
         near : TerminalSet, optional
             Set of a gain nearby: the same answer in less time, see `maximal_invariant_set`.
@@ -168,7 +176,8 @@ class Controller(Value):
         Raises
         ------
         InputError
-            When the gain does not stabilise the plant or the metric is not positive definite.
+            When the gain does not stabilise the plant, the metric is not positive definite, or
+            there is no such solver.
         """
         plant.require_discrete()
         K = finite_array("gain", gain, (plant.m, plant.n))
@@ -190,6 +199,7 @@ class Controller(Value):
             horizon=horizon,
             terminal=maximal_invariant_set(plant, K, bounds, near=near) if terminal_set else None,
             softening=softening,
+            solver=require_solver(solver),
         )
         return made
 

@@ -413,6 +413,7 @@ def verify_hard(problem: Problem, weights: Weights) -> list[Simulation]:
         problem.bounds,
         problem.horizon,
         terminal_set=problem.terminal_set,
+        solver=problem.solver,
     )
     return [simulate(controller, drive) for drive in scenarios(problem)]
 

@@ -19,6 +19,7 @@ from impc.arrays import Array, finite_array, frozen
 from impc.checking import Value, checked, replace
 from impc.control.closed_loop import Scenario
 from impc.control.controller import LONGEST_HORIZON, Controller
+from impc.control.named_solver import COMPILED, require_solver
 from impc.errors import DataError, InputError
 from impc.model.bounds import Bounds
 from impc.model.plant_family import plant_at
@@ -58,7 +59,7 @@ class Problem(Value):
     horizon : int
         N, in samples.
     recordings : sequence of Recording
-    terminal_set, softening, unknown_start, family, structure
+    terminal_set, softening, unknown_start, family, structure, solver
         See the attributes.
     output_scale : array_like, optional
         (p,), positive; by default the root-mean-square of each output over all recordings, so
@@ -86,11 +87,15 @@ class Problem(Value):
         Logarithms of the family's parameters over their nominal values at which `plant` is (k,).
     structure : Structure or None
         What may be costed, for the method "structured"; other methods do not ask.
+    solver : str
+        What solves the controller's quadratic programs in every simulation of a search, see
+        `Controller`.
 
     Raises
     ------
     PlantError, DataError, InputError
-        When the plant is continuous, there is no recording, or a scale is not positive.
+        When the plant is continuous, there is no recording, a scale is not positive, or there is
+        no such solver.
 
     Examples
     --------
@@ -121,6 +126,7 @@ class Problem(Value):
     family: PlantFamily | None
     logarithms: Array
     structure: Structure | None
+    solver: str
 
     @checked(horizon=(1, LONGEST_HORIZON), output_scale="p")
     def __init__(
@@ -136,6 +142,7 @@ class Problem(Value):
         unknown_start: bool = False,
         family: PlantFamily | None = None,
         structure: Structure | None = None,
+        solver: str = COMPILED,
     ) -> None:
         plant.require_discrete()
         if not recordings:
@@ -156,6 +163,7 @@ class Problem(Value):
             family=family,
             logarithms=frozen(np.zeros(0 if family is None else len(family.names))),
             structure=structure,
+            solver=require_solver(solver),
         )
 
     def without_bounds(self) -> Problem:
@@ -223,6 +231,7 @@ def controller_for(
         terminal_set=problem.terminal_set,
         softening=problem.softening,
         near=near,
+        solver=problem.solver,
     )
 
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from impc.assess.judged import judge
 from impc.checking import checked
+from impc.control.named_solver import described
 from impc.errors import InputError
 from impc.inverse.estimates import Estimate
 from impc.inverse.methods import METHODS
@@ -113,7 +114,13 @@ def _document(fit: MethodFit) -> Report:
             Section(
                 "2. Controller", [tables[name] for name in ("gain", "weights") if name in tables]
             ),
-            Section("3. Versions", (f"{provenance.made}; {provenance.all_versions}.",)),
+            Section(
+                "3. Versions",
+                (
+                    f"{provenance.made}; {provenance.all_versions}.",
+                    f"Quadratic programs: solved by {described(estimate.problem.solver)}.",
+                ),
+            ),
         ],
         figures=figures,
         tables=tables,
@@ -123,6 +130,7 @@ def _document(fit: MethodFit) -> Report:
             "controls": estimate.problem.plant.controls,
             "outputs": estimate.problem.plant.outputs,
             "horizon": estimate.problem.horizon,
+            "solver": estimate.problem.solver,
             "starts": estimate.problem.starts,
             "logarithms": estimate.problem.logarithms,
         },

@@ -219,12 +219,15 @@ def test_a_plant_and_a_file_of_ones_own(tmp_path: Path, monkeypatch: pytest.Monk
         "[plant]\nmass = 1.0\n[fit]\nhorizon = 10\nu_max = 1.0\n"
     )
     done = run("fit", str(file), "--plant", "mine_to_fit:cart", "--config", "mine.toml",
-               "--out", "out")  # fmt: skip
+               "--out", "out", "--solver", "daqp")  # fmt: skip
     assert done.exit_code == 0, done.stderr
     found = json.loads(Path("out/result.json").read_text())
+    assert found["solver"] == found["settings"]["solver"] == "daqp"
+    assert found["command"].endswith("--solver daqp")
     assert found["vaf"]["position"] > 99
     assert found["held_out_vaf"]["position"] is None
     page = Path("out/report.html").read_text()
+    assert "Solved by daqp, of CasADi." in page
     assert "<script>alert" not in page
     assert "&lt;script&gt;alert" in page
     assert "<i>" not in page
@@ -258,6 +261,7 @@ def test_a_damaged_recording_ends_in_one_line_and_nothing_else(name: str, tmp_pa
     [
         (("u_max = 6.0", 'u_max = "six"'), "u_max"),
         (("horizon = 20", "horizn = 20"), "horizn"),
+        (("horizon = 20", 'solver = "best"'), "solver: got 'best'; choose one of"),
         (("mass = 79.7", "mass = -3"), "mass"),
         (("mass = 79.7", "weight = 3"), "weight"),
         (("[signals.theta2]", "[signals.theta3]"), "theta3"),

@@ -13,6 +13,7 @@ from click.testing import CliRunner, Result
 
 import impc.studies.example.cases
 from impc.cli.main import main
+from impc.control.named_solver import SOLVERS
 from impc.errors import SolverError
 from impc.model.plant import Plant
 from impc.studies.example.cases import run_case
@@ -28,7 +29,7 @@ def run(*arguments: str) -> Result:
 @pytest.fixture(scope="module")
 def case_b(tmp_path_factory: pytest.TempPathFactory) -> tuple[Result, Path]:
     folder = tmp_path_factory.mktemp("out") / "example"
-    return run("example", "--case", "B", "--out", str(folder)), folder
+    return run("example", "--case", "B", "--out", str(folder), "--solver", "daqp"), folder
 
 
 def test_example_writes_the_files_that_it_names(case_b: tuple[Result, Path]) -> None:
@@ -59,9 +60,12 @@ def test_example_prints_the_table_and_what_was_determined(
 
 
 def test_result_json_is_the_run(case_b: tuple[Result, Path], example_plant: Plant) -> None:
-    cases = json.loads((case_b[1] / "result.json").read_text(encoding="utf-8"))["cases"]
+    result = json.loads((case_b[1] / "result.json").read_text(encoding="utf-8"))
+    cases = result["cases"]
     assert list(cases) == ["B"]
-    again = run_case(example_plant, "B")
+    assert result["solver"] == "daqp"
+    assert "daqp, of CasADi" in (case_b[1] / "report.html").read_text(encoding="utf-8")
+    again = run_case(example_plant, "B", solver="daqp")
     assert cases["B"]["x0"] == again.x0.tolist()
     assert cases["B"]["truth"]["x"] == again.truth.x.tolist()
     assert cases["B"]["truth"]["u"] == again.truth.u.tolist()
@@ -84,6 +88,7 @@ def test_result_json_is_the_run(case_b: tuple[Result, Path], example_plant: Plan
     [
         (("example", "--case", "D"), "--case"),
         (("example", "--wrong"), "--wrong"),
+        (("example", "--solver", "gurobi"), "compiled, daqp, qpoases, ipopt"),
         (("exam",), "exam"),
         (("--wrong",), "--wrong"),
         (("simulate", "seated-balance", "--motor-noise", "nan"), "--motor-noise"),
@@ -101,6 +106,17 @@ def test_bad_arguments_get_one_line(arguments: tuple[str, ...], names: str) -> N
     result = run(*arguments)
     check_one_line(result, 2)
     assert names in result.stderr
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_any_solver_finds_the_weights_of_the_example(solver: str, example_plant: Plant) -> None:
+    """Case A, whose recording stands at the bound for three samples."""
+    found = run_case(example_plant, "A", solver=solver)
+    assert found.controller.solver == solver
+    for name in ("inverse_mpc", "inverse_mpc_reduced"):
+        residual = found.method(name).residual
+        assert residual is not None
+        assert residual <= 1e-6  # measured: 1e-14
 
 
 @pytest.mark.parametrize("below", ["file", "file/below", "file/far/below"])

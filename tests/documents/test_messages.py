@@ -14,6 +14,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import casadi
 import control
 import distributed
 import numpy as np
@@ -27,6 +28,7 @@ from impc.cli.main import main
 from impc.cli.plant import find_plant
 from impc.control.closed_loop import require_complete, scenario, simulate
 from impc.control.controller import Controller
+from impc.control.named_solver import require_solver
 from impc.errors import ImpcError
 from impc.files import apart
 from impc.files.alignment import misaligned
@@ -422,6 +424,12 @@ def unused_setting(_: Path) -> None:
     require_used(fit_settings({"profiles": ["K.u.x"]}), (), "compare")
 
 
+def without_daqp(_: Path) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(casadi, "has_conic", lambda _: False)
+        require_solver("daqp")
+
+
 def beyond_feasibility(_: Path) -> str:
     plant = Plant(control.ss([[2.0]], [[1]], [[1]], 0, 1))
     law = Controller(plant, Weights(1, 1), Bounds(plant, u_min=-1, u_max=1), 3)
@@ -472,6 +480,8 @@ PROVOKED: dict[str, Callable[[Path], object]] = {
     ),
     "sample ...: ...; what follows is NaN": beyond_feasibility,
     "method: got ...; choose one of ...": lambda _: fit_settings({"methods": ["best"]}),
+    "solver: got ...; choose one of ...": lambda _: fit_settings({"solver": "gurobi"}),
+    "solver: ... is not part of the CasADi that is installed": without_daqp,
     "[fit] ...: is not a setting; known: ...": lambda _: fit_settings({"horzon": 20}),
     "[fit.structure] ...: is not a setting; known: ...": lambda _: fit_settings(
         {"structure": {"q": "diagonal"}}

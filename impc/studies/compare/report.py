@@ -8,6 +8,7 @@ import numpy as np
 from markupsafe import Markup
 
 from impc.assess.assessments import ASSESSMENTS
+from impc.control.named_solver import described
 from impc.inverse.methods import METHODS
 from impc.reporting.document import (
     Lines,
@@ -77,6 +78,7 @@ def compare_report(
                     [
                         ("Made", (provenance.made,)),
                         ("Plant", (Markup("<code>{}</code>").format(provenance.plant_name),)),
+                        ("Quadratic programs", (f"Solved by {described(problem.solver)}.",)),
                         ("Versions", (provenance.all_versions,)),
                     ]
                 ),
@@ -200,4 +202,5 @@ def _data(problem: Problem, compared: Sequence[MethodFit]) -> dict[str, Any]:
         "states": problem.plant.states,
         "outputs": problem.plant.outputs,
         "horizon": problem.horizon,
+        "solver": problem.solver,
     }

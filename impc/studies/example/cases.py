@@ -17,6 +17,7 @@ from impc.assess.identified_directions import Identifiability, identifiability
 from impc.assess.judged import judge
 from impc.control.closed_loop import Simulation, require_complete, scenario, simulate
 from impc.control.controller import Controller
+from impc.control.named_solver import COMPILED
 from impc.inverse.direct_and_reduced import CONDITION_WEIGHT
 from impc.inverse.groundwork import PlantUnits
 from impc.inverse.methods import METHODS
@@ -165,7 +166,11 @@ def true_weights(plant: Plant) -> Weights:
 
 
 def run_case(
-    plant: Plant, name: str, *, progress: Callable[[str], None] = lambda _: None
+    plant: Plant,
+    name: str,
+    *,
+    solver: str = COMPILED,
+    progress: Callable[[str], None] = lambda _: None,
 ) -> CaseResult:
     """Simulate the true controller from a case's initial state and run every method on it.
 
@@ -175,6 +180,8 @@ def run_case(
         Two states, one input.
     name : str
         ``"A"``, ``"B"`` or ``"C"``.
+    solver : str
+        Of the quadratic programs, see `Controller`.
     progress : callable, optional
         Called with the name of each method when it is done.
 
@@ -185,11 +192,16 @@ def run_case(
     """
     bounds = Bounds(plant, u_min=-BOUND, u_max=BOUND)
     truth_weights = true_weights(plant)
-    controller = Controller(plant, truth_weights, bounds, HORIZON)
+    controller = Controller(plant, truth_weights, bounds, HORIZON, solver=solver)
     truth = require_complete(controller, simulate(controller, scenario(plant, CASES[name], STEPS)))
     # Scale and condition weights as the equations have them: the table is in the plant's own units.
     problem = Problem(
-        plant, bounds, HORIZON, (Recording(plant, truth.x),), output_scale=np.ones(plant.n)
+        plant,
+        bounds,
+        HORIZON,
+        (Recording(plant, truth.x),),
+        output_scale=np.ones(plant.n),
+        solver=solver,
     )
     ground = PlantUnits(problem)
     results = []

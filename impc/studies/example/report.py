@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from impc.control.named_solver import described
 from impc.reporting.document import Picture, Report
 from impc.studies.example.cases import LOST, SETTINGS
 from impc.studies.example.figures import FIGURES, example_figures
@@ -65,6 +66,7 @@ def example_report(cases: Sequence[CaseResult], provenance: Provenance) -> Repor
             "methods": METHODS,
             "plant": plant,
             "settings": SETTINGS,
+            "solver": described(cases[0].controller.solver),
             "provenance": provenance,
         },
     )

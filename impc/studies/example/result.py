@@ -1,5 +1,6 @@
 """result.json: the numbers of a run for other programs.
 
+    solver                              what solved the quadratic programs
     cases.<A|B|C>.x0
     cases.<A|B|C>.truth                 x, u, Q, R, K of the controller that made the recording
     cases.<A|B|C>.methods.<name>        Q, R, K, state_misfit, max_abs_u, residual, seconds,
@@ -38,6 +39,7 @@ def example_data(
     return {
         "plant": {"name": provenance.plant_name, "A": plant.A, "B": plant.B, "dt": plant.dt},
         "settings": settings,
+        "solver": cases[0].controller.solver,
         "cases": {case.name: _case(case) for case in cases},
     }
 

@@ -9,6 +9,7 @@ import numpy as np
 from markupsafe import Markup
 
 from impc.assess.covariance import TOLD
+from impc.control.named_solver import described
 from impc.reporting.document import (
     Block,
     Details,
@@ -238,6 +239,10 @@ def _made(result: FitResult, provenance: Provenance) -> list[Block]:
                     ),
                 ),
                 ("Settings", ("; ".join(f"{key} = {value}" for key, value in settings.items()),)),
+                (
+                    "Quadratic programs",
+                    (f"Solved by {described(result.fitted.problem.solver)}.",),
+                ),
                 ("Recordings", (", ".join(provenance.files),)),
                 ("Versions", (provenance.all_versions,)),
             ]

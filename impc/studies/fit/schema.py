@@ -3,6 +3,7 @@
     vaf.<output>, held_out_vaf.<output>      %, all trials; the mean of the trials left out
     states, controls, outputs, disturbances  names, in the order of every array below
     units.<signal>                           where the plant says them
+    solver                                   what solved the quadratic programs
     K, S, Q, R, P, horizon, bounds           the controller of the weights, at R[0][0] = 1
     weights_rule                             which of all weights with this gain Q and R are; those
                                              of methods.inverse_mpc are where the search ended
@@ -72,6 +73,7 @@ def _controller(result: FitResult) -> dict[str, Any]:
         "weights_rule": result.intent.reported.rule,
         "P": result.reported_P,
         "horizon": result.fitted.problem.horizon,
+        "solver": result.fitted.problem.solver,
         "bounds": {name: getattr(bounds, name) for name in ("x_min", "x_max", "u_min", "u_max")},
     }
 

@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 import scipy.signal
 
+from impc.control.named_solver import COMPILED, require_solver
 from impc.errors import InputError, brief
 from impc.files.configuration import FILL_IN
 from impc.inverse.methods import method_named
@@ -139,6 +140,8 @@ class FitSettings:
         What may be costed: the table [fit.structure]. None: any weights, and no word on it.
     structures : list of StructureSettings
         Others, to compare it with.
+    solver : str
+        What solves the controller's quadratic programs (`impc.control.named_solver`).
 
     Examples
     --------
@@ -167,6 +170,7 @@ class FitSettings:
     methods: list[str] = field(default_factory=lambda: list(BESIDE))
     structure: StructureSettings | None = None
     structures: list[StructureSettings] = field(default_factory=list)
+    solver: str = COMPILED
 
 
 def require_used(settings: FitSettings, used: Collection[str], command: str) -> None:
@@ -246,6 +250,7 @@ def fit_settings(table: Mapping[str, Any]) -> FitSettings:
     _require_distinct(settings)
     for name in settings.methods:
         method_named(name)
+    require_solver(settings.solver)
     return settings
 
 

@@ -144,6 +144,7 @@ def fit_problem(
         unknown_start=True,
         family=family,
         structure=next(iter(fit_structures(plant, settings)), None),
+        solver=settings.solver,
     )
 
 

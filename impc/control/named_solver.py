@@ -1,0 +1,368 @@
+"""The least-distance problem of one sample, built and solved by CasADi with a solver by its name.
+
+`compiled_loop` has a method of its own for it (docs/theory.md, section 4). Any other finds the same answer, and is asked for
+what only a solver can tell: which rows hold. With those the input and its derivative follow from
+the equations of the active set (`closed_loop`), and a solver whose own answer is not that one, to
+1e-6 of its size, is not believed. What a solver says of its success is not asked for.
+
+    minimise z'z / 2 + price sum(t) (1 + small t)   subject to  A z <= d + t,  t >= 0 for soft rows
+
+is the problem in numbers of size one: z is v in coordinates in which S is the identity, over the
+distance of a typical row; rows are divided by their bounds. Soft rows enter it only where the hard
+problem has no answer, or one whose multipliers exceed the price of the rows.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+import threading
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import casadi as ca
+import numpy as np
+import scipy.optimize
+
+from impc.arrays import Array, BoolArray, IntArray
+from impc.errors import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from impc.control.constraint_rows import Rows
+
+__all__ = [
+    "COMPILED",
+    "SOLVERS",
+    "ActiveSet",
+    "Program",
+    "active_set",
+    "build_program",
+    "described",
+    "plugin",
+    "require_solver",
+    "silent",
+]
+
+#: The package's own method, see `compiled_loop`.
+COMPILED = "compiled"
+_IPOPT: dict[str, Any] = {
+    "print_time": False,
+    "error_on_fail": False,
+    "ipopt": {
+        "print_level": 0,
+        "sb": "yes",
+        "tol": 1e-12,
+        "compl_inf_tol": 1e-12,
+        "constr_viol_tol": 1e-12,
+        "acceptable_tol": 1e-11,
+        "bound_relax_factor": 0.0,
+        "hessian_constant": "yes",
+        "jac_c_constant": "yes",
+        "jac_d_constant": "yes",
+    },
+}
+# Plugin and options of each. Active-set methods end at round-off, IPOPT's interior-point method at
+# its tolerance, which is tightened from 1e-8. Of 180 random loops (hard state bounds, soft ones,
+# soft ones at a price of a million) these three find every input. Not offered: qrqp, which had no
+# answer in 2 of 30 loops with hard rows and in most with soft ones; OSQP, in 7 of 90; fatrop, which
+# wants the stages apart and prints.
+_PLUGINS: dict[str, tuple[str, dict[str, Any]]] = {
+    "daqp": ("daqp", {"error_on_fail": False}),
+    "qpoases": (
+        "qpoases",
+        {
+            "printLevel": "none",
+            "error_on_fail": False,
+            "sparse": False,
+            # By default it starts at lower bounds, which are infinite here: of 180 random loops one
+            # ended in a division by zero.
+            "initialStatusBounds": "inactive",
+        },
+    ),
+    "ipopt": ("nlpsol", {"error_on_fail": False, "nlpsol": "ipopt", "nlpsol_options": _IPOPT}),
+}
+#: Names of CasADi's solvers that may be asked for.
+SOLVERS = tuple(_PLUGINS)
+
+# Slacks enter the cost linearly, so the Hessian is singular, which DAQP does not take. They get a
+# quadratic cost about a centre, of this share of their price, and the problem is solved again about
+# what was found until that no longer moves: then the quadratic cost has no effect (proximal point).
+_PROXIMAL, _ROUNDS = 1e-3, 10
+# Relative to 1 and to the largest slack.
+_SETTLED = 1e-7
+# What the conditions of optimality may be broken by in a solver's own answer, and what its z may
+# differ from that of the equations by, relative to the larger of 1 and z. DAQP keeps rows to 1e-5
+# where a price of a million is paid. The answer of the equations is checked to 1e-9.
+_AGREES = 1e-4
+# A row is dependent on others when less than this share of its length is new (`compiled_loop`).
+_DEPENDENT = 1e-9
+
+_own = threading.local()  # a CasADi function is not to be evaluated in two threads at a time
+_printing = threading.Lock()
+
+_Answer = tuple[Array, Array, Array, float]
+
+
+class _Shape(NamedTuple):
+    """minimise y'H y / 2 + g'y  subject to  A y <= right,  y >= least; H is a diagonal."""
+
+    H: Array
+    g: Array
+    A: Array
+    least: Array
+
+
+@dataclass(frozen=True)
+class Program:
+    """The problem of the module's text for one controller; made by `build_program`.
+
+    Attributes
+    ----------
+    solver : str
+    A : Array
+        (r, N m).
+    squares : Array
+        Squared length of each row of A (r,).
+    unit : float
+        What z is multiplied by to become L'v, S = LL'.
+    b : Array
+        Bounds (r,).
+    soft : BoolArray
+        Which rows may be exceeded (r,).
+    price : float
+        Of the excess, in the problem's numbers.
+    hard, softened : tuple of casadi.DM
+        What does not change from sample to sample, with all rows hard and with slacks.
+    """
+
+    solver: str
+    A: Array
+    squares: Array
+    unit: float
+    b: Array
+    soft: BoolArray
+    price: float
+    hard: tuple[ca.DM, ...]
+    softened: tuple[ca.DM, ...]
+
+
+@dataclass(frozen=True)
+class ActiveSet:
+    """What a solver found at one sample.
+
+    Attributes
+    ----------
+    tight : IntArray
+        Rows that hold with equality, linearly independent (a,).
+    given_up : BoolArray
+        Soft rows that are exceeded (r,).
+    w : Array
+        The solver's own answer L'v with S = LL' (N m,).
+    agrees : float
+        What w may differ from that of the equations by, in its unit.
+    """
+
+    tight: IntArray
+    given_up: BoolArray
+    w: Array
+    agrees: float
+
+
+def require_solver(name: str) -> str:
+    """Return the name of a solver that there is.
+
+    Parameters
+    ----------
+    name : str
+        "compiled", or one of `SOLVERS`.
+
+    Raises
+    ------
+    InputError
+        When it is not one of them, or CasADi as it is installed has it not.
+    """
+    if name not in (COMPILED, *SOLVERS):
+        known = ", ".join((COMPILED, *SOLVERS))
+        raise InputError("solver", f"got {name!r}", f"choose one of {known}")
+    if name != COMPILED and not _installed(name):
+        raise InputError(
+            "solver",
+            f"{name!r} is not part of the CasADi that is installed",
+            "choose another, or install CasADi from its wheel",
+        )
+    return name
+
+
+def _installed(name: str) -> bool:
+    return bool(ca.has_nlpsol("ipopt") if name == "ipopt" else ca.has_conic(name))
+
+
+def described(name: str) -> str:
+    """A solver by its `name` as a page says it."""
+    return "the package's own" if name == COMPILED else f"{name}, of CasADi"
+
+
+def plugin(name: str) -> tuple[str, dict[str, Any]]:
+    """CasADi's name of the plugin of a solver, as `conic` and `qpsol` take it, and its options.
+
+    Parameters
+    ----------
+    name : str
+        One of `SOLVERS`.
+    """
+    return _PLUGINS[name]
+
+
+class _Silence:
+    """Standard output but for what one thread writes."""
+
+    def __init__(self, beneath: Any) -> None:
+        self._beneath = beneath
+        self._thread = threading.get_ident()
+
+    def write(self, text: str) -> int:
+        if threading.get_ident() == self._thread:
+            return len(text)
+        return int(self._beneath.write(text))
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._beneath, name)
+
+
+@contextlib.contextmanager
+def silent() -> Iterator[None]:
+    """Keep from standard output what a solver prints while it is built or solves.
+
+    qpOASES prints its licence whenever one is made, and no option turns that off. CasADi writes it
+    through `sys.stdout`; what other threads print meanwhile is passed on.
+    """
+    with _printing, contextlib.redirect_stdout(_Silence(sys.stdout)):
+        yield
+
+
+def build_program(solver: str, rows: Rows) -> Program:
+    """Write the problem of rows for a solver.
+
+    Parameters
+    ----------
+    solver : str
+        One of `SOLVERS`.
+    rows : Rows
+    """
+    squares = np.diag(rows.gram)
+    reaching = squares > 0
+    distances = rows.b[reaching] / np.sqrt(squares[reaching])
+    unit = float(np.median(distances)) if reaching.any() else 1.0
+    A = unit * rows.W / rows.b[:, None]
+    soft = np.isfinite(rows.limit)
+    price = float(np.max(rows.limit[soft] * rows.b[soft], initial=0.0)) / unit**2
+    width, slacks = rows.W.shape[1], int(soft.sum())
+    hard = _Shape(np.ones(width), np.zeros(width), A, np.full(width, -np.inf))
+    softened = _Shape(
+        np.r_[np.ones(width), np.full(slacks, _PROXIMAL * np.sqrt(price))],
+        np.r_[np.zeros(width), np.full(slacks, price)],
+        np.column_stack([A, -np.eye(len(A))[:, soft]]),
+        np.r_[np.full(width, -np.inf), np.zeros(slacks)],
+    )
+    lengths = unit**2 * squares / rows.b**2
+    return Program(solver, A, lengths, unit, rows.b, soft, price, _given(hard), _given(softened))
+
+
+def active_set(program: Program, d: Array) -> ActiveSet | None:
+    """Ask a solver which rows hold; None when its answer breaks the conditions of optimality.
+
+    Parameters
+    ----------
+    program : Program
+    d : Array
+        Slack of the rows at v = 0, b - T x (r,).
+    """
+    A, right, soft = program.A, d / program.b, program.soft
+    found = _solve(program, program.hard, right, np.zeros(len(d)))
+    if soft.any() and (found is None or np.any(found[1][soft] > program.price)):
+        found = _solve_softened(program, right)
+    if found is None:
+        return None
+    z, multipliers, excess, size = found
+    # The rule of the primal-dual active-set method: a multiplier, as the share of the bound that it
+    # stands for, against the slack; and what the price leaves of it against the excess.
+    given_up = soft & (excess > np.maximum(program.price - multipliers, 0.0) * program.squares)
+    held = np.flatnonzero((multipliers * program.squares > right - A @ z) & ~given_up)
+    pull = -z - A.T @ (program.price * given_up)
+    tight = _independent(A, held, multipliers, pull)
+    return ActiveSet(tight, given_up, program.unit * z, _AGREES * program.unit * size)
+
+
+def _solve_softened(program: Program, right: Array) -> _Answer | None:
+    centre: Array = np.zeros(len(right))
+    for _ in range(_ROUNDS):
+        found = _solve(program, program.softened, right, centre)
+        if found is None:
+            return None
+        excess = found[2]
+        if np.abs(excess - centre).max() <= _SETTLED * max(1.0, excess.max()):
+            return found
+        centre = excess
+    return None
+
+
+def _solve(
+    program: Program, given: tuple[ca.DM, ...], right: Array, centre: Array
+) -> _Answer | None:
+    """The solver's answer, when it keeps the rows and its multipliers belong to it."""
+    A, soft = program.A, program.soft
+    H, g, rows, least = given
+    if given is program.softened:
+        g = np.r_[
+            np.zeros(A.shape[1]), program.price - _PROXIMAL * np.sqrt(program.price) * centre[soft]
+        ]
+    (count, width) = A.shape
+    function = _function(program.solver, H.size1(), count)
+    with silent():
+        answer = function(h=H, g=g, a=rows, lba=-np.inf, uba=right, lbx=least, ubx=np.inf)
+    found, multipliers = answer["x"].full().ravel(), answer["lam_a"].full().ravel()
+    z, excess = found[:width], np.zeros(count)
+    if len(found) > width:
+        excess[soft] = found[width:]
+    size = max(1.0, float(np.abs(z).max()))
+    most = max(1.0, float(np.abs(multipliers).max()))
+    kept = (A @ z - right - excess).max() <= _AGREES * size
+    stationary = np.abs(z + A.T @ multipliers).max() <= _AGREES * max(size, most)
+    signed = multipliers.min() >= -_AGREES * most
+    return (z, multipliers, excess, size) if kept and stationary and signed else None
+
+
+def _independent(A: Array, held: IntArray, multipliers: Array, pull: Array) -> IntArray:
+    """Rows among those held that carry the pull, linearly independent.
+
+    Where some depend on the others, non-negative least squares chooses: it ends with an
+    independent set whose multipliers have their signs.
+    """
+    if len(held) == 0:
+        return held
+    diagonal = np.abs(np.diagonal(np.linalg.qr(A[held].T, mode="r")))
+    lengths = np.linalg.norm(A[held], axis=1)[: len(diagonal)]
+    if len(held) <= A.shape[1] and np.all(diagonal > _DEPENDENT * lengths):
+        return held
+    order = held[np.argsort(-multipliers[held], kind="stable")]
+    chosen, _ = scipy.optimize.nnls(A[order].T, pull)
+    return np.sort(order[chosen > 0])
+
+
+def _given(shape: _Shape) -> tuple[ca.DM, ...]:
+    """Of the problem, what does not change from sample to sample, as CasADi takes it."""
+    return ca.diag(ca.DM(shape.H)), ca.DM(shape.g), ca.DM(shape.A), ca.DM(shape.least)
+
+
+def _function(solver: str, width: int, count: int) -> Callable[..., Any]:
+    """The solver for problems of this size, one for each thread."""
+    kept: dict[tuple[str, int, int], Any] = _own.__dict__.setdefault("functions", {})
+    key = solver, width, count
+    if key not in kept:
+        name, options = plugin(solver)
+        shapes = {"h": ca.Sparsity.diag(width), "a": ca.Sparsity.dense(count, width)}
+        with silent():
+            kept[key] = ca.conic("mpc", name, shapes, options)
+    return kept[key]  # type: ignore[no-any-return]
