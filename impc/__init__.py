@@ -79,6 +79,7 @@ _NAMES = {
     "control.constraint_rows": "directions",
     "control.controller": "Controller",
     "control.terminal_set": "TerminalSet maximal_invariant_set",
+    "control.optimal_control": "OptimalControlProblem",
     "errors": "BoundsError DataError ImpcError InfeasibleError InputError OutputError PlantError"
     " SolverError WeightsError",
     "files.configuration": "read_configuration",

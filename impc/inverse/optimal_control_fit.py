@@ -1,0 +1,339 @@
+"""Nonlinear inverse MPC: the parameters of an optimal control problem behind its recordings.
+
+    minimise over theta    sum ((x_sim(theta) - x) / scale)^2 + ((u_sim(theta) - u) / scale)^2
+
+by Levenberg and Marquardt's method with exact derivatives, positive parameters in their logarithms.
+The plans are those of the relaxed conditions s lam = mu, with mu falling in steps: at 1e-1 a
+constraint is felt from afar, also one that the first parameters never reach, and the derivative is
+smooth over changes of the active rows; at 1e-10 it is the problem itself. docs/nonlinear.md.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.arrays import Array, Frozen
+from impc.control.nlp_solvers import require_solver
+from impc.control.plan import Plan, nearby_plan, solve_plan
+from impc.control.plan_derivatives import differentiate_plan
+from impc.control.receding_horizon import ClosedLoop, closed_loop_from, simulate_receding
+from impc.errors import DataError, InputError, SolverError
+from impc.inverse.told_combinations import Combinations, combinations
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from impc.control.optimal_control import OptimalControlProblem
+    from impc.control.optimal_recordings import OptimalRecording
+    from impc.control.plan_derivatives import PlanDerivatives
+
+__all__ = ["MU_STEPS", "OptimalControlEstimate", "fit_optimal_control"]
+
+#: The falling sequence of mu, of the dimension of the cost.
+MU_STEPS = (1e-1, 1e-2, 1e-4, 1e-10)
+_LONGEST_STEP = 0.7  # in a logarithm: a factor of two
+_LEAST_DAMPING, _MOST_DAMPING = 1e-14, 1e6
+
+
+@dataclass(frozen=True, eq=False)
+class _Evaluation:
+    """Residuals (r,) and their derivative (r, k) at unknowns (k,), and what they came from."""
+
+    unknowns: Array
+    theta: Array
+    mu: float
+    residual: Array
+    jacobian: Array
+    runs: tuple[tuple[Plan, PlanDerivatives] | ClosedLoop, ...]
+
+    @property
+    def loss(self) -> float:
+        return float(self.residual @ self.residual)
+
+
+@dataclass(frozen=True, eq=False)
+class OptimalControlEstimate(Frozen):
+    """What was found, and which part of it the recordings tell.
+
+    Attributes
+    ----------
+    problem : OptimalControlProblem
+    recordings : tuple of OptimalRecording
+    theta : dict
+        Values by name.
+    loss : float
+        Sum of squares of all that was measured, in its units.
+    residual : Array
+        Differences over their scales (r,).
+    jacobian : Array
+        Its derivative (r, k) by logarithms of positive parameters, by signed ones, and by unknown
+        initial states over their scales.
+    signals : Array
+        Of each residual the index of its state, or n and the index of its input (r,).
+    scales : Array
+        Root-mean-square of each state and input in the recordings (n + m,).
+    singular_values : Array
+        Of the part of the Jacobian that belongs to the parameters (p,), initial states projected
+        out.
+    combinations : Combinations
+        What is told and what is not.
+    x0 : tuple of Array
+        Initial state of each recording (n,).
+    runs : tuple
+        States (T + 1, n) and inputs (T, m) of each recording as the estimate has them.
+    settled : bool
+        Whether the search ended by itself.
+    evaluations : int
+        How often all recordings were solved and differentiated.
+    seconds : float
+        Of the search, s.
+    """
+
+    problem: OptimalControlProblem
+    recordings: tuple[OptimalRecording, ...]
+    theta: dict[str, float]
+    loss: float
+    residual: Array
+    jacobian: Array
+    signals: Array
+    scales: Array
+    singular_values: Array
+    combinations: Combinations
+    x0: tuple[Array, ...]
+    runs: tuple[tuple[Array, Array], ...]
+    settled: bool
+    evaluations: int
+    seconds: float
+
+
+class _Search:
+    """The recordings with their scales, and a count of evaluations."""
+
+    def __init__(
+        self,
+        problem: OptimalControlProblem,
+        recordings: tuple[OptimalRecording, ...],
+        solver: str,
+        bar: object = None,
+    ) -> None:
+        self.problem, self.recordings, self.solver = problem, recordings, solver
+        self.evaluations = 0
+        x = np.concatenate([one.x for one in recordings])
+        u = np.concatenate([one.u for one in recordings])
+        self.scales = np.array([_root_mean_square(column) for column in (*x.T, *u.T)])
+
+    def unknowns(self, theta: Array) -> Array:
+        logarithms = np.where(self.problem.positive, np.log(np.abs(theta)), theta)
+        starts = [one.x0 / self.scales[: self.problem.n] for one in self.recordings
+                  if one.unknown_start]  # fmt: skip
+        return np.concatenate([logarithms, *starts])
+
+    def parameters(self, unknowns: Array) -> Array:
+        part = unknowns[: len(self.problem.parameter_names)]
+        return np.where(self.problem.positive, np.exp(part), part)
+
+    def evaluate(
+        self, unknowns: Array, mu: float, before: _Evaluation | None
+    ) -> _Evaluation | None:
+        """Solve and differentiate every recording; None where one has no solution near by."""
+        self.evaluations += 1
+        problem, p, n = self.problem, len(self.problem.parameter_names), self.problem.n
+        theta = self.parameters(unknowns)
+        chain = np.where(problem.positive, theta, 1.0)
+        place, runs, parts, slopes = p, [], [], []
+        for index, one in enumerate(self.recordings):
+            own = one.unknown_start
+            x0 = unknowns[place : place + n] * self.scales[:n] if own else one.x0
+            run = self._run(index, theta, x0, mu, before)
+            if run is None:
+                return None
+            x, u, dx, du = _trajectories(run)
+            kept = np.isfinite(np.hstack([one.x[1:], one.u]))
+            scaled = np.hstack([x[1:] - one.x[1:], u - one.u]) / self.scales
+            slope = np.concatenate([dx[1:], du], axis=1) / self.scales[:, None]
+            first = np.isfinite(one.x[0]) & own
+            residual = np.concatenate([((x[0] - one.x[0]) / self.scales[:n])[first], scaled[kept]])
+            rows = np.concatenate([(dx[0] / self.scales[:n, None])[first], slope[kept]])
+            whole = np.zeros((len(rows), len(unknowns)))
+            whole[:, :p] = rows[:, :p] * chain
+            if own:
+                whole[:, place : place + n] = rows[:, p:] * self.scales[:n]
+                place += n
+            runs.append(run)
+            parts.append(residual)
+            slopes.append(whole)
+        return _Evaluation(
+            unknowns, theta, mu, np.concatenate(parts), np.concatenate(slopes), tuple(runs)
+        )
+
+    def _run(
+        self, index: int, theta: Array, x0: Array, mu: float, before: _Evaluation | None
+    ) -> tuple[Plan, PlanDerivatives] | ClosedLoop | None:
+        one = self.recordings[index]
+        if before is None:
+            if one.closed_loop:
+                return simulate_receding(
+                    self.problem, theta, x0, one.d, solver=self.solver, mu=mu
+                )
+            plan = self._first_plan(one, theta, x0, mu)
+            return plan, differentiate_plan(plan)
+        old = before.runs[index]
+        if isinstance(old, ClosedLoop):
+            loop = closed_loop_from(old.plans[0], theta, x0, one.d, mu, self.solver, old)
+            return None if isinstance(loop, int) else loop
+        change = np.concatenate([theta - old[0].theta, x0 - old[0].x[0]])
+        steps = (old[1].step(change),) if np.any(change) else ()
+        near = nearby_plan(old[0], theta, x0, mu, steps, self.solver)
+        return None if near is None else (near, differentiate_plan(near))
+
+    def _first_plan(self, one: OptimalRecording, theta: Array, x0: Array, mu: float) -> Plan:
+        measured = bool(np.all(np.isfinite(one.x)) and np.all(np.isfinite(one.u)))
+        guesses = ((np.array(one.x), np.array(one.u)),) if measured else ()
+        return solve_plan(
+            self.problem, theta, x0, d=one.d, solver=self.solver, mu=mu, guesses=guesses
+        )
+
+    def signals(self) -> Array:
+        """Of each residual the column of its state or input."""
+        n, found = self.problem.n, []
+        for one in self.recordings:
+            kept = np.isfinite(np.hstack([one.x[1:], one.u]))
+            first = np.isfinite(one.x[0]) & one.unknown_start
+            found += [np.flatnonzero(first), np.nonzero(kept)[1]]
+        return np.concatenate(found).astype(np.float64) if n else np.zeros(0)
+
+
+def fit_optimal_control(
+    problem: OptimalControlProblem,
+    recordings: Sequence[OptimalRecording],
+    start: Mapping[str, float],
+    *,
+    solver: str = "ipopt",
+    mu_steps: Sequence[float] = MU_STEPS,
+    evaluations: int = 200,
+) -> OptimalControlEstimate:
+    """Search the parameters from a start.
+
+    Parameters
+    ----------
+    problem : OptimalControlProblem
+    recordings : sequence of OptimalRecording
+        Of `problem.recorded_plan` and `problem.recorded_loop`.
+    start : dict
+        First value of each parameter by its name.
+    solver : str
+        One of `impc.control.nlp_solvers.SOLVERS`.
+    mu_steps : sequence of float
+        Falling.
+    evaluations : int
+        After how many the search is stopped.
+
+    Returns
+    -------
+    OptimalControlEstimate
+        Its `settled` says whether the search ended by itself.
+
+    Raises
+    ------
+    DataError
+        When there are no recordings.
+    InputError
+        When a start is not usable, or a parameter moves nothing that was measured at any mu.
+    InfeasibleError, SolverError
+        When there is no plan at the start.
+    """
+    require_solver(solver)
+    if not recordings:
+        raise DataError("recordings", "there are none", "give at least one")
+    if not mu_steps or any(b >= a for a, b in zip(mu_steps[:-1], mu_steps[1:], strict=True)):
+        raise InputError("mu_steps", f"got {tuple(mu_steps)!r:.60}", "give falling numbers")
+    began = time.perf_counter()
+    search = _Search(problem, tuple(recordings), solver)
+    current = search.evaluate(search.unknowns(problem.values(start)), mu_steps[0], None)
+    if current is None:
+        raise SolverError("start", "has no solution", "begin nearer")
+    settled = True
+    for mu in mu_steps:
+        if mu != current.mu:
+            moved = search.evaluate(current.unknowns, mu, current)
+            if moved is None:
+                settled = False
+                break
+            current = moved
+        current, settled = _levenberg(search, current, mu == mu_steps[-1], evaluations)
+    return _estimate(search, current, settled, time.perf_counter() - began)
+
+
+def _levenberg(
+    search: _Search, current: _Evaluation, last: bool, most: int
+) -> tuple[_Evaluation, bool]:
+    """Steps until the loss no longer falls; at a mu on the way a rough answer is enough."""
+    damping, patience, enough = (1e-3, 60, 1e-13) if last else (1e-2, 12, 1e-2)
+    for _ in range(patience):
+        left, values, right = np.linalg.svd(current.jacobian, full_matrices=False)
+        drive = left.T @ current.residual
+        while True:
+            if search.evaluations >= most:
+                return current, False
+            gain = values / (values**2 + damping * values[0] ** 2)
+            step = -right.T @ (gain * drive)
+            step *= min(1.0, _LONGEST_STEP / max(float(np.max(np.abs(step))), 1e-300))
+            if current.loss == 0 or np.max(np.abs(step)) < 1e-12:
+                return current, True
+            predicted = current.loss - float(
+                np.sum((current.residual + current.jacobian @ step) ** 2)
+            )
+            tried = search.evaluate(current.unknowns + step, current.mu, current)
+            ratio = -1.0 if tried is None else (current.loss - tried.loss) / max(predicted, 1e-300)
+            if tried is not None and ratio > 1e-4:
+                break
+            damping *= 8
+            if damping > _MOST_DAMPING or predicted < 1e-14 * current.loss:
+                return current, True
+        damping = max(damping / 10 if ratio > 0.5 else damping * 2, _LEAST_DAMPING)
+        fell = (current.loss - tried.loss) / current.loss
+        current = tried
+        if fell < enough or current.loss < 1e-28 * len(current.residual):
+            return current, True
+    return current, not last
+
+
+def _estimate(
+    search: _Search, found: _Evaluation, settled: bool, seconds: float
+) -> OptimalControlEstimate:
+    problem, p = search.problem, len(search.problem.parameter_names)
+    signals = search.signals()
+    loss = float(np.sum((found.residual * search.scales[signals.astype(int)]) ** 2))
+    told = combinations(problem, found.theta, found.jacobian, found.residual)
+    starts = [one.x0 for one in search.recordings]
+    place = p
+    for index, one in enumerate(search.recordings):
+        if one.unknown_start:
+            part = found.unknowns[place : place + problem.n]
+            starts[index], place = part * search.scales[: problem.n], place + problem.n
+    return OptimalControlEstimate(
+        problem, search.recordings,
+        dict(zip(problem.parameter_names, map(float, found.theta), strict=True)), loss,
+        found.residual, found.jacobian, signals, search.scales, told.singular_values, told,
+        tuple(starts), tuple(_trajectories(run)[:2] for run in found.runs), settled,
+        search.evaluations, seconds,
+    )  # fmt: skip
+
+
+def _trajectories(
+    run: tuple[Plan, PlanDerivatives] | ClosedLoop,
+) -> tuple[Array, Array, Array, Array]:
+    """x (T + 1, n), u (T, m) and their derivatives by theta and x_0."""
+    if isinstance(run, ClosedLoop):
+        return run.x, run.u, run.dx, run.du
+    return run[0].x, run[0].u, run[1].x, run[1].u
+
+
+def _root_mean_square(column: Array) -> float:
+    known = column[np.isfinite(column)]
+    size = float(np.sqrt(np.mean(known**2))) if len(known) else 1.0
+    return size if size > 0 else 1.0
