@@ -34,13 +34,14 @@ if TYPE_CHECKING:
     from impc.control.optimal_control import OptimalControlProblem
     from impc.control.relaxed_conditions import Conditions, System
 
-__all__ = ["Plan", "moved", "nearby_plan", "solve_plan"]
+__all__ = ["Plan", "moved", "nearby_plan", "solve_plan", "solved_plan"]
 
 # Of the conditions, relative to the largest multiplier (gradient) or as they are (dynamics, rows).
 # Newton's method ends at 1e-13 to 1e-15 on the four systems of docs/nonlinear.md.
 _TOLERANCE = 1e-10
 _PRODUCT = 1e-3  # of s lam - mu, relative to mu
 _STEPS = 40
+_SHORTEST = 1e-3  # a second step in a row that is shorter leads nowhere
 _TO_BOUNDARY = 0.995
 _EXCESS = 1e-6  # of a row, above which a problem without a plan is called infeasible
 
@@ -130,7 +131,7 @@ def solve_plan(
     _require_finite_start(problem, theta, known, *trials[0])
     reasons = []
     for x, u in trials:
-        found = _solved(problem, theta, known, np.vstack([x0, x[1:]]), u, solver, mu)
+        found = solved_plan(problem, theta, known, np.vstack([x0, x[1:]]), u, solver, mu)
         if isinstance(found, Plan):
             return found
         reasons.append(found)
@@ -144,18 +145,20 @@ def nearby_plan(
     """The plan at other parameters (p,), another state (n,) or another mu; None if there is none.
 
     Newton's method begins at the plan, moved by each of `steps` in turn and then as it is; where
-    none of these ends, the solver by its name begins at the plan.
+    none of these ends, the solver by its name begins at the plan, if there is a name.
     """
     problem, d = plan.problem, plan.d
     for guess in (*(moved(plan.point, step) for step in steps), plan.point):
         begun = replace(guess, x=np.vstack([x0, guess.x[1:]]))
         if isinstance(found := _follow(problem, theta, d, begun, plan.mu, mu), Plan):
             return found
-    found = _solved(problem, theta, d, np.vstack([x0, plan.x[1:]]), plan.u, solver, mu)
+    if not solver:
+        return None
+    found = solved_plan(problem, theta, d, np.vstack([x0, plan.x[1:]]), plan.u, solver, mu)
     return found if isinstance(found, Plan) else None
 
 
-def _solved(
+def solved_plan(
     problem: OptimalControlProblem,
     theta: Array,
     d: Array,
@@ -164,7 +167,11 @@ def _solved(
     solver: str,
     mu: float,
 ) -> Plan | str:
-    """By a solver from a guess; at a large mu too: far from every bound the program is easier."""
+    """By a solver from a guess x (N + 1, n), u (N, m); a reason, or nothing, where it ends without.
+
+    At theta (p,) and d (N, d). It is tried at a large mu too: far from every bound the program is
+    easier.
+    """
     found: Plan | str = ""
     for first in sorted({mu, max(mu, 1e-1)}):
         point = start_of(problem, solver, theta, d, x, u, first)
@@ -244,6 +251,7 @@ def _newton(
     at = conditions(problem, theta, d, point)
     left = residuals(problem, point, at, mu)
     error, merit = _errors(point, left, mu)
+    short = 0
     for _ in range(_STEPS):
         factors = system(problem, point, at)
         if not np.isfinite(merit) or not factors.regular:
@@ -260,9 +268,10 @@ def _newton(
             length /= 2
         else:
             break
+        short = short + 1 if length < _SHORTEST else 0
         settled = new_error < _TOLERANCE and new_error > error / 4
         point, at, left, error, merit = trial, new_at, new_left, new_error, new_merit
-        if settled or error < 1e-14:
+        if settled or error < 1e-14 or short == 2:
             break
     if error >= _TOLERANCE:
         return ""

@@ -16,11 +16,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.arrays import Array, Frozen
+from impc.arrays import Array, BoolArray, Frozen, IntArray
 from impc.control.nlp_solvers import require_solver
-from impc.control.plan import Plan, nearby_plan, solve_plan
+from impc.control.plan import Plan, nearby_plan, solve_plan, solved_plan
 from impc.control.plan_derivatives import differentiate_plan
-from impc.control.receding_horizon import ClosedLoop, closed_loop_from, simulate_receding
+from impc.control.receding_horizon import ClosedLoop, closed_loop_from
 from impc.errors import DataError, InputError, SolverError
 from impc.inverse.told_combinations import Combinations, combinations
 
@@ -31,11 +31,16 @@ if TYPE_CHECKING:
     from impc.control.optimal_recordings import OptimalRecording
     from impc.control.plan_derivatives import PlanDerivatives
 
+    _Run = tuple[Plan, PlanDerivatives] | ClosedLoop
+
 __all__ = ["MU_STEPS", "OptimalControlEstimate", "fit_optimal_control"]
 
 #: The falling sequence of mu, of the dimension of the cost.
 MU_STEPS = (1e-1, 1e-2, 1e-4, 1e-10)
 _LONGEST_STEP = 0.7  # in a logarithm: a factor of two
+_STILL = 1e-9
+_EXPLAINED = 0.01  # of the squares of a recording; a plan of another kind leaves far more
+_SMALL_STEP = 1e-9
 _LEAST_DAMPING, _MOST_DAMPING = 1e-14, 1e6
 
 
@@ -48,7 +53,7 @@ class _Evaluation:
     mu: float
     residual: Array
     jacobian: Array
-    runs: tuple[tuple[Plan, PlanDerivatives] | ClosedLoop, ...]
+    runs: tuple[_Run, ...]
 
     @property
     def loss(self) -> float:
@@ -72,7 +77,7 @@ class OptimalControlEstimate(Frozen):
     jacobian : Array
         Its derivative (r, k) by logarithms of positive parameters, by signed ones, and by unknown
         initial states over their scales.
-    signals : Array
+    signals : IntArray
         Of each residual the index of its state, or n and the index of its input (r,).
     scales : Array
         Root-mean-square of each state and input in the recordings (n + m,).
@@ -99,7 +104,7 @@ class OptimalControlEstimate(Frozen):
     loss: float
     residual: Array
     jacobian: Array
-    signals: Array
+    signals: IntArray
     scales: Array
     singular_values: Array
     combinations: Combinations
@@ -118,13 +123,18 @@ class _Search:
         problem: OptimalControlProblem,
         recordings: tuple[OptimalRecording, ...],
         solver: str,
-        bar: object = None,
     ) -> None:
         self.problem, self.recordings, self.solver = problem, recordings, solver
         self.evaluations = 0
         x = np.concatenate([one.x for one in recordings])
         u = np.concatenate([one.u for one in recordings])
-        self.scales = np.array([_root_mean_square(column) for column in (*x.T, *u.T)])
+        sizes = np.array([_root_mean_square(column) for column in (*x.T, *u.T)])
+        # A signal that stands still has no size of its own: it is measured by the largest.
+        largest = float(np.max(sizes, initial=0.0)) or 1.0
+        self.scales = np.where(sizes > _STILL * largest, sizes, largest)
+        #: Sum of squares of all that was measured, over the scales.
+        self.size = sum(float(np.nansum((np.hstack([one.x[1:], one.u]) / self.scales) ** 2))
+                        for one in recordings)  # fmt: skip
 
     def unknowns(self, theta: Array) -> Array:
         logarithms = np.where(self.problem.positive, np.log(np.abs(theta)), theta)
@@ -136,75 +146,117 @@ class _Search:
         part = unknowns[: len(self.problem.parameter_names)]
         return np.where(self.problem.positive, np.exp(part), part)
 
-    def evaluate(
-        self, unknowns: Array, mu: float, before: _Evaluation | None
-    ) -> _Evaluation | None:
-        """Solve and differentiate every recording; None where one has no solution near by."""
-        self.evaluations += 1
-        problem, p, n = self.problem, len(self.problem.parameter_names), self.problem.n
-        theta = self.parameters(unknowns)
-        chain = np.where(problem.positive, theta, 1.0)
-        place, runs, parts, slopes = p, [], [], []
-        for index, one in enumerate(self.recordings):
-            own = one.unknown_start
-            x0 = unknowns[place : place + n] * self.scales[:n] if own else one.x0
-            run = self._run(index, theta, x0, mu, before)
-            if run is None:
+    def begin(self, unknowns: Array, mu: float, branch: int) -> _Evaluation | None:
+        """Solve every recording from a guess of its own.
+
+        Branch 0 begins at what was recorded, 1 at the initial state held, 2 at zeros: a problem
+        that is not convex has several plans, and only one of them was recorded.
+        """
+        theta, starts = self.split(unknowns)
+        runs: list[_Run] = []
+        for one, x0 in zip(self.recordings, starts, strict=True):
+            plan = self._first_plan(one, theta, x0, mu, branch)
+            if plan is None:
                 return None
+            if not one.closed_loop:
+                runs.append((plan, differentiate_plan(plan)))
+                continue
+            loop = closed_loop_from(plan, theta, x0, one.d, mu, self.solver)
+            if isinstance(loop, int):
+                if branch:
+                    return None
+                raise SolverError(
+                    f"sample {loop}", "no plan was found at the first parameters", "begin nearer"
+                )
+            runs.append(loop)
+        return self._assembled(unknowns, theta, mu, tuple(runs))
+
+    def _first_plan(
+        self, one: OptimalRecording, theta: Array, x0: Array, mu: float, branch: int
+    ) -> Plan | None:
+        problem, N = self.problem, self.problem.horizon
+        d = np.zeros((N, problem.disturbance_count)) if one.closed_loop else np.array(one.d)
+        held, still = np.repeat(x0[None], N + 1, axis=0), np.zeros((N, problem.m))
+        if branch == 0:
+            known = bool(np.all(np.isfinite(one.x)) and np.all(np.isfinite(one.u)))
+            guess = known and not one.closed_loop
+            guesses = ((np.array(one.x), np.array(one.u)),) if guess else ()
+            return solve_plan(problem, theta, x0, d=d, solver=self.solver, mu=mu, guesses=guesses)
+        x = held if branch == 1 else np.vstack([x0, np.zeros((N, problem.n))])
+        found = solved_plan(problem, theta, d, x, still, self.solver, mu)
+        return found if isinstance(found, Plan) else None
+
+    def evaluate(self, unknowns: Array, mu: float, before: _Evaluation) -> _Evaluation | None:
+        """Solve every recording near a solution; None where one has none near by."""
+        theta, starts = self.split(unknowns)
+        runs: list[_Run] = []
+        for one, old, x0 in zip(self.recordings, before.runs, starts, strict=True):
+            if isinstance(old, ClosedLoop):
+                loop = closed_loop_from(old.plans[0], theta, x0, one.d, mu, self.solver, old)
+                if isinstance(loop, int):
+                    return None
+                runs.append(loop)
+                continue
+            change = np.concatenate([theta - old[0].theta, x0 - old[0].x[0]])
+            # A step too long for Newton's method is a step to be shortened, not one to be
+            # repaired by a solver from outside: that takes forty times as long.
+            far = bool(np.any(change))
+            steps, solver = ((old[1].step(change),), "") if far else ((), self.solver)
+            near = nearby_plan(old[0], theta, x0, mu, steps, solver)
+            if near is None:
+                return None
+            runs.append((near, differentiate_plan(near)))
+        return self._assembled(unknowns, theta, mu, tuple(runs))
+
+    def split(self, unknowns: Array) -> tuple[Array, list[Array]]:
+        """Parameters, and the initial state of each recording."""
+        place, starts = len(self.problem.parameter_names), []
+        for one in self.recordings:
+            if one.unknown_start:
+                part = unknowns[place : place + self.problem.n]
+                starts.append(part * self.scales[: self.problem.n])
+                place += self.problem.n
+            else:
+                starts.append(one.x0)
+        return self.parameters(unknowns), starts
+
+    def _assembled(
+        self, unknowns: Array, theta: Array, mu: float, runs: tuple[_Run, ...]
+    ) -> _Evaluation:
+        """Residuals and their derivatives."""
+        self.evaluations += 1
+        n, place = self.problem.n, len(theta)
+        chain = np.where(self.problem.positive, theta, 1.0)
+        parts, slopes = [], []
+        for one, run in zip(self.recordings, runs, strict=True):
             x, u, dx, du = _trajectories(run)
-            kept = np.isfinite(np.hstack([one.x[1:], one.u]))
+            kept, first = _measured(one)
             scaled = np.hstack([x[1:] - one.x[1:], u - one.u]) / self.scales
             slope = np.concatenate([dx[1:], du], axis=1) / self.scales[:, None]
-            first = np.isfinite(one.x[0]) & own
-            residual = np.concatenate([((x[0] - one.x[0]) / self.scales[:n])[first], scaled[kept]])
+            parts += [((x[0] - one.x[0]) / self.scales[:n])[first], scaled[kept]]
             rows = np.concatenate([(dx[0] / self.scales[:n, None])[first], slope[kept]])
             whole = np.zeros((len(rows), len(unknowns)))
-            whole[:, :p] = rows[:, :p] * chain
-            if own:
-                whole[:, place : place + n] = rows[:, p:] * self.scales[:n]
+            whole[:, : len(theta)] = rows[:, : len(theta)] * chain
+            if one.unknown_start:
+                whole[:, place : place + n] = rows[:, len(theta) :] * self.scales[:n]
                 place += n
-            runs.append(run)
-            parts.append(residual)
             slopes.append(whole)
         return _Evaluation(
-            unknowns, theta, mu, np.concatenate(parts), np.concatenate(slopes), tuple(runs)
+            unknowns, theta, mu, np.concatenate(parts), np.concatenate(slopes), runs
         )
 
-    def _run(
-        self, index: int, theta: Array, x0: Array, mu: float, before: _Evaluation | None
-    ) -> tuple[Plan, PlanDerivatives] | ClosedLoop | None:
-        one = self.recordings[index]
-        if before is None:
-            if one.closed_loop:
-                return simulate_receding(
-                    self.problem, theta, x0, one.d, solver=self.solver, mu=mu
-                )
-            plan = self._first_plan(one, theta, x0, mu)
-            return plan, differentiate_plan(plan)
-        old = before.runs[index]
-        if isinstance(old, ClosedLoop):
-            loop = closed_loop_from(old.plans[0], theta, x0, one.d, mu, self.solver, old)
-            return None if isinstance(loop, int) else loop
-        change = np.concatenate([theta - old[0].theta, x0 - old[0].x[0]])
-        steps = (old[1].step(change),) if np.any(change) else ()
-        near = nearby_plan(old[0], theta, x0, mu, steps, self.solver)
-        return None if near is None else (near, differentiate_plan(near))
-
-    def _first_plan(self, one: OptimalRecording, theta: Array, x0: Array, mu: float) -> Plan:
-        measured = bool(np.all(np.isfinite(one.x)) and np.all(np.isfinite(one.u)))
-        guesses = ((np.array(one.x), np.array(one.u)),) if measured else ()
-        return solve_plan(
-            self.problem, theta, x0, d=one.d, solver=self.solver, mu=mu, guesses=guesses
-        )
-
-    def signals(self) -> Array:
+    def signals(self) -> IntArray:
         """Of each residual the column of its state or input."""
-        n, found = self.problem.n, []
+        found = []
         for one in self.recordings:
-            kept = np.isfinite(np.hstack([one.x[1:], one.u]))
-            first = np.isfinite(one.x[0]) & one.unknown_start
+            kept, first = _measured(one)
             found += [np.flatnonzero(first), np.nonzero(kept)[1]]
-        return np.concatenate(found).astype(np.float64) if n else np.zeros(0)
+        return np.concatenate(found)
+
+
+def _measured(one: OptimalRecording) -> tuple[BoolArray, BoolArray]:
+    """Which entries behind the first sample count, and which of the initial state."""
+    return np.isfinite(np.hstack([one.x[1:], one.u])), np.isfinite(one.x[0]) & one.unknown_start
 
 
 def fit_optimal_control(
@@ -253,19 +305,33 @@ def fit_optimal_control(
         raise InputError("mu_steps", f"got {tuple(mu_steps)!r:.60}", "give falling numbers")
     began = time.perf_counter()
     search = _Search(problem, tuple(recordings), solver)
-    current = search.evaluate(search.unknowns(problem.values(start)), mu_steps[0], None)
-    if current is None:
-        raise SolverError("start", "has no solution", "begin nearer")
+    unknowns, best, settled = search.unknowns(problem.values(start)), None, False
+    for branch in range(3):
+        begun = search.begin(unknowns, mu_steps[0], branch)
+        if begun is None:
+            continue
+        found, ended = _descend(search, begun, mu_steps, evaluations)
+        if best is None or found.loss < best.loss:
+            best, settled = found, ended
+        if best.loss < _EXPLAINED * search.size or search.evaluations >= evaluations:
+            break
+    assert best is not None  # noqa: S101 - branch 0 ends with an answer or an error
+    return _estimate(search, best, settled, time.perf_counter() - began)
+
+
+def _descend(
+    search: _Search, current: _Evaluation, mu_steps: Sequence[float], most: int
+) -> tuple[_Evaluation, bool]:
+    """The search along the falling mu."""
     settled = True
     for mu in mu_steps:
         if mu != current.mu:
-            moved = search.evaluate(current.unknowns, mu, current)
-            if moved is None:
-                settled = False
-                break
-            current = moved
-        current, settled = _levenberg(search, current, mu == mu_steps[-1], evaluations)
-    return _estimate(search, current, settled, time.perf_counter() - began)
+            followed = search.evaluate(current.unknowns, mu, current)
+            if followed is None:
+                return current, False
+            current = followed
+        current, settled = _levenberg(search, current, mu == mu_steps[-1], most)
+    return current, settled
 
 
 def _levenberg(
@@ -282,7 +348,7 @@ def _levenberg(
             gain = values / (values**2 + damping * values[0] ** 2)
             step = -right.T @ (gain * drive)
             step *= min(1.0, _LONGEST_STEP / max(float(np.max(np.abs(step))), 1e-300))
-            if current.loss == 0 or np.max(np.abs(step)) < 1e-12:
+            if current.loss == 0 or np.max(np.abs(step)) < _SMALL_STEP:
                 return current, True
             predicted = current.loss - float(
                 np.sum((current.residual + current.jacobian @ step) ** 2)
@@ -307,7 +373,7 @@ def _estimate(
 ) -> OptimalControlEstimate:
     problem, p = search.problem, len(search.problem.parameter_names)
     signals = search.signals()
-    loss = float(np.sum((found.residual * search.scales[signals.astype(int)]) ** 2))
+    loss = float(np.sum((found.residual * search.scales[signals]) ** 2))
     told = combinations(problem, found.theta, found.jacobian, found.residual)
     starts = [one.x0 for one in search.recordings]
     place = p
@@ -324,9 +390,7 @@ def _estimate(
     )  # fmt: skip
 
 
-def _trajectories(
-    run: tuple[Plan, PlanDerivatives] | ClosedLoop,
-) -> tuple[Array, Array, Array, Array]:
+def _trajectories(run: _Run) -> tuple[Array, Array, Array, Array]:
     """x (T + 1, n), u (T, m) and their derivatives by theta and x_0."""
     if isinstance(run, ClosedLoop):
         return run.x, run.u, run.dx, run.du
@@ -335,5 +399,4 @@ def _trajectories(
 
 def _root_mean_square(column: Array) -> float:
     known = column[np.isfinite(column)]
-    size = float(np.sqrt(np.mean(known**2))) if len(known) else 1.0
-    return size if size > 0 else 1.0
+    return float(np.sqrt(np.mean(known**2))) if len(known) else 0.0
