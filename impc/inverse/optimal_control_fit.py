@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy.stats
 
 from impc.arrays import Array, BoolArray, Frozen, IntArray
 from impc.control.nlp_solvers import require_solver
@@ -114,6 +115,31 @@ class OptimalControlEstimate(Frozen):
     evaluations: int
     seconds: float
 
+    def intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
+        """Low and high end of each parameter by its name, from the noise that is left.
+
+        Normal in the logarithms of positive parameters; the noise of each signal is the root mean
+        square of what is left of it. A parameter that is part of an untold combination has an
+        infinite interval.
+
+        Raises
+        ------
+        InputError
+            When the level is not between 0 and 1.
+        """
+        if not 0 < level < 1:
+            raise InputError("level", f"got {level:g}", "give one between 0 and 1")
+        reach = float(scipy.stats.norm.ppf(0.5 + level / 2)) * self.combinations.deviations
+        found = {}
+        for index, (name, value) in enumerate(self.theta.items()):
+            if self.problem.positive[index]:
+                with np.errstate(over="ignore"):
+                    factor = float(np.exp(reach[index]))
+                found[name] = (value / factor, value * factor)
+            else:
+                found[name] = (value - float(reach[index]), value + float(reach[index]))
+        return found
+
 
 class _Search:
     """The recordings with their scales, and a count of evaluations."""
@@ -198,11 +224,17 @@ class _Search:
                 runs.append(loop)
                 continue
             change = np.concatenate([theta - old[0].theta, x0 - old[0].x[0]])
-            # A step too long for Newton's method is a step to be shortened, not one to be
-            # repaired by a solver from outside: that takes forty times as long.
+            # Where plans of this kind explain the recording, a step too long for Newton's method is
+            # one to be shortened: a solver from outside takes forty times as long. Where they do
+            # not, it may find the kind that was recorded.
             far = bool(np.any(change))
-            steps, solver = ((old[1].step(change),), "") if far else ((), self.solver)
-            near = nearby_plan(old[0], theta, x0, mu, steps, solver)
+            lost = before.loss > _EXPLAINED * self.size
+            steps = (old[1].step(change),) if far else ()
+            near = nearby_plan(old[0], theta, x0, mu, steps, "" if far else self.solver)
+            if near is None and far and lost:
+                kind = solved_plan(self.problem, theta, old[0].d, np.vstack([x0, old[0].x[1:]]),
+                                   old[0].u, self.solver, mu)  # fmt: skip
+                near = kind if isinstance(kind, Plan) else None
             if near is None:
                 return None
             runs.append((near, differentiate_plan(near)))
@@ -374,7 +406,7 @@ def _estimate(
     problem, p = search.problem, len(search.problem.parameter_names)
     signals = search.signals()
     loss = float(np.sum((found.residual * search.scales[signals]) ** 2))
-    told = combinations(problem, found.theta, found.jacobian, found.residual)
+    told = combinations(problem, found.theta, found.jacobian, found.residual, signals)
     starts = [one.x0 for one in search.recordings]
     place = p
     for index, one in enumerate(search.recordings):
