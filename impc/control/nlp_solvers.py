@@ -171,6 +171,8 @@ def worst_row(
     """
     program = _program(problem)
     equal = np.concatenate([_equal(problem, k) for k in range(problem.horizon + 1)])
+    if np.all(equal):
+        return "", -1, 0.0
     excess = ca.MX.sym("excess", int((~equal).sum()))
     placed = np.zeros((len(equal), excess.numel()))
     placed[np.flatnonzero(~equal), np.arange(excess.numel())] = 1
@@ -190,7 +192,5 @@ def worst_row(
     wanted = wanted_rows(problem)
     labels = [(problem.rows[j], k) for k in range(problem.horizon) for j in np.flatnonzero(wanted[k])]
     labels += [(name, problem.horizon) for name in problem.terminal_rows]
-    if not len(left):
-        return "", -1, 0.0
     worst = int(np.argmax(left))
     return labels[worst][0], labels[worst][1], float(left[worst])

@@ -40,6 +40,7 @@ __all__ = ["Plan", "moved", "nearby_plan", "solve_plan", "solved_plan"]
 # Newton's method ends at 1e-13 to 1e-15 on the four systems of docs/nonlinear.md.
 _TOLERANCE = 1e-10
 _PRODUCT = 1e-3  # of s lam - mu, relative to mu
+_CENTRAL = 1e-2
 _STEPS = 40
 _SHORTEST = 1e-3  # a second step in a row that is shorter leads nowhere
 _TO_BOUNDARY = 0.995
@@ -150,8 +151,10 @@ def nearby_plan(
     problem, d = plan.problem, plan.d
     for guess in (*(moved(plan.point, step) for step in steps), plan.point):
         begun = replace(guess, x=np.vstack([x0, guess.x[1:]]))
-        if isinstance(found := _follow(problem, theta, d, begun, plan.mu, mu), Plan):
-            return found
+        # From a larger mu where a multiplier must come off: at 1e-10 its slack holds it there.
+        for first in dict.fromkeys([plan.mu, max(mu, _CENTRAL)]):
+            if isinstance(found := _follow(problem, theta, d, begun, first, mu), Plan):
+                return found
     if not solver:
         return None
     found = solved_plan(problem, theta, d, np.vstack([x0, plan.x[1:]]), plan.u, solver, mu)
@@ -254,8 +257,10 @@ def _newton(
     short = 0
     for _ in range(_STEPS):
         factors = system(problem, point, at)
-        if not np.isfinite(merit) or not factors.regular:
+        if not np.isfinite(merit):
             return ""
+        if not factors.regular:
+            return _flat(problem, factors, at)
         step = _step(problem, point, at, left, factors)
         length = _longest(point, step)
         for _halved in range(12):
@@ -275,10 +280,8 @@ def _newton(
             break
     if error >= _TOLERANCE:
         return ""
-    flat = _flat_sample(problem, system(problem, point, at), at)
-    if flat >= 0:
-        return f"the cost has no minimum in the inputs of sample {flat}"
-    return Plan(problem, theta, d, point, mu, at.cost, error)
+    flat = _flat(problem, system(problem, point, at), at)
+    return flat or Plan(problem, theta, d, point, mu, at.cost, error)
 
 
 def _errors(point: Point, left: Residuals, mu: float) -> tuple[float, float]:
@@ -304,15 +307,14 @@ def _step(
 
 def _longest(point: Point, step: Point) -> float:
     """The largest step up to 1 that leaves a share of every slack and multiplier."""
-    longest = 1.0
+    fall = 0.0
     for value, change in (
         (point.lam, step.lam), (point.s, step.s),
         (point.lam_end, step.lam_end), (point.s_end, step.s_end),
     ):  # fmt: skip
-        falling = change < 0
-        if np.any(falling):
-            longest = min(longest, _TO_BOUNDARY * float(np.min(value[falling] / -change[falling])))
-    return longest
+        asked = value > 0  # rows that are not asked for have a multiplier of zero
+        fall = max(fall, float(np.max(-change[asked] / value[asked], initial=0.0)))
+    return min(1.0, _TO_BOUNDARY / max(fall, 1e-300))
 
 
 def moved(point: Point, step: Point, length: float = 1.0, keep: float = 0.1) -> Point:
@@ -331,8 +333,8 @@ def moved(point: Point, step: Point, length: float = 1.0, keep: float = 0.1) -> 
     )  # fmt: skip
 
 
-def _flat_sample(problem: OptimalControlProblem, factors: System, at: Conditions) -> int:
-    """The last sample at which the second derivative along the dynamics is not positive, or -1.
+def _flat(problem: OptimalControlProblem, factors: System, at: Conditions) -> str:
+    """Where the second derivative along the dynamics is not positive, in words; or nothing.
 
     It is positive when the Riccati recursion over the stages has positive pivots.
     """
@@ -344,9 +346,9 @@ def _flat_sample(problem: OptimalControlProblem, factors: System, at: Conditions
         try:
             np.linalg.cholesky(whole[n:, n:])
         except np.linalg.LinAlgError:
-            return k
+            return f"the cost has no minimum in the inputs of sample {k}"
         P = whole[:n, :n] - whole[:n, n:] @ np.linalg.solve(whole[n:, n:], whole[n:, :n])
-    return -1
+    return ""
 
 
 def _no_plan(

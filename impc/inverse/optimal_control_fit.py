@@ -358,6 +358,8 @@ def _descend(
     settled = True
     for mu in mu_steps:
         if mu != current.mu:
+            if search.evaluations >= most:
+                return current, False
             followed = search.evaluate(current.unknowns, mu, current)
             if followed is None:
                 return current, False

@@ -182,7 +182,8 @@ def _power(name: str, exponent: float) -> str:
 
 def _untold_sentence(one: Combination) -> str:
     if len(one.exponents) == 1:
-        return f"{next(iter(one.exponents))} may have any value: nothing measured depends on it."
+        name = next(iter(one.exponents))
+        return f"{name} is not told: near its value nothing that was measured depends on it."
     parts = ", ".join(
         f"{name} by a" if item == 1 else f"{name} by a^{item:.3g}"
         for name, item in one.exponents.items()
