@@ -1,8 +1,8 @@
 """Nonlinear equations of motion in CasADi: cart-pole, robot arm, quadrotor, rocket.
 
 The four systems of the benchmark of Jin, Mou and Pappas 2021 (Safe Pontryagin Differentiable
-Programming), written from their mechanics: each function gives the rate of the state, for symbols or
-numbers. Attitudes are unit quaternions q = (q0, q1, q2, q3) of the body in the inertial frame.
+Programming), written from their mechanics: each function gives the rate of the state, for symbols
+or numbers. Attitudes are unit quaternions q = (q0, q1, q2, q3) of the body in the inertial frame.
 """
 
 from __future__ import annotations
@@ -37,15 +37,11 @@ def cart_pole(state: Any, force: Any, cart: Any, pole: Any, length: Any) -> Any:
         ca.horzcat(cart + pole, pole * length * cosine),
         ca.horzcat(pole * length * cosine, pole * length**2),
     )
-    right = ca.vertcat(
-        force + pole * length * rate**2 * sine, -pole * GRAVITY * length * sine
-    )
+    right = ca.vertcat(force + pole * length * rate**2 * sine, -pole * GRAVITY * length * sine)
     return ca.vertcat(velocity, rate, _solved(mass, right))
 
 
-def robot_arm(
-    state: Any, torque: Any, lengths: tuple[Any, Any], masses: tuple[Any, Any]
-) -> Any:
+def robot_arm(state: Any, torque: Any, lengths: tuple[Any, Any], masses: tuple[Any, Any]) -> Any:
     """Rate of (two joint angles, two rates) of two uniform rods in a horizontal plane.
 
     Parameters
@@ -64,9 +60,7 @@ def robot_arm(
     coupling = m2 * l1 * r2 * ca.cos(state[1])
     second = m2 * r2**2 + i2
     first = m1 * r1**2 + i1 + m2 * l1**2 + second + 2 * coupling
-    mass = ca.vertcat(
-        ca.horzcat(first, second + coupling), ca.horzcat(second + coupling, second)
-    )
+    mass = ca.vertcat(ca.horzcat(first, second + coupling), ca.horzcat(second + coupling, second))
     h = m2 * l1 * r2 * ca.sin(state[1])
     centrifugal = h * ca.vertcat(-(2 * rate[0] + rate[1]) * rate[1], rate[0] ** 2)
     return ca.vertcat(rate, _solved(mass, torque - centrifugal))
@@ -118,15 +112,13 @@ def rocket(state: Any, force: Any, inertia: Any, mass: Any, length: Any) -> Any:
 
 
 def rotation(q: Any) -> Any:
-    """Matrix (3, 3) that takes the body's coordinates to the inertial ones, of a unit quaternion."""
+    """Matrix (3, 3) from the body's coordinates to the inertial ones, of a unit quaternion q."""
     axis = q[1:]
     cross = ca.skew(axis)
     return ca.DM.eye(3) + 2 * q[0] * cross + 2 * ca.mtimes(cross, cross)
 
 
-def _free_body(
-    state: Any, force: Any, moment: Any, inertia: Any, mass: Any, gravity: Any
-) -> Any:
+def _free_body(state: Any, force: Any, moment: Any, inertia: Any, mass: Any, gravity: Any) -> Any:
     """Newton's and Euler's laws: force and moment in the body's frame, gravity in the inertial."""
     velocity, q, rates = state[3:6], state[6:10], state[10:13]
     acceleration = ca.mtimes(rotation(q), force) / mass + gravity

@@ -1,7 +1,7 @@
 """CasADi's solvers of nonlinear programs by name, as starts of `impc.control.plan`.
 
-The program is written with x_0 as an unknown that one equation fixes, and in the order u, x stage by
-stage, which is the structure that fatrop looks for. A solver's own word on how it ended is not
+The program is written with x_0 as an unknown that one equation fixes, and in the order x, u stage
+by stage, which is the structure that fatrop looks for. A solver's own word on how it ended is not
 used: with a mu_target above zero IPOPT converges and says that it did not. What it leaves is taken
 as a start, and judged by the conditions of docs/nonlinear.md.
 """
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
-from impc.arrays import Array
+from impc.arrays import Array, BoolArray
 from impc.control.relaxed_conditions import Point, wanted_rows
 from impc.errors import InputError
 
@@ -62,7 +62,7 @@ def _options(name: str, problem: OptimalControlProblem, mu: float) -> dict[str, 
     }  # fmt: skip
 
 
-def _equal(problem: OptimalControlProblem, k: int) -> Array:
+def _equal(problem: OptimalControlProblem, k: int) -> BoolArray:
     """Which constraints of a stage are equations: dynamics, and x_0 itself."""
     if k == problem.horizon:
         return np.zeros(len(problem.terminal_rows), dtype=bool)
@@ -190,7 +190,9 @@ def worst_row(
     )  # fmt: skip
     left = answer["x"].full().ravel()[len(guess) :]
     wanted = wanted_rows(problem)
-    labels = [(problem.rows[j], k) for k in range(problem.horizon) for j in np.flatnonzero(wanted[k])]
+    labels = [
+        (problem.rows[j], k) for k in range(problem.horizon) for j in np.flatnonzero(wanted[k])
+    ]
     labels += [(name, problem.horizon) for name in problem.terminal_rows]
     worst = int(np.argmax(left))
     return labels[worst][0], labels[worst][1], float(left[worst])

@@ -1,6 +1,6 @@
 """An optimal control problem with parameters anywhere, from CasADi expressions of the user's own.
 
-    minimise    e(x_N; theta) + sum_{k<N} l(x_k, u_k; theta)          over u_0 .. u_{N-1}, subject to
+    minimise    e(x_N; theta) + sum_{k<N} l(x_k, u_k; theta)      over u_0 .. u_{N-1}, subject to
                 x_{k+1} = f(x_k, u_k, d_k; theta),   x_0 given,
                 h(x_k, u_k; theta) <= 0,   k = 0 .. N-1,       h_N(x_N; theta) <= 0
 
@@ -10,6 +10,7 @@ docs/nonlinear.md has the derivation and an example.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -198,14 +199,12 @@ class OptimalControlProblem(Frozen):
         """
         for name in theta:
             if name not in self.parameter_names:
-                raise InputError(
-                    f"parameter {name}", "is not known", _among(self.parameter_names)
-                )
+                raise InputError(f"parameter {name}", "is not known", _among(self.parameter_names))
         found = []
         for name, positive in zip(self.parameter_names, self.positive, strict=True):
             if name not in theta:
                 raise InputError(f"parameter {name}", "has no value", "give one for each name")
-            value = theta[name]
+            value: Any = theta[name]
             if isinstance(value, bool) or not np.isscalar(value) or not np.isreal(value):
                 raise InputError(f"parameter {name}", f"got {value!r:.40}", "give a number")
             number = float(value)
@@ -355,7 +354,8 @@ def _names(symbols: Iterable[Any]) -> tuple[str, ...]:
 
 def _stacked(given: Mapping[str, Any]) -> tuple[Any, tuple[str, ...]]:
     """Expressions below each other, and a name for each row."""
-    parts, names = [], []
+    parts: list[Any] = []
+    names: list[str] = []
     for name, expression in given.items():
         part = ca.vec(expression) if isinstance(expression, ca.SX | ca.MX) else ca.DM(expression)
         parts.append(part)
@@ -369,7 +369,7 @@ def _function(
 ) -> Any:
     """A function of (x, u, d, theta) in SX where CasADi can; `alone`: of x and theta only."""
     flat = [item for group in symbols for item in group]
-    kind = ca.SX if isinstance(flat[0], ca.SX) else ca.MX
+    kind: Any = ca.SX if isinstance(flat[0], ca.SX) else ca.MX
     if any(not isinstance(item, kind) for item in flat):
         raise InputError("symbols", "are of SX and of MX", "make all of them with one of the two")
     try:
@@ -391,7 +391,7 @@ def _function(
     parts: list[Any] = []
     for whole, group in zip(outer, symbols, strict=True):
         ends = np.cumsum([0, *(item.numel() for item in group)])
-        parts += [whole[int(a) : int(b)] for a, b in zip(ends[:-1], ends[1:], strict=True)]
+        parts += [whole[int(a) : int(b)] for a, b in itertools.pairwise(ends)]
     made = ca.Function(name, outer, [raw(*parts)])
     if alone and any(made.jac_sparsity(0, index).nnz() for index in (1, 2)):
         raise InputError(name, "depends on an input or a disturbance", "give it of the last state")

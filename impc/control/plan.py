@@ -202,8 +202,12 @@ def _require_finite_start(
             at_end = k == problem.horizon
             if at_end != (function.name() in ("terminal_cost", "terminal_constraints")):
                 continue
-            found = function(x[k], np.zeros(problem.m) if at_end else u[k],
-                             np.zeros(problem.disturbance_count) if at_end else d[k], theta)
+            found = function(
+                x[k],
+                np.zeros(problem.m) if at_end else u[k],
+                np.zeros(problem.disturbance_count) if at_end else d[k],
+                theta,
+            )
             if not np.all(np.isfinite(found.full())):
                 raise InputError(
                     function.name(), f"is not finite at sample {k} of the start",

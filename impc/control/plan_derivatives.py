@@ -5,8 +5,8 @@ Differentiating the relaxed conditions of docs/nonlinear.md gives, with S = lam 
     [H + G'SG   J'] [dz ]     [L_zp + G'S g_p]
     [J          0 ] [dnu] = - [c_p           ],      ds = -(G dz + g_p),    dlam = -S ds,
 
-the system that Newton's method has factorised, with a right side for every parameter. As mu falls to
-zero S selects the active rows by itself. A row whose slack and multiplier are of one size is
+the system that Newton's method has factorised, with a right side for every parameter. As mu falls
+to zero S selects the active rows by itself. A row whose slack and multiplier are of one size is
 neither: the plan has a kink there, and what is returned lies between its two slopes.
 """
 

@@ -58,7 +58,7 @@ class ClosedLoop(Frozen):
 def _step(problem: OptimalControlProblem) -> Any:
     """f with its derivatives by x, u and theta."""
     f = problem.functions[0]
-    kind = ca.SX if f.is_a("SXFunction") else ca.MX
+    kind: Any = ca.SX if f.is_a("SXFunction") else ca.MX
     given = [kind.sym(letter, f.numel_in(index)) for index, letter in enumerate("xudt")]
     following = f(*given)
     slopes = [ca.densify(ca.jacobian(following, given[index])) for index in (0, 1, 3)]
@@ -74,9 +74,7 @@ def shifted(plan: Plan) -> Plan:
 
     lam, s = later(point.lam), later(point.s)
     lam[0], s[0] = np.where(plan.problem.movable, (lam[0], s[0]), ((0.0,), (1.0,)))
-    moved = replace(
-        point, x=later(point.x), u=later(point.u), nu=later(point.nu), lam=lam, s=s
-    )
+    moved = replace(point, x=later(point.x), u=later(point.u), nu=later(point.nu), lam=lam, s=s)
     return replace(plan, point=moved)
 
 
@@ -152,7 +150,9 @@ def closed_loop_from(
         u[t] = plan.u[0]
         own = np.vstack([np.hstack([np.eye(p), np.zeros((p, problem.n))]), dx[t]])
         du[t] = slope.u[0] @ own
-        next_x, f_x, f_u, f_theta = (item.full() for item in _step(problem)(x[t], u[t], d[t], theta))
+        next_x, f_x, f_u, f_theta = (
+            item.full() for item in _step(problem)(x[t], u[t], d[t], theta)
+        )
         x[t + 1] = next_x.ravel()
         dx[t + 1] = f_x @ dx[t] + f_u @ du[t]
         dx[t + 1, :, :p] += f_theta

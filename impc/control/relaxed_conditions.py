@@ -10,8 +10,8 @@ define x, u smoothly in theta and x_0 (Fiacco 1976). Eliminating ds and dlam lea
     [H + G'SG   J'] [dz ]     [grad L + G'(S (h + s) + (mu - s lam) / s)]
     [J          0 ] [dnu] = - [c                                        ],     S = lam / s,
 
-which is banded in the order u_0, nu_0, x_1, u_1, nu_1, x_2 ...: one LU factorisation (LAPACK's gbtrf)
-of 2n + m - 1 diagonals on either side serves Newton's step, every parameter and every x_0.
+which is banded in the order u_0, nu_0, x_1, u_1, nu_1, x_2 ...: one LU factorisation (LAPACK's
+gbtrf) of 2n + m - 1 diagonals on either side serves Newton's step, every parameter and every x_0.
 docs/nonlinear.md.
 """
 
@@ -198,14 +198,10 @@ def _stacks(values: Any, horizon: int) -> list[Array]:
             for item in values]  # fmt: skip
 
 
-def conditions(
-    problem: OptimalControlProblem, theta: Array, d: Array, point: Point
-) -> Conditions:
+def conditions(problem: OptimalControlProblem, theta: Array, d: Array, point: Point) -> Conditions:
     """Evaluate at parameters theta (p,) and disturbances d (N, d) that the plan reckons with."""
     made, N = _compiled(problem), problem.horizon
-    cost, gradient, f, h, H, F, G = _stacks(
-        made.stage(*_arguments(problem, theta, d, point)), N
-    )
+    cost, gradient, f, h, H, F, G = _stacks(made.stage(*_arguments(problem, theta, d, point)), N)
     end = made.end(point.x[-1], theta, point.lam_end)
     e, gradient_end, h_end, H_end, G_end = (item.full() for item in end)
     rows = np.where(wanted_rows(problem), h[:, :, 0], -1.0)
@@ -239,9 +235,7 @@ class Residuals(NamedTuple):
     products_end: Array
 
 
-def residuals(
-    problem: OptimalControlProblem, point: Point, at: Conditions, mu: float
-) -> Residuals:
+def residuals(problem: OptimalControlProblem, point: Point, at: Conditions, mu: float) -> Residuals:
     """The relaxed conditions of `at`, evaluated at the point, for the product mu."""
     n = problem.n
     by_x = np.vstack([at.gradient[1:, :n], at.gradient_end[None]]) - point.nu
@@ -380,7 +374,10 @@ def _reduced(
     ds = -sides.rows - at.G @ np.concatenate([x[:-1], u], axis=1)
     ds = ds * wanted_rows(problem)[:, :, None]
     ds_end = -sides.rows_end - at.G_end @ x[-1]
-    dlam, dlam_end = (-sides.products - lam * ds) / s, (-sides.products_end - lam_end * ds_end) / s_end
+    dlam, dlam_end = (
+        (-sides.products - lam * ds) / s,
+        (-sides.products_end - lam_end * ds_end) / s_end,
+    )
     return Point(x, u, found[:, m : m + n], dlam, ds, dlam_end, ds_end)
 
 
@@ -400,5 +397,7 @@ def _left(
         (sides.rows + at.G @ w) * wanted + step.s,
         sides.rows_end + at.G_end @ step.x[-1] + step.s_end,
         sides.products + point.lam[:, :, None] * step.s + point.s[:, :, None] * step.lam,
-        sides.products_end + point.lam_end[:, None] * step.s_end + point.s_end[:, None] * step.lam_end,
+        sides.products_end
+        + point.lam_end[:, None] * step.s_end
+        + point.s_end[:, None] * step.lam_end,
     )

@@ -10,6 +10,7 @@ smooth over changes of the active rows; at 1e-10 it is the problem itself. docs/
 
 from __future__ import annotations
 
+import itertools
 import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -273,9 +274,7 @@ class _Search:
                 whole[:, place : place + n] = rows[:, len(theta) :] * self.scales[:n]
                 place += n
             slopes.append(whole)
-        return _Evaluation(
-            unknowns, theta, mu, np.concatenate(parts), np.concatenate(slopes), runs
-        )
+        return _Evaluation(unknowns, theta, mu, np.concatenate(parts), np.concatenate(slopes), runs)
 
     def signals(self) -> IntArray:
         """Of each residual the column of its state or input."""
@@ -329,11 +328,33 @@ def fit_optimal_control(
         When a start is not usable, or a parameter moves nothing that was measured at any mu.
     InfeasibleError, SolverError
         When there is no plan at the start.
+
+    Examples
+    --------
+    A point with drag, pushed to the origin; drag and price are not known.
+
+    >>> import casadi as ca
+    >>> import impc
+    >>> x, u, drag, price = ca.SX.sym("x", 2), ca.SX.sym("u"), ca.SX.sym("drag"), ca.SX.sym("w")
+    >>> problem = impc.OptimalControlProblem(
+    ...     x, u, {"drag": drag, "price": price},
+    ...     next_state=x + 0.1 * ca.vertcat(x[1], u - drag * x[1] ** 3),
+    ...     stage_cost=price * x[0] ** 2 + u**2,
+    ...     constraints={"push": ca.vertcat(u - 1, -u - 1)},
+    ...     horizon=15,
+    ... )
+    >>> loop = problem.closed_loop({"drag": 0.3, "price": 5.0}, [1.0, 0.5], steps=20)
+    >>> recording = problem.recorded_loop(loop.x, loop.u)
+    >>> found = impc.fit_optimal_control(problem, [recording], {"drag": 0.5, "price": 3.0})
+    >>> {name: round(value, 6) for name, value in found.theta.items()}
+    {'drag': 0.3, 'price': 5.0}
+    >>> found.combinations.untold
+    ()
     """
     require_solver(solver)
     if not recordings:
         raise DataError("recordings", "there are none", "give at least one")
-    if not mu_steps or any(b >= a for a, b in zip(mu_steps[:-1], mu_steps[1:], strict=True)):
+    if not mu_steps or any(b >= a for a, b in itertools.pairwise(mu_steps)):
         raise InputError("mu_steps", f"got {tuple(mu_steps)!r:.60}", "give falling numbers")
     began = time.perf_counter()
     search = _Search(problem, tuple(recordings), solver)
@@ -347,7 +368,7 @@ def fit_optimal_control(
             best, settled = found, ended
         if best.loss < _EXPLAINED * search.size or search.evaluations >= evaluations:
             break
-    assert best is not None  # noqa: S101 - branch 0 ends with an answer or an error
+    assert best is not None  # branch 0 ends with an answer or an error
     return _estimate(search, best, settled, time.perf_counter() - began)
 
 

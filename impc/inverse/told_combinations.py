@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.arrays import Array, Frozen, IntArray
+from impc.arrays import Array, BoolArray, Frozen, IntArray
 
 if TYPE_CHECKING:
     from impc.control.optimal_control import OptimalControlProblem
@@ -135,7 +135,7 @@ def combinations(
     return Combinations(tuple(kept), untold, values, deviations)
 
 
-def _covariance(jacobian: Array, residual: Array, signals: IntArray, told: Array) -> Array:
+def _covariance(jacobian: Array, residual: Array, signals: IntArray, told: BoolArray) -> Array:
     """Of the estimate along told directions, each signal with the noise that is left of it."""
     left, values, right = np.linalg.svd(jacobian, full_matrices=False)
     rank = len(values) - int(np.count_nonzero(~told))
@@ -169,7 +169,9 @@ def _sparse(basis: Array) -> Array:
             smallest = np.min(np.abs(row[columns]))
             nearly = columns[np.abs(row[columns]) < smallest * (1 + _ROUND)]
             rows[index] = row / row[int(nearly[0])]
-    return np.where(np.abs(6 * rows - np.round(6 * rows)) < 6 * _ROUND, np.round(6 * rows) / 6, rows)
+    return np.where(
+        np.abs(6 * rows - np.round(6 * rows)) < 6 * _ROUND, np.round(6 * rows) / 6, rows
+    )
 
 
 def _named(row: Array, names: tuple[str, ...]) -> dict[str, float]:

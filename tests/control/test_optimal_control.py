@@ -113,7 +113,7 @@ def test_values_that_are_none_are_refused(theta: dict[str, Any], words: str) -> 
 def test_initial_states_solvers_and_mu_are_checked() -> None:
     problem = made()
     for x0 in ([1.0], [1.0, np.nan]):
-        with pytest.raises(DataError, match="x0: got shape .*; give 2 finite numbers"):
+        with pytest.raises(DataError, match=r"x0: got shape .*; give 2 finite numbers"):
             problem.plan(TRUTH, x0)
     with pytest.raises(InputError, match=r"solver: got 'snopt'; choose one of ipopt, sqpmethod"):
         problem.plan(TRUTH, [1, 0], solver="snopt")
@@ -142,7 +142,9 @@ def test_an_infeasible_problem_names_the_constraint_and_the_sample() -> None:
     """
     problem = made(constraints=lambda x, u, p: {
         "force": ca.vertcat(u - p["limit"], -u - p["limit"]), "place": x[0] - 0.3})  # fmt: skip
-    with pytest.raises(InfeasibleError, match=r"constraint force\[1\]: no plan .* keeps it at sample 0: the"):
+    with pytest.raises(
+        InfeasibleError, match=r"constraint force\[1\]: no plan .* keeps it at sample 0: the"
+    ):
         problem.plan(TRUTH, [0.0, 1.0])
     problem.plan(TRUTH | {"limit": 5.0}, [0.0, 1.0])
 

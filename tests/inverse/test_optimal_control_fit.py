@@ -35,9 +35,7 @@ def test_a_demonstration_gives_back_what_it_tells(name: str) -> None:
     truth = system.problem.values(system.truth)
     demonstration = system.problem.plan(system.truth, system.x0, mu=1e-12)
     rng = np.random.default_rng(5)
-    start = dict(
-        zip(system.truth, truth * np.exp(0.1 * rng.normal(size=len(truth))), strict=True)
-    )
+    start = dict(zip(system.truth, truth * np.exp(0.1 * rng.normal(size=len(truth))), strict=True))
     found = fit_optimal_control(
         system.problem, [system.problem.recorded_plan(demonstration.x, demonstration.u)], start
     )
