@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from impc.control.closed_loop import simulate_and_differentiate as simulate_and_differentiate
     from impc.control.constraint_rows import directions as directions
     from impc.control.controller import Controller as Controller
+    from impc.control.optimal_control import OptimalControlProblem as OptimalControlProblem
     from impc.control.terminal_set import TerminalSet as TerminalSet
     from impc.control.terminal_set import maximal_invariant_set as maximal_invariant_set
     from impc.errors import BoundsError as BoundsError
@@ -51,6 +52,7 @@ if TYPE_CHECKING:
     from impc.inverse.inverse_lqr import inverse_lqr_gradient as inverse_lqr_gradient
     from impc.inverse.inverse_lqr import inverse_lqr_lmi as inverse_lqr_lmi
     from impc.inverse.methods import estimate as estimate
+    from impc.inverse.optimal_control_fit import fit_optimal_control as fit_optimal_control
     from impc.inverse.problem import Problem as Problem
     from impc.inverse.solution_set import gain_fibre as gain_fibre
     from impc.model.bounds import Bounds as Bounds
@@ -81,6 +83,7 @@ _NAMES = {
     " simulate_and_differentiate",
     "control.constraint_rows": "directions",
     "control.controller": "Controller",
+    "control.optimal_control": "OptimalControlProblem",
     "control.terminal_set": "TerminalSet maximal_invariant_set",
     "errors": "BoundsError DataError ImpcError InfeasibleError InputError OutputError PlantError"
     " SolverError WeightsError",
@@ -95,6 +98,7 @@ _NAMES = {
     "inverse.estimates": "Estimate",
     "inverse.inverse_lqr": "inverse_lqr_gradient inverse_lqr_lmi",
     "inverse.methods": "estimate",
+    "inverse.optimal_control_fit": "fit_optimal_control",
     "inverse.problem": "Problem",
     "inverse.solution_set": "gain_fibre",
     "model.bounds": "Bounds",

@@ -46,6 +46,10 @@ ELSEWHERE = {
     "control/test_closed_loop.py": """
         control/compiled_loop.py control/constraint_rows.py""",
     "control/test_hard_plants.py": "control/infeasibility.py control/saturated.py",
+    "control/test_optimal_control.py": """
+        control/nlp_solvers.py control/optimal_recordings.py""",
+    "control/test_plan.py": """
+        control/plan_derivatives.py control/receding_horizon.py control/relaxed_conditions.py""",
     "control/test_seat_workload.py": "assess/identified_directions.py",
     "control/test_terminal_set.py": "control/halfspaces.py control/polygon.py",
     "documents/test_blocks.py": "cli/simulate_cohort.py",
@@ -76,6 +80,7 @@ ELSEWHERE = {
         inverse/quiet_samples.py""",
     "inverse/test_arrow.py": "inverse/trial_span.py",
     "inverse/test_structured_fit.py": "inverse/structured_search.py",
+    "inverse/test_optimal_control_fit.py": "inverse/told_combinations.py",
     "inverse/test_stationarity.py": "inverse/smoothing.py",
     "model/test_riccati.py": "model/bounds.py model/plant.py model/weights.py",
     "studies/plan/test_study.py": """

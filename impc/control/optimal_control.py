@@ -1,0 +1,422 @@
+"""An optimal control problem with parameters anywhere, from CasADi expressions of the user's own.
+
+    minimise    e(x_N; theta) + sum_{k<N} l(x_k, u_k; theta)      over u_0 .. u_{N-1}, subject to
+                x_{k+1} = f(x_k, u_k, d_k; theta),   x_0 given,
+                h(x_k, u_k; theta) <= 0,   k = 0 .. N-1,       h_N(x_N; theta) <= 0
+
+A row of h that no input moves is not asked for at k = 0, where nothing can be done about it.
+docs/nonlinear.md has the derivation and an example.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+
+from impc.arrays import Array, BoolArray, Frozen
+from impc.control.optimal_recordings import optimal_recording
+from impc.errors import DataError, InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+
+    from impc.control.optimal_recordings import OptimalRecording
+    from impc.control.plan import Plan
+    from impc.control.receding_horizon import ClosedLoop
+
+__all__ = ["OptimalControlProblem"]
+
+_LONGEST = 10_000  # stages: the program has as many as it has unknowns times states
+
+
+@dataclass(frozen=True, init=False, eq=False)
+class OptimalControlProblem(Frozen):
+    """The problem as a value: CasADi functions, names and sizes, checked once.
+
+    Parameters
+    ----------
+    states, inputs : casadi.SX or casadi.MX, or a list of them
+        Symbols x (n) and u (m): one vector, or scalars whose names are those of the signals.
+    parameters : dict
+        Name of each unknown -> its scalar symbol in the expressions.
+    next_state : casadi expression
+        f(x, u, d; theta) (n).
+    stage_cost : casadi expression
+        l(x, u; theta), a number; as a rule prices times features, one price a known number.
+    horizon : int
+        N, samples.
+    terminal_cost : casadi expression
+        e(x; theta), a number; none by default.
+    constraints, terminal_constraints : dict
+        Name -> expression, every entry of which is to be at most 0: rows of h(x, u; theta) and of
+        h_N(x; theta).
+    disturbances : casadi.SX or casadi.MX
+        Symbols d; they are known to the plant and 0 to a controller that looks ahead.
+    signed : sequence of str
+        Parameters that may have any sign; the others are positive and are searched in logarithms.
+    units : dict
+        Unit of a parameter by its name, for tables.
+
+    Attributes
+    ----------
+    horizon : int
+        N.
+    state_names, input_names, parameter_names : tuple of str
+        n, m and p of them.
+    rows, terminal_rows : tuple of str
+        A name for each row of h and h_N.
+    movable : BoolArray
+        Which rows of h an input moves (q,): the others are not asked for at k = 0.
+    positive : BoolArray
+        Which parameters are (p,).
+    units : tuple of str
+        (p,), empty where none is given.
+    disturbance_count : int
+        Number of disturbances.
+    functions : tuple
+        casadi.Function of (x, u, d, theta): f, l, e, h, h_N.
+
+    Raises
+    ------
+    InputError
+        When an expression has a symbol that is not among states, inputs, disturbances and
+        parameters, or the wrong size; when a parameter is in no expression.
+
+    Examples
+    --------
+    A point that is driven to the origin at the least effort, its force limited; mass and price are
+    not known.
+
+    >>> import casadi as ca
+    >>> import impc
+    >>> x, u = ca.SX.sym("x", 2), ca.SX.sym("force")
+    >>> mass, price = ca.SX.sym("mass"), ca.SX.sym("price")
+    >>> problem = impc.OptimalControlProblem(
+    ...     x, u, {"mass": mass, "price": price},
+    ...     next_state=x + 0.1 * ca.vertcat(x[1], u / mass),
+    ...     stage_cost=price * ca.sumsqr(x) + u**2,
+    ...     constraints={"force": ca.vertcat(u - 1, -u - 1)},
+    ...     horizon=20,
+    ... )
+    >>> plan = problem.plan({"mass": 1.5, "price": 10.0}, [1.0, 0.0])
+    >>> plan.x.shape, bool(plan.u.min() > -1.0 - 1e-9)
+    ((21, 2), True)
+    """
+
+    horizon: int
+    state_names: tuple[str, ...]
+    input_names: tuple[str, ...]
+    parameter_names: tuple[str, ...]
+    rows: tuple[str, ...]
+    terminal_rows: tuple[str, ...]
+    movable: BoolArray
+    positive: BoolArray
+    units: tuple[str, ...]
+    disturbance_count: int
+    functions: tuple[Any, ...]
+
+    def __init__(
+        self,
+        states: Any,
+        inputs: Any,
+        parameters: Mapping[str, Any],
+        next_state: Any,
+        stage_cost: Any,
+        horizon: int,
+        *,
+        terminal_cost: Any = 0,
+        constraints: Mapping[str, Any] | None = None,
+        terminal_constraints: Mapping[str, Any] | None = None,
+        disturbances: Any = None,
+        signed: Sequence[str] = (),
+        units: Mapping[str, str] | None = None,
+    ) -> None:
+        if isinstance(horizon, bool) or not isinstance(horizon, int | np.integer):
+            raise InputError("horizon", f"got {horizon!r:.40}", "give a whole number of samples")
+        if not 1 <= horizon <= _LONGEST:
+            raise InputError("horizon", f"got {horizon}", f"give 1 to {_LONGEST} samples")
+        kinds = (states, inputs, [] if disturbances is None else disturbances)
+        x, u, d = (_symbols(name, given) for name, given in
+                   zip(("states", "inputs", "disturbances"), kinds, strict=True))  # fmt: skip
+        theta = [_scalar(name, symbol) for name, symbol in dict(parameters).items()]
+        for subject, given in (("states", x), ("inputs", u), ("parameters", theta)):
+            if not given:
+                raise InputError(subject, "there are none", "give at least one")
+        names = tuple(dict(parameters))
+        path, rows = _stacked(constraints or {})
+        last, terminal_rows = _stacked(terminal_constraints or {})
+        count = [sum(item.numel() for item in given) for given in (x, u, d)]
+        symbols = (x, u, d, theta)
+        functions = (
+            _function("next_state", next_state, symbols, (count[0],)),
+            _function("stage_cost", stage_cost, symbols, (1,)),
+            _function("terminal_cost", terminal_cost, symbols, (1,), alone=True),
+            _function("constraints", path, symbols, (len(rows),)),
+            _function("terminal_constraints", last, symbols, (len(terminal_rows),), alone=True),
+        )
+        _require_influence(names, functions)
+        for name in (*signed, *(units or {})):
+            if name not in names:
+                raise InputError(f"parameter {name}", "is not among the parameters", _among(names))
+        moved = ca.DM(functions[3].jac_sparsity(0, 1), 1).full()
+        fields = {
+            "horizon": int(horizon),
+            "state_names": _names(x),
+            "input_names": _names(u),
+            "parameter_names": names,
+            "rows": rows,
+            "terminal_rows": terminal_rows,
+            "movable": _fixed(moved.any(axis=1)),
+            "positive": _fixed([name not in signed for name in names]),
+            "units": tuple((units or {}).get(name, "") for name in names),
+            "disturbance_count": count[2],
+            "functions": functions,
+        }
+        for field, value in fields.items():
+            object.__setattr__(self, field, value)
+
+    @property
+    def n(self) -> int:
+        """Number of states."""
+        return len(self.state_names)
+
+    @property
+    def m(self) -> int:
+        """Number of inputs."""
+        return len(self.input_names)
+
+    def values(self, theta: Mapping[str, float]) -> Array:
+        """Values of the parameters (p,) in their order, from values by name.
+
+        Raises
+        ------
+        InputError
+            When one is missing, unknown, not finite, or not positive and not signed.
+        """
+        for name in theta:
+            if name not in self.parameter_names:
+                raise InputError(f"parameter {name}", "is not known", _among(self.parameter_names))
+        found = []
+        for name, positive in zip(self.parameter_names, self.positive, strict=True):
+            if name not in theta:
+                raise InputError(f"parameter {name}", "has no value", "give one for each name")
+            value: Any = theta[name]
+            if isinstance(value, bool) or not np.isscalar(value) or not np.isreal(value):
+                raise InputError(f"parameter {name}", f"got {value!r:.40}", "give a number")
+            number = float(value)
+            if not np.isfinite(number) or (positive and number <= 0):
+                wanted = "a positive one, or name it in signed" if positive else "a finite one"
+                raise InputError(f"parameter {name}", f"got {number:g}", f"give {wanted}")
+            found.append(number)
+        return np.array(found)
+
+    def start(self, x0: Any) -> Array:
+        """The initial state (n,), checked.
+
+        Raises
+        ------
+        DataError
+            When it has another size or entries that are not finite.
+        """
+        given = np.asarray(x0, dtype=np.float64).ravel()
+        if given.shape != (self.n,) or not np.all(np.isfinite(given)):
+            raise DataError("x0", f"got shape {np.shape(x0)}", f"give {self.n} finite numbers")
+        return given
+
+    def plan(
+        self, theta: Mapping[str, float], x0: Any, *, solver: str = "ipopt", mu: float = 1e-10
+    ) -> Plan:
+        """The optimal plan from a state, as `impc.control.plan.solve_plan`.
+
+        Parameters
+        ----------
+        theta : dict
+            Value of each parameter by its name.
+        x0 : array_like
+            (n,).
+        solver : str
+            One of `impc.control.nlp_solvers.SOLVERS`.
+        mu : float
+            Of the relaxed conditions lam g = -mu.
+
+        Raises
+        ------
+        InfeasibleError, SolverError
+            As `impc.control.plan.solve_plan`.
+        """
+        from impc.control.plan import solve_plan  # noqa: PLC0415 - it stands on this module
+
+        return solve_plan(self, self.values(theta), self.start(x0), solver=solver, mu=mu)
+
+    def closed_loop(
+        self,
+        theta: Mapping[str, float],
+        x0: Any,
+        steps: int,
+        *,
+        d: Any = None,
+        solver: str = "ipopt",
+        mu: float = 1e-10,
+    ) -> ClosedLoop:
+        """The closed loop of `steps` samples: at each the first input of the plan from there.
+
+        Parameters
+        ----------
+        theta, x0, solver, mu
+            As `plan`.
+        steps : int
+            T, samples.
+        d : array_like, optional
+            Disturbances (T, d) that the plant sees and the controller does not.
+
+        Raises
+        ------
+        InfeasibleError, SolverError
+            As `impc.control.receding_horizon.simulate_receding`.
+        """
+        from impc.control.receding_horizon import simulate_receding  # noqa: PLC0415 - see plan
+
+        known = np.zeros((steps, self.disturbance_count)) if d is None else np.asarray(d)
+        return simulate_receding(
+            self, self.values(theta), self.start(x0), known.reshape(steps, -1), solver=solver, mu=mu
+        )
+
+    def recorded_plan(
+        self,
+        x: Any,
+        u: Any = None,
+        *,
+        d: Any = None,
+        x0: Any = None,
+        unknown_start: bool = False,
+    ) -> OptimalRecording:
+        """A recording that is one plan: `impc.control.optimal_recordings.optimal_recording`.
+
+        x (N + 1, n), u (N, m), d (N, d), x0 (n,); NaN is not measured.
+        """
+        return optimal_recording(
+            self, x, u, closed_loop=False, d=d, x0=x0, unknown_start=unknown_start
+        )
+
+    def recorded_loop(
+        self,
+        x: Any,
+        u: Any = None,
+        *,
+        d: Any = None,
+        x0: Any = None,
+        unknown_start: bool = False,
+    ) -> OptimalRecording:
+        """A recording of the closed loop: `impc.control.optimal_recordings.optimal_recording`.
+
+        x (T + 1, n), u (T, m), d (T, d), x0 (n,); NaN is not measured.
+        """
+        return optimal_recording(
+            self, x, u, closed_loop=True, d=d, x0=x0, unknown_start=unknown_start
+        )
+
+
+def _symbols(subject: str, given: Any) -> list[Any]:
+    """Symbols of SX or MX; SX are taken apart, so that each has its name."""
+    items = given if isinstance(given, list | tuple) else [given]
+    found: list[Any] = []
+    for item in items:
+        if not isinstance(item, ca.SX | ca.MX) or not item.is_valid_input():
+            raise InputError(
+                subject, f"got {type(item).__name__}, not symbols", "make them with casadi's sym"
+            )
+        found += ca.vertsplit(ca.vec(item)) if isinstance(item, ca.SX) else [ca.vec(item)]
+    return found
+
+
+def _scalar(name: str, symbol: Any) -> Any:
+    if len(found := _symbols(f"parameter {name}", symbol)) != 1 or found[0].numel() != 1:
+        raise InputError(f"parameter {name}", "is not a scalar symbol", "give one symbol a name")
+    return found[0]
+
+
+def _names(symbols: Iterable[Any]) -> tuple[str, ...]:
+    """Of scalars their own; of the entries of MX, the vector's with a number."""
+    return tuple(
+        name
+        for item in symbols
+        for name in (
+            [item.name()]
+            if item.numel() == 1
+            else [f"{item.name()}[{k}]" for k in range(item.numel())]
+        )
+    )
+
+
+def _stacked(given: Mapping[str, Any]) -> tuple[Any, tuple[str, ...]]:
+    """Expressions below each other, and a name for each row."""
+    parts: list[Any] = []
+    names: list[str] = []
+    for name, expression in given.items():
+        part = ca.vec(expression) if isinstance(expression, ca.SX | ca.MX) else ca.DM(expression)
+        parts.append(part)
+        size = part.numel()
+        names += [name] if size == 1 else [f"{name}[{row}]" for row in range(size)]
+    return (ca.vertcat(*parts) if parts else ca.DM.zeros(0, 1)), tuple(names)
+
+
+def _function(
+    name: str, expression: Any, symbols: Sequence[list[Any]], size: tuple[int], alone: bool = False
+) -> Any:
+    """A function of (x, u, d, theta) in SX where CasADi can; `alone`: of x and theta only."""
+    flat = [item for group in symbols for item in group]
+    kind: Any = ca.SX if isinstance(flat[0], ca.SX) else ca.MX
+    if any(not isinstance(item, kind) for item in flat):
+        raise InputError("symbols", "are of SX and of MX", "make all of them with one of the two")
+    try:
+        vector = ca.densify(kind(expression))
+        raw = ca.Function(name, flat, [vector], {"allow_free": True})
+    except (NotImplementedError, TypeError, RuntimeError):
+        raise InputError(
+            name, f"got {type(expression).__name__}", f"give an expression of {kind.__name__}"
+        ) from None
+    if vector.shape != (size[0], 1) and not (size[0] == 0 and vector.numel() == 0):
+        raise InputError(name, f"has shape {vector.shape}", f"give ({size[0]}, 1)")
+    if raw.has_free():
+        raise InputError(
+            name, f"has the symbol {', '.join(raw.get_free())}",
+            "which is neither a state, an input, a disturbance nor a parameter: give it a value",
+        )  # fmt: skip
+    outer = [ca.MX.sym(letter, sum(i.numel() for i in group))
+             for letter, group in zip("xudp", symbols, strict=True)]  # fmt: skip
+    parts: list[Any] = []
+    for whole, group in zip(outer, symbols, strict=True):
+        ends = np.cumsum([0, *(item.numel() for item in group)])
+        parts += [whole[int(a) : int(b)] for a, b in itertools.pairwise(ends)]
+    made = ca.Function(name, outer, [raw(*parts)])
+    if alone and any(made.jac_sparsity(0, index).nnz() for index in (1, 2)):
+        raise InputError(name, "depends on an input or a disturbance", "give it of the last state")
+    try:
+        return made.expand()
+    except RuntimeError:  # it calls what has no scalar form, such as an integrator
+        return made
+
+
+def _require_influence(names: Sequence[str], functions: Sequence[Any]) -> None:
+    """Every parameter is in an expression."""
+    seen = np.zeros(len(names), dtype=bool)
+    for function in functions:
+        if function.numel_out(0):
+            seen |= np.array(ca.DM(function.jac_sparsity(0, 3), 1).full()).any(axis=0)
+    for name, there in zip(names, seen, strict=True):
+        if not there:
+            raise InputError(f"parameter {name}", "is in no expression", "take it out")
+
+
+def _among(names: Sequence[str]) -> str:
+    return f"known: {', '.join(names)}"
+
+
+def _fixed(values: Any) -> BoolArray:
+    found = np.array(values, dtype=bool)
+    found.flags.writeable = False
+    return found

@@ -1,0 +1,116 @@
+"""Recordings that an optimal control problem is to explain: one plan, or a closed loop.
+
+What is not measured is NaN. docs/nonlinear.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from impc.arrays import Array, Frozen, frozen
+from impc.errors import DataError
+
+if TYPE_CHECKING:
+    from impc.control.optimal_control import OptimalControlProblem
+
+__all__ = ["OptimalRecording", "optimal_recording"]
+
+
+@dataclass(frozen=True, eq=False)
+class OptimalRecording(Frozen):
+    """States and inputs over T samples; NaN where they are not measured.
+
+    Attributes
+    ----------
+    x, u : Array
+        (T + 1, n) and (T, m).
+    d : Array
+        Disturbances (T, d).
+    x0 : Array
+        Initial state (n,): the true one, or a guess when it is unknown.
+    closed_loop : bool
+        Whether every input is the first of a plan of its own, and not all of one plan.
+    unknown_start : bool
+        Whether the initial state is searched too.
+    """
+
+    x: Array
+    u: Array
+    d: Array
+    x0: Array
+    closed_loop: bool
+    unknown_start: bool
+
+
+def optimal_recording(
+    problem: OptimalControlProblem,
+    x: Any,
+    u: Any = None,
+    *,
+    closed_loop: bool,
+    d: Any = None,
+    x0: Any = None,
+    unknown_start: bool = False,
+) -> OptimalRecording:
+    """A recording, checked.
+
+    Parameters
+    ----------
+    problem : OptimalControlProblem
+    x : array_like
+        States (T + 1, n); T is the horizon for one plan.
+    u : array_like, optional
+        Inputs (T, m); not measured by default.
+    closed_loop : bool
+        Whether it is one; else it is one plan.
+    d : array_like, optional
+        Disturbances (T, d); none by default.
+    x0 : array_like, optional
+        (n,); the first of x by default.
+    unknown_start : bool
+        Whether x0 is only a guess.
+
+    Raises
+    ------
+    DataError
+        When a size is not that of the problem, an entry is infinite, nothing is measured, or
+        the initial state or a disturbance is missing.
+    """
+    states = _table("states", x, problem.n)
+    T = len(states) - 1
+    if T < 1 or (not closed_loop and problem.horizon != T):
+        wanted = "at least 2" if closed_loop else str(problem.horizon + 1)
+        raise DataError("states", f"has {T + 1} samples", f"give {wanted}")
+    inputs = np.full((T, problem.m), np.nan) if u is None else _table("inputs", u, problem.m)
+    count = problem.disturbance_count
+    known = np.zeros((T, count)) if d is None else _table("disturbances", d, count)
+    for name, values in (("inputs", inputs), ("disturbances", known)):
+        if len(values) != T:
+            raise DataError(name, f"has {len(values)} samples", f"give {T}, one fewer than states")
+    start = states[0] if x0 is None else np.asarray(x0, dtype=np.float64).ravel()
+    if start.shape != (problem.n,) or not np.all(np.isfinite(start)):
+        raise DataError("x0", "is not known", f"give {problem.n} finite numbers as x0")
+    if not np.all(np.isfinite(known)):
+        raise DataError("disturbances", "are not all known", "give finite numbers")
+    if not np.any(np.isfinite(states[1:])) and not np.any(np.isfinite(inputs)):
+        raise DataError("recording", "has nothing that was measured", "give states or inputs")
+    return OptimalRecording(
+        frozen(states), frozen(inputs), frozen(known), frozen(start), closed_loop, unknown_start
+    )
+
+
+def _table(name: str, values: Any, columns: int) -> Array:
+    try:
+        table = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise DataError(name, "are not numbers", "give an array") from None
+    if table.ndim == 1 and columns == 1:
+        table = table[:, None]
+    if table.ndim != 2 or table.shape[1] != columns:
+        raise DataError(name, f"has shape {table.shape}", f"give (samples, {columns})")
+    if np.any(np.isinf(table)):
+        raise DataError(name, "has infinite entries", "give NaN where nothing was measured")
+    return table

@@ -1,0 +1,193 @@
+"""Which combinations of the parameters the recordings tell: singular values, with names.
+
+To first order the residual moves by J dphi, phi the logarithms of the positive parameters and the
+signed ones themselves. Directions of J with a singular value of nothing are combinations that may
+take any value; written with as few parameters as there are, their exponents are those of a scaling
+(l by a, m by a^-2). The told ones are the products that no such scaling changes. docs/nonlinear.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.arrays import Array, BoolArray, Frozen, IntArray
+
+if TYPE_CHECKING:
+    from impc.control.optimal_control import OptimalControlProblem
+
+__all__ = ["Combination", "Combinations", "combinations"]
+
+# Relative to the largest singular value. On the four systems of docs/nonlinear.md the weakest told
+# direction has 3e-4 and the strongest untold one, of a bound that nothing touches, 5e-11.
+_NOTHING = 1e-8
+_ROUND = 1e-3  # of an exponent: nearer to nothing, or to a multiple of a sixth, it is that
+
+
+@dataclass(frozen=True)
+class Combination:
+    """A product of powers of parameters.
+
+    Attributes
+    ----------
+    exponents : dict
+        By name; of a signed parameter the factor of its difference.
+    value : float
+        Of the product at the estimate, 1 for an untold one.
+    deviation : float
+        Standard deviation of its logarithm; infinite for an untold one.
+    """
+
+    exponents: dict[str, float]
+    value: float
+    deviation: float
+
+    @property
+    def name(self) -> str:
+        """Such as m1 l1^2 or l2 / l1."""
+        over = [_power(name, item) for name, item in self.exponents.items() if item > 0]
+        under = [_power(name, -item) for name, item in self.exponents.items() if item < 0]
+        return " / ".join([" ".join(over) or "1", *under])
+
+
+@dataclass(frozen=True, eq=False)
+class Combinations(Frozen):
+    """What is told and what is not.
+
+    Attributes
+    ----------
+    told, untold : tuple of Combination
+        Together as many as there are parameters.
+    singular_values : Array
+        (p,), falling.
+    deviations : Array
+        Standard deviation of each logarithm or signed parameter (p,); infinite where it is part
+        of an untold combination.
+    """
+
+    told: tuple[Combination, ...]
+    untold: tuple[Combination, ...]
+    singular_values: Array
+    deviations: Array
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """One for each untold combination, and one for those told."""
+        found = [_untold_sentence(one) for one in self.untold]
+        values = ", ".join(f"{one.name} = {one.value:.6g}" for one in self.told)
+        return (*found, f"Told: {values}." if values else "Nothing is told.")
+
+
+def combinations(
+    problem: OptimalControlProblem,
+    theta: Array,
+    jacobian: Array,
+    residual: Array,
+    signals: IntArray,
+) -> Combinations:
+    """Split the parameters.
+
+    Parameters
+    ----------
+    problem : OptimalControlProblem
+    theta : Array
+        (p,).
+    jacobian : Array
+        (r, k), the parameters first, unknown initial states behind.
+    residual : Array
+        (r,).
+    signals : IntArray
+        Which signal each residual is of (r,); each has its own noise.
+    """
+    p = len(theta)
+    own, rest = jacobian[:, :p], jacobian[:, p:]
+    if rest.shape[1]:
+        own = own - rest @ np.linalg.lstsq(rest, own, rcond=None)[0]
+    _, values, right = np.linalg.svd(own, full_matrices=True)
+    values = np.append(values, np.zeros(p - len(values)))
+    freedom = max(len(residual) - jacobian.shape[1], 1)
+    noise = float(np.sqrt(residual @ residual / freedom))
+    # A direction that the noise leaves open by more than a factor of e is not told either.
+    told = (values > _NOTHING * values[0]) & (values > noise)
+    covariance = _covariance(jacobian, residual, signals, told)[:p, :p]
+    basis = _sparse(right[~told])
+    pivots = [int(np.flatnonzero(np.isclose(row, 1.0))[0]) for row in basis]
+    names = problem.parameter_names
+    untold = tuple(
+        Combination(_named(row / np.min(np.abs(row[row != 0])), names), 1.0, np.inf)
+        for row in basis
+    )
+    kept = []
+    for index in range(p):
+        if index in pivots:
+            continue
+        exponents = np.eye(p)[index]
+        exponents[pivots] = -basis[:, index]
+        deviation = float(np.sqrt(max(exponents @ covariance @ exponents, 0.0)))
+        logarithms = np.where(problem.positive, np.log(np.abs(theta)), theta)
+        single = np.count_nonzero(exponents) == 1 and not problem.positive[index]
+        value = float(theta[index] if single else np.exp(exponents @ logarithms))
+        kept.append(Combination(_named(exponents, names), value, deviation))
+    involved = np.any(basis != 0, axis=0) if len(basis) else np.zeros(p, dtype=bool)
+    deviations = np.where(involved, np.inf, np.sqrt(np.maximum(np.diag(covariance), 0.0)))
+    return Combinations(tuple(kept), untold, values, deviations)
+
+
+def _covariance(jacobian: Array, residual: Array, signals: IntArray, told: BoolArray) -> Array:
+    """Of the estimate along told directions, each signal with the noise that is left of it."""
+    left, values, right = np.linalg.svd(jacobian, full_matrices=False)
+    rank = len(values) - int(np.count_nonzero(~told))
+    gains = right[:rank].T @ (left[:, :rank] / values[:rank]).T
+    freedom = max(len(residual) - rank, 1)
+    variance = np.zeros(len(residual))
+    for signal in np.unique(signals):
+        own = signals == signal
+        variance[own] = np.mean(residual[own] ** 2) * len(residual) / freedom
+    return np.asarray((gains * variance) @ gains.T)
+
+
+def _sparse(basis: Array) -> Array:
+    """The same space (k, p) by rows that are one in a column where the others are zero."""
+    rows, taken = basis.copy(), []
+    for index in range(len(rows)):
+        free = np.abs(rows[index:])
+        place = np.unravel_index(int(np.argmax(free)), free.shape)
+        row, column = index + int(place[0]), int(place[1])
+        rows[[index, row]] = rows[[row, index]]
+        rows[index] /= rows[index, column]
+        for other in range(len(rows)):
+            if other != index:
+                rows[other] -= rows[other, column] * rows[index]
+        taken.append(column)
+    rows[np.abs(rows) < _ROUND] = 0.0
+    for index, row in enumerate(rows):  # the column with the smallest entry: exponents are whole
+        alone = (row != 0) & (np.count_nonzero(rows, axis=0) == 1)
+        if np.any(alone):
+            columns = np.flatnonzero(alone)
+            smallest = np.min(np.abs(row[columns]))
+            nearly = columns[np.abs(row[columns]) < smallest * (1 + _ROUND)]
+            rows[index] = row / row[int(nearly[0])]
+    return np.where(
+        np.abs(6 * rows - np.round(6 * rows)) < 6 * _ROUND, np.round(6 * rows) / 6, rows
+    )
+
+
+def _named(row: Array, names: tuple[str, ...]) -> dict[str, float]:
+    return {name: float(item) for name, item in zip(names, row, strict=True) if item != 0}
+
+
+def _power(name: str, exponent: float) -> str:
+    return name if exponent == 1 else f"{name}^{exponent:.3g}"
+
+
+def _untold_sentence(one: Combination) -> str:
+    if len(one.exponents) == 1:
+        name = next(iter(one.exponents))
+        return f"{name} is not told: near its value nothing that was measured depends on it."
+    parts = ", ".join(
+        f"{name} by a" if item == 1 else f"{name} by a^{item:.3g}"
+        for name, item in one.exponents.items()
+    )
+    return f"Together any factor a is possible: {parts}."

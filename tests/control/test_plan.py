@@ -1,0 +1,159 @@
+"""Plans against other routes to the same answer, and their derivatives against differences."""
+
+from __future__ import annotations
+
+import casadi as ca
+import control
+import numpy as np
+import pytest
+
+from experiments.peer_systems import SYSTEMS, PeerSystem
+from impc.control.closed_loop import Status, scenario, simulate
+from impc.control.controller import Controller
+from impc.control.nlp_solvers import SOLVERS
+from impc.control.optimal_control import OptimalControlProblem
+from impc.control.plan import Plan, nearby_plan
+from impc.control.plan_derivatives import (
+    dependent_rows,
+    differentiate_plan,
+    weakly_active_rows,
+)
+from impc.model.bounds import Bounds
+from impc.model.plant import Plant
+from impc.model.weights import Weights
+from tests.control.linear_twin import linear_twin
+from tests.support import extrapolated_slope, random_plant, random_weights
+
+
+@pytest.mark.parametrize("limit", [0.3, 50.0], ids=["saturated", "not saturated"])
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_a_linear_plant_has_the_loop_of_the_linear_route(limit: float, solver: str) -> None:
+    rng = np.random.default_rng(7)
+    plant = random_plant(rng, 3, 2, 1.05)
+    weights = Weights(random_weights(rng, 3), random_weights(rng, 2))
+    controller = Controller(plant, weights, Bounds(plant, u_min=-limit, u_max=limit), 6,
+                            terminal_set=False)  # fmt: skip
+    expected = simulate(controller, scenario(plant, [0.8, -0.5, 0.4], 15))
+    assert bool(np.any(expected.status == Status.ACTIVE)) == (limit < 1)
+    problem, theta = linear_twin(controller, weights)
+    found = problem.closed_loop(theta, [0.8, -0.5, 0.4], 15, solver=solver)
+    # 3e-10 at mu = 1e-10: the distance from a bound is mu over its multiplier.
+    np.testing.assert_allclose(found.x, expected.x, atol=1e-8)
+    np.testing.assert_allclose(found.u, expected.u, atol=1e-8)
+
+
+@pytest.fixture(scope="module", params=list(SYSTEMS))
+def system(request: pytest.FixtureRequest) -> PeerSystem:
+    return SYSTEMS[request.param]()
+
+
+@pytest.fixture(scope="module")
+def plan(system: PeerSystem) -> Plan:
+    return system.problem.plan(system.truth, system.x0)
+
+
+#: Constraint -> samples at which it is active in the demonstration, as the peer's have it.
+ACTIVE = {
+    "cart-pole": {"force": 6, "position": 2},
+    "robot arm": {"torque": 13},
+    "quadrotor": {"thrust": 11},
+    "rocket": {"thrust": 12, "tilt": 3},
+}
+
+
+def test_the_demonstrations_have_the_active_constraints_of_the_peer(
+    system: PeerSystem, plan: Plan
+) -> None:
+    counts: dict[str, int] = {}
+    for row in np.nonzero(plan.point.lam > plan.point.s)[1]:
+        name = system.problem.rows[row].split("[")[0]
+        counts[name] = counts.get(name, 0) + 1
+    assert counts == ACTIVE[system.name]
+    assert weakly_active_rows(plan) == ()
+    assert dependent_rows(plan) == ()
+
+
+def test_derivatives_are_those_of_differences_with_active_constraints(
+    system: PeerSystem, plan: Plan
+) -> None:
+    """Along random directions of the logarithms and the initial state, all parameters at once."""
+    found = differentiate_plan(plan)
+    rng = np.random.default_rng(3)
+    for _ in range(3):
+        direction = rng.normal(size=len(plan.theta) + system.problem.n)
+        change = direction * np.r_[plan.theta, np.full(system.problem.n, 0.1)]
+        p = len(plan.theta)
+
+        def moved(t: float, change: np.ndarray = change, p: int = p) -> np.ndarray:
+            there = nearby_plan(
+                plan, plan.theta + t * change[:p], system.x0 + t * change[p:], 1e-10, (), ""
+            )
+            assert there is not None
+            return np.hstack([there.x[1:], there.u])
+
+        expected = extrapolated_slope(moved, 1e-4)
+        slope = np.concatenate([found.x[1:], found.u], axis=1) @ change
+        # Measured: 1e-8 to 2e-7 of the largest, by rounding in the differences.
+        np.testing.assert_allclose(slope, expected, atol=1e-6 * np.max(np.abs(expected)))
+
+
+def test_solvers_agree_on_the_robot_arm() -> None:
+    arm = SYSTEMS["robot arm"]()
+    plans = [arm.problem.plan(arm.truth, arm.x0, solver=name) for name in SOLVERS]
+    for other in plans[1:]:
+        np.testing.assert_allclose(other.u, plans[0].u, atol=1e-10)
+        np.testing.assert_allclose(other.point.lam, plans[0].point.lam, atol=1e-8)
+
+
+def one_step(constraints: dict[str, ca.SX], u: ca.SX, p: ca.SX) -> OptimalControlProblem:
+    """Minimise (u - p)^2 and nothing else."""
+    x = ca.SX.sym("x")
+    return OptimalControlProblem(
+        x, u, {"p": p}, next_state=x + u, stage_cost=(u - p) ** 2, horizon=1,
+        constraints=constraints,
+    )  # fmt: skip
+
+
+def test_a_weakly_active_row_is_named_and_has_a_slope_between_its_sides() -> None:
+    """u = min(p, 1) at p = 1: slopes 1 and 0."""
+    u, p = ca.SX.sym("u"), ca.SX.sym("p")
+    problem = one_step({"cap": u - 1}, u, p)
+    plan = problem.plan({"p": 1.0}, [0.0])
+    assert weakly_active_rows(plan) == (("cap", 0),)
+    assert differentiate_plan(plan).u[0, 0, 0] == pytest.approx(0.5, abs=1e-4)
+    for value, slope in ((0.9, 1.0), (1.1, 0.0)):
+        side = problem.plan({"p": value}, [0.0])
+        assert weakly_active_rows(side) == ()
+        assert differentiate_plan(side).u[0, 0, 0] == pytest.approx(slope, abs=1e-7)
+
+
+def test_dependent_rows_are_named() -> None:
+    """A cap that is written twice: the plan is told, each multiplier is not."""
+    u, p = ca.SX.sym("u"), ca.SX.sym("p")
+    plan = one_step({"cap": u - 1, "again": 2 * u - 2}, u, p).plan({"p": 2.0}, [0.0])
+    assert plan.u[0, 0] == pytest.approx(1)
+    assert dependent_rows(plan) == (("cap", 0), ("again", 0))
+    assert differentiate_plan(plan).u[0, 0, 0] == pytest.approx(0, abs=1e-7)
+
+
+def test_a_row_at_the_end_is_kept_and_differentiated() -> None:
+    """A point that must have left: x_N >= p, the least effort is p / N at every sample."""
+    x, u, p = ca.SX.sym("x"), ca.SX.sym("u"), ca.SX.sym("p")
+    problem = OptimalControlProblem(
+        x, u, {"p": p}, next_state=x + u, stage_cost=u**2, horizon=5,
+        terminal_constraints={"away": p - x},
+    )  # fmt: skip
+    plan = problem.plan({"p": 2.0}, [0.0])
+    np.testing.assert_allclose(plan.u[:, 0], 0.4, atol=1e-9)
+    np.testing.assert_allclose(differentiate_plan(plan).u[:, 0, 0], 0.2, atol=1e-8)
+
+
+def test_a_solver_writes_nothing(capfd: pytest.CaptureFixture[str]) -> None:
+    plant = Plant(control.ss([[1.1]], [[1.0]], [[1.0]], 0, 1))
+    weights = Weights(1, 1)
+    controller = Controller(plant, weights, Bounds(plant, u_min=-0.5, u_max=0.5), 4,
+                            terminal_set=False)  # fmt: skip
+    problem, theta = linear_twin(controller, weights)
+    for name in SOLVERS:
+        problem.plan(theta, [2.0], solver=name)
+    assert capfd.readouterr() == ("", "")

@@ -1,0 +1,174 @@
+"""Parameters behind plans and closed loops: known truths, the linear route, noise, refusals."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from experiments.peer_systems import SYSTEMS
+from impc.control.closed_loop import Status, scenario, simulate
+from impc.control.controller import Controller
+from impc.control.optimal_control import OptimalControlProblem
+from impc.errors import DataError, InfeasibleError, InputError
+from impc.inverse.methods import estimate
+from impc.inverse.optimal_control_fit import fit_optimal_control
+from impc.inverse.problem import Problem
+from impc.model.bounds import Bounds
+from impc.model.recordings import Recording
+from impc.model.weights import Weights
+from tests.control.linear_twin import linear_twin
+from tests.support import random_plant
+
+#: System -> sentences of what is not told; by the mechanics, see docs/nonlinear.md.
+UNTOLD = {
+    "cart-pole": [],
+    "robot arm": [{"max_q": 1.0}, {"l1": 1.0, "m1": -2.0, "l2": 1.0, "m2": -2.0}],
+    "quadrotor": [{"max_r": 1.0}],
+    "rocket": [{"Jx": 1.0}, {"Jy": 1.0, "Jz": 1.0, "l": 1.0}],
+}
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_a_demonstration_gives_back_what_it_tells(name: str) -> None:
+    system = SYSTEMS[name]()
+    truth = system.problem.values(system.truth)
+    demonstration = system.problem.plan(system.truth, system.x0, mu=1e-12)
+    rng = np.random.default_rng(5)
+    start = dict(zip(system.truth, truth * np.exp(0.1 * rng.normal(size=len(truth))), strict=True))
+    found = fit_optimal_control(
+        system.problem, [system.problem.recorded_plan(demonstration.x, demonstration.u)], start
+    )
+    assert found.settled
+    assert found.loss < 1e-10
+    told = found.combinations
+    assert [one.exponents for one in told.untold] == UNTOLD[name]
+    assert len(told.told) == len(truth) - len(told.untold)
+    for one in told.told:
+        expected = np.prod([system.truth[key] ** power for key, power in one.exponents.items()])
+        assert one.value == pytest.approx(expected, rel=1e-5)
+
+
+@pytest.mark.parametrize("limit", [0.6, 50.0], ids=["saturated", "not saturated"])
+def test_a_linear_loop_has_the_weights_of_the_linear_route(limit: float) -> None:
+    """Two states, one input: the gain's two numbers are what the diagonal of Q says."""
+    plant = random_plant(np.random.default_rng(11), 2, 1, 1.05)
+    weights = Weights(np.diag([2.0, 0.5]), 1)
+    bounds = Bounds(plant, u_min=-limit, u_max=limit)
+    controller = Controller(plant, weights, bounds, 6, terminal_set=False)
+    run = simulate(controller, scenario(plant, [0.8, -0.5], 20))
+    assert bool(np.any(run.status == Status.ACTIVE)) == (limit < 1)
+    linear = estimate(Problem(plant, bounds, 6, (Recording(plant, run.x),), terminal_set=False))
+    problem, _ = linear_twin(controller, weights)
+    found = fit_optimal_control(
+        problem, [problem.recorded_loop(run.x, run.u)], {"q0": 1.5, "q1": 0.7}
+    )
+    Q = np.diag([2.0 * found.theta["q0"], 0.5 * found.theta["q1"]])
+    again = Controller(plant, Weights(Q, 1), bounds, 6, terminal_set=False)
+    np.testing.assert_allclose(again.K, linear.gain, rtol=1e-6)
+    np.testing.assert_allclose([found.theta["q0"], found.theta["q1"]], 1, rtol=1e-6)
+
+
+def point(disturbed: bool = False) -> OptimalControlProblem:
+    """A point with drag, its force limited."""
+    x, u, d = ca.SX.sym("x", 2), ca.SX.sym("u"), ca.SX.sym("d")
+    drag, price, limit = ca.SX.sym("drag"), ca.SX.sym("price"), ca.SX.sym("limit")
+    force = u + d if disturbed else u
+    return OptimalControlProblem(
+        x, u, {"drag": drag, "price": price, "limit": limit},
+        next_state=x + 0.1 * ca.vertcat(x[1], force - drag * x[1] * ca.fabs(x[1])),
+        stage_cost=price * x[0] ** 2 + u**2, terminal_cost=price * x[0] ** 2,
+        constraints={"force": ca.vertcat(u - limit, -u - limit)}, horizon=15,
+        disturbances=d if disturbed else None, signed=["drag"],
+    )  # fmt: skip
+
+
+TRUTH = {"drag": 0.3, "price": 5.0, "limit": 1.2}
+START = {"drag": 0.1, "price": 8.0, "limit": 1.0}
+
+
+def test_several_recordings_of_both_kinds_with_missing_samples_and_disturbances() -> None:
+    problem = point(disturbed=True)
+    d = 0.5 * np.sin(np.arange(25.0))[:, None]
+    loop = problem.closed_loop(TRUTH, [1.0, 0.5], 25, d=d)
+    plan = problem.plan(TRUTH, [-0.5, 1.0])
+    x = loop.x.copy()
+    x[5:9, 1] = np.nan
+    found = fit_optimal_control(
+        problem, [problem.recorded_loop(x, d=d), problem.recorded_plan(plan.x, plan.u)], START
+    )
+    for name, value in TRUTH.items():
+        assert found.theta[name] == pytest.approx(value, rel=1e-6)
+    assert found.combinations.untold == ()
+
+
+def test_an_unknown_initial_state_is_found_with_the_parameters() -> None:
+    problem = point()
+    loop = problem.closed_loop(TRUTH, [1.0, 0.5], 25)
+    x = loop.x.copy()
+    x[0] = np.nan
+    recording = problem.recorded_loop(x, loop.u, x0=[0.8, 0.8], unknown_start=True)
+    found = fit_optimal_control(problem, [recording], START)
+    np.testing.assert_allclose(found.x0[0], [1.0, 0.5], atol=1e-7)
+    assert found.theta["drag"] == pytest.approx(0.3, rel=1e-6)
+
+
+def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
+    """Thirty noisy plans, three parameters each: 95 % of ninety, within three deviations."""
+    problem = point()
+    plan = problem.plan(TRUTH, [1.0, 0.5])
+    rng = np.random.default_rng(2)
+    held = 0
+    for _ in range(30):
+        noisy = [
+            item + 0.05 * np.sqrt(np.mean(item**2, axis=0)) * rng.normal(size=item.shape)
+            for item in (plan.x, plan.u)
+        ]
+        recording = problem.recorded_plan(*noisy, x0=plan.x[0])
+        intervals = fit_optimal_control(problem, [recording], TRUTH).intervals()
+        held += sum(low < TRUTH[name] < high for name, (low, high) in intervals.items())
+    assert 79 <= held <= 90
+
+
+def test_solvers_find_the_same() -> None:
+    problem = point()
+    plan = problem.plan(TRUTH, [1.0, 0.5])
+    recording = problem.recorded_plan(plan.x, plan.u)
+    found = [
+        fit_optimal_control(problem, [recording], START, solver=name).theta
+        for name in ("ipopt", "sqpmethod", "fatrop")
+    ]
+    for other in found[1:]:
+        assert other == pytest.approx(found[0], rel=1e-8)
+
+
+def test_what_cannot_be_fitted_is_refused_in_a_line() -> None:
+    problem = point()
+    plan = problem.plan(TRUTH, [1.0, 0.5])
+    recording = problem.recorded_plan(plan.x, plan.u)
+    with pytest.raises(DataError, match="recordings: there are none; give at least one"):
+        fit_optimal_control(problem, [], START)
+    with pytest.raises(InputError, match="solver: got 'knitro'; choose one of"):
+        fit_optimal_control(problem, [recording], START, solver="knitro")
+    with pytest.raises(InputError, match=r"mu_steps: got \(0.1, 0.1\); give falling"):
+        fit_optimal_control(problem, [recording], START, mu_steps=(0.1, 0.1))
+    with pytest.raises(InputError, match="level: got 95; give one between 0 and 1"):
+        fit_optimal_control(problem, [recording], TRUTH).intervals(95)
+
+
+def test_an_infeasible_start_names_the_constraint_and_the_sample() -> None:
+    arm = SYSTEMS["robot arm"]()
+    plan = arm.problem.plan(arm.truth, arm.x0)
+    recording = arm.problem.recorded_plan(plan.x, plan.u)
+    with pytest.raises(InfeasibleError, match=r"constraint angle\[1\]: no plan .* at sample 1"):
+        fit_optimal_control(arm.problem, [recording], arm.truth | {"max_q": 2.3})
+
+
+def test_a_search_that_is_stopped_says_so() -> None:
+    problem = point()
+    plan = problem.plan(TRUTH, [1.0, 0.5])
+    found = fit_optimal_control(
+        problem, [problem.recorded_plan(plan.x, plan.u)], START, evaluations=3
+    )
+    assert not found.settled
+    assert found.evaluations <= 3
