@@ -35,6 +35,11 @@ _QUESTIONS = {
     "mixed": ("Between groups, over all visits: mixed model of the prices", ""),
     "reliability": ("Reliability between visits, ICC(A,1)", ""),
 }
+_WITHIN = "those of the structure, compared in their logarithms"
+_CENTRE = (
+    "those of the analytic centre of all weights with the same gain: a choice, the same for every "
+    "subject"
+)
 _GROUPS = Picture(
     "groups",
     "Measures of every unit by group",
@@ -83,7 +88,7 @@ def write_report(study: Study, store: Store, failures: Failures, command: str) -
         ),
         [
             *([Section("Not fitted", (Lines(failures.lines),))] if failures.lines else ()),
-            Section("1. Groups and visits", _comparisons(compared, figures)),
+            Section("1. Groups and visits", _comparisons(compared, figures, units)),
             Section("2. Subjects", _subjects(subjects, units)),
             Section("3. The run", _run(command)),
         ],
@@ -103,11 +108,13 @@ def write_report(study: Study, store: Store, failures: Failures, command: str) -
     write_files(store.folder, numbers | report.files())
 
 
-def _comparisons(compared: tuple[Comparison, ...], figures: dict[str, bytes]) -> list[Block]:
+def _comparisons(
+    compared: tuple[Comparison, ...], figures: dict[str, bytes], units: pd.DataFrame
+) -> list[Block]:
+    structured = "structure_refused" in units.columns
     blocks: list[Block] = [
-        "Gains are what the recordings give. Prices (centre_price) are those of the analytic "
-        "centre of all weights with the same gain: a choice, the same for every subject. Holm's "
-        "correction is over the measures of one question."
+        f"Gains are what the recordings give. Prices are {_WITHIN if structured else _CENTRE}. "
+        "Holm's correction is over the measures of one question."
     ]
     if "groups.png" in figures:
         blocks.append(_GROUPS)
@@ -143,8 +150,8 @@ def _structure_table(units: pd.DataFrame) -> list[TextTable]:
         rows.append((str(row["unit"]), str(row["group"]), word, *cells))
     heads = ("unit", "group", "structure", *(name.removeprefix("log_price.") for name in priced))
     caption = (
-        "Prices within the structure, with one for the first command, and their intervals of 95 %; "
-        "`holds`: the recordings do not refuse it."
+        "Prices within the structure, with one for the first command, and their intervals of 95 %; it "
+        "holds where the recordings do not refuse it."
     )
     return [TextTable(caption, heads, rows)]
 
@@ -192,7 +199,8 @@ def _findings(compared: tuple[Comparison, ...]) -> list[str]:
             effect = f", effect {item.effect:+.2f}" if np.isfinite(item.effect) else ""
             where = f"{item.condition}: " if item.condition else ""
             told = f"p = {item.p_holm:.2g} after Holm{effect}"
-            lines.append(where + (_times(item, told) or f"{_differs(item, what)} ({told})."))
+            line = where + (_times(item, told) or f"{_differs(item, what)} ({told}).")
+            lines.append(line[0].upper() + line[1:])
     return lines or ["No difference between groups or visits stands after Holm's correction."]
 
 
