@@ -12,6 +12,7 @@ __all__ = ["WORDS", "Glossary", "used_words"]
 
 #: Word -> what it means. A word is found in any case of its first letter, and in the plural.
 WORDS: dict[str, str] = {
+    "A-optimal": "Of experiments: with the least mean variance of the logarithms of the prices.",
     "AIC": "Akaike's information criterion: misfit plus a price for each number that was fitted. "
     "Less is better; differences below 2 say nothing.",
     "analytic centre": "Of all weights with the same gain the one that is farthest from the edge "
@@ -29,11 +30,14 @@ WORDS: dict[str, str] = {
     "directions. It depends on units.",
     "Cramér-Rao": "The least variance that any unbiased estimate can have, if the residuals are "
     "white.",
+    "D-optimal": "Of experiments: with the least determinant of the covariance of the prices, the "
+    "smallest volume of uncertainty.",
     "direction of the gain": "A combination of entries of the gain. Recordings determine some "
     "combinations well although no entry by itself.",
     "dominant direction": "The combination of states on which the weights set the highest price.",
     "dominant cost": "The largest part of the cost: the combination of states with the highest "
     "price.",
+    "dwell": "For how long a perturbation keeps each of its values.",
     "eigenvalue": "Of weights: the price of one of the combinations of states that are priced "
     "apart.",
     "ETFE": "Empirical transfer function estimate: response over perturbation at each frequency.",

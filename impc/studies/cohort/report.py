@@ -150,8 +150,8 @@ def _structure_table(units: pd.DataFrame) -> list[TextTable]:
         rows.append((str(row["unit"]), str(row["group"]), word, *cells))
     heads = ("unit", "group", "structure", *(name.removeprefix("log_price.") for name in priced))
     caption = (
-        "Prices within the structure, with one for the first command, and their intervals of 95 %; it "
-        "holds where the recordings do not refuse it."
+        "Prices within the structure, with one for the first command, and their intervals of 95 %; "
+        "it holds where the recordings do not refuse it."
     )
     return [TextTable(caption, heads, rows)]
 

@@ -12,7 +12,7 @@ import numpy as np
 from markupsafe import Markup
 
 from impc.model.signal_units import gain_unit
-from impc.reporting.document import Lines, Picture, Report, Section, Terms, TextTable
+from impc.reporting.document import Lines, Picture, Report, Section, Terms, TextTable, Verdict
 from impc.reporting.rendering import number
 from impc.reporting.shown_units import shown_unit
 from impc.reporting.style import drawn, journal_style
@@ -40,36 +40,27 @@ _PICTURES = (
         "What the perturbation does to the person, over its amplitude; each line is a dwell.",
     ),
 )
-_WORDS = (
-    ("price", "What a feature of the motion costs the person, with a price of one for the command; "
-     "a structure says which features have one."),
-    ("dwell", "For how long the perturbation keeps each of its three values."),
-    ("VAF", "Variance accounted for: what a fit without an error would explain of an output."),
-    ("A-optimal, D-optimal", "With the least mean variance of the logarithms of the prices; with "
-     "the least determinant of their covariance, that is the smallest volume of uncertainty."),
-    ("the limit", "The largest command that the person can give, u_max."),
-)  # fmt: skip
 
 
 def plan_report(plan: Plan, provenance: Provenance) -> Report:
     """Page, result.json, experiments.csv and figures."""
     with journal_style():
         figures = drawn({"prices": prices_figure(plan), "experiments": experiments_figure(plan)})
+    first, *rest = plan_sentences(plan)
     sections = [
         Section("1. The experiments", (*_PICTURES, _experiments(plan)), "Experiments"),
         Section("2. What the best one would tell", _best(plan), "Best"),
         Section("3. Groups", (_groups(plan),), "Groups"),
         Section("4. The presumed person", _presumed(plan), "Person"),
-        Section("5. Words", (Terms([(word, (text,)) for word, text in _WORDS]),), "Words"),
         Section(
-            "6. Versions",
+            "5. Versions",
             (Markup("<code>{}</code>").format(provenance.command), provenance.all_versions),
         ),
     ]
     return Report(
         "impc plan",
         "What an experiment would tell",
-        (Lines(plan_sentences(plan)),),
+        (Verdict(first), Lines(rest)),
         sections,
         figures=figures,
         tables={"experiments": _numbers(plan)},

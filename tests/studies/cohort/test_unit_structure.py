@@ -66,7 +66,7 @@ def test_the_page_says_it_as_a_factor(fitted: tuple[Study, Store]) -> None:
     write_report(study, store, Failures({}, {}), "impc cohort study.toml")
     page = (store.folder / "report.html").read_text(encoding="utf-8")
     assert "times as high in b as in a" in page
-    assert "The structure of the weights is refused by the recordings of" in page
+    assert "is refused by the recordings of" in page
     assert "Prices within the structure" in page
 
 
