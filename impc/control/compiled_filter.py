@@ -181,7 +181,7 @@ def run_filter(
     lam, du = np.zeros(len(rows.b)), np.empty((m, q))
     here = _room(len(z), outputs.shape[1], k)
     drift = np.zeros(k + 1)
-    varies, settled = bool(np.any(joint.share)), False
+    varies, settled, moves = bool(np.any(joint.share)), False, _moving(djoint.F)
     _weigh(joint, djoint, joint.P0, djoint.P0, here)
     for t in range(len(outputs)):
         _update(joint, djoint, here, outputs[t], z, dz, result, t)
@@ -197,17 +197,27 @@ def run_filter(
             status, met = max(status, beyond), met or near
         result.status[t] = status
         if not settled or met:
-            P, dP = _spread(joint, djoint, here, slope, dslope, at, u, du, drift)
+            P, dP = _spread(joint, djoint, moves, here, slope, dslope, at, u, du, drift)
             settled = steady.known and not met and not varies and _near(P, dP, steady)
             if settled:
                 _weigh(joint, djoint, steady.P, steady.dP, here)
             else:
                 _weigh(joint, djoint, P, dP, here)
-        _ahead(joint, djoint, u, du, disturbance[t], z, dz)
+        _ahead(joint, djoint, moves, u, du, disturbance[t], z, dz)
         if not np.max(np.abs(z)) < _LARGEST:
             result.status[t] = _DIVERGED
             return t
     return len(outputs)
+
+
+@njit(cache=True)
+def _moving(dF: Buffer) -> Buffer:
+    """Which entries move along any direction."""
+    found = np.zeros(dF.shape[:2], dtype=np.bool_)
+    for i in range(dF.shape[0]):
+        for j in range(dF.shape[1]):
+            found[i, j] = np.any(dF[i, j])
+    return found
 
 
 @njit(cache=True)
@@ -418,57 +428,72 @@ def _slope(
 ) -> tuple[Buffer, Buffer]:
     """Slope of the input with the state (m, n), and its derivative (m, n, k): exact.
 
-    With the active rows a and X = Gram_aa^-1 T_a it is -K - N_a0' X, of the first stage.
+    With the active rows a it is -K - (Gram_aa^-1 N_a0)' T_a, N_a0 the columns of the first stage.
     """
     (m, n), active, free = loop.K.shape, work.active[0], work.free
     slope, dslope = -loop.K, -dloop.K[:, :, :k].copy()
-    X, dX = np.empty((active, n)), np.empty((active, n * k))
+    if active == 0:
+        return slope, dslope
+    first = np.empty((active, m))
     for a in range(active):
-        X[a] = rows.T[free[a]]
-    substitute_all(work.factor, active, X)
-    dN = np.zeros((active, m, k))
-    for a in range(active):
-        dX[a] = drows.T[free[a], :, :k].copy().reshape(n * k)
-        for b in range(active):
-            for c in range(k):
-                change = _gram_change(dloop, rows, drows, free[a], free[b], m, c)
-                for i in range(n):
-                    dX[a, i * k + c] -= change * X[b, i]
-        for i in range(m):
-            for c in range(k):
-                left = drows.M[free[a], i, c]
-                for j in range(m):
-                    left -= rows.N[free[a], j] * dloop.S[j, i, c]
-                for j in range(m):
-                    dN[a, j, c] += left * loop.S[i, j]
-    substitute_all(work.factor, active, dX)
-    for a in range(active):
-        for i in range(m):
+        first[a] = rows.N[free[a], :m]
+    substitute_all(work.factor, active, first)
+    dfirst = _first_changes(loop, dloop, rows, drows, work, first, k)
+    for i in range(m):
+        for a in range(active):
             for j in range(n):
-                slope[i, j] -= rows.N[free[a], i] * X[a, j]
+                slope[i, j] -= first[a, i] * rows.T[free[a], j]
                 for c in range(k):
-                    dslope[i, j, c] -= dN[a, i, c] * X[a, j]
-                    dslope[i, j, c] -= rows.N[free[a], i] * dX[a, j * k + c]
+                    dslope[i, j, c] -= dfirst[a, i * k + c] * rows.T[free[a], j]
+                    dslope[i, j, c] -= first[a, i] * drows.T[free[a], j, c]
     return slope, dslope
 
 
 @njit(cache=True)
-def _gram_change(
-    dloop: LoopMatrices, rows: Rows, drows: RowDirections, r: int, s: int, m: int, c: int
-) -> float:
-    """Derivative of M_r S^-1 M_s' along direction c."""
-    total = 0.0
-    for i in range(rows.N.shape[1]):
-        total += drows.M[r, i, c] * rows.N[s, i] + rows.N[r, i] * drows.M[s, i, c]
-        for j in range(m):
-            total -= rows.N[r, i] * dloop.S[i % m, j, c] * rows.N[s, i - i % m + j]
-    return total
+def _first_changes(
+    loop: LoopMatrices,
+    dloop: LoopMatrices,
+    rows: Rows,
+    drows: RowDirections,
+    work: Workspace,
+    first: Buffer,
+    k: int,
+) -> Buffer:
+    """Derivative (a, m k) of `first` = Gram^-1 N_0: Gram^-1 (dN_0 - dGram first)."""
+    (active, m), free, width = first.shape, work.free, rows.N.shape[1]
+    pulled, moved = np.zeros((m, width)), np.zeros((m, width, k))
+    for i in range(m):
+        for a in range(active):
+            for j in range(width):
+                pulled[i, j] += rows.N[free[a], j] * first[a, i]
+                for c in range(k):
+                    moved[i, j, c] += drows.M[free[a], j, c] * first[a, i]
+        for j in range(width):
+            for h in range(m):
+                for c in range(k):
+                    moved[i, j, c] -= dloop.S[j % m, h, c] * pulled[i, j - j % m + h]
+    result = np.zeros((active, m * k))
+    for a in range(active):
+        for i in range(m):
+            for c in range(k):
+                left = drows.M[free[a], i, c]
+                for h in range(m):
+                    left -= rows.N[free[a], h] * dloop.S[h, i, c]
+                for h in range(m):
+                    result[a, h * k + c] += left * loop.S[i, h]
+            for j in range(width):
+                for c in range(k):
+                    result[a, i * k + c] -= drows.M[free[a], j, c] * pulled[i, j]
+                    result[a, i * k + c] -= rows.N[free[a], j] * moved[i, j, c]
+    substitute_all(work.factor, active, result)
+    return result
 
 
 @njit(cache=True)
 def _spread(
     joint: JointLoop,
     djoint: JointLoop,
+    moves: Buffer,
     here: _Update,
     slope: Buffer,
     dslope: Buffer,
@@ -486,7 +511,7 @@ def _spread(
     half = np.dot(F, here.dP.reshape(size, size * k)).reshape(size, size, k)
     turned = np.ascontiguousarray(half.transpose(1, 0, 2)).reshape(size, size * k)
     dP = np.dot(F, turned).reshape(size, size, k) + djoint.Q
-    _add_turns(joint, djoint, slope, dslope, at, ahead, dP)
+    _add_turns(joint, djoint, moves, slope, dslope, at, ahead, dP)
     for a in range(len(u)):
         if joint.share[a] != 0.0:
             size_of = joint.share[a] * u[a]
@@ -540,6 +565,7 @@ def _shrink(P: Buffer, dP: Buffer, here: _Update) -> None:
 def _add_turns(
     joint: JointLoop,
     djoint: JointLoop,
+    moves: Buffer,
     slope: Buffer,
     dslope: Buffer,
     at: int,
@@ -551,7 +577,7 @@ def _add_turns(
     turns = np.zeros((size, size, k))
     for i in range(size):
         for j in range(size):
-            if np.any(djoint.F[i, j]):
+            if moves[i, j]:
                 for b in range(size):
                     for c in range(k):
                         turns[i, b, c] += djoint.F[i, j, c] * ahead[j, b]
@@ -596,6 +622,7 @@ def _near(P: Buffer, dP: Buffer, steady: Steady) -> bool:
 def _ahead(
     joint: JointLoop,
     djoint: JointLoop,
+    moves: Buffer,
     u: Buffer,
     du: Buffer,
     disturbance: Buffer,
@@ -612,7 +639,7 @@ def _ahead(
             if joint.F[i, j] != 0.0:
                 for c in range(dz.shape[1]):
                     dz[i, c] += joint.F[i, j] * dbefore[j, c]
-            if np.any(djoint.F[i, j]):
+            if moves[i, j]:
                 for c in range(k):
                     dz[i, c] += djoint.F[i, j, c] * before[j]
         for a in range(len(u)):

@@ -20,11 +20,12 @@ from impc.control.joint_loop import joint_loop
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
+    from impc.control.closed_loop import PreparedLoop
     from impc.control.controller import Controller
     from impc.control.joint_loop import JointLoop
     from impc.model.observer import Observer
 
-__all__ = ["PersonTrial", "simulate_person"]
+__all__ = ["PersonTrial", "run_joint", "simulate_person"]
 
 
 @dataclass(frozen=True)
@@ -102,28 +103,50 @@ def simulate_person(
     white = finite_array("recorder", np.full(p, recorder, dtype=np.float64), (p,))
     joint = joint_loop(plant, person, white, believes)
     at = plant.n if person.estimates else 0
-    z, u, status = _moved(controller, joint, at, given.x0, np.array(given.disturbance), rng)
+    size, (m, n) = len(joint.F), controller.K.shape
+    start = _root(joint.P0) @ rng.standard_normal(size)
+    start[at : at + n] += given.x0
+    noise = rng.standard_normal((given.steps, size)) @ _root(joint.Q).T
+    shared = rng.standard_normal((given.steps, m))
+    law = prepare_loop(controller, directions(controller, 0))
+    z, u, status = run_joint(law, joint, start, np.array(given.disturbance), (noise, shared))
+    z = z[:-1]
     estimates = z[:, at : at + plant.n]
     states = estimates + z[:, : plant.n] if person.estimates else estimates
     outputs = states @ plant.C.T + white * rng.standard_normal((len(u), p))
     return PersonTrial(frozen(outputs), frozen(states), frozen(estimates), frozen(u), status)
 
 
-def _moved(
-    controller: Controller,
+def run_joint(
+    law: PreparedLoop,
     joint: JointLoop,
-    at: int,
-    x0: Array,
+    start: Array,
     disturbance: Array,
-    rng: np.random.Generator,
+    noise: tuple[Array, Array],
 ) -> tuple[Array, Array, np.ndarray[tuple[int], np.dtype[np.int8]]]:
-    """States of the joint system and commands at each sample."""
-    steps, size, (m, n) = len(disturbance), len(joint.F), controller.K.shape
-    law = prepare_loop(controller, directions(controller, 0))
-    z, u = np.zeros((steps + 1, size)), np.zeros((steps, m))
-    z[0] = _root(joint.P0) @ rng.standard_normal(size)
-    z[0, at : at + n] += x0
-    noise = rng.standard_normal((steps, size)) @ _root(joint.Q).T
+    """States of plant and estimate, and commands, with noise that has been drawn.
+
+    Parameters
+    ----------
+    law : PreparedLoop
+        Along no direction.
+    joint : JointLoop
+    start : Array
+        (z,).
+    disturbance : Array
+        (steps, d).
+    noise : pair of Array
+        What is added to each next state (steps, z), and normal numbers for the share of the
+        commands (steps, m).
+
+    Returns
+    -------
+    z, u, status : Array
+        (steps + 1, z), (steps, m) and (steps,). What is not reached repeats the last.
+    """
+    steps, (m, n) = len(disturbance), law.controller.K.shape
+    z, u = np.zeros((steps + 1, len(start))), np.zeros((steps, m))
+    z[0] = start
     status = np.full(steps, Status.NOT_REACHED, dtype=np.int8)
     reached = run_person(
         law.matrices,
@@ -132,16 +155,15 @@ def _moved(
         law.row_directions,
         law.unit,
         joint,
-        at,
+        0 if len(start) == n else n,
         disturbance,
-        noise,
-        rng.standard_normal((steps, m)),
+        *noise,
         z,
         u,
         status,
     )
     z[reached + 1 :], u[reached:] = z[reached], u[max(reached - 1, 0)]
-    return z[:steps], u, status
+    return z, u, status
 
 
 def _root(covariance: Array) -> Array:

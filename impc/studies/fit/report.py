@@ -24,6 +24,7 @@ from impc.reporting.document import (
 from impc.reporting.rendering import number
 from impc.studies.fit.csv_tables import fit_tables
 from impc.studies.fit.figures import fit_figures
+from impc.studies.fit.person import person_section
 from impc.studies.fit.result import shown_trials, trial_name
 from impc.studies.fit.schema import fit_data
 from impc.studies.fit.sentences import (
@@ -90,6 +91,7 @@ def fit_report(result: FitResult, provenance: Provenance) -> Report:
     converged = result.fitted.converged
     found = [
         *([structure_section(result)] if result.structures else []),
+        *([] if result.person is None else [person_section(result, result.person)]),
         Section("1. Recorded and simulated", _trajectories(result), "Trajectories", together=True),
         Section("2. What is left", (_LEFT, _RESIDUALS), "What is left"),
         Section(

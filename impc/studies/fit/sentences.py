@@ -9,6 +9,7 @@ import numpy as np
 from impc.assess.covariance import DETERMINED, TOLD
 from impc.assess.intent_rules import dominant_sentence
 from impc.reporting.rendering import number
+from impc.studies.fit.person import person_sentences
 from impc.studies.fit.result import trial_name
 from impc.studies.fit.structures import structure_sentences
 
@@ -38,6 +39,7 @@ def findings(result: FitResult) -> tuple[str, ...]:
         ),
         _how_sure(result),
         _determined(result),
+        *person_sentences(result),
     )
 
 
