@@ -5,7 +5,7 @@
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
-.PHONY: help env demo test full check docs architecture reproduce wheel slow coverage structures plans search numerics bench fuzz lock clean
+.PHONY: help env demo test full check docs architecture reproduce wheel slow coverage structures plans noisy-people search numerics bench fuzz lock clean
 
 PYTHON ?= python3
 # Not to be set from outside: the environment is made with `venv --clear`.
@@ -44,6 +44,7 @@ help:
 	@echo 'make check   ruff check, ruff format --check, mypy --strict'
 	@echo 'make slow    hundreds of recordings, fits and subjects: an hour'
 	@echo 'make coverage  how often printed intervals hold the truth: the table of docs/fitting.md'
+	@echo 'make noisy-people  people who sense with noise: least squares beside the likelihood (hours)'
 	@echo 'make structures  coverage of prices, level and power of the test of a structure (hours)'
 	@echo 'make plans   do plans come true? fits of simulated recordings beside them (a quarter of an hour)'
 	@echo 'make search   new examples for the tests by hypothesis, from a seed that is printed'
@@ -116,6 +117,14 @@ numerics: .venv-oldest/.stamp .venv-newest/.stamp
 	$(UV) venv -q --clear --python $(if $(findstring oldest,$@),3.11,3.13) $(@D)
 	$(UV) pip install -q --python $(@D) $(if $(findstring oldest,$@),--resolution lowest-direct) -r pyproject.toml --extra dev
 	@touch $@
+
+# Hundreds of simulated subjects: the table of docs/noisy-people.md.
+PEOPLE = $(PY) -m experiments.noisy_people_study
+noisy-people: env
+	for noise in motor sensory both; do for vaf in 90 70; do for limit in 5 0.7; do \
+	$(PEOPLE) run --noise $$noise --vaf $$vaf --limit $$limit --subjects 200 \
+	--out results/noisy-people.jsonl || exit 1; done; done; done
+	$(PEOPLE) sum results/noisy-people.jsonl
 
 # Hundreds of simulated subjects: the table of docs/structures.md.
 STUDY = OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.structure_study

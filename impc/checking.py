@@ -359,6 +359,7 @@ _VALUES = {
     "Scenario": ("impc.control.closed_loop", "make it with scenario"),
     "Simulation": ("impc.control.closed_loop", "make it with simulate"),
     "Directions": ("impc.control.constraint_rows", "make it with directions"),
+    "Observer": ("impc.model.observer", "make it with Observer(plant, ...)"),
     "Structure": ("impc.model.structure", "make it with Structure(plant, ...)"),
     "Problem": ("impc.inverse.problem", "make it with Problem(plant, ...)"),
     "PlantFamily": ("impc.model.plant_family", "make it with plant_family"),

@@ -45,6 +45,8 @@ ELSEWHERE = {
         studies/reliability/tables.py""",
     "control/test_closed_loop.py": """
         control/compiled_loop.py control/constraint_rows.py""",
+    "control/test_joint_likelihood.py": """
+        control/compiled_filter.py control/joint_loop.py control/noisy_person.py""",
     "control/test_hard_plants.py": "control/infeasibility.py control/saturated.py",
     "control/test_optimal_control.py": """
         control/nlp_solvers.py control/optimal_recordings.py""",
@@ -78,6 +80,7 @@ ELSEWHERE = {
     "inverse/test_several_inputs.py": """
         inverse/consistent_pairs.py inverse/explaining_weights.py inverse/one_step.py
         inverse/quiet_samples.py""",
+    "inverse/test_likelihood_fit.py": "inverse/person_coordinates.py",
     "inverse/test_arrow.py": "inverse/trial_span.py",
     "inverse/test_structured_fit.py": "inverse/structured_search.py",
     "inverse/test_optimal_control_fit.py": "inverse/told_combinations.py",

@@ -25,7 +25,7 @@ from impc.inverse import gain_search as gain
 from impc.inverse import noisy_fit as fitted_controller
 from impc.inverse import problem as inverse_problem
 from impc.inverse import solution_set as gain_fibre
-from impc.model import bounds, plant, plant_family, weights
+from impc.model import bounds, observer, plant, plant_family, weights
 from impc.model import recordings as recording
 from impc.model import riccati as lqr
 
@@ -171,6 +171,18 @@ def calls() -> list[Call]:
                 "x0": size,
                 "label": recording.Label("one"),
                 "findings": ("none",),
+            },
+        ),
+        (
+            observer.Observer,
+            {
+                "plant": v["plant"],
+                "sensed": ["x[0]", "x[1]"],
+                "motor": 0.1,
+                "share": size,
+                "process": size,
+                "sensory": 0.1,
+                "walk": 0.2,
             },
         ),
         (lqr.solve_lqr, {"plant": v["plant"], "weights": v["weights"]}),

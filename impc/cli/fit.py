@@ -72,11 +72,13 @@ def command(
 def _print(result: FitResult) -> None:
     """The table of methods and the intent, as the page has them."""
     from impc.assess.intent_rules import dominant_sentence  # noqa: PLC0415
+    from impc.studies.fit.person import person_sentences  # noqa: PLC0415
     from impc.studies.fit.structures import structure_sentences  # noqa: PLC0415
     from impc.studies.fit.verdict import verdict  # noqa: PLC0415
     from impc.studies.methods_table import methods_table  # noqa: PLC0415
 
-    for line in dict.fromkeys((verdict(result), *structure_sentences(result), *result.warnings)):
+    told = (*structure_sentences(result), *person_sentences(result), *result.warnings)
+    for line in dict.fromkeys((verdict(result), *told)):
         click.echo(line)
     plant = result.fitted.problem.plant
     click.echo(methods_table(result.methods).text())

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from impc.control.controller import Controller
+    from impc.model.observer import Observer
     from impc.studies.simulated_people import SubjectTrial
 
 __all__ = ["command"]
@@ -37,6 +38,8 @@ _FORMATS = (*_ENDINGS, "mat73")
 # What a plain installation cannot write.
 _LIBRARIES = {"tdms": "nptdms", "c3d": "c3d"}
 _RATE = 1000.0
+#: What a person on the seat senses.
+_SENSED = ("theta1", "theta2", "theta1_rate", "theta2_rate")
 _STOP = "limit = 12.0                 # mechanical stop, in this unit\n"
 
 
@@ -72,6 +75,23 @@ def command() -> None:
     type=Number(min=0, max=1e6),
     default=0.1,
     help="Standard deviation of the noise on the angles, degrees.",
+)
+@click.option(
+    "--observer",
+    is_flag=True,
+    help="The person senses angles and rates with noise, and acts on estimates.",
+)
+@click.option(
+    "--sensory-noise",
+    type=Number(min=0, max=1e6, min_open=True),
+    default=0.1,
+    help="Of such a person: how far one look (0.01 s) at an angle errs, degrees; at a rate ten "
+    "times that per second.",
+)
+@click.option(
+    "--unknown-perturbation",
+    is_flag=True,
+    help="Such a person does not know the torque on the seat, and estimates it.",
 )
 @click.option("--mass", type=Number(), default=79.7, help="kg")
 @click.option("--height", type=Number(), default=1.66, help="m")
@@ -145,10 +165,30 @@ def _trials(
             rate=_RATE,
             motor=given["motor_noise"],
             sensor=np.radians(given["sensor_noise"]),
+            person=_observer(controller, given),
             seed=seed,
         )
         for number, seed in enumerate(seeds)
     ]
+
+
+def _observer(controller: Controller, given: dict[str, Any]) -> Observer | None:
+    """The person who senses with noise, where one is asked for."""
+    import numpy as np  # noqa: PLC0415
+
+    from impc.model.observer import Observer  # noqa: PLC0415
+
+    if not given["observer"]:
+        return None
+    look = np.radians(given["sensory_noise"])
+    walk = given["amplitude"] if given["unknown_perturbation"] else None
+    return Observer(
+        controller.plant,
+        _SENSED,
+        motor=given["motor_noise"],
+        sensory=look * np.array([1.0, 1.0, 10.0, 10.0]),
+        walk=walk,
+    )
 
 
 def _encoded(name: str, trial: SubjectTrial, wanted: Sequence[str]) -> dict[str, bytes]:
@@ -203,6 +243,16 @@ sex = "{person["sex"]}"
 [fit]
 horizon = {HORIZON}                 # samples of 0.01 s
 u_max = {given["torque_limit"]}                  # N m
+{_observer_table(given)}"""
+
+
+def _observer_table(given: dict[str, Any]) -> str:
+    if not given["observer"]:
+        return ""
+    return f"""
+[fit.observer]
+sensed = {json.dumps(_SENSED)}
+known = {json.dumps(not given["unknown_perturbation"])}
 """
 
 

@@ -37,9 +37,13 @@ __all__ = [
     "INCONSISTENT",
     "UNSOLVED",
     "LoopMatrices",
+    "Workspace",
     "answer_with",
+    "law",
     "run",
     "solve_dual",
+    "substitute_all",
+    "workspace",
 ]
 
 #: What `solve_dual` says first: an answer, rows that exclude each other, none within its steps.
@@ -296,6 +300,22 @@ class LoopMatrices(NamedTuple):
     S: Buffer
 
 
+class Workspace(NamedTuple):
+    """Arrays that one sample after the other uses; `active` counts the free rows of the last."""
+
+    slack: Buffer
+    kept: Buffer
+    free: Buffer
+    factor: Buffer
+    basis: Buffer
+    v: Buffer
+    rounding: Buffer
+    dv0: Buffer
+    T: Buffer
+    M: Buffer
+    active: Buffer
+
+
 @njit(cache=True, nogil=True)  # trials left out are fitted side by side
 def run(
     loop: LoopMatrices,
@@ -346,32 +366,18 @@ def run(
         Number of samples at which the active set is about to change; the row that proved the last
         problem inconsistent, or -1.
     """
-    count, plant_moves = len(rows.b), bool(np.any(dloop.A) or np.any(dloop.B) or np.any(dloop.E))
-    work = _workspace(rows, du.shape[1], du.shape[2])
-    slack, kept, v, dv0, T = work.slack, work.kept, work.v, work.dv0, work.T
+    plant_moves = bool(np.any(dloop.A) or np.any(dloop.B) or np.any(dloop.E))
+    work = workspace(rows, du.shape[1], du.shape[2])
     weakly_active = 0
     for t in range(first, len(u)):
         if status[t] > _SOFTENED:
-            needs_qp, near = False, False
-            _fill_slack(T, rows.b, x[t], slack)
-            for r in range(count):
-                needs_qp |= not slack[r] >= -kept[r]
-                near |= abs(slack[r]) < _WEAK * rows.b[r]
-            v[: u.shape[1]] = 0.0
-            dv0[:] = 0.0
-            status[t] = _FREE
-            if needs_qp:
-                if gain_only:
-                    status[t], row = _UNSOLVED, -1
-                else:
-                    status[t], near, row = _solve(
-                        loop, dloop, rows, drows, unit, work, x[t], dx[t], lam
-                    )
-                if status[t] > _SOFTENED:
-                    _hold(x, dx, t)
-                    return weakly_active, row
+            status[t], near, row = law(
+                loop, dloop, rows, drows, unit, work, x[t], dx[t], lam, gain_only, u[t], du[t]
+            )
+            if status[t] > _SOFTENED:
+                _hold(x, dx, t)
+                return weakly_active, row
             weakly_active += near
-            _apply(loop, dloop, v, dv0, x[t], dx[t], u[t], du[t])
         _advance(loop, dloop, plant_moves, disturbance[t], x, dx, u[t], du[t], t)
         size = np.max(np.abs(x[t + 1]))
         if not size < divergence:
@@ -379,6 +385,80 @@ def run(
             _hold(x, dx, t)
             return weakly_active, -1
     return weakly_active, -1
+
+
+@njit(cache=True)
+def workspace(rows: Rows, m: int, p: int) -> Workspace:
+    """Arrays that `law` works in, for m inputs and p directions."""
+    count, width = rows.M.shape
+    room = min(count, width) + 1
+    # One column of T and M after the other: sums over columns then run over all rows at once.
+    return Workspace(
+        np.empty(count),
+        _KEPT * rows.b,
+        np.empty(room, dtype=np.int64),
+        np.empty((room, room)),
+        np.empty((room, width)),
+        np.zeros(width),
+        np.empty(width),
+        np.zeros((m, p)),
+        np.ascontiguousarray(rows.T.T),
+        np.ascontiguousarray(rows.M.T),
+        np.zeros(1, dtype=np.int64),
+    )
+
+
+@njit(cache=True)
+def law(
+    loop: LoopMatrices,
+    dloop: LoopMatrices,
+    rows: Rows,
+    drows: RowDirections,
+    unit: Buffer,
+    work: Workspace,
+    x: Buffer,
+    dx: Buffer,
+    lam: Buffer,
+    gain_only: bool,
+    u: Buffer,
+    du: Buffer,
+) -> tuple[int, bool, int]:
+    """Write the input of one state, with its derivatives; the rest as in `run`.
+
+    Parameters
+    ----------
+    work : Workspace
+        Its multipliers and active rows are those of this state afterwards.
+    x, dx : Buffer
+        State (n,) and its derivatives (n, p).
+    u, du : Buffer
+        Written: input (m,) and its derivatives (m, p).
+
+    Returns
+    -------
+    status, near, row : int, bool, int
+        Whether the gain keeps every bound, a bound is active, and so on; whether the active set is
+        about to change; the row that proved the problem inconsistent, or -1.
+    """
+    slack, kept, v = work.slack, work.kept, work.v
+    needs_qp, near = False, False
+    _fill_slack(work.T, rows.b, x, slack)
+    for r in range(len(slack)):
+        needs_qp |= not slack[r] >= -kept[r]
+        near |= abs(slack[r]) < _WEAK * rows.b[r]
+    v[: len(u)] = 0.0
+    work.dv0[:] = 0.0
+    work.active[0] = 0
+    if needs_qp:
+        if gain_only:
+            return _UNSOLVED, False, -1
+        status, near, row = _solve(loop, dloop, rows, drows, unit, work, x, dx, lam)
+        if status > _SOFTENED:
+            return status, near, row
+    else:
+        status = _FREE
+    _apply(loop, dloop, v, work.dv0, x, dx, u, du)
+    return status, near, -1
 
 
 @njit(cache=True)
@@ -392,33 +472,6 @@ def _fill_slack(T: Buffer, b: Buffer, x: Buffer, slack: Buffer) -> None:
         slack[r] = b[r] - slack[r]
 
 
-class _Workspace(NamedTuple):
-    """Arrays that one sample after the other uses."""
-
-    slack: Buffer
-    kept: Buffer
-    free: Buffer
-    factor: Buffer
-    basis: Buffer
-    v: Buffer
-    rounding: Buffer
-    dv0: Buffer
-    T: Buffer
-    M: Buffer
-
-
-@njit(cache=True)
-def _workspace(rows: Rows, m: int, p: int) -> _Workspace:
-    count, width = rows.M.shape
-    room = min(count, width) + 1
-    # One column of T and M after the other: sums over columns then run over all rows at once.
-    T, M = np.ascontiguousarray(rows.T.T), np.ascontiguousarray(rows.M.T)
-    free, factor = np.empty(room, dtype=np.int64), np.empty((room, room))
-    basis, rounding = np.empty((room, width)), np.empty(width)
-    v, dv0 = np.zeros(width), np.zeros((m, p))
-    return _Workspace(np.empty(count), _KEPT * rows.b, free, factor, basis, v, rounding, dv0, T, M)
-
-
 @njit(cache=True)
 def _solve(
     loop: LoopMatrices,
@@ -426,7 +479,7 @@ def _solve(
     rows: Rows,
     drows: RowDirections,
     unit: Buffer,
-    work: _Workspace,
+    work: Workspace,
     x: Buffer,
     dx: Buffer,
     lam: Buffer,
@@ -440,6 +493,7 @@ def _solve(
         return _INFEASIBLE, False, active
     if code == UNSOLVED:
         return _UNSOLVED, False, -1
+    work.active[0] = active
     status, near = _answer(loop, dloop, rows, drows, unit, work, x, dx, lam, active)
     return status, near, -1
 
@@ -451,7 +505,7 @@ def _answer(
     rows: Rows,
     drows: RowDirections,
     unit: Buffer,
-    work: _Workspace,
+    work: Workspace,
     x: Buffer,
     dx: Buffer,
     lam: Buffer,
@@ -504,7 +558,7 @@ def answer_with(
     status, weak : int, bool
         ACTIVE or SOFTENED when the answer keeps what `_check` asks for, UNSOLVED otherwise.
     """
-    work, active = _workspace(rows, du.shape[0], du.shape[1]), len(tight)
+    work, active = workspace(rows, du.shape[0], du.shape[1]), len(tight)
     if active >= len(work.free):
         return _UNSOLVED, False
     _fill_slack(work.T, rows.b, x, work.slack)
@@ -543,7 +597,7 @@ def _hold(x: Buffer, dx: Buffer, t: int) -> None:
 
 
 @njit(cache=True)
-def _recover(rows: Rows, lam: Buffer, work: _Workspace) -> None:
+def _recover(rows: Rows, lam: Buffer, work: Workspace) -> None:
     """v = -N' lam, and what rounding made of it."""
     v, rounding = work.v, work.rounding
     v[:] = 0.0
@@ -557,7 +611,7 @@ def _recover(rows: Rows, lam: Buffer, work: _Workspace) -> None:
 
 
 @njit(cache=True)
-def _tighten(rows: Rows, work: _Workspace, active: int) -> None:
+def _tighten(rows: Rows, work: Workspace, active: int) -> None:
     """Correct v so that the tight rows are tight.
 
     The price of a soft row is a million and more: what is left of v has lost as many digits.
@@ -577,7 +631,7 @@ def _check(
     K: Buffer,
     rows: Rows,
     lam: Buffer,
-    work: _Workspace,
+    work: Workspace,
     active: int,
     x: Buffer,
     unit: Buffer,
@@ -640,7 +694,7 @@ def _differentiate(
     rows: Rows,
     drows: RowDirections,
     lam: Buffer,
-    work: _Workspace,
+    work: Workspace,
     active: int,
     x: Buffer,
     dx: Buffer,
@@ -665,7 +719,7 @@ def _differentiate(
         for i in range(_reach(rows, r, m)):
             for c in range(p):
                 dlam[a, c] += drows.M[r, i, c] * v[i] - rows.N[r, i] * q[i, c]
-    _substitute_all(work.factor, active, dlam)
+    substitute_all(work.factor, active, dlam)
     for i in range(m):
         for j in range(m):
             for c in range(p):
@@ -697,7 +751,7 @@ def _add_pulls(rows: Rows, drows: RowDirections, lam: Buffer, m: int, q: Buffer)
 
 
 @njit(cache=True)
-def _substitute_all(factor: Buffer, count: int, right: Buffer) -> None:
+def substitute_all(factor: Buffer, count: int, right: Buffer) -> None:
     """`substitute` for every column of right at once."""
     for i in range(count):
         for k in range(i):

@@ -1,9 +1,10 @@
 """A subject for everybody without data: a constrained controller that holds a nonlinear plant.
 
-The controller sees the true state at its own rate and holds its command until the next sample; the
-plant runs at the rate of the recording. Motor noise is added to the held command, white from one
-sample of the controller to the next; sensor noise to the recorded outputs, white from one recorded
-sample to the next. What is recorded is what a laboratory would have: clock, outputs, disturbance.
+The controller sees the true state, or what a person who senses with noise takes for it, at its own
+rate and holds its command until the next sample; the plant runs at the rate of the recording. Motor
+noise is added to the held command, white from one sample of the controller to the next; sensor
+noise to the recorded outputs, white from one recorded sample to the next. What is recorded is what
+a laboratory would have: clock, outputs, disturbance.
 The controller is that of (3.1); docs/fitting.md has what a fit makes of such subjects.
 """
 
@@ -19,11 +20,13 @@ from impc.assess.variance_accounted_for import saturated_share
 from impc.control.closed_loop import Scenario, Status, prepare_loop, run_loop
 from impc.control.constraint_rows import directions
 from impc.errors import InputError
+from impc.model.observer import Observer, believed_filter, believed_matrices
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from impc.control.controller import Controller
+    from impc.model.plant import Plant
 
 __all__ = ["SubjectTrial", "simulate_subject"]
 
@@ -68,6 +71,7 @@ def simulate_subject(
     rate: float = 1000.0,
     motor: ArrayLike = 0.0,
     sensor: ArrayLike = 0.0,
+    person: Observer | None = None,
     largest: float = 1e3,
     seed: int | np.random.SeedSequence = 0,
 ) -> SubjectTrial:
@@ -87,6 +91,9 @@ def simulate_subject(
         Standard deviation of the motor noise, in the commands' units, one or (m,).
     sensor : array_like
         Standard deviation of the sensor noise, in the outputs' units, one or (p,).
+    person : Observer, optional
+        Someone who acts on estimates, with the linear plant in mind; the motor noise is then that
+        of the person, and `motor` is not used. By default the true state is seen.
     largest : float
         An output beyond this, in its unit, is a fall.
     seed : int or SeedSequence
@@ -95,7 +102,8 @@ def simulate_subject(
     Raises
     ------
     InputError
-        When the rate is no whole multiple of the controller's.
+        When the rate is no whole multiple of the controller's, or a person has process noise, for
+        which the nonlinear plant has no place.
     """
     plant, within = controller.plant, _samples_within(rate, controller.plant.dt)
     columns = np.asarray(disturbance, dtype=np.float64)
@@ -103,7 +111,7 @@ def simulate_subject(
         "disturbance", columns[:, None] if columns.ndim == 1 else columns, (None, plant.E.shape[1])
     )
     rng = np.random.default_rng(seed)
-    noise = _Noise(rng, np.asarray(motor))
+    noise = _Noise(rng, np.asarray(motor), _Senses(plant, person))
     x, u, end = _moved(controller, step.mapaccum(within), d, within, noise, largest)
     limits = controller.bounds
     sensed = np.asarray(sensor) * rng.standard_normal((len(d), len(plant.outputs)))
@@ -119,10 +127,47 @@ def simulate_subject(
 
 
 class _Noise(NamedTuple):
-    """Noise of the motor: numbers drawn, and their standard deviation, one or (m,)."""
+    """Noise of the motor: numbers drawn, and their standard deviation, one or (m,); the senses."""
 
     rng: np.random.Generator
     deviation: Array
+    senses: _Senses
+
+    def on(self, command: Array) -> Array:
+        """Motor noise beside a command (m,)."""
+        person, deviation = self.senses.person, self.deviation
+        if person is not None:
+            deviation = np.hypot(person.motor, person.share * command)
+        return np.asarray(deviation * self.rng.standard_normal(len(command)))
+
+
+class _Senses:
+    """What a person takes for the state: the state itself, or an estimate."""
+
+    def __init__(self, plant: Plant, person: Observer | None) -> None:
+        self.plant, self.person = plant, person
+        if person is not None and np.any(person.process):
+            raise InputError("process", "cannot be simulated here", "leave it at 0")
+        self.estimating = person is not None and person.estimates
+        if person is not None and self.estimating:
+            self.F, self.C, _, _ = believed_matrices(plant, person)
+            self.L = believed_filter(plant, person).L
+            self.found = np.zeros(len(self.F))
+
+    def of(self, state: Array) -> Array:
+        """Estimate (n,) at a `state` (n,)."""
+        return np.asarray(self.found[: self.plant.n]) if self.estimating else state
+
+    def look(self, rng: np.random.Generator, state: Array, command: Array, d: Array) -> None:
+        """Sense a state (n,); a command (m,), and a known perturbation d (d,), have acted."""
+        if self.person is None or not self.estimating:
+            return
+        noise = self.person.sensory * rng.standard_normal(len(self.C))
+        error = self.person.C @ state + noise - self.C @ self.found
+        self.found = self.F @ self.found + self.L @ error
+        self.found[: self.plant.n] += self.plant.B @ command
+        if self.person.walk is None:
+            self.found[: self.plant.n] += self.plant.E @ d
 
 
 def _samples_within(rate: float, dt: float) -> int:
@@ -143,13 +188,14 @@ def _moved(
     x, u = np.zeros((samples, plant.n)), np.zeros((samples, plant.m))
     state = np.zeros(plant.n)
     for first in range(0, samples, within):
-        run, _ = run_loop(prepared, Scenario(state, still))
+        run, _ = run_loop(prepared, Scenario(noise.senses.of(state), still))
         last = min(first + within, samples)
         if run.status[0] > Status.SOFTENED:
             x[first:], u[first:] = state, u[first - 1]
             return x, u, first
         command = run.u[0]
-        moved = command + noise.deviation * noise.rng.standard_normal(plant.m)
+        moved = command + noise.on(command)
+        noise.senses.look(noise.rng, state, command, np.mean(d[first:last], axis=0))
         inputs = np.hstack(
             [np.tile(moved, (within, 1)), np.resize(d[first:last], (within, d.shape[1]))]
         )

@@ -98,6 +98,18 @@ def test_the_same_seed_gives_the_same_bytes(subject: Path, tmp_path: Path) -> No
     assert not (tmp_path / "trial_1.tdms").exists()
 
 
+def test_a_person_who_senses_with_noise_is_simulated_and_asked_for(tmp_path: Path) -> None:
+    done = run("simulate", "seated-balance", "--out", str(tmp_path), "--duration", "6",
+               "--formats", "csv", "--observer", "--unknown-perturbation")  # fmt: skip
+    assert done.exit_code == 0, done.stderr
+    configuration = read_configuration(tmp_path / "subject.toml")
+    asked = fit_settings(configuration.fit).observer
+    assert asked is not None
+    assert asked.sensed == ["theta1", "theta2", "theta1_rate", "theta2_rate"]
+    assert not asked.known
+    assert json.loads((tmp_path / "truth.json").read_text())["settings"]["observer"] is True
+
+
 def test_result_json_is_the_fit(fitted: tuple[Result, Path], subject: Path, quick: Path) -> None:
     """Against a fit of the same files without command and report."""
     found = json.loads((fitted[1] / "result.json").read_text())

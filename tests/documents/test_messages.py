@@ -39,10 +39,13 @@ from impc.files.reading import read_recordings, recording_of
 from impc.files.results import read_result
 from impc.files.sealed import Kept
 from impc.files.table import Table, make_table
+from impc.inverse.likelihood_fit import fit_person
+from impc.inverse.methods import estimate
 from impc.inverse.problem import Problem
 from impc.inverse.structured_fit import fit_structure
 from impc.jit import keep_caches
 from impc.model.bounds import Bounds
+from impc.model.observer import Observer, believed_filter
 from impc.model.plant import Plant
 from impc.model.recordings import Recording
 from impc.model.riccati import solve_lqr
@@ -428,6 +431,20 @@ def without_daqp(_: Path) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(casadi, "has_conic", lambda _: False)
         require_solver("daqp")
+def integrator() -> Plant:
+    """A cart: where it is cannot be told from how fast it goes."""
+    system = control.ss([[1, 0.1], [0, 0.9]], [[0], [0.1]], [[1, 0]], 0, 0.1, states=["x", "v"])
+    return Plant(system)
+
+
+def nobody_estimates(_: Path) -> None:
+    plant = integrator()
+    law = Controller(plant, Weights(np.eye(2), 1), Bounds(plant), 3, terminal_set=False)
+    outputs = law.simulate([1, 0], 60).x[:, :1]
+    noisy = outputs + 0.01 * np.random.default_rng(1).standard_normal(outputs.shape)
+    problem = Problem(plant, Bounds(plant), 3, [Recording(plant, noisy, x0=[1, 0])],
+                      terminal_set=False)  # fmt: skip
+    fit_person(estimate(problem), Observer(plant, ["v"], motor=1.0, sensory=1.0))
 
 
 def beyond_feasibility(_: Path) -> str:
@@ -486,6 +503,20 @@ PROVOKED: dict[str, Callable[[Path], object]] = {
     "[fit.structure] ...: is not a setting; known: ...": lambda _: fit_settings(
         {"structure": {"q": "diagonal"}}
     ),
+    "[fit.observer] ...: is not a setting; known: ...": lambda _: fit_settings(
+        {"observer": {"senses": ["theta1"]}}
+    ),
+    "walk: is given, but every state is seen; say what is sensed": lambda _: Observer(
+        integrator(), walk=1.0
+    ),
+    "sensory: has a zero; give each sensed signal some noise": lambda _: Observer(
+        integrator(), ["x"], motor=1.0
+    ),
+    "filter: has no stationary gain: ...; let another signal be sensed, or give some motor or"
+    " process noise": lambda _: believed_filter(
+        integrator(), Observer(integrator(), ["v"], motor=1.0, sensory=1.0)
+    ),
+    "person: no start has a likelihood: ...; give other levels": nobody_estimates,
     "[fit] structures: has '...' twice; name each by itself": lambda _: fit_structures(
         running_away(), fit_settings({"structure": {}, "structures": [{}]})
     ),

@@ -11,7 +11,9 @@ import plants
 from experiments.benchmarks.workloads import seat
 from impc.arrays import Array
 from impc.control.closed_loop import simulate
+from impc.control.noisy_person import simulate_person
 from impc.errors import InputError
+from impc.model.observer import Observer
 from impc.studies.simulated_people import simulate_subject
 
 STEP = plants.seated_balance_step_for()
@@ -39,6 +41,38 @@ def test_on_the_linear_plant_it_is_the_closed_loop() -> None:
     run = simulate(work.controller, work.drives[0])
     np.testing.assert_allclose(trial.states[::10], run.x[:-1], atol=1e-8)
     np.testing.assert_allclose(trial.commands[::10], run.u, atol=1e-6)
+
+
+def test_who_hardly_errs_moves_as_who_sees_all() -> None:
+    """Estimates of a person with next to no noise are the states of the linear plant."""
+    work = seat(1, 5.0, 6.0)
+    torque = held(work.drives[0].disturbance[:, 0])
+    sensed = ["theta1", "theta2", "theta1_rate", "theta2_rate"]
+    person = Observer(work.controller.plant, sensed, motor=1e-9, sensory=1e-9)
+    plain = simulate_subject(work.controller, linear_step(), torque)
+    found = simulate_subject(work.controller, linear_step(), torque, person=person)
+    np.testing.assert_allclose(found.states, plain.states, atol=1e-7)
+
+
+def test_noise_of_a_person_is_that_of_the_linear_loop() -> None:
+    """The linear plant at 100 Hz and at 1000 Hz: the same spread of the angles, to its error."""
+    work = seat(1, 30.0, 70.0)
+    plant = work.controller.plant
+    person = Observer(plant, ["theta1", "theta2", "theta1_rate", "theta2_rate"], motor=0.5,
+                      sensory=[2e-3, 2e-3, 2e-2, 2e-2])  # fmt: skip
+    still = np.zeros((3000, 1))
+    ours = simulate_subject(work.controller, linear_step(), held(still[:, 0]), person=person)
+    other = simulate_person(work.controller, person, still, seed=1)
+    spread = [np.std(item[:, :2], axis=0) for item in (ours.states[::10], other.states)]
+    # Thirty seconds of a motion that forgets in about one: a sixth of a deviation.
+    np.testing.assert_allclose(spread[0], spread[1], rtol=0.5)
+
+
+def test_process_noise_has_no_place_on_a_nonlinear_plant() -> None:
+    controller = seat(1, 1.0, 6.0).controller
+    with pytest.raises(InputError, match="process: cannot be simulated here"):
+        simulate_subject(controller, STEP, np.zeros(100),
+                         person=Observer(controller.plant, process=1e-3))  # fmt: skip
 
 
 def test_ranges_and_saturation_of_the_reference() -> None:

@@ -28,6 +28,7 @@ from impc.reporting.rendering import number
 from impc.studies.fit.csv_tables import fit_tables
 from impc.studies.fit.figures import fit_figures
 from impc.studies.fit.interval_figures import shown_statements
+from impc.studies.fit.person import person_section
 from impc.studies.fit.result import shown_trials, trial_name
 from impc.studies.fit.schema import fit_data
 from impc.studies.fit.sentences import direction_name, remarks
@@ -122,6 +123,7 @@ def fit_report(result: FitResult, provenance: Provenance, truth: Array | None = 
         [
             Section("1. The gain, and how sure it is", _gain(result, truth), "Gain", together=True),
             *([structure_section(result)] if result.structures else []),
+            *([] if result.person is None else [person_section(result, result.person)]),
             Section("2. What may be said of the weights", _statements(result), "Weights"),
             Section("3. Inverse LQR on the same recordings", _methods(result), "Inverse LQR"),
             Section("4. Recorded and simulated", _trajectories(result), "Trajectories"),

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from impc.assess.identified_directions import Identifiability
     from impc.assess.intent_rules import Intent
     from impc.assess.judged import MethodFit
+    from impc.assess.person_models import PersonReport
     from impc.assess.printed_gain import GainEstimate
     from impc.assess.structures import StructureFit
     from impc.assess.variance_accounted_for import TrialAgreement
@@ -96,6 +97,8 @@ class FitResult:
         Time of the whole fit, s.
     structures : tuple of StructureFit
         Those that were asked for, that of [fit.structure] first.
+    person : PersonReport or None
+        Of [fit.observer]; None where none was asked for.
     """
 
     settings: FitSettings
@@ -113,6 +116,7 @@ class FitResult:
     terminal_set_difference: float
     seconds: float
     structures: tuple[StructureFit, ...] = ()
+    person: PersonReport | None = None
 
     @property
     def reported_P(self) -> Array:  # noqa: N802

@@ -14,6 +14,8 @@
     intent                                   eigenvalues (ascending), dominant, sentence, readings
     structures                               of each that was named: prices and ratios with
                                              intervals, rank, directions, test, vaf, aic
+    person                                   of [fit.observer]: K, levels with intervals, models
+                                             with log_likelihood and aic, whiteness, errors ahead
     identifiability                          rank, free, chosen, singular_values
     parameters.<name>                        nominal, value, deviation, determined
     trials                                   label, vaf, whiteness, x0, held_out_vaf, findings
@@ -32,6 +34,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from impc.assess.intent_rules import dominant_sentence
+from impc.studies.fit.person import person_data
 from impc.studies.fit.structures import structure_data
 from impc.studies.methods_table import methods_data
 
@@ -45,7 +48,7 @@ __all__ = ["fit_data"]
 
 def fit_data(result: FitResult, provenance: Provenance) -> dict[str, Any]:
     """Content of result.json."""
-    within = {"structures": structure_data(result)}
+    within = {"structures": structure_data(result), "person": person_data(result)}
     return _controller(result) | _found(result) | within | _made(result, provenance)
 
 

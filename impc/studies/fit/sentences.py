@@ -8,6 +8,7 @@ import numpy as np
 
 from impc.assess.covariance import DETERMINED, TOLD
 from impc.assess.intent_rules import dominant_sentence
+from impc.studies.fit.person import person_sentences
 from impc.studies.fit.result import trial_name
 from impc.studies.fit.structures import structure_sentences
 
@@ -30,6 +31,7 @@ def remarks(result: FitResult) -> tuple[str, ...]:
         ),
         _how_sure(result),
         _determined(result),
+        *person_sentences(result),
     )
 
 

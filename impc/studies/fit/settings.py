@@ -14,6 +14,7 @@ from impc.errors import InputError, brief
 from impc.files.configuration import FILL_IN
 from impc.inverse.methods import method_named
 from impc.model.bounds import Bounds
+from impc.model.observer import Observer
 from impc.model.structure import Structure
 
 if TYPE_CHECKING:
@@ -26,8 +27,10 @@ if TYPE_CHECKING:
 __all__ = [
     "BESIDE",
     "FitSettings",
+    "ObserverSettings",
     "StructureSettings",
     "fit_bounds",
+    "fit_observer",
     "fit_settings",
     "fit_structures",
     "read_settings",
@@ -54,6 +57,7 @@ _OF_SOME = (
     "feedback_states",
     "horizons",
     "methods",
+    "observer",
     "profiles",
     "replicates",
     "structure",
@@ -64,6 +68,9 @@ _PAGES = {"fit": "docs/fitting.md", "plan": "docs/planning.md", "select": "docs/
 
 #: Methods that a fit shows beside inverse MPC, which comes last (docs/fitting.md).
 BESIDE = ("feedback_gain", "inverse_lqr", "inverse_lqr_output", "clipped_lqr")
+
+# Of the command that is noise, where the search begins: what isometric force has, and less.
+_SHARE = 0.1
 
 T = TypeVar("T")
 
@@ -86,6 +93,27 @@ class StructureSettings:
     R: str | list[str] = "diagonal"
     over: list[str] | None = None
     name: str | None = None
+
+
+@dataclass(frozen=True)
+class ObserverSettings:
+    """How a person senses, and which noise is in the loop (`impc.model.observer`).
+
+    Attributes
+    ----------
+    sensed : list of str
+        Combinations of states and outputs; none for a person who sees every state.
+    motor, share, process : bool
+        Whether there is such noise; its size is searched.
+    known : bool
+        Whether the person knows the perturbation.
+    """
+
+    sensed: list[str] = field(default_factory=list)
+    motor: bool = True
+    share: bool = False
+    process: bool = False
+    known: bool = True
 
 
 @dataclass(frozen=True)
@@ -142,6 +170,8 @@ class FitSettings:
         Others, to compare it with.
     solver : str
         What solves the controller's quadratic programs (`impc.control.named_solver`).
+    observer : ObserverSettings or None
+        A person who senses with noise: the table [fit.observer]. None: no word on it.
 
     Examples
     --------
@@ -171,6 +201,7 @@ class FitSettings:
     structure: StructureSettings | None = None
     structures: list[StructureSettings] = field(default_factory=list)
     solver: str = COMPILED
+    observer: ObserverSettings | None = None
 
 
 def require_used(settings: FitSettings, used: Collection[str], command: str) -> None:
@@ -270,16 +301,47 @@ def _require_distinct(settings: FitSettings) -> None:
 
 
 def _require_structures(table: Mapping[str, Any]) -> None:
-    """Every key of the tables of structures is known: msgspec passes over those that are not."""
-    known = [item.name for item in fields(StructureSettings)]
+    """Every key of the tables in the table is known: msgspec passes over those that are not."""
     others = table.get("structures", [])
     given = [table.get("structure"), *(others if isinstance(others, list) else [])]
-    for item in given:
+    asked = [("structure", StructureSettings, item) for item in given]
+    for name, kind, item in (*asked, ("observer", ObserverSettings, table.get("observer"))):
+        known = [each.name for each in fields(kind)]
         for key in item if isinstance(item, dict) else ():
             if key not in known:
                 raise InputError(
-                    f"[fit.structure] {key}", "is not a setting", f"known: {', '.join(known)}"
+                    f"[fit.{name}] {key}", "is not a setting", f"known: {', '.join(known)}"
                 )
+
+
+def fit_observer(
+    plant: Plant, settings: FitSettings, recordings: Sequence[Recording]
+) -> tuple[Observer, Array] | None:
+    """The person of [fit.observer], and where steps of an unknown perturbation begin (d,).
+
+    Levels stand at places to begin from; the search finds others by the residuals.
+
+    Raises
+    ------
+    InputError, PlantError
+        When a sensed signal is not known, or an unknown perturbation has nobody to estimate it.
+    """
+    asked = settings.observer
+    if asked is None:
+        return None
+    steps = np.concatenate([np.diff(trial.disturbance, axis=0) for trial in recordings])
+    size = np.sqrt(np.mean(steps**2, axis=0))
+    walk = np.where(size > 0, size, 1.0)
+    person = Observer(
+        plant,
+        asked.sensed,
+        motor=float(asked.motor),
+        share=_SHARE * asked.share,
+        process=float(asked.process),
+        sensory=1.0,
+        walk=None if asked.known else walk,
+    )
+    return person, walk
 
 
 def fit_structures(plant: Plant, settings: FitSettings) -> tuple[Structure, ...]:

@@ -24,6 +24,7 @@ from impc.assess.identified_directions import identifiability
 from impc.assess.intent_draws import drawn_gains
 from impc.assess.intent_rules import intent
 from impc.assess.judged import judge
+from impc.assess.person_models import person_report
 from impc.assess.printed_gain import gain_estimate
 from impc.assess.structures import assess_structure, no_structure
 from impc.assess.variance_accounted_for import agreement
@@ -38,12 +39,13 @@ from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.problem import Problem, controller_for, scenarios
 from impc.inverse.structured_fit import fit_structured
 from impc.studies.fit.result import FitResult, FittedParameter
-from impc.studies.fit.settings import FitSettings, fit_bounds, fit_structures
+from impc.studies.fit.settings import FitSettings, fit_bounds, fit_observer, fit_structures
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from impc.assess.judged import MethodFit
+    from impc.assess.person_models import PersonReport
     from impc.assess.printed_gain import GainEstimate
     from impc.assess.resampling import Replicate
     from impc.assess.structures import StructureFit
@@ -85,7 +87,8 @@ def stages(problem: Problem, settings: FitSettings) -> int:
     trials = len(problem.recordings)
     left_out = trials if _leaves_out(trials, settings) else 0
     structures = (settings.structure is not None) + len(settings.structures)
-    return 1 + len(_beside(settings)) + left_out + structures + count_stages(problem, settings)
+    others = structures + (settings.observer is not None)
+    return 1 + len(_beside(settings)) + left_out + others + count_stages(problem, settings)
 
 
 def _beside(settings: FitSettings) -> tuple[str, ...]:
@@ -234,7 +237,20 @@ def fit_recordings(
         _terminal_set_difference(methods[-1]),
         time.perf_counter() - started,
         structures,
+        _person(problem, settings, fitted, progress),
     )
+
+
+def _person(
+    problem: Problem, settings: FitSettings, fitted: Estimate, progress: FitProgress
+) -> PersonReport | None:
+    """A person who senses with noise, where one was asked for."""
+    asked = fit_observer(problem.plant, settings, problem.recordings)
+    if asked is None:
+        return None
+    found = person_report(fitted, *asked)
+    progress.done("person who senses with noise")
+    return found
 
 
 def _structures(

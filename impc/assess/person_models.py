@@ -1,0 +1,180 @@
+"""Models of how a person senses, side by side, and what the one that was asked for leaves.
+
+Each is fitted by maximum likelihood to the same recordings, from the same first fit, so that
+Akaike's criterion compares them: noise in the recorder alone, which is least squares; a person who
+sees every state and has noise in the loop; who estimates, the perturbation known, and not known;
+and the one that was asked for without its limits.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.arrays import Array, Frozen, frozen
+from impc.assess.person_covariance import confusion, person_covariance
+from impc.assess.variance_accounted_for import whiteness
+from impc.checking import replace
+from impc.control.closed_loop import prepare_loop
+from impc.control.constraint_rows import directions
+from impc.control.joint_loop import joint_loop
+from impc.control.noisy_person import run_joint
+from impc.errors import ImpcError
+from impc.inverse.likelihood_fit import PersonFit, fit_person
+from impc.inverse.problem import controller_for
+from impc.model.bounds import bound_rows
+
+if TYPE_CHECKING:
+    from impc.assess.person_covariance import Confusion, PersonCovariance
+    from impc.inverse.estimates import Estimate
+    from impc.model.observer import Observer
+
+__all__ = ["PersonModel", "PersonReport", "person_report", "prediction_errors"]
+
+# Samples ahead of which predictions are judged, as seconds; and how many starts in a trial at most.
+_AHEAD, _STARTS = (0.0, 0.1, 0.5), 100
+# One second of lags tells a rhythm that was missed; fewer than ten tell nothing.
+_LEAST_LAGS = 10
+
+
+@dataclass(frozen=True)
+class PersonModel:
+    """One model.
+
+    Attributes
+    ----------
+    name : str
+        In words.
+    fit : PersonFit or None
+        None where it has no likelihood.
+    reason : str
+        Why it has none.
+    """
+
+    name: str
+    fit: PersonFit | None
+    reason: str
+
+
+@dataclass(frozen=True)
+class PersonReport(Frozen):
+    """What is said of a person who senses with noise.
+
+    Attributes
+    ----------
+    models : tuple of PersonModel
+        The first is the one that was asked for.
+    covariance : PersonCovariance or None
+        Of that, by the sandwich; None where it has no likelihood.
+    confusion : Confusion or None
+        What of gain and noise is told least apart.
+    whiteness : Array
+        p-values that the innovations of each output are white (p,).
+    ahead : tuple of int
+        Samples ahead.
+    errors : Array
+        Root-mean-square errors of predictions so far ahead (len(ahead), p), in the outputs' units.
+    """
+
+    models: tuple[PersonModel, ...]
+    covariance: PersonCovariance | None
+    confusion: Confusion | None
+    whiteness: Array
+    ahead: tuple[int, ...]
+    errors: Array
+
+    @property
+    def fit(self) -> PersonFit | None:
+        """The one that was asked for."""
+        return self.models[0].fit
+
+
+def person_report(found: Estimate, asked: Observer, walk: Array) -> PersonReport:
+    """Fit a person and the models beside, from a fit of least squares.
+
+    Parameters
+    ----------
+    found : Estimate
+    asked : Observer
+        What is sensed, and which levels are searched.
+    walk : Array
+        Where the steps of an unknown perturbation begin to be searched (d,).
+    """
+    models = [_model(name, found, person) for name, person in _persons(asked, walk)]
+    problem = found.problem
+    if len(bound_rows(problem.bounds, problem.plant).b):
+        free = replace(found, problem=problem.without_bounds())
+        models.append(_model(f"{models[0].name}, no limit", free, asked))
+    fit = models[0].fit
+    p = len(problem.plant.outputs)
+    if fit is None:
+        return PersonReport(tuple(models), None, None, frozen([np.nan] * p), (), frozen([[]]))
+    ahead = tuple(sorted({1 + round(time / problem.plant.dt) for time in _AHEAD}))
+    return PersonReport(
+        tuple(models),
+        person_covariance(fit),
+        confusion(fit),
+        frozen(_white(fit)),
+        ahead,
+        frozen(prediction_errors(fit, ahead)),
+    )
+
+
+def _persons(asked: Observer, walk: Array) -> list[tuple[str, Observer]]:
+    seeing = replace(asked, sensed=(), C=asked.C[:0], sensory=asked.sensory[:0], walk=None)
+    quiet = replace(seeing, motor=0 * asked.motor, share=0 * asked.share, process=0 * asked.process)
+    models = []
+    if asked.estimates:
+        models += [("estimates, perturbation known", replace(asked, walk=None))]
+        if len(walk):
+            unknown = replace(asked, walk=walk if asked.walk is None else asked.walk)
+            models.append(("estimates, perturbation not known", unknown))
+        if asked.walk is not None:
+            models.reverse()
+    if np.any(seeing.levels):
+        models.append(("sees every state, noise in the loop", seeing))
+    return [*models, ("sees every state, noise in the recorder alone", quiet)]
+
+
+def _model(name: str, found: Estimate, person: Observer) -> PersonModel:
+    try:
+        return PersonModel(name, fit_person(found, person), "")
+    except ImpcError as error:
+        return PersonModel(name, None, str(error))
+
+
+def _white(fit: PersonFit) -> Array:
+    """Of all trials together: standardised innovations, trial by trial, in a row."""
+    lags = max(_LEAST_LAGS, round(1 / fit.problem.plant.dt))
+    rows = []
+    for trial in fit.told.trials:
+        deviations = np.sqrt(np.einsum("tpp->tp", trial.spreads))
+        rows.append(trial.innovations / deviations)
+    joined = np.concatenate(rows)
+    return whiteness(joined, min(lags, len(joined) - 1))
+
+
+def prediction_errors(fit: PersonFit, ahead: tuple[int, ...]) -> Array:
+    """Root-mean-square errors (len(ahead), p) of what the filter expects so many samples ahead.
+
+    From the expectation at a sample the plant runs on without noise, perturbations as recorded.
+    """
+    problem, plant = fit.problem, fit.problem.plant
+    controller = controller_for(problem, fit.K, fit.S)
+    law = prepare_loop(controller, directions(controller, 0))
+    joint = joint_loop(plant, fit.observer, fit.recorder)
+    farthest = max(ahead)
+    quiet = np.zeros((farthest, len(joint.F))), np.zeros((farthest, plant.m))
+    errors = []
+    for trial, told in zip(problem.recordings, fit.told.trials, strict=True):
+        starts = range(0, trial.samples - farthest, max(1, trial.samples // _STARTS))
+        for t in starts:
+            driven = np.array(trial.disturbance[t : t + farthest])
+            z, _, _ = run_joint(law, joint, told.filtered[t], driven, quiet)
+            expected = z[list(ahead)] @ joint.C.T
+            errors.append(expected - trial.outputs[t + np.array(ahead)])
+    if not errors:
+        return np.full((len(ahead), len(plant.outputs)), np.nan)
+    return np.asarray(np.sqrt(np.mean(np.square(errors), axis=0)))

@@ -1,0 +1,172 @@
+"""A trial of a person who senses with noise, under the constrained controller.
+
+The system is that of `joint_loop`: commands follow from the estimate, with every bound active.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from impc.arrays import Array, Frozen, finite_array, frozen
+from impc.checking import checked
+from impc.control.closed_loop import Status, prepare_loop, scenario
+from impc.control.compiled_filter import run_person
+from impc.control.constraint_rows import directions
+from impc.control.joint_loop import joint_loop
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from impc.control.closed_loop import PreparedLoop
+    from impc.control.controller import Controller
+    from impc.control.joint_loop import JointLoop
+    from impc.model.observer import Observer
+
+__all__ = ["PersonTrial", "run_joint", "simulate_person"]
+
+
+@dataclass(frozen=True)
+class PersonTrial(Frozen):
+    """What a person does, and what is recorded of it.
+
+    Attributes
+    ----------
+    outputs : Array
+        Recorded, with the recorder's noise (samples, p).
+    states, estimates : Array
+        What is, and what the person takes it for (samples, n).
+    u : Array
+        Commands without motor noise (samples, m).
+    status : Array
+        `Status` of each sample (samples,).
+    """
+
+    outputs: Array
+    states: Array
+    estimates: Array
+    u: Array
+    status: np.ndarray[tuple[int], np.dtype[np.int8]]
+
+    @property
+    def reached(self) -> int:
+        """Samples with a command; where it is less than all, the rest repeats the last."""
+        return int(np.count_nonzero(self.status <= Status.SOFTENED))
+
+
+@checked(x0="n", steps=(1, 10_000_000))
+def simulate_person(
+    controller: Controller,
+    person: Observer,
+    disturbance: ArrayLike | None = None,
+    *,
+    steps: int | None = None,
+    recorder: ArrayLike = 0.0,
+    x0: ArrayLike | None = None,
+    believes: Observer | None = None,
+    seed: Any = 0,
+) -> PersonTrial:
+    """Simulate one trial.
+
+    Parameters
+    ----------
+    controller : Controller
+        What the person does with the estimate.
+    person : Observer
+        What is sensed, and the noise that there is.
+    disturbance : array_like, optional
+        (samples, d), or (samples,) for one.
+    steps : int, optional
+        Number of samples, where there is no disturbance.
+    recorder : array_like
+        Standard deviation of the noise in the recorded outputs, in their units, one or (p,).
+    x0 : array_like, optional
+        What the person takes for the state at first (n,); rest by default. A person who estimates
+        errs there by as much as always.
+    believes : Observer, optional
+        What the person takes for true, when that is not what is; the same signals are sensed.
+    seed : int or SeedSequence
+        All numbers drawn follow from it.
+
+    Raises
+    ------
+    DataError
+        When the disturbance is not of the plant's shape.
+    SolverError
+        When the person's filter has no stationary gain.
+    """
+    plant = controller.plant
+    given = scenario(plant, np.zeros(plant.n) if x0 is None else x0, steps, disturbance)
+    rng, p = np.random.default_rng(seed), len(plant.outputs)
+    white = finite_array("recorder", np.full(p, recorder, dtype=np.float64), (p,))
+    joint = joint_loop(plant, person, white, believes)
+    at = plant.n if person.estimates else 0
+    size, (m, n) = len(joint.F), controller.K.shape
+    start = _root(joint.P0) @ rng.standard_normal(size)
+    start[at : at + n] += given.x0
+    noise = rng.standard_normal((given.steps, size)) @ _root(joint.Q).T
+    shared = rng.standard_normal((given.steps, m))
+    law = prepare_loop(controller, directions(controller, 0))
+    z, u, status = run_joint(law, joint, start, np.array(given.disturbance), (noise, shared))
+    z = z[:-1]
+    estimates = z[:, at : at + plant.n]
+    states = estimates + z[:, : plant.n] if person.estimates else estimates
+    outputs = states @ plant.C.T + white * rng.standard_normal((len(u), p))
+    return PersonTrial(frozen(outputs), frozen(states), frozen(estimates), frozen(u), status)
+
+
+def run_joint(
+    law: PreparedLoop,
+    joint: JointLoop,
+    start: Array,
+    disturbance: Array,
+    noise: tuple[Array, Array],
+) -> tuple[Array, Array, np.ndarray[tuple[int], np.dtype[np.int8]]]:
+    """States of plant and estimate, and commands, with noise that has been drawn.
+
+    Parameters
+    ----------
+    law : PreparedLoop
+        Along no direction.
+    joint : JointLoop
+    start : Array
+        (z,).
+    disturbance : Array
+        (steps, d).
+    noise : pair of Array
+        What is added to each next state (steps, z), and normal numbers for the share of the
+        commands (steps, m).
+
+    Returns
+    -------
+    z, u, status : Array
+        (steps + 1, z), (steps, m) and (steps,). What is not reached repeats the last.
+    """
+    steps, (m, n) = len(disturbance), law.controller.K.shape
+    z, u = np.zeros((steps + 1, len(start))), np.zeros((steps, m))
+    z[0] = start
+    status = np.full(steps, Status.NOT_REACHED, dtype=np.int8)
+    reached = run_person(
+        law.matrices,
+        law.matrix_directions,
+        law.rows,
+        law.row_directions,
+        law.unit,
+        joint,
+        0 if len(start) == n else n,
+        disturbance,
+        *noise,
+        z,
+        u,
+        status,
+    )
+    z[reached + 1 :], u[reached:] = z[reached], u[max(reached - 1, 0)]
+    return z, u, status
+
+
+def _root(covariance: Array) -> Array:
+    """A with A A' the covariance, which need not be definite."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))

@@ -1,0 +1,268 @@
+"""What a fit says of a person who senses with noise: sentences, tables, numbers."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from impc.assess.intervals import entry_names
+from impc.reporting.document import Block, Heading, Section, TextTable, table_of
+from impc.reporting.rendering import number
+from impc.reporting.shown_units import shown_unit
+
+if TYPE_CHECKING:
+    from impc.assess.person_models import PersonModel, PersonReport
+    from impc.model.plant import Plant
+    from impc.studies.fit.result import FitResult
+
+__all__ = ["person_data", "person_section", "person_sentences"]
+
+_TWO_SIDED = 1.959964
+# A level whose interval of 95 % ends beyond a factor of ten is not told.
+_TOLD = np.log(10)
+# Gain and noise that go together by more than this are hardly told apart.
+_CONFUSED = 0.9
+# Criteria that differ by less do not decide (Burnham and Anderson 2002).
+_UNDECIDED = 4.0
+_WHITE = 0.01
+
+
+class _Level(NamedTuple):
+    """A level with its interval of 95 %, in the unit in which it is shown."""
+
+    name: str
+    unit: str
+    value: float
+    low: float
+    high: float
+
+    @property
+    def told(self) -> bool:
+        return bool(np.log(self.high / self.value) < _TOLD)
+
+
+def person_sentences(result: FitResult) -> tuple[str, ...]:
+    """What may be said of the person; nothing where none was asked for."""
+    report = result.person
+    if report is None:
+        return ()
+    asked = report.models[0]
+    if asked.fit is None:
+        return (f"Nothing can be said of a person who senses with noise: {asked.reason}.",)
+    lines = [_compared(report)]
+    told = [item for item in _levels(result.fitted.problem.plant, report) if item.told]
+    if told:
+        each = ", ".join(
+            f"{item.name} {number(item.value)} {item.unit} ({number(item.low, 2)} to "
+            f"{number(item.high, 2)})"
+            for item in told
+        )
+        lines.append(f"As one who {asked.name}: {each}, standard deviations of a sample (95 %).")
+    return (*lines, *_apart(result, report), *_left(result, report))
+
+
+def _compared(report: PersonReport) -> str:
+    asked = report.models[0]
+    others = sorted((item for item in report.models[1:] if item.fit is not None), key=_criterion)
+    if not others:
+        return f"As one who {asked.name} the recordings can be told; nothing stands beside it."
+    best = others[0]
+    apart = _criterion(best) - _criterion(asked)
+    if abs(apart) < _UNDECIDED:
+        return (
+            f"Whether the person {asked.name}, or {best.name}, the recordings do not tell "
+            f"(Akaike's criterion {abs(apart):.1f} apart)."
+        )
+    if apart > 0:
+        return (
+            f"The recordings prefer one who {asked.name} to all others, by {apart:.1f} in Akaike's "
+            f"criterion to the next, who {best.name}."
+        )
+    return (
+        f"The recordings prefer one who {best.name} to the one that was asked for, who "
+        f"{asked.name}, by {-apart:.1f} in Akaike's criterion."
+    )
+
+
+def _apart(result: FitResult, report: PersonReport) -> list[str]:
+    """Which step of gain and noise is told least apart, where that is not told."""
+    fit, found = report.models[0].fit, report.confusion
+    if fit is None or found is None or found.correlation < _CONFUSED:
+        return []
+    names = entry_names(fit.problem.plant)
+    sizes = np.ravel(found.gain) / np.maximum(np.abs(np.ravel(fit.K)), 1e-300)
+    entry = int(np.argmax(np.abs(np.ravel(found.gain)) * _state_sizes(result)))
+    level = int(np.argmax(np.abs(found.levels)))
+    more = "more" if found.levels[level] * sizes[entry] > 0 else "less"
+    return [
+        f"Gain and noise are hardly told apart here (correlation {found.correlation:.2f}): a gain "
+        f"{names[entry]} that is {100 * abs(sizes[entry]):.0f} % larger goes with "
+        f"{100 * abs(np.expm1(abs(found.levels[level]))):.0f} % {more} of the noise "
+        f"{fit.space.names[level]}."
+    ]
+
+
+def _state_sizes(result: FitResult) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+    m = result.fitted.problem.plant.m
+    return np.tile(np.asarray(result.intent.sizes), m)
+
+
+def _left(result: FitResult, report: PersonReport) -> list[str]:
+    outputs = result.fitted.problem.plant.outputs
+    coloured = [
+        name
+        for name, value in zip(outputs, report.whiteness, strict=True)
+        if value < _WHITE  # NaN: nothing is left
+    ]
+    if not coloured:
+        return []
+    return [
+        f"What this person leaves of {' and '.join(coloured)} is not white: the model misses "
+        "something, and its intervals are those of a model that is not true."
+    ]
+
+
+def person_section(result: FitResult, report: PersonReport) -> Section:
+    """Section of the page."""
+    blocks: list[Block] = [_models_table(report)]
+    fit = report.models[0].fit
+    if fit is not None:
+        blocks += [Heading("Noise"), _levels_table(result.fitted.problem.plant, report)]
+        blocks += [Heading("Gain"), _gain_table(result, report)]
+        blocks += [Heading("What is left"), _left_table(result, report)]
+    return Section("A person who senses with noise", blocks, "Senses and noise")
+
+
+def person_data(result: FitResult) -> dict[str, Any] | None:
+    """For result.json."""
+    report = result.person
+    if report is None:
+        return None
+    fit, covariance = report.models[0].fit, report.covariance
+    data: dict[str, Any] = {
+        "models": [
+            {
+                "name": item.name,
+                "log_likelihood": None if item.fit is None else item.fit.log_likelihood,
+                "aic": None if item.fit is None else item.fit.criterion,
+                "count": None if item.fit is None else item.fit.count,
+                "converged": None if item.fit is None else item.fit.converged,
+                "reason": item.reason,
+            }
+            for item in report.models
+        ]
+    }
+    if fit is None or covariance is None or report.confusion is None:
+        return data
+    values = np.exp(fit.theta[fit.space.own :])
+    intervals = [covariance.level_interval(k, value) for k, value in enumerate(values)]
+    return data | {
+        "K": fit.K,
+        "K_deviations": covariance.entries,
+        "sensed": fit.observer.sensed,
+        "known": fit.observer.walk is None,
+        "levels": {
+            name: {"value": value, "low": low, "high": high}
+            for name, value, (low, high) in zip(fit.space.names, values, intervals, strict=True)
+        },
+        "confusion": report.confusion.correlation,
+        "whiteness": report.whiteness,
+        "ahead": report.ahead,
+        "errors_ahead": report.errors,
+    }
+
+
+def _criterion(model: PersonModel) -> float:
+    return np.inf if model.fit is None else model.fit.criterion
+
+
+def _models_table(report: PersonReport) -> TextTable:
+    least = min((_criterion(item) for item in report.models), default=np.inf)
+    return table_of(
+        "Models of sensing on the same recordings, the one that was asked for first. The criterion "
+        "is Akaike's, over the least; searched: gain or prices, initial states, levels of noise.",
+        report.models,
+        {
+            "the person": lambda item: item.name,
+            "searched": lambda item: "-" if item.fit is None else str(item.fit.count),
+            "log-likelihood": lambda item: (
+                item.reason if item.fit is None else f"{item.fit.log_likelihood:.1f}"
+            ),
+            "criterion": lambda item: (
+                "-" if item.fit is None else f"{_criterion(item) - least:.1f}"
+            ),
+            "settled": lambda item: (
+                "-" if item.fit is None else ("yes" if item.fit.converged else "no")
+            ),
+        },
+    )
+
+
+def _levels_table(plant: Plant, report: PersonReport) -> TextTable:
+    return table_of(
+        "Levels of noise: standard deviations of one sample, with intervals of 95 % (sandwich). A "
+        "level whose interval reaches a factor of ten is only told to be at most its upper end.",
+        _levels(plant, report),
+        {
+            "noise": lambda item: item.name,
+            "level": lambda item: number(item.value) if item.told else "-",
+            "95 %": lambda item: (
+                f"{number(item.low)} to {number(item.high)}"
+                if item.told
+                else f"at most {number(item.high)}"
+            ),
+            "unit": lambda item: item.unit,
+        },
+    )
+
+
+def _gain_table(result: FitResult, report: PersonReport) -> TextTable:
+    fit, covariance = report.models[0].fit, report.covariance
+    assert fit is not None
+    assert covariance is not None
+    names = entry_names(fit.problem.plant)
+    least = np.ravel(result.estimate.K)
+    own, deviations = np.ravel(fit.K), np.ravel(covariance.entries)
+    return table_of(
+        "The gain of this person with deviations by the sandwich, beside that of least squares.",
+        range(len(names)),
+        {
+            "entry": lambda k: names[k],
+            "maximum likelihood": lambda k: number(float(own[k]), 4),
+            "deviation": lambda k: number(float(deviations[k]), 2),
+            "least squares": lambda k: number(float(least[k]), 4),
+        },
+    )
+
+
+def _left_table(result: FitResult, report: PersonReport) -> TextTable:
+    plant = result.fitted.problem.plant
+    units = [shown_unit(plant, name) for name in plant.outputs]
+    heads = ["output", "innovations white, p"]
+    heads += [f"error {k} ahead" for k in report.ahead] + ["unit"]
+    rows = []
+    for index, name in enumerate(plant.outputs):
+        factor, unit = units[index]
+        errors = [number(float(factor * value)) for value in report.errors[:, index]]
+        rows.append((name, number(float(report.whiteness[index]), 2), *errors, unit))
+    return TextTable(
+        "What the filter leaves: Ljung and Box's test of the innovations over one second, and "
+        "root-mean-square errors of what it expects so many samples ahead.",
+        heads,
+        rows,
+    )
+
+
+def _levels(plant: Plant, report: PersonReport) -> list[_Level]:
+    fit, covariance = report.models[0].fit, report.covariance
+    if fit is None or covariance is None:
+        return []
+    found = []
+    for index, name in enumerate(fit.space.names):
+        kind, signal = name.split(" ", 1)
+        factor, unit = (100.0, "%") if kind == "share" else shown_unit(plant, signal)
+        value = float(np.exp(fit.theta[fit.space.own + index]))
+        low, high = covariance.level_interval(index, value)
+        found.append(_Level(name, unit, factor * value, factor * low, factor * high))
+    return found

@@ -1,0 +1,126 @@
+"""Fits by maximum likelihood: the limit of no noise, derivatives, a known person, prices."""
+
+from __future__ import annotations
+
+import control
+import numpy as np
+import pytest
+
+from impc.control.controller import Controller
+from impc.control.noisy_person import simulate_person
+from impc.errors import ImpcError
+from impc.inverse.estimates import Estimate
+from impc.inverse.gain_search import fit_gain
+from impc.inverse.likelihood_fit import PersonFit, fit_person
+from impc.inverse.methods import estimate
+from impc.inverse.problem import Problem
+from impc.model.bounds import Bounds
+from impc.model.observer import Observer
+from impc.model.plant import Plant
+from impc.model.recordings import Recording
+from impc.model.structure import Structure
+from impc.model.weights import Weights
+from tests.support import extrapolated_slope
+
+
+def cart() -> Plant:
+    system = control.ss(
+        [[1, 0.05], [0, 0.98]], [[0, 0], [0.05, 0.05]], [[1, 0]], 0, 0.05,
+        states=["x", "v"], inputs=["u", "d"], outputs=["x"],
+    )  # fmt: skip
+    return Plant(system, ["u"])
+
+
+def posed(person: Observer, recorder: float, limit: float, trials: int = 2) -> Problem:
+    plant = cart()
+    bounds = Bounds(plant, u_min=-limit, u_max=limit)
+    weights = Weights(np.diag([8.0, 1.0]), 1)
+    law = Controller(plant, weights, bounds, 5, terminal_set=False)
+    rng, recordings = np.random.default_rng(3), []
+    for seed in range(trials):
+        push = np.repeat(rng.choice([-0.7, 0.0, 0.7], 40), 10)
+        found = simulate_person(law, person, push, recorder=recorder, seed=seed)
+        assert found.reached == len(push)
+        recordings.append(Recording(plant, found.outputs, push))
+    return Problem(plant, bounds, 5, recordings, terminal_set=False, unknown_start=True)
+
+
+@pytest.fixture(scope="module")
+def noisy() -> tuple[Observer, Estimate]:
+    person = Observer(cart(), ["x"], motor=0.15, sensory=0.02)
+    return person, estimate(posed(person, 0.01, 0.9))
+
+
+@pytest.fixture(scope="module")
+def fitted(noisy: tuple[Observer, Estimate]) -> PersonFit:
+    return fit_person(noisy[1], noisy[0])
+
+
+def test_the_gradient_is_that_of_the_likelihood(noisy: tuple[Observer, Estimate]) -> None:
+    """Along gain, initial states of both trials, and levels together."""
+    space = fit_person(noisy[1], noisy[0], max_evaluations=1).space
+    told = space.told(space.start)
+    assert told.value == pytest.approx(space.value(space.start), rel=1e-12)
+    for step in np.random.default_rng(1).normal(size=(3, len(space.start))):
+        slope = extrapolated_slope(
+            lambda t, step=step: np.array([space.value(space.start + t * step)]), 1e-3
+        )
+        assert told.gradient @ step == pytest.approx(slope[0], rel=1e-6)
+
+
+def test_a_person_is_found_and_told_better_than_without_the_noise(
+    noisy: tuple[Observer, Estimate], fitted: PersonFit
+) -> None:
+    person, first = noisy
+    truth = Controller(cart(), Weights(np.diag([8.0, 1.0]), 1), first.problem.bounds, 5).K
+    assert fitted.converged
+    np.testing.assert_allclose(fitted.observer.motor, person.motor, rtol=0.2)
+    np.testing.assert_allclose(fitted.recorder, 0.01, rtol=0.1)
+    np.testing.assert_allclose(fitted.K, truth, rtol=0.15)
+    # Its gradient is none: nothing within a thousandth of a deviation is better.
+    weights = np.where(np.arange(fitted.count) < fitted.space.own, 1.0, 0.0)
+    gradient = fitted.told.gradient - weights * (fitted.theta - fitted.space.start)
+    step = np.linalg.solve(fitted.told.information + np.diag(weights), gradient)
+    assert gradient @ step < 1e-5
+
+
+def test_a_level_of_zero_is_not_searched(noisy: tuple[Observer, Estimate]) -> None:
+    seeing = fit_person(noisy[1], Observer(cart(), motor=0.4))
+    assert seeing.observer.share[0] == 0
+    assert np.all(seeing.observer.process == 0)
+    assert seeing.space.names == ["motor u", "recorder x"]
+
+
+def test_without_noise_in_the_loop_it_is_the_fit_of_least_squares() -> None:
+    """W, V -> 0: the same gain to 1e-6, where neither has a prior."""
+    problem = posed(Observer(cart()), 0.01, 0.9)
+    start = estimate(problem)
+    least = fit_gain(start.problem, (np.array(start.gain), np.array(start.metric)),
+                     attempts=1, regulators=False)  # fmt: skip
+    tiny = Observer(cart(), ["x", "v"], motor=1e-9, sensory=1e-9)
+    for person in (Observer(cart()), tiny):
+        found = fit_person(start, person, recorder=np.array([0.01]), spread=np.inf)
+        np.testing.assert_allclose(found.K, least.K, rtol=1e-6)
+        np.testing.assert_allclose(found.problem.starts, least.problem.starts, atol=1e-6)
+
+
+def test_prices_of_a_structure_are_searched() -> None:
+    person = Observer(cart(), ["x"], motor=0.15, sensory=0.02)
+    given = posed(person, 0.01, 0.9)
+    problem = Problem(
+        given.plant, given.bounds, 5, given.recordings, terminal_set=False, unknown_start=True,
+        structure=Structure(given.plant, ["x", "v"]),
+    )  # fmt: skip
+    found = fit_person(estimate(problem, "structured"), person)
+    assert found.prices is not None
+    assert found.converged
+    weights = found.problem.structure.weights(found.prices)  # type: ignore[union-attr]
+    law = Controller(given.plant, weights, given.bounds, 5, terminal_set=False)
+    np.testing.assert_allclose(law.K, found.K, rtol=1e-9)
+    # In two trials of 20 s prices are told to a factor of two.
+    assert np.all(np.abs(np.array(found.prices) - np.log([8.0, 1.0])) < 1.0)
+
+
+def test_what_cannot_be_estimated_is_an_error(noisy: tuple[Observer, Estimate]) -> None:
+    with pytest.raises(ImpcError, match="no start has a likelihood"):
+        fit_person(noisy[1], Observer(cart(), ["v"], sensory=0.1, motor=0.4))

@@ -1,0 +1,106 @@
+"""A fit with a person who senses with noise: first sentences, tables, what result.json keeps."""
+
+from __future__ import annotations
+
+import functools
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+
+from impc.control.controller import Controller
+from impc.control.noisy_person import simulate_person
+from impc.errors import InputError
+from impc.model.bounds import Bounds
+from impc.model.observer import Observer
+from impc.model.recordings import Recording
+from impc.model.weights import Weights
+from impc.reporting.rendering import plain
+from impc.studies.fit.person import person_data, person_section, person_sentences
+from impc.studies.fit.result import FitResult
+from impc.studies.fit.settings import FitSettings, fit_observer, fit_settings
+from impc.studies.fit.subject import fit_problem, fit_recordings, stages
+from tests.inverse.test_likelihood_fit import cart
+
+TABLE: dict[str, Any] = {
+    "horizon": 5,
+    "u_max": 0.9,
+    "methods": [],
+    "held_out": False,
+    "intent_draws": False,
+    "observer": {"sensed": ["x", "v"]},
+}
+
+
+def trials() -> list[Recording]:
+    """Someone whose senses err by half of what is to be seen."""
+    plant = cart()
+    bounds = Bounds(plant, u_min=-0.9, u_max=0.9)
+    law = Controller(plant, Weights(np.diag([8.0, 1.0]), 1), bounds, 5, terminal_set=False)
+    person = Observer(plant, ["x", "v"], motor=0.05, sensory=[0.05, 0.1])
+    rng, found = np.random.default_rng(3), []
+    for seed in range(2):
+        push = np.repeat(rng.choice([-0.7, 0.0, 0.7], 40), 10)
+        outputs = simulate_person(law, person, push, recorder=0.002, seed=seed).outputs
+        found.append(Recording(plant, outputs, push))
+    return found
+
+
+@functools.cache
+def fitted() -> FitResult:
+    settings = fit_settings(TABLE)
+    return fit_recordings(fit_problem(cart(), trials(), settings), settings)
+
+
+def test_who_senses_with_noise_is_preferred_to_who_sees_all() -> None:
+    result = fitted()
+    assert result.person is not None
+    criteria = {item.name: item.fit.criterion for item in result.person.models if item.fit}
+    asked = result.person.models[0].name
+    assert asked == "estimates, perturbation known"
+    assert criteria[asked] < criteria["sees every state, noise in the loop"] - 10
+    assert criteria[asked] < criteria["sees every state, noise in the recorder alone"] - 100
+    assert f"{asked}, no limit" in criteria
+    lines = person_sentences(result)
+    assert "Akaike's criterion" in lines[0]
+    assert any("sensory" in line and "of a sample (95 %)" in line for line in lines[1:])
+
+
+def test_the_section_and_result_json_have_the_same_numbers() -> None:
+    result = fitted()
+    assert result.person is not None
+    section = person_section(result, result.person)
+    tables = [block for block in section.blocks if hasattr(block, "rows")]
+    assert [len(table.rows) for table in tables] == [5, 4, 2, 1]
+    kept = json.loads(json.dumps(plain(person_data(result))))
+    assert [item["name"] for item in kept["models"]] == [row[0] for row in tables[0].rows]
+    level = kept["levels"]["motor u"]
+    assert level["low"] < level["value"] < level["high"]
+    assert kept["known"] is True
+    assert kept["sensed"] == ["x", "v"]
+    assert np.array(kept["errors_ahead"]).shape == (len(kept["ahead"]), 1)
+    np.testing.assert_allclose(kept["K"], result.person.models[0].fit.K)  # type: ignore[union-attr]
+
+
+def test_one_more_stage_is_told() -> None:
+    settings = fit_settings(TABLE)
+    without = fit_settings({key: item for key, item in TABLE.items() if key != "observer"})
+    problem = fit_problem(cart(), trials(), settings)
+    assert stages(problem, settings) == stages(problem, without) + 1
+    assert fit_observer(cart(), without, trials()) is None
+
+
+def test_settings_of_a_person() -> None:
+    table = {"observer": {"sensed": ["x"], "known": False, "share": True, "motor": False}}
+    found = fit_observer(cart(), fit_settings(table), trials())
+    assert found is not None
+    person, walk = found
+    assert person.walk is not None
+    # A push of one of three sizes every tenth sample: steps of .7 or 1.4, most of them none.
+    np.testing.assert_allclose(walk, person.walk)
+    assert 0.1 < walk[0] < 0.7
+    assert person.motor[0] == 0 < person.share[0]
+    with pytest.raises(InputError, match=r"\[fit.observer\] senses: is not a setting"):
+        fit_settings({"observer": {"senses": ["x"]}})
+    assert FitSettings().observer is None
