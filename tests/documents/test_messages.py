@@ -431,6 +431,8 @@ def without_daqp(_: Path) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(casadi, "has_conic", lambda _: False)
         require_solver("daqp")
+
+
 def integrator() -> Plant:
     """A cart: where it is cannot be told from how fast it goes."""
     system = control.ss([[1, 0.1], [0, 0.9]], [[0], [0.1]], [[1, 0]], 0, 0.1, states=["x", "v"])
