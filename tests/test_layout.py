@@ -44,6 +44,7 @@ ELSEWHERE = {
     "control/test_closed_loop.py": """
         control/compiled_loop.py control/constraint_rows.py""",
     "control/test_hard_plants.py": "control/infeasibility.py control/saturated.py",
+    "control/test_loop_function.py": "control/casadi_callback.py",
     "control/test_seat_workload.py": "assess/identified_directions.py",
     "control/test_terminal_set.py": "control/halfspaces.py control/polygon.py",
     "documents/test_blocks.py": "cli/simulate_cohort.py",
