@@ -32,8 +32,8 @@ print(loop)
 # %%
 # The upper level, in the manner of (3.6): weights that explain the recording, and of these those of
 # least condition number. Only the ratio of Q to R matters, so R = 1. The misfit is the sum of
-# magnitudes: small against it, the second term decides only what the recording does not. In place of
-# the condition number stands tr(W) tr(W^-1) for W = blkdiag(Q, R), which is smooth and like it
+# magnitudes: small against it, the second term decides only what the recording does not. In place
+# of the condition number stands tr(W) tr(W^-1) for W = blkdiag(Q, R), which is smooth and like it
 # least where W is a multiple of the identity.
 q11, q12, q22 = ca.MX.sym("q11"), ca.MX.sym("q12"), ca.MX.sym("q22")
 Q = ca.blockcat([[q11, q12], [q12, q22]])
