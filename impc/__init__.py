@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from impc.assess.identified_directions import identifiability as identifiability
     from impc.assess.variance_accounted_for import vaf as vaf
     from impc.assess.variance_accounted_for import whiteness as whiteness
+    from impc.control.casadi_controller import mpc_function as mpc_function
     from impc.control.closed_loop import Scenario as Scenario
     from impc.control.closed_loop import Simulation as Simulation
     from impc.control.closed_loop import Status as Status
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from impc.control.closed_loop import simulate_and_differentiate as simulate_and_differentiate
     from impc.control.constraint_rows import directions as directions
     from impc.control.controller import Controller as Controller
+    from impc.control.loop_function import closed_loop_function as closed_loop_function
     from impc.control.optimal_control import OptimalControlProblem as OptimalControlProblem
     from impc.control.terminal_set import TerminalSet as TerminalSet
     from impc.control.terminal_set import maximal_invariant_set as maximal_invariant_set
@@ -81,11 +83,13 @@ _NAMES = {
     "assess.expected": "Expectation expected_intervals",
     "assess.identified_directions": "Identifiability identifiability",
     "assess.variance_accounted_for": "vaf whiteness",
+    "control.casadi_controller": "mpc_function",
     "control.closed_loop": "Scenario Simulation Status require_complete scenario"
     " simulate_and_differentiate",
     "control.constraint_rows": "directions",
     "control.controller": "Controller",
     "control.optimal_control": "OptimalControlProblem",
+    "control.loop_function": "closed_loop_function",
     "control.terminal_set": "TerminalSet maximal_invariant_set",
     "errors": "BoundsError DataError ImpcError InfeasibleError InputError OutputError PlantError"
     " SolverError WeightsError",

@@ -2,7 +2,7 @@
 
     python -m experiments.benchmarks [--runs 7]
 
-Every figure is a ratio of medians measured side by side in this run. About six minutes.
+Every figure is a ratio of medians measured side by side in this run. About seven minutes.
 """
 
 from __future__ import annotations
@@ -18,10 +18,12 @@ from experiments.benchmarks.layers import layer_rows
 from experiments.benchmarks.routes import route_rows
 from experiments.benchmarks.search import search_rows
 from experiments.benchmarks.simulation import simulation_rows
+from experiments.benchmarks.solvers import solver_rows
 from experiments.benchmarks.table import write_tables
 
 _PARTS = {
     "simulation": simulation_rows,
+    "solvers": solver_rows,
     "fits": fit_rows,
     "growth": growth_rows,
     "search": search_rows,

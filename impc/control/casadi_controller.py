@@ -21,6 +21,7 @@ from impc.arrays import Array, BoolArray, finite_array
 from impc.checking import checked
 from impc.control.closed_loop import Simulation, Status
 from impc.control.constraint_rows import build_rows
+from impc.control.controller import Controller
 from impc.control.infeasibility import excluded_row
 from impc.control.named_solver import plugin, silent
 from impc.errors import InputError
@@ -30,9 +31,16 @@ if TYPE_CHECKING:
 
     from impc.control.closed_loop import Scenario
     from impc.control.constraint_rows import Rows
-    from impc.control.controller import Controller
 
-__all__ = ["SOLVERS", "MpcSolver", "MpcStep", "build_mpc", "simulate_mpc", "solve_mpc"]
+__all__ = [
+    "SOLVERS",
+    "MpcSolver",
+    "MpcStep",
+    "build_mpc",
+    "mpc_function",
+    "simulate_mpc",
+    "solve_mpc",
+]
 
 # Slacks enter the cost linearly, so the Hessian is singular, which DAQP does not take; its proximal
 # iterations called feasible programs infeasible. Its slacks get a quadratic cost of this share of
@@ -206,6 +214,53 @@ def simulate_mpc(mpc: MpcSolver, given: Scenario) -> Simulation:
         u[t] = step.u
         x[t + 1] = plant.A @ x[t] + plant.B @ u[t] + plant.E @ given.disturbance[t]
     return Simulation(x, u, status, 0, failed_row)
+
+
+@checked
+def mpc_function(controller: Controller) -> ca.Function:
+    """One step of a controller as a `casadi.Function` of the state.
+
+    A branch: where the gain keeps every bound, the gain; elsewhere the quadratic program, solved by
+    DAQP. It is an ordinary graph of CasADi, with CasADi's derivatives, and may be saved, loaded and
+    turned into C (which is then linked with DAQP).
+
+    Parameters
+    ----------
+    controller : Controller
+
+    Returns
+    -------
+    casadi.Function
+        x (n, 1) -> u (m, 1); NaN where no plan that keeps the bounds was found.
+
+    Examples
+    --------
+    >>> import impc
+    >>> from plants import yalmip_example
+    >>> plant = impc.Plant(yalmip_example())
+    >>> bounds = impc.Bounds(plant, u_min=-1, u_max=1)
+    >>> law = impc.Controller(plant, impc.Weights([[1, 0], [0, 1]], 1), bounds, horizon=3)
+    >>> step = impc.mpc_function(law)
+    >>> float(step([1, 3])), step.jacobian()([0.1, 0], 0).shape
+    (1.0, (1, 2))
+    """
+    mpc = build_mpc(controller, "daqp")
+    rows, width = mpc.rows, mpc.rows.M.shape[1]
+    x = ca.MX.sym("x", controller.plant.n)
+    gain = -ca.mtimes(ca.DM(controller.K), x)
+    free = ca.Function("gain", [x], [gain])
+    if len(rows.b) == 0:
+        return ca.Function("mpc", [x], [free(x)], ["x"], ["u"])
+    least = np.r_[np.full(width, -np.inf), np.zeros(int(mpc.soft.sum()))]
+    v = mpc.function(p=x, lbx=least, ubx=np.inf, lbg=-np.inf, ubg=1)["x"][:width]
+    reached = ca.mtimes(ca.DM(rows.T / rows.b[:, None]), x)
+    planned = reached + ca.mtimes(ca.DM(rows.M / rows.b[:, None]), v)
+    hard = np.flatnonzero(~mpc.soft).tolist()
+    kept = ca.mmax(planned[hard]) <= 1 + _EXCEEDED if hard else ca.MX(1)
+    told = ca.if_else(kept, gain + v[: controller.plant.m], np.nan)
+    busy = ca.Function("program", [x], [told])
+    branch = ca.Function.if_else("branch", free, busy)
+    return ca.Function("mpc", [x], [branch(ca.mmax(reached) <= 1, x)], ["x"], ["u"])
 
 
 def _judge(soft_excess: Array, v: Array) -> Status:

@@ -321,10 +321,14 @@ def prepare_loop(controller: Controller, along: Directions) -> PreparedLoop:
     )
 
 
-def run_loop(prepared: PreparedLoop, given: Scenario) -> tuple[Simulation, Sensitivity]:
+def run_loop(
+    prepared: PreparedLoop, given: Scenario, *, local: bool = False
+) -> tuple[Simulation, Sensitivity]:
     """Simulate one recording of a prepared loop, with its derivatives.
 
-    Samples that were not reached repeat the last state, so that a search can go on with them.
+    Samples that were not reached repeat the last state, so that a search can go on with them. Where
+    `local`, the state at every sample moves along the directions of the first, whatever the others
+    did: `Sensitivity.u` then has the derivatives of the controller at each sample by itself.
     """
     plant, along = prepared.controller.plant, prepared.along
     steps, n, m, p = given.steps, plant.n, plant.m, along.count
@@ -354,6 +358,7 @@ def run_loop(prepared: PreparedLoop, given: Scenario) -> tuple[Simulation, Sensi
             status,
             multipliers,
             prepared.program is not None or plan is not None,
+            local,
         )
         weakly_active += weak
         t = int(np.count_nonzero(status <= Status.SOFTENED))

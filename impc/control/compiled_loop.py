@@ -333,6 +333,7 @@ def run(
     status: Buffer,
     lam: Buffer,
     gain_only: bool,
+    local: bool,
 ) -> tuple[int, int]:
     """Simulate from x[first] and dx[first], with derivatives along p directions (p may be 0).
 
@@ -359,6 +360,9 @@ def run(
         prove it inconsistent.
     gain_only : bool
         Whether to end, UNSOLVED, at the first sample where the gain breaks a bound.
+    local : bool
+        Whether every sample has the directions dx[0] in place of what came of them: du is then the
+        derivative of each input with respect to its own state and to what is common to all.
 
     Returns
     -------
@@ -379,6 +383,8 @@ def run(
                 return weakly_active, row
             weakly_active += near
         _advance(loop, dloop, plant_moves, disturbance[t], x, dx, u[t], du[t], t)
+        if local:
+            dx[t + 1] = dx[0]
         size = np.max(np.abs(x[t + 1]))
         if not size < divergence:
             status[t] = _DIVERGED

@@ -3,10 +3,10 @@
 `compiled_loop` has a method of its own for it (docs/theory.md, section 4). Any other finds the same
 answer, and is asked for what only a solver can tell: which rows hold. With those the input and its
 derivative follow from the equations of the active set (`closed_loop`), and a solver whose own
-answer is not that one, to 1e-6 of its size, is not believed. What a solver says of its success is
+answer is not that one, to 1e-4 of its size, is not believed. What a solver says of its success is
 not asked for.
 
-    minimise z'z / 2 + price sum(t) (1 + small t)   subject to  A z <= d + t,  t >= 0 for soft rows
+    minimise  z'z / 2 + price sum(t)   subject to  A z <= d + t,  t >= 0 for soft rows
 
 is the problem in numbers of size one: z is v in coordinates in which S is the identity, over the
 distance of a typical row; rows are divided by their bounds. Soft rows enter it only where the hard
@@ -122,8 +122,9 @@ class Program:
     Attributes
     ----------
     solver : str
+        One of `SOLVERS`.
     A : Array
-        (r, N m).
+        Rows in the problem's numbers (r, N m).
     squares : Array
         Squared length of each row of A (r,).
     unit : float

@@ -24,12 +24,14 @@ from impc.control.named_solver import (
     require_solver,
 )
 from impc.errors import InputError
+from impc.inverse.direct_and_reduced import inverse_mpc_reduced
 from impc.inverse.problem import Problem
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.recordings import Recording
 from impc.model.weights import Weights
 from tests.control.test_closed_loop import entries, problem, unit_directions
+from tests.support import saturated_problem
 
 ROOT = Path(__file__).parents[2]
 
@@ -70,6 +72,17 @@ def test_loops_of_ipopt_are_those_of_the_compiled_method(softening: float | None
 def test_sixty_loops_are_those_of_the_compiled_method(solver: str, softening: float | None) -> None:
     for seed in range(60):
         check_against_compiled(solver, seed, softening)
+
+
+@pytest.mark.parametrize("solver", ["daqp", pytest.param("qpoases", marks=pytest.mark.slow)])
+def test_fits_with_other_solvers_end_at_the_same_gain(solver: str) -> None:
+    """Exact recordings of two inputs at their bounds; W2 is compared in the benchmarks."""
+    _, truth, posed = saturated_problem(np.random.default_rng(3), 2, 2)
+    found = [inverse_mpc_reduced(replace(posed, solver=name)).gain for name in (COMPILED, solver)]
+    for fit in found:
+        assert fit.explained
+        np.testing.assert_allclose(fit.K, truth.K, atol=1e-6 * np.max(np.abs(truth.K)))
+    np.testing.assert_allclose(found[1].K, found[0].K, atol=1e-9 * np.max(np.abs(truth.K)))
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
