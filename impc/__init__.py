@@ -10,9 +10,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from impc.assess.expected import Expectation as Expectation
     from impc.assess.expected import expected_intervals as expected_intervals
-    from impc.assess.identified_directions import Identifiability as Identifiability
     from impc.assess.identified_directions import identifiability as identifiability
     from impc.assess.variance_accounted_for import vaf as vaf
     from impc.assess.variance_accounted_for import whiteness as whiteness
@@ -44,7 +42,6 @@ if TYPE_CHECKING:
     from impc.files.reading import read_recordings as read_recordings
     from impc.files.results import read_result as read_result
     from impc.files.table import make_table as make_table
-    from impc.inverse.cross_term import inverse_lqr_cross_term as inverse_lqr_cross_term
     from impc.inverse.direct_and_reduced import infer_weights as infer_weights
     from impc.inverse.direct_and_reduced import inverse_mpc as inverse_mpc
     from impc.inverse.direct_and_reduced import inverse_mpc_reduced as inverse_mpc_reduced
@@ -64,13 +61,10 @@ if TYPE_CHECKING:
     from impc.model.plant_family import PlantFamily as PlantFamily
     from impc.model.recordings import Label as Label
     from impc.model.recordings import Recording as Recording
-    from impc.model.riccati import LqrSolution as LqrSolution
     from impc.model.riccati import gain_gradients as gain_gradients
     from impc.model.riccati import solve_lqr as solve_lqr
     from impc.model.structure import Structure as Structure
     from impc.model.weights import Weights as Weights
-    from impc.model.weights import condition_number as condition_number
-    from impc.model.weights import normalised as normalised
     from impc.model.weights import weight_error as weight_error
     from impc.studies.estimate_page import report as report
     from impc.studies.fit.settings import FitSettings as FitSettings
@@ -80,8 +74,8 @@ if TYPE_CHECKING:
     __version__: str
 
 _NAMES = {
-    "assess.expected": "Expectation expected_intervals",
-    "assess.identified_directions": "Identifiability identifiability",
+    "assess.expected": "expected_intervals",
+    "assess.identified_directions": "identifiability",
     "assess.variance_accounted_for": "vaf whiteness",
     "control.casadi_controller": "mpc_function",
     "control.closed_loop": "Scenario Simulation Status require_complete scenario"
@@ -98,7 +92,6 @@ _NAMES = {
     "files.reading": "read_recordings",
     "files.results": "read_result",
     "files.table": "make_table",
-    "inverse.cross_term": "inverse_lqr_cross_term",
     "inverse.direct_and_reduced": "infer_weights inverse_mpc inverse_mpc_reduced",
     "inverse.equivalent_weights": "least_condition_weights other_weights",
     "inverse.estimates": "Estimate",
@@ -113,9 +106,9 @@ _NAMES = {
     "model.plant": "Plant",
     "model.plant_family": "PlantFamily",
     "model.recordings": "Label Recording",
-    "model.riccati": "LqrSolution gain_gradients solve_lqr",
+    "model.riccati": "gain_gradients solve_lqr",
     "model.structure": "Structure",
-    "model.weights": "Weights condition_number normalised weight_error",
+    "model.weights": "Weights weight_error",
     "studies.estimate_page": "report",
     "studies.fit.settings": "FitSettings",
     "studies.fit.subject": "fit_problem fit_recordings",

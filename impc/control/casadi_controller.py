@@ -148,6 +148,8 @@ def build_mpc(controller: Controller, solver: str = "daqp") -> MpcSolver:
         ),
     }
     name, options = plugin(solver)
+    if soft.any():  # qpOASES loses a program with a singular Hessian when it begins without bounds
+        options = {key: value for key, value in options.items() if key != "initialStatusBounds"}
     with silent():
         function = ca.qpsol("mpc", name, program, options)
     return MpcSolver(controller, rows, solver, function, soft)

@@ -74,10 +74,11 @@ def inverse_lqr_cross_term(plant: Plant, gain: ArrayLike) -> CrossTerm:
     A gain that some weights have needs no cross term.
 
     >>> import impc
+    >>> from impc.inverse.cross_term import inverse_lqr_cross_term
     >>> from plants import yalmip_example
     >>> plant = impc.Plant(yalmip_example())
     >>> gain = impc.solve_lqr(plant, impc.Weights([[1, 0], [0, 1]], 1)).K
-    >>> impc.inverse_lqr_cross_term(plant, gain).norm < 1e-6
+    >>> inverse_lqr_cross_term(plant, gain).norm < 1e-6
     True
     """
     n, m = plant.n, plant.m

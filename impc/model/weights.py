@@ -100,7 +100,8 @@ def condition_number(weights: Weights) -> float:
     Examples
     --------
     >>> import impc
-    >>> impc.condition_number(impc.Weights([[1, 0], [0, 4]], 2))
+    >>> from impc.model.weights import condition_number
+    >>> condition_number(impc.Weights([[1, 0], [0, 4]], 2))
     4.0
     """
     eigenvalues = np.linalg.eigvalsh(weights.block)
@@ -114,7 +115,8 @@ def normalised(weights: Weights) -> Weights:
     Examples
     --------
     >>> import impc
-    >>> impc.normalised(impc.Weights([[1, 0], [0, 4]], 2)).Q
+    >>> from impc.model.weights import normalised
+    >>> normalised(impc.Weights([[1, 0], [0, 4]], 2)).Q
     array([[0.5, 0. ],
            [0. , 2. ]])
     """
