@@ -51,6 +51,7 @@ help:
 	@echo 'make architecture  draw docs/images/rooms.svg from the imports of the code'
 	@echo 'make reproduce  write docs/reproduction: the dissertation, line by line (half an hour)'
 	@echo 'make wheel   build a wheel, install it in an empty environment, run impc example there'
+	@echo 'make look    every kind of page at the width of a desk and of a phone (needs chromium)'
 	@echo 'make bench   the benchmarks:                     python -m experiments.benchmarks'
 	@echo 'make fuzz    160 000 mutated files, configurations and plants; FUZZ="--seed 1 --cases 1000"'
 	@echo 'make lock    compile both lock files again (needs uv); UPGRADE=--upgrade takes newer versions'
@@ -125,6 +126,10 @@ structures: env
 	$(STUDY) run carts --test-only --root 0.8 --subjects 400 --out results/structures-carts.jsonl
 	$(STUDY) run carts --test-only --cross 0.5 --subjects 100 --out results/structures-carts.jsonl
 	$(STUDY) sum results/structures-seat.jsonl results/structures-carts.jsonl
+
+# What a reader's eye would find: cut, pale, unnamed or unexplained.
+look: env
+	OPENBLAS_NUM_THREADS=1 $(PY) -m tests.look $(PAGES)
 
 bench: env
 	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(PY) -m experiments.benchmarks

@@ -42,6 +42,8 @@ class Subject:
         The command line, without folders.
     files : tuple of str
         Names of the recordings.
+    angles : str
+        "degrees" or "radians", as [report] says.
     """
 
     problem: Problem
@@ -50,6 +52,7 @@ class Subject:
     inputs: Inputs
     command: str
     files: tuple[str, ...]
+    angles: str = "degrees"
 
     @property
     def provenance(self) -> Provenance:
@@ -89,4 +92,4 @@ def read_subject(command: str, files: Sequence[Path], plant_name: str, config: P
     names = tuple(path.name for path in files)
     line = f"impc {command} {' '.join(names)} --plant {plant_name} --config {config.name}"
     problem = fit_problem(plant, recordings, settings, family)
-    return Subject(problem, settings, source, inputs, line, names)
+    return Subject(problem, settings, source, inputs, line, names, configuration.report.angles)

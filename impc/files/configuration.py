@@ -28,6 +28,7 @@ __all__ = [
     "FILL_IN",
     "Configuration",
     "RecordingTable",
+    "ReportTable",
     "SignalTable",
     "read_configuration",
 ]
@@ -37,7 +38,7 @@ FILL_IN = "?"
 
 _LARGEST = 1_000_000
 _LABELS = ("subject", "visit", "condition", "trial")
-_TABLES = ("recording", "signals", "plant", "fit")
+_TABLES = ("recording", "signals", "plant", "fit", "report")
 _STUDY = ("study", "model", "select")
 
 
@@ -100,6 +101,18 @@ class SignalTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sign: Literal[1, -1] = 1
 
 
+class ReportTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The [report] table.
+
+    Attributes
+    ----------
+    angles : str
+        "degrees" or "radians": in which all pages and figures of a run show angles.
+    """
+
+    angles: Literal["degrees", "radians"] = "degrees"
+
+
 class Configuration(msgspec.Struct, frozen=True):
     """What a configuration file says.
 
@@ -114,6 +127,7 @@ class Configuration(msgspec.Struct, frozen=True):
         Settings of the fit; not interpreted here.
     study, model, select : dict
         Tables of a study; not interpreted here.
+    report : ReportTable
     """
 
     recording: RecordingTable
@@ -123,6 +137,7 @@ class Configuration(msgspec.Struct, frozen=True):
     study: dict[str, Any] = {}
     model: dict[str, Any] = {}
     select: dict[str, Any] = {}
+    report: ReportTable = ReportTable()
 
 
 def read_configuration(path: Path | str, *more: str) -> Configuration:
@@ -169,7 +184,9 @@ def read_configuration(path: Path | str, *more: str) -> Configuration:
         raise InputError(
             f"{source}: signals", "names no signal", "write a table [signals.NAME] for each"
         )
-    return Configuration(recording, signals, *(tables[name] for name in ("plant", "fit", *_STUDY)))
+    plain = (tables[name] for name in ("plant", "fit", *_STUDY))
+    report = _convert(source, "report", tables["report"], ReportTable)
+    return Configuration(recording, signals, *plain, report=report)
 
 
 _Struct = TypeVar("_Struct", bound=msgspec.Struct)
