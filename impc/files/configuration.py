@@ -184,9 +184,9 @@ def read_configuration(path: Path | str, *more: str) -> Configuration:
         raise InputError(
             f"{source}: signals", "names no signal", "write a table [signals.NAME] for each"
         )
-    plain = (tables[name] for name in ("plant", "fit", *_STUDY))
+    plain: dict[str, Any] = {name: tables[name] for name in ("plant", "fit", *_STUDY)}
     report = _convert(source, "report", tables["report"], ReportTable)
-    return Configuration(recording, signals, *plain, report=report)
+    return Configuration(recording, signals, report=report, **plain)
 
 
 _Struct = TypeVar("_Struct", bound=msgspec.Struct)

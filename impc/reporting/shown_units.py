@@ -40,5 +40,14 @@ def shown_unit(plant: Plant, name: str, angles: str = "degrees") -> tuple[float,
 
 
 def axis_label(plant: Plant, name: str, angles: str = "degrees") -> str:
-    """The name of a signal with the unit in which it is shown; arguments as of `shown_unit`."""
+    """The name of a signal with the unit in which it is shown.
+
+    Parameters
+    ----------
+    plant : Plant
+    name : str
+        Of the signal.
+    angles : str
+        "degrees" or "radians".
+    """
     return f"{name} ({shown_unit(plant, name, angles)[1]})"

@@ -9,7 +9,15 @@ import pandas as pd
 from markupsafe import Markup
 
 from impc.errors import DataError
-from impc.reporting.document import Block, Lines, Picture, Report, Section, TextTable
+from impc.reporting.document import (
+    Block,
+    Lines,
+    Picture,
+    Report,
+    Section,
+    TextTable,
+    Verdict,
+)
 from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import number
 from impc.reporting.style import drawn, journal_style
@@ -73,11 +81,13 @@ def write_report(study: Study, store: Store, failures: Failures, command: str) -
         # One after the other: the figures of a thousand subjects would fill the memory.
         write_files(store.folder, _subject_files(subject, own, store, failures))
     figures = _figures(units, compared)
+    said = [*_findings(compared), *_limits(units)]
     report = Report(
         "impc cohort",
         f"Groups and visits of {len(subjects)} subjects",
         (
-            Lines([*_findings(compared), *_limits(units)]),
+            Verdict(said[0]),
+            *((Lines(said[1:]),) if said[1:] else ()),
             _summary(study, tables, subjects, failures),
         ),
         [
@@ -104,7 +114,7 @@ def write_report(study: Study, store: Store, failures: Failures, command: str) -
 
 def _comparisons(compared: tuple[Comparison, ...], figures: dict[str, bytes]) -> list[Block]:
     blocks: list[Block] = [
-        "Gains are what the recordings give. Prices (centre_price) are those of the analytic "
+        "Gains are what the recordings give. Prices are those of the analytic "
         "centre of all weights with the same gain: a choice, the same for every subject. Holm's "
         "correction is over the measures of one question."
     ]
