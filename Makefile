@@ -53,6 +53,7 @@ help:
 	@echo 'make architecture  draw docs/images/rooms.svg from the imports of the code'
 	@echo 'make reproduce  write docs/reproduction: the dissertation, line by line (half an hour)'
 	@echo 'make wheel   build a wheel, install it in an empty environment, run impc example there'
+	@echo 'make look    every kind of page at the width of a desk and of a phone (needs chromium)'
 	@echo 'make bench   the benchmarks:                     python -m experiments.benchmarks'
 	@echo 'make fuzz    160 000 mutated files, configurations and plants; FUZZ="--seed 1 --cases 1000"'
 	@echo 'make lock    compile both lock files again (needs uv); UPGRADE=--upgrade takes newer versions'
@@ -140,6 +141,10 @@ structures: env
 plans: env
 	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.plan_study cart --fits 100
 	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.plan_study seat --fits 100
+
+# What a reader's eye would find: cut, pale, unnamed or unexplained.
+look: env
+	OPENBLAS_NUM_THREADS=1 $(PY) -m tests.look $(PAGES)
 
 bench: env
 	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(PY) -m experiments.benchmarks

@@ -58,7 +58,9 @@ def command(
     with progress(count, "estimate", lambda _: memory.kept()) as done:
         remember = replace(memory, done=done).estimate
         compared = compare_recordings(problem, settings.settle, remember, held_out=held_out)
-    written = write_files(out, compare_report(problem, compared, subject.provenance).files())
+    written = write_files(
+        out, compare_report(problem, compared, subject.provenance, subject.angles).files()
+    )
     memory.forget()
     click.echo(methods_table(compared).text())
     print_files(out, written)

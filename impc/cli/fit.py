@@ -59,7 +59,7 @@ def command(
     with progress(stages(problem, settings) + 1, "stage", lambda _: memory.kept()) as done:
         told = FitProgress(done, memory.estimate, memory.replicate)
         result = fit_recordings(problem, settings, told)
-        content = fit_report(result, subject.provenance, truth).files()
+        content = fit_report(result, subject.provenance, truth, subject.angles).files()
         done("page")
     written = write_files(out, content)
     memory.forget()

@@ -44,6 +44,8 @@ class Subject:
         The command line, without folders.
     files : tuple of str
         Names of the recordings.
+    angles : str
+        "degrees" or "radians", as [report] says.
     """
 
     problem: Problem
@@ -52,6 +54,7 @@ class Subject:
     inputs: Inputs
     command: str
     files: tuple[str, ...]
+    angles: str = "degrees"
 
     @property
     def provenance(self) -> Provenance:
@@ -102,4 +105,4 @@ def read_subject(
     line = f"impc {command} {' '.join(names)} --plant {plant_name} --config {config.name}"
     line += "" if solver is None else f" --solver {solver}"
     problem = fit_problem(plant, recordings, settings, family)
-    return Subject(problem, settings, source, inputs, line, names)
+    return Subject(problem, settings, source, inputs, line, names, configuration.report.angles)

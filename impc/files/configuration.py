@@ -28,6 +28,7 @@ __all__ = [
     "FILL_IN",
     "Configuration",
     "RecordingTable",
+    "ReportTable",
     "SignalTable",
     "read_configuration",
 ]
@@ -37,7 +38,7 @@ FILL_IN = "?"
 
 _LARGEST = 1_000_000
 _LABELS = ("subject", "visit", "condition", "trial")
-_TABLES = ("recording", "signals", "plant", "fit", "plan")
+_TABLES = ("recording", "signals", "plant", "fit", "plan", "report")
 _STUDY = ("study", "model", "select")
 
 
@@ -100,6 +101,18 @@ class SignalTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sign: Literal[1, -1] = 1
 
 
+class ReportTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The [report] table.
+
+    Attributes
+    ----------
+    angles : str
+        "degrees" or "radians": in which all pages and figures of a run show angles.
+    """
+
+    angles: Literal["degrees", "radians"] = "degrees"
+
+
 class Configuration(msgspec.Struct, frozen=True):
     """What a configuration file says.
 
@@ -116,6 +129,7 @@ class Configuration(msgspec.Struct, frozen=True):
         Of an experiment that is planned; not interpreted here.
     study, model, select : dict
         Tables of a study; not interpreted here.
+    report : ReportTable
     """
 
     recording: RecordingTable
@@ -126,6 +140,7 @@ class Configuration(msgspec.Struct, frozen=True):
     study: dict[str, Any] = {}
     model: dict[str, Any] = {}
     select: dict[str, Any] = {}
+    report: ReportTable = ReportTable()
 
 
 def read_configuration(path: Path | str, *more: str) -> Configuration:
@@ -173,7 +188,9 @@ def read_configuration(path: Path | str, *more: str) -> Configuration:
         raise InputError(
             f"{source}: signals", "names no signal", "write a table [signals.NAME] for each"
         )
-    return Configuration(recording, signals, *(tables[name] for name in (*_TABLES[2:], *_STUDY)))
+    plain: dict[str, Any] = {name: tables[name] for name in ("plant", "fit", "plan", *_STUDY)}
+    report = _convert(source, "report", tables["report"], ReportTable)
+    return Configuration(recording, signals, report=report, **plain)
 
 
 _Struct = TypeVar("_Struct", bound=msgspec.Struct)

@@ -184,6 +184,7 @@ class Details:
     summary : str
         What is inside, always shown.
     blocks : sequence of Block
+        What is folded, in this order.
     """
 
     summary: str

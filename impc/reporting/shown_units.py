@@ -1,4 +1,4 @@
-"""In which unit a signal is shown: angles in degrees, everything else as the plant has it.
+"""In which unit a signal is shown: angles in degrees or radians, all else as the plant has it.
 
 Every page and figure asks here (docs/fitting.md).
 """
@@ -20,16 +20,34 @@ _DEGREES = {"rad": "deg", "rad/s": "deg/s", "rad/s^2": "deg/s^2"}
 _ANGLES = ("theta", "angle", "yaw", "pitch", "roll")
 
 
-def shown_unit(plant: Plant, name: str) -> tuple[float, str]:
-    """Factor from the plant's unit of a signal, by its name, and the unit that is shown."""
+def shown_unit(plant: Plant, name: str, angles: str = "degrees") -> tuple[float, str]:
+    """Factor from the plant's unit of a signal, and the unit that is shown.
+
+    Parameters
+    ----------
+    plant : Plant
+    name : str
+        Of the signal.
+    angles : str
+        "degrees" or "radians", as [report] says.
+    """
     unit = plant.unit(name)
     if unit == UNKNOWN and name.lower().startswith(_ANGLES):
         unit = "rad/s" if name.endswith("_rate") else "rad"
-    if unit in _DEGREES:
+    if unit in _DEGREES and angles == "degrees":
         return math.degrees(1.0), _DEGREES[unit]
     return 1.0, "-" if unit == "1" else unit
 
 
-def axis_label(plant: Plant, name: str) -> str:
-    """The name of a signal with the unit in which it is shown."""
-    return f"{name} ({shown_unit(plant, name)[1]})"
+def axis_label(plant: Plant, name: str, angles: str = "degrees") -> str:
+    """The name of a signal with the unit in which it is shown.
+
+    Parameters
+    ----------
+    plant : Plant
+    name : str
+        Of the signal.
+    angles : str
+        "degrees" or "radians".
+    """
+    return f"{name} ({shown_unit(plant, name, angles)[1]})"

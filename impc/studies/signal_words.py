@@ -1,4 +1,4 @@
-"""What the signals of a plant are, in words and with their units: how a page's glossary begins."""
+"""What the signals of a plant are, in words: how a page's glossary begins (docs/units.md)."""
 
 from __future__ import annotations
 

@@ -44,6 +44,7 @@ NOT_RUN = {
     ("docs/contributing.md", "make slow"): _WHOLE,
     ("docs/contributing.md", "make fuzz"): _WHOLE,
     ("docs/contributing.md", "make search"): _WHOLE,
+    ("docs/contributing.md", "make look"): _WHOLE,
     ("docs/contributing.md", "make numerics"): _WHOLE,
     ("docs/contributing.md", "python -m pytest tests/documents -k start"): _WHOLE,
     ("docs/contributing.md", "python -m pytest tests/model/test_riccati.py"): _WHOLE,

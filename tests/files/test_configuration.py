@@ -40,6 +40,9 @@ mass = 70
 [fit]
 horizon = 20
 free = ["J2"]
+
+[report]
+angles = "radians"
 """
 
 
@@ -65,6 +68,8 @@ def test_every_key(tmp_path: Path) -> None:
     assert configuration.signals == {"theta1": SignalTable("seat angle", "deg", 12.0, 0.5, -1)}
     assert configuration.plant == {"sample_time": 0.01, "nested": {"mass": 70}}
     assert configuration.fit == {"horizon": 20, "free": ["J2"]}
+    assert configuration.report.angles == "radians"
+    assert read_configuration(written(tmp_path, settings())).report.angles == "degrees"
     with pytest.raises(AttributeError):
         configuration.recording.rate = 5.0  # type: ignore[misc]
 
@@ -72,6 +77,7 @@ def test_every_key(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "phrase"),
     [
+        ("[recording]", '[report]\nangles = "grad"\n[recording]', "report.angles: Invalid enum"),
         ("[recording]", "[recordings]", "recordings: is not known; did you mean recording?"),
         ('subject = "S01"', "subjekt = 1", "recording.subjekt: is not known; did you mean subject"),
         ('time = "time"', "rate = 0.0", "recording.rate: is 0; give samples per second"),

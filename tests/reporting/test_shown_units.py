@@ -21,6 +21,13 @@ def test_units_of_the_plants() -> None:
     assert axis_label(cursor, "target_rate") == "target_rate (px/s)"
 
 
+def test_radians_where_they_are_asked_for() -> None:
+    seat = Plant(seated_balance_plant())
+    assert shown_unit(seat, "theta1", "radians") == (1.0, "rad")
+    assert axis_label(seat, "theta2_rate", "radians") == "theta2_rate (rad/s)"
+    assert shown_unit(seat, "command", "radians") == shown_unit(seat, "command")
+
+
 def test_of_a_plant_that_says_none_angles_are_told_by_their_names() -> None:
     system = control.ss(
         np.eye(2) / 2, np.ones((2, 1)), np.eye(2), 0, 0.1,

@@ -9,7 +9,15 @@ import pandas as pd
 from markupsafe import Markup
 
 from impc.errors import DataError
-from impc.reporting.document import Block, Lines, Picture, Report, Section, TextTable
+from impc.reporting.document import (
+    Block,
+    Lines,
+    Picture,
+    Report,
+    Section,
+    TextTable,
+    Verdict,
+)
 from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import number
 from impc.reporting.style import drawn, journal_style
@@ -79,11 +87,13 @@ def write_report(study: Study, store: Store, failures: Failures, command: str) -
         # One after the other: the figures of a thousand subjects would fill the memory.
         write_files(store.folder, _subject_files(subject, own, store, failures))
     figures = _figures(units, compared)
+    said = [*_findings(compared), *_structure_lines(units), *_limits(units)]
     report = Report(
         "impc cohort",
         f"Groups and visits of {len(subjects)} subjects",
         (
-            Lines([*_findings(compared), *_structure_lines(units), *_limits(units)]),
+            Verdict(said[0]),
+            *((Lines(said[1:]),) if said[1:] else ()),
             _summary(study, tables, subjects, failures),
         ),
         [

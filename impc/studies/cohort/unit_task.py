@@ -81,7 +81,7 @@ def fit_unit(task: FitTask) -> dict[str, Any]:
     try:
         problem, settings = unit_problem(task)
         fitted = fit_controller(problem)
-        content = _described(problem, fitted, settings)
+        content = _described(problem, fitted, settings, task.configuration.report.angles)
     except ImpcError as error:
         return {"reason": str(error)}
     content["seconds"] = time.perf_counter() - started
@@ -137,7 +137,9 @@ def unit_problem(task: FitTask) -> tuple[Problem, FitSettings]:
     return fit_problem(plant, recordings, settings, family), settings
 
 
-def _described(problem: Problem, fitted: Estimate, settings: FitSettings) -> dict[str, Any]:
+def _described(
+    problem: Problem, fitted: Estimate, settings: FitSettings, angles: str
+) -> dict[str, Any]:
     plant, K, weights = fitted.problem.plant, np.array(fitted.gain), fitted.stage_weights
     fit = judge(fitted, problem.bounds)
     fit = replace(fit, held_out=_held_out(problem, fitted, settings))
@@ -152,7 +154,7 @@ def _described(problem: Problem, fitted: Estimate, settings: FitSettings) -> dic
         "states": plant.states,
         "controls": plant.controls,
         "outputs": plant.outputs,
-        "shown_units": [shown_unit(plant, name) for name in plant.outputs],
+        "shown_units": [shown_unit(plant, name, angles) for name in plant.outputs],
         "trials": len(problem.recordings),
         "samples": sum(trial.samples for trial in problem.recordings),
         "K": estimate.K,

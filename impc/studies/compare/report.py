@@ -49,13 +49,16 @@ _PICTURE = Picture(
 
 
 def compare_report(
-    problem: Problem, compared: Sequence[MethodFit], provenance: Provenance
+    problem: Problem,
+    compared: Sequence[MethodFit],
+    provenance: Provenance,
+    angles: str = "degrees",
 ) -> Report:
-    """Page, result.json, methods.csv and the figure."""
+    """Page, result.json, methods.csv and the figure, with `angles` in "degrees" or "radians"."""
     subject = str(problem.recordings[0].label.subject) or "a subject"
     methods = [METHODS[item.name] for item in compared]
     with journal_style():
-        figures = drawn({"comparison": _figure(problem, compared)})
+        figures = drawn({"comparison": _figure(problem, compared, angles)})
     sections = [
         Section(
             "1. All methods on the same recordings",
@@ -163,7 +166,7 @@ def _weights(problem: Problem, compared: Sequence[MethodFit]) -> TextTable:
     )
 
 
-def _figure(problem: Problem, compared: Sequence[MethodFit]) -> Figure:
+def _figure(problem: Problem, compared: Sequence[MethodFit], angles: str) -> Figure:
     shown = [item for item in compared if item.estimate.K is not None][::-1]
     figure = new_figure(DOUBLE_COLUMN, 0.5 + 0.36 * max(len(shown), 2))
     left, right = figure.subplots(1, 2, sharey=True, width_ratios=(1.6, 1))
@@ -187,7 +190,7 @@ def _figure(problem: Problem, compared: Sequence[MethodFit]) -> Figure:
     if np.isfinite(limit):
         right.axvline(limit, color=INK, linestyle=":", linewidth=1.2)
         right.set_xlim(0, min(1.05 * max(largest), 5 * limit))
-    right.set_xlabel(f"largest {axis_label(problem.plant, problem.plant.controls[0])}")
+    right.set_xlabel(f"largest {axis_label(problem.plant, problem.plant.controls[0], angles)}")
     return figure
 
 

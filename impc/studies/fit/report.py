@@ -98,7 +98,12 @@ _INTENT = Picture(
 )
 
 
-def fit_report(result: FitResult, provenance: Provenance, truth: Array | None = None) -> Report:
+def fit_report(
+    result: FitResult,
+    provenance: Provenance,
+    truth: Array | None = None,
+    angles: str = "degrees",
+) -> Report:
     """Page, result.json, tables and figures.
 
     Parameters
@@ -107,6 +112,8 @@ def fit_report(result: FitResult, provenance: Provenance, truth: Array | None = 
     provenance : Provenance
     truth : Array, optional
         Gain (m, n) of a simulated subject: the page then compares with it.
+    angles : str
+        "degrees" or "radians": how figures show them.
     """
     told = () if truth is None else (Note("Truth.", truth_sentence(result, truth)),)
     subject = str(result.given.recordings[0].label.subject) or "a subject"
@@ -132,7 +139,7 @@ def fit_report(result: FitResult, provenance: Provenance, truth: Array | None = 
             Section("7. Checks of the recordings", (_checks(result),), "Checks", folded=True),
             Section("8. Settings and versions", _made(result, provenance), "Settings", folded=True),
         ],
-        figures=fit_figures(result),
+        figures=fit_figures(result, angles),
         tables=fit_tables(result),
         data={**fit_data(result, provenance), "truth": None if truth is None else {"K": truth}},
         provenance=provenance,
@@ -224,7 +231,7 @@ def _checks(result: FitResult) -> Terms:
 
 def _made(result: FitResult, provenance: Provenance) -> list[Block]:
     plant = result.fitted.problem.plant
-    given = "".join(f"; {key} = {value}" for key, value in provenance.plant_arguments.items())
+    arguments = "; ".join(f"{key} = {value}" for key, value in provenance.plant_arguments.items())
     settings = asdict(result.settings)
     return [
         _terminal_set(result),
@@ -235,12 +242,21 @@ def _made(result: FitResult, provenance: Provenance) -> list[Block]:
                 (
                     "Plant",
                     (
-                        Markup("<code>{}</code>, sample time {} s, states {}{}").format(
-                            provenance.plant_name, plant.dt, ", ".join(plant.states), given
+                        Markup(
+                            "<code>{}</code>, sample time {} s, states {} <code>{}</code>"
+                        ).format(
+                            provenance.plant_name, plant.dt, ", ".join(plant.states), arguments
                         ),
                     ),
                 ),
-                ("Settings", ("; ".join(f"{key} = {value}" for key, value in settings.items()),)),
+                (
+                    "Settings",
+                    (
+                        Markup("<code>{}</code>").format(
+                            "; ".join(f"{key} = {value}" for key, value in settings.items())
+                        ),
+                    ),
+                ),
                 (
                     "Quadratic programs",
                     (f"Solved by {described(result.fitted.problem.solver)}.",),

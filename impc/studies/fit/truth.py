@@ -26,12 +26,20 @@ __all__ = ["read_truth", "truth_sentence", "truth_table"]
 
 
 def read_truth(recordings: Iterable[Path], plant: Plant) -> Array | None:
-    """The gain (m, n) of the truth.json that lies beside the `recordings`, of a plant's states.
+    """The gain of the truth.json that lies beside recordings.
+
+    Parameters
+    ----------
+    recordings : iterable of Path
+        The files.
+    plant : Plant
+        Whose gain it has to be.
 
     Returns
     -------
     Array or None
-        None where there is no such file, they lie in several folders, or it is of another plant.
+        (m, n); None where there is no such file, they lie in several folders, or it is of another
+        plant.
     """
     folders = {path.absolute().parent for path in recordings}
     path = folders.pop() / "truth.json" if len(folders) == 1 else None
@@ -46,7 +54,10 @@ def read_truth(recordings: Iterable[Path], plant: Plant) -> Array | None:
 
 
 def truth_sentence(result: FitResult, truth: Array) -> str:
-    """How many entries of the gain lie inside their intervals, and which is farthest off."""
+    """How many entries of a `truth` (m, n) lie inside their intervals, and which is farthest off.
+
+    Of the gain of a `result`.
+    """
     pairs = _pairs(result, truth)
     level = pairs[0][0].level
     off = [pair for pair in pairs if not _inside(*pair)]
@@ -65,7 +76,7 @@ def truth_sentence(result: FitResult, truth: Array) -> str:
 
 
 def truth_table(result: FitResult, truth: Array) -> TextTable:
-    """Every entry of the gain with its interval beside the truth (m, n)."""
+    """Every entry of the gain of a `result` with its interval beside the `truth` (m, n)."""
     rows = [
         (
             number_name(result.given.plant, item.name),

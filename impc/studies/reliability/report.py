@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from markupsafe import Markup
 
-from impc.reporting.document import Lines, Picture, Report, Section
+from impc.reporting.document import Lines, Picture, Report, Section, Verdict
 from impc.reporting.provenance import Provenance
 from impc.studies.reliability.figures import reliability_figures
 from impc.studies.reliability.findings import findings
@@ -70,13 +70,14 @@ def reliability_report(trials: Trials, result: Reliability, command: str, inputs
     sections = [
         *(Section(title, [tables[name] for name in names]) for title, names in shown.items()),
         Section("4. Pictures", _PICTURES),
-        Section("5. The dissertation's findings, looked for here", (Lines(found),)),
-        Section("6. Versions", (Markup("<code>{}</code>").format(command),)),
+        Section("5. The dissertation's findings, looked for here", (Lines(found),), folded=True),
+        Section("6. Versions", (Markup("<code>{}</code>").format(command),), folded=True),
     ]
+    said = answer(result)
     return Report(
         "impc reliability",
         "Reliability of a test",
-        (Lines(answer(result)), summary, *result.notes),
+        (Verdict(said[0]), *((Lines(said[1:]),) if said[1:] else ()), summary, *result.notes),
         sections,
         figures=reliability_figures(trials, result),
         tables=tables,

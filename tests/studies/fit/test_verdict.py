@@ -18,6 +18,7 @@ from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.recordings import Recording
 from impc.model.weights import Weights
+from impc.studies.fit.figures import trajectory_figure
 from impc.studies.fit.interval_figures import gain_figure, shown_statements, statements_figure
 from impc.studies.fit.settings import FitSettings
 from impc.studies.fit.subject import fit_problem, fit_recordings, stages
@@ -100,6 +101,21 @@ def bars(ax: Axes) -> list[Array]:
     """Both ends of each line, from below to above on the page."""
     found = [np.asarray(line.get_xdata(), dtype=np.float64) for line in ax.lines]
     return [ends for ends in found if len(ends) == 2]
+
+
+def test_angles_are_shown_as_is_asked() -> None:
+    """In the figures of a fit whose output is an angle."""
+    result = fitted(1.0)
+    turned = replace(result.given.plant, units=(("place", "rad"), ("pull", "rad/s^2")))
+    shown = replace(result, fitted=replace(
+        result.fitted, problem=replace(result.fitted.problem, plant=turned)
+    ))  # fmt: skip
+    for angles, label, factor in (("degrees", "deg", 180 / np.pi), ("radians", "rad", 1.0)):
+        ax = trajectory_figure(shown, 0, angles).axes[0]
+        assert ax.get_ylabel() == f"place ({label})"
+        (line, _) = ax.lines
+        recorded = factor * result.given.recordings[0].outputs[:, 0]
+        np.testing.assert_allclose(np.asarray(line.get_ydata()), recorded)
 
 
 def test_bars_are_the_intervals() -> None:
