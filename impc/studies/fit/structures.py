@@ -41,6 +41,12 @@ _SO_FAR = (
     "In the first simulated studies these intervals of 95 % held the truth in 85 to 90 %: take "
     "them for somewhat wider."
 )
+# The test holds its level where noise is in the recorder and the plant is the body.
+_OF_THE_MODEL = (
+    "The recordings also show an error of the body's model or of the controller's, whatever the "
+    "weights: that alone makes the test refuse a structure, so that the refusal may not be the "
+    "structure's fault."
+)
 _PICTURE = Picture(
     "structured-weights",
     "Prices of the features with their intervals, one row each, on a logarithmic axis",
@@ -58,6 +64,9 @@ def structure_sentences(result: FitResult) -> tuple[str, ...]:
     lines = [_verdict(found)]
     if found.estimate is None:
         return tuple(lines)
+    other = result.diagnostics.structure
+    if found.refused and other is not None and other.found:
+        lines.append(_OF_THE_MODEL)
     lines.append(_explains(result, found))
     if not found.refused:
         lines += [*_prices(found), _told(found), _SO_FAR]

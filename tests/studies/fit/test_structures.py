@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from experiments.printed_intervals import carts, with_noise
+from impc.checking import replace
 from impc.control.controller import Controller
 from impc.errors import InputError
 from impc.inverse.noisy_fit import fit_controller
@@ -64,6 +65,19 @@ def test_statements_within_a_structure_that_holds() -> None:
         for name, item in zip(truth, result.structures[0].intervals, strict=True)
     ]
     assert sum(held) >= 4  # of 95 % each
+
+
+def test_a_refusal_may_be_the_fault_of_the_model() -> None:
+    """On a nonlinear body the true structure of the simulated subject is refused too."""
+    result = fitted(0.5)
+    assert not any("not be the structure's fault" in line for line in structure_sentences(result))
+    error = result.diagnostics.structure
+    assert error is not None
+    wrong = replace(result.diagnostics, structure=replace(error, p_linear=0.001, share=0.1))
+    lines = structure_sentences(replace(result, diagnostics=wrong))
+    assert lines[1].endswith("the refusal may not be the structure's fault.")
+    whole = replace(fitted(0.0), diagnostics=wrong)
+    assert not any("not be the structure's fault" in line for line in structure_sentences(whole))
 
 
 def test_a_structure_that_does_not_hold_is_refused_first() -> None:
