@@ -2,9 +2,9 @@
 
 CasADi asks for the value, for directions of the outputs that belong to directions of the inputs
 (forward), and for weights of the inputs that belong to weights of the outputs (in reverse), each as
-a function of its own that stands beside the others (`casadi.Callback`). All of them share one map,
-which is evaluated and linearised once at each point. Directions are the first axis of an array here
-and stand beside each other in CasADi.
+a function of its own that stands beside the others (`casadi.Callback`; docs/casadi.md). All of them
+share one map, which is evaluated and linearised once at each point. Directions are the first axis
+of an array here, and stand beside each other in CasADi.
 """
 
 from __future__ import annotations
@@ -45,22 +45,51 @@ class Linear(Protocol):
     """A linear map of changes."""
 
     def forward(self, seeds: list[Array]) -> list[Array]:
-        """Directions (k, rows, columns) of each input, `seeds`, to those of the outputs."""
+        """Directions of the outputs, (k, rows, columns) of each.
+
+        Parameters
+        ----------
+        seeds : list of Array
+            Directions of the inputs, (k, rows, columns) of each.
+        """
 
     def reverse(self, seeds: list[Array]) -> list[Array]:
-        """Weights (k, rows, columns) of each output, `seeds`, to those of the inputs."""
+        """Weights of the inputs, (k, rows, columns) of each.
+
+        Parameters
+        ----------
+        seeds : list of Array
+            Weights of the outputs, (k, rows, columns) of each.
+        """
 
 
 class Map(Protocol):
-    """What `differentiable` makes a function of; NaN where there is no value."""
+    """What `differentiable` makes a function of; NaN where there is no value.
+
+    Attributes
+    ----------
+    signature : Signature
+    """
 
     signature: Signature
 
     def value(self, point: list[Array]) -> list[Array]:
-        """The outputs at a `point`, in the order of the signature."""
+        """The outputs, (rows, columns) of each as in the signature.
+
+        Parameters
+        ----------
+        point : list of Array
+            The inputs, (rows, columns) of each.
+        """
 
     def linearised(self, point: list[Array]) -> Linear:
-        """The linear map of changes at a `point`."""
+        """The linear map of changes.
+
+        Parameters
+        ----------
+        point : list of Array
+            The inputs, (rows, columns) of each.
+        """
 
 
 class Matrix:
@@ -70,11 +99,33 @@ class Matrix:
         self._matrix, self._signature = matrix, signature
 
     def forward(self, seeds: list[Array]) -> list[Array]:
-        """As `Linear`."""
+        """As in `Linear`.
+
+        Parameters
+        ----------
+        seeds : list of Array
+            Of the inputs, (k, rows, columns) of each.
+
+        Returns
+        -------
+        list of Array
+            Of the outputs, (k, rows, columns) of each.
+        """
         return _parts(_flat(seeds) @ self._matrix.T, self._signature.outputs)
 
     def reverse(self, seeds: list[Array]) -> list[Array]:
-        """As `Linear`."""
+        """As in `Linear`.
+
+        Parameters
+        ----------
+        seeds : list of Array
+            Of the outputs, (k, rows, columns) of each.
+
+        Returns
+        -------
+        list of Array
+            Of the inputs, (k, rows, columns) of each.
+        """
         return _parts(_flat(seeds) @ self._matrix, self._signature.inputs)
 
 

@@ -550,8 +550,14 @@ def answer_with(
 
     Parameters
     ----------
-    loop, dloop, rows, drows, unit, x, dx
-        As in `run`, of this sample.
+    loop, dloop : LoopMatrices
+        Of the loop and its derivatives, as in `run`.
+    rows, drows : Rows, RowDirections
+        Likewise.
+    unit : Buffer
+        What the error of each input is measured by (m,).
+    x, dx : Buffer
+        State (n,) and its derivative (n, p).
     tight : Buffer
         Rows that hold with equality, linearly independent, (a,).
     given_up : Buffer of bool

@@ -26,7 +26,7 @@ import numpy as np
 from impc.arrays import Array, frozen
 from impc.checking import checked
 from impc.control.casadi_callback import Linear, Matrix, Signature, differentiable
-from impc.control.closed_loop import Scenario, prepare_loop, run_loop
+from impc.control.closed_loop import Scenario, prepare_loop, run_loop, scenario
 from impc.control.constraint_rows import directions
 from impc.control.controller import Controller
 from impc.errors import ImpcError, InputError
@@ -34,15 +34,24 @@ from impc.model.riccati import regulator_changes, solve_lqr
 from impc.model.weights import Weights
 
 if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
     from impc.control.closed_loop import Simulation
     from impc.control.terminal_set import TerminalSet
+    from impc.model.plant import Plant
     from impc.model.riccati import LqrSolution
 
 __all__ = ["closed_loop_function"]
 
 
 @checked(steps=(1, 10_000_000))
-def closed_loop_function(controller: Controller, steps: int, of: str = "gain") -> ca.Function:
+def closed_loop_function(
+    controller: Controller,
+    steps: int | None = None,
+    disturbance: ArrayLike | None = None,
+    *,
+    of: str = "gain",
+) -> ca.Function:
     """Closed loop of a plant as a `casadi.Function` of its controller.
 
     Matrices have one row for each sample, as everywhere in the package. Plant, bounds, horizon,
@@ -53,8 +62,13 @@ def closed_loop_function(controller: Controller, steps: int, of: str = "gain") -
     Parameters
     ----------
     controller : Controller
-    steps : int
-        Samples at which an input is applied.
+    steps : int, optional
+        Samples at which an input is applied. Needed when there is no disturbance; otherwise its
+        length is taken.
+    disturbance : array_like, optional
+        (steps, d), or (steps,) for a single one: a constant of the function, which then has no such
+        input. CasADi keeps the pattern of every derivative, and that of 3000 samples of a
+        disturbance takes a gigabyte.
     of : str
         "gain": a function of K (m, n) and S (m, m), of which the symmetric part counts and the
         scale does not. "weights": of Q (n, n) and R (m, m), of which the symmetric parts count.
@@ -63,14 +77,14 @@ def closed_loop_function(controller: Controller, steps: int, of: str = "gain") -
     -------
     casadi.Function
         (K, S, x0, disturbance) -> (x, u), or (Q, R, x0, disturbance) -> (x, u), with x0 (n, 1),
-        disturbance (steps, d), x (steps + 1, n) and u (steps, m). Its derivatives, forward and in
-        reverse, are exact; at samples that are weakly active they are one-sided. There are no
-        second ones.
+        disturbance (steps, d) where it is not given, x (steps + 1, n) and u (steps, m). Its
+        derivatives, forward and in reverse, are exact; at samples that are weakly active they are
+        one-sided. There are no second ones.
 
     Raises
     ------
-    InputError
-        When `of` is neither.
+    InputError, DataError
+        When `of` is neither, the disturbance is not one of the plant, or there is no length.
 
     Examples
     --------
@@ -82,7 +96,7 @@ def closed_loop_function(controller: Controller, steps: int, of: str = "gain") -
     >>> law = impc.Controller(plant, impc.Weights([[1, 0], [0, 1]], 1), bounds, horizon=3)
     >>> loop = impc.closed_loop_function(law, steps=20)
     >>> K = casadi.MX.sym("K", 1, 2)
-    >>> x, u = loop(K, 1, [1, 3], casadi.DM(20, 0))
+    >>> x, u = loop(K, 1, [1, 3], casadi.DM(20, 0))  # this plant has no disturbance
     >>> slope = casadi.Function("slope", [K], [casadi.jacobian(casadi.sumsqr(x), K)])
     >>> slope(law.K).shape
     (1, 2)
@@ -90,32 +104,35 @@ def closed_loop_function(controller: Controller, steps: int, of: str = "gain") -
     if of not in ("gain", "weights"):
         raise InputError("of", f"got {of!r}", "choose gain or weights")
     plant = controller.plant
-    loop = differentiable("closed_loop", _LoopOfGain(controller, steps))
+    drive = scenario(plant, np.zeros(plant.n), steps, disturbance).disturbance
+    loop = differentiable("closed_loop", _LoopOfGain(controller, drive, disturbance is not None))
     if of == "gain":
         return loop
     regulator = differentiable("regulator", _RegulatorOfWeights(controller))
     Q, R = ca.MX.sym("Q", plant.n, plant.n), ca.MX.sym("R", plant.m, plant.m)
-    x0, disturbance = ca.MX.sym("x0", plant.n), ca.MX.sym("d", steps, plant.E.shape[1])
-    x, u = loop(*regulator(Q, R), x0, disturbance)
-    names = ["Q", "R", "x0", "disturbance"]
-    return ca.Function("closed_loop", [Q, R, x0, disturbance], [x, u], names, ["x", "u"])
+    given = {"Q": Q, "R": R, "x0": ca.MX.sym("x0", plant.n)}
+    if disturbance is None:
+        given["disturbance"] = ca.MX.sym("disturbance", *drive.shape)
+    x, u = loop(*regulator(Q, R), *list(given.values())[2:])
+    return ca.Function("closed_loop", [*given.values()], [x, u], [*given], ["x", "u"])
 
 
 class _LoopOfGain:
-    """(K, S, x0, disturbance) -> (x, u), linearised where it was evaluated last."""
+    """(K, S, x0) -> (x, u) under a disturbance, or (K, S, x0, disturbance) -> (x, u)."""
 
-    def __init__(self, controller: Controller, steps: int) -> None:
-        plant = controller.plant
-        n, m, d = plant.n, plant.m, plant.E.shape[1]
-        self.signature = Signature(
-            {"K": (m, n), "S": (m, m), "x0": (n, 1), "disturbance": (steps, d)},
-            {"x": (steps + 1, n), "u": (steps, m)},
-        )
+    def __init__(self, controller: Controller, disturbance: Array, fixed: bool) -> None:
+        n, m, steps = controller.plant.n, controller.plant.m, len(disturbance)
+        inputs: dict[str, tuple[int, int]] = {"K": (m, n), "S": (m, m), "x0": (n, 1)}
+        if not fixed:
+            inputs["disturbance"] = (steps, disturbance.shape[1])
+        self.signature = Signature(inputs, {"x": (steps + 1, n), "u": (steps, m)})
+        self._fixed = [disturbance] if fixed else []
         self._controller = controller
         self._near: TerminalSet | None = controller.terminal
 
     def value(self, point: list[Array]) -> list[Array]:
         """States and inputs."""
+        point = [*point, *self._fixed]
         made = self._make(point)
         if made is None:
             return [np.full(shape, np.nan) for shape in self.signature.outputs.values()]
@@ -124,6 +141,7 @@ class _LoopOfGain:
 
     def linearised(self, point: list[Array]) -> Linear:
         """The linear map of changes at a point, and its adjoint."""
+        point = [*point, *self._fixed]
         made = self._make(point)
         plant, steps = self._controller.plant, len(point[3])
         n, m = plant.n, plant.m
@@ -133,14 +151,12 @@ class _LoopOfGain:
         dS = np.zeros((m, m, count))
         at = np.arange(n + m * n, count)
         dS[low[0], low[1], at] = dS[low[1], low[0], at] = 1.0
-        if made is None:
-            local = np.full((steps, m, count), np.nan)
-        else:
+        local: Array = np.full((steps, m, count), np.nan)
+        if made is not None:
             along = directions(made, count, x0=dx0, K=dK, S=dS)
             run, moved = run_loop(prepare_loop(made, along), _scenario(point), local=True)
-            local = moved.u
-            local[run.reached :] = np.nan
-        return _LinearLoop(plant.A, plant.B, plant.E, local[..., :n], local[..., n:], point[1])
+            local[: run.reached] = moved.u[: run.reached]
+        return _LinearLoop(plant, local[..., :n], local[..., n:], point[1], bool(self._fixed))
 
     def _make(self, point: list[Array]) -> Controller | None:
         K, S, x0, disturbance = point
@@ -206,19 +222,21 @@ class _RegulatorOfWeights:
 class _LinearLoop:
     """The equations of the module's text at one point."""
 
-    def __init__(self, A: Array, B: Array, E: Array, L: Array, G: Array, S: Array) -> None:
-        self._B, self._E, self._L, self._G = B, E, L, G
-        self._F = A + B @ L  # (steps, n, n)
+    def __init__(self, plant: Plant, L: Array, G: Array, S: Array, fixed: bool) -> None:
+        self._B, self._E, self._L, self._G, self._fixed = plant.B, plant.E, L, G, fixed
+        self._F = plant.A + plant.B @ L  # (steps, n, n)
         self._S = (S + S.T) / 2
         self._low = np.tril_indices(len(S))
 
     def forward(self, seeds: list[Array]) -> list[Array]:
         """Directions of the inputs (k, ...) to those of the outputs."""
-        dK, dS, dx0, dd = seeds
+        dK, dS, dx0, *drive = seeds
         count, steps = len(dK), len(self._F)
         theta = np.column_stack([dK.reshape(count, -1), self._scaled(dS)[:, *self._low]])
         moved = np.moveaxis(self._G @ theta.T, 1, 2)  # (steps, k, m)
-        push = moved @ self._B.T + np.moveaxis(dd, 0, 1) @ self._E.T
+        push = moved @ self._B.T
+        for dd in drive:
+            push = push + np.moveaxis(dd, 0, 1) @ self._E.T
         x = np.empty((steps + 1, count, dx0.shape[1]))
         x[0] = dx0[..., 0]
         for t in range(steps):
@@ -242,7 +260,7 @@ class _LinearLoop:
             theta[:, : m * n].reshape(count, m, n),
             self._scaled_back(entries),
             p[0][..., None],
-            np.moveaxis(p[1:] @ self._E, 1, 0),
+            *([] if self._fixed else [np.moveaxis(p[1:] @ self._E, 1, 0)]),
         ]
 
     def _scaled(self, dS: Array) -> Array:

@@ -24,6 +24,8 @@ __all__ = ["SECONDS_A_SAMPLE", "Effort", "fit_effort"]
 SECONDS_A_SAMPLE = 5.4e-3 / (3000 * 10 * 20)
 # For each number of the derivatives of the rows, which are built again for each simulation.
 _A_NUMBER = 1e-8
+# Times of a simulation with other solvers over that of the compiled one, docs/benchmarks/results.md.
+_SLOWER = {"compiled": 1.0, "daqp": 18.0, "qpoases": 24.0, "ipopt": 225.0}
 # What a simulation takes however short the trial is: the calls around the compiled loop.
 _A_TRIAL = 1e-3
 # Simulations of all trials: of a fit (4 s of three trials of 15 ms), of a replicate (0.6 s of it),
@@ -65,9 +67,8 @@ def fit_effort(problem: Problem, settings: FitSettings) -> Effort:
     derivatives = rows * horizon * m * along
     numbers = derivatives + 4 * rows * horizon * m + rows**2
     numbers += 2 * longest * (n + m) * along + 2 * samples * len(plant.outputs) * along
-    once = (
-        samples * n * horizon * SECONDS_A_SAMPLE + derivatives * _A_NUMBER + len(trials) * _A_TRIAL
-    )
+    once = samples * n * horizon * SECONDS_A_SAMPLE * _SLOWER[problem.solver]
+    once += derivatives * _A_NUMBER + len(trials) * _A_TRIAL
     left_out = len(trials) if settings.held_out and len(trials) > 1 else 0
     structures = (settings.structure is not None) + len(settings.structures)
     fits = 2 + left_out + len(settings.horizons) + m * settings.unknown_limit

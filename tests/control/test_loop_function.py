@@ -16,7 +16,7 @@ from impc.control.closed_loop import Scenario, simulate, simulate_and_differenti
 from impc.control.constraint_rows import directions
 from impc.control.controller import Controller
 from impc.control.loop_function import closed_loop_function
-from impc.errors import InputError
+from impc.errors import DataError, InputError
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.riccati import solve_lqr
@@ -140,6 +140,24 @@ def test_weights_move_the_loop_as_differences_say() -> None:
         expected,
         atol=1e-6 * np.abs(expected).max(),
     )
+
+
+def test_a_given_disturbance_is_no_input() -> None:
+    """The same states and gradients as where it is one."""
+    controller, drive, _ = problem(5, None)
+    open_one = closed_loop_function(controller, drive.steps)
+    given = closed_loop_function(controller, disturbance=drive.disturbance)
+    assert given.name_in() == ["K", "S", "x0"]
+    K, S = ca.MX.sym("K", *controller.K.shape), ca.MX.sym("S", *controller.S.shape)
+    slopes = []
+    for x, u in (open_one(K, S, drive.x0, drive.disturbance), given(K, S, drive.x0)):
+        both = ca.veccat(x, u)
+        parts = [ca.jacobian(both, K), ca.gradient(ca.sumsqr(both), S)]
+        slopes.append(ca.Function("slope", [K, S], parts)(controller.K, controller.S))
+    for one, other in zip(*slopes, strict=True):
+        np.testing.assert_array_equal(one.full(), other.full())
+    with pytest.raises(DataError, match=r"^steps: got None without a disturbance"):
+        closed_loop_function(controller)
 
 
 def test_the_solver_of_the_controller_is_that_of_the_function(example_plant: Plant) -> None:

@@ -20,6 +20,7 @@ from impc.cli.main import main
 from impc.control.closed_loop import prepare_loop
 from impc.control.constraint_rows import directions
 from impc.control.controller import Controller
+from impc.control.named_solver import SOLVERS
 from impc.errors import InputError
 from impc.inverse.problem import Problem
 from impc.model.bounds import Bounds
@@ -84,6 +85,12 @@ def test_time_grows_with_what_is_asked() -> None:
     usual = fit_effort(problem, FitSettings(replicates=1000, profiles=["a"], horizons=[10])).seconds
     assert 60 < usual < 7200
     assert fit_effort(problem, FitSettings(replicates=10**6)).seconds > 7200
+    plain = fit_effort(problem, FitSettings()).seconds
+    slower = [
+        fit_effort(replace(problem, solver=name), FitSettings()).seconds / plain for name in SOLVERS
+    ]
+    assert min(slower) > 5
+    assert max(slower) > 50  # IPOPT's
 
 
 def test_consent(monkeypatch: pytest.MonkeyPatch) -> None:
