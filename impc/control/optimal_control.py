@@ -189,6 +189,13 @@ class OptimalControlProblem(Frozen):
         """Number of inputs."""
         return len(self.input_names)
 
+    def with_horizon(self, horizon: int) -> OptimalControlProblem:
+        """The same problem over another `horizon` in samples."""
+        made = object.__new__(OptimalControlProblem)
+        for name, value in {**vars(self), "horizon": horizon}.items():
+            object.__setattr__(made, name, value)
+        return made
+
     def values(self, theta: Mapping[str, float]) -> Array:
         """Values of the parameters (p,) in their order, from values by name.
 

@@ -25,8 +25,10 @@ class OptimalRecording(Frozen):
 
     Attributes
     ----------
+    problem : OptimalControlProblem
+        Whose plan or closed loop it is.
     x, u : Array
-        (T + 1, n) and (T, m).
+        States (T + 1, n) and inputs (T, m).
     d : Array
         Disturbances (T, d).
     x0 : Array
@@ -37,6 +39,7 @@ class OptimalRecording(Frozen):
         Whether the initial state is searched too.
     """
 
+    problem: OptimalControlProblem
     x: Array
     u: Array
     d: Array
@@ -98,8 +101,9 @@ def optimal_recording(
     if not np.any(np.isfinite(states[1:])) and not np.any(np.isfinite(inputs)):
         raise DataError("recording", "has nothing that was measured", "give states or inputs")
     return OptimalRecording(
-        frozen(states), frozen(inputs), frozen(known), frozen(start), closed_loop, unknown_start
-    )
+        problem, frozen(states), frozen(inputs), frozen(known), frozen(start), closed_loop,
+        unknown_start,
+    )  # fmt: skip
 
 
 def _table(name: str, values: Any, columns: int) -> Array:
