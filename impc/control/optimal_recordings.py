@@ -27,10 +27,12 @@ class OptimalRecording(Frozen):
     ----------
     problem : OptimalControlProblem
         Whose plan or closed loop it is.
-    x, u : Array
-        States (T + 1, n) and inputs (T, m).
+    x : Array
+        States (steps + 1, n).
+    u : Array
+        Inputs (steps, m).
     d : Array
-        Disturbances (T, d).
+        Disturbances, of shape (steps, d).
     x0 : Array
         Initial state (n,): the true one, or a guess when it is unknown.
     closed_loop : bool
@@ -64,13 +66,13 @@ def optimal_recording(
     ----------
     problem : OptimalControlProblem
     x : array_like
-        States (T + 1, n); T is the horizon for one plan.
+        States (steps + 1, n); T is the horizon for one plan.
     u : array_like, optional
-        Inputs (T, m); not measured by default.
+        Inputs (steps, m); not measured by default.
     closed_loop : bool
         Whether it is one; else it is one plan.
     d : array_like, optional
-        Disturbances (T, d); none by default.
+        Disturbances (steps, d); none by default.
     x0 : array_like, optional
         (n,); the first of x by default.
     unknown_start : bool

@@ -75,6 +75,7 @@ class Conditions(NamedTuple):
     Attributes
     ----------
     cost : float
+        Of all stages and the end.
     gradient : Array
         Of l + nu'f + lam'h by w (N, n + m).
     f, h : Array

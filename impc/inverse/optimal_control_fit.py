@@ -20,7 +20,7 @@ import scipy.stats
 
 from impc.arrays import Array, Frozen, IntArray
 from impc.control.nlp_solvers import require_solver
-from impc.errors import DataError, InputError, SolverError
+from impc.errors import DataError, InfeasibleError, InputError, SolverError
 from impc.inverse.optimal_control_residuals import EXPLAINED, begin, first_plan, residuals_of
 from impc.inverse.optimal_control_search import Count, along_mu, guided
 from impc.inverse.told_combinations import Combinations, combinations
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 __all__ = ["MU_STEPS", "OptimalControlEstimate", "fit_optimal_control"]
 
-#: The falling sequence of mu, of the dimension of the cost.
+#: The falling sequence of mu, over the mean cost of a recorded stage where that is below one.
 MU_STEPS = (1e-1, 1e-2, 1e-4, 1e-10)
 
 
@@ -64,7 +64,7 @@ class OptimalControlEstimate(Frozen):
     x0 : tuple of Array
         Initial state of each recording (n,).
     runs : tuple
-        States (T + 1, n) and inputs (T, m) of each recording as the estimate has them.
+        Of each recording the states (steps + 1, n) and inputs (steps, m) that the estimate has.
     settled : bool
         Whether the search ended by itself.
     evaluations : int
@@ -89,7 +89,7 @@ class OptimalControlEstimate(Frozen):
     seconds: float
 
     def intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
-        """Low and high end of each parameter by its name, from the noise that is left.
+        """Low and high end of each parameter by its name, at a `level` between 0 and 1.
 
         Normal in the logarithms of positive parameters; the noise of each signal is the root mean
         square of what is left of it. A parameter that is part of an untold combination has an
@@ -120,7 +120,7 @@ def fit_optimal_control(
     start: Mapping[str, float],
     *,
     solver: str = "ipopt",
-    mu_steps: Sequence[float] = MU_STEPS,
+    mu_steps: Sequence[float] | None = None,
     evaluations: int = 200,
 ) -> OptimalControlEstimate:
     """Search the parameters from a start.
@@ -134,8 +134,9 @@ def fit_optimal_control(
         First value of each parameter by its name.
     solver : str
         One of `impc.control.nlp_solvers.SOLVERS`.
-    mu_steps : sequence of float
-        Falling.
+    mu_steps : sequence of float, optional
+        Falling, of the dimension of the cost; by default `MU_STEPS` times the mean cost of a
+        recorded stage at the start, at most one, and at least 1e-10.
     evaluations : int
         After how many a search is stopped; there are at most two, guided and not.
 
@@ -178,6 +179,8 @@ def fit_optimal_control(
     require_solver(solver)
     if not recordings:
         raise DataError("recordings", "there are none", "give at least one")
+    if mu_steps is None:
+        mu_steps = _scaled(recordings, problem.values(start))
     if not mu_steps or any(b >= a for a, b in itertools.pairwise(mu_steps)):
         raise InputError("mu_steps", f"got {tuple(mu_steps)!r:.60}", "give falling numbers")
     began = time.perf_counter()
@@ -201,6 +204,22 @@ def fit_optimal_control(
     return _estimate(given, best, settled, done, time.perf_counter() - began)
 
 
+def _scaled(recordings: Sequence[OptimalRecording], theta: Array) -> tuple[float, ...]:
+    """mu in the size of the cost: at 0.1 of it a limit is felt from afar and moves little else."""
+    costs: list[Array] = []
+    for one in recordings:
+        w = np.hstack([one.x[:-1], one.u, one.d])
+        known = np.all(np.isfinite(w), axis=1)
+        if np.any(known):
+            function = one.problem.functions[1].map(int(known.sum()))
+            x, u, d = one.x[:-1][known].T, one.u[known].T, one.d[known].T
+            repeated = np.repeat(theta[:, None], x.shape[1], axis=1)
+            costs.append(np.abs(function(x, u, d, repeated).full().ravel()))
+    mean = float(np.mean(np.concatenate(costs))) if costs else 1.0
+    size = min(1.0, mean) if np.isfinite(mean) else 1.0
+    return tuple(dict.fromkeys(max(mu * size, MU_STEPS[-1]) for mu in MU_STEPS))
+
+
 def _attempt(
     given: Residuals, theta: Array, mu_steps: Sequence[float], count: Count, guide: bool
 ) -> tuple[Evaluation, bool] | None:
@@ -211,7 +230,12 @@ def _attempt(
         if found is None:
             return None
         theta, mu_steps = found, mu_steps[-2:] if loops else mu_steps
-    first = begin(given, given.unknowns(theta), mu_steps[0])
+    try:
+        first = begin(given, given.unknowns(theta), mu_steps[0])
+    except (InfeasibleError, SolverError):
+        if not guide:
+            raise
+        return None  # what guided the search may end where the recordings have no plan
     count.done += 1
     return along_mu(given, first, mu_steps, count)
 

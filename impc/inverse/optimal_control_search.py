@@ -1,7 +1,7 @@
 """Levenberg and Marquardt's method over a falling sequence of mu (docs/nonlinear.md).
 
-`along_mu` searches the recordings as they are. `guided` takes every recorded state for the beginning
-of a plan of its own, of which the first input and the next state were recorded: of a closed loop
+`along_mu` searches the recordings as they are. `guided` takes every recorded state for the start of
+a plan of its own, of which the first input and the next state were recorded: of a closed loop
 that is what it is; of one plan it holds because the rest of an optimal plan is optimal (Bellman
 1957). Such plans do not run away from the recording where the first parameters are wrong.
 """
@@ -51,7 +51,7 @@ class Count:
     def evaluate(
         self, given: Residuals, unknowns: Array, mu: float, before: Evaluation
     ) -> Evaluation | None:
-        """As `impc.inverse.optimal_control_residuals.evaluate` at unknowns (k,), counted."""
+        """`impc.inverse.optimal_control_residuals.evaluate` at unknowns (k,) and mu, counted."""
         self.done += 1
         return evaluate(given, unknowns, mu, before)
 
@@ -59,7 +59,7 @@ class Count:
 def along_mu(
     given: Residuals, current: Evaluation, mu_steps: Sequence[float], count: Count
 ) -> tuple[Evaluation, bool]:
-    """Search at each of falling mu; whether the last search ended by itself."""
+    """Search at each of the falling `mu_steps`; whether the last search ended by itself."""
     settled = True
     for mu in mu_steps:
         if mu != current.mu:
@@ -106,10 +106,8 @@ def _levenberg(
     return current, not last
 
 
-def guided(
-    given: Residuals, theta: Array, mu_steps: Sequence[float], count: Count
-) -> Array | None:
-    """Parameters (p,) that explain each recorded state's own plan, from theta (p,).
+def guided(given: Residuals, theta: Array, mu_steps: Sequence[float], count: Count) -> Array | None:
+    """Parameters (p,) by each recorded state's own plan, from theta (p,) along falling `mu_steps`.
 
     States from which theta has no plan are left out; None when none is left.
     """
