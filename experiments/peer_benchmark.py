@@ -11,6 +11,7 @@ records (Jin, Mou and Pappas, NeurIPS 2021).
 from __future__ import annotations
 
 import argparse
+import itertools
 import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -99,8 +100,8 @@ def told_error(found: Combinations, truth: dict[str, float]) -> float:
     )
 
 
-def coverage(repetitions: int, decibel: float = 20.0) -> tuple[dict[str, float], list[str]]:
-    """Share of 95 % intervals that hold the truth, by told product, on the noisy robot arm.
+def coverage(repetitions: int, decibel: float = 20.0) -> tuple[dict[str, list[bool]], list[str]]:
+    """Whether 95 % intervals hold the truth, by told product, on the noisy robot arm.
 
     Noise on states and inputs, each of its signal's root mean square less `decibel`; the initial
     state is known, and the start is the truth. What else was untold by the noise is listed.
@@ -121,7 +122,7 @@ def coverage(repetitions: int, decibel: float = 20.0) -> tuple[dict[str, float],
             held.setdefault(one.name, []).append(bool(inside))
         if len(found.untold) != 2:
             odd.append("; ".join(found.sentences[:-1]))
-    return {name: float(np.mean(item)) for name, item in held.items()}, odd
+    return held, odd
 
 
 def _noisy(values: Array, share: float, rng: np.random.Generator) -> Array:
@@ -175,9 +176,10 @@ def main() -> None:
     elif given.study == "loops":
         _loops(given.count)
     else:
-        shares, odd = coverage(10 * given.count)
-        print(*(f"{name}: {100 * share:.0f} %" for name, share in shares.items()), sep="\n")
-        print(f"all: {100 * float(np.mean(list(shares.values()))):.1f} %", *odd, sep="\n")
+        held, odd = coverage(10 * given.count)
+        for name, item in (*held.items(), ("all", list(itertools.chain(*held.values())))):
+            print(f"{name}: {sum(item)} of {len(item)}, {100 * np.mean(item):.1f} %")
+        print(f"another direction is not told in {len(odd)}:", *odd, sep="\n")
 
 
 if __name__ == "__main__":

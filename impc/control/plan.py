@@ -249,6 +249,7 @@ def _pair(lam: Array, s: Array, mu: float) -> tuple[Array, Array]:
     return lam, np.where(held, mu / lam, slack)
 
 
+@np.errstate(over="ignore", invalid="ignore")  # a step that leads nowhere ends as such
 def _newton(
     problem: OptimalControlProblem, theta: Array, d: Array, point: Point, mu: float
 ) -> Plan | str:
@@ -262,7 +263,7 @@ def _newton(
     short = 0
     for _ in range(_STEPS):
         factors = system(problem, point, at)
-        if not np.isfinite(merit):
+        if not np.isfinite(merit) or not np.all(np.isfinite(factors.lu)):
             return ""
         if not factors.regular:
             return _flat(problem, factors, at)

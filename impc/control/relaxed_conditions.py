@@ -290,7 +290,7 @@ def system(problem: OptimalControlProblem, point: Point, at: Conditions) -> Syst
     matrix = np.zeros((3 * band + 1, N * (m + 2 * n)))
     matrix[rows, columns] = values
     lu, pivots, info = lapack.dgbtrf(matrix, band, band)
-    return System(lu, pivots, band, H, H_end, info == 0 and bool(np.all(np.isfinite(lu))))
+    return System(lu, pivots, band, H, H_end, info == 0)
 
 
 def parameter_sides(
