@@ -5,7 +5,7 @@
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
-.PHONY: help env demo test full check docs architecture reproduce wheel slow coverage structures search numerics bench fuzz lock clean
+.PHONY: help env demo test full check docs architecture reproduce wheel slow coverage structures nonlinear search numerics bench fuzz lock clean
 
 PYTHON ?= python3
 # Not to be set from outside: the environment is made with `venv --clear`.
@@ -45,6 +45,7 @@ help:
 	@echo 'make slow    hundreds of recordings, fits and subjects: an hour'
 	@echo 'make coverage  how often printed intervals hold the truth: the table of docs/fitting.md'
 	@echo 'make structures  coverage of prices, level and power of the test of a structure (hours)'
+	@echo 'make nonlinear  the four systems of docs/nonlinear.md: starts, closed loops, noise (an hour)'
 	@echo 'make search   new examples for the tests by hypothesis, from a seed that is printed'
 	@echo 'make numerics the numerical tests on other processors and dependencies (an hour; needs uv)'
 	@echo 'make docs    build the site in docs/_build/html; warnings are errors, tutorials run (minutes)'
@@ -125,6 +126,12 @@ structures: env
 	$(STUDY) run carts --test-only --root 0.8 --subjects 400 --out results/structures-carts.jsonl
 	$(STUDY) run carts --test-only --cross 0.5 --subjects 100 --out results/structures-carts.jsonl
 	$(STUDY) sum results/structures-seat.jsonl results/structures-carts.jsonl
+
+# The tables of docs/nonlinear.md: four systems, twenty starts each; closed loops; noise.
+nonlinear: env
+	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.peer_benchmark starts
+	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.peer_benchmark loops
+	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.peer_benchmark noise
 
 bench: env
 	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(PY) -m experiments.benchmarks

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from experiments.peer_systems import PeerSystem
     from impc.arrays import Array
     from impc.control.optimal_recordings import OptimalRecording
-    from impc.inverse.told_combinations import Combinations
+    from impc.inverse.told_combinations import Combination, Combinations
 
 __all__ = ["LOOPS", "Outcome", "coverage", "demonstration", "fit_from", "told_error"]
 
@@ -86,18 +86,18 @@ def fit_from(
         return Outcome(np.nan, np.nan, 0, time.process_time() - began, str(error))
     seconds = time.process_time() - began
     untold = ", ".join(one.name for one in found.combinations.untold) or "none"
-    error = told_error(found.combinations, truth)
-    return Outcome(found.loss, error, found.evaluations, seconds, untold)
+    wrong = told_error(found.combinations, truth)
+    return Outcome(found.loss, wrong, found.evaluations, seconds, untold)
 
 
 def told_error(found: Combinations, truth: dict[str, float]) -> float:
     """Largest relative error of the told products."""
-    return max(
-        abs(
-            one.value / np.prod([truth[name] ** power for name, power in one.exponents.items()]) - 1
-        )
-        for one in found.told
-    )
+    errors = [abs(one.value / _product(truth, one) - 1) for one in found.told]
+    return max(errors)
+
+
+def _product(truth: dict[str, float], one: Combination) -> float:
+    return float(np.prod([truth[name] ** power for name, power in one.exponents.items()]))
 
 
 def coverage(repetitions: int, decibel: float = 20.0) -> tuple[dict[str, list[bool]], list[str]]:
@@ -117,7 +117,7 @@ def coverage(repetitions: int, decibel: float = 20.0) -> tuple[dict[str, list[bo
         recording = system.problem.recorded_plan(*noisy, x0=system.x0)
         found = fit_optimal_control(system.problem, [recording], system.truth).combinations
         for one in found.told:
-            expected = np.prod([system.truth[name] ** k for name, k in one.exponents.items()])
+            expected = _product(system.truth, one)
             inside = abs(np.log(one.value / expected)) < 1.96 * one.deviation
             held.setdefault(one.name, []).append(bool(inside))
         if len(found.untold) != 2:

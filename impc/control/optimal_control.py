@@ -208,7 +208,7 @@ class OptimalControlProblem(Frozen):
         for name in theta:
             if name not in self.parameter_names:
                 raise InputError(f"parameter {name}", "is not known", _among(self.parameter_names))
-        found = []
+        found: list[float] = []
         for name, positive in zip(self.parameter_names, self.positive, strict=True):
             if name not in theta:
                 raise InputError(f"parameter {name}", "has no value", "give one for each name")

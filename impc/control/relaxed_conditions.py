@@ -140,9 +140,8 @@ class _Compiled(NamedTuple):
 def _compiled(problem: OptimalControlProblem) -> _Compiled:
     """Stage functions with derivatives; those of a stage are mapped over the horizon."""
     f, cost, e, h, h_end = problem.functions
-    kind = ca.SX if f.is_a("SXFunction") and all(
-        item.is_a("SXFunction") for item in problem.functions
-    ) else ca.MX  # fmt: skip
+    plain = all(item.is_a("SXFunction") for item in problem.functions)
+    kind: Any = ca.SX if plain else ca.MX
     n, m, p = problem.n, problem.m, len(problem.parameter_names)
     q, q_end = len(problem.rows), len(problem.terminal_rows)
     w, d, theta = kind.sym("w", n + m), kind.sym("d", problem.disturbance_count), kind.sym("t", p)
