@@ -5,7 +5,7 @@
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
-.PHONY: help env demo test full check docs architecture reproduce wheel slow coverage structures plans noisy-people search numerics bench fuzz lock clean
+.PHONY: help env demo test full check docs architecture reproduce wheel slow coverage structures plans noisy-people nonlinear look search numerics bench fuzz lock clean
 
 PYTHON ?= python3
 # Not to be set from outside: the environment is made with `venv --clear`.
@@ -47,6 +47,7 @@ help:
 	@echo 'make noisy-people  people who sense with noise: least squares beside the likelihood (hours)'
 	@echo 'make structures  coverage of prices, level and power of the test of a structure (hours)'
 	@echo 'make plans   do plans come true? fits of simulated recordings beside them (a quarter of an hour)'
+	@echo 'make nonlinear  the four systems of docs/nonlinear.md: starts, closed loops, noise (an hour)'
 	@echo 'make search   new examples for the tests by hypothesis, from a seed that is printed'
 	@echo 'make numerics the numerical tests on other processors and dependencies (an hour; needs uv)'
 	@echo 'make docs    build the site in docs/_build/html; warnings are errors, tutorials run (minutes)'
@@ -145,6 +146,12 @@ plans: env
 # What a reader's eye would find: cut, pale, unnamed or unexplained.
 look: env
 	OPENBLAS_NUM_THREADS=1 $(PY) -m tests.look $(PAGES)
+
+# The tables of docs/nonlinear.md: four systems, twenty starts each; closed loops; noise.
+nonlinear: env
+	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.peer_benchmark starts
+	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.peer_benchmark loops
+	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.peer_benchmark noise
 
 bench: env
 	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(PY) -m experiments.benchmarks

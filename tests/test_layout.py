@@ -84,7 +84,9 @@ ELSEWHERE = {
     "inverse/test_likelihood_fit.py": "inverse/person_coordinates.py",
     "inverse/test_arrow.py": "inverse/trial_span.py",
     "inverse/test_structured_fit.py": "inverse/structured_search.py",
-    "inverse/test_optimal_control_fit.py": "inverse/told_combinations.py",
+    "inverse/test_optimal_control_fit.py": """
+        inverse/optimal_control_residuals.py inverse/optimal_control_search.py
+        inverse/told_combinations.py""",
     "inverse/test_stationarity.py": "inverse/smoothing.py",
     "model/test_riccati.py": "model/bounds.py model/plant.py model/weights.py",
     "studies/plan/test_study.py": """

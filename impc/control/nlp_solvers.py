@@ -29,7 +29,7 @@ _SILENT: dict[str, Any] = {"print_time": False, "error_on_fail": False}
 
 
 def require_solver(name: str) -> None:
-    """Require one of `SOLVERS` that CasADi's wheel has.
+    """Require that `name` is one of `SOLVERS`, and in CasADi's wheel.
 
     Raises
     ------
@@ -68,7 +68,7 @@ def _equal(problem: OptimalControlProblem, k: int) -> BoolArray:
         return np.zeros(len(problem.terminal_rows), dtype=bool)
     first = problem.n if k == 0 else 0
     rows = int(wanted_rows(problem)[k].sum())
-    return np.r_[np.ones(problem.n + first, dtype=bool), np.zeros(rows, dtype=bool)]
+    return np.arange(problem.n + first + rows) < problem.n + first
 
 
 def _program(problem: OptimalControlProblem) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
+from numbers import Real
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
@@ -189,8 +190,15 @@ class OptimalControlProblem(Frozen):
         """Number of inputs."""
         return len(self.input_names)
 
+    def with_horizon(self, horizon: int) -> OptimalControlProblem:
+        """The same problem over another `horizon` in samples."""
+        made = object.__new__(OptimalControlProblem)
+        for name, value in {**vars(self), "horizon": horizon}.items():
+            object.__setattr__(made, name, value)
+        return made
+
     def values(self, theta: Mapping[str, float]) -> Array:
-        """Values of the parameters (p,) in their order, from values by name.
+        """Values of the parameters (p,) in their order, from `theta`, values by name.
 
         Raises
         ------
@@ -200,12 +208,12 @@ class OptimalControlProblem(Frozen):
         for name in theta:
             if name not in self.parameter_names:
                 raise InputError(f"parameter {name}", "is not known", _among(self.parameter_names))
-        found = []
+        found: list[float] = []
         for name, positive in zip(self.parameter_names, self.positive, strict=True):
             if name not in theta:
                 raise InputError(f"parameter {name}", "has no value", "give one for each name")
-            value: Any = theta[name]
-            if isinstance(value, bool) or not np.isscalar(value) or not np.isreal(value):
+            value = theta[name]
+            if isinstance(value, bool) or not isinstance(value, Real):
                 raise InputError(f"parameter {name}", f"got {value!r:.40}", "give a number")
             number = float(value)
             if not np.isfinite(number) or (positive and number <= 0):
@@ -215,7 +223,7 @@ class OptimalControlProblem(Frozen):
         return np.array(found)
 
     def start(self, x0: Any) -> Array:
-        """The initial state (n,), checked.
+        """The initial state `x0` as an array (n,), checked.
 
         Raises
         ------
@@ -271,7 +279,7 @@ class OptimalControlProblem(Frozen):
         steps : int
             T, samples.
         d : array_like, optional
-            Disturbances (T, d) that the plant sees and the controller does not.
+            Disturbances (steps, d) that the plant sees and the controller does not.
 
         Raises
         ------
@@ -296,7 +304,8 @@ class OptimalControlProblem(Frozen):
     ) -> OptimalRecording:
         """A recording that is one plan: `impc.control.optimal_recordings.optimal_recording`.
 
-        x (N + 1, n), u (N, m), d (N, d), x0 (n,); NaN is not measured.
+        x (N + 1, n), u (N, m), d (N, d), x0 (n,); NaN is not measured. With
+        `unknown_start` x0 is searched from what is given.
         """
         return optimal_recording(
             self, x, u, closed_loop=False, d=d, x0=x0, unknown_start=unknown_start
@@ -313,7 +322,8 @@ class OptimalControlProblem(Frozen):
     ) -> OptimalRecording:
         """A recording of the closed loop: `impc.control.optimal_recordings.optimal_recording`.
 
-        x (T + 1, n), u (T, m), d (T, d), x0 (n,); NaN is not measured.
+        x (steps + 1, n), u (steps, m), d (steps, d), x0 (n,); NaN is not measured. With
+        `unknown_start` x0 is searched from what is given.
         """
         return optimal_recording(
             self, x, u, closed_loop=True, d=d, x0=x0, unknown_start=unknown_start

@@ -25,10 +25,14 @@ class OptimalRecording(Frozen):
 
     Attributes
     ----------
-    x, u : Array
-        (T + 1, n) and (T, m).
+    problem : OptimalControlProblem
+        Whose plan or closed loop it is.
+    x : Array
+        States (steps + 1, n).
+    u : Array
+        Inputs (steps, m).
     d : Array
-        Disturbances (T, d).
+        Disturbances, of shape (steps, d).
     x0 : Array
         Initial state (n,): the true one, or a guess when it is unknown.
     closed_loop : bool
@@ -37,6 +41,7 @@ class OptimalRecording(Frozen):
         Whether the initial state is searched too.
     """
 
+    problem: OptimalControlProblem
     x: Array
     u: Array
     d: Array
@@ -61,13 +66,13 @@ def optimal_recording(
     ----------
     problem : OptimalControlProblem
     x : array_like
-        States (T + 1, n); T is the horizon for one plan.
+        States (steps + 1, n); T is the horizon for one plan.
     u : array_like, optional
-        Inputs (T, m); not measured by default.
+        Inputs (steps, m); not measured by default.
     closed_loop : bool
         Whether it is one; else it is one plan.
     d : array_like, optional
-        Disturbances (T, d); none by default.
+        Disturbances (steps, d); none by default.
     x0 : array_like, optional
         (n,); the first of x by default.
     unknown_start : bool
@@ -98,8 +103,9 @@ def optimal_recording(
     if not np.any(np.isfinite(states[1:])) and not np.any(np.isfinite(inputs)):
         raise DataError("recording", "has nothing that was measured", "give states or inputs")
     return OptimalRecording(
-        frozen(states), frozen(inputs), frozen(known), frozen(start), closed_loop, unknown_start
-    )
+        problem, frozen(states), frozen(inputs), frozen(known), frozen(start), closed_loop,
+        unknown_start,
+    )  # fmt: skip
 
 
 def _table(name: str, values: Any, columns: int) -> Array:

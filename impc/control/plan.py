@@ -63,6 +63,7 @@ class Plan(Frozen):
     mu : float
         Product of slack and multiplier of every row.
     cost : float
+        Without the relaxation.
     residual : float
         Largest of the conditions, relative as the test takes them.
     """
@@ -143,7 +144,7 @@ def solve_plan(
 def nearby_plan(
     plan: Plan, theta: Array, x0: Array, mu: float, steps: tuple[Point, ...], solver: str
 ) -> Plan | None:
-    """The plan at other parameters (p,), another state (n,) or another mu; None if there is none.
+    """The plan at other parameters theta (p,), another state x0 (n,) or mu; None if there is none.
 
     Newton's method begins at the plan, moved by each of `steps` in turn and then as it is; where
     none of these ends, the solver by its name begins at the plan, if there is a name.
@@ -248,6 +249,7 @@ def _pair(lam: Array, s: Array, mu: float) -> tuple[Array, Array]:
     return lam, np.where(held, mu / lam, slack)
 
 
+@np.errstate(over="ignore", invalid="ignore")  # a step that leads nowhere ends as such
 def _newton(
     problem: OptimalControlProblem, theta: Array, d: Array, point: Point, mu: float
 ) -> Plan | str:
@@ -261,7 +263,7 @@ def _newton(
     short = 0
     for _ in range(_STEPS):
         factors = system(problem, point, at)
-        if not np.isfinite(merit):
+        if not np.isfinite(merit) or not np.all(np.isfinite(factors.lu)):
             return ""
         if not factors.regular:
             return _flat(problem, factors, at)
@@ -321,17 +323,17 @@ def _longest(point: Point, step: Point) -> float:
     return min(1.0, _TO_BOUNDARY / max(fall, 1e-300))
 
 
-def moved(point: Point, step: Point, length: float = 1.0, keep: float = 0.1) -> Point:
-    """The point moved; slacks and multipliers keep a share of what they were.
+def moved(point: Point, step: Point, share: float = 1.0, keep: float = 0.1) -> Point:
+    """The point moved by a `share` of a step, its multipliers and slacks positive.
 
-    By default a tenth, for a step that is only a guess.
+    They keep at least the share `keep` of what they were: a tenth, for a step that is only a guess.
     """
 
     def positive(value: Array, change: Array) -> Array:
-        return np.maximum(value + length * change, keep * value)
+        return np.maximum(value + share * change, keep * value)
 
     return Point(
-        point.x + length * step.x, point.u + length * step.u, point.nu + length * step.nu,
+        point.x + share * step.x, point.u + share * step.u, point.nu + share * step.nu,
         positive(point.lam, step.lam), positive(point.s, step.s),
         positive(point.lam_end, step.lam_end), positive(point.s_end, step.s_end),
     )  # fmt: skip

@@ -36,10 +36,14 @@ class ClosedLoop(Frozen):
 
     Attributes
     ----------
-    x, u : Array
-        (T + 1, n) and (T, m).
-    dx, du : Array
-        (T + 1, n, p + n) and (T, m, p + n).
+    x : Array
+        States (steps + 1, n).
+    u : Array
+        Inputs (steps, m).
+    dx : Array
+        Derivative of x (steps + 1, n, p + n).
+    du : Array
+        Derivative of u (steps, m, p + n).
     plans : tuple of Plan
         T of them.
     slopes : tuple of PlanDerivatives
@@ -87,7 +91,9 @@ def simulate_receding(
     solver: str = "ipopt",
     mu: float = 1e-10,
 ) -> ClosedLoop:
-    """Simulate from nothing: theta (p,), x0 (n,), disturbances d (T, d).
+    """Simulate from nothing, at theta (p,), from x0 (n,), disturbed by d of shape (steps, d).
+
+    `solver` and `mu` are those of `impc.control.plan.solve_plan`.
 
     Raises
     ------
@@ -124,9 +130,11 @@ def closed_loop_from(
     theta, x0 : Array
         (p,) and (n,).
     d : Array
-        Disturbances (T, d).
+        Disturbances, of shape (steps, d).
     mu : float
+        Of the relaxed conditions.
     solver : str
+        One of `impc.control.nlp_solvers.SOLVERS`.
     before : ClosedLoop, optional
         At a theta near by: its plans, moved along their derivatives, are the guesses.
 

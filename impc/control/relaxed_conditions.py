@@ -75,6 +75,7 @@ class Conditions(NamedTuple):
     Attributes
     ----------
     cost : float
+        Of all stages and the end.
     gradient : Array
         Of l + nu'f + lam'h by w (N, n + m).
     f, h : Array
@@ -139,9 +140,8 @@ class _Compiled(NamedTuple):
 def _compiled(problem: OptimalControlProblem) -> _Compiled:
     """Stage functions with derivatives; those of a stage are mapped over the horizon."""
     f, cost, e, h, h_end = problem.functions
-    kind = ca.SX if f.is_a("SXFunction") and all(
-        item.is_a("SXFunction") for item in problem.functions
-    ) else ca.MX  # fmt: skip
+    plain = all(item.is_a("SXFunction") for item in problem.functions)
+    kind: Any = ca.SX if plain else ca.MX
     n, m, p = problem.n, problem.m, len(problem.parameter_names)
     q, q_end = len(problem.rows), len(problem.terminal_rows)
     w, d, theta = kind.sym("w", n + m), kind.sym("d", problem.disturbance_count), kind.sym("t", p)
@@ -289,7 +289,7 @@ def system(problem: OptimalControlProblem, point: Point, at: Conditions) -> Syst
     matrix = np.zeros((3 * band + 1, N * (m + 2 * n)))
     matrix[rows, columns] = values
     lu, pivots, info = lapack.dgbtrf(matrix, band, band)
-    return System(lu, pivots, band, H, H_end, info == 0 and bool(np.all(np.isfinite(lu))))
+    return System(lu, pivots, band, H, H_end, info == 0)
 
 
 def parameter_sides(

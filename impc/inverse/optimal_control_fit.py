@@ -18,12 +18,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy.stats
 
-from impc.arrays import Array, BoolArray, Frozen, IntArray
+from impc.arrays import Array, Frozen, IntArray
 from impc.control.nlp_solvers import require_solver
-from impc.control.plan import Plan, nearby_plan, solve_plan, solved_plan
-from impc.control.plan_derivatives import differentiate_plan
-from impc.control.receding_horizon import ClosedLoop, closed_loop_from
-from impc.errors import DataError, InputError, SolverError
+from impc.errors import DataError, InfeasibleError, InputError, SolverError
+from impc.inverse.optimal_control_residuals import EXPLAINED, begin, first_plan, residuals_of
+from impc.inverse.optimal_control_search import Count, along_mu, guided
 from impc.inverse.told_combinations import Combinations, combinations
 
 if TYPE_CHECKING:
@@ -31,35 +30,12 @@ if TYPE_CHECKING:
 
     from impc.control.optimal_control import OptimalControlProblem
     from impc.control.optimal_recordings import OptimalRecording
-    from impc.control.plan_derivatives import PlanDerivatives
-
-    _Run = tuple[Plan, PlanDerivatives] | ClosedLoop
+    from impc.inverse.optimal_control_residuals import Evaluation, Residuals
 
 __all__ = ["MU_STEPS", "OptimalControlEstimate", "fit_optimal_control"]
 
-#: The falling sequence of mu, of the dimension of the cost.
+#: The falling sequence of mu, over the mean cost of a recorded stage where that is below one.
 MU_STEPS = (1e-1, 1e-2, 1e-4, 1e-10)
-_LONGEST_STEP = 0.7  # in a logarithm: a factor of two
-_STILL = 1e-9
-_EXPLAINED = 0.01  # of the squares of a recording; a plan of another kind leaves far more
-_SMALL_STEP = 1e-9
-_LEAST_DAMPING, _MOST_DAMPING = 1e-14, 1e6
-
-
-@dataclass(frozen=True, eq=False)
-class _Evaluation:
-    """Residuals (r,) and their derivative (r, k) at unknowns (k,), and what they came from."""
-
-    unknowns: Array
-    theta: Array
-    mu: float
-    residual: Array
-    jacobian: Array
-    runs: tuple[_Run, ...]
-
-    @property
-    def loss(self) -> float:
-        return float(self.residual @ self.residual)
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,15 +59,12 @@ class OptimalControlEstimate(Frozen):
         Of each residual the index of its state, or n and the index of its input (r,).
     scales : Array
         Root-mean-square of each state and input in the recordings (n + m,).
-    singular_values : Array
-        Of the part of the Jacobian that belongs to the parameters (p,), initial states projected
-        out.
     combinations : Combinations
-        What is told and what is not.
+        What is told and what is not, with the singular values that say so.
     x0 : tuple of Array
         Initial state of each recording (n,).
     runs : tuple
-        States (T + 1, n) and inputs (T, m) of each recording as the estimate has them.
+        Of each recording the states (steps + 1, n) and inputs (steps, m) that the estimate has.
     settled : bool
         Whether the search ended by itself.
     evaluations : int
@@ -108,7 +81,6 @@ class OptimalControlEstimate(Frozen):
     jacobian: Array
     signals: IntArray
     scales: Array
-    singular_values: Array
     combinations: Combinations
     x0: tuple[Array, ...]
     runs: tuple[tuple[Array, Array], ...]
@@ -117,7 +89,7 @@ class OptimalControlEstimate(Frozen):
     seconds: float
 
     def intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
-        """Low and high end of each parameter by its name, from the noise that is left.
+        """Low and high end of each parameter by its name, at a `level` between 0 and 1.
 
         Normal in the logarithms of positive parameters; the noise of each signal is the root mean
         square of what is left of it. A parameter that is part of an untold combination has an
@@ -142,161 +114,13 @@ class OptimalControlEstimate(Frozen):
         return found
 
 
-class _Search:
-    """The recordings with their scales, and a count of evaluations."""
-
-    def __init__(
-        self,
-        problem: OptimalControlProblem,
-        recordings: tuple[OptimalRecording, ...],
-        solver: str,
-    ) -> None:
-        self.problem, self.recordings, self.solver = problem, recordings, solver
-        self.evaluations = 0
-        x = np.concatenate([one.x for one in recordings])
-        u = np.concatenate([one.u for one in recordings])
-        sizes = np.array([_root_mean_square(column) for column in (*x.T, *u.T)])
-        # A signal that stands still has no size of its own: it is measured by the largest.
-        largest = float(np.max(sizes, initial=0.0)) or 1.0
-        self.scales = np.where(sizes > _STILL * largest, sizes, largest)
-        #: Sum of squares of all that was measured, over the scales.
-        self.size = sum(float(np.nansum((np.hstack([one.x[1:], one.u]) / self.scales) ** 2))
-                        for one in recordings)  # fmt: skip
-
-    def unknowns(self, theta: Array) -> Array:
-        logarithms = np.where(self.problem.positive, np.log(np.abs(theta)), theta)
-        starts = [one.x0 / self.scales[: self.problem.n] for one in self.recordings
-                  if one.unknown_start]  # fmt: skip
-        return np.concatenate([logarithms, *starts])
-
-    def parameters(self, unknowns: Array) -> Array:
-        part = unknowns[: len(self.problem.parameter_names)]
-        return np.where(self.problem.positive, np.exp(part), part)
-
-    def begin(self, unknowns: Array, mu: float, branch: int) -> _Evaluation | None:
-        """Solve every recording from a guess of its own.
-
-        Branch 0 begins at what was recorded, 1 at the initial state held, 2 at zeros: a problem
-        that is not convex has several plans, and only one of them was recorded.
-        """
-        theta, starts = self.split(unknowns)
-        runs: list[_Run] = []
-        for one, x0 in zip(self.recordings, starts, strict=True):
-            plan = self._first_plan(one, theta, x0, mu, branch)
-            if plan is None:
-                return None
-            if not one.closed_loop:
-                runs.append((plan, differentiate_plan(plan)))
-                continue
-            loop = closed_loop_from(plan, theta, x0, one.d, mu, self.solver)
-            if isinstance(loop, int):
-                if branch:
-                    return None
-                raise SolverError(
-                    f"sample {loop}", "no plan was found at the first parameters", "begin nearer"
-                )
-            runs.append(loop)
-        return self._assembled(unknowns, theta, mu, tuple(runs))
-
-    def _first_plan(
-        self, one: OptimalRecording, theta: Array, x0: Array, mu: float, branch: int
-    ) -> Plan | None:
-        problem, N = self.problem, self.problem.horizon
-        d = np.zeros((N, problem.disturbance_count)) if one.closed_loop else np.array(one.d)
-        held, still = np.repeat(x0[None], N + 1, axis=0), np.zeros((N, problem.m))
-        if branch == 0:
-            known = bool(np.all(np.isfinite(one.x)) and np.all(np.isfinite(one.u)))
-            guess = known and not one.closed_loop
-            guesses = ((np.array(one.x), np.array(one.u)),) if guess else ()
-            return solve_plan(problem, theta, x0, d=d, solver=self.solver, mu=mu, guesses=guesses)
-        x = held if branch == 1 else np.vstack([x0, np.zeros((N, problem.n))])
-        found = solved_plan(problem, theta, d, x, still, self.solver, mu)
-        return found if isinstance(found, Plan) else None
-
-    def evaluate(self, unknowns: Array, mu: float, before: _Evaluation) -> _Evaluation | None:
-        """Solve every recording near a solution; None where one has none near by."""
-        theta, starts = self.split(unknowns)
-        runs: list[_Run] = []
-        for one, old, x0 in zip(self.recordings, before.runs, starts, strict=True):
-            if isinstance(old, ClosedLoop):
-                loop = closed_loop_from(old.plans[0], theta, x0, one.d, mu, self.solver, old)
-                if isinstance(loop, int):
-                    return None
-                runs.append(loop)
-                continue
-            change = np.concatenate([theta - old[0].theta, x0 - old[0].x[0]])
-            # Where plans of this kind explain the recording, a step too long for Newton's method is
-            # one to be shortened: a solver from outside takes forty times as long. Where they do
-            # not, it may find the kind that was recorded.
-            far = bool(np.any(change))
-            lost = before.loss > _EXPLAINED * self.size
-            steps = (old[1].step(change),) if far else ()
-            near = nearby_plan(old[0], theta, x0, mu, steps, "" if far else self.solver)
-            if near is None and far and lost:
-                kind = solved_plan(self.problem, theta, old[0].d, np.vstack([x0, old[0].x[1:]]),
-                                   old[0].u, self.solver, mu)  # fmt: skip
-                near = kind if isinstance(kind, Plan) else None
-            if near is None:
-                return None
-            runs.append((near, differentiate_plan(near)))
-        return self._assembled(unknowns, theta, mu, tuple(runs))
-
-    def split(self, unknowns: Array) -> tuple[Array, list[Array]]:
-        """Parameters, and the initial state of each recording."""
-        place, starts = len(self.problem.parameter_names), []
-        for one in self.recordings:
-            if one.unknown_start:
-                part = unknowns[place : place + self.problem.n]
-                starts.append(part * self.scales[: self.problem.n])
-                place += self.problem.n
-            else:
-                starts.append(one.x0)
-        return self.parameters(unknowns), starts
-
-    def _assembled(
-        self, unknowns: Array, theta: Array, mu: float, runs: tuple[_Run, ...]
-    ) -> _Evaluation:
-        """Residuals and their derivatives."""
-        self.evaluations += 1
-        n, place = self.problem.n, len(theta)
-        chain = np.where(self.problem.positive, theta, 1.0)
-        parts, slopes = [], []
-        for one, run in zip(self.recordings, runs, strict=True):
-            x, u, dx, du = _trajectories(run)
-            kept, first = _measured(one)
-            scaled = np.hstack([x[1:] - one.x[1:], u - one.u]) / self.scales
-            slope = np.concatenate([dx[1:], du], axis=1) / self.scales[:, None]
-            parts += [((x[0] - one.x[0]) / self.scales[:n])[first], scaled[kept]]
-            rows = np.concatenate([(dx[0] / self.scales[:n, None])[first], slope[kept]])
-            whole = np.zeros((len(rows), len(unknowns)))
-            whole[:, : len(theta)] = rows[:, : len(theta)] * chain
-            if one.unknown_start:
-                whole[:, place : place + n] = rows[:, len(theta) :] * self.scales[:n]
-                place += n
-            slopes.append(whole)
-        return _Evaluation(unknowns, theta, mu, np.concatenate(parts), np.concatenate(slopes), runs)
-
-    def signals(self) -> IntArray:
-        """Of each residual the column of its state or input."""
-        found = []
-        for one in self.recordings:
-            kept, first = _measured(one)
-            found += [np.flatnonzero(first), np.nonzero(kept)[1]]
-        return np.concatenate(found)
-
-
-def _measured(one: OptimalRecording) -> tuple[BoolArray, BoolArray]:
-    """Which entries behind the first sample count, and which of the initial state."""
-    return np.isfinite(np.hstack([one.x[1:], one.u])), np.isfinite(one.x[0]) & one.unknown_start
-
-
 def fit_optimal_control(
     problem: OptimalControlProblem,
     recordings: Sequence[OptimalRecording],
     start: Mapping[str, float],
     *,
     solver: str = "ipopt",
-    mu_steps: Sequence[float] = MU_STEPS,
+    mu_steps: Sequence[float] | None = None,
     evaluations: int = 200,
 ) -> OptimalControlEstimate:
     """Search the parameters from a start.
@@ -310,10 +134,11 @@ def fit_optimal_control(
         First value of each parameter by its name.
     solver : str
         One of `impc.control.nlp_solvers.SOLVERS`.
-    mu_steps : sequence of float
-        Falling.
+    mu_steps : sequence of float, optional
+        Falling, of the dimension of the cost; by default `MU_STEPS` times the mean cost of a
+        recorded stage at the start, at most one, and at least 1e-10.
     evaluations : int
-        After how many the search is stopped.
+        After how many a search is stopped; there are at most two, guided and not.
 
     Returns
     -------
@@ -354,104 +179,76 @@ def fit_optimal_control(
     require_solver(solver)
     if not recordings:
         raise DataError("recordings", "there are none", "give at least one")
+    if mu_steps is None:
+        mu_steps = _scaled(recordings, problem.values(start))
     if not mu_steps or any(b >= a for a, b in itertools.pairwise(mu_steps)):
         raise InputError("mu_steps", f"got {tuple(mu_steps)!r:.60}", "give falling numbers")
     began = time.perf_counter()
-    search = _Search(problem, tuple(recordings), solver)
-    unknowns, best, settled = search.unknowns(problem.values(start)), None, False
-    for branch in range(3):
-        begun = search.begin(unknowns, mu_steps[0], branch)
-        if begun is None:
-            continue
-        found, ended = _descend(search, begun, mu_steps, evaluations)
-        if best is None or found.loss < best.loss:
-            best, settled = found, ended
-        if best.loss < _EXPLAINED * search.size or search.evaluations >= evaluations:
+    theta, done = problem.values(start), 0
+    given = residuals_of(problem, tuple(recordings), solver)
+    for one in given.recordings:  # an error at the first parameters is one of the start
+        if one.problem is not problem:
+            raise InputError("recordings", "are of another problem", "record them with this one")
+        first_plan(one, theta, one.x0, mu_steps[0], solver)
+    best, settled = None, False
+    for guide in (True, False) if any(one.closed_loop for one in recordings) else (False, True):
+        count = Count(evaluations)
+        found = _attempt(given, theta, mu_steps, count, guide)
+        done += count.done
+        if found is not None and (best is None or found[0].loss < best.loss):
+            best, settled = found
+        if best is not None and best.loss < EXPLAINED * given.size:
             break
-    assert best is not None  # branch 0 ends with an answer or an error
-    return _estimate(search, best, settled, time.perf_counter() - began)
+    if best is None:
+        raise SolverError("start", "no search got away from it", "begin nearer")
+    return _estimate(given, best, settled, done, time.perf_counter() - began)
 
 
-def _descend(
-    search: _Search, current: _Evaluation, mu_steps: Sequence[float], most: int
-) -> tuple[_Evaluation, bool]:
-    """The search along the falling mu."""
-    settled = True
-    for mu in mu_steps:
-        if mu != current.mu:
-            if search.evaluations >= most:
-                return current, False
-            followed = search.evaluate(current.unknowns, mu, current)
-            if followed is None:
-                return current, False
-            current = followed
-        current, settled = _levenberg(search, current, mu == mu_steps[-1], most)
-    return current, settled
+def _scaled(recordings: Sequence[OptimalRecording], theta: Array) -> tuple[float, ...]:
+    """mu in the size of the cost: at 0.1 of it a limit is felt from afar and moves little else."""
+    costs: list[Array] = []
+    for one in recordings:
+        w = np.hstack([one.x[:-1], one.u, one.d])
+        known = np.all(np.isfinite(w), axis=1)
+        if np.any(known):
+            function = one.problem.functions[1].map(int(known.sum()))
+            x, u, d = one.x[:-1][known].T, one.u[known].T, one.d[known].T
+            repeated = np.repeat(theta[:, None], x.shape[1], axis=1)
+            costs.append(np.abs(function(x, u, d, repeated).full().ravel()))
+    mean = float(np.mean(np.concatenate(costs))) if costs else 1.0
+    size = min(1.0, mean) if np.isfinite(mean) else 1.0
+    return tuple(dict.fromkeys(max(mu * size, MU_STEPS[-1]) for mu in MU_STEPS))
 
 
-def _levenberg(
-    search: _Search, current: _Evaluation, last: bool, most: int
-) -> tuple[_Evaluation, bool]:
-    """Steps until the loss no longer falls; at a mu on the way a rough answer is enough."""
-    damping, patience, enough = (1e-3, 60, 1e-13) if last else (1e-2, 12, 1e-2)
-    for _ in range(patience):
-        left, values, right = np.linalg.svd(current.jacobian, full_matrices=False)
-        drive = left.T @ current.residual
-        while True:
-            if search.evaluations >= most:
-                return current, False
-            gain = values / (values**2 + damping * values[0] ** 2)
-            step = -right.T @ (gain * drive)
-            step *= min(1.0, _LONGEST_STEP / max(float(np.max(np.abs(step))), 1e-300))
-            if current.loss == 0 or np.max(np.abs(step)) < _SMALL_STEP:
-                return current, True
-            predicted = current.loss - float(
-                np.sum((current.residual + current.jacobian @ step) ** 2)
-            )
-            tried = search.evaluate(current.unknowns + step, current.mu, current)
-            ratio = -1.0 if tried is None else (current.loss - tried.loss) / max(predicted, 1e-300)
-            if tried is not None and ratio > 1e-4:
-                break
-            damping *= 8
-            if damping > _MOST_DAMPING or predicted < 1e-14 * current.loss:
-                return current, True
-        damping = max(damping / 10 if ratio > 0.5 else damping * 2, _LEAST_DAMPING)
-        fell = (current.loss - tried.loss) / current.loss
-        current = tried
-        if fell < enough or current.loss < 1e-28 * len(current.residual):
-            return current, True
-    return current, not last
+def _attempt(
+    given: Residuals, theta: Array, mu_steps: Sequence[float], count: Count, guide: bool
+) -> tuple[Evaluation, bool] | None:
+    """From a start, or from what the recorded states' own plans make of it."""
+    loops = any(one.closed_loop for one in given.recordings)
+    if guide:
+        found = guided(given, theta, mu_steps if loops else mu_steps[:1], count)
+        if found is None:
+            return None
+        theta, mu_steps = found, mu_steps[-2:] if loops else mu_steps
+    try:
+        first = begin(given, given.unknowns(theta), mu_steps[0])
+    except (InfeasibleError, SolverError):
+        if not guide:
+            raise
+        return None  # what guided the search may end where the recordings have no plan
+    count.done += 1
+    return along_mu(given, first, mu_steps, count)
 
 
 def _estimate(
-    search: _Search, found: _Evaluation, settled: bool, seconds: float
+    given: Residuals, found: Evaluation, settled: bool, evaluations: int, seconds: float
 ) -> OptimalControlEstimate:
-    problem, p = search.problem, len(search.problem.parameter_names)
-    signals = search.signals()
-    loss = float(np.sum((found.residual * search.scales[signals]) ** 2))
+    problem, signals = given.problem, given.signals()
+    loss = float(np.sum((found.residual * given.scales[signals]) ** 2))
     told = combinations(problem, found.theta, found.jacobian, found.residual, signals)
-    starts = [one.x0 for one in search.recordings]
-    place = p
-    for index, one in enumerate(search.recordings):
-        if one.unknown_start:
-            part = found.unknowns[place : place + problem.n]
-            starts[index], place = part * search.scales[: problem.n], place + problem.n
+    named = dict(zip(problem.parameter_names, map(float, found.theta), strict=True))
     return OptimalControlEstimate(
-        problem, search.recordings,
-        dict(zip(problem.parameter_names, map(float, found.theta), strict=True)), loss,
-        found.residual, found.jacobian, signals, search.scales, told.singular_values, told,
-        tuple(starts), tuple(_trajectories(run)[:2] for run in found.runs), settled,
-        search.evaluations, seconds,
+        problem, given.recordings, named, loss, found.residual, found.jacobian, signals,
+        given.scales, told, tuple(given.split(found.unknowns)[1]), found.trajectories(), settled,
+        evaluations, seconds,
     )  # fmt: skip
-
-
-def _trajectories(run: _Run) -> tuple[Array, Array, Array, Array]:
-    """x (T + 1, n), u (T, m) and their derivatives by theta and x_0."""
-    if isinstance(run, ClosedLoop):
-        return run.x, run.u, run.dx, run.du
-    return run[0].x, run[0].u, run[1].x, run[1].u
-
-
-def _root_mean_square(column: Array) -> float:
-    known = column[np.isfinite(column)]
-    return float(np.sqrt(np.mean(known**2))) if len(known) else 0.0

@@ -148,6 +148,8 @@ def test_what_cannot_be_fitted_is_refused_in_a_line() -> None:
     recording = problem.recorded_plan(plan.x, plan.u)
     with pytest.raises(DataError, match="recordings: there are none; give at least one"):
         fit_optimal_control(problem, [], START)
+    with pytest.raises(InputError, match="recordings: are of another problem"):
+        fit_optimal_control(point(), [recording], START)
     with pytest.raises(InputError, match="solver: got 'knitro'; choose one of"):
         fit_optimal_control(problem, [recording], START, solver="knitro")
     with pytest.raises(InputError, match=r"mu_steps: got \(0.1, 0.1\); give falling"):
@@ -164,6 +166,22 @@ def test_an_infeasible_start_names_the_constraint_and_the_sample() -> None:
         fit_optimal_control(arm.problem, [recording], arm.truth | {"max_q": 2.3})
 
 
+def test_the_size_of_the_cost_does_not_matter() -> None:
+    """Everything in the cost times 1e-3: the same answer, from a mu that is smaller too."""
+    u = ca.SX.sym("u")
+    x, price, limit = ca.SX.sym("x", 2), ca.SX.sym("price"), ca.SX.sym("limit")
+    problem = OptimalControlProblem(
+        x, u, {"price": price, "limit": limit}, next_state=x + 0.1 * ca.vertcat(x[1], u),
+        stage_cost=1e-3 * (price * x[0] ** 2 + u**2), horizon=15,
+        constraints={"force": ca.vertcat(u - limit, -u - limit)},
+    )  # fmt: skip
+    plan = problem.plan({"price": 5.0, "limit": 0.8}, [1.0, 0.5], mu=1e-12)
+    found = fit_optimal_control(
+        problem, [problem.recorded_plan(plan.x, plan.u)], {"price": 2.0, "limit": 3.0}
+    )
+    assert found.theta == pytest.approx({"price": 5.0, "limit": 0.8}, rel=1e-4)
+
+
 def test_a_search_that_is_stopped_says_so() -> None:
     problem = point()
     plan = problem.plan(TRUTH, [1.0, 0.5])
@@ -171,4 +189,4 @@ def test_a_search_that_is_stopped_says_so() -> None:
         problem, [problem.recorded_plan(plan.x, plan.u)], START, evaluations=3
     )
     assert not found.settled
-    assert found.evaluations <= 3
+    assert found.evaluations <= 6  # three guided, three not

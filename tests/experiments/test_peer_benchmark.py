@@ -1,0 +1,60 @@
+"""The study of the four systems, small; in full: python -m experiments.peer_benchmark."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from experiments.peer_benchmark import LOOPS, coverage, demonstration, fit_from
+from experiments.peer_systems import SYSTEMS
+
+
+def test_a_start_a_third_off_ends_at_what_is_told() -> None:
+    system = SYSTEMS["rocket"]()
+    found = fit_from(system, demonstration(system), system.truth, 0.3, 3)
+    assert found.loss < 1e-10
+    assert found.error < 1e-5
+    assert found.untold == "Jx, Jy Jz l"
+
+
+def test_a_start_without_a_plan_is_a_line_and_not_a_loss() -> None:
+    system = SYSTEMS["robot arm"]()
+    found = fit_from(system, demonstration(system), system.truth, 0.3, 7)
+    assert np.isnan(found.loss)
+    assert found.untold.startswith("constraint angle[1]: no plan was found that keeps it")
+
+
+def test_intervals_of_noisy_recordings_hold_the_truth() -> None:
+    held, odd = coverage(3, decibel=40)
+    assert odd == []
+    assert len(held) == 8
+    assert sum(sum(item) for item in held.values()) >= 20  # of 24; 22.8 are expected
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_nine_of_ten_starts_a_tenth_off_end_at_the_truth(name: str) -> None:
+    system = SYSTEMS[name]()
+    recording = demonstration(system)
+    found = [fit_from(system, recording, system.truth, 0.1, seed) for seed in range(10)]
+    good = [one for one in found if one.loss < 1e-10]
+    assert len(good) >= 9
+    assert max(one.error for one in good) < 1e-5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", LOOPS)
+def test_a_closed_loop_gives_back_what_it_tells(name: str) -> None:
+    """Sixty samples, a horizon of twenty; limits of inputs and of states are met."""
+    system = SYSTEMS[name](20)
+    x0, changes = LOOPS[name]
+    truth = system.truth | changes
+    loop = system.problem.closed_loop(truth, x0, 60, mu=1e-12)
+    met = {
+        system.problem.rows[row].split("[")[0]
+        for plan in loop.plans
+        for row in np.nonzero(plan.point.lam > plan.point.s)[1]
+    }
+    assert len(met) == 2
+    found = fit_from(system, system.problem.recorded_loop(loop.x, loop.u), truth, 0.1, 0)
+    assert found.error < 1e-5
