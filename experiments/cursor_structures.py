@@ -14,21 +14,33 @@ import argparse
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from tqdm import tqdm
 
 from experiments.cursor_data import Condition, data_file, read_conditions
 from experiments.cursor_tracking import condition_problem
+from impc.assess.covariance import gain_covariance
+from impc.assess.held_out import left_out_vaf
+from impc.assess.long_run_covariance import residual_noise
+from impc.assess.other_models import residuals_of
 from impc.assess.price_profiles import PriceProfiles
 from impc.assess.structured_weights import tangent
-from impc.assess.structures import StructureFit, assess_structure
+from impc.assess.structures import StructureFit, assess_structure, criterion_of
+from impc.assess.variance_accounted_for import vaf
+from impc.control.closed_loop import simulate
 from impc.errors import SolverError, WeightsError
 from impc.inverse.noisy_fit import fit_controller
+from impc.inverse.problem import scenarios
 from impc.inverse.structured_fit import fit_structured
 from impc.model.structure import Structure
 from impc.reporting.rendering import plain
 from impc.reporting.writer import write_files
+
+if TYPE_CHECKING:
+    from impc.inverse.estimates import Estimate
+    from impc.inverse.problem import Problem
 
 __all__ = ["STRUCTURES", "StructureRow", "structure_rows"]
 
@@ -86,7 +98,7 @@ def structure_rows(condition: Condition) -> list[StructureRow]:
     """Every structure on the trials of a condition."""
     problem = condition_problem(condition)
     near = fit_controller(problem)
-    rows = []
+    rows = [_any_weights(condition.blur, problem, near)]
     for name, features in STRUCTURES.items():
         structure = Structure(problem.plant, features, name=name)
         try:
@@ -103,6 +115,25 @@ def structure_rows(condition: Condition) -> list[StructureRow]:
             continue
         rows.append(_row(condition.blur, name, fit))
     return rows
+
+
+def _any_weights(blur: float, problem: Problem, near: Estimate) -> StructureRow:
+    """The fit that no structure confines."""
+    runs = [simulate(near.controller(), drive) for drive in scenarios(near.problem)]
+    simulated = np.concatenate([run.x @ near.problem.plant.C.T for run in runs])
+    recorded = np.concatenate([trial.outputs for trial in problem.recordings])
+    held = []
+    for index in range(len(problem.recordings)):
+        other = fit_controller(problem.leaving_out(index), near.stage_weights)
+        held.append(left_out_vaf(other, problem.recordings[index], 1.0)[0])
+    at = near.problem, np.array(near.gain), np.array(near.metric)
+    told = int(np.count_nonzero(gain_covariance(*at).told))
+    roots = np.asarray(residual_noise(residuals_of(near, near.problem)).root)
+    nothing = float("nan")
+    return StructureRow(
+        blur, "any weights", "", False, nothing, 0, float(vaf(recorded, simulated)[0]),
+        float(np.mean(held)), criterion_of(near, roots, told), [], nothing, nothing, nothing,
+    )  # fmt: skip
 
 
 def _row(blur: float, name: str, fit: StructureFit) -> StructureRow:
@@ -151,6 +182,7 @@ def _table(rows: list[StructureRow]) -> str:
         if np.isfinite(row.velocity):
             ratio = f"{row.velocity:.2g} ({row.low:.2g} to {row.high:.2g})"
         word = row.reason or ("refused" if row.refused else "no")
+        word = "-" if row.structure == "any weights" else word
         lines.append(
             f"| {row.blur:g} | {row.structure} | {word} | {row.probability:.2g} | {row.vaf:.1f} | "
             f"{row.held_out:.1f} | {row.aic:.0f} | {ratio} |"

@@ -24,7 +24,7 @@ __all__ = ["SECONDS_A_SAMPLE", "Effort", "fit_effort"]
 SECONDS_A_SAMPLE = 5.4e-3 / (3000 * 10 * 20)
 # For each number of the derivatives of the rows, which are built again for each simulation.
 _A_NUMBER = 1e-8
-# Times of a simulation with other solvers over that of the compiled one, docs/benchmarks/results.md.
+# Times of a simulation with other solvers over the compiled one, docs/benchmarks/results.md.
 _SLOWER = {"compiled": 1.0, "daqp": 18.0, "qpoases": 24.0, "ipopt": 225.0}
 # What a simulation takes however short the trial is: the calls around the compiled loop.
 _A_TRIAL = 1e-3
