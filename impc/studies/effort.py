@@ -23,7 +23,7 @@ __all__ = ["Effort", "fit_effort"]
 # Seconds for each sample, state and sample of the horizon; and for each number of the derivatives
 # of the rows, which are built again for each simulation.
 _A_SAMPLE, _A_NUMBER = 5.4e-3 / (3000 * 10 * 20), 1e-8
-# Times of a simulation with other solvers over that of the compiled one, docs/benchmarks/results.md.
+# Times of a simulation over that of the compiled method, docs/benchmarks/results.md.
 _SLOWER = {"compiled": 1.0, "daqp": 18.0, "qpoases": 24.0, "ipopt": 225.0}
 # What a simulation takes however short the trial is: the calls around the compiled loop.
 _A_TRIAL = 1e-3
