@@ -337,37 +337,24 @@ def run_loop(
     status = np.full(steps, Status.NOT_REACHED, dtype=np.int8)
     x[0], dx[0] = given.x0, along.x0
     multipliers = np.zeros(len(prepared.rows.b))
-    disturbance, divergence = np.array(given.disturbance), _divergence(plant, given)
+    program = prepared.program
+    loop = (
+        *(prepared.matrices, prepared.matrix_directions, prepared.rows, prepared.row_directions),
+        *(np.array(given.disturbance), _divergence(plant, given), prepared.unit),
+    )
+    written = (x, u, dx, du, status, multipliers)
     t, weakly_active = 0, 0
     plan: Plan | None = None  # of the sample before, where the rows did not tell its input
     while True:
         first = t
-        weak, failed_row = run(
-            prepared.matrices,
-            prepared.matrix_directions,
-            prepared.rows,
-            prepared.row_directions,
-            disturbance,
-            divergence,
-            prepared.unit,
-            first,
-            x,
-            u,
-            dx,
-            du,
-            status,
-            multipliers,
-            prepared.program is not None or plan is not None,
-            local,
-        )
+        gain_only = program is not None or plan is not None
+        weak, failed_row = run(*loop, first, *written, gain_only, local)
         weakly_active += weak
         t = int(np.count_nonzero(status <= Status.SOFTENED))
         if t == steps or status[t] == Status.DIVERGED:
             break
-        if prepared.program is not None:
-            status[t], weak, failed_row = _ask_solver(
-                prepared, prepared.program, x[t], dx[t], u[t], du[t]
-            )
+        if program is not None:
+            status[t], weak, failed_row = _ask_solver(prepared, program, x[t], dx[t], u[t], du[t])
             weakly_active += weak
             if status[t] > Status.SOFTENED:
                 break
