@@ -14,7 +14,8 @@ that command (`Clip`); for several inputs it is the extended filter. Derivatives
 sets, as those of a simulation do, and hold wherever none is about to change.
 
 P_t does not depend on what is recorded while D_t stays. Once it has come as near to its stationary
-value as rounding lets a derivative see it is taken for that value, until a bound is met.
+value as rounding lets a derivative see it is taken for that value, until a bound is met
+(docs/noisy-people.md).
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ where nothing but u depends on the controller. An error that nobody commands kee
     dh+ = dh + L_d C_s e + L_d v
 
 At the first sample the estimate is a value to be given, and the error has the covariance that it
-keeps: the person has been at it for some time.
+keeps: the person has been at it for some time (docs/noisy-people.md).
 """
 
 from __future__ import annotations

@@ -77,11 +77,11 @@ def test_a_person_is_found_and_told_better_than_without_the_noise(
     np.testing.assert_allclose(fitted.observer.motor, person.motor, rtol=0.2)
     np.testing.assert_allclose(fitted.recorder, 0.01, rtol=0.1)
     np.testing.assert_allclose(fitted.K, truth, rtol=0.15)
-    # Its gradient is none: nothing within a thousandth of a deviation is better.
+    # Its gradient is none: nothing within a hundredth of a deviation is better.
     weights = np.where(np.arange(fitted.count) < fitted.space.own, 1.0, 0.0)
     gradient = fitted.told.gradient - weights * (fitted.theta - fitted.space.start)
     step = np.linalg.solve(fitted.told.information + np.diag(weights), gradient)
-    assert gradient @ step < 1e-5
+    assert gradient @ step < 2e-4
 
 
 def test_a_level_of_zero_is_not_searched(noisy: tuple[Observer, Estimate]) -> None:
