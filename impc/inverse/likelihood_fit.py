@@ -236,7 +236,7 @@ def _suggested(observer: Observer, size: _Sizes, inside: float, sensed: float) -
     signals = np.sqrt(np.einsum("si,ij,sj->s", observer.C, size.sensory, observer.C))
     suggested = {
         "motor": share * size.motor,
-        "process": share * size.process / np.sqrt(max(np.count_nonzero(observer.process), 1)),
+        "process": share * size.process / np.sqrt(max(int(np.count_nonzero(observer.process)), 1)),
         "sensory": sensed * signals,
     }
     parts = [suggested.get(name, observer.level(name)) for name in LEVELS]

@@ -155,11 +155,11 @@ class PersonCoordinates:
         columns = [self._columns(trial) for trial in range(self.space.trials)]
         trials = self._trials(theta, person, columns)
         gradient, information = np.zeros(q), np.zeros((q, q))
-        scores = []
+        scores: list[Array] = []
         for moved, found in zip(columns, trials, strict=True):
             gradient[moved.all] += found.score.sum(axis=0)
             information[np.ix_(moved.all, moved.all)] += found.information
-            score = np.zeros((len(found.told), q))
+            score: Array = np.zeros((len(found.told), q))
             score[:, moved.all] = found.score
             scores.append(score)
         value = sum(item.value for item in trials)

@@ -6,6 +6,7 @@ import control
 import numpy as np
 import pytest
 
+from impc.arrays import Array
 from impc.control.controller import Controller
 from impc.control.noisy_person import simulate_person
 from impc.errors import ImpcError
@@ -62,9 +63,11 @@ def test_the_gradient_is_that_of_the_likelihood(noisy: tuple[Observer, Estimate]
     told = space.told(space.start)
     assert told.value == pytest.approx(space.value(space.start), rel=1e-12)
     for step in np.random.default_rng(1).normal(size=(3, len(space.start))):
-        slope = extrapolated_slope(
-            lambda t, step=step: np.array([space.value(space.start + t * step)]), 1e-3
-        )
+
+        def moved(t: float, step: Array = step) -> Array:
+            return np.array([space.value(space.start + t * step)])
+
+        slope = extrapolated_slope(moved, 1e-3)
         assert told.gradient @ step == pytest.approx(slope[0], rel=1e-6)
 
 
