@@ -39,6 +39,8 @@ from impc.model.recordings import Recording
 from impc.model.weights import Weights
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from impc.arrays import Array
 
 __all__ = ["NOISES", "Score", "score", "subject"]
@@ -113,7 +115,7 @@ class Subject:
     controller: Controller
     person: Observer
     recorder: float
-    pushes: list[Array]
+    pushes: Sequence[Array]
 
 
 def subject(seed: int, noise: str, share: float, limit: float) -> Subject:
@@ -145,7 +147,7 @@ def _person(plant: Plant, noise: str, size: float) -> Observer:
 
 
 def _agreement(
-    law: Controller, person: Observer, pushes: list[Array], rng: np.random.Generator
+    law: Controller, person: Observer, pushes: Sequence[Array], rng: np.random.Generator
 ) -> float:
     shares = []
     for push in pushes:

@@ -3,7 +3,7 @@
 Each is fitted by maximum likelihood to the same recordings, from the same first fit, so that
 Akaike's criterion compares them: noise in the recorder alone, which is least squares; a person who
 sees every state and has noise in the loop; who estimates, the perturbation known, and not known;
-and the one that was asked for without its limits.
+and the one that was asked for without its limits (docs/noisy-people.md).
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class PersonReport(Frozen):
     ahead : tuple of int
         Samples ahead.
     errors : Array
-        Root-mean-square errors of predictions so far ahead (len(ahead), p), in the outputs' units.
+        Root-mean-square errors of predictions so far ahead (k, p), in the outputs' units.
     """
 
     models: tuple[PersonModel, ...]
@@ -157,7 +157,7 @@ def _white(fit: PersonFit) -> Array:
 
 
 def prediction_errors(fit: PersonFit, ahead: tuple[int, ...]) -> Array:
-    """Root-mean-square errors (len(ahead), p) of what the filter expects so many samples ahead.
+    """Root-mean-square errors (k, p) of what the filter expects k numbers of samples `ahead`.
 
     From the expectation at a sample the plant runs on without noise, perturbations as recorded.
     """

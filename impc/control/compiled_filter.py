@@ -1,6 +1,6 @@
 """Compiled code: the filter of plant and estimate together, with its exact derivatives.
 
-The filter is that of `joint_likelihood`, which has its mathematics. It calls the least-distance
+The filter is that of `joint_likelihood` (docs/noisy-people.md). It calls the least-distance
 problem of `compiled_loop`. numba's cache looks at this file only: a change of the other one must
 change `COMPILED_WITH` below, which tests/control/test_joint_likelihood.py asks for.
 """
@@ -27,7 +27,7 @@ from impc.jit import njit
 __all__ = ["COMPILED_WITH", "Clip", "FilterResult", "Steady", "run_filter", "run_person"]
 
 #: First digits of the SHA-256 of compiled_loop.py.
-COMPILED_WITH = "4cd294b1294b4f94"
+COMPILED_WITH = "e060bf2f2fd164dc"
 
 _SOFTENED, _DIVERGED = 2, 5
 # A bound that is so many deviations away is not met: a normal number is there once in 1e13.
@@ -99,7 +99,7 @@ class FilterResult(NamedTuple):
     u : Buffer
         Command expected there (samples, m).
     status : Buffer
-        Of each sample: the value of `closed_loop.Status`.
+        Of each sample: the value of `closed_loop.Status` (samples,).
     """
 
     told: Buffer
@@ -153,7 +153,7 @@ def run_filter(
     Parameters
     ----------
     loop, dloop, rows, drows, unit
-        Of the controller's law, as in `compiled_loop.run`, along all q directions.
+        Of the controller's law, as in `compiled_loop.run`, along all q directions; unit (m,).
     clip : Clip
         What is done to the law's command.
     joint, djoint : JointLoop
@@ -210,7 +210,7 @@ def run_filter(
     return len(outputs)
 
 
-@njit(cache=True)
+@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 def _moving(dF: Buffer) -> Buffer:
     """Which entries move along any direction."""
     found = np.zeros(dF.shape[:2], dtype=np.bool_)
@@ -220,7 +220,7 @@ def _moving(dF: Buffer) -> Buffer:
     return found
 
 
-@njit(cache=True)
+@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 def _room(size: int, p: int, k: int) -> _Update:
     return _Update(
         np.empty((size, p)),
@@ -236,7 +236,7 @@ def _room(size: int, p: int, k: int) -> _Update:
     )
 
 
-@njit(cache=True)
+@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 def _clipped(
     clip: Clip,
     here: _Update,
@@ -297,7 +297,7 @@ def _clipped(
     return beyond, True
 
 
-@njit(cache=True)
+@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 def _tail(a: float, s: float) -> tuple[float, float, float, float, float]:
     """Of a normal number below a: its probability, density, a times it; and s a, squared, below."""
     if a == -np.inf:
@@ -307,7 +307,7 @@ def _tail(a: float, s: float) -> tuple[float, float, float, float, float]:
     return below, density, a * density, s * a * below, (s * a) ** 2 * below
 
 
-@njit(cache=True)
+@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 def _weigh(joint: JointLoop, djoint: JointLoop, P: Buffer, dP: Buffer, here: _Update) -> None:
     """Gain and covariance of the next innovation, with half of what they tell of the noise."""
     size, p, k = len(P), len(joint.C), dP.shape[2]
@@ -346,7 +346,7 @@ def _weigh(joint: JointLoop, djoint: JointLoop, P: Buffer, dP: Buffer, here: _Up
     _shrink(P, dP, here)
 
 
-@njit(cache=True)
+@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 def _weigh_noise(here: _Update) -> None:
     """tr(S^-1 dS S^-1 dS) / 2 for each pair of directions."""
     p, k = len(here.S), here.dS.shape[2]
@@ -366,7 +366,7 @@ def _weigh_noise(here: _Update) -> None:
             here.half[d, c] = total / 2
 
 
-@njit(cache=True)
+@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 def _update(
     joint: JointLoop,
     djoint: JointLoop,
@@ -417,7 +417,7 @@ def _update(
     result.filtered[t] = z
 
 
-@njit(cache=True)
+@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 def _slope(
     loop: LoopMatrices,
     dloop: LoopMatrices,
@@ -449,7 +449,7 @@ def _slope(
     return slope, dslope
 
 
-@njit(cache=True)
+@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 def _first_changes(
     loop: LoopMatrices,
     dloop: LoopMatrices,
@@ -489,7 +489,7 @@ def _first_changes(
     return result
 
 
-@njit(cache=True)
+@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 def _spread(
     joint: JointLoop,
     djoint: JointLoop,
@@ -525,7 +525,7 @@ def _spread(
     return (P + P.T) / 2, dP
 
 
-@njit(cache=True)
+@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 def _add_noise(
     column: Buffer, dcolumn: Buffer, variance: float, dvariance: Buffer, P: Buffer, dP: Buffer
 ) -> None:
@@ -539,7 +539,7 @@ def _add_noise(
                 dP[i, j, c] += both * dvariance[c] + moved * variance
 
 
-@njit(cache=True)
+@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 def _shrink(P: Buffer, dP: Buffer, here: _Update) -> None:
     """Covariance once a sample of the outputs is known, and its derivative."""
     size, p, k = len(P), len(here.S), dP.shape[2]
@@ -561,7 +561,7 @@ def _shrink(P: Buffer, dP: Buffer, here: _Update) -> None:
                     here.dP[i, j, c] += here.gain[i, a] * weighed[j, a, c]
 
 
-@njit(cache=True)
+@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 def _add_turns(
     joint: JointLoop,
     djoint: JointLoop,
@@ -604,7 +604,7 @@ def _add_turns(
                 dP[i, j, c] += turns[i, j, c] + turns[j, i, c]
 
 
-@njit(cache=True)
+@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 def _near(P: Buffer, dP: Buffer, steady: Steady) -> bool:
     """Whether covariance and derivative are the stationary ones, but for what is left out."""
     for i in range(len(P)):
@@ -618,7 +618,7 @@ def _near(P: Buffer, dP: Buffer, steady: Steady) -> bool:
     return True
 
 
-@njit(cache=True)
+@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 def _ahead(
     joint: JointLoop,
     djoint: JointLoop,
@@ -674,7 +674,7 @@ def run_person(
     Parameters
     ----------
     loop, dloop, rows, drows, unit, joint, at
-        As in `run_filter`, along no direction.
+        As in `run_filter`, along no direction; unit (m,).
     disturbance, noise : Buffer
         (samples, d), and what is added to the next z (samples, z).
     shared : Buffer

@@ -301,7 +301,23 @@ class LoopMatrices(NamedTuple):
 
 
 class Workspace(NamedTuple):
-    """Arrays that one sample after the other uses; `active` counts the free rows of the last."""
+    """Arrays that one sample after the other uses.
+
+    Attributes
+    ----------
+    slack, kept, free : Buffer
+        Of the rows (r,), the violation of each that counts as kept (r,), the free rows (a + 1,).
+    factor, basis : Buffer
+        As in `solve_dual`, (a + 1, a + 1) and (a + 1, N m).
+    v, rounding : Buffer
+        Inputs ahead beside the gain's, and what rounding makes of them (N m,).
+    dv0 : Buffer
+        Derivatives of the first of them (m, p).
+    T, M : Buffer
+        Columns of the rows, one after the other: (n, r) and (N m, r).
+    active : Buffer
+        How many rows are free at the last sample, (1,).
+    """
 
     slack: Buffer
     kept: Buffer
@@ -395,7 +411,7 @@ def run(
 
 @njit(cache=True)
 def workspace(rows: Rows, m: int, p: int) -> Workspace:
-    """Arrays that `law` works in, for m inputs and p directions."""
+    """Arrays that `law` works in, for `m` inputs and `p` directions of given `rows`."""
     count, width = rows.M.shape
     room = min(count, width) + 1
     # One column of T and M after the other: sums over columns then run over all rows at once.
@@ -429,10 +445,12 @@ def law(
     u: Buffer,
     du: Buffer,
 ) -> tuple[int, bool, int]:
-    """Write the input of one state, with its derivatives; the rest as in `run`.
+    """Write the input of one state, with its derivatives.
 
     Parameters
     ----------
+    loop, dloop, rows, drows, unit, lam, gain_only
+        As in `run`; unit (m,) and lam (r,).
     work : Workspace
         Its multipliers and active rows are those of this state afterwards.
     x, dx : Buffer
@@ -764,7 +782,7 @@ def _add_pulls(rows: Rows, drows: RowDirections, lam: Buffer, m: int, q: Buffer)
 
 @njit(cache=True)
 def substitute_all(factor: Buffer, count: int, right: Buffer) -> None:
-    """`substitute` for every column of right at once."""
+    """`substitute` for every column of `right` (count, c) at once, with the `factor` (a, a)."""
     for i in range(count):
         for k in range(i):
             for c in range(right.shape[1]):

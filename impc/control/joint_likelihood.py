@@ -14,7 +14,8 @@ that command (`Clip`); for several inputs it is the extended filter. Derivatives
 sets, as those of a simulation do, and hold wherever none is about to change.
 
 P_t does not depend on what is recorded while D_t stays. Once it has come as near to its stationary
-value as rounding lets a derivative see it is taken for that value, until a bound is met.
+value as rounding lets a derivative see it is taken for that value, until a bound is met
+(docs/noisy-people.md).
 """
 
 from __future__ import annotations
@@ -219,7 +220,16 @@ def joint_likelihood(
         raise SolverError(
             f"sample {reached}", f"{status.sentence}, as the filter expects it", "start elsewhere"
         )
-    return Likelihood(*(frozen(part) for part in result[:-1]), result.status)
+    return Likelihood(
+        frozen(result.told),
+        frozen(result.score),
+        frozen(result.information),
+        frozen(result.innovation),
+        frozen(result.spread),
+        frozen(result.filtered),
+        frozen(result.u),
+        result.status,
+    )
 
 
 def _unclipped(law: PreparedLoop) -> tuple[PreparedLoop, Clip]:
@@ -230,10 +240,18 @@ def _unclipped(law: PreparedLoop) -> tuple[PreparedLoop, Clip]:
         return law, Clip(used=False, low=-np.inf, high=np.inf, unit=1.0)
     on_state = bound_rows(controller.bounds, controller.plant).on_state
     kept = np.flatnonzero((rows.stage > 0) | on_state[rows.family])
-    inner = Rows(*(part[kept] for part in rows))._replace(
-        gram=np.ascontiguousarray(rows.gram[np.ix_(kept, kept)])
+    inner = Rows(
+        rows.T[kept],
+        rows.M[kept],
+        rows.N[kept],
+        rows.W[kept],
+        np.ascontiguousarray(rows.gram[np.ix_(kept, kept)]),
+        rows.b[kept],
+        rows.limit[kept],
+        rows.family[kept],
+        rows.stage[kept],
     )
-    others = RowDirections(*(part[kept] for part in moved))
+    others = RowDirections(moved.T[kept], moved.M[kept], moved.b[kept])
     return (
         dataclasses.replace(law, rows=inner, row_directions=others),
         Clip(used=True, low=low, high=high, unit=min(-low, high)),

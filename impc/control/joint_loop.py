@@ -12,7 +12,7 @@ where nothing but u depends on the controller. An error that nobody commands kee
     dh+ = dh + L_d C_s e + L_d v
 
 At the first sample the estimate is a value to be given, and the error has the covariance that it
-keeps: the person has been at it for some time.
+keeps: the person has been at it for some time (docs/noisy-people.md).
 """
 
 from __future__ import annotations
@@ -185,12 +185,13 @@ def _estimated(
     dQ = turned + turned.transpose(0, 2, 1) + entry @ dV @ entry.T
     dQ[:, rows.error, rows.error] += moved
     F, _ = _transition(plant, person, L)
-    apart = np.ix_(rows.wandering, rows.wandering)
-    each = (slice(None), *apart)
+    apart, own = np.ix_(rows.wandering, rows.wandering), rows.wandering
     P0 = lyapunov_series(F[apart], (entry @ V @ entry.T)[apart][None] + _moved(plant, person, rows))
-    turned = dF[each] @ P0 @ F[apart].T
+    turned = dF[:, own[:, None], own] @ P0 @ F[apart].T
     dP0 = np.zeros_like(dF)
-    dP0[each] = lyapunov_series(F[apart], turned + turned.transpose(0, 2, 1) + dQ[each])
+    dP0[:, own[:, None], own] = lyapunov_series(
+        F[apart], turned + turned.transpose(0, 2, 1) + dQ[:, own[:, None], own]
+    )
     return _last(dF, dB, dE, dG, dC, dQ, dR, dP0, share)
 
 

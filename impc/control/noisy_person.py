@@ -1,6 +1,7 @@
 """A trial of a person who senses with noise, under the constrained controller.
 
-The system is that of `joint_loop`: commands follow from the estimate, with every bound active.
+The system is that of `joint_loop`: commands follow from the estimate, with every bound active
+(docs/noisy-people.md).
 """
 
 from __future__ import annotations

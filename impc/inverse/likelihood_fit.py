@@ -7,7 +7,7 @@ climbs by Fisher's scoring: with s the gradient of the log-likelihood, I the exp
 
 with mu raised until the likelihood grows. Noisy recordings leave some directions of the gain all
 but free; a weak normal prior in natural coordinates keeps those where the first fit was, as in
-`gain_search`.
+`gain_search` (docs/noisy-people.md).
 """
 
 from __future__ import annotations
@@ -38,8 +38,15 @@ __all__ = ["PersonFit", "fit_person"]
 # Of the residual, shares that a search begins with: inside the loop, of the senses, the recorder's.
 # The optimum of 20 simulated people was reached from the best of these four by its likelihood.
 _STARTS = ((0.7, 0.5, 0.3), (0.3, 0.3, 0.9), (0.7, 0.1, 0.3), (0.1, 0.1, 1.0))
-# A search ends when a step promises less: a thousandth of a deviation along any direction.
-_SETTLED = 1e-6
+# A search ends when a step promises less: a hundredth of a deviation along any direction.
+_SETTLED = 1e-4
+# A level that slides to zero, or a sense to one that is not used, has no end: along what is so flat
+# a step of ten is as far as a promise is believed.
+_FLAT = 1e-2
+# A level is held within a factor of e^9, some thousands, of where its search begins: there it is
+# none, or the sense is not used, and beyond it a filter is not told from rounding.
+_REACH = 9.0
+_TINY = 1e-9
 # Longest step of a coordinate.
 _STEP = 1.0
 _LARGEST_MU = 1e12
@@ -140,15 +147,20 @@ def fit_person(
     >>> import numpy as np
     >>> import impc
     >>> from impc.control.noisy_person import simulate_person
-    >>> system = control.ss([[1, 0.1], [0, 0.9]], [[0], [0.1]], [[1, 0]], 0, 0.1, states=["x", "v"])
-    >>> plant = impc.Plant(system)
+    >>> system = control.ss(
+    ...     [[1, 0.1], [0, 0.9]], [[0, 0], [0.1, 0.1]], [[1, 0]], 0, 0.1,
+    ...     states=["x", "v"], inputs=["u", "push"],
+    ... )
+    >>> plant = impc.Plant(system, ["u"])
     >>> bounds = impc.Bounds(plant, u_min=-3, u_max=3)
     >>> law = impc.Controller(plant, impc.Weights(np.eye(2), 1), bounds, 3, terminal_set=False)
     >>> person = impc.Observer(plant, ["x"], motor=0.5, sensory=0.05)
-    >>> y = simulate_person(law, person, steps=400, recorder=0.01).outputs
-    >>> problem = impc.Problem(plant, bounds, 3, [impc.Recording(plant, y)], terminal_set=False)
-    >>> found = impc.fit_person(impc.estimate(problem), person)
-    >>> found.converged, bool(0.4 < found.observer.motor[0] < 0.6)
+    >>> push = np.repeat([1.0, -1.0, 0.0, 1.0, 0.0, -1.0, 1.0, -1.0], 50)
+    >>> y = simulate_person(law, person, push, recorder=0.01).outputs
+    >>> trial = impc.Recording(plant, y, push)
+    >>> found = impc.estimate(impc.Problem(plant, bounds, 3, [trial], terminal_set=False))
+    >>> likely = impc.fit_person(found, person)
+    >>> likely.converged, bool(0.4 < likely.observer.motor[0] < 0.6)
     (True, True)
     """
     space = _space(found)
@@ -224,7 +236,7 @@ def _suggested(observer: Observer, size: _Sizes, inside: float, sensed: float) -
     signals = np.sqrt(np.einsum("si,ij,sj->s", observer.C, size.sensory, observer.C))
     suggested = {
         "motor": share * size.motor,
-        "process": share * size.process / np.sqrt(max(np.count_nonzero(observer.process), 1)),
+        "process": share * size.process / np.sqrt(max(int(np.count_nonzero(observer.process)), 1)),
         "sensory": sensed * signals,
     }
     parts = [suggested.get(name, observer.level(name)) for name in LEVELS]
@@ -250,19 +262,23 @@ def _climb(
 ) -> tuple[Array, Told, int, bool]:
     """The largest likelihood near theta, with a prior of such weights about the start."""
     told, mu, spent = space.told(theta), 1e-3, 1
-    about = space.start
+    about, reach = space.start, np.full(len(theta), np.inf)
+    reach[space.own :] = _REACH
+    low, high = theta - reach, theta + reach
     while True:
         gradient = told.gradient - weights * (theta - about)
-        curvature = told.information + np.diag(weights)
-        plain = np.linalg.lstsq(curvature, gradient, rcond=1e-12)[0]
+        free = ~((theta <= low) & (gradient < 0) | (theta >= high) & (gradient > 0))
+        gradient = np.where(free, gradient, 0.0)
+        curvature = np.where(np.outer(free, free), told.information, 0.0) + np.diag(weights)
+        plain = np.linalg.solve(curvature + _FLAT * np.eye(len(theta)), gradient)
         if gradient @ plain / 2 < _SETTLED:
             return theta, told, spent, True
         accepted = False
         while not accepted and mu < _LARGEST_MU and spent < budget:
-            damped = curvature + mu * np.diag(np.diag(curvature) + 1)
+            damped = curvature + mu * np.diag(np.diag(curvature) + 1) + _TINY * np.eye(len(theta))
             step = np.linalg.solve(damped, gradient)
             step *= min(1.0, _STEP / float(np.max(np.abs(step))))
-            there = theta + step
+            there = np.clip(theta + step, low, high)
             spent += 1
             try:
                 new = space.told(there)
@@ -275,5 +291,5 @@ def _climb(
             promised = float(gradient @ step - step @ curvature @ step / 2)
             mu = mu / 10 if gain > promised / 2 else mu * (2 if accepted else 10)
         if not accepted:
-            return theta, told, spent, spent < budget and gradient @ plain / 2 < 1e3 * _SETTLED
+            return theta, told, spent, False
         theta, told = there, new

@@ -2,7 +2,8 @@
 
     theta = (coordinates of `Coordinates` or `PriceCoordinates` | logarithms of the levels)
 
-A level of zero stays zero, all others are searched: of the person's noise, and of the recorder's.
+A level of zero stays zero, all others are searched: of the person's noise, and of the recorder's
+(docs/noisy-people.md).
 """
 
 from __future__ import annotations
@@ -107,7 +108,7 @@ class PersonCoordinates:
         return [every[index] for index in self.moving]
 
     def levels(self, theta: Array) -> Array:
-        """All levels at theta (q,), those of zero among them."""
+        """All levels (levels + p,) at theta (q,), those of zero among them."""
         found = self.first.copy()
         found[self.moving] = np.exp(theta[self.own :])
         return found
@@ -154,11 +155,11 @@ class PersonCoordinates:
         columns = [self._columns(trial) for trial in range(self.space.trials)]
         trials = self._trials(theta, person, columns)
         gradient, information = np.zeros(q), np.zeros((q, q))
-        scores = []
+        scores: list[Array] = []
         for moved, found in zip(columns, trials, strict=True):
             gradient[moved.all] += found.score.sum(axis=0)
             information[np.ix_(moved.all, moved.all)] += found.information
-            score = np.zeros((len(found.told), q))
+            score: Array = np.zeros((len(found.told), q))
             score[:, moved.all] = found.score
             scores.append(score)
         value = sum(item.value for item in trials)

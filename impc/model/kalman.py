@@ -8,7 +8,9 @@ and as there it is stationary in L, so that its differential leaves L alone: wit
 dG = dF - L dC,
 
     dP = G dP G' + dG P G' + G P dG' + dQ + L dR L'
-    dL = (dF P C' + F dP C' + F P dC' - L dS) S^-1,    dS = C dP C' + dC P C' + C P dC' + dR.
+    dL = (dF P C' + F dP C' + F P dC' - L dS) S^-1,    dS = C dP C' + dC P C' + C P dC' + dR
+
+(docs/noisy-people.md).
 """
 
 from __future__ import annotations

@@ -144,11 +144,11 @@ class Observer(Value):
 
     @property
     def levels(self) -> Array:
-        """All levels in a row, those of `LEVELS` one after the other."""
+        """All levels in a row (l,), those of `LEVELS` one after the other."""
         return np.concatenate([self.level(name) for name in LEVELS])
 
     def with_levels(self, levels: Array) -> Observer:
-        """The same person at other levels, in the order of `levels`."""
+        """The same person at other `levels` (l,), in their order."""
         sizes = [len(self.level(name)) for name in LEVELS]
         parts = np.split(levels, np.cumsum(sizes)[:-1])
         found = {name: frozen(part) for name, part in zip(LEVELS, parts, strict=True)}

@@ -182,9 +182,11 @@ def test_derivatives_equal_differences(who: Someone) -> None:
     found = likelihood(who, outputs, slopes=True)
     assert bool(np.any(found.status > 0)) == bool(np.isfinite(who.limit))
     for step in np.random.default_rng(4).normal(size=(2, 11)):
-        slope = extrapolated_slope(
-            lambda t, step=step: np.array([likelihood(who.moved(t * step), outputs).value]), 1e-3
-        )
+
+        def moved(t: float, step: Array = step) -> Array:
+            return np.array([likelihood(who.moved(t * step), outputs).value])
+
+        slope = extrapolated_slope(moved, 1e-3)
         exact = found.score.sum(axis=0) @ step
         # Differences of a sum of size 300 carry 1e-9 of rounding at these steps.
         assert exact == pytest.approx(slope[0], rel=1e-6, abs=1e-6)

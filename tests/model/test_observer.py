@@ -54,9 +54,9 @@ def test_what_cannot_be_meant_is_refused(given: dict[str, object], message: str)
 def test_a_perturbation_that_is_not_known_is_a_state_of_the_belief() -> None:
     person = Observer(cart(), ["x"], motor=0.3, sensory=0.1, walk=0.5)
     F, C, Q, R = believed_matrices(cart(), person)
-    np.testing.assert_allclose(F, [[1, 0.1, 0], [0, 0.9, 0.2], [0, 0, 1]])
+    np.testing.assert_allclose(F, np.array([[1.0, 0.1, 0.0], [0.0, 0.9, 0.2], [0.0, 0.0, 1.0]]))
     np.testing.assert_allclose(C, [[1, 0, 0]])
-    np.testing.assert_allclose(Q, np.diag([0, (0.1 * 0.3) ** 2, 0.25]))
+    np.testing.assert_allclose(Q, np.diag(np.array([0.0, 9e-4, 0.25])))
     assert float(R[0, 0]) == pytest.approx(0.01)
     # A constant push is found out: the estimate of it ends at its value.
     L, true, estimate = believed_filter(cart(), person).L, np.zeros(2), np.zeros(3)
