@@ -60,8 +60,8 @@ WORDS: dict[str, str] = {
     "Ljung and Box": "A test of whether a residual is white; a small p-value says that it is not.",
     "LQR": "Linear-quadratic regulator: the controller that minimises the sum of priced squares "
     "when nothing is bounded.",
-    "MDC": "Minimal detectable change: a person's change between two visits that is larger than the "
-    "test's own scatter, at 95 %.",
+    "MDC": "Minimal detectable change: a person's change between two visits that is larger than "
+    "the test's own scatter, at 95 %.",
     "MPC": "Model predictive control: at each sample the best plan over the horizon inside the "
     "bounds, of which the first step is done.",
     "natural coordinates": "States in units in which noise at the input moves all of them alike.",
