@@ -267,7 +267,7 @@ def _interior(fibre: GainFibre, member: Weights | None = None) -> Weights:
         raise WeightsError(
             "gain",
             f"no positive definite weights have it (margin {found.margin:.3g})",
-            "look for the nearest gain that has, by inverse_lqr_gradient",
+            "look for the nearest gain that has, by the gradient of inverse LQR",
         )
     return found.weights
 

@@ -64,6 +64,8 @@ WORDS: dict[str, str] = {
     "Ljung and Box": "A test of whether a residual is white; a small p-value says that it is not.",
     "LQR": "Linear-quadratic regulator: the controller that minimises the sum of priced squares "
     "when nothing is bounded.",
+    "MDC": "Minimal detectable change: a person's change between two visits that is larger than "
+    "the test's own scatter, at 95 %.",
     "MPC": "Model predictive control: at each sample the best plan over the horizon inside the "
     "bounds, of which the first step is done.",
     "natural coordinates": "States in units in which noise at the input moves all of them alike.",
@@ -78,8 +80,6 @@ WORDS: dict[str, str] = {
     "SD": "Standard deviation.",
     "SEM": "Standard error of measurement: the scatter of one person's result.",
     "SI": "The international units: metre, kilogram, second, newton, radian.",
-    "smallest detectable change": "A person's change between two visits that is larger than the "
-    "test's own scatter, at 95 %.",
     "terminal set": "States from which the controller's law keeps all bounds for ever; the plan "
     "has to end there.",
     "trace": "Sum of the diagonal of a matrix.",

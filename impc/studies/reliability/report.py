@@ -83,6 +83,7 @@ def reliability_report(trials: Trials, result: Reliability, command: str, inputs
         tables=tables,
         data=_data(result),
         provenance=Provenance(command=command, inputs=inputs),
+        words=[(name, "A condition of this study.") for name in result.conditions],
     )
 
 
