@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
-from impc.arrays import Array, BoolArray, Frozen
+from impc.arrays import Array, BoolArray, Frozen, finite_array
 from impc.control.optimal_recordings import optimal_recording
-from impc.errors import DataError, InputError
+from impc.errors import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -228,12 +228,9 @@ class OptimalControlProblem(Frozen):
         Raises
         ------
         DataError
-            When it has another size or entries that are not finite.
+            As `impc.arrays.finite_array`: another size, or entries that are not finite.
         """
-        given = np.asarray(x0, dtype=np.float64).ravel()
-        if given.shape != (self.n,) or not np.all(np.isfinite(given)):
-            raise DataError("x0", f"got shape {np.shape(x0)}", f"give {self.n} finite numbers")
-        return given
+        return finite_array("x0", x0, (self.n,))
 
     def plan(
         self, theta: Mapping[str, float], x0: Any, *, solver: str = "ipopt", mu: float = 1e-10
@@ -277,20 +274,25 @@ class OptimalControlProblem(Frozen):
         theta, x0, solver, mu
             As `plan`.
         steps : int
-            T, samples.
+            Samples.
         d : array_like, optional
             Disturbances (steps, d) that the plant sees and the controller does not.
 
         Raises
         ------
+        InputError, DataError
+            When `steps` or `d` are not such.
         InfeasibleError, SolverError
             As `impc.control.receding_horizon.simulate_receding`.
         """
         from impc.control.receding_horizon import simulate_receding  # noqa: PLC0415 - see plan
 
-        known = np.zeros((steps, self.disturbance_count)) if d is None else np.asarray(d)
+        if isinstance(steps, bool) or not isinstance(steps, int | np.integer) or steps < 1:
+            raise InputError("steps", f"got {steps!r:.40}", "give a whole number of samples")
+        shape = (int(steps), self.disturbance_count)
+        known = finite_array("d", np.zeros(shape) if d is None else d, shape)
         return simulate_receding(
-            self, self.values(theta), self.start(x0), known.reshape(steps, -1), solver=solver, mu=mu
+            self, self.values(theta), self.start(x0), known, solver=solver, mu=mu
         )
 
     def recorded_plan(

@@ -112,9 +112,17 @@ def test_values_that_are_none_are_refused(theta: dict[str, Any], words: str) -> 
 
 def test_initial_states_solvers_and_mu_are_checked() -> None:
     problem = made()
-    for x0 in ([1.0], [1.0, np.nan]):
-        with pytest.raises(DataError, match=r"x0: got shape .*; give 2 finite numbers"):
+    for x0, words in (
+        ([1.0], r"x0: expected shape \(2\), got \(1,\)"),
+        ([1.0, np.nan], "x0: 1 of 2 entries are NaN"),
+        ("origin", "x0: expected real numbers"),
+    ):
+        with pytest.raises(DataError, match=words):
             problem.plan(TRUTH, x0)
+    with pytest.raises(DataError, match=r"d: expected shape \(3, 0\), got \(2, 1\)"):
+        problem.closed_loop(TRUTH, [1, 0], 3, d=[[1.0], [0.0]])
+    with pytest.raises(InputError, match="steps: got 0; give a whole number of samples"):
+        problem.closed_loop(TRUTH, [1, 0], 0)
     with pytest.raises(InputError, match=r"solver: got 'snopt'; choose one of ipopt, sqpmethod"):
         problem.plan(TRUTH, [1, 0], solver="snopt")
     with pytest.raises(InputError, match="mu: got 0; give 1e-12 to 1e"):
