@@ -65,8 +65,11 @@ help:
 demo: env
 	$(VENV)/bin/impc example
 
-# A file of tests stays on one process, in the order of the folders: the longest are first.
-test: check
+# A file of tests stays on one process, in the order of the folders: the longest are first. What all of
+# them share is compiled on one core while the checks run on the other.
+test: env
+	@OPENBLAS_NUM_THREADS=1 $(PY) -m tests.warm & warm=$$!; \
+	$(MAKE) --no-print-directory check; checked=$$?; wait $$warm && exit $$checked
 	$(PYTEST) -m "not slow and not full"
 
 # The site on one process, the studies on the other.
