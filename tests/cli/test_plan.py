@@ -27,10 +27,10 @@ u_max = 6.0
 
 [fit.structure]
 Q = "diagonal"
-over = ["theta1", "theta2", "theta1_rate", "theta2_rate"]
+over = ["theta1", "theta2"]
 
 [plan]
-prices = { theta1 = 6e3, theta2 = 9e3, theta1_rate = 6e2, theta2_rate = 4e2 }
+prices = { theta1 = 6e3, theta2 = 9e3 }
 noise = { theta1 = "0.05 deg", theta2 = "0.05 deg" }
 correlation = 0.02
 stops = { theta1 = "12 deg" }

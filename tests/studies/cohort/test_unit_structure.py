@@ -28,9 +28,9 @@ STRUCTURE = '[fit.structure]\nQ = ["x[0]", "x[1]"]\n'
 
 @pytest.fixture(scope="module")
 def fitted(tmp_path_factory: pytest.TempPathFactory) -> tuple[Study, Store]:
-    """Six subjects, two visits; the position costs group a 4 and group b 8."""
+    """Six subjects; the position costs group a 4 and group b 8."""
     folder = tmp_path_factory.mktemp("structured")
-    path = write_study(folder, 6, visits=2)
+    path = write_study(folder, 6)
     path.write_text(path.read_text() + STRUCTURE)
     study = read_study(path)
     source = plant_source("tests.studies.cohort.carts:cart_plant", {})
@@ -47,17 +47,16 @@ def test_prices_hold_the_truth_and_the_groups_differ(fitted: tuple[Study, Store]
     price = units["log_price.x[0]"]
     truth = np.where(units["group"] == "a", np.log(4.0), np.log(8.0))
     low, high = units["log_price_low.x[0]"], units["log_price_high.x[0]"]
-    # Subjects differ by 10 % and one interval in twenty misses: 12 of them, seed 0.
-    assert np.sum((low - 0.2 < truth) & (truth < high + 0.2)) == len(units) == 12
-    assert np.sum(units["structure_refused"]) <= 2
+    # Subjects differ by 10 % and one interval in twenty misses: six of them, seed 0.
+    assert np.sum((low - 0.2 < truth) & (truth < high + 0.2)) == len(units) == 6
+    assert np.sum(units["structure_refused"]) <= 1
     assert measures_of(units)[:2] == ("log_price.x[0]", "log_price.x[1]")
     found = {
         item.question: item for item in compare_cohort(units) if item.measure == "log_price.x[0]"
     }
-    assert set(found) == {"group", "visit", "change", "mixed", "reliability"}
-    for question in ("group", "mixed"):
-        assert found[question].low < np.log(2.0) < found[question].high
-        assert found[question].p < 0.01
+    assert set(found) == {"group"}
+    assert found["group"].low < np.log(2.0) < found["group"].high
+    assert found["group"].p < 0.05
     assert price.notna().all()
 
 
