@@ -39,8 +39,8 @@ endif
 
 help:
 	@echo 'make demo    set up .venv and run the example:   impc example'
-	@echo 'make test    set up .venv, then check and pytest: all that matters, about five minutes'
-	@echo 'make full    the site, and studies in full size: what .ci/run does after make test'
+	@echo 'make test    set up .venv, then check and pytest: all that matters, about ten minutes'
+	@echo 'make full    the site, and studies in full size: five minutes more, before a merge'
 	@echo 'make check   ruff check, ruff format --check, mypy --strict'
 	@echo 'make slow    hundreds of recordings, fits and subjects: an hour'
 	@echo 'make coverage  how often printed intervals hold the truth: the table of docs/fitting.md'
