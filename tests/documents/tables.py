@@ -83,6 +83,10 @@ NOT_RUN = {
         "docs/cursor-tracking.md",
         "python -m experiments.cursor_tracking --out results/cursor-tracking",
     ): "needs recordings that are no part of the project; test_cursor_tracking.py has them",
+    (
+        "docs/cursor-tracking.md",
+        "python -m experiments.cursor_structures --out results/cursor-structures",
+    ): "needs the same recordings; test_cursor_structures.py has one blur",
     ("docs/release.md", "make wheel"): "builds in the checkout, and needs a network",
     (
         "docs/release.md",
