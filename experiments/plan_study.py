@@ -22,7 +22,7 @@ from impc.control.controller import Controller
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.structure import Structure
-from impc.studies.plan.designs import Design, Person, designs, held_trials, problem_of, try_design
+from impc.studies.plan.designs import Design, Person, designs, try_design
 from impc.studies.plan.simulated_fits import simulated_fits
 
 if TYPE_CHECKING:
@@ -83,10 +83,9 @@ def compare(name: str, fits: int) -> list[tuple[Design, Array, Array, Array, Arr
     found = []
     for design in tqdm(grid, disable=None):
         told = try_design(person, design, perturbation, trials=trials, draws=trials)
-        if told.expected is None:
+        if told.expected is None or told.problem is None:
             continue
-        kept = held_trials(person, design, perturbation, trials)
-        seen = simulated_fits(person, problem_of(person, kept), fits, 1)
+        seen = simulated_fits(person, told.problem, fits, 1)
         gain = told.expected.gain
         steps = np.array([gain.along(K - person.controller.K) for K in seen.gains])[:, gain.told]
         found.append(

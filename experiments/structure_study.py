@@ -20,21 +20,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.signal
 
 import plants
-from experiments.printed_intervals import carts
+from experiments.printed_intervals import carts, with_noise
 from impc.assess.price_profiles import PriceProfiles
 from impc.assess.structure_test import structure_test
 from impc.assess.structured_weights import price_covariance, tangent
-from impc.control.closed_loop import require_complete, scenario, simulate
 from impc.control.controller import Controller
 from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.structured_fit import fit_structure
 from impc.inverse.structured_search import search_from
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
-from impc.model.recordings import Recording
 from impc.model.structure import Structure
 from impc.model.weights import Weights
 from impc.studies.fit.settings import FitSettings
@@ -48,7 +45,6 @@ __all__ = ["Person", "Score", "cart_person", "score", "seat_person"]
 
 _BODY = ("theta1", "theta2", "theta1_rate", "theta2_rate")
 _TYPICAL = np.log([6e3, 9e3, 6e2, 4e2])
-_BEFORE = 500
 # Misfits that differ by less are those of one end: half a unit of chi-squared's distance.
 _GLOBAL = 0.5
 
@@ -116,7 +112,7 @@ def seat_person(seed: int, vaf: float, root: float) -> Person:
     trials = []
     for phase in (None, 1, 2):
         torque = plants.ternary_torque(duration=30.0, rate=100, seed=phase)
-        trials.append(_recorded(controller, torque, rng, vaf, root))
+        trials.append(with_noise(controller, torque, rng, vaf, root))
     return Person(structure, prices, fit_problem(plant, trials, FitSettings()))
 
 
@@ -135,21 +131,9 @@ def cart_person(seed: int, vaf: float, root: float, cross: float) -> Person:
     trials = []
     for _ in range(2):
         push = np.repeat(rng.choice([-0.8, 0.0, 0.8], (80, 2)), 10, axis=0)
-        trials.append(_recorded(controller, push, rng, vaf, root))
+        trials.append(with_noise(controller, push, rng, vaf, root))
     settings = FitSettings(horizon=8, u_max=1.0)
     return Person(structure, prices, fit_problem(plant, trials, settings))
-
-
-def _recorded(
-    controller: Controller, push: Array, rng: np.random.Generator, vaf: float, root: float
-) -> Recording:
-    plant, samples = controller.plant, len(push)
-    run = simulate(controller, scenario(plant, np.zeros(plant.n), disturbance=push))
-    clean = (require_complete(controller, run).x @ plant.C.T)[:samples]
-    white = rng.standard_normal((samples + _BEFORE, clean.shape[1]))
-    noise = scipy.signal.lfilter([np.sqrt(1 - root**2)], [1.0, -root], white, axis=0)[_BEFORE:]
-    size = np.sqrt((100 - vaf) / vaf * np.mean(clean**2, axis=0))
-    return Recording(plant, clean + size * noise, push)
 
 
 def score(person: Person, study: str, seed: int, *, intervals: bool = True) -> Score:

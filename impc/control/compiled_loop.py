@@ -393,11 +393,7 @@ def run(
     for t in range(first, len(u)):
         if status[t] > _SOFTENED:
             # As `law`, whose call would cost a fourth of a sample that the gain answers.
-            needs_qp, near = False, False
-            _fill_slack(T, rows.b, x[t], slack)
-            for r in range(len(slack)):
-                needs_qp |= not slack[r] >= -kept[r]
-                near |= abs(slack[r]) < _WEAK * rows.b[r]
+            needs_qp, near = _look(T, rows.b, kept, x[t], slack)
             v[: u.shape[1]] = 0.0
             dv0[:] = 0.0
             status[t] = _FREE
@@ -479,12 +475,8 @@ def law(
         Whether the gain keeps every bound, a bound is active, and so on; whether the active set is
         about to change; the row that proved the problem inconsistent, or -1.
     """
-    slack, kept, v = work.slack, work.kept, work.v
-    needs_qp, near = False, False
-    _fill_slack(work.T, rows.b, x, slack)
-    for r in range(len(slack)):
-        needs_qp |= not slack[r] >= -kept[r]
-        near |= abs(slack[r]) < _WEAK * rows.b[r]
+    v = work.v
+    needs_qp, near = _look(work.T, rows.b, work.kept, x, work.slack)
     v[: len(u)] = 0.0
     work.dv0[:] = 0.0
     work.active[0] = 0
@@ -498,6 +490,17 @@ def law(
         status = _FREE
     _apply(loop, dloop, v, work.dv0, x, dx, u, du)
     return status, near, -1
+
+
+@njit(cache=True, inline="always")  # for most samples it is all there is to do
+def _look(T: Buffer, b: Buffer, kept: Buffer, x: Buffer, slack: Buffer) -> tuple[bool, bool]:
+    """Write the slack of the gain; whether a row is broken, and whether one is about to be."""
+    broken, near = False, False
+    _fill_slack(T, b, x, slack)
+    for r in range(len(slack)):
+        broken |= not slack[r] >= -kept[r]
+        near |= abs(slack[r]) < _WEAK * b[r]
+    return broken, near
 
 
 @njit(cache=True)

@@ -80,6 +80,17 @@ def test_the_page_the_table_and_the_numbers_say_the_same(folder: Path) -> None:
         assert (folder / "out" / f"{name}.png").stat().st_size > 10_000
 
 
+def test_an_interval_without_an_upper_end_is_infinite_not_a_large_number(tmp_path: Path) -> None:
+    done = planned(tmp_path, PLAN.replace("0.05 deg", "100000 deg").replace("[2, 4]", "[2]"))
+    assert done.exit_code == 0, done.output
+    assert "says next to nothing of theta1" in done.output
+    (found,) = json.loads((tmp_path / "out" / "result.json").read_text("utf-8"))["experiments"]
+    (row,) = pd.read_csv(tmp_path / "out" / "experiments.csv").to_dict("records")
+    assert found["theta1 high"] is None
+    assert row["theta1 low"] == 0
+    assert row["theta1 high"] == np.inf
+
+
 def test_a_perturbation_from_a_file_is_scaled(folder: Path) -> None:
     time = np.arange(800) / 100
     push = np.where(np.floor(time * 4) % 3 == 0, 2.0, -1.0)

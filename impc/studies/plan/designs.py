@@ -38,8 +38,6 @@ __all__ = [
     "Perturbation",
     "best_of",
     "designs",
-    "held_trials",
-    "problem_of",
     "try_design",
 ]
 
@@ -98,7 +96,7 @@ class Design:
 
 
 @dataclass(frozen=True)
-class Trial(Frozen):
+class _Trial(Frozen):
     """A simulated trial that does not end in a fall.
 
     Attributes
@@ -131,8 +129,11 @@ class Outcome(Frozen):
         Largest magnitude of each output in these (p,).
     vaf : Array
         What a fit without an error would explain of each output, % (p,).
+    problem : Problem or None
+        The recordings, without noise, of so many trials as a person does; None where too few
+        trials end without a fall.
     expected : Expectation or None
-        Of so many trials as a person does; None where too few trials end without a fall.
+        What they would tell.
     """
 
     design: Design
@@ -140,6 +141,7 @@ class Outcome(Frozen):
     at_limit: float
     peaks: Array
     vaf: Array
+    problem: Problem | None
     expected: Expectation | None
 
 
@@ -165,45 +167,29 @@ def try_design(
         Trials that are simulated, at least so many as are recorded.
     """
     plant, limits = person.controller.plant, person.controller.bounds
-    kept = held_trials(person, design, perturbation, max(draws, trials))
-    falls = 1 - len(kept) / max(draws, trials)
+    numbers = range(max(draws, trials))
+    tried = [_held(person, perturbation(design.amplitude, design.dwell, k)) for k in numbers]
+    kept = [trial for trial in tried if trial is not None]
+    falls = 1 - len(kept) / len(tried)
     if len(kept) < trials:
         nothing = frozen(np.full(len(plant.outputs), np.nan))
-        return Outcome(design, falls, float("nan"), nothing, nothing, None)
+        return Outcome(design, falls, float("nan"), nothing, nothing, None, None)
     outputs = np.concatenate([trial.outputs for trial in kept])
     power = np.mean(outputs**2, axis=0)
     sides = np.array(limits.u_min), np.array(limits.u_max)
-    told = _expected(person, problem_of(person, kept[:trials]))
+    problem = _problem_of(person, kept[:trials])
     return Outcome(
         design,
         falls,
         float(np.mean([saturated_share(np.array(trial.inputs), *sides) for trial in kept])),
         frozen(np.max(np.abs(outputs), axis=0)),
         frozen(100 * power / (power + person.deviation**2)),
-        told,
+        problem,
+        _expected(person, problem),
     )
 
 
-def held_trials(
-    person: Person, design: Design, perturbation: Perturbation, draws: int
-) -> list[Trial]:
-    """Those of so many simulated trials that do not end in a fall.
-
-    Parameters
-    ----------
-    person : Person
-    design : Design
-    perturbation : callable
-        As for `try_design`.
-    draws : int
-        Trials that are simulated.
-    """
-    pushes = [perturbation(design.amplitude, design.dwell, number) for number in range(draws)]
-    found = [_held(person, push) for push in pushes]
-    return [trial for trial in found if trial is not None]
-
-
-def _held(person: Person, push: Array) -> Trial | None:
+def _held(person: Person, push: Array) -> _Trial | None:
     """The trial, or None for a fall: the perturbation, and a rest as long."""
     plant, samples = person.controller.plant, len(push)
     alone = np.vstack([push, np.zeros_like(push)])
@@ -214,12 +200,12 @@ def _held(person: Person, push: Array) -> Trial | None:
     peaks, end = np.max(motion[:samples], axis=0), np.max(motion[-samples // 10 :], axis=0)
     if np.any(peaks > person.stops) or np.any(end > _CALM * peaks):
         return None
-    return Trial(
+    return _Trial(
         frozen(push), frozen((run.x @ plant.C.T)[:samples]), frozen(np.array(run.u)[:samples])
     )
 
 
-def problem_of(person: Person, trials: Sequence[Trial]) -> Problem:
+def _problem_of(person: Person, trials: Sequence[_Trial]) -> Problem:
     """The inverse problem of simulated trials."""
     controller, plant = person.controller, person.controller.plant
     recordings = [

@@ -203,7 +203,7 @@ def _row(plan: Plan, item: Outcome) -> dict[str, Any]:
     for index, name in enumerate(names):
         told = None if item.expected is None else item.expected.intervals[index]
         row[f"{name} low"] = np.nan if told is None else math.exp(told.low)
-        row[f"{name} high"] = np.nan if told is None else math.exp(min(told.high, 700.0))
+        row[f"{name} high"] = np.nan if told is None else math.exp(told.high)
         row[f"{name} deviation"] = (
             np.nan if item.expected is None else float(item.expected.deviations[index])
         )

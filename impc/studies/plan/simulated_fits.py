@@ -80,7 +80,7 @@ def simulated_fits(
     ----------
     person : Person
     problem : Problem
-        Its recordings without noise (`designs.problem_of`).
+        Its recordings without noise (`designs.Outcome.problem`).
     count : int
         Of the fits.
     seed : int

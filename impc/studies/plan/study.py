@@ -19,8 +19,6 @@ from impc.studies.plan.designs import (
     Outcome,
     best_of,
     designs,
-    held_trials,
-    problem_of,
     try_design,
 )
 from impc.studies.plan.simulated_fits import SimulatedFits, simulated_fits
@@ -131,11 +129,8 @@ def make_plan(
         done(f"amplitude {design.amplitude:g}")
     best, sharpest = best_of(outcomes, settings.falls / 100)
     fits = None
-    if settings.fits:
-        draws = max(settings.draws, settings.trials)
-        kept = held_trials(person, best.design, perturbation, draws)
-        problem = problem_of(person, kept[: settings.trials])
-        fits = simulated_fits(person, problem, settings.fits, settings.seed, done)
+    if settings.fits and best.problem is not None:
+        fits = simulated_fits(person, best.problem, settings.fits, settings.seed, done)
     groups = group_powers(person, best, settings)
     return Plan(person, settings, tuple(outcomes), best, sharpest, groups, fits)
 

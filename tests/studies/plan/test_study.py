@@ -16,7 +16,7 @@ from impc.errors import InputError, SolverError
 from impc.model.bounds import Bounds
 from impc.model.structure import Structure
 from impc.studies.fit.settings import FitSettings, StructureSettings
-from impc.studies.plan.designs import Design, Person, held_trials, problem_of, try_design
+from impc.studies.plan.designs import Design, Person, try_design
 from impc.studies.plan.settings import (
     PlanSettings,
     mechanical_stops,
@@ -101,11 +101,10 @@ def test_power_is_that_of_the_noncentral_t() -> None:
 def test_fits_scatter_as_foreseen() -> None:
     """Twenty fits: a deviation of 16 % of their own; the noise is that of the recordings."""
     someone = replace(person(), root=0.5, deviation=np.array([0.02]))
-    kept = held_trials(someone, Design(0.8, 2.0), perturbation, 2)
-    problem = problem_of(someone, kept[:1])
     told = try_design(someone, Design(0.8, 2.0), perturbation, trials=1, draws=2)
     assert told.expected is not None
-    fits = simulated_fits(someone, problem, 20, 1)
+    assert told.problem is not None
+    fits = simulated_fits(someone, told.problem, 20, 1)
     assert fits.failed == 0
     ratios = np.std(fits.prices, axis=0) / told.expected.deviations
     assert np.all((ratios > 0.65) & (ratios < 1.35)), ratios
