@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -33,6 +34,7 @@ _ONE_COLUMN = 6  # signals above each other; more stand in two columns
 _TWO_SIDED = 1.959964
 # Factors beyond which an interval is drawn with an arrow.
 _FURTHEST = 30.0
+_LONGEST = 45  # characters of a legend
 
 
 def optimal_figures(fit: OptimalFit, angles: str = "degrees") -> dict[str, bytes]:
@@ -97,9 +99,7 @@ def interval_rows(fit: OptimalFit) -> list[tuple[str, float, float]]:
     """
     found = []
     for one in fit.estimate.combinations.told:
-        problem = fit.estimate.problem
-        places = [problem.parameter_names.index(name) for name in one.exponents]
-        if all(problem.positive[place] for place in places):
+        if not one.difference:
             factor = float(np.exp(np.minimum(_TWO_SIDED * one.deviation, 100.0)))
             found.append((one.name, 1 / factor, factor))
     return found
@@ -109,7 +109,7 @@ def _parameters(fit: OptimalFit) -> Figure:
     rows = interval_rows(fit)
     figure = new_figure(SINGLE_COLUMN, 0.7 + 0.24 * len(rows))
     ax = figure.subplots()
-    reach = min(max(max(high for _, _, high in rows), 1.01) ** 1.1, _FURTHEST)
+    reach = min(max(1.01, *(high for _, _, high in rows)) ** 1.1, _FURTHEST)
     for place, (_, low, high) in enumerate(rows):
         ax.plot([max(low, 1 / reach), min(high, reach)], [place, place], color=BLUE, linewidth=1.6)
         ax.plot(1.0, place, color=BLUE, marker="o", markerfacecolor="white", linestyle="")
@@ -135,14 +135,16 @@ def _singular_values(fit: OptimalFit) -> Figure:
     figure = new_figure(SINGLE_COLUMN, 2.2)
     ax = figure.subplots()
     place, told = np.arange(1, len(values) + 1), len(found.told)
+    ax.plot(place[:told], values[:told], color=BLUE, marker="o", linestyle="", label="told")
     if told < len(values):
         ax.axvspan(told + 0.5, len(values) + 0.5, color=FORBIDDEN, linewidth=0)
-    ax.plot(place[:told], values[:told], color=BLUE, marker="o", linestyle="", label="told")
-    ax.plot(
-        place[told:], values[told:], color=VERMILLION, marker="s", markerfacecolor="white",
-        linestyle="", label="not told",
-    )  # fmt: skip
+        names = "; ".join(" ".join(one.exponents) for one in found.untold)
+        ax.plot(
+            place[told:], values[told:], color=VERMILLION, marker="s", markerfacecolor="white",
+            linestyle="", label=textwrap.shorten(f"not told: {names}", _LONGEST),
+        )  # fmt: skip
     ax.set_yscale("log")
+    ax.set_ylim(0.3 * float(values[-1]), 3.0)
     ax.set_xticks(place)
     ax.set_xlabel("direction of the parameters (-)")
     ax.set_ylabel("singular value / largest (-)")

@@ -44,10 +44,11 @@ _INTERVALS = Picture(
 _VALUES = Picture(
     "singular-values",
     "Singular values of the derivative of the recordings by the parameters, told and not told",
-    "How strongly the recordings move along each direction of the parameters. Round: told. Square, "
-    "on grey: not told, because nothing moves or less than the noise does.",
+    "Singular values: how strongly the recordings move along each direction of the parameters. "
+    "Round: told. Square, on grey: not told, because nothing that was measured moves.",
     narrow=True,
 )
+_WORDS = {"known": "known", "yes": "by itself", "roughly": "roughly", "no": "not by itself"}
 _TOLD = (
     "A product that is told has one value whatever the others have. Along a direction that is not "
     "told the parameters may change together, by any factor a, and the recordings stay what they "
@@ -93,6 +94,7 @@ def _rows(fit: OptimalFit) -> list[dict[str, Any]]:
     estimate, problem = fit.estimate, fit.estimate.problem
     ends = estimate.intervals(_LEVEL)
     apart = {name for one in estimate.combinations.untold for name in one.exponents}
+    roughly = {one.name for one in estimate.combinations.told if one.rough}
     rows = [
         {
             "parameter": name,
@@ -101,7 +103,7 @@ def _rows(fit: OptimalFit) -> list[dict[str, Any]]:
             "low": ends[name][0],
             "high": ends[name][1],
             "level": _LEVEL,
-            "told": "no" if name in apart else "yes",
+            "told": "no" if name in apart else "roughly" if name in roughly else "yes",
             "start": fit.start.get(name, np.nan),
         }
         for (name, value), unit in zip(estimate.theta.items(), problem.units, strict=True)
@@ -121,14 +123,14 @@ def parameters_table(fit: OptimalFit) -> TextTable:
 def _parameters(fit: OptimalFit) -> list[Block]:
     rows = []
     for row in _rows(fit):
-        known, told = row["told"] == "known", row["told"] == "yes"
+        known, told = row["told"] == "known", row["told"] != "no"
         ends = f"{number(row['low'], 4)} to {number(row['high'], 4)}" if told else "any"
         rows.append(
             (
                 row["parameter"],
                 number(row["value"], 5) + (f" {row['unit']}" if row["unit"] else ""),
                 "-" if known else ends,
-                {"known": "known", "yes": "by itself"}.get(row["told"], "not by itself"),
+                _WORDS[row["told"]],
                 number(row["start"], 4),
             )
         )
@@ -145,17 +147,15 @@ def _combination_numbers(fit: OptimalFit) -> TextTable:
     found = fit.estimate.combinations
     rows = []
     for one in (*found.told, *found.untold):
-        low, high = _ends(fit, one)
-        rows.append((one.name, one.value, low, high, _LEVEL, "yes" if one in found.told else "no"))
+        low, high = _ends(one)
+        told = "no" if one in found.untold else "roughly" if one.rough else "yes"
+        rows.append((one.name, one.value, low, high, _LEVEL, told))
     return TextTable("", ("product", "value", "low", "high", "level", "told"), rows)
 
 
-def _ends(fit: OptimalFit, one: Combination) -> tuple[float, float]:
+def _ends(one: Combination) -> tuple[float, float]:
     """Both ends of a told product; any positive number for one that is not."""
-    problem = fit.estimate.problem
-    single = len(one.exponents) == 1
-    first = problem.parameter_names.index(next(iter(one.exponents)))
-    if single and not problem.positive[first]:
+    if one.difference:
         return one.value - _TWO_SIDED * one.deviation, one.value + _TWO_SIDED * one.deviation
     with np.errstate(over="ignore"):
         factor = float(np.exp(_TWO_SIDED * one.deviation))
@@ -166,7 +166,7 @@ def _combinations(fit: OptimalFit) -> TextTable:
     found = fit.estimate.combinations
     rows = []
     for one in found.told:
-        low, high = _ends(fit, one)
+        low, high = _ends(one)
         rows.append((one.name, number(one.value, 5), f"{number(low, 4)} to {number(high, 4)}"))
     for one in found.untold:
         moved = ", ".join(

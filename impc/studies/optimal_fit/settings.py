@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -177,7 +178,7 @@ def recorded(
             raise InputError(f"[fit.x0] {brief(name, 80)}", "is no state", f"it has {known}")
     first = dict(zip(problem.state_names, trial.x[0], strict=True)) | settings.x0
     for name, value in first.items():
-        if value != value:
+        if math.isnan(value):
             raise InputError(
                 f"[fit.x0] {name}", "is missing, and was not recorded",
                 "give it, or a guess with unknown_start = true",
