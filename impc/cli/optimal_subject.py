@@ -107,7 +107,6 @@ def _fitted(
         tuple(str(trial.label) for trial in trials),
         tuple(trial.findings for trial in trials),
         trials[0].dt,
-        start,
         {name: (value, units[name]) for name, value in known.items()},
         asdict(settings),
     )

@@ -149,26 +149,21 @@ class OptimalControlProblem(Frozen):
         dt: float | None = None,
     ) -> None:
         _require_horizon(horizon)
-        if dt is not None and not (isinstance(dt, Real) and 0 < float(dt) < np.inf):
-            raise InputError("dt", f"got {dt!r:.40}", "give a sample time above 0, s")
         kinds = (states, inputs, [] if disturbances is None else disturbances)
         x, u, d = (_symbols(name, given) for name, given in
                    zip(("states", "inputs", "disturbances"), kinds, strict=True))  # fmt: skip
         theta = [_scalar(name, symbol) for name, symbol in dict(parameters).items()]
-        for subject, given in (("states", x), ("inputs", u), ("parameters", theta)):
-            if not given:
-                raise InputError(subject, "there are none", "give at least one")
+        _require_some(states=x, inputs=u, parameters=theta)
         names = tuple(dict(parameters))
         path, rows = _stacked(constraints or {})
         last, terminal_rows = _stacked(terminal_constraints or {})
-        count = [sum(item.numel() for item in given) for given in (x, u, d)]
         symbols = (x, u, d, theta)
         signals = [_names(item) for item in (x, u, d)]
-        following = next_state
+        step, following = _sample_time(dt), next_state
         if is_system(next_state):
-            following = system_equations(next_state, (x, u, d), signals, dict(parameters), dt)
+            following = system_equations(next_state, (x, u, d), signals, dict(parameters), step)
         functions = (
-            _function("next_state", following, symbols, (count[0],)),
+            _function("next_state", following, symbols, (len(signals[0]),)),
             _function("stage_cost", stage_cost, symbols, (1,)),
             _function("terminal_cost", terminal_cost, symbols, (1,), alone=True),
             _function("constraints", path, symbols, (len(rows),)),
@@ -176,9 +171,7 @@ class OptimalControlProblem(Frozen):
         )
         _require_influence(names, functions)
         told, flat = dict(units or {}), [name for group in signals for name in group]
-        for name in (*signed, *(key for key in told if key not in flat)):
-            if name not in names:
-                raise InputError(f"parameter {name}", "is not among the parameters", _among(names))
+        _require_named((*signed, *(key for key in told if key not in flat)), names)
         moved = ca.DM(functions[3].jac_sparsity(0, 1), 1).full()
         fields = {
             "horizon": int(horizon),
@@ -192,7 +185,7 @@ class OptimalControlProblem(Frozen):
             "units": tuple(told.get(name, "") for name in names),
             "disturbance_names": signals[2],
             "signal_units": {name: told[name] for name in flat if name in told},
-            "dt": None if dt is None else float(dt),
+            "dt": step,
             "functions": functions,
         }
         for field, value in fields.items():
@@ -392,6 +385,14 @@ def _require_horizon(horizon: Any) -> None:
         raise InputError("horizon", f"got {horizon}", f"give 1 to {_LONGEST} samples")
 
 
+def _sample_time(dt: Any) -> float | None:
+    if dt is None:
+        return None
+    if isinstance(dt, bool) or not isinstance(dt, Real) or not 0 < float(dt) < np.inf:
+        raise InputError("dt", f"got {dt!r:.40}", "give a sample time above 0, s")
+    return float(dt)
+
+
 def _with_values(function: Any, free: list[int], values: Array) -> Any:
     """A function of (x, u, d, theta) as one of the free entries of theta."""
     given = [ca.MX.sym(letter, function.numel_in(k)) for k, letter in enumerate("xud")]
@@ -495,6 +496,18 @@ def _require_influence(names: Sequence[str], functions: Sequence[Any]) -> None:
     for name, there in zip(names, seen, strict=True):
         if not there:
             raise InputError(f"parameter {name}", "is in no expression", "take it out")
+
+
+def _require_some(**given: Sequence[Any]) -> None:
+    for subject, symbols in given.items():
+        if not symbols:
+            raise InputError(subject, "there are none", "give at least one")
+
+
+def _require_named(given: Iterable[str], names: Sequence[str]) -> None:
+    for name in given:
+        if name not in names:
+            raise InputError(f"parameter {name}", "is not among the parameters", _among(names))
 
 
 def _among(names: Sequence[str]) -> str:

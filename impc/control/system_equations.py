@@ -6,6 +6,8 @@ then gives an expression. A continuous one is stepped by the method of Runge and
 order with its input held:
 
     x_{k+1} = x_k + dt (k1 + 2 k2 + 2 k3 + k4) / 6
+
+docs/nonlinear.md has an example.
 """
 
 from __future__ import annotations

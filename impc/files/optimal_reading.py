@@ -78,6 +78,7 @@ def read_optimal_trials(
     Parameters
     ----------
     paths : sequence of Path
+        One file a recording.
     configuration : Configuration
         Names a column for each disturbance, and for the states and inputs that were measured.
     problem : OptimalControlProblem

@@ -252,7 +252,7 @@ def require_kind(name: str, written: str, expected: str) -> None:
 
 
 def require_distinct(paths: Sequence[Path]) -> None:
-    """No file is given twice, by whatever name.
+    """None of the `paths` is given twice, by whatever name.
 
     Raises
     ------

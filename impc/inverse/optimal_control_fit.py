@@ -46,6 +46,8 @@ class OptimalControlEstimate(Frozen):
     ----------
     problem : OptimalControlProblem
     recordings : tuple of OptimalRecording
+    start : dict
+        Values by name at which the search began.
     theta : dict
         Values by name.
     loss : float
@@ -75,6 +77,7 @@ class OptimalControlEstimate(Frozen):
 
     problem: OptimalControlProblem
     recordings: tuple[OptimalRecording, ...]
+    start: dict[str, float]
     theta: dict[str, float]
     loss: float
     residual: Array
@@ -201,7 +204,7 @@ def fit_optimal_control(
             break
     if best is None:
         raise SolverError("start", "no search got away from it", "begin nearer")
-    return _estimate(given, best, settled, done, time.perf_counter() - began)
+    return _estimate(given, theta, best, settled, done, time.perf_counter() - began)
 
 
 def _scaled(recordings: Sequence[OptimalRecording], theta: Array) -> tuple[float, ...]:
@@ -241,14 +244,22 @@ def _attempt(
 
 
 def _estimate(
-    given: Residuals, found: Evaluation, settled: bool, evaluations: int, seconds: float
+    given: Residuals,
+    start: Array,
+    found: Evaluation,
+    settled: bool,
+    evaluations: int,
+    seconds: float,
 ) -> OptimalControlEstimate:
     problem, signals = given.problem, given.signals()
     loss = float(np.sum((found.residual * given.scales[signals]) ** 2))
     told = combinations(problem, found.theta, found.jacobian, found.residual, signals)
-    named = dict(zip(problem.parameter_names, map(float, found.theta), strict=True))
+    begun, named = (
+        dict(zip(problem.parameter_names, map(float, values), strict=True))
+        for values in (start, found.theta)
+    )
     return OptimalControlEstimate(
-        problem, given.recordings, named, loss, found.residual, found.jacobian, signals,
+        problem, given.recordings, begun, named, loss, found.residual, found.jacobian, signals,
         given.scales, told, tuple(given.split(found.unknowns)[1]), found.trajectories(), settled,
         evaluations, seconds,
     )  # fmt: skip

@@ -16,6 +16,7 @@ import pandas as pd
 import pytest
 from click.testing import CliRunner, Result
 
+import impc
 from impc.cli.main import main
 from impc.files.results import read_result
 from impc.reporting.style import journal_style
@@ -233,6 +234,22 @@ def test_one_plan_by_another_solver(folder: Path, done: Result) -> None:
     for name in ("drag", "price", "limit"):
         assert found.content["parameters"][name]["value"] == pytest.approx(TRUTH[name], rel=1e-4)
     assert "was fitted to one recording of one plan, 25 samples in all" in told.stdout
+
+
+def test_the_same_page_from_python(folder: Path, done: Result, tmp_path: Path) -> None:
+    problem = own_problem().with_known({"mass": 1.5, "far": 20.0})
+    plan = problem.plan({name: TRUTH[name] for name in ("drag", "price", "limit")}, [1.0, 0.5])
+    start = {"drag": 0.5, "price": 8.0, "limit": 0.9}
+    found = impc.fit_optimal_control(problem, [problem.recorded_plan(plan.x, plan.u)], start)
+    names = {path.name for path in impc.report(found, tmp_path)}
+    assert names == {path.name for path in (folder / "out").iterdir() if path.is_file()} - {
+        ".impc", "trajectories-2.png", "trajectories-2.pdf",
+    }  # fmt: skip
+    content = read_result(tmp_path).content
+    assert content["verdict"].startswith("The problem explains the recordings, which tell every")
+    assert content["parameters"]["drag"]["start"] == 0.5
+    with pytest.raises(impc.InputError, match="estimate: expected a Estimate, got dict of 3"):
+        impc.report(start, tmp_path)  # type: ignore[arg-type]
 
 
 def fault(name: str) -> tuple[str, str]:

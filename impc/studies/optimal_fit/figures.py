@@ -1,4 +1,7 @@
-"""Figures of the fit of an optimal control problem: trajectories, parameters, what is told."""
+"""Figures of the fit of an optimal control problem: trajectories, parameters, what is told.
+
+See docs/nonlinear.md.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""The report of the fit of an optimal control problem: page, tables, result.json, figures."""
+"""The report of the fit of an optimal control problem: page, tables, result.json, figures.
+
+See docs/nonlinear.md.
+"""
 
 from __future__ import annotations
 
@@ -104,7 +107,7 @@ def _rows(fit: OptimalFit) -> list[dict[str, Any]]:
             "high": ends[name][1],
             "level": _LEVEL,
             "told": "no" if name in apart else "roughly" if name in roughly else "yes",
-            "start": fit.start.get(name, np.nan),
+            "start": estimate.start[name],
         }
         for (name, value), unit in zip(estimate.theta.items(), problem.units, strict=True)
     ]

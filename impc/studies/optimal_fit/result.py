@@ -1,4 +1,7 @@
-"""What the fit of an optimal control problem found, with what its page says of it."""
+"""What the fit of an optimal control problem found, with what its page says of it.
+
+See docs/nonlinear.md.
+"""
 
 from __future__ import annotations
 
@@ -40,8 +43,6 @@ class OptimalFit(Frozen):
         What the checks of each let pass.
     dt : float or None
         Sample time, s; None where nobody says it.
-    start : mapping of str to float
-        Where the search began.
     known : mapping of str to (float, str)
         Parameters that were not searched: value and unit.
     settings : mapping
@@ -52,7 +53,6 @@ class OptimalFit(Frozen):
     trials: tuple[str, ...]
     findings: tuple[tuple[str, ...], ...]
     dt: float | None = None
-    start: Mapping[str, float] = field(default_factory=dict)
     known: Mapping[str, tuple[float, str]] = field(default_factory=dict)
     settings: Mapping[str, Any] = field(default_factory=dict)
 

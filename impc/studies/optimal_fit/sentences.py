@@ -1,4 +1,7 @@
-"""What the page of an optimal control problem's fit says in words."""
+"""What the page of an optimal control problem's fit says in words.
+
+See docs/nonlinear.md.
+"""
 
 from __future__ import annotations
 
@@ -66,7 +69,7 @@ def _what_was_done(fit: OptimalFit) -> str:
         count: "of a controller that plans anew at every sample",
     }.get(loops, f"of which {loops} are of a controller that plans anew at every sample")
     ahead = "" if fit.dt is None else f" ({problem.horizon * fit.dt:.3g} s)"
-    known = f" and {len(fit.known)} known ones" if fit.known else ""
+    known = f" (and {len(fit.known)} known)" if fit.known else ""
     return (
         f"An optimal control problem over {problem.horizon} samples{ahead} with "
         f"{len(estimate.theta)} unknown parameters{known} was fitted to {each} {kind}, "
