@@ -19,6 +19,7 @@ from click.testing import CliRunner, Result
 import impc
 from impc.cli.main import main
 from impc.files.results import read_result
+from impc.reporting import style
 from impc.reporting.style import journal_style
 from impc.studies.optimal_fit import figures
 from tests.labelled_axes import require_labels
@@ -144,7 +145,7 @@ def fitted(folder: Path, config: str, out: str, *more: str) -> Result:
 @pytest.fixture(scope="module")
 def done(folder: Path) -> Result:
     with pytest.MonkeyPatch.context() as patch:
-        shown = figures.new_figure
+        shown = style.new_figure
         made: list[Any] = []
 
         def kept(width: float, height: float) -> Any:
