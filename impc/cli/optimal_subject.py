@@ -100,7 +100,12 @@ def _fitted(
     trials = read_optimal_trials(files, configuration, fitted)
     recordings = [recorded(fitted, trial, settings) for trial in trials]
     estimate = fit_optimal_control(
-        fitted, recordings, start, solver=settings.solver, evaluations=settings.evaluations
+        fitted,
+        recordings,
+        start,
+        solver=settings.solver,
+        evaluations=settings.evaluations,
+        starts=settings.starts,
     )
     return OptimalFit(
         estimate,

@@ -276,6 +276,7 @@ WRONG: dict[str, tuple[tuple[str, str], str]] = {
     "no evaluations": (
         ('recorded = "loop"', "evaluations = 0"), "[fit] evaluations: got 0; give 1 to 100000"
     ),
+    "no start": (('recorded = "loop"', "starts = 0"), "[fit] starts: got 0; give 1 to 1000"),
     "a setting of the linear fit": (
         ('recorded = "loop"', "u_max = 3.0"), "[fit] u_max: is not a setting; known: parameters"
     ),

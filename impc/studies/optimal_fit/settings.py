@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 __all__ = ["OptimalFitSettings", "ParameterSettings", "optimal_fit_settings", "posed", "recorded"]
 
 
+_MOST = {"evaluations": 100_000, "starts": 1000}
+
+
 @dataclass(frozen=True)
 class ParameterSettings:
     """A parameter of the problem: where its search begins, or its value.
@@ -61,6 +64,8 @@ class OptimalFitSettings:
         One of `impc.control.nlp_solvers.SOLVERS`.
     evaluations : int
         After how many a search is stopped.
+    starts : int
+        From how many starts, where the first explains little or has no plan.
     """
 
     parameters: dict[str, ParameterSettings] = field(default_factory=dict)
@@ -70,6 +75,7 @@ class OptimalFitSettings:
     unknown_start: bool = True
     solver: str = "ipopt"
     evaluations: int = 200
+    starts: int = 5
 
 
 def optimal_fit_settings(table: Mapping[str, Any]) -> OptimalFitSettings:
@@ -99,8 +105,9 @@ def optimal_fit_settings(table: Mapping[str, Any]) -> OptimalFitSettings:
                 "has both start and known" if one.known is not None else "has no number",
                 "give start for one that is searched, or known",
             )
-    if not 1 <= settings.evaluations <= 100_000:
-        raise InputError("[fit] evaluations", f"got {settings.evaluations}", "give 1 to 100000")
+    for key, most in _MOST.items():
+        if not 1 <= getattr(settings, key) <= most:
+            raise InputError(f"[fit] {key}", f"got {getattr(settings, key)}", f"give 1 to {most}")
     require_solver(settings.solver)
     return settings
 
