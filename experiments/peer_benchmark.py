@@ -20,6 +20,7 @@ import numpy as np
 from tqdm import tqdm
 
 from experiments.peer_systems import SYSTEMS
+from impc.control.nlp_solvers import SOLVERS
 from impc.errors import ImpcError
 from impc.inverse.optimal_control_fit import fit_optimal_control
 
@@ -72,7 +73,12 @@ def demonstration(system: PeerSystem) -> OptimalRecording:
 
 
 def fit_from(
-    system: PeerSystem, recording: OptimalRecording, truth: dict[str, float], S: float, seed: int
+    system: PeerSystem,
+    recording: OptimalRecording,
+    truth: dict[str, float],
+    S: float,
+    seed: int,
+    solver: str = "ipopt",
 ) -> Outcome:
     """Search from truth * exp(S normal)."""
     factors = np.exp(S * np.random.default_rng(seed).normal(size=len(truth)))
@@ -81,7 +87,7 @@ def fit_from(
     }
     began = time.process_time()
     try:
-        found = fit_optimal_control(system.problem, [recording], start)
+        found = fit_optimal_control(system.problem, [recording], start, solver=solver)
     except ImpcError as error:
         return Outcome(np.nan, np.nan, 0, time.process_time() - began, str(error))
     seconds = time.process_time() - began
@@ -154,14 +160,20 @@ def _starts(systems: Iterable[str], count: int) -> None:
                     print(f"  seed {seed}: loss {one.loss:.3g}, {one.seconds:.1f} s; {one.untold}")
 
 
-def _loops(count: int) -> None:
-    for name, (x0, changes) in LOOPS.items():
+def _loops(systems: Iterable[str], count: int, solver: str) -> None:
+    for name in [name for name in LOOPS if name in systems]:
+        x0, changes = LOOPS[name]
         system = SYSTEMS[name](20)
         truth = system.truth | changes
         loop = system.problem.closed_loop(truth, x0, 60, mu=1e-12)
         recording = system.problem.recorded_loop(loop.x, loop.u)
         for seed in range(count):
-            print(_line(name, 0.1, [fit_from(system, recording, truth, 0.1, seed)]), flush=True)
+            found = fit_from(system, recording, truth, 0.1, seed, solver)
+            print(
+                f"| {name} | {solver} | {seed} | {found.loss:.1e} | {found.error:.1e} | "
+                f"{found.evaluations} | {found.seconds:.1f} | {found.untold} |",
+                flush=True,
+            )
 
 
 def main() -> None:
@@ -170,11 +182,12 @@ def main() -> None:
     parser.add_argument("study", choices=["starts", "loops", "noise"])
     parser.add_argument("--systems", nargs="+", default=list(SYSTEMS), choices=list(SYSTEMS))
     parser.add_argument("--count", type=int, default=10, help="starts, or tens of repetitions")
+    parser.add_argument("--solver", default="ipopt", choices=SOLVERS, help="of the closed loops")
     given = parser.parse_args()
     if given.study == "starts":
         _starts(given.systems, given.count)
     elif given.study == "loops":
-        _loops(given.count)
+        _loops(given.systems, given.count, given.solver)
     else:
         held, odd = coverage(10 * given.count)
         for name, item in (*held.items(), ("all", list(itertools.chain(*held.values())))):

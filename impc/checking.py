@@ -316,6 +316,16 @@ def _instance(module: str, kind: str) -> Kind:
     return check
 
 
+def _either(module: str, kind: str, other: Kind) -> Kind:
+    """A value of the package, or else what the `other` kind says."""
+
+    def check(name: str, value: Any) -> Any:
+        known = getattr(sys.modules.get(module), kind, None)
+        return value if known is not None and isinstance(value, known) else other(name, value)
+
+    return check
+
+
 def _several(kind: Kind, what: str) -> Kind:
     """A tuple of the items of any sequence but a text, an array or a frame of several columns."""
 
@@ -380,6 +390,11 @@ _VALUES = {
 _MADE_BY = {kind: remedy for kind, (_, remedy) in _VALUES.items()}
 _KINDS: dict[str, Kind] = {
     **{kind: _instance(module, kind) for kind, (module, _) in _VALUES.items()},
+    "Estimate | OptimalControlEstimate": _either(
+        "impc.inverse.optimal_control_fit",
+        "OptimalControlEstimate",
+        _instance("impc.inverse.estimates", "Estimate"),
+    ),
     "ArrayLike": as_numbers,
     "Array": _array,
     "IntArray": _as_it_is,

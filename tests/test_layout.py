@@ -37,6 +37,10 @@ ELSEWHERE = {
     "cli/test_folders.py": "cli/options.py",
     "cli/test_main.py": """
         cli/example.py cli/numbers.py studies/example/cases.py studies/example/table.py""",
+    "cli/test_optimal_subject.py": """
+        files/optimal_reading.py studies/optimal_fit/figures.py studies/optimal_fit/report.py
+        studies/optimal_fit/result.py studies/optimal_fit/sentences.py
+        studies/optimal_fit/settings.py""",
     "cli/test_plan.py": """
         studies/plan/figures.py studies/plan/report.py studies/plan/sentences.py""",
     "cli/test_reliability.py": """

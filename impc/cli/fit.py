@@ -34,9 +34,11 @@ def command(
     """Fit the controller behind the trials of one subject, one file a trial.
 
     What is done when you interrupt it is kept in the folder: the same command goes on from there.
+    Where the plant is an impc.OptimalControlProblem, its parameters are fitted (docs/nonlinear.md).
     """
     # Imported here: the libraries take seconds to load, and --help needs none.
     from impc.cli.consent import require_consent  # noqa: PLC0415
+    from impc.cli.optimal_subject import fit_optimal  # noqa: PLC0415
     from impc.cli.subject import read_subject  # noqa: PLC0415
     from impc.reporting.writer import require_writable, write_files  # noqa: PLC0415
     from impc.studies.effort import fit_effort  # noqa: PLC0415
@@ -50,6 +52,8 @@ def command(
     from impc.studies.fit.truth import read_truth, truth_sentence  # noqa: PLC0415
 
     require_writable(out)
+    if fit_optimal(files, plant_name, config, out, solver):
+        return
     subject = read_subject("fit", files, plant_name, config, solver)
     problem, settings = subject.problem, subject.settings
     require_consent(fit_effort(problem, settings), yes)

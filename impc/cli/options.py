@@ -38,7 +38,8 @@ seed_option = click.option(
 solver_option = click.option(
     "--solver",
     help="What solves the controller's quadratic programs: compiled (the package's own, and the "
-    "default), or daqp, qpoases or ipopt of CasADi.",
+    "default), or daqp, qpoases or ipopt of CasADi. Of an optimal control problem of your own: "
+    "ipopt, sqpmethod or fatrop.",
 )
 
 #: --yes of what may take hours, see `impc.cli.consent`.

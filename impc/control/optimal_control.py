@@ -20,6 +20,7 @@ import numpy as np
 
 from impc.arrays import Array, BoolArray, Frozen, finite_array
 from impc.control.optimal_recordings import optimal_recording
+from impc.control.system_equations import is_system, system_equations
 from impc.errors import InputError
 
 if TYPE_CHECKING:
@@ -44,8 +45,9 @@ class OptimalControlProblem(Frozen):
         Symbols x (n) and u (m): one vector, or scalars whose names are those of the signals.
     parameters : dict
         Name of each unknown -> its scalar symbol in the expressions.
-    next_state : casadi expression
-        f(x, u, d; theta) (n).
+    next_state : casadi expression or control.NonlinearIOSystem
+        f(x, u, d; theta) (n); of a system its own equations, with the symbols in the place of its
+        parameters of those names (`impc.control.system_equations`).
     stage_cost : casadi expression
         l(x, u; theta), a number; as a rule prices times features, one price a known number.
     horizon : int
@@ -60,7 +62,9 @@ class OptimalControlProblem(Frozen):
     signed : sequence of str
         Parameters that may have any sign; the others are positive and are searched in logarithms.
     units : dict
-        Unit of a parameter by its name, for tables.
+        Unit of a parameter, a state, an input or a disturbance by its name, for tables.
+    dt : float
+        Sample time, s: of recordings in files, and of a system that is continuous.
 
     Attributes
     ----------
@@ -76,8 +80,12 @@ class OptimalControlProblem(Frozen):
         Which parameters are (p,).
     units : tuple of str
         (p,), empty where none is given.
-    disturbance_count : int
-        Number of disturbances.
+    disturbance_names : tuple of str
+        Of disturbances.
+    signal_units : dict
+        Units of states, inputs and disturbances by name, where they are given.
+    dt : float or None
+        Sample time, s; None where it is not said.
     functions : tuple
         casadi.Function of (x, u, d, theta): f, l, e, h, h_N.
 
@@ -85,7 +93,8 @@ class OptimalControlProblem(Frozen):
     ------
     InputError
         When an expression has a symbol that is not among states, inputs, disturbances and
-        parameters, or the wrong size; when a parameter is in no expression.
+        parameters, or the wrong size; when a parameter is in no expression; when the equations of
+        a system cannot be written with symbols.
 
     Examples
     --------
@@ -117,7 +126,9 @@ class OptimalControlProblem(Frozen):
     movable: BoolArray
     positive: BoolArray
     units: tuple[str, ...]
-    disturbance_count: int
+    disturbance_names: tuple[str, ...]
+    signal_units: dict[str, str]
+    dt: float | None
     functions: tuple[Any, ...]
 
     def __init__(
@@ -135,46 +146,46 @@ class OptimalControlProblem(Frozen):
         disturbances: Any = None,
         signed: Sequence[str] = (),
         units: Mapping[str, str] | None = None,
+        dt: float | None = None,
     ) -> None:
-        if isinstance(horizon, bool) or not isinstance(horizon, int | np.integer):
-            raise InputError("horizon", f"got {horizon!r:.40}", "give a whole number of samples")
-        if not 1 <= horizon <= _LONGEST:
-            raise InputError("horizon", f"got {horizon}", f"give 1 to {_LONGEST} samples")
+        _require_horizon(horizon)
         kinds = (states, inputs, [] if disturbances is None else disturbances)
         x, u, d = (_symbols(name, given) for name, given in
                    zip(("states", "inputs", "disturbances"), kinds, strict=True))  # fmt: skip
         theta = [_scalar(name, symbol) for name, symbol in dict(parameters).items()]
-        for subject, given in (("states", x), ("inputs", u), ("parameters", theta)):
-            if not given:
-                raise InputError(subject, "there are none", "give at least one")
+        _require_some(states=x, inputs=u, parameters=theta)
         names = tuple(dict(parameters))
         path, rows = _stacked(constraints or {})
         last, terminal_rows = _stacked(terminal_constraints or {})
-        count = [sum(item.numel() for item in given) for given in (x, u, d)]
         symbols = (x, u, d, theta)
+        signals = [_names(item) for item in (x, u, d)]
+        step, following = _sample_time(dt), next_state
+        if is_system(next_state):
+            following = system_equations(next_state, (x, u, d), signals, dict(parameters), step)
         functions = (
-            _function("next_state", next_state, symbols, (count[0],)),
+            _function("next_state", following, symbols, (len(signals[0]),)),
             _function("stage_cost", stage_cost, symbols, (1,)),
             _function("terminal_cost", terminal_cost, symbols, (1,), alone=True),
             _function("constraints", path, symbols, (len(rows),)),
             _function("terminal_constraints", last, symbols, (len(terminal_rows),), alone=True),
         )
         _require_influence(names, functions)
-        for name in (*signed, *(units or {})):
-            if name not in names:
-                raise InputError(f"parameter {name}", "is not among the parameters", _among(names))
+        told, flat = dict(units or {}), [name for group in signals for name in group]
+        _require_named((*signed, *(key for key in told if key not in flat)), names)
         moved = ca.DM(functions[3].jac_sparsity(0, 1), 1).full()
         fields = {
             "horizon": int(horizon),
-            "state_names": _names(x),
-            "input_names": _names(u),
+            "state_names": signals[0],
+            "input_names": signals[1],
             "parameter_names": names,
             "rows": rows,
             "terminal_rows": terminal_rows,
             "movable": _fixed(moved.any(axis=1)),
             "positive": _fixed([name not in signed for name in names]),
-            "units": tuple((units or {}).get(name, "") for name in names),
-            "disturbance_count": count[2],
+            "units": tuple(told.get(name, "") for name in names),
+            "disturbance_names": signals[2],
+            "signal_units": {name: told[name] for name in flat if name in told},
+            "dt": step,
             "functions": functions,
         }
         for field, value in fields.items():
@@ -190,10 +201,45 @@ class OptimalControlProblem(Frozen):
         """Number of inputs."""
         return len(self.input_names)
 
+    @property
+    def disturbance_count(self) -> int:
+        """Number of disturbances."""
+        return len(self.disturbance_names)
+
     def with_horizon(self, horizon: int) -> OptimalControlProblem:
-        """The same problem over another `horizon` in samples."""
+        """The same problem over another `horizon` in samples.
+
+        Raises
+        ------
+        InputError
+            When it is no such number.
+        """
+        _require_horizon(horizon)
+        return self._changed(horizon=int(horizon))
+
+    def with_known(self, known: Mapping[str, float]) -> OptimalControlProblem:
+        """The same problem with the values of some parameters `known` by name: the others are left.
+
+        Raises
+        ------
+        InputError
+            When a parameter is unknown, its value is none, or no parameter is left.
+        """
+        numbers = {name: self._value(name, value) for name, value in known.items()}
+        free = [k for k, name in enumerate(self.parameter_names) if name not in numbers]
+        if not free:
+            raise InputError("parameters", "are all known", "leave one to be searched")
+        values = np.array([numbers.get(name, 0.0) for name in self.parameter_names])
+        return self._changed(
+            parameter_names=tuple(self.parameter_names[k] for k in free),
+            positive=_fixed(self.positive[free]),
+            units=tuple(self.units[k] for k in free),
+            functions=tuple(_with_values(item, free, values) for item in self.functions),
+        )
+
+    def _changed(self, **fields: Any) -> OptimalControlProblem:
         made = object.__new__(OptimalControlProblem)
-        for name, value in {**vars(self), "horizon": horizon}.items():
+        for name, value in {**vars(self), **fields}.items():
             object.__setattr__(made, name, value)
         return made
 
@@ -205,22 +251,22 @@ class OptimalControlProblem(Frozen):
         InputError
             When one is missing, unknown, not finite, or not positive and not signed.
         """
-        for name in theta:
-            if name not in self.parameter_names:
-                raise InputError(f"parameter {name}", "is not known", _among(self.parameter_names))
-        found: list[float] = []
-        for name, positive in zip(self.parameter_names, self.positive, strict=True):
-            if name not in theta:
+        found = {name: self._value(name, value) for name, value in theta.items()}
+        for name in self.parameter_names:
+            if name not in found:
                 raise InputError(f"parameter {name}", "has no value", "give one for each name")
-            value = theta[name]
-            if isinstance(value, bool) or not isinstance(value, Real):
-                raise InputError(f"parameter {name}", f"got {value!r:.40}", "give a number")
-            number = float(value)
-            if not np.isfinite(number) or (positive and number <= 0):
-                wanted = "a positive one, or name it in signed" if positive else "a finite one"
-                raise InputError(f"parameter {name}", f"got {number:g}", f"give {wanted}")
-            found.append(number)
-        return np.array(found)
+        return np.array([found[name] for name in self.parameter_names])
+
+    def _value(self, name: str, value: object) -> float:
+        if name not in self.parameter_names:
+            raise InputError(f"parameter {name}", "is not known", _among(self.parameter_names))
+        if isinstance(value, bool) or not isinstance(value, Real):
+            raise InputError(f"parameter {name}", f"got {value!r:.40}", "give a number")
+        positive, number = self.positive[self.parameter_names.index(name)], float(value)
+        if not np.isfinite(number) or (positive and number <= 0):
+            wanted = "a positive one, or name it in signed" if positive else "a finite one"
+            raise InputError(f"parameter {name}", f"got {number:g}", f"give {wanted}")
+        return number
 
     def start(self, x0: Any) -> Array:
         """The initial state `x0` as an array (n,), checked.
@@ -332,6 +378,30 @@ class OptimalControlProblem(Frozen):
         )
 
 
+def _require_horizon(horizon: Any) -> None:
+    if isinstance(horizon, bool) or not isinstance(horizon, int | np.integer):
+        raise InputError("horizon", f"got {horizon!r:.40}", "give a whole number of samples")
+    if not 1 <= horizon <= _LONGEST:
+        raise InputError("horizon", f"got {horizon}", f"give 1 to {_LONGEST} samples")
+
+
+def _sample_time(dt: Any) -> float | None:
+    if dt is None:
+        return None
+    if isinstance(dt, bool) or not isinstance(dt, Real) or not 0 < float(dt) < np.inf:
+        raise InputError("dt", f"got {dt!r:.40}", "give a sample time above 0, s")
+    return float(dt)
+
+
+def _with_values(function: Any, free: list[int], values: Array) -> Any:
+    """A function of (x, u, d, theta) as one of the free entries of theta."""
+    given = [ca.MX.sym(letter, function.numel_in(k)) for k, letter in enumerate("xud")]
+    left = ca.MX.sym("p", len(free))
+    whole = ca.MX(ca.DM(values))
+    whole[free] = left
+    return _expanded(ca.Function(function.name(), [*given, left], [function(*given, whole)]))
+
+
 def _symbols(subject: str, given: Any) -> list[Any]:
     """Symbols of SX or MX; SX are taken apart, so that each has its name."""
     items = given if isinstance(given, list | tuple) else [given]
@@ -407,6 +477,10 @@ def _function(
     made = ca.Function(name, outer, [raw(*parts)])
     if alone and any(made.jac_sparsity(0, index).nnz() for index in (1, 2)):
         raise InputError(name, "depends on an input or a disturbance", "give it of the last state")
+    return _expanded(made)
+
+
+def _expanded(made: Any) -> Any:
     try:
         return made.expand()
     except RuntimeError:  # it calls what has no scalar form, such as an integrator
@@ -422,6 +496,18 @@ def _require_influence(names: Sequence[str], functions: Sequence[Any]) -> None:
     for name, there in zip(names, seen, strict=True):
         if not there:
             raise InputError(f"parameter {name}", "is in no expression", "take it out")
+
+
+def _require_some(**given: Sequence[Any]) -> None:
+    for subject, symbols in given.items():
+        if not symbols:
+            raise InputError(subject, "there are none", "give at least one")
+
+
+def _require_named(given: Iterable[str], names: Sequence[str]) -> None:
+    for name in given:
+        if name not in names:
+            raise InputError(f"parameter {name}", "is not among the parameters", _among(names))
 
 
 def _among(names: Sequence[str]) -> str:

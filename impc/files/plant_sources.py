@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from impc.checking import checked
+from impc.control.optimal_control import OptimalControlProblem
 from impc.errors import ImpcError, InputError, PlantError, one_line
 from impc.files.configuration import FILL_IN
 from impc.files.saved_plant import SAVED, read_matrices, state_space
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
 __all__ = [
     "PlantSource",
     "import_function",
+    "made_by",
     "make_plant",
     "plant_family_of",
     "plant_source",
@@ -175,21 +177,49 @@ def make_plant(source: PlantSource, recorded: Sequence[str], **changed: float) -
     InputError, PlantError
         When the arguments do not fit the function, or what it returns is no usable plant.
     """
+    name, system = f"plant {source.name}", made_by(source, **changed)
+    if isinstance(system, OptimalControlProblem):
+        raise PlantError(name, "is an optimal control problem", "impc fit takes one, this does not")
+    inputs = tuple(getattr(system, "input_labels", ()))
+    controls = [item for item in inputs if item not in recorded]
+    if inputs and not controls:
+        raise PlantError(name, "all its inputs are recorded", "one must be the command")
+    with _refused_arguments(name), users_code(name, *_REFUSED):
+        return Plant(system, controls or None)
+
+
+def made_by(source: PlantSource, **changed: float) -> Any:
+    """What the function of a source returns: a plant as a rule, or an optimal control problem.
+
+    Parameters
+    ----------
+    source : PlantSource
+    **changed : float
+        Arguments that replace those of the source.
+
+    Raises
+    ------
+    InputError, PlantError
+        When the arguments do not fit the function, or it fails.
+    """
     arguments = {**source.arguments, **changed}
     for key, value in arguments.items():
         if isinstance(value, str) and value == FILL_IN:
             raise InputError(f"[plant] {key}", f"is still {FILL_IN!r}", "fill it in")
     name = f"plant {source.name}"
+    with _refused_arguments(name), users_code(name, *_REFUSED), warnings.catch_warnings():
+        warnings.simplefilter("error", np.exceptions.ComplexWarning)
+        return source.make(**arguments)
+
+
+_REFUSED = (TypeError, ValueError, np.exceptions.ComplexWarning)
+
+
+@contextmanager
+def _refused_arguments(name: str) -> Iterator[None]:
+    """What a function says of its arguments, as one line on the plant `name`."""
     try:
-        with users_code(name, TypeError, ValueError, np.exceptions.ComplexWarning):
-            with warnings.catch_warnings():
-                warnings.simplefilter("error", np.exceptions.ComplexWarning)
-                system = source.make(**arguments)
-            inputs = tuple(getattr(system, "input_labels", ()))
-            controls = [item for item in inputs if item not in recorded]
-            if inputs and not controls:
-                raise PlantError(name, "all its inputs are recorded", "one must be the command")
-            return Plant(system, controls or None)
+        yield
     except ImpcError:
         raise
     except np.exceptions.ComplexWarning:  # control.ss would drop the imaginary parts

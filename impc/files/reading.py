@@ -32,7 +32,17 @@ if TYPE_CHECKING:
     from impc.files.units import Unit
     from impc.model.plant import Plant
 
-__all__ = ["disturbances_of", "read_recordings", "recording_of"]
+__all__ = [
+    "channel_of",
+    "disturbances_of",
+    "label_of",
+    "read_recordings",
+    "recording_of",
+    "require_distinct",
+    "require_filled_in",
+    "require_kind",
+    "told_unit",
+]
 
 # Samples for each state of the plant below which nothing can be fitted.
 _SAMPLES_A_STATE = 5
@@ -84,7 +94,7 @@ def read_recordings(
     """
     plant.require_discrete()
     _require_names(configuration, plant)  # before files are read, which may take long
-    _require_distinct(paths)
+    require_distinct(paths)
     if not paths:
         raise InputError("recordings", "no file is given", "name at least one")
     trials = [recording_of(read_table(Path(path)), configuration, plant) for path in paths]
@@ -109,7 +119,7 @@ def recording_of(table: Table, configuration: Configuration, plant: Plant) -> Re
     """
     _require_names(configuration, plant)
     entry = configuration.recording
-    label = _label(table.source, entry)
+    label = label_of(table.source, entry)
     clock = read_clock(table, entry)
     measurable.comparable_rates(table.source, clock.period, plant.dt)
     samples = resampled_samples(int(clock.steps[-1]) + 1, clock.period, plant.dt)
@@ -118,7 +128,7 @@ def recording_of(table: Table, configuration: Configuration, plant: Plant) -> Re
     acting = [name for name in plant.disturbances if name in configuration.signals]
     series: dict[str, Array] = {}
     for name in (*plant.outputs, *acting):
-        channel = _channel(table, clock, name, configuration.signals[name])
+        channel = channel_of(table, clock, name, configuration.signals[name])
         response = name in plant.outputs
         findings += _checked(table, channel, configuration.signals[name], entry, response)
         even = on_even_instants(clock, channel.values * channel.unit.factor)
@@ -161,8 +171,8 @@ def disturbances_of(table: Table, configuration: Configuration, plant: Plant) ->
         if name not in configuration.signals:
             raise InputError(f"signals.{name}", "is missing", "name the column of the file")
         signal = configuration.signals[name]
-        _require_kind(name, signal.unit, plant.unit(name))
-        channel = _channel(table, clock, name, signal)
+        require_kind(name, signal.unit, plant.unit(name))
+        channel = channel_of(table, clock, name, signal)
         _checked(table, channel, signal, entry, response=False)
         even = on_even_instants(clock, channel.values * channel.unit.factor)
         columns.append(held_means(even, clock.period, plant.dt))
@@ -184,16 +194,46 @@ def _require_names(configuration: Configuration, plant: Plant) -> None:
             "write a table [signals.NAME] for each",
         )
     for name, entry in configuration.signals.items():
-        for key, meant in (("column", "its name in the file"), ("unit", "the column's unit")):
-            if getattr(entry, key) == FILL_IN:
-                raise InputError(
-                    f"signals.{name}.{key}", f"is still {FILL_IN!r}", f"fill in {meant}"
-                )
-        _require_kind(name, entry.unit, plant.unit(name))
+        require_filled_in(name, entry)
+        require_kind(name, entry.unit, plant.unit(name))
 
 
-def _require_kind(name: str, written: str, expected: str) -> None:
-    """A force cannot stand for an angle; what has no unit may stand for anything."""
+def require_filled_in(name: str, entry: SignalTable) -> None:
+    """Column and unit of the signal `name` are said.
+
+    Parameters
+    ----------
+    name : str
+        Of the signal.
+    entry : SignalTable
+
+    Raises
+    ------
+    InputError
+        When one of them is what `impc inspect` writes for a reader to fill in.
+    """
+    for key, meant in (("column", "its name in the file"), ("unit", "the column's unit")):
+        if getattr(entry, key) == FILL_IN:
+            raise InputError(f"signals.{name}.{key}", f"is still {FILL_IN!r}", f"fill in {meant}")
+
+
+def require_kind(name: str, written: str, expected: str) -> None:
+    """A force cannot stand for an angle; what has no unit may stand for anything.
+
+    Parameters
+    ----------
+    name : str
+        Of the signal.
+    written : str
+        Unit of its column.
+    expected : str
+        Unit of the plant's.
+
+    Raises
+    ------
+    InputError
+        When they are of different kinds, or the plant's is no SI unit.
+    """
     if expected == UNKNOWN:
         return
     unit = si_unit(expected)
@@ -211,7 +251,14 @@ def _require_kind(name: str, written: str, expected: str) -> None:
         )
 
 
-def _require_distinct(paths: Sequence[Path]) -> None:
+def require_distinct(paths: Sequence[Path]) -> None:
+    """None of the `paths` is given twice, by whatever name.
+
+    Raises
+    ------
+    InputError
+        When one is.
+    """
     seen: set[str] = set()
     for path in paths:
         place = os.path.realpath(path)  # Path.resolve raises on a circle of links
@@ -220,7 +267,20 @@ def _require_distinct(paths: Sequence[Path]) -> None:
         seen.add(place)
 
 
-def _label(source: str, entry: RecordingTable) -> Label:
+def label_of(source: str, entry: RecordingTable) -> Label:
+    """Whose trial a file is, by its name and the [recording] table.
+
+    Parameters
+    ----------
+    source : str
+        The file.
+    entry : RecordingTable
+
+    Raises
+    ------
+    DataError
+        When the name does not match the pattern.
+    """
     stem = Path(source).stem
     groups: dict[str, str | None] = {}
     if entry.pattern is not None:
@@ -240,7 +300,22 @@ def _label(source: str, entry: RecordingTable) -> Label:
     )
 
 
-def _channel(table: Table, clock: Clock, name: str, entry: SignalTable) -> checks.Channel:
+def channel_of(table: Table, clock: Clock, name: str, entry: SignalTable) -> checks.Channel:
+    """The column of a signal, in its own unit, after offset and sign.
+
+    Parameters
+    ----------
+    table : Table
+    clock : Clock
+    name : str
+        Of the signal.
+    entry : SignalTable
+
+    Raises
+    ------
+    DataError
+        When the file has no such column.
+    """
     column, values = column_of(table, entry.column, f"signals.{name}.column")
     # Beyond the largest number, or a NaN that signals: not finite, and told below.
     with np.errstate(over="ignore", invalid="ignore"):
@@ -257,7 +332,7 @@ def _checked(
 ) -> list[str]:
     """Every check of one channel, those first whose fault would explain the others."""
     found = [
-        checks.unit_of_the_file(channel, _told_unit(table, channel.column)),
+        checks.unit_of_the_file(channel, told_unit(table, channel.column)),
         measurable.size(channel),
         checks.missing(channel, recorded.fill_gaps),
         checks.constant(channel),
@@ -269,7 +344,8 @@ def _checked(
     return [finding for finding in found if finding]
 
 
-def _told_unit(table: Table, column: str) -> Unit | None:
+def told_unit(table: Table, column: str) -> Unit | None:
+    """The unit that a file tells of a `column`, if it tells one that is known."""
     try:
         return si_unit(table.units[column])
     except (KeyError, InputError):

@@ -26,7 +26,7 @@ from impc.inverse.optimal_control_search import Count, along_mu, guided
 from impc.inverse.told_combinations import Combinations, combinations
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from impc.control.optimal_control import OptimalControlProblem
     from impc.control.optimal_recordings import OptimalRecording
@@ -36,6 +36,8 @@ __all__ = ["MU_STEPS", "OptimalControlEstimate", "fit_optimal_control"]
 
 #: The falling sequence of mu, over the mean cost of a recorded stage where that is below one.
 MU_STEPS = (1e-1, 1e-2, 1e-4, 1e-10)
+_MOST_STARTS = 1000
+_SPREAD = 0.3  # of further starts, in a logarithm
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +48,8 @@ class OptimalControlEstimate(Frozen):
     ----------
     problem : OptimalControlProblem
     recordings : tuple of OptimalRecording
+    start : dict
+        Values by name at which the search began.
     theta : dict
         Values by name.
     loss : float
@@ -75,6 +79,7 @@ class OptimalControlEstimate(Frozen):
 
     problem: OptimalControlProblem
     recordings: tuple[OptimalRecording, ...]
+    start: dict[str, float]
     theta: dict[str, float]
     loss: float
     residual: Array
@@ -122,6 +127,7 @@ def fit_optimal_control(
     solver: str = "ipopt",
     mu_steps: Sequence[float] | None = None,
     evaluations: int = 200,
+    starts: int = 1,
 ) -> OptimalControlEstimate:
     """Search the parameters from a start.
 
@@ -138,7 +144,10 @@ def fit_optimal_control(
         Falling, of the dimension of the cost; by default `MU_STEPS` times the mean cost of a
         recorded stage at the start, at most one, and at least 1e-10.
     evaluations : int
-        After how many a search is stopped; there are at most two, guided and not.
+        After how many a search is stopped; there are at most two from a start, guided and not.
+    starts : int
+        From how many starts, where the recordings are not explained from the first or it has no
+        plan: the others are about it by 0.3 in a logarithm.
 
     Returns
     -------
@@ -152,7 +161,7 @@ def fit_optimal_control(
     InputError
         When a start is not usable, or a parameter moves nothing that was measured at any mu.
     InfeasibleError, SolverError
-        When there is no plan at the start.
+        When there is no plan at any start.
 
     Examples
     --------
@@ -183,25 +192,64 @@ def fit_optimal_control(
         mu_steps = _scaled(recordings, problem.values(start))
     if not mu_steps or any(b >= a for a, b in itertools.pairwise(mu_steps)):
         raise InputError("mu_steps", f"got {tuple(mu_steps)!r:.60}", "give falling numbers")
+    if isinstance(starts, bool) or not 1 <= starts <= _MOST_STARTS:
+        raise InputError("starts", f"got {starts!r:.40}", f"give 1 to {_MOST_STARTS}")
     began = time.perf_counter()
-    theta, done = problem.values(start), 0
+    theta, count = problem.values(start), Count(evaluations)
     given = residuals_of(problem, tuple(recordings), solver)
-    for one in given.recordings:  # an error at the first parameters is one of the start
-        if one.problem is not problem:
-            raise InputError("recordings", "are of another problem", "record them with this one")
-        first_plan(one, theta, one.x0, mu_steps[0], solver)
-    best, settled = None, False
-    for guide in (True, False) if any(one.closed_loop for one in recordings) else (False, True):
-        count = Count(evaluations)
-        found = _attempt(given, theta, mu_steps, count, guide)
-        done += count.done
+    if any(one.problem is not problem for one in recordings):
+        raise InputError("recordings", "are of another problem", "record them with this one")
+    best, settled, refused = None, False, None
+    for begun in _starts(problem, theta, starts):
+        try:
+            found = _from_start(given, begun, mu_steps, count)
+        except (InfeasibleError, SolverError) as error:  # no plan there: told if none has one
+            refused = refused or error
+            continue
         if found is not None and (best is None or found[0].loss < best.loss):
             best, settled = found
         if best is not None and best.loss < EXPLAINED * given.size:
             break
     if best is None:
-        raise SolverError("start", "no search got away from it", "begin nearer")
-    return _estimate(given, best, settled, done, time.perf_counter() - began)
+        raise refused or SolverError("start", "no search got away from it", "begin nearer")
+    return _estimate(given, theta, best, settled, count.all, time.perf_counter() - began)
+
+
+def _starts(problem: OptimalControlProblem, theta: Array, count: int) -> Iterator[Array]:
+    """The start itself, then others about it: the same for the same start."""
+    yield theta
+    for index in range(1, count):
+        noise = _SPREAD * np.random.default_rng(index).normal(size=len(theta))
+        yield np.where(problem.positive, theta * np.exp(noise), theta * (1 + noise))
+
+
+def _from_start(
+    given: Residuals, theta: Array, mu_steps: Sequence[float], count: Count
+) -> tuple[Evaluation, bool] | None:
+    """The better of two searches, guided and not; the second only where the first explains little.
+
+    Raises
+    ------
+    InputError, InfeasibleError, SolverError
+        When there is no plan at the start.
+    """
+    for one in given.recordings:  # an error at the first parameters is one of the start
+        first_plan(one, theta, one.x0, mu_steps[0], given.solver)
+    loops = any(one.closed_loop for one in given.recordings)
+    best: tuple[Evaluation, bool] | None = None
+    for guide in (loops, not loops):
+        count.again()
+        try:
+            found = _attempt(given, theta, mu_steps, count, guide)
+        except (InfeasibleError, SolverError):
+            if best is None:
+                raise
+            break  # the other search got somewhere
+        if found is not None and (best is None or found[0].loss < best[0].loss):
+            best = found
+        if best is not None and best[0].loss < EXPLAINED * given.size:
+            break
+    return best
 
 
 def _scaled(recordings: Sequence[OptimalRecording], theta: Array) -> tuple[float, ...]:
@@ -241,14 +289,22 @@ def _attempt(
 
 
 def _estimate(
-    given: Residuals, found: Evaluation, settled: bool, evaluations: int, seconds: float
+    given: Residuals,
+    start: Array,
+    found: Evaluation,
+    settled: bool,
+    evaluations: int,
+    seconds: float,
 ) -> OptimalControlEstimate:
     problem, signals = given.problem, given.signals()
     loss = float(np.sum((found.residual * given.scales[signals]) ** 2))
     told = combinations(problem, found.theta, found.jacobian, found.residual, signals)
-    named = dict(zip(problem.parameter_names, map(float, found.theta), strict=True))
+    begun, named = (
+        dict(zip(problem.parameter_names, map(float, values), strict=True))
+        for values in (start, found.theta)
+    )
     return OptimalControlEstimate(
-        problem, given.recordings, named, loss, found.residual, found.jacobian, signals,
+        problem, given.recordings, begun, named, loss, found.residual, found.jacobian, signals,
         given.scales, told, tuple(given.split(found.unknowns)[1]), found.trajectories(), settled,
         evaluations, seconds,
     )  # fmt: skip

@@ -46,7 +46,16 @@ class Count:
     """
 
     def __init__(self, most: int) -> None:
-        self.most, self.done = most, 0
+        self.most, self.done, self.before = most, 0, 0
+
+    @property
+    def all(self) -> int:
+        """Those of earlier searches too."""
+        return self.before + self.done
+
+    def again(self) -> None:
+        """Begin another search."""
+        self.before, self.done = self.all, 0
 
     def evaluate(
         self, given: Residuals, unknowns: Array, mu: float, before: Evaluation

@@ -23,6 +23,7 @@ __all__ = ["Combination", "Combinations", "combinations"]
 # Relative to the largest singular value. On the four systems of docs/nonlinear.md the weakest told
 # direction has 3e-4 and the strongest untold one, of a bound that nothing touches, 5e-11.
 _NOTHING = 1e-8
+_ROUGH = 0.5  # of a logarithm: twice that is a factor of e
 _ROUND = 1e-3  # of an exponent: nearer to nothing, or to a multiple of a sixth, it is that
 
 
@@ -38,11 +39,19 @@ class Combination:
         Of the product at the estimate, 1 for an untold one.
     deviation : float
         Standard deviation of its logarithm; infinite for an untold one.
+    difference : bool
+        Whether it is a signed parameter by itself, and deviation that of its value.
     """
 
     exponents: dict[str, float]
     value: float
     deviation: float
+    difference: bool = False
+
+    @property
+    def rough(self) -> bool:
+        """Whether it is told to a factor of more than e only, at 95 %."""
+        return self.deviation > _ROUGH and not self.difference
 
     @property
     def name(self) -> str:
@@ -74,10 +83,12 @@ class Combinations(Frozen):
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """One for each untold combination, and one for those told."""
+        """One for each untold combination, one for those told, and one for those told roughly."""
         found = [_untold_sentence(one) for one in self.untold]
-        values = ", ".join(f"{one.name} = {one.value:.6g}" for one in self.told)
-        return (*found, f"Told: {values}." if values else "Nothing is told.")
+        for rough, words in ((False, "Told"), (True, "Told roughly, as the intervals say")):
+            values = [f"{one.name} = {one.value:.6g}" for one in self.told if one.rough is rough]
+            found += [f"{words}: {', '.join(values)}."] if values else []
+        return (*found, *(() if self.told else ("Nothing is told.",)))
 
 
 def combinations(
@@ -107,10 +118,9 @@ def combinations(
         own = own - rest @ np.linalg.lstsq(rest, own, rcond=None)[0]
     _, values, right = np.linalg.svd(own, full_matrices=True)
     values = np.append(values, np.zeros(p - len(values)))
-    freedom = max(len(residual) - jacobian.shape[1], 1)
-    noise = float(np.sqrt(residual @ residual / freedom))
-    # A direction that the noise leaves open by more than a factor of e is not told either.
-    told = (values > _NOTHING * values[0]) & (values > noise)
+    # Not by the noise: what it leaves open by a factor of ten is told that roughly, and which
+    # products are told does not change from one recording to the next (docs/nonlinear.md).
+    told = values > _NOTHING * values[0]
     covariance = _covariance(jacobian, residual, signals, told)[:p, :p]
     basis = _sparse(right[~told])
     pivots = [int(np.flatnonzero(np.isclose(row, 1.0))[0]) for row in basis]
@@ -129,7 +139,7 @@ def combinations(
         logarithms = np.where(problem.positive, np.log(np.abs(theta)), theta)
         single = np.count_nonzero(exponents) == 1 and not problem.positive[index]
         value = float(theta[index] if single else np.exp(exponents @ logarithms))
-        kept.append(Combination(_named(exponents, names), value, deviation))
+        kept.append(Combination(_named(exponents, names), value, deviation, bool(single)))
     involved = np.any(basis != 0, axis=0) if len(basis) else np.zeros(p, dtype=bool)
     deviations = np.where(involved, np.inf, np.sqrt(np.maximum(np.diag(covariance), 0.0)))
     return Combinations(tuple(kept), untold, values, deviations)

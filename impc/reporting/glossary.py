@@ -80,6 +80,8 @@ WORDS: dict[str, str] = {
     "SD": "Standard deviation.",
     "SEM": "Standard error of measurement: the scatter of one person's result.",
     "SI": "The international units: metre, kilogram, second, newton, radian.",
+    "singular value": "How much recordings change along a combination of unknowns; the smaller it "
+    "is, the less they tell of that combination.",
     "terminal set": "States from which the controller's law keeps all bounds for ever; the plan "
     "has to end there.",
     "trace": "Sum of the diagonal of a matrix.",

@@ -13,7 +13,7 @@ from impc.model.signal_units import UNKNOWN
 if TYPE_CHECKING:
     from impc.model.plant import Plant
 
-__all__ = ["axis_label", "shown_unit"]
+__all__ = ["axis_label", "shown_as", "shown_unit"]
 
 _DEGREES = {"rad": "deg", "rad/s": "deg/s", "rad/s^2": "deg/s^2"}
 # Of plants that say no units, angles are told by their names.
@@ -34,6 +34,19 @@ def shown_unit(plant: Plant, name: str, angles: str = "degrees") -> tuple[float,
     unit = plant.unit(name)
     if unit == UNKNOWN and name.lower().startswith(_ANGLES):
         unit = "rad/s" if name.endswith("_rate") else "rad"
+    return shown_as(unit, angles)
+
+
+def shown_as(unit: str, angles: str = "degrees") -> tuple[float, str]:
+    """Factor from a `unit` to the one that is shown, and that one.
+
+    Parameters
+    ----------
+    unit : str
+        SI.
+    angles : str
+        "degrees" or "radians".
+    """
     if unit in _DEGREES and angles == "degrees":
         return math.degrees(1.0), _DEGREES[unit]
     return 1.0, "-" if unit == "1" else unit

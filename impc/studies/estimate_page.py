@@ -17,6 +17,7 @@ from impc.control.named_solver import described
 from impc.errors import InputError
 from impc.inverse.estimates import Estimate
 from impc.inverse.methods import METHODS
+from impc.inverse.optimal_control_fit import OptimalControlEstimate
 from impc.reporting.document import Lines, Picture, Report, Section, TextTable, Verdict
 from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import number
@@ -24,6 +25,8 @@ from impc.reporting.shown_units import axis_label, shown_unit
 from impc.reporting.style import BLUE, DOUBLE_COLUMN, INK, drawn, journal_style, new_figure
 from impc.reporting.writer import owned, write_files
 from impc.studies.methods_table import column_terms, methods_data, methods_table
+from impc.studies.optimal_fit.report import optimal_report
+from impc.studies.optimal_fit.result import OptimalFit
 from impc.studies.signal_words import signal_words
 
 if TYPE_CHECKING:
@@ -33,6 +36,7 @@ if TYPE_CHECKING:
 
 __all__ = ["report"]
 
+_CALLER = "of the program that called impc.report"
 # Trials that are drawn, the first ones.
 _DRAWN = 6
 # Of the largest entry of a matrix: below it stands the rounding of a search.
@@ -40,13 +44,13 @@ _ROUNDING = 1e-12
 
 
 @checked
-def report(estimate: Estimate, folder: str | Path) -> tuple[Path, ...]:
+def report(estimate: Estimate | OptimalControlEstimate, folder: str | Path) -> tuple[Path, ...]:
     """Write the page of an estimate, its figures, tables and result.json into a folder.
 
     Parameters
     ----------
-    estimate : Estimate
-        Of `estimate`.
+    estimate : Estimate or OptimalControlEstimate
+        Of `estimate`, or of `fit_optimal_control`.
     folder : str or Path
         Made when it is missing; an earlier report in it is replaced.
 
@@ -76,17 +80,26 @@ def report(estimate: Estimate, folder: str | Path) -> tuple[Path, ...]:
     ...     [path.name for path in impc.report(found, folder)][:2]
     ['report.html', 'result.json']
     """
+    place = Path(folder)
+    if isinstance(estimate, OptimalControlEstimate):
+        with owned(place, "report"):
+            return write_files(place, _of_a_problem(estimate).files())
     if estimate.K is None:
         raise InputError("estimate", f"has no gain: {estimate.reason}", "try another method")
     fit = judge(estimate, estimate.problem.bounds)
-    place = Path(folder)
     with owned(place, "report"):
         return write_files(place, _document(fit).files())
 
 
+def _of_a_problem(estimate: OptimalControlEstimate) -> Report:
+    names = tuple(f"recording {index + 1}" for index in range(len(estimate.recordings)))
+    fit = OptimalFit(estimate, names, ((),) * len(names), estimate.problem.dt)
+    return optimal_report(fit, Provenance(_CALLER))
+
+
 def _document(fit: MethodFit) -> Report:
     estimate, method = fit.estimate, METHODS[fit.estimate.method]
-    provenance = Provenance("of the program that called impc.report")
+    provenance = Provenance(_CALLER)
     with journal_style():
         shown = range(min(len(fit.runs), _DRAWN))
         figures = drawn({f"trial-{index + 1}": _trajectories(fit, index) for index in shown})

@@ -10,6 +10,7 @@ import msgspec
 from impc.files.configuration import read_configuration
 from impc.studies.cohort.study import StudyTable
 from impc.studies.fit.settings import fit_settings
+from impc.studies.optimal_fit.settings import optimal_fit_settings
 from impc.studies.selection.settings import select_settings
 
 if TYPE_CHECKING:
@@ -34,6 +35,6 @@ def require_valid(text: str, folder: Path) -> None:
     path.write_text(text if whole else text + _SIGNAL, encoding="utf-8")
     found = read_configuration(path, "study", "model", "select")
     path.unlink()
-    fit_settings(found.fit)
+    (optimal_fit_settings if "parameters" in found.fit else fit_settings)(found.fit)
     select_settings(found.select)
     msgspec.convert(found.study, StudyTable)

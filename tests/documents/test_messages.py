@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import datetime
 import json
+import math
 import os
 import re
 import resource
@@ -29,11 +30,14 @@ from impc.cli.plant import find_plant
 from impc.control.closed_loop import require_complete, scenario, simulate
 from impc.control.controller import Controller
 from impc.control.named_solver import require_solver
+from impc.control.nlp_solvers import require_solver as require_nlp_solver
+from impc.control.optimal_control import OptimalControlProblem
 from impc.errors import ImpcError
 from impc.files import apart
 from impc.files.alignment import misaligned
 from impc.files.configuration import read_configuration
 from impc.files.formats import encode_table, read_table
+from impc.files.optimal_reading import OptimalTrial, read_optimal_trials
 from impc.files.plant_sources import PlantSource, make_plant, plant_source
 from impc.files.reading import read_recordings, recording_of
 from impc.files.results import read_result
@@ -47,7 +51,7 @@ from impc.jit import keep_caches
 from impc.model.bounds import Bounds
 from impc.model.observer import Observer, believed_filter
 from impc.model.plant import Plant
-from impc.model.recordings import Recording
+from impc.model.recordings import Label, Recording
 from impc.model.riccati import solve_lqr
 from impc.model.structure import Structure
 from impc.model.weights import Weights
@@ -60,6 +64,7 @@ from impc.studies.cohort.study import read_study
 from impc.studies.effort import Effort
 from impc.studies.fit.settings import FitSettings, fit_settings, fit_structures, require_used
 from impc.studies.fit.subject import fit_problem
+from impc.studies.optimal_fit.settings import optimal_fit_settings, posed, recorded
 from impc.studies.selection.subsets import largest_subsets
 from plants import seated_balance_plant
 from tests.documents.blocks import PAGES
@@ -433,6 +438,40 @@ def without_daqp(_: Path) -> None:
         require_solver("daqp")
 
 
+def own_problem(**changes: Any) -> OptimalControlProblem:
+    """A point with a limited force, one entry of it changed."""
+    x, u, price, w = (casadi.SX.sym(name) for name in ("x", "u", "price", "w"))
+    parameters = {"price": price} | ({"w": w} if "w" in changes else {})
+    given = {
+        "next_state": x + 0.1 * u, "stage_cost": price * x**2 + u**2, "horizon": 4,
+        "constraints": {"force": casadi.vertcat(u - 1, -u - 1), "x": x - 1},
+    }  # fmt: skip
+    given |= {name: value(x, u, price) for name, value in changes.items() if callable(value)}
+    return OptimalControlProblem(x, u, parameters, **given)  # type: ignore[arg-type]
+
+
+def own_system(update: Callable[..., Any]) -> Callable[[Path], object]:
+    system = control.nlsys(update, states=["x"], inputs=["u"], dt=0.1)
+    return lambda _: own_problem(next_state=lambda x, u, p: system)
+
+
+def without_fatrop(_: Path) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(casadi, "has_nlpsol", lambda _: False)
+        require_nlp_solver("fatrop")
+
+
+def signal_of_no_problem(folder: Path) -> None:
+    (folder / "own.toml").write_text('[signals.y]\ncolumn = "y"\nunit = "m"\n', encoding="utf-8")
+    read_optimal_trials([], read_configuration(folder / "own.toml"), own_problem())
+
+
+def unknown_first_value(_: Path) -> None:
+    nothing = np.full((5, 1), np.nan)
+    trial = OptimalTrial(Label(), nothing, np.zeros((4, 1)), np.zeros((4, 0)), 0.1, ())
+    recorded(own_problem(), trial, optimal_fit_settings({}))
+
+
 def integrator() -> Plant:
     """A cart: where it is cannot be told from how fast it goes."""
     system = control.ss([[1, 0.1], [0, 0.9]], [[0], [0.1]], [[1, 0]], 0, 0.1, states=["x", "v"])
@@ -502,6 +541,35 @@ PROVOKED: dict[str, Callable[[Path], object]] = {
     "solver: got ...; choose one of ...": lambda _: fit_settings({"solver": "gurobi"}),
     "solver: ... is not part of the CasADi that is installed": without_daqp,
     "[fit] ...: is not a setting; known: ...": lambda _: fit_settings({"horzon": 20}),
+    "... has the symbol ...; which is neither a state, an input, a disturbance nor a parameter": (
+        lambda _: own_problem(stage_cost=lambda x, u, p: p * x**2 + casadi.SX.sym("w") * u**2)
+    ),
+    "parameter ...: is in no expression; take it out": lambda _: own_problem(w=1),
+    "next_state: is a system whose function takes no symbols (...)": own_system(
+        lambda t, x, u, params: x + u if x[0] > 0 else x
+    ),
+    "next_state: is a system whose function is another on symbols than on numbers": own_system(
+        lambda t, x, u, params: [math.sin(x[0]) + u[0]]
+    ),
+    "... is not finite at sample ... of the start": lambda _: own_problem(
+        stage_cost=lambda x, u, p: p * casadi.log(x) ** 2 + u**2
+    ).plan({"price": 1.0}, [-1.0]),
+    "constraint ...: no plan was found that keeps it at sample ...": lambda _: own_problem().plan(
+        {"price": 1.0}, [2.0]
+    ),
+    "plan: the cost has no minimum in the inputs of sample ...": lambda _: own_problem(
+        stage_cost=lambda x, u, p: p * x, constraints=lambda x, u, p: None
+    ).plan({"price": 1.0}, [0.5]),
+    "solver: ... is not in this CasADi; choose ipopt": without_fatrop,
+    "[fit.parameters] ...: is missing; give it start or known": lambda _: posed(
+        own_problem(), optimal_fit_settings({})
+    ),
+    "[fit.x0] ...: is missing, and was not recorded": unknown_first_value,
+    "is no signal of the problem": signal_of_no_problem,
+    "states: has ... samples; give ...": lambda _: own_problem().recorded_plan(np.zeros((3, 1))),
+    "is an optimal control problem; impc fit takes one, this does not": lambda _: make_plant(
+        PlantSource("mine:problem", own_problem, {}), ()
+    ),
     "[fit.structure] ...: is not a setting; known: ...": lambda _: fit_settings(
         {"structure": {"q": "diagonal"}}
     ),

@@ -166,6 +166,19 @@ def test_an_infeasible_start_names_the_constraint_and_the_sample() -> None:
         fit_optimal_control(arm.problem, [recording], arm.truth | {"max_q": 2.3})
 
 
+def test_another_start_is_tried_where_the_first_has_no_plan() -> None:
+    """The angle's first limit is below where the arm begins to be stopped; the second is not."""
+    arm = SYSTEMS["robot arm"]()
+    plan = arm.problem.plan(arm.truth, arm.x0, mu=1e-12)
+    recording = arm.problem.recorded_plan(plan.x, plan.u)
+    start = arm.truth | {"max_q": 2.3}
+    found = fit_optimal_control(arm.problem, [recording], start, starts=4)
+    assert found.loss < 1e-10
+    assert found.start == start
+    with pytest.raises(InputError, match="starts: got 0; give 1 to 1000"):
+        fit_optimal_control(arm.problem, [recording], start, starts=0)
+
+
 def test_the_size_of_the_cost_does_not_matter() -> None:
     """Everything in the cost times 1e-3: the same answer, from a mu that is smaller too."""
     u = ca.SX.sym("u")

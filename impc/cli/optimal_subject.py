@@ -1,0 +1,117 @@
+"""`impc fit` of an optimal control problem of the user's own (docs/nonlinear.md)."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import TYPE_CHECKING
+
+import click
+
+from impc.checking import replace
+from impc.cli.output import print_files
+from impc.cli.plant import find_plant
+from impc.cli.progress import progress
+from impc.control.nlp_solvers import require_solver
+from impc.control.optimal_control import OptimalControlProblem
+from impc.files.configuration import read_configuration
+from impc.files.inputs import gather_inputs
+from impc.files.optimal_reading import read_optimal_trials
+from impc.files.plant_sources import made_by
+from impc.inverse.optimal_control_fit import fit_optimal_control
+from impc.reporting.provenance import Provenance
+from impc.reporting.writer import write_files
+from impc.studies.optimal_fit.report import optimal_report
+from impc.studies.optimal_fit.result import OptimalFit
+from impc.studies.optimal_fit.sentences import abstract, verdict
+from impc.studies.optimal_fit.settings import optimal_fit_settings, posed, recorded
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from impc.files.configuration import Configuration
+
+__all__ = ["fit_optimal"]
+
+
+def fit_optimal(
+    files: Sequence[Path], plant_name: str, config: Path, out: Path, solver: str | None
+) -> bool:
+    """Read, fit, write and print, if the plant is an optimal control problem; else do nothing.
+
+    Parameters
+    ----------
+    files : sequence of Path
+        The recordings.
+    plant_name : str
+        As `impc fit` was given it.
+    config : Path
+        The configuration.
+    out : Path
+        Folder of the result.
+    solver : str or None
+        In place of the one that the configuration names.
+
+    Returns
+    -------
+    bool
+        Whether it is one.
+
+    Raises
+    ------
+    ImpcError
+        When a file, the configuration or the problem cannot be used, or there is no plan at the
+        start; nothing has been written.
+    """
+    configuration = read_configuration(config)
+    source = find_plant(plant_name, configuration.plant)
+    problem = made_by(source) if ":" in source.name else None  # a file holds matrices
+    if not isinstance(problem, OptimalControlProblem):
+        return False
+    with progress(2, "stage") as done:
+        fit = _fitted(problem, files, configuration, solver)
+        done("search")
+        inputs = gather_inputs(files, config, source.name, source.arguments)
+        names = tuple(path.name for path in files)
+        line = f"impc fit {' '.join(names)} --plant {plant_name} --config {config.name}"
+        line += "" if solver is None else f" --solver {solver}"
+        provenance = Provenance(source.name, line, dict(source.arguments), names, inputs)
+        content = optimal_report(fit, provenance, configuration.report.angles).files()
+        done("page")
+    written = write_files(out, content)
+    for sentence in (verdict(fit), *abstract(fit)):
+        click.echo(sentence)
+    print_files(out, written)
+    return True
+
+
+def _fitted(
+    problem: OptimalControlProblem,
+    files: Sequence[Path],
+    configuration: Configuration,
+    solver: str | None,
+) -> OptimalFit:
+    settings = optimal_fit_settings(configuration.fit)
+    if solver is not None:
+        require_solver(solver)
+        settings = replace(settings, solver=solver)
+    units = dict(zip(problem.parameter_names, problem.units, strict=True))
+    fitted, start, known = posed(problem, settings)
+    trials = read_optimal_trials(files, configuration, fitted)
+    recordings = [recorded(fitted, trial, settings) for trial in trials]
+    estimate = fit_optimal_control(
+        fitted,
+        recordings,
+        start,
+        solver=settings.solver,
+        evaluations=settings.evaluations,
+        starts=settings.starts,
+    )
+    return OptimalFit(
+        estimate,
+        tuple(str(trial.label) for trial in trials),
+        tuple(trial.findings for trial in trials),
+        trials[0].dt,
+        {name: (value, units[name]) for name, value in known.items()},
+        asdict(settings),
+    )

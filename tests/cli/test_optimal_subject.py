@@ -1,0 +1,354 @@
+"""`impc fit` of an optimal control problem of the user's own, as its users type it."""
+
+from __future__ import annotations
+
+import html
+import importlib
+import json
+import re
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+import pandas as pd
+import pytest
+from click.testing import CliRunner, Result
+
+import impc
+from impc.cli.main import main
+from impc.files.results import read_result
+from impc.reporting import style
+from impc.reporting.style import journal_style
+from impc.studies.optimal_fit import figures
+from tests.labelled_axes import require_labels
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from impc.control.optimal_control import OptimalControlProblem
+
+MODULE = '''
+"""A point with drag that is pushed to the origin; its force is limited."""
+
+import casadi as ca
+import impc
+
+def point(fault="", horizon=12):
+    x = ca.vertcat(ca.SX.sym("place"), ca.SX.sym("speed"))
+    u, d = ca.SX.sym("force"), ca.SX.sym("push")
+    names = ["mass", "drag", "price", "limit", "far"]
+    p = {name: ca.SX.sym(name) for name in names}
+    cost = p["price"] * x[0] ** 2 + u**2
+    following = x + 0.1 * ca.vertcat(x[1], (u + d - p["drag"] * x[1] * ca.fabs(x[1])) / p["mass"])
+    rows = {"force": ca.vertcat(u - p["limit"], -u - p["limit"]), "place": x[0] - p["far"]}
+    if fault == "symbol":
+        cost = cost * ca.SX.sym("w")
+    if fault == "size":
+        following = following[0]
+    if fault == "nan":
+        cost = cost + ca.log(x[0] - 50) ** 2
+    if fault == "infeasible":
+        rows["near"] = x[0] - 0.5
+    if fault == "influence":
+        p["colour"] = ca.SX.sym("colour")
+    if fault == "text":
+        return "no problem"
+    if fault == "raises":
+        raise RuntimeError("the sensor is\\nbroken")
+    return impc.OptimalControlProblem(
+        x, u, p, following, cost, horizon, constraints=rows, disturbances=d, dt=0.1,
+        units={"mass": "kg", "drag": "kg/m", "limit": "N", "far": "m", "place": "m",
+               "speed": "m/s", "force": "N", "push": "N"},
+    )
+'''
+
+CONFIG = """
+[recording]
+time = "t"
+
+[signals.place]
+column = "position"
+unit = "cm"
+
+[signals.force]
+column = "motor"
+unit = "N"
+
+[signals.push]
+column = "wind"
+unit = "N"
+
+[fit]
+recorded = "loop"
+x0 = { speed = 0.5 }
+
+[fit.parameters]
+mass = { known = 1500.0, unit = "gram" }
+drag = { start = 0.5 }
+price = { start = 8.0 }
+limit = { start = 0.9, unit = "N" }
+far = { start = 30.0 }
+"""
+TRUTH = {"mass": 1.5, "drag": 0.3, "price": 5.0, "limit": 0.8, "far": 20.0}
+
+
+def run(*arguments: str) -> Result:
+    return CliRunner().invoke(main, list(arguments))
+
+
+def own_problem() -> OptimalControlProblem:
+    problem: OptimalControlProblem = importlib.import_module("own_point").point()
+    return problem
+
+
+def write_trial(path: Path, place: Any, force: Any, push: Any) -> None:
+    table = {
+        "t": 0.1 * np.arange(len(place)),
+        "position": 100 * np.asarray(place),
+        "motor": [*np.ravel(force), np.nan],
+        "wind": [*np.ravel(push), 0.0],
+    }
+    pd.DataFrame(table).to_csv(path, index=False)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Two recordings of a closed loop in which the speed was not measured, one with a hole."""
+    folder = tmp_path_factory.mktemp("optimal")
+    (folder / "own_point.py").write_text(MODULE, encoding="utf-8")
+    (folder / "point.toml").write_text(CONFIG, encoding="utf-8")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.syspath_prepend(str(folder))
+        problem = own_problem()
+        for index, x0 in enumerate(([1.0, 0.5], [-0.8, 0.5])):
+            push = 0.3 * np.sin(np.arange(25.0) + index)[:, None]
+            loop = problem.closed_loop(TRUTH, x0, 25, d=push)
+            place = loop.x[:, 0].copy()
+            if index:
+                place[7:9] = np.nan
+            write_trial(folder / f"trial_{index + 1}.csv", place, loop.u, push)
+        yield folder
+    sys.modules.pop("own_point", None)
+
+
+def fitted(folder: Path, config: str, out: str, *more: str) -> Result:
+    (folder / f"{out}.toml").write_text(config, encoding="utf-8")
+    return run(
+        "fit", "trial_1.csv", "trial_2.csv", "--plant", "own_point:point", "--config",
+        f"{out}.toml", "--out", out, *more,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def done(folder: Path) -> Result:
+    with pytest.MonkeyPatch.context() as patch:
+        shown = style.new_figure
+        made: list[Any] = []
+
+        def kept(width: float, height: float) -> Any:
+            made.append(shown(width, height))
+            return made[-1]
+
+        patch.setattr(figures, "new_figure", kept)
+        done = fitted(folder, CONFIG, "out")
+        with journal_style():
+            for figure in made:
+                require_labels(figure)
+    assert done.exit_code == 0, done.stderr
+    return done
+
+
+def test_the_parameters_are_those_that_made_the_recordings(folder: Path, done: Result) -> None:
+    found = json.loads((folder / "out" / "result.json").read_text(encoding="utf-8"))
+    for name in ("drag", "price", "limit"):
+        one = found["parameters"][name]
+        assert one["value"] == pytest.approx(TRUTH[name], rel=1e-5)
+        assert one["low"] <= one["value"] <= one["high"]
+        assert one["told"] == "yes"
+    assert found["parameters"]["mass"] == {
+        "unit": "kg", "value": 1.5, "low": None, "high": None, "level": None, "told": "known",
+        "start": None,
+    }  # fmt: skip
+    assert found["parameters"]["far"]["told"] == "no"
+    assert found["parameters"]["far"]["high"] is None
+    assert found["combinations"]["untold"][0]["exponents"] == {"far": 1.0}
+    np.testing.assert_allclose(found["x0"], [[1.0, 0.5], [-0.8, 0.5]], atol=1e-5)
+    assert found["reached"]["force"] > 5
+    assert found["reached"]["place"] == 0
+    assert found["problem"]["dt"] == 0.1
+    assert found["methods"]["nonlinear_inverse_mpc"]["vaf"]["place"] == pytest.approx(100)
+    assert found["methods"]["nonlinear_inverse_mpc"]["vaf"]["speed"] is None
+
+
+def test_page_tables_terminal_and_numbers_say_the_same(folder: Path, done: Result) -> None:
+    out = folder / "out"
+    found = read_result(out)
+    assert found.methods["nonlinear_inverse_mpc"].status in {"explained", "settled"}
+    page = html.unescape(re.sub("<[^>]*>", "", (out / "report.html").read_text("utf-8")))
+    for sentence in (found.content["verdict"], *found.content["sentences"]):
+        assert sentence in page
+        assert sentence in done.stdout
+    assert "they do not tell all of its parameters: far may be others" in found.content["verdict"]
+    assert "far is not told: near its value nothing that was measured depends on it." in page
+    table = pd.read_csv(out / "parameters.csv").set_index("parameter")
+    for name, one in found.content["parameters"].items():
+        assert table.loc[name, "value"] == one["value"]
+        assert table.loc[name, "told"] == one["told"]
+        assert table.loc[name, "unit"] == (one["unit"] or pytest.approx(np.nan, nan_ok=True))
+    assert table.loc["mass", "unit"] == "kg"
+    assert "2 samples are missing, the first sample 8 (0.7 s); they count as not measured" in page
+    assert "The international units" not in page  # a word that stands nowhere is not explained
+    for word in ("VAF", "horizon", "singular value"):
+        assert f'id="word-{word.lower().replace(" ", "-")}"' in (out / "report.html").read_text()
+
+
+def test_the_trajectories_are_those_of_the_files(folder: Path, done: Result) -> None:
+    table = pd.read_csv(folder / "out" / "trajectories.csv")
+    recorded = pd.read_csv(folder / "trial_2.csv")
+    own = table[table["trial"] == 2].reset_index(drop=True)
+    np.testing.assert_allclose(own["time"], recorded["t"], atol=1e-12)
+    np.testing.assert_allclose(own["place_recorded"], recorded["position"] / 100, rtol=1e-12)
+    assert own["speed_recorded"].isna().all()
+    kept = own["place_recorded"].notna()
+    np.testing.assert_allclose(own["place_simulated"][kept], own["place_recorded"][kept], atol=1e-6)
+    np.testing.assert_allclose(own["force_simulated"][:-1], recorded["motor"][:-1], atol=1e-5)
+    for name in ("trajectories-1", "trajectories-2", "parameters", "singular-values"):
+        assert (folder / "out" / f"{name}.png").stat().st_size > 5_000
+
+
+def test_one_plan_by_another_solver(folder: Path, done: Result) -> None:
+    """The same page from one optimum as a whole; the command line names the solver."""
+    problem = own_problem().with_horizon(25)
+    plan = problem.plan(TRUTH, [1.0, 0.5])
+    write_trial(folder / "plan.csv", plan.x[:, 0], plan.u, np.zeros(25))
+    text = CONFIG.replace('"loop"', '"plan"\nhorizon = 25\nunknown_start = false')
+    (folder / "plan.toml").write_text(text, encoding="utf-8")
+    given = ("plan.csv", "--plant", "own_point:point", "--config", "plan.toml")
+    told = run("fit", *given, "--solver", "sqpmethod", "--out", "plan-out")
+    assert told.exit_code == 0, told.stderr
+    found = read_result(folder / "plan-out")
+    assert found.command.endswith("--solver sqpmethod")
+    assert found.content["settings"]["solver"] == "sqpmethod"
+    for name in ("drag", "price", "limit"):
+        assert found.content["parameters"][name]["value"] == pytest.approx(TRUTH[name], rel=1e-4)
+    assert "was fitted to one recording of one plan, 25 samples in all" in told.stdout
+
+
+def test_the_same_page_from_python(folder: Path, done: Result, tmp_path: Path) -> None:
+    problem = own_problem().with_known({"mass": 1.5, "far": 20.0})
+    plan = problem.plan({name: TRUTH[name] for name in ("drag", "price", "limit")}, [1.0, 0.5])
+    start = {"drag": 0.5, "price": 8.0, "limit": 0.9}
+    found = impc.fit_optimal_control(problem, [problem.recorded_plan(plan.x, plan.u)], start)
+    names = {path.name for path in impc.report(found, tmp_path)}
+    assert names == {path.name for path in (folder / "out").iterdir() if path.is_file()} - {
+        ".impc", "trajectories-2.png", "trajectories-2.pdf",
+    }  # fmt: skip
+    content = read_result(tmp_path).content
+    assert content["verdict"].startswith("The problem explains the recordings, which tell every")
+    assert content["parameters"]["drag"]["start"] == 0.5
+    with pytest.raises(impc.InputError, match="estimate: expected a Estimate, got dict of 3"):
+        impc.report(start, tmp_path)  # type: ignore[arg-type]
+
+
+def fault(name: str) -> tuple[str, str]:
+    return "[fit]", f'[plant]\nfault = "{name}"\n[fit]'
+
+
+WRONG: dict[str, tuple[tuple[str, str], str]] = {
+    "a free symbol": (fault("symbol"), "stage_cost: has the symbol w; which is neither a state"),
+    "a wrong size": (fault("size"), "next_state: has shape (1, 1); give (2, 1)"),
+    "not finite": (fault("nan"), "stage_cost: is not finite at sample 0 of the start"),
+    "no plan": (fault("infeasible"), "constraint near: no plan was found that keeps it at samp"),
+    "a parameter in nothing": (fault("influence"), "parameter colour: is in no expression"),
+    "a function that fails": (
+        fault("raises"), "plant own_point:point: ends in RuntimeError (the sensor is\\nbroken)"
+    ),
+    "no such solver": (
+        ('recorded = "loop"', 'solver = "snopt"'), "solver: got 'snopt'; choose one of ipopt, "
+    ),
+    "a plan of another length": (
+        ('"loop"', '"plan"'), "states: has 26 samples; give 13"
+    ),
+    "no horizon": (('recorded = "loop"', "horizon = 0"), "horizon: got 0; give 1 to 10000 samples"),
+    "no evaluations": (
+        ('recorded = "loop"', "evaluations = 0"), "[fit] evaluations: got 0; give 1 to 100000"
+    ),
+    "no start": (('recorded = "loop"', "starts = 0"), "[fit] starts: got 0; give 1 to 1000"),
+    "a setting of the linear fit": (
+        ('recorded = "loop"', "u_max = 3.0"), "[fit] u_max: is not a setting; known: parameters"
+    ),
+    "a kind that is none": (('"loop"', '"walk"'), "[fit]: Invalid enum value 'walk'"),
+    "a parameter without a word": (
+        ("drag = { start = 0.5 }", ""), "[fit.parameters] drag: is missing; give it start or known"
+    ),
+    "a parameter that is not there": (
+        ("[fit.parameters]", "[fit.parameters]\ncolor = { start = 1.0 }"),
+        "[fit.parameters] color: is no parameter of the problem; it has mass, drag, price",
+    ),
+    "both": (
+        ("start = 0.5", "start = 0.5, known = 0.5"), "drag: has both start and known; give start"
+    ),
+    "no number": (("start = 0.5", 'unit = "kg/m"'), "drag: has no number; give start for one"),
+    "a bare number": (
+        ("{ start = 0.5 }", "0.5"), "[fit.parameters] drag: got 0.5; write it as in { start"
+    ),
+    "a misspelt key": (("start = 0.5", "begin = 0.5"), "drag.begin: is not a setting; known: sta"),
+    "not filled in": (("start = 0.5", 'start = "?"'), "drag start: is still '?'; fill it in"),
+    "another kind of unit": (
+        ('"gram"', '"cm"'), "mass.unit: is 'cm', and the problem has kg; correct the unit"
+    ),
+    "a negative start": (("start = 0.5", "start = -0.5"), "parameter drag: got -0.5; give a posit"),
+    "all are known": (
+        (CONFIG[CONFIG.index("drag =") :],
+         "".join(f"{name} = {{ known = 1.0 }}\n" for name in ("drag", "price", "limit", "far"))),
+        "parameters: are all known; leave one to be searched",
+    ),
+    "no initial state": (
+        ("speed = 0.5", ""), "[fit.x0] speed: is missing, and was not recorded; give it, or a guess"
+    ),
+    "an initial state of nothing": (
+        ("speed = 0.5", "pace = 0.5"), "[fit.x0] pace: is no state; it has place, speed"
+    ),
+    "a signal that is not there": (
+        ("[signals.force]", "[signals.forse]"),
+        "signals.forse: is no signal of the problem; did you mean force?",
+    ),
+    "a signal in another kind of unit": (
+        ('unit = "cm"', 'unit = "deg"'), "signals.place.unit: is 'deg', and the plant has place in"
+    ),
+    "no disturbance": (
+        ('[signals.push]\ncolumn = "wind"\nunit = "N"', ""),
+        "signals.push: is missing; a disturbance has to be recorded",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_bad_input_ends_in_one_line_and_nothing_is_written(folder: Path, case: str) -> None:
+    (old, new), words = WRONG[case]
+    assert old in CONFIG
+    done = fitted(folder, CONFIG.replace(old, new), "wrong")
+    assert done.exit_code == 2
+    (line,) = done.stderr.strip().splitlines()
+    assert words in line
+    assert not (folder / "wrong").exists()
+
+
+def test_a_solver_that_the_wheel_lacks_is_told_before_anything_is_read(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ca, "has_nlpsol", lambda name: name == "ipopt")
+    done = fitted(folder, CONFIG, "wrong", "--solver", "fatrop")
+    assert done.exit_code == 2
+    assert "solver: fatrop is not in this CasADi; choose ipopt" in done.stderr
+
+
+def test_commands_for_linear_plants_say_that_they_are(folder: Path) -> None:
+    (folder / "compare.toml").write_text(CONFIG[: CONFIG.index("[fit]")], encoding="utf-8")
+    given = ("trial_1.csv", "--plant", "own_point:point", "--config", "compare.toml")
+    done = run("compare", *given, "--out", "wrong")
+    assert done.exit_code == 2
+    assert "plant own_point:point: is an optimal control problem; impc fit takes one" in done.stderr
