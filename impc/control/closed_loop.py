@@ -23,6 +23,7 @@ import numpy as np
 
 from impc.arrays import Array, Frozen, as_numbers, finite_array, frozen
 from impc.checking import Value, checked
+from impc.control.compiled_body import BodyTape
 from impc.control.compiled_loop import LoopMatrices, answer_with, run
 from impc.control.constraint_rows import RowDirections, build_rows, differentiate_rows, directions
 from impc.control.infeasibility import excluded_row, proves_infeasible
@@ -340,6 +341,7 @@ def run_loop(
     program = prepared.program
     loop = (
         *(prepared.matrices, prepared.matrix_directions, prepared.rows, prepared.row_directions),
+        _tape(plant, along),
         *(np.array(given.disturbance), _divergence(plant, given), prepared.unit),
     )
     written = (x, u, dx, du, status, multipliers)
@@ -492,6 +494,16 @@ def require_complete(controller: Controller, simulation: Simulation) -> Simulati
 def _writable(*matrices: Array) -> LoopMatrices:
     """Copies, because read-only arrays are another type to numba and would be compiled again."""
     return LoopMatrices(*(np.array(matrix, order="C") for matrix in matrices))
+
+
+def _tape(plant: Plant, along: Directions) -> BodyTape:
+    """The plant's body with slots of its own, for trials are simulated side by side."""
+    if plant.body is None:
+        return BodyTape(np.zeros((0, 4), dtype=np.int64), 0, np.zeros(0), np.zeros((0, along.count)))
+    constants, slots = plant.body.constants, plant.body.slots
+    values, slopes = np.zeros(slots), np.zeros((slots, along.count))
+    values[: len(constants)], slopes[: len(constants)] = constants, along.body
+    return BodyTape(np.array(plant.body.code), len(constants), values, slopes)
 
 
 def _no_directions(rows: Rows) -> RowDirections:

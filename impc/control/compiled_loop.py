@@ -19,7 +19,8 @@ multiplier that would leave [0, limit] blocks the step; at its limit the row is 
 unblocked step along which the slack of the violated row does not change proves the rows
 inconsistent.
 
-The loop over samples is that of `closed_loop`, which has its mathematics.
+The loop over samples is that of `closed_loop`, which has its mathematics. Where the body that moves
+is not linear, its operations are run one after the other (`compiled_body`).
 """
 
 from __future__ import annotations
@@ -29,10 +30,12 @@ from typing import NamedTuple
 import numpy as np
 
 from impc.arrays import Buffer
+from impc.control.compiled_body import BodyTape, move_body
 from impc.control.constraint_rows import RowDirections, Rows
 from impc.jit import njit
 
 __all__ = [
+    "COMPILED_WITH",
     "CONVERGED",
     "INCONSISTENT",
     "UNSOLVED",
@@ -46,6 +49,8 @@ __all__ = [
     "workspace",
 ]
 
+#: First digits of the SHA-256 of compiled_body.py, at which numba's cache of this file does not look.
+COMPILED_WITH = "95a6cc702a68ef07"
 #: What `solve_dual` says first: an answer, rows that exclude each other, none within its steps.
 CONVERGED, INCONSISTENT, UNSOLVED = 0, 1, 2
 
@@ -338,6 +343,7 @@ def run(
     dloop: LoopMatrices,
     rows: Rows,
     drows: RowDirections,
+    body: BodyTape,
     disturbance: Buffer,
     divergence: float,
     unit: Buffer,
@@ -357,6 +363,8 @@ def run(
     ----------
     dloop, drows : LoopMatrices, RowDirections
         Derivatives of the loop and of its rows.
+    body : BodyTape
+        What moves, unless it is empty.
     disturbance : Buffer
         (steps, d).
     divergence : float
@@ -409,7 +417,10 @@ def run(
                     return weakly_active, row
             weakly_active += near
             _apply(loop, dloop, v, dv0, x[t], dx[t], u[t], du[t])
-        _advance(loop, dloop, plant_moves, disturbance[t], x, dx, u[t], du[t], t)
+        if len(body.code):
+            move_body(body, x[t], u[t], disturbance[t], dx[t], du[t], x[t + 1], dx[t + 1])
+        else:
+            _advance(loop, dloop, plant_moves, disturbance[t], x, dx, u[t], du[t], t)
         if local:
             dx[t + 1] = dx[0]
         size = np.max(np.abs(x[t + 1]))

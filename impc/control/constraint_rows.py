@@ -99,6 +99,8 @@ class Directions:
         Right sides b of `bound_rows` (c, p).
     x0 : Array
         Initial state (n, p).
+    body : Array
+        Constants of the plant's body (c, p); none where it has none.
     """
 
     A: Array
@@ -108,6 +110,7 @@ class Directions:
     S: Array
     bounds: Array
     x0: Array
+    body: Array
 
     @property
     def count(self) -> int:
@@ -146,6 +149,7 @@ def directions(controller: Controller, count: int, **given: Array) -> Directions
         "S": controller.S.shape,
         "bounds": rows.b.shape,
         "x0": (plant.n,),
+        "body": (0,) if plant.body is None else plant.body.constants.shape,
     }
     parts = {name: np.zeros((*shape, count)) for name, shape in shapes.items()}
     for name, values in given.items():

@@ -257,7 +257,7 @@ def _all_directions(
     dx0[:, layout.start] = np.eye(n, width)
     given = {"K": dK, "S": dS, "x0": dx0}
     if differential is not None:
-        for name in ("A", "B", "E"):
+        for name in ("A", "B", "E", "body"):
             part = getattr(differential, name)
             given[name] = np.zeros((*part.shape[:-1], count))
             given[name][..., layout.parameters] = part

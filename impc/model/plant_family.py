@@ -22,6 +22,7 @@ from impc.errors import InputError, PlantError
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    from impc.model.body import Body
     from impc.model.plant import Plant
 
 __all__ = ["PlantDifferential", "PlantFamily", "plant_at", "plant_differential"]
@@ -99,12 +100,15 @@ class PlantDifferential(NamedTuple):
     ----------
     A, B, E, C : Array
         (n, n, k), (n, m, k), (n, d, k) and (p, n, k).
+    body : Array
+        Of the constants of the plant's body (c, k); none where it has none.
     """
 
     A: Array
     B: Array
     E: Array
     C: Array
+    body: Array
 
 
 @checked(logarithms="*")
@@ -121,12 +125,14 @@ def plant_differential(family: PlantFamily, logarithms: Array) -> PlantDifferent
     Raises
     ------
     PlantError
-        When the plant jumps as a parameter moves by a thousandth.
+        When the plant jumps as a parameter moves by a thousandth, or its body has other operations
+        then.
     """
     parts: list[tuple[Array, ...]] = []
+    body = plant_at(family, logarithms).body
     for index, name in enumerate(family.names):
-        coarse = _central(family, logarithms, index, _STEP)
-        fine = _central(family, logarithms, index, _STEP / 2)
+        coarse = _central(family, logarithms, index, _STEP, body)
+        fine = _central(family, logarithms, index, _STEP / 2, body)
         for one, other in zip(coarse, fine, strict=True):
             if np.max(np.abs(one - other), initial=0) > _ROUGH * np.max(np.abs(other), initial=0):
                 raise PlantError(
@@ -138,11 +144,22 @@ def plant_differential(family: PlantFamily, logarithms: Array) -> PlantDifferent
 
 
 def _central(
-    family: PlantFamily, logarithms: Array, index: int, step: float
-) -> tuple[Array, Array, Array, Array]:
+    family: PlantFamily, logarithms: Array, index: int, step: float, body: Body | None
+) -> tuple[Array, ...]:
     shift = np.zeros(len(family.names))
     shift[index] = step
     above, below = plant_at(family, logarithms + shift), plant_at(family, logarithms - shift)
     pairs = ((above.A, below.A), (above.B, below.B), (above.E, below.E), (above.C, below.C))
-    a, b, e, c = ((up - down) / (2 * step) for up, down in pairs)
-    return a, b, e, c
+    changes = tuple((up - down) / (2 * step) for up, down in pairs)
+    if above.body is None or below.body is None or body is None:
+        return *changes, np.zeros(0)
+    if not (_alike(above.body, body) and _alike(below.body, body)):
+        raise PlantError(
+            f"parameter {family.names[index]}", "the body's operations change with it", "keep it"
+        )
+    return *changes, (above.body.constants - below.body.constants) / (2 * step)
+
+
+def _alike(one: Body, other: Body) -> bool:
+    """Whether two bodies differ in their constants alone."""
+    return one.slots == other.slots and np.array_equal(one.code, other.code)
