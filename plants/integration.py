@@ -67,8 +67,10 @@ def with_linear_part(step: ca.Function, A: object, B: object) -> ca.Function:
     slopes = ca.Function(
         "slopes", [state, inputs], [ca.jacobian(ahead, state), ca.jacobian(ahead, inputs)]
     )
-    wrong = [ca.DM(exact) - ca.densify(found) for exact, found in zip((A, B), slopes(0, 0))]
-    corrected = ahead + ca.sparsify(wrong[0], 1e-15) @ state + ca.sparsify(wrong[1], 1e-15) @ inputs
+    at_rest = slopes(0, 0)
+    wrong = [ca.DM(exact) - ca.densify(found) for exact, found in zip((A, B), at_rest, strict=True)]
+    by_state, by_input = (ca.sparsify(part, 1e-15) for part in wrong)
+    corrected = ahead + by_state @ state + by_input @ inputs
     return ca.Function(
         "step", [state, inputs], [corrected], ["state", "input"], ["next"], {"cse": True}
     )

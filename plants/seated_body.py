@@ -59,7 +59,7 @@ def seated_balance_body(
     state, inputs = ca.SX.sym("state", 4 + n), ca.SX.sym("input", 2)
     command, perturbation = inputs[0], inputs[1]
     generator = np.block([[chain.A, chain.B[:, None]], [np.zeros((1, n + 1))]])
-    # exp(generator t) has the chain's state after t in its first rows, the torque in the last of these.
+    # exp(generator t) has the chain's state after t in its first n rows, the last is the torque.
     held = ca.vertcat(state[4:], command)
 
     def rate(body: ca.SX, half_steps: int) -> ca.SX:

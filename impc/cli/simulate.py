@@ -67,8 +67,8 @@ def command() -> None:
 @click.option(
     "--motor-noise",
     type=Number(min=0, max=1e6),
-    default=0.3,
-    help="Standard deviation of the noise on the torque, Nm.",
+    default=0.0,
+    help="Standard deviation of the noise on the torque, Nm; a fit by the output error knows none.",
 )
 @click.option(
     "--sensor-noise",

@@ -11,6 +11,10 @@ follows from the stationarity S v + M'lam = 0 and the tight rows T_a x + M_a v =
 is that of the active set at hand. At a sample where the active set is about to change (a row that
 is tight without a multiplier) it is one-sided: the row counts as inactive there. Such samples are
 counted in the result.
+
+Where the plant offers a body that is not linear, that one moves and the controller still predicts
+by A and B: x+ = f(x, u, d) and dx+ = f_x dx + f_u du + f_theta take the place of the linear
+recursion (docs/nonlinear.md).
 """
 
 from __future__ import annotations
@@ -23,7 +27,7 @@ import numpy as np
 
 from impc.arrays import Array, Frozen, as_numbers, finite_array, frozen
 from impc.checking import Value, checked
-from impc.control.compiled_body import BodyTape
+from impc.control.body_steps import body_tape
 from impc.control.compiled_loop import LoopMatrices, answer_with, run
 from impc.control.constraint_rows import RowDirections, build_rows, differentiate_rows, directions
 from impc.control.infeasibility import excluded_row, proves_infeasible
@@ -341,7 +345,7 @@ def run_loop(
     program = prepared.program
     loop = (
         *(prepared.matrices, prepared.matrix_directions, prepared.rows, prepared.row_directions),
-        _tape(plant, along),
+        body_tape(plant, along.body),
         *(np.array(given.disturbance), _divergence(plant, given), prepared.unit),
     )
     written = (x, u, dx, du, status, multipliers)
@@ -494,16 +498,6 @@ def require_complete(controller: Controller, simulation: Simulation) -> Simulati
 def _writable(*matrices: Array) -> LoopMatrices:
     """Copies, because read-only arrays are another type to numba and would be compiled again."""
     return LoopMatrices(*(np.array(matrix, order="C") for matrix in matrices))
-
-
-def _tape(plant: Plant, along: Directions) -> BodyTape:
-    """The plant's body with slots of its own, for trials are simulated side by side."""
-    if plant.body is None:
-        return BodyTape(np.zeros((0, 4), dtype=np.int64), 0, np.zeros(0), np.zeros((0, along.count)))
-    constants, slots = plant.body.constants, plant.body.slots
-    values, slopes = np.zeros(slots), np.zeros((slots, along.count))
-    values[: len(constants)], slopes[: len(constants)] = constants, along.body
-    return BodyTape(np.array(plant.body.code), len(constants), values, slopes)
 
 
 def _no_directions(rows: Rows) -> RowDirections:

@@ -15,7 +15,7 @@ from impc.arrays import Buffer
 from impc.jit import njit
 from impc.model.body import OPERATIONS
 
-__all__ = ["BodyTape", "move_body"]
+__all__ = ["BodyTape", "move_along", "move_body"]
 
 (
     _OUTPUT,
@@ -121,6 +121,27 @@ def move_body(
         values[to] = value
         for c in range(p):
             slopes[to, c] = by_a * slopes[a, c] + by_b * slopes[b, c]
+
+
+@njit(cache=True)
+def move_along(body: BodyTape, x: Buffer, u: Buffer, disturbance: Buffer, slopes: Buffer) -> None:
+    """Derivatives of one sample by all that is given, at every sample of a trajectory.
+
+    Parameters
+    ----------
+    body : BodyTape
+        With the identity in the slopes of the states, inputs and disturbances.
+    x, u, disturbance : Buffer
+        (steps, n), (steps, m) and (steps, d).
+    slopes : Buffer
+        Written: (steps, n, n + m + d).
+    """
+    n, m = x.shape[1], u.shape[1]
+    unit = body.slopes[body.given : body.given + n + m].copy()
+    ahead = np.empty(n)
+    for t in range(len(slopes)):
+        at, to = unit[:n], unit[n:]
+        move_body(body, x[t], u[t], disturbance[t], at, to, ahead, slopes[t])
 
 
 @njit(cache=True, error_model="numpy")

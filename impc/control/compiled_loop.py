@@ -49,8 +49,8 @@ __all__ = [
     "workspace",
 ]
 
-#: First digits of the SHA-256 of compiled_body.py, at which numba's cache of this file does not look.
-COMPILED_WITH = "95a6cc702a68ef07"
+#: First digits of the SHA-256 of compiled_body.py, at which numba's cache does not look.
+COMPILED_WITH = "fb4466973fa25e93"
 #: What `solve_dual` says first: an answer, rows that exclude each other, none within its steps.
 CONVERGED, INCONSISTENT, UNSOLVED = 0, 1, 2
 

@@ -152,6 +152,11 @@ class Plant(Value):
         """Number of control inputs."""
         return self.B.shape[1]
 
+    @property
+    def moves(self) -> str:
+        """Which body every simulation moves: "nonlinear" or "linear"."""
+        return "linear" if self.body is None else "nonlinear"
+
     def linear(self) -> Plant:
         """The same plant without a body of its own: the matrices alone move."""
         return replace(self, body=None)

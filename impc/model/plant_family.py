@@ -92,6 +92,10 @@ class PlantFamily(Frozen):
         for field, given in (("make", make), ("names", tuple(names)), ("nominal", frozen(nominal))):
             object.__setattr__(self, field, given)
 
+    def linear(self) -> PlantFamily:
+        """The same family without bodies of their own: the matrices alone move."""
+        return PlantFamily(lambda values: self.make(values).linear(), self.names, self.nominal)
+
 
 class PlantDifferential(NamedTuple):
     """Derivatives of A, B, E and C with respect to the logarithms; the parameters' axis is last.

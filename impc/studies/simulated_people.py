@@ -185,8 +185,9 @@ def _moved(
     plant, samples = controller.plant, len(d)
     prepared = prepare_loop(controller, directions(controller, 0))
     still = np.zeros((1, plant.E.shape[1]))
-    # As it is read again: linear between its samples (`impc.files.resampling`).
-    between = (d + np.vstack([d[1:], d[-1:]])) / 2
+    # As it is read again (`impc.files.resampling`): linear between its samples, unless it is taken
+    # at the controller's own rate. Half a sample of 1 ms would move a gain by eight deviations.
+    between = d if within == 1 else (d + np.vstack([d[1:], d[-1:]])) / 2
     x, u = np.zeros((samples, plant.n)), np.zeros((samples, plant.m))
     state = np.zeros(plant.n)
     for first in range(0, samples, within):
