@@ -71,9 +71,8 @@ def fitted_subject(files: tuple[Path, ...], body: str) -> Found:
     intervals = covariance_intervals(estimate, estimate.covariance, "sandwich")
     seconds = time.process_time() - begun
     truth = np.ravel(json.loads((folder / "truth.json").read_text())["K"])
-    inside = sum(
-        item.low <= value <= item.high for item, value in zip(intervals, truth, strict=True)
-    )
+    pairs = zip(intervals, truth, strict=True)
+    inside = sum(bool(item.low <= value <= item.high) for item, value in pairs)
     return Found(inside, len(truth), fitted.misfit, seconds)
 
 
@@ -81,31 +80,29 @@ def main() -> None:
     """Print a line a subject, and the shares over all of them."""
     parser = argparse.ArgumentParser(description="Fits of the default subject beside its truth.")
     parser.add_argument("--seeds", type=int, default=20)
-    parser.add_argument("--motor-noise", default="0")
+    parser.add_argument("--first", type=int, default=0, help="the first seed")
+    parser.add_argument("--motor-noise", default="0", help="Nm")
+    parser.add_argument("--beside", type=int, default=20, help="of them with the linear body too")
     given = parser.parse_args()
-    rows = []
-    for seed in tqdm(range(given.seeds), unit="subject", disable=None):
+    found: dict[str, list[Found]] = {"nonlinear": [], "linear": []}
+    for seed in tqdm(range(given.first, given.first + given.seeds), unit="subject", disable=None):
         with tempfile.TemporaryDirectory() as folder:
             files = simulated_files(Path(folder, "one"), seed, "--motor-noise", given.motor_noise)
-            pair = [fitted_subject(files, body) for body in ("nonlinear", "linear")]
-        rows.append(pair)
-        told = "; ".join(
-            f"{item.inside} of {item.entries} inside, misfit {item.misfit:.4f}, "
-            f"{item.seconds:.1f} s"
-            for item in pair
-        )
-        print(f"seed {seed}: {told}", flush=True)
-    for index, body in enumerate(("nonlinear", "linear")):
-        found = [pair[index] for pair in rows]
-        inside, entries = (
-            sum(getattr(item, name) for item in found) for name in ("inside", "entries")
-        )
-        print(f"{body:<9} {inside} of {entries} entries inside, {100 * inside / entries:.1f} %")
-    ratios = [first.seconds / second.seconds for first, second in rows]
-    print(
-        f"CPU time of a fit, nonlinear over linear: median {np.median(ratios):.2f}, "
-        f"{min(ratios):.2f} to {max(ratios):.2f}"
-    )
+            for body in [*found][: 2 if seed < given.beside else 1]:
+                one = fitted_subject(files, body)
+                found[body].append(one)
+                print(f"seed {seed}, {body}: {one}", flush=True)
+    for body, fits in found.items():
+        if fits:
+            inside, entries = (
+                sum(getattr(one, key) for one in fits) for key in ("inside", "entries")
+            )
+            print(f"{body}: {inside} of {entries} entries inside, {100 * inside / entries:.1f} %")
+    pairs = zip(found["nonlinear"], found["linear"], strict=False)
+    ratios = [own.seconds / other.seconds for own, other in pairs]
+    if ratios:
+        least, median, most = np.quantile(ratios, [0, 0.5, 1])
+        print(f"CPU time, nonlinear over linear: {median:.2f} ({least:.2f} to {most:.2f})")
 
 
 if __name__ == "__main__":

@@ -67,8 +67,9 @@ def command() -> None:
 @click.option(
     "--motor-noise",
     type=Number(min=0, max=1e6),
-    default=0.0,
-    help="Standard deviation of the noise on the torque, Nm; a fit by the output error knows none.",
+    show_default="0, with --observer 0.3",
+    help="Standard deviation of the noise on the torque, Nm: what a fit without [fit.observer] "
+    "takes for noise of the recorder.",
 )
 @click.option(
     "--sensor-noise",
@@ -113,6 +114,8 @@ def seated_balance(out: Path, formats: str | None, **given: Any) -> None:
 
     wanted = _wanted(formats)
     require_writable(out)
+    if given["motor_noise"] is None:
+        given["motor_noise"] = 0.3 if given["observer"] else 0.0
     person = {key: given[key] for key in ("mass", "height", "sex")}
     controller = seat_controller(person, given["torque_limit"])
     trials = _trials(controller, person, given)

@@ -7,31 +7,26 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.arrays import Array
-from impc.control.compiled_body import BodyTape, move_along, move_body
+from impc.control.compiled_body import BodyTape, move_along, states_along
 
 if TYPE_CHECKING:
+    from impc.control.constraint_rows import Directions
+    from impc.model.body import Body
     from impc.model.plant import Plant
 
-__all__ = ["body_tape", "next_state", "slopes_along"]
+__all__ = ["body_tape", "next_state", "pushes", "slopes_along"]
 
 
-def body_tape(plant: Plant, moves: Array) -> BodyTape:
-    """The body of a plant for the compiled loop, empty where it has none.
+def body_tape(body: Body | None, count: int) -> BodyTape:
+    """A body for the compiled loop along `count` directions, empty where there is none.
 
     With slots of its own each time, because trials are simulated side by side.
-
-    Parameters
-    ----------
-    moves : Array
-        Derivatives of the body's constants along p directions (c, p).
     """
-    count = moves.shape[1]
-    if plant.body is None:
+    if body is None:
         return BodyTape(np.zeros((0, 4), dtype=np.int64), 0, np.zeros(0), np.zeros((0, count)))
-    constants, slots = plant.body.constants, plant.body.slots
-    values, slopes = np.zeros(slots), np.zeros((slots, count))
-    values[: len(constants)], slopes[: len(constants)] = constants, moves
-    return BodyTape(np.array(plant.body.code), len(constants), values, slopes)
+    values, first = np.zeros(body.slots), len(body.constants)
+    values[:first] = body.constants
+    return BodyTape(np.array(body.code), first, values, np.zeros((body.slots, count)))
 
 
 def next_state(plant: Plant, x: Array, u: Array, d: Array) -> Array:
@@ -39,10 +34,32 @@ def next_state(plant: Plant, x: Array, u: Array, d: Array) -> Array:
     if plant.body is None:
         linear: Array = plant.A @ x + plant.B @ u + plant.E @ d
         return linear
-    tape = body_tape(plant, np.zeros((len(plant.body.constants), 0)))
-    ahead, none = np.empty(plant.n), np.zeros((plant.n, 0))
-    still = np.zeros((plant.m, 0))
-    move_body(tape, np.array(x), np.array(u), np.array(d), none, still, ahead, none.copy())
+    return _ahead(plant.body, x[None], u[None], d[None])[0]
+
+
+def pushes(along: Directions, x: Array, u: Array, d: Array) -> Array:
+    """What the parameters in the body add to each derivative of the next state.
+
+    Parameters
+    ----------
+    x, u, d : Array
+        (steps, n), (steps, m) and (steps, d).
+
+    Returns
+    -------
+    Array
+        (steps, n, p).
+    """
+    found = np.zeros((*x.shape, along.count))
+    for index, bodies in enumerate(along.bodies):
+        for factor, body in bodies:
+            found[..., index] += factor * _ahead(body, x, u, d)
+    return found
+
+
+def _ahead(body: Body, x: Array, u: Array, d: Array) -> Array:
+    ahead = np.empty(x.shape)
+    states_along(body_tape(body, 0), np.array(x), np.array(u), np.array(d), ahead)
     return ahead
 
 
@@ -64,7 +81,7 @@ def slopes_along(plant: Plant, x: Array, u: Array, d: Array) -> tuple[Array, Arr
         A, B, E = (np.broadcast_to(part, (steps, *part.shape)) for part in _matrices(plant))
         return A, B, E
     count = n + m + plant.E.shape[1]
-    tape = body_tape(plant, np.zeros((len(plant.body.constants), count)))
+    tape = body_tape(plant.body, count)
     tape.slopes[tape.given : tape.given + count] = np.eye(count)
     found = np.empty((steps, n, count))
     move_along(tape, np.array(x), np.array(u), np.array(d), found)

@@ -15,7 +15,7 @@ from impc.arrays import Buffer
 from impc.jit import njit
 from impc.model.body import OPERATIONS
 
-__all__ = ["BodyTape", "move_along", "move_body"]
+__all__ = ["BodyTape", "move_along", "move_body", "states_along"]
 
 (
     _OUTPUT,
@@ -69,7 +69,7 @@ class BodyTape(NamedTuple):
     code : Buffer
         (k, 4); no rows where the linear plant moves.
     given : int
-        Slot of the first state; those before it hold the constants and their derivatives.
+        Slot of the first state; those before it hold the constants, without derivatives.
     values, slopes : Buffer
         (slots,) and (slots, p).
     """
@@ -121,6 +121,24 @@ def move_body(
         values[to] = value
         for c in range(p):
             slopes[to, c] = by_a * slopes[a, c] + by_b * slopes[b, c]
+
+
+@njit(cache=True)
+def states_along(body: BodyTape, x: Buffer, u: Buffer, disturbance: Buffer, ahead: Buffer) -> None:
+    """The next state at every sample of a trajectory.
+
+    Parameters
+    ----------
+    body : BodyTape
+        Without directions.
+    x, u, disturbance : Buffer
+        (steps, n), (steps, m) and (steps, d).
+    ahead : Buffer
+        Written: (steps, n).
+    """
+    still, at = np.empty((x.shape[1], 0)), np.empty((u.shape[1], 0))
+    for t in range(len(ahead)):
+        move_body(body, x[t], u[t], disturbance[t], still, at, ahead[t], still)
 
 
 @njit(cache=True)

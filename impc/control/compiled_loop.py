@@ -50,7 +50,7 @@ __all__ = [
 ]
 
 #: First digits of the SHA-256 of compiled_body.py, at which numba's cache does not look.
-COMPILED_WITH = "fb4466973fa25e93"
+COMPILED_WITH = "c33183578eeed970"
 #: What `solve_dual` says first: an answer, rows that exclude each other, none within its steps.
 CONVERGED, INCONSISTENT, UNSOLVED = 0, 1, 2
 
@@ -344,6 +344,7 @@ def run(
     rows: Rows,
     drows: RowDirections,
     body: BodyTape,
+    pushes: Buffer,
     disturbance: Buffer,
     divergence: float,
     unit: Buffer,
@@ -365,6 +366,8 @@ def run(
         Derivatives of the loop and of its rows.
     body : BodyTape
         What moves, unless it is empty.
+    pushes : Buffer
+        What its parameters add to each derivative, (steps, n, p), or nothing, (0, n, p).
     disturbance : Buffer
         (steps, d).
     divergence : float
@@ -419,6 +422,8 @@ def run(
             _apply(loop, dloop, v, dv0, x[t], dx[t], u[t], du[t])
         if len(body.code):
             move_body(body, x[t], u[t], disturbance[t], dx[t], du[t], x[t + 1], dx[t + 1])
+            if len(pushes):
+                dx[t + 1] += pushes[t]
         else:
             _advance(loop, dloop, plant_moves, disturbance[t], x, dx, u[t], du[t], t)
         if local:

@@ -22,6 +22,7 @@ from impc.model.bounds import bound_rows
 
 if TYPE_CHECKING:
     from impc.control.controller import Controller
+    from impc.model.body import Body
 
 __all__ = ["Directions", "RowDirections", "Rows", "build_rows", "differentiate_rows", "directions"]
 
@@ -99,8 +100,8 @@ class Directions:
         Right sides b of `bound_rows` (c, p).
     x0 : Array
         Initial state (n, p).
-    body : Array
-        Constants of the plant's body (c, p); none where it has none.
+    bodies : tuple
+        For each direction, bodies nearby with factors (`PlantDifferential`); may be left empty.
     """
 
     A: Array
@@ -110,7 +111,7 @@ class Directions:
     S: Array
     bounds: Array
     x0: Array
-    body: Array
+    bodies: tuple[tuple[tuple[float, Body], ...], ...] = ()
 
     @property
     def count(self) -> int:
@@ -118,13 +119,20 @@ class Directions:
         return self.x0.shape[1]
 
 
-def directions(controller: Controller, count: int, **given: Array) -> Directions:
+def directions(
+    controller: Controller,
+    count: int,
+    bodies: tuple[tuple[tuple[float, Body], ...], ...] = (),
+    **given: Array,
+) -> Directions:
     """Return `count` directions with the given parts; those not given are zero.
 
     Parameters
     ----------
     count : int
         Number of directions p.
+    bodies : tuple
+        See `Directions`.
     **given : Array
         Fields of `Directions` by name, in any layout that reshapes to theirs: K to (m, n, p).
 
@@ -149,12 +157,11 @@ def directions(controller: Controller, count: int, **given: Array) -> Directions
         "S": controller.S.shape,
         "bounds": rows.b.shape,
         "x0": (plant.n,),
-        "body": (0,) if plant.body is None else plant.body.constants.shape,
     }
     parts = {name: np.zeros((*shape, count)) for name, shape in shapes.items()}
     for name, values in given.items():
         parts[name] = np.ascontiguousarray(values).reshape(*shapes[name], count)
-    return Directions(**parts)
+    return Directions(**parts, bodies=bodies)
 
 
 def build_rows(controller: Controller) -> Rows:

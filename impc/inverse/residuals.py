@@ -257,11 +257,13 @@ def _all_directions(
     dx0[:, layout.start] = np.eye(n, width)
     given = {"K": dK, "S": dS, "x0": dx0}
     if differential is not None:
-        for name in ("A", "B", "E", "body"):
+        for name in ("A", "B", "E"):
             part = getattr(differential, name)
             given[name] = np.zeros((*part.shape[:-1], count))
             given[name][..., layout.parameters] = part
-    return directions(controller, count, **given)
+    still = ((),) * layout.parameters.start
+    bodies = () if differential is None else differential.bodies
+    return directions(controller, count, (*still, *bodies) if bodies else (), **given)
 
 
 def _symmetric(columns: Array, m: int) -> Array:

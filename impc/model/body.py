@@ -4,7 +4,7 @@ A plant may offer its own equations beside the matrices by which its controller 
 (docs/nonlinear.md, "A body that is not linear"). They come as a `casadi.Function` and are kept as
 the list of its scalar operations: arrays, which the compiled loop runs and differentiates sample by
 sample, without a compiler, and which can be compared, kept and sent. Parameters are among the
-constants of the list, so a plant with other parameters has the same list with other constants.
+constants of the list.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 
 from impc.arrays import Array, IntArray, frozen
 from impc.checking import Value
-from impc.errors import PlantError, one_line
+from impc.errors import PlantError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -90,12 +90,7 @@ def read_body(function: Any, order: Sequence[int], n: int) -> Body:
         )
     given = ca.SX.sym("given", n + len(order))
     inputs = ca.vertcat(*(given[n + list(order).index(k)] for k in range(len(order))))
-    try:
-        ahead = ca.densify(function.expand()(given[:n], inputs))
-    except RuntimeError as error:
-        raise PlantError(
-            "plant.body", f"is not made of expressions ({one_line(error)})", "use SX or MX symbols"
-        ) from None
+    ahead = ca.densify(function.expand()(given[:n], inputs))
     return _listed(ca.Function("body", [given], [ahead], {"cse": True}), n + len(order))
 
 
@@ -105,7 +100,7 @@ def _listed(function: Any, given: int) -> Body:
     code: list[tuple[int, int, int, int]] = []
     count = function.n_instructions()
     kinds = [function.instruction_id(k) for k in range(count)]
-    called = [names.get(kind, "") for kind in kinds]
+    called = [names.get(kind, str(kind)) for kind in kinds]
     constants = [function.instruction_constant(k) for k in range(count) if called[k] == "CONST"]
     first, met = len(constants) + given, 0
     where: dict[int, int] = {}  # slot of each register of the function
@@ -123,9 +118,7 @@ def _listed(function: Any, given: int) -> Body:
             slot = to[1] if name == "OUTPUT" else where[to[0]]
             code.append((OPERATIONS.index(name), slot, read[0], read[-1]))
         else:
-            raise PlantError(
-                "plant.body", f"has the operation {name or kinds[k]}", "write it without"
-            )
+            raise PlantError("plant.body", f"has the operation {name}", "write it without")
     table = np.array(code, dtype=np.int64).reshape(-1, 4)
     table.flags.writeable = False
     return Body(table, frozen(constants), first + function.sz_w())

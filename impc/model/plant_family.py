@@ -104,15 +104,16 @@ class PlantDifferential(NamedTuple):
     ----------
     A, B, E, C : Array
         (n, n, k), (n, m, k), (n, d, k) and (p, n, k).
-    body : Array
-        Of the constants of the plant's body (c, k); none where it has none.
+    bodies : tuple
+        For each parameter, bodies nearby with their factors: the sum of what they do at a sample is
+        the derivative of the plant's own. Empty where it has none.
     """
 
     A: Array
     B: Array
     E: Array
     C: Array
-    body: Array
+    bodies: tuple[tuple[tuple[float, Body], ...], ...]
 
 
 @checked(logarithms="*")
@@ -129,41 +130,35 @@ def plant_differential(family: PlantFamily, logarithms: Array) -> PlantDifferent
     Raises
     ------
     PlantError
-        When the plant jumps as a parameter moves by a thousandth, or its body has other operations
-        then.
+        When the plant jumps as a parameter moves by a thousandth.
     """
     parts: list[tuple[Array, ...]] = []
-    body = plant_at(family, logarithms).body
+    bodies: list[tuple[tuple[float, Body], ...]] = []
     for index, name in enumerate(family.names):
-        coarse = _central(family, logarithms, index, _STEP, body)
-        fine = _central(family, logarithms, index, _STEP / 2, body)
+        coarse, far = _central(family, logarithms, index, _STEP)
+        fine, near = _central(family, logarithms, index, _STEP / 2)
         for one, other in zip(coarse, fine, strict=True):
             if np.max(np.abs(one - other), initial=0) > _ROUGH * np.max(np.abs(other), initial=0):
                 raise PlantError(
                     f"parameter {name}", "the plant is not smooth in it", "do not free it"
                 )
         parts.append(tuple((4 * b - a) / 3 for a, b in zip(coarse, fine, strict=True)))
+        shares = [(4 / 3 * factor, body) for factor, body in near]
+        bodies.append((*shares, *((-factor / 3, body) for factor, body in far)))
     stacked = [np.stack(group, axis=-1) for group in zip(*parts, strict=True)]
-    return PlantDifferential(*stacked)
+    return PlantDifferential(*stacked, tuple(bodies) if any(bodies) else ())
 
 
 def _central(
-    family: PlantFamily, logarithms: Array, index: int, step: float, body: Body | None
-) -> tuple[Array, ...]:
+    family: PlantFamily, logarithms: Array, index: int, step: float
+) -> tuple[tuple[Array, ...], tuple[tuple[float, Body], ...]]:
+    """Central differences of the matrices, and the two bodies with their factors."""
     shift = np.zeros(len(family.names))
     shift[index] = step
     above, below = plant_at(family, logarithms + shift), plant_at(family, logarithms - shift)
     pairs = ((above.A, below.A), (above.B, below.B), (above.E, below.E), (above.C, below.C))
-    changes = tuple((up - down) / (2 * step) for up, down in pairs)
-    if above.body is None or below.body is None or body is None:
-        return *changes, np.zeros(0)
-    if not (_alike(above.body, body) and _alike(below.body, body)):
-        raise PlantError(
-            f"parameter {family.names[index]}", "the body's operations change with it", "keep it"
-        )
-    return *changes, (above.body.constants - below.body.constants) / (2 * step)
-
-
-def _alike(one: Body, other: Body) -> bool:
-    """Whether two bodies differ in their constants alone."""
-    return one.slots == other.slots and np.array_equal(one.code, other.code)
+    ends = ((1 / (2 * step), above.body), (-1 / (2 * step), below.body))
+    return (
+        tuple((up - down) / (2 * step) for up, down in pairs),
+        tuple((factor, body) for factor, body in ends if body is not None),
+    )
