@@ -185,9 +185,6 @@ def _moved(
     plant, samples = controller.plant, len(d)
     prepared = prepare_loop(controller, directions(controller, 0))
     still = np.zeros((1, plant.E.shape[1]))
-    # As it is read again (`impc.files.resampling`): linear between its samples, unless it is taken
-    # at the controller's own rate. Half a sample of 1 ms would move a gain by eight deviations.
-    between = d if within == 1 else (d + np.vstack([d[1:], d[-1:]])) / 2
     x, u = np.zeros((samples, plant.n)), np.zeros((samples, plant.m))
     state = np.zeros(plant.n)
     for first in range(0, samples, within):
@@ -198,9 +195,9 @@ def _moved(
             return x, u, first
         command = run.u[0]
         moved = command + noise.on(command)
-        noise.senses.look(noise.rng, state, command, np.mean(between[first:last], axis=0))
+        noise.senses.look(noise.rng, state, command, np.mean(d[first:last], axis=0))
         inputs = np.hstack(
-            [np.tile(moved, (within, 1)), np.resize(between[first:last], (within, d.shape[1]))]
+            [np.tile(moved, (within, 1)), np.resize(d[first:last], (within, d.shape[1]))]
         )
         ahead = np.asarray(several(state, inputs.T)).T
         x[first:last] = np.vstack([state, ahead[:-1]])[: last - first]
