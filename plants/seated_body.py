@@ -3,7 +3,8 @@
 Delay and muscle are linear and nothing acts on them but the command, which is held: the torque at
 the nodes of a Runge-Kutta step is known in closed form, and only the two bodies are integrated.
 That is a sixth of the operations of the same method on all states, and does not depend on how
-fast the delay is.
+fast the delay is. Delay and muscle: equations (3.18) to (3.20) of the dissertation; the step: Hairer,
+Nørsett and Wanner 1993, section II.1.
 """
 
 from __future__ import annotations

@@ -97,7 +97,7 @@ def seat_controller(person: dict[str, Any], limit: float, price: float = 1.0) ->
 def between_samples(torque: Array) -> Array:
     """The torque (samples,) that acts from one sample to the next: linear between them.
 
-    So it is read again (`impc.files.resampling`). Held instead, it would come half a sample late:
+    So it is read again (docs/recordings.md). Held instead, it would come half a sample late:
     0.5 ms, which moves a fitted gain by eight of its deviations.
     """
     import numpy as np  # noqa: PLC0415

@@ -1,4 +1,7 @@
-"""One sample of whatever moves, a plant's body or its matrices; slopes along a trajectory."""
+"""One sample of whatever moves, a plant's body or its matrices; slopes along a trajectory.
+
+docs/nonlinear.md has the equations.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +37,7 @@ def next_state(plant: Plant, x: Array, u: Array, d: Array) -> Array:
     if plant.body is None:
         linear: Array = plant.A @ x + plant.B @ u + plant.E @ d
         return linear
-    return _ahead(plant.body, x[None], u[None], d[None])[0]
+    return np.array(_ahead(plant.body, x[None], u[None], d[None])[0])
 
 
 def pushes(along: Directions, x: Array, u: Array, d: Array) -> Array:

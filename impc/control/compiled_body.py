@@ -2,7 +2,8 @@
 
 The operations of a `impc.model.body.Body` are run one after the other; each has its value and its
 derivative along p directions, by the chain rule, so that the derivative is exact and costs p
-multiplications an operation. A division by zero is infinite here, and the loop then diverges.
+multiplications an operation (docs/nonlinear.md). A division by zero is infinite here, and the loop
+then diverges.
 """
 
 from __future__ import annotations

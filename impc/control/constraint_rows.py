@@ -119,20 +119,13 @@ class Directions:
         return self.x0.shape[1]
 
 
-def directions(
-    controller: Controller,
-    count: int,
-    bodies: tuple[tuple[tuple[float, Body], ...], ...] = (),
-    **given: Array,
-) -> Directions:
+def directions(controller: Controller, count: int, **given: Array) -> Directions:
     """Return `count` directions with the given parts; those not given are zero.
 
     Parameters
     ----------
     count : int
         Number of directions p.
-    bodies : tuple
-        See `Directions`.
     **given : Array
         Fields of `Directions` by name, in any layout that reshapes to theirs: K to (m, n, p).
 
@@ -161,7 +154,7 @@ def directions(
     parts = {name: np.zeros((*shape, count)) for name, shape in shapes.items()}
     for name, values in given.items():
         parts[name] = np.ascontiguousarray(values).reshape(*shapes[name], count)
-    return Directions(**parts, bodies=bodies)
+    return Directions(**parts)
 
 
 def build_rows(controller: Controller) -> Rows:

@@ -154,7 +154,8 @@ class _LoopOfGain:
         at = np.arange(n + m * n, count)
         dS[low[0], low[1], at] = dS[low[1], low[0], at] = 1.0
         local: Array = np.full((steps, m, count), np.nan)
-        x, u = np.zeros((steps, n)), np.zeros((steps, m))
+        x: Array = np.zeros((steps, n))
+        u: Array = np.zeros((steps, m))
         if made is not None:
             along = directions(made, count, x0=dx0, K=dK, S=dS)
             run, moved = run_loop(prepare_loop(made, along), _scenario(point), local=True)

@@ -94,7 +94,9 @@ class PlantFamily(Frozen):
 
     def linear(self) -> PlantFamily:
         """The same family without bodies of their own: the matrices alone move."""
-        return PlantFamily(lambda values: self.make(values).linear(), self.names, self.nominal)
+        return PlantFamily(
+            lambda values: self.make(values).linear(), self.names, self.nominal.tolist()
+        )
 
 
 class PlantDifferential(NamedTuple):
@@ -145,8 +147,8 @@ def plant_differential(family: PlantFamily, logarithms: Array) -> PlantDifferent
         parts.append(tuple((4 * b - a) / 3 for a, b in zip(coarse, fine, strict=True)))
         shares = [(4 / 3 * factor, body) for factor, body in near]
         bodies.append((*shares, *((-factor / 3, body) for factor, body in far)))
-    stacked = [np.stack(group, axis=-1) for group in zip(*parts, strict=True)]
-    return PlantDifferential(*stacked, tuple(bodies) if any(bodies) else ())
+    A, B, E, C = (np.stack(group, axis=-1) for group in zip(*parts, strict=True))
+    return PlantDifferential(A, B, E, C, tuple(bodies))
 
 
 def _central(

@@ -183,10 +183,13 @@ def test_a_sample_of_the_seat_is_that_of_another_integrator() -> None:
     exact, drift = nonlinear_dynamics(seated_parameters_for()), []
     for k in range(0, 75, 5):
         held = np.append(run.u[k], torque[k])
+
+        def rates(_: float, x: Array, held: Array = held) -> Array:
+            return np.ravel(exact(x, held).full())
+
         ahead = scipy.integrate.solve_ivp(
-            lambda _, x, held=held: exact(x, held).full().ravel(), (0, plant.dt), run.x[k],
-            method="DOP853", rtol=1e-12, atol=1e-13,
-        ).y[:, -1]  # fmt: skip
+            rates, (0, plant.dt), np.array(run.x[k]), method="DOP853", rtol=1e-12, atol=1e-13
+        ).y[:, -1]
         assert np.allclose(run.x[k + 1], ahead, atol=2e-7)
         drift.append(plant.A @ run.x[k] + plant.B @ run.u[k] + plant.E @ torque[k] - ahead)
     assert np.max(np.abs(drift)) > 1e-5
@@ -229,7 +232,7 @@ def test_the_loop_function_differentiates_through_the_body() -> None:
     by_gain, by_start, by_push = (part.full() for part in slope(*at))
 
     def end(gain: Array, start: Array, push: Array) -> Array:
-        return loop(gain, 1, start, push)[0][-1, :].full().ravel()
+        return np.ravel(loop(gain, 1, start, push)[0][-1, :].full())
 
     h = 1e-6
     for index, unit in enumerate(h * np.eye(2)):
