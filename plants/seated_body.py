@@ -1,10 +1,9 @@
 """One sample of the seated body by its full equations, with the way of the command solved exactly.
 
 Delay and muscle are linear and nothing acts on them but the command, which is held: the torque at
-the nodes of a Runge-Kutta step is known in closed form, and only the two bodies are integrated.
-That is a sixth of the operations of the same method on all states, and does not depend on how
-fast the delay is. Delay and muscle: equations (3.18) to (3.20) of the dissertation; the step: Hairer,
-Nørsett and Wanner 1993, section II.1.
+the nodes of a Runge-Kutta step is known in closed form, and only the two bodies are integrated:
+the step need not follow the fast states of the delay. Equations (3.18) to (3.20) of the
+dissertation; the step is that of Hairer, Nørsett and Wanner 1993, section II.1.
 """
 
 from __future__ import annotations

@@ -93,7 +93,7 @@ def test_every_operation_and_its_slopes_are_casadis() -> None:
 
 @pytest.mark.parametrize("rate", [np.inf, 0.4])
 def test_derivatives_equal_central_differences_with_active_bounds(rate: float) -> None:
-    """By gain, limit and initial state. Largest difference found: 2e-9 of the largest entry."""
+    """By gain, limit and initial state. Largest difference found: 3e-9 of the largest entry."""
     plant = pendulum()
     controller = law(plant, rate=rate)
     along = directions(
@@ -127,7 +127,7 @@ def _on_inputs(controller: Controller) -> Array:
 
 
 def test_parameters_move_the_body_as_differences_say() -> None:
-    """Stiffness and damping are in the matrices and in the body; 1e-7 of the largest was found."""
+    """Stiffness and damping are in the matrices and in the body; 1e-10 of the largest was found."""
     family = pendulum_family()
     plant = pendulum()
     controller = law(plant)
@@ -171,9 +171,9 @@ def test_a_linear_body_is_the_linear_plant(limit: float) -> None:
 
 
 def test_a_sample_of_the_seat_is_that_of_another_integrator() -> None:
-    """The closed loop at up to 12 degrees: each step by DOP853 from the state before it.
+    """The closed loop at up to 10 degrees: each step by DOP853 from the state before it.
 
-    Largest difference found: 2e-9 rad, 9e-8 rad/s, where the linear plant is off by 4e-5 rad/s.
+    Largest difference found: 1e-8 rad, 7e-7 rad/s, where the linear plant is off by 7e-3 rad/s.
     """
     controller = seat_controller({}, 40.0)
     plant = controller.plant
@@ -190,9 +190,9 @@ def test_a_sample_of_the_seat_is_that_of_another_integrator() -> None:
         ahead = scipy.integrate.solve_ivp(
             rates, (0, plant.dt), np.array(run.x[k]), method="DOP853", rtol=1e-12, atol=1e-13
         ).y[:, -1]
-        assert np.allclose(run.x[k + 1], ahead, atol=2e-7)
+        assert np.allclose(run.x[k + 1], ahead, rtol=0, atol=1e-6)
         drift.append(plant.A @ run.x[k] + plant.B @ run.u[k] + plant.E @ torque[k] - ahead)
-    assert np.max(np.abs(drift)) > 1e-5
+    assert np.max(np.abs(drift)) > 1e-3
 
 
 def test_the_linearisation_of_the_seats_body_is_its_plant() -> None:
