@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import casadi as ca
 
-from plants._checks import finite_number, whole_number
+from plants._checks import Array, finite_number, whole_number
 
 __all__ = ["runge_kutta_step", "with_linear_part"]
 
@@ -49,7 +49,7 @@ def runge_kutta_step(dynamics: ca.Function, step: float, substeps: int = 1) -> c
     return ca.Function("runge_kutta_step", [start, held], [state], ["state", "input"], ["next"])
 
 
-def with_linear_part(step: ca.Function, A: object, B: object) -> ca.Function:
+def with_linear_part(step: ca.Function, A: Array, B: Array) -> ca.Function:
     """Make a sample whose linearisation at rest is x+ = A x + B u exactly.
 
     An integrator's error is that of its linear part nearly all of it, and that part is known: the
@@ -59,7 +59,7 @@ def with_linear_part(step: ca.Function, A: object, B: object) -> ca.Function:
     ----------
     step : casadi.Function
         (state (n), input (m)) -> next state (n), near enough to A and B.
-    A, B : array_like
+    A, B : Array
         Of the sampled linear plant, (n, n) and (n, m).
     """
     state, inputs = ca.SX.sym("state", *step.size_in(0)), ca.SX.sym("input", *step.size_in(1))

@@ -95,15 +95,15 @@ def seat_controller(person: dict[str, Any], limit: float, price: float = 1.0) ->
 
 
 def between_samples(torque: Array) -> Array:
-    """Torque (samples,) in Nm that acts from one sample to the next, where it is linear between.
+    """Mean torque from each sample to the next (samples,): what acts where it is linear between.
 
-    So it is read again (docs/recordings.md). Held instead, it would come half a sample late:
-    0.5 ms, which moves a fitted gain by eight of its deviations.
+    So a recording is read again (docs/recordings.md). Held instead, the torque would come half a
+    sample late: 0.5 ms, which moves a fitted gain by eight of its deviations.
 
-    Returns
-    -------
-    Array
-        (samples,), Nm.
+    Parameters
+    ----------
+    torque : Array
+        At the samples (samples,), Nm.
     """
     import numpy as np  # noqa: PLC0415
 

@@ -154,7 +154,7 @@ def directions(controller: Controller, count: int, **given: Array) -> Directions
     parts = {name: np.zeros((*shape, count)) for name, shape in shapes.items()}
     for name, values in given.items():
         parts[name] = np.ascontiguousarray(values).reshape(*shapes[name], count)
-    return Directions(**parts)
+    return Directions(**parts, bodies=())
 
 
 def build_rows(controller: Controller) -> Rows:
