@@ -104,6 +104,11 @@ def between_samples(torque: Array) -> Array:
     ----------
     torque : Array
         At the samples (samples,), Nm.
+
+    Returns
+    -------
+    Array
+        (samples,), Nm.
     """
     import numpy as np  # noqa: PLC0415
 
