@@ -5,7 +5,7 @@
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
-.PHONY: help env demo test full check docs architecture reproduce wheel slow coverage structures plans noisy-people nonlinear look search numerics bench fuzz lock clean
+.PHONY: help env demo test full check docs architecture reproduce wheel slow coverage structures plans default-subjects noisy-people nonlinear look search numerics bench fuzz lock clean
 
 PYTHON ?= python3
 # Not to be set from outside: the environment is made with `venv --clear`.
@@ -48,6 +48,7 @@ help:
 	@echo 'make structures  coverage of prices, level and power of the test of a structure (hours)'
 	@echo 'make plans   do plans come true? fits of simulated recordings beside them (a quarter of an hour)'
 	@echo 'make nonlinear  the four systems of docs/nonlinear.md: starts, closed loops, noise (an hour)'
+	@echo 'make default-subjects  is the truth of twenty simulated subjects found? (a quarter of an hour)'
 	@echo 'make search   new examples for the tests by hypothesis, from a seed that is printed'
 	@echo 'make numerics the numerical tests on other processors and dependencies (an hour; needs uv)'
 	@echo 'make docs    build the site in docs/_build/html; warnings are errors, tutorials run (minutes)'
@@ -145,6 +146,10 @@ structures: env
 plans: env
 	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.plan_study cart --fits 100
 	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.plan_study seat --fits 100
+
+# Twenty subjects of `impc simulate seated-balance`: the figures of docs/nonlinear.md.
+default-subjects: env
+	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.default_subjects --seeds 20
 
 # What a reader's eye would find: cut, pale, unnamed or unexplained.
 look: env

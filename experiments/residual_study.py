@@ -1,11 +1,12 @@
 """How often the tests of the residuals speak, on simulated subjects whose noise is known.
 
-The seat, three trials of 30 s at 100 Hz, |u| <= 6 Nm, fitted from the true weights. The subjects:
+The seat, three trials of 30 s at 100 Hz, |u| <= 6 Nm, fitted from the true weights
+and with the linear plant, whichever body moved. The subjects:
 
     recorder     the linear plant, white noise on the angles
     coloured     the same of first order, root 0.9
-    linear       that of `impc simulate seated-balance` on the linear plant: motor noise of 0.3 Nm
-    default      the same on its own, nonlinear plant
+    linear       that of `impc simulate seated-balance --motor-noise 0.3` on the linear plant
+    default      the same on its own, nonlinear body
     motor        the linear plant, motor noise of 1 Nm, which the loop answers
 
     python -m experiments.residual_study --seeds 20
@@ -65,7 +66,8 @@ SUBJECTS = {
 
 def fitted_subject(kind: Kind, seed: int, order: int, horizon: int) -> Estimate:
     """Simulate and fit a subject; `order` is that of the delay's approximant."""
-    plant = Plant(plants.seated_balance_for(sample_time=0.01, delay_order=order), ["command"])
+    system = plants.seated_balance_for(sample_time=0.01, delay_order=order)
+    plant = Plant(system, ["command"]).linear()
     weights = _weights(plant)
     bounds = Bounds(plant, u_min=-_LIMIT, u_max=_LIMIT)
     controller = Controller(plant, weights, bounds, horizon, terminal_set=False)

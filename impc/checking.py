@@ -359,6 +359,7 @@ def _described(value: object) -> str:
 # Who makes a value, for the remedy; and where its class is.
 _VALUES = {
     "Plant": ("impc.model.plant", "make it with Plant(system)"),
+    "Body": ("impc.model.body", "make it with Plant(system, body=function)"),
     "Bounds": ("impc.model.bounds", "make it with Bounds(plant, ...)"),
     "BoundRows": ("impc.model.bounds", "make it with bound_rows"),
     "Weights": ("impc.model.weights", "make it with Weights(Q, R)"),

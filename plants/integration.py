@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import casadi as ca
 
-from plants._checks import finite_number, whole_number
+from plants._checks import Array, finite_number, whole_number
 
-__all__ = ["runge_kutta_step"]
+__all__ = ["runge_kutta_step", "with_linear_part"]
 
 
 def runge_kutta_step(dynamics: ca.Function, step: float, substeps: int = 1) -> ca.Function:
@@ -47,3 +47,30 @@ def runge_kutta_step(dynamics: ca.Function, step: float, substeps: int = 1) -> c
         k4 = dynamics(state + h * k3, held)
         state = state + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
     return ca.Function("runge_kutta_step", [start, held], [state], ["state", "input"], ["next"])
+
+
+def with_linear_part(step: ca.Function, A: Array, B: Array) -> ca.Function:
+    """Make a sample whose linearisation at rest is x+ = A x + B u exactly.
+
+    An integrator's error is that of its linear part nearly all of it, and that part is known: the
+    slopes of the step at rest are replaced.
+
+    Parameters
+    ----------
+    step : casadi.Function
+        (state (n), input (m)) -> next state (n), near enough to A and B.
+    A, B : Array
+        Of the sampled linear plant, (n, n) and (n, m).
+    """
+    state, inputs = ca.SX.sym("state", *step.size_in(0)), ca.SX.sym("input", *step.size_in(1))
+    ahead = step(state, inputs)
+    slopes = ca.Function(
+        "slopes", [state, inputs], [ca.jacobian(ahead, state), ca.jacobian(ahead, inputs)]
+    )
+    at_rest = slopes(0, 0)
+    wrong = [ca.DM(exact) - ca.densify(found) for exact, found in zip((A, B), at_rest, strict=True)]
+    by_state, by_input = (ca.sparsify(part, 1e-15) for part in wrong)
+    corrected = ahead + by_state @ state + by_input @ inputs
+    return ca.Function(
+        "step", [state, inputs], [corrected], ["state", "input"], ["next"], {"cse": True}
+    )

@@ -11,8 +11,9 @@ from typing import Any
 import casadi as ca
 
 from plants.anthropometry import Sex, from_anthropometry
-from plants.integration import runge_kutta_step
+from plants.integration import runge_kutta_step, with_linear_part
 from plants.seated_balance import nonlinear_dynamics, seated_balance_plant
+from plants.seated_body import seated_balance_body
 from plants.seated_parameters import SeatedBalanceParameters
 
 __all__ = ["seated_balance_for", "seated_balance_step_for", "seated_parameters_for"]
@@ -46,7 +47,7 @@ def seated_balance_for(
     delay_order: int = 5,
     **parameters: float,
 ) -> Any:
-    """Return the linear plant of a person as a discrete control.StateSpace.
+    """Return the plant of a person as a discrete control.StateSpace, with the body that moves.
 
     Parameters
     ----------
@@ -67,7 +68,10 @@ def seated_balance_for(
         As `seated_parameters_for` and `seated_balance_plant`.
     """
     found = seated_parameters_for(mass, height, sex, **parameters)
-    return seated_balance_plant(found, sample_time, delay_order)
+    system = seated_balance_plant(found, sample_time, delay_order)
+    step = seated_balance_body(found, sample_time, delay_order)
+    system.body = with_linear_part(step, system.A, system.B)
+    return system
 
 
 def seated_balance_step_for(

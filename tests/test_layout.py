@@ -47,6 +47,7 @@ ELSEWHERE = {
         cli/simulate_reliability.py studies/reliability/analysis.py studies/reliability/figures.py
         studies/reliability/findings.py studies/reliability/report.py
         studies/reliability/tables.py""",
+    "control/test_body_steps.py": "control/compiled_body.py",
     "control/test_closed_loop.py": """
         control/compiled_loop.py control/constraint_rows.py""",
     "control/test_joint_likelihood.py": """

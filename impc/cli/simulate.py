@@ -11,7 +11,16 @@ import click
 from impc.cli.numbers import Number
 from impc.cli.options import out_option, seed_option
 from impc.cli.output import print_files
-from impc.cli.seat import HORIZON, SIGNALS, STEP, TORQUE, seat_controller, seat_table, seat_weights
+from impc.cli.seat import (
+    HORIZON,
+    SIGNALS,
+    STEP,
+    TORQUE,
+    between_samples,
+    seat_controller,
+    seat_table,
+    seat_weights,
+)
 from impc.cli.simulate_cohort import cohort
 from impc.cli.simulate_head_tracking import head_tracking
 from impc.cli.simulate_reliability import reliability_study
@@ -67,8 +76,9 @@ def command() -> None:
 @click.option(
     "--motor-noise",
     type=Number(min=0, max=1e6),
-    default=0.3,
-    help="Standard deviation of the noise on the torque, Nm.",
+    show_default="0, with --observer 0.3",
+    help="Standard deviation of the noise on the torque, Nm: what a fit without [fit.observer] "
+    "takes for noise of the recorder.",
 )
 @click.option(
     "--sensor-noise",
@@ -113,6 +123,8 @@ def seated_balance(out: Path, formats: str | None, **given: Any) -> None:
 
     wanted = _wanted(formats)
     require_writable(out)
+    if given["motor_noise"] is None:
+        given["motor_noise"] = 0.3 if given["observer"] else 0.0
     person = {key: given[key] for key in ("mass", "height", "sex")}
     controller = seat_controller(person, given["torque_limit"])
     trials = _trials(controller, person, given)
@@ -147,28 +159,33 @@ def _trials(
 ) -> list[SubjectTrial]:
     import numpy as np  # noqa: PLC0415
 
+    from impc.arrays import frozen  # noqa: PLC0415
+    from impc.checking import replace  # noqa: PLC0415
     from impc.files.plant_sources import import_function, plant_source  # noqa: PLC0415
     from impc.studies.simulated_people import simulate_subject  # noqa: PLC0415
 
     torque, step = import_function(TORQUE), plant_source(STEP, person).make(**person)
     seeds = np.random.SeedSequence(given["seed"]).spawn(given["trials"])
-    return [
+    length = {"amplitude": given["amplitude"], "duration": given["duration"], "rate": _RATE}
+    recorded = [
+        torque(**length, seed=given["seed"] * 100 + number) for number in range(1, 1 + len(seeds))
+    ]
+    trials = [
         simulate_subject(
             controller,
             step,
-            torque(
-                amplitude=given["amplitude"],
-                duration=given["duration"],
-                rate=_RATE,
-                seed=given["seed"] * 100 + number + 1,
-            ),
+            between_samples(pushed),
             rate=_RATE,
             motor=given["motor_noise"],
             sensor=np.radians(given["sensor_noise"]),
             person=_observer(controller, given),
             seed=seed,
         )
-        for number, seed in enumerate(seeds)
+        for pushed, seed in zip(recorded, seeds, strict=True)
+    ]
+    return [
+        replace(trial, disturbance=frozen(pushed[:, None]))
+        for trial, pushed in zip(trials, recorded, strict=True)
     ]
 
 

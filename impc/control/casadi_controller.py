@@ -19,6 +19,7 @@ import scipy.linalg
 
 from impc.arrays import Array, BoolArray, finite_array
 from impc.checking import checked
+from impc.control.body_steps import next_state
 from impc.control.closed_loop import Simulation, Status
 from impc.control.constraint_rows import build_rows
 from impc.control.controller import Controller
@@ -214,7 +215,7 @@ def simulate_mpc(mpc: MpcSolver, given: Scenario) -> Simulation:
             x[t + 1 :], failed_row = x[t], step.failed_row
             break
         u[t] = step.u
-        x[t + 1] = plant.A @ x[t] + plant.B @ u[t] + plant.E @ given.disturbance[t]
+        x[t + 1] = next_state(plant, x[t], u[t], given.disturbance[t])
     return Simulation(x, u, status, 0, failed_row)
 
 

@@ -11,6 +11,10 @@ follows from the stationarity S v + M'lam = 0 and the tight rows T_a x + M_a v =
 is that of the active set at hand. At a sample where the active set is about to change (a row that
 is tight without a multiplier) it is one-sided: the row counts as inactive there. Such samples are
 counted in the result.
+
+Where the plant offers a body that is not linear, that one moves and the controller still predicts
+by A and B: x+ = f(x, u, d) and dx+ = f_x dx + f_u du + f_theta take the place of the linear
+recursion (docs/nonlinear.md).
 """
 
 from __future__ import annotations
@@ -23,6 +27,7 @@ import numpy as np
 
 from impc.arrays import Array, Frozen, as_numbers, finite_array, frozen
 from impc.checking import Value, checked
+from impc.control.body_steps import body_tape, pushes
 from impc.control.compiled_loop import LoopMatrices, answer_with, run
 from impc.control.constraint_rows import RowDirections, build_rows, differentiate_rows, directions
 from impc.control.infeasibility import excluded_row, proves_infeasible
@@ -340,6 +345,8 @@ def run_loop(
     program = prepared.program
     loop = (
         *(prepared.matrices, prepared.matrix_directions, prepared.rows, prepared.row_directions),
+        body_tape(plant.body, p),
+        _pushes(prepared, given),
         *(np.array(given.disturbance), _divergence(plant, given), prepared.unit),
     )
     written = (x, u, dx, du, status, multipliers)
@@ -375,6 +382,18 @@ def run_loop(
         else:
             plan = None
     return Simulation(x, u, status, weakly_active, failed_row), Sensitivity(dx, du)
+
+
+def _pushes(prepared: PreparedLoop, given: Scenario) -> Array:
+    """What parameters in the body add to the derivatives, along the trajectory.
+
+    (steps, n, p), or nothing. The trajectory is simulated first, without derivatives.
+    """
+    controller, along = prepared.controller, prepared.along
+    if not any(along.bodies):
+        return np.zeros((0, controller.plant.n, along.count))
+    run, _ = run_loop(prepare_loop(controller, directions(controller, 0)), given)
+    return pushes(along, run.x[:-1], run.u, given.disturbance)
 
 
 def _ask_solver(

@@ -27,7 +27,7 @@ from impc.jit import njit
 __all__ = ["COMPILED_WITH", "Clip", "FilterResult", "Steady", "run_filter", "run_person"]
 
 #: First digits of the SHA-256 of compiled_loop.py.
-COMPILED_WITH = "745447b6591c3265"
+COMPILED_WITH = "7ac3d621e593d752"
 
 _SOFTENED, _DIVERGED = 2, 5
 # A bound that is so many deviations away is not met: a normal number is there once in 1e13.

@@ -19,7 +19,8 @@ multiplier that would leave [0, limit] blocks the step; at its limit the row is 
 unblocked step along which the slack of the violated row does not change proves the rows
 inconsistent.
 
-The loop over samples is that of `closed_loop`, which has its mathematics.
+The loop over samples is that of `closed_loop`, which has its mathematics. Where the body that moves
+is not linear, its operations are run one after the other (`compiled_body`).
 """
 
 from __future__ import annotations
@@ -29,10 +30,12 @@ from typing import NamedTuple
 import numpy as np
 
 from impc.arrays import Buffer
+from impc.control.compiled_body import BodyTape, move_body
 from impc.control.constraint_rows import RowDirections, Rows
 from impc.jit import njit
 
 __all__ = [
+    "COMPILED_WITH",
     "CONVERGED",
     "INCONSISTENT",
     "UNSOLVED",
@@ -46,6 +49,8 @@ __all__ = [
     "workspace",
 ]
 
+#: First digits of the SHA-256 of compiled_body.py, at which numba's cache does not look.
+COMPILED_WITH = "b7a1c1ff1298a4c7"
 #: What `solve_dual` says first: an answer, rows that exclude each other, none within its steps.
 CONVERGED, INCONSISTENT, UNSOLVED = 0, 1, 2
 
@@ -338,6 +343,8 @@ def run(
     dloop: LoopMatrices,
     rows: Rows,
     drows: RowDirections,
+    body: BodyTape,
+    pushes: Buffer,
     disturbance: Buffer,
     divergence: float,
     unit: Buffer,
@@ -357,6 +364,10 @@ def run(
     ----------
     dloop, drows : LoopMatrices, RowDirections
         Derivatives of the loop and of its rows.
+    body : BodyTape
+        What moves, unless it is empty.
+    pushes : Buffer
+        What its parameters add to each derivative, (steps, n, p), or nothing, (0, n, p).
     disturbance : Buffer
         (steps, d).
     divergence : float
@@ -409,7 +420,12 @@ def run(
                     return weakly_active, row
             weakly_active += near
             _apply(loop, dloop, v, dv0, x[t], dx[t], u[t], du[t])
-        _advance(loop, dloop, plant_moves, disturbance[t], x, dx, u[t], du[t], t)
+        if len(body.code):
+            move_body(body, x[t], u[t], disturbance[t], dx[t], du[t], x[t + 1], dx[t + 1])
+            if len(pushes):
+                dx[t + 1] += pushes[t]
+        else:
+            _advance(loop, dloop, plant_moves, disturbance[t], x, dx, u[t], du[t], t)
         if local:
             dx[t + 1] = dx[0]
         size = np.max(np.abs(x[t + 1]))

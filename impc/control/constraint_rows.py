@@ -22,6 +22,7 @@ from impc.model.bounds import bound_rows
 
 if TYPE_CHECKING:
     from impc.control.controller import Controller
+    from impc.model.body import Body
 
 __all__ = ["Directions", "RowDirections", "Rows", "build_rows", "differentiate_rows", "directions"]
 
@@ -99,6 +100,8 @@ class Directions:
         Right sides b of `bound_rows` (c, p).
     x0 : Array
         Initial state (n, p).
+    bodies : tuple
+        For each direction, bodies nearby with factors (`PlantDifferential`); may be left empty.
     """
 
     A: Array
@@ -108,6 +111,7 @@ class Directions:
     S: Array
     bounds: Array
     x0: Array
+    bodies: tuple[tuple[tuple[float, Body], ...], ...] = ()
 
     @property
     def count(self) -> int:
@@ -150,7 +154,7 @@ def directions(controller: Controller, count: int, **given: Array) -> Directions
     parts = {name: np.zeros((*shape, count)) for name, shape in shapes.items()}
     for name, values in given.items():
         parts[name] = np.ascontiguousarray(values).reshape(*shapes[name], count)
-    return Directions(**parts)
+    return Directions(**parts, bodies=())
 
 
 def build_rows(controller: Controller) -> Rows:

@@ -6,6 +6,8 @@ active set's equations, docs/theory.md, section 4),
 
     du_t = L_t dx_t + G_t dtheta,      dx_{t+1} = A dx_t + B du_t + E dd_t,
 
+A, B and E being the slopes of the plant's body at the sample, where it has one,
+
 and every derivative is a pass over these: forward as written, in reverse by the adjoint
 
     p_t = xbar_t + L_t'ubar_t + (A + B L_t)'p_{t+1},     p_T = xbar_T,
@@ -25,6 +27,7 @@ import numpy as np
 
 from impc.arrays import Array, frozen
 from impc.checking import checked
+from impc.control.body_steps import slopes_along
 from impc.control.casadi_callback import Linear, Matrix, Signature, differentiable
 from impc.control.closed_loop import Scenario, prepare_loop, run_loop, scenario
 from impc.control.constraint_rows import directions
@@ -38,7 +41,6 @@ if TYPE_CHECKING:
 
     from impc.control.closed_loop import Simulation
     from impc.control.terminal_set import TerminalSet
-    from impc.model.plant import Plant
     from impc.model.riccati import LqrSolution
 
 __all__ = ["closed_loop_function"]
@@ -152,11 +154,15 @@ class _LoopOfGain:
         at = np.arange(n + m * n, count)
         dS[low[0], low[1], at] = dS[low[1], low[0], at] = 1.0
         local: Array = np.full((steps, m, count), np.nan)
+        x: Array = np.zeros((steps, n))
+        u: Array = np.zeros((steps, m))
         if made is not None:
             along = directions(made, count, x0=dx0, K=dK, S=dS)
             run, moved = run_loop(prepare_loop(made, along), _scenario(point), local=True)
             local[: run.reached] = moved.u[: run.reached]
-        return _LinearLoop(plant, local[..., :n], local[..., n:], point[1], bool(self._fixed))
+            x, u = run.x[:-1], run.u
+        slopes = slopes_along(plant, x, u, point[3])
+        return _LinearLoop(slopes, local[..., :n], local[..., n:], point[1], bool(self._fixed))
 
     def _make(self, point: list[Array]) -> Controller | None:
         K, S, x0, disturbance = point
@@ -222,9 +228,12 @@ class _RegulatorOfWeights:
 class _LinearLoop:
     """The equations of the module's text at one point."""
 
-    def __init__(self, plant: Plant, L: Array, G: Array, S: Array, fixed: bool) -> None:
-        self._B, self._E, self._L, self._G, self._fixed = plant.B, plant.E, L, G, fixed
-        self._F = plant.A + plant.B @ L  # (steps, n, n)
+    def __init__(
+        self, slopes: tuple[Array, Array, Array], L: Array, G: Array, S: Array, fixed: bool
+    ) -> None:
+        A, self._B, self._E = slopes  # (steps, n, ...)
+        self._L, self._G, self._fixed = L, G, fixed
+        self._F = A + self._B @ L  # (steps, n, n)
         self._S = (S + S.T) / 2
         self._low = np.tril_indices(len(S))
 
@@ -234,9 +243,9 @@ class _LinearLoop:
         count, steps = len(dK), len(self._F)
         theta = np.column_stack([dK.reshape(count, -1), self._scaled(dS)[:, *self._low]])
         moved = np.moveaxis(self._G @ theta.T, 1, 2)  # (steps, k, m)
-        push = moved @ self._B.T
+        push = moved @ np.swapaxes(self._B, 1, 2)
         for dd in drive:
-            push = push + np.moveaxis(dd, 0, 1) @ self._E.T
+            push = push + np.moveaxis(dd, 0, 1) @ np.swapaxes(self._E, 1, 2)
         x = np.empty((steps + 1, count, dx0.shape[1]))
         x[0] = dx0[..., 0]
         for t in range(steps):

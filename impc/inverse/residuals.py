@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.arrays import Array, frozen
+from impc.checking import replace
 from impc.control.closed_loop import Scenario, Status, prepare_loop, run_loop, simulate
 from impc.control.constraint_rows import Directions, directions
 from impc.errors import ImpcError
@@ -261,7 +262,10 @@ def _all_directions(
             part = getattr(differential, name)
             given[name] = np.zeros((*part.shape[:-1], count))
             given[name][..., layout.parameters] = part
-    return directions(controller, count, **given)
+    along = directions(controller, count, **given)
+    if differential is None:
+        return along
+    return replace(along, bodies=((),) * layout.parameters.start + differential.bodies)
 
 
 def _symmetric(columns: Array, m: int) -> Array:

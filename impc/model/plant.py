@@ -5,6 +5,8 @@
 
 u are the inputs that the controller commands, d the recorded disturbances. A plant without
 disturbances has an E with no columns. What the controller makes of it: docs/theory.md, section 1.
+A plant may also offer the body that really moves, x_{t+1} = f(x_t, u_t, d_t), whose linearisation
+at rest the matrices are: every simulation moves that one, and the controller predicts with these.
 """
 
 from __future__ import annotations
@@ -19,6 +21,7 @@ import scipy.linalg
 from impc.arrays import Array, frozen
 from impc.checking import Value, checked, replace
 from impc.errors import PlantError, brief
+from impc.model.body import Body, read_body
 from impc.model.signal_units import UNKNOWN
 
 if TYPE_CHECKING:
@@ -57,13 +60,15 @@ class Plant(Value):
         Names of signals with their units; `unit` finds one.
     words : tuple of (str, str)
         Names of signals with what they are; `word` finds one.
+    body : Body or None
+        What moves in every simulation; None where it is the linear plant itself.
 
     Raises
     ------
     PlantError
         When the matrices are missing or not finite, when an output depends directly on an input,
-        when a control is not among the inputs, a unit or words are of no signal, or when (A, B) is
-        not stabilisable.
+        when a control is not among the inputs, a unit or words are of no signal, when (A, B) is
+        not stabilisable, or the matrices are not the linearisation of the body at rest.
 
     Examples
     --------
@@ -94,6 +99,7 @@ class Plant(Value):
     outputs: tuple[str, ...]
     units: tuple[tuple[str, str], ...]
     words: tuple[tuple[str, str], ...]
+    body: Body | None
 
     @checked
     def __init__(
@@ -102,6 +108,7 @@ class Plant(Value):
         controls: Sequence[str] | None = None,
         units: Mapping[str, Any] | None = None,
         words: Mapping[str, Any] | None = None,
+        body: Any = None,
     ) -> None:
         if isinstance(system, Plant):
             self._fill(**vars(system))
@@ -115,6 +122,8 @@ class Plant(Value):
                 "controls", f"{unknown or 'none given'}: the inputs are {list(names)}", "name some"
             )
         rest = tuple(name for name in names if name not in chosen)
+        moves = getattr(system, "body", None) if body is None else body
+        order = [names.index(name) for name in (*chosen, *rest)]
         self._fill(
             A=matrices["A"],
             B=matrices["B"][:, [names.index(name) for name in chosen]],
@@ -127,8 +136,11 @@ class Plant(Value):
             outputs=tuple(system.output_labels),
             units=_texts(system, "units", units, 'unit, as in {"angle": "rad"}'),
             words=_texts(system, "words", words, 'few words, as in {"angle": "tilt of the seat"}'),
+            body=None if moves is None else read_body(moves, order, len(matrices["A"])),
         )
         _require_stabilisable(self)
+        if moves is not None:
+            _require_linearisation(self.require_discrete(), moves, matrices["B"])
 
     @property
     def n(self) -> int:
@@ -139,6 +151,15 @@ class Plant(Value):
     def m(self) -> int:
         """Number of control inputs."""
         return self.B.shape[1]
+
+    @property
+    def moves(self) -> str:
+        """Which body every simulation moves: "nonlinear" or "linear"."""
+        return "linear" if self.body is None else "nonlinear"
+
+    def linear(self) -> Plant:
+        """The same plant without a body of its own: the matrices alone move."""
+        return replace(self, body=None)
 
     def unit(self, name: str) -> str:
         """The unit of a signal by its `name`; "SI" where it is not known."""
@@ -172,7 +193,7 @@ class Plant(Value):
 
 @checked(T="n n", G="m m")
 def change_coordinates(plant: Plant, T: Array, G: Array | None = None) -> Plant:
-    """Return the plant in z = T^-1 x and v = G^-1 u, T (n, n) and G (m, m); names stay."""
+    """Return the linear plant in z = T^-1 x and v = G^-1 u, T (n, n), G (m, m); names stay."""
     back = np.linalg.inv(T)
     inputs = np.eye(plant.m) if G is None else G
     return replace(
@@ -181,6 +202,7 @@ def change_coordinates(plant: Plant, T: Array, G: Array | None = None) -> Plant:
         B=frozen(back @ plant.B @ inputs),
         E=frozen(back @ plant.E),
         C=frozen(plant.C @ T),
+        body=None,
     )
 
 
@@ -222,6 +244,27 @@ def _sample_time(dt: object) -> float:
     if dt is True:
         return 1.0
     return float(dt)  # type: ignore[arg-type]  # python-control: a number from here on
+
+
+def _require_linearisation(plant: Plant, body: Any, B: Array) -> None:
+    """At rest the body stays there, and its slopes are A and B (n, all inputs), to a thousandth.
+
+    By central differences with a step of 1e-4: their error is of the body's curvature times 1e-8.
+    """
+    n, count = B.shape
+    step = 1e-4 * np.eye(n + count)
+    states, inputs = (np.hstack([part, -part]) for part in np.split(step, [n]))
+    moved = body.map(2 * (n + count))(states, inputs).full()
+    found = (moved[:, : n + count] - moved[:, n + count :]) / 2e-4
+    wanted = np.hstack([plant.A, B])
+    sizes = np.maximum(np.max(np.abs(wanted), axis=0), 1e-300)
+    rest = body(0, 0).full()
+    if not np.max(np.abs(rest)) <= 1e-9 or not np.max(np.abs(found - wanted) / sizes) <= 1e-3:
+        raise PlantError(
+            "plant.body",
+            "has another linearisation at rest than A and B",
+            "linearise it there, with the order of its states and inputs",
+        )
 
 
 def _of_length_one(B: Array) -> Array:

@@ -22,6 +22,7 @@ from impc.errors import InputError, PlantError
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    from impc.model.body import Body
     from impc.model.plant import Plant
 
 __all__ = ["PlantDifferential", "PlantFamily", "plant_at", "plant_differential"]
@@ -91,6 +92,12 @@ class PlantFamily(Frozen):
         for field, given in (("make", make), ("names", tuple(names)), ("nominal", frozen(nominal))):
             object.__setattr__(self, field, given)
 
+    def linear(self) -> PlantFamily:
+        """The same family without bodies of their own: the matrices alone move."""
+        return PlantFamily(
+            lambda values: self.make(values).linear(), self.names, self.nominal.tolist()
+        )
+
 
 class PlantDifferential(NamedTuple):
     """Derivatives of A, B, E and C with respect to the logarithms; the parameters' axis is last.
@@ -99,12 +106,16 @@ class PlantDifferential(NamedTuple):
     ----------
     A, B, E, C : Array
         (n, n, k), (n, m, k), (n, d, k) and (p, n, k).
+    bodies : tuple
+        For each parameter, bodies nearby with their factors: the sum of what they do at a sample is
+        the derivative of the plant's own. Empty where it has none.
     """
 
     A: Array
     B: Array
     E: Array
     C: Array
+    bodies: tuple[tuple[tuple[float, Body], ...], ...]
 
 
 @checked(logarithms="*")
@@ -124,25 +135,32 @@ def plant_differential(family: PlantFamily, logarithms: Array) -> PlantDifferent
         When the plant jumps as a parameter moves by a thousandth.
     """
     parts: list[tuple[Array, ...]] = []
+    bodies: list[tuple[tuple[float, Body], ...]] = []
     for index, name in enumerate(family.names):
-        coarse = _central(family, logarithms, index, _STEP)
-        fine = _central(family, logarithms, index, _STEP / 2)
+        coarse, far = _central(family, logarithms, index, _STEP)
+        fine, near = _central(family, logarithms, index, _STEP / 2)
         for one, other in zip(coarse, fine, strict=True):
             if np.max(np.abs(one - other), initial=0) > _ROUGH * np.max(np.abs(other), initial=0):
                 raise PlantError(
                     f"parameter {name}", "the plant is not smooth in it", "do not free it"
                 )
         parts.append(tuple((4 * b - a) / 3 for a, b in zip(coarse, fine, strict=True)))
-    stacked = [np.stack(group, axis=-1) for group in zip(*parts, strict=True)]
-    return PlantDifferential(*stacked)
+        shares = [(4 / 3 * factor, body) for factor, body in near]
+        bodies.append((*shares, *((-factor / 3, body) for factor, body in far)))
+    A, B, E, C = (np.stack(group, axis=-1) for group in zip(*parts, strict=True))
+    return PlantDifferential(A, B, E, C, tuple(bodies))
 
 
 def _central(
     family: PlantFamily, logarithms: Array, index: int, step: float
-) -> tuple[Array, Array, Array, Array]:
+) -> tuple[tuple[Array, ...], tuple[tuple[float, Body], ...]]:
+    """Central differences of the matrices, and the two bodies with their factors."""
     shift = np.zeros(len(family.names))
     shift[index] = step
     above, below = plant_at(family, logarithms + shift), plant_at(family, logarithms - shift)
     pairs = ((above.A, below.A), (above.B, below.B), (above.E, below.E), (above.C, below.C))
-    a, b, e, c = ((up - down) / (2 * step) for up, down in pairs)
-    return a, b, e, c
+    ends = ((1 / (2 * step), above.body), (-1 / (2 * step), below.body))
+    return (
+        tuple((up - down) / (2 * step) for up, down in pairs),
+        tuple((factor, body) for factor, body in ends if body is not None),
+    )

@@ -27,7 +27,7 @@ from impc.reporting.writer import owned, write_files
 from impc.studies.methods_table import column_terms, methods_data, methods_table
 from impc.studies.optimal_fit.report import optimal_report
 from impc.studies.optimal_fit.result import OptimalFit
-from impc.studies.signal_words import signal_words
+from impc.studies.signal_words import body_sentence, signal_words
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -131,6 +131,7 @@ def _document(fit: MethodFit) -> Report:
                 "3. Versions",
                 (
                     f"{provenance.made}; {provenance.all_versions}.",
+                    body_sentence(estimate.problem.plant),
                     f"Quadratic programs: solved by {described(estimate.problem.solver)}.",
                 ),
             ),
@@ -143,6 +144,7 @@ def _document(fit: MethodFit) -> Report:
             "controls": estimate.problem.plant.controls,
             "outputs": estimate.problem.plant.outputs,
             "horizon": estimate.problem.horizon,
+            "body": estimate.problem.plant.moves,
             "solver": estimate.problem.solver,
             "starts": estimate.problem.starts,
             "logarithms": estimate.problem.logarithms,

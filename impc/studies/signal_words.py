@@ -1,4 +1,4 @@
-"""What the signals of a plant are, in words: how a page's glossary begins (docs/units.md)."""
+"""What a plant and its signals are, in words: for the end of every page (docs/units.md)."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from impc.model.plant import Plant
 
-__all__ = ["signal_words"]
+__all__ = ["body_sentence", "signal_words"]
 
 
 def signal_words(plant: Plant) -> tuple[tuple[str, str], ...]:
@@ -17,4 +17,14 @@ def signal_words(plant: Plant) -> tuple[tuple[str, str], ...]:
         (name, f"{words[0].upper()}{words[1:]}, in {plant.unit(name)}.")
         for name in names
         if (words := plant.word(name))
+    )
+
+
+def body_sentence(plant: Plant) -> str:
+    """Which body every simulation of a page moved, that of a `plant` or its matrices."""
+    if plant.body is None:
+        return "What moves is the linear plant, by which the controller predicts too."
+    return (
+        "What moves are the plant's own equations, which are not linear; the controller predicts "
+        "by their linearisation at rest."
     )

@@ -87,6 +87,14 @@ unit = "1"
 """
 
 
+PLACE, PUSH = casadi.SX.sym("place"), casadi.SX.sym("push")
+
+
+def with_body(body: Any) -> Plant:
+    """A plant of one state with a body of its own."""
+    return Plant(control.ss([[0.9]], [[1]], [[1]], 0, 0.1), body=body)
+
+
 def damaged(name: str) -> Callable[[Path], None]:
     """Read one of the damaged recordings of tests/files."""
 
@@ -642,6 +650,16 @@ PROVOKED: dict[str, Callable[[Path], object]] = {
     "is continuous, a discrete one is needed": lambda _: Plant(
         control.ss([[-1]], [[1]], [[1]], 0)
     ).require_discrete(),
+    "plant.body: expected a casadi.Function, got ...": lambda _: with_body(3.0),
+    "plant.body: takes ... and gives ...": lambda _: with_body(
+        casadi.Function("f", [PLACE], [PLACE])
+    ),
+    "plant.body: has the operation ...; write it without": lambda _: with_body(
+        casadi.Function("f", [PLACE, PUSH], [0.9 * PLACE + PUSH * casadi.erf(PLACE)])
+    ),
+    "plant.body: has another linearisation at rest than A and B": lambda _: with_body(
+        casadi.Function("f", [PLACE, PUSH], [PLACE + PUSH])
+    ),
     "plant.D: is not zero": lambda _: Plant(control.ss([[0.5]], [[1]], [[1]], 1, 0.1)),
     "is not stabilisable: no input reaches the mode ...": lambda _: Plant(
         control.ss([[2, 0], [0, 0.5]], [[0], [1]], np.eye(2), 0, 0.1)

@@ -23,7 +23,7 @@ from impc.reporting.rendering import number
 from impc.reporting.shown_units import axis_label
 from impc.reporting.style import BLUE, DOUBLE_COLUMN, INK, drawn, journal_style, new_figure
 from impc.studies.methods_table import column_terms, methods_data, methods_numbers, methods_table
-from impc.studies.signal_words import signal_words
+from impc.studies.signal_words import body_sentence, signal_words
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -81,6 +81,7 @@ def compare_report(
                     [
                         ("Made", (provenance.made,)),
                         ("Plant", (Markup("<code>{}</code>").format(provenance.plant_name),)),
+                        ("Body", (body_sentence(problem.plant),)),
                         ("Quadratic programs", (f"Solved by {described(problem.solver)}.",)),
                         ("Versions", (provenance.all_versions,)),
                     ]
@@ -205,5 +206,6 @@ def _data(problem: Problem, compared: Sequence[MethodFit]) -> dict[str, Any]:
         "states": problem.plant.states,
         "outputs": problem.plant.outputs,
         "horizon": problem.horizon,
+        "body": problem.plant.moves,
         "solver": problem.solver,
     }

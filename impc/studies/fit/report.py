@@ -46,7 +46,7 @@ from impc.studies.fit.tables import (
 from impc.studies.fit.truth import truth_sentence, truth_table
 from impc.studies.fit.verdict import abstract, verdict
 from impc.studies.methods_table import column_terms, methods_table
-from impc.studies.signal_words import signal_words
+from impc.studies.signal_words import body_sentence, signal_words
 
 if TYPE_CHECKING:
     from impc.arrays import Array
@@ -257,6 +257,7 @@ def _made(result: FitResult, provenance: Provenance) -> list[Block]:
                         ),
                     ),
                 ),
+                ("Body", (body_sentence(plant),)),
                 (
                     "Quadratic programs",
                     (f"Solved by {described(result.fitted.problem.solver)}.",),

@@ -3,6 +3,8 @@
     vaf.<output>, held_out_vaf.<output>      %, all trials; the mean of the trials left out
     states, controls, outputs, disturbances  names, in the order of every array below
     units.<signal>                           where the plant says them
+    body                                     "nonlinear" where the plant's own equations moved, or
+                                             "linear"
     solver                                   what solved the quadratic programs
     K, S, Q, R, P, horizon, bounds           the controller of the weights, at R[0][0] = 1
     weights_rule                             which of all weights with this gain Q and R are; those
@@ -76,6 +78,7 @@ def _controller(result: FitResult) -> dict[str, Any]:
         "weights_rule": result.intent.reported.rule,
         "P": result.reported_P,
         "horizon": result.fitted.problem.horizon,
+        "body": plant.moves,
         "solver": result.fitted.problem.solver,
         "bounds": {name: getattr(bounds, name) for name in ("x_min", "x_max", "u_min", "u_max")},
     }

@@ -168,6 +168,9 @@ class FitSettings:
         What may be costed: the table [fit.structure]. None: any weights, and no word on it.
     structures : list of StructureSettings
         Others, to compare it with.
+    body : str
+        What moves in every simulation: "nonlinear", the equations that the plant offers, where it
+        does, or "linear", its matrices in any case.
     solver : str
         What solves the controller's quadratic programs (`impc.control.named_solver`).
     observer : ObserverSettings or None
@@ -200,6 +203,7 @@ class FitSettings:
     methods: list[str] = field(default_factory=lambda: list(BESIDE))
     structure: StructureSettings | None = None
     structures: list[StructureSettings] = field(default_factory=list)
+    body: Literal["nonlinear", "linear"] = "nonlinear"
     solver: str = COMPILED
     observer: ObserverSettings | None = None
 

@@ -137,6 +137,8 @@ def fit_problem(
             f"the shortest has {shortest} samples, {least} serve to find where it starts",
             "give longer ones, or lower [fit] settle",
         )
+    if settings.body == "linear":
+        plant, family = plant.linear(), None if family is None else family.linear()
     return Problem(
         plant,
         fit_bounds(plant, settings, recordings),

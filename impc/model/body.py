@@ -1,0 +1,134 @@
+"""The body that moves, where it is not linear: x_{k+1} = f(x_k, u_k, d_k) as a list of operations.
+
+A plant may offer its own equations beside the matrices by which its controller predicts them
+(docs/nonlinear.md, "A body that is not linear"). They come as a `casadi.Function` and are kept as
+the list of its scalar operations: arrays, which the compiled loop runs and differentiates sample by
+sample, without a compiler, and which can be compared, kept and sent. Parameters are among the
+constants of the list.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+
+from impc.arrays import Array, IntArray, frozen
+from impc.checking import Value
+from impc.errors import PlantError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+__all__ = ["OPERATIONS", "Body", "read_body"]
+
+#: Names of the operations in CasADi, without OP_; the compiled loop knows them by their places.
+OPERATIONS = (
+    *("OUTPUT", "MUL", "ADD", "SUB", "DIV", "NEG", "SQ", "TWICE", "SIN", "COS", "TAN", "SQRT"),
+    *("INV", "EXP", "LOG", "POW", "CONSTPOW", "FABS", "SIGN", "TANH", "SINH", "COSH", "ASIN"),
+    *("ACOS", "ATAN", "ATAN2", "FMIN", "FMAX", "LT", "LE", "EQ", "NE", "NOT", "AND", "OR"),
+    *("IF_ELSE_ZERO", "ASSIGN", "HYPOT", "LOG1P", "EXPM1"),
+)
+
+
+@dataclass(frozen=True)
+class Body(Value):
+    """The operations of one sample of a body.
+
+    A value has a slot. The first slots hold the constants, those behind them the states, inputs
+    and disturbances, the rest what is computed.
+
+    Attributes
+    ----------
+    code : IntArray
+        (k, 4): operation, by its place in `OPERATIONS`; slot of the answer (of an OUTPUT, the
+        state that it is); slots of its two operands, of which one may not be used.
+    constants : Array
+        (c,).
+    slots : int
+        How many there are.
+    """
+
+    _rules: ClassVar[Mapping[str, Any]] = {"constants": "*", "slots": 1}
+
+    code: IntArray
+    constants: Array
+    slots: int
+
+
+def read_body(function: Any, order: Sequence[int], n: int) -> Body:
+    """The operations of a function (state, input) -> next state.
+
+    Parameters
+    ----------
+    function : casadi.Function
+        Of the states (n) and of all inputs in the order of their `control.StateSpace`.
+    order : sequence of int
+        Which of those inputs are the controls, then which are the disturbances.
+    n : int
+        Number of states.
+
+    Raises
+    ------
+    PlantError
+        When it is no such function, or has operations that are not in `OPERATIONS`.
+    """
+    import casadi as ca  # noqa: PLC0415  # a third of a second, and most plants have no body
+
+    if not isinstance(function, ca.Function):
+        kind = type(function).__name__
+        raise PlantError("plant.body", f"expected a casadi.Function, got {kind}", "see docs")
+    sizes = [function.size_in(i) for i in range(function.n_in())]
+    wanted = [(n, 1), (len(order), 1)]
+    if sizes != wanted or function.n_out() != 1 or function.size_out(0) != (n, 1):
+        raise PlantError(
+            "plant.body",
+            f"takes {sizes} and gives {function.n_out()} of {function.size_out(0)}",
+            f"make it (states {wanted[0]}, inputs {wanted[1]}) -> next states",
+        )
+    given = ca.SX.sym("given", n + len(order))
+    inputs = ca.vertcat(*(given[n + list(order).index(k)] for k in range(len(order))))
+    ahead = ca.densify(function.expand()(given[:n], inputs))
+    return _listed(ca.Function("body", [given], [ahead], {"cse": True}), n + len(order))
+
+
+def _listed(function: Any, given: int) -> Body:
+    """The operations of a function of one vector, of SX expressions."""
+    names = _names()
+    code: list[tuple[int, int, int, int]] = []
+    count = function.n_instructions()
+    kinds = [function.instruction_id(k) for k in range(count)]
+    called = [names.get(kind, str(kind)) for kind in kinds]
+    constants = [function.instruction_constant(k) for k in range(count) if called[k] == "CONST"]
+    first, met = len(constants) + given, 0
+    where: dict[int, int] = {}  # slot of each register of the function
+    for k, name in enumerate(called):
+        to = function.instruction_output(k)
+        if name == "CONST":
+            where[to[0]] = met
+            met += 1
+        elif name == "INPUT":
+            where[to[0]] = len(constants) + function.instruction_input(k)[1]
+        elif name in OPERATIONS:
+            read = [where[register] for register in function.instruction_input(k)]
+            if name != "OUTPUT":
+                where[to[0]] = first + to[0]
+            slot = to[1] if name == "OUTPUT" else where[to[0]]
+            code.append((OPERATIONS.index(name), slot, read[0], read[-1]))
+        else:
+            raise PlantError("plant.body", f"has the operation {name}", "write it without")
+    table = np.array(code, dtype=np.int64).reshape(-1, 4)
+    table.flags.writeable = False
+    return Body(table, frozen(constants), first + function.sz_w())
+
+
+@functools.cache
+def _names() -> dict[int, str]:
+    """CasADi's numbers of operations with their names."""
+    import casadi as ca  # noqa: PLC0415  # as above
+
+    found = {getattr(ca, f"OP_{name}"): name for name in (*OPERATIONS, "CONST", "INPUT")}
+    others = {getattr(ca, name): name[3:] for name in dir(ca) if name.startswith("OP_")}
+    return {**others, **found}

@@ -1,0 +1,247 @@
+"""The loop with a body that is not linear: its trajectory, and its derivatives."""
+
+from __future__ import annotations
+
+import hashlib
+
+import casadi as ca
+import control
+import numpy as np
+import pytest
+import scipy.integrate
+
+from impc.arrays import Array
+from impc.checking import replace
+from impc.cli.seat import seat_controller
+from impc.control.body_steps import next_state, slopes_along
+from impc.control.casadi_controller import build_mpc, simulate_mpc
+from impc.control.closed_loop import (
+    Scenario,
+    Status,
+    scenario,
+    simulate,
+    simulate_and_differentiate,
+)
+from impc.control.compiled_loop import COMPILED_WITH
+from impc.control.constraint_rows import directions
+from impc.control.controller import Controller
+from impc.control.loop_function import closed_loop_function
+from impc.inverse.methods import estimate
+from impc.inverse.problem import Problem
+from impc.inverse.residuals import evaluate, residual_only
+from impc.model.bounds import Bounds, bound_rows
+from impc.model.plant import Plant
+from impc.model.recordings import Recording
+from impc.model.weights import Weights
+from plants.seated_balance import nonlinear_dynamics
+from plants.seated_subject import seated_parameters_for
+from tests.control.hanging_body import linear_body, pendulum, pendulum_family
+from tests.documents.blocks import ROOT
+
+STEPS = 60
+PUSH = np.repeat(np.random.default_rng(3).choice([-1.0, 0.0, 1.0], STEPS // 6), 6)[:, None]
+START = np.array([0.6, -0.4])
+
+
+def test_the_loop_was_compiled_with_this_body() -> None:
+    """numba's cache of the loop does not see a change of the operations: COMPILED_WITH does."""
+    source = (ROOT / "impc" / "control" / "compiled_body.py").read_bytes()
+    assert hashlib.sha256(source).hexdigest()[:16] == COMPILED_WITH
+
+
+def law(plant: Plant, limit: float = 1.5, rate: float = np.inf) -> Controller:
+    bounds = Bounds(plant, u_min=-limit, u_max=limit, x_min=[-9, -rate], x_max=[9, rate])
+    weights = Weights(np.diag([3.0, 1.0]), 0.2)
+    return Controller(plant, weights, bounds, 8, terminal_set=False, softening=50.0)
+
+
+def drive(plant: Plant) -> Scenario:
+    return scenario(plant, START, disturbance=PUSH)
+
+
+def test_every_operation_and_its_slopes_are_casadis() -> None:
+    """Each where it is smooth, at 50 points, in a body that adds them up."""
+    x, w = ca.SX.sym("x", 2), ca.SX.sym("w", 2)
+    a, b = x[0] + 0.3, x[1] * w[0] + 0.2
+    terms = [
+        a / b, -a, a * a, a + a, ca.sin(a), ca.cos(a), ca.tan(a), ca.sqrt(a), 1 / a, ca.exp(b),
+        ca.log(a), a**b, a**3.7, ca.fabs(b), ca.sign(b), ca.tanh(a), ca.sinh(b), ca.cosh(b),
+        ca.asin(b), ca.acos(b), ca.atan(a), ca.atan2(a, b), ca.fmin(a, b), ca.fmax(a, b),
+        a * (a < b), b * (a <= b), ca.if_else(a == b, a, b), ca.if_else(a != b, a, b),
+        a * ca.logic_not(a < b), b * ca.logic_and(a > 0.4, b < 0.3),
+        a * ca.logic_or(a > 0.4, b < 0.3), ca.hypot(a, b), ca.log1p(a), ca.expm1(b), a - b,
+    ]  # fmt: skip
+    weights = np.cos(np.arange(len(terms)))
+    total = sum(weight * term for weight, term in zip(weights, terms, strict=True))
+    # No slopes and no value at rest, so that it is a body; products of squares leave all in place.
+    ahead = ca.vertcat(0.5 * x[0] + w[0], w[1] + total * x[0] ** 2)
+    inputs = ["u", "d"]
+    system = control.ss([[0.5, 0], [0, 0]], np.eye(2), np.eye(2), 0, 0.1, inputs=inputs)
+    function = ca.Function("f", [x, w], [ahead])
+    plant = Plant(system, ["u"], body=function)
+    rng = np.random.default_rng(1)
+    points = rng.uniform(0.05, 0.6, (50, 4))
+    given = points[:, :2], points[:, 2:3], points[:, 3:]
+    names = ca.Function("j", [x, w], [ca.jacobian(ahead, ca.vertcat(x, w))])
+    expected = np.array([names(point[:2], point[2:]).full() for point in points])
+    found = np.concatenate(slopes_along(plant, *given), axis=2)
+    assert np.allclose(found, expected, rtol=1e-12, atol=1e-12)
+    for state, u, d, point in zip(*given, points, strict=True):
+        exact = function(point[:2], point[2:]).full().ravel()
+        assert np.allclose(next_state(plant, state, u, d), exact, rtol=1e-13)
+
+
+@pytest.mark.parametrize("rate", [np.inf, 0.4])
+def test_derivatives_equal_central_differences_with_active_bounds(rate: float) -> None:
+    """By gain, limit and initial state. Largest difference found: 3e-9 of the largest entry."""
+    plant = pendulum()
+    controller = law(plant, rate=rate)
+    along = directions(
+        controller,
+        5,
+        K=np.eye(2, 5),
+        x0=np.eye(2, 5, 2),
+        bounds=np.outer(_on_inputs(controller), np.eye(5)[4]),
+    )
+    run, moved = simulate_and_differentiate(controller, drive(plant), along)
+    assert run.complete
+    assert 0.2 < np.mean(run.status > Status.FREE) < 0.9
+    # Without a bound on it the rate comes to 0.55; with one at 0.4 the push takes it to 0.50.
+    assert (np.max(np.abs(run.x[1:, 1])) < 0.5) == np.isfinite(rate)
+
+    def at(step: Array) -> Array:
+        limit = 1.5 + step[4]
+        made = Controller.from_gain(
+            plant, np.array(controller.K) + step[:2], law(plant, limit, rate).bounds, 8,
+            terminal_set=False, softening=50.0,
+        )  # fmt: skip
+        return np.array(simulate(made, scenario(plant, START + step[2:4], disturbance=PUSH)).x)
+
+    for index, unit in enumerate(1e-6 * np.eye(5)):
+        slope = (at(unit) - at(-unit)) / 2e-6
+        assert np.max(np.abs(slope - moved.x[..., index])) <= 1e-6 * np.max(np.abs(slope))
+
+
+def _on_inputs(controller: Controller) -> Array:
+    return np.where(bound_rows(controller.bounds, controller.plant).on_state, 0.0, 1.0)
+
+
+def test_parameters_move_the_body_as_differences_say() -> None:
+    """Stiffness and damping are in the matrices and in the body; 1e-10 of the largest was found."""
+    family = pendulum_family()
+    plant = pendulum()
+    controller = law(plant)
+    run = simulate(controller, drive(plant))
+    trial = Recording(plant, run.x @ plant.C.T, np.vstack([PUSH, PUSH[-1:]]), START)
+    problem = Problem(
+        plant, controller.bounds, 8, [trial], terminal_set=False, family=family, unknown_start=True
+    )
+    K, S = np.array(controller.K), np.array(controller.S)
+    found = evaluate(problem, K, S)
+    for index, unit in enumerate(1e-5 * np.eye(2)):
+        ends = [residual_only(problem.at(problem.starts, sign * unit), K, S) for sign in (1, -1)]
+        slope = (ends[0] - ends[1]) / 2e-5
+        assert np.max(np.abs(slope)) > 0.1
+        assert np.allclose(found.dparameters[:, index], slope, atol=1e-6 * np.max(np.abs(slope)))
+
+
+@pytest.mark.parametrize("limit", [0.7, 1e3])
+def test_a_linear_body_is_the_linear_plant(limit: float) -> None:
+    """Trajectory and derivatives, and what a fit finds; saturated and not."""
+    plant = pendulum().linear()
+    twin = linear_body(plant)
+    mild = PUSH / 2
+    K = np.array(law(plant).K)
+    runs, fits = [], []
+    for one in (plant, twin):
+        controller = Controller.from_gain(one, K, law(one, limit).bounds, 8, terminal_set=False)
+        along = directions(controller, 4, K=np.eye(2, 4), x0=np.eye(2, 4, 2))
+        given = scenario(one, [0.1, 0.0], disturbance=mild)
+        runs.append(simulate_and_differentiate(controller, given, along))
+        clean = runs[0][0].x @ plant.C.T
+        noise = 1e-3 * np.random.default_rng(0).standard_normal(clean.shape)
+        trial = Recording(one, clean + noise, np.vstack([mild, mild[-1:]]), [0.1, 0.0])
+        problem = Problem(one, controller.bounds, 8, [trial], terminal_set=False)
+        fits.append(estimate(problem))
+    (run, moved), (twin_run, twin_moved) = runs
+    assert np.any(run.status > Status.FREE) == (limit < 1)
+    assert np.allclose(run.x, twin_run.x, atol=1e-12)
+    assert np.allclose(moved.x, twin_moved.x, atol=1e-11)
+    assert np.allclose(fits[0].gain, fits[1].gain, rtol=1e-6)
+
+
+def test_a_sample_of_the_seat_is_that_of_another_integrator() -> None:
+    """The closed loop at up to 10 degrees: each step by DOP853 from the state before it.
+
+    Largest difference found: 1e-8 rad, 7e-7 rad/s, where the linear plant is off by 7e-3 rad/s.
+    """
+    controller = seat_controller({}, 40.0)
+    plant = controller.plant
+    torque = np.repeat([[15.0], [-15.0], [15.0]], 25, axis=0)
+    run = simulate(controller, scenario(plant, np.zeros(plant.n), disturbance=torque))
+    assert np.degrees(np.max(np.abs(run.x[:, :2]))) > 6
+    exact, drift = nonlinear_dynamics(seated_parameters_for()), []
+    for k in range(0, 75, 5):
+        held = np.append(run.u[k], torque[k])
+
+        def rates(_: float, x: Array, held: Array = held) -> Array:
+            return np.ravel(exact(x, held).full())
+
+        ahead = scipy.integrate.solve_ivp(
+            rates, (0, plant.dt), np.array(run.x[k]), method="DOP853", rtol=1e-12, atol=1e-13
+        ).y[:, -1]
+        assert np.allclose(run.x[k + 1], ahead, rtol=0, atol=1e-6)
+        drift.append(plant.A @ run.x[k] + plant.B @ run.u[k] + plant.E @ torque[k] - ahead)
+    assert np.max(np.abs(drift)) > 1e-3
+
+
+def test_the_linearisation_of_the_seats_body_is_its_plant() -> None:
+    plant = seat_controller({}, 6.0).plant
+    still = np.zeros((1, plant.n)), np.zeros((1, plant.m)), np.zeros((1, 1))
+    for found, exact in zip(slopes_along(plant, *still), (plant.A, plant.B, plant.E), strict=True):
+        assert np.allclose(found[0], exact, rtol=0, atol=1e-14)
+
+
+def test_other_solvers_and_casadis_controller_move_the_same_body() -> None:
+    plant = pendulum()
+    controller = law(plant)
+    run = simulate(controller, drive(plant))
+    other = simulate(replace(controller, solver="daqp"), drive(plant))
+    assert np.allclose(other.x, run.x, atol=1e-8)
+    assert np.allclose(
+        simulate_mpc(build_mpc(controller, "qpoases"), drive(plant)).x, run.x, atol=1e-6
+    )
+    assert (
+        np.max(np.abs(simulate(replace(controller, plant=plant.linear()), drive(plant)).x - run.x))
+        > 1e-2
+    )
+
+
+def test_the_loop_function_differentiates_through_the_body() -> None:
+    """By the gain, the start and the push, forward and in reverse."""
+    plant = pendulum()
+    controller = law(plant)
+    loop = closed_loop_function(controller, STEPS)
+    K, x0, d = ca.MX.sym("K", 1, 2), ca.MX.sym("x0", 2), ca.MX.sym("d", STEPS, 1)
+    x, _ = loop(K, 1, x0, d)
+    last = x[-1, :].T
+    slope = ca.Function(
+        "slope", [K, x0, d], [ca.jacobian(last, K), ca.jacobian(last, x0), ca.gradient(x[-1, 0], d)]
+    )
+    at = np.array(controller.K), START, PUSH
+    by_gain, by_start, by_push = (part.full() for part in slope(*at))
+
+    def end(gain: Array, start: Array, push: Array) -> Array:
+        return np.ravel(loop(gain, 1, start, push)[0][-1, :].full())
+
+    h = 1e-6
+    for index, unit in enumerate(h * np.eye(2)):
+        moved = end(at[0] + unit, START, PUSH) - end(at[0] - unit, START, PUSH)
+        assert np.allclose(by_gain[:, index], moved / (2 * h), rtol=1e-5, atol=1e-7)
+        moved = end(at[0], START + unit, PUSH) - end(at[0], START - unit, PUSH)
+        assert np.allclose(by_start[:, index], moved / (2 * h), rtol=1e-5, atol=1e-7)
+    for k in (0, 20, 45, 59):
+        push = np.zeros_like(PUSH)
+        push[k] = h
+        moved = end(at[0], START, PUSH + push) - end(at[0], START, PUSH - push)
+        assert np.allclose(by_push[k, 0], moved[0] / (2 * h), rtol=1e-5, atol=1e-7)

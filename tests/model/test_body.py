@@ -1,0 +1,78 @@
+"""A plant's own body: how it is read, and what is refused."""
+
+from __future__ import annotations
+
+import pickle
+from typing import Any
+
+import casadi as ca
+import control
+import numpy as np
+import pytest
+
+from impc.errors import PlantError
+from impc.files.digests import digest
+from impc.model.plant import Plant
+from tests.control.hanging_body import linear_body, pendulum
+
+X, W = ca.SX.sym("x", 2), ca.SX.sym("w", 2)
+A, B = np.array([[1.0, 0.1], [0.2, 0.97]]), np.array([[0.0, 0.0], [0.1, 0.1]])
+LINEAR = ca.DM(A) @ X + ca.DM(B) @ W
+
+
+def system(dt: float = 0.1) -> Any:
+    return control.ss(A, B, [[1.0, 0.0]], 0, dt, inputs=["push", "torque"])
+
+
+@pytest.mark.parametrize(
+    ("body", "words"),
+    [
+        (3.0, "expected a casadi.Function"),
+        (ca.Function("f", [X], [X]), r"make it \(states \(2, 1\), inputs \(2, 1\)\)"),
+        (ca.Function("f", [X, W], [LINEAR, W]), "takes"),
+        (ca.Function("f", [X, W], [LINEAR + 1e-6]), "another linearisation"),
+        (ca.Function("f", [X, W], [LINEAR + 0.01 * X[0]]), "another linearisation"),
+        (ca.Function("f", [X, W], [LINEAR + ca.erf(X[0]) * X[0]]), "has the operation ERF"),
+    ],
+)
+def test_what_is_no_body_is_refused(body: Any, words: str) -> None:
+    with pytest.raises(PlantError, match=words):
+        Plant(system(), ["torque"], body=body)
+
+
+def test_the_order_of_the_inputs_is_that_of_the_system() -> None:
+    """The push comes first there and last in the plant; exchanged, the linearisation is another."""
+    tilted = np.array([[0.0, 0.0], [0.1, 0.3]])
+    given = control.ss(A, tilted, [[1.0, 0.0]], 0, 0.1, inputs=["push", "torque"])
+    ahead = ca.DM(A) @ X + ca.DM(tilted) @ W
+    assert Plant(given, ["torque"], body=ca.Function("f", [X, W], [ahead])).moves == "nonlinear"
+    exchanged = ca.DM(A) @ X + ca.DM(tilted[:, ::-1]) @ W
+    with pytest.raises(PlantError, match="order of its states and inputs"):
+        Plant(given, ["torque"], body=ca.Function("f", [X, W], [exchanged]))
+
+
+def test_a_body_is_of_a_sampled_plant() -> None:
+    with pytest.raises(PlantError, match="is continuous"):
+        Plant(system(0.0), ["torque"], body=ca.Function("f", [X, W], [LINEAR]))
+
+
+def test_what_is_no_expression_is_refused() -> None:
+    given, z = (ca.MX.sym("x", 2), ca.MX.sym("w", 2)), ca.MX.sym("z")
+    known = ca.MX.sym("known")
+    equation = {"x": z, "p": known, "g": z - ca.sin(known)}
+    solved = ca.rootfinder("solved", "newton", equation)(p=given[0][0])["x"]
+    ahead = ca.DM(A) @ given[0] + ca.DM(B) @ given[1] + solved**2
+    with pytest.raises(PlantError, match="has the operation CALL"):
+        Plant(system(), ["torque"], body=ca.Function("f", [*given], [ahead]))
+
+
+def test_a_body_is_a_value() -> None:
+    """It can be sent and compared; parameters count; without it the plant is linear."""
+    plant = pendulum()
+    sent = pickle.loads(pickle.dumps(plant))
+    assert digest(sent) == digest(plant) != digest(pendulum(2.1)) != digest(plant.linear())
+    assert plant.body is not None
+    assert not plant.body.constants.flags.writeable
+    assert not sent.body.code.flags.writeable
+    assert (plant.moves, plant.linear().moves) == ("nonlinear", "linear")
+    assert linear_body(plant).moves == "nonlinear"
