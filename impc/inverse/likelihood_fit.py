@@ -1,16 +1,7 @@
 """A person who senses with noise, by maximum likelihood.
 
-The search starts from a fit that takes all that it does not explain for noise in the recorder. It
-climbs by Fisher's scoring in a box: with g the gradient of the log-likelihood, I the expected
-information, the step is that of
-
-    maximise  g's - s'I s / 2    over  |s_i| <= radius
-
-and the radius follows from what the step brings. A box, because a level that is all but none may
-slide as far as it likes while all else takes its step: a step scaled as a whole crept for hundreds
-of rounds. Noisy recordings leave some directions of the gain all but free; a weak normal prior in
-natural coordinates keeps those where the first fit was, as in `gain_search`, and a barrier keeps
-gains that stabilise from the border of those that do not (docs/noisy-people.md).
+The search starts from a fit that takes all that it does not explain for noise in the recorder, with
+levels that what this leaves suggests, and climbs from there (`likelihood_search`).
 """
 
 from __future__ import annotations
@@ -19,13 +10,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.linalg import solve_triangular
-from scipy.optimize import lsq_linear
 
 from impc.arrays import Array, Frozen, frozen
 from impc.checking import checked
 from impc.errors import ImpcError, SolverError
 from impc.inverse.coordinates import Coordinates
+from impc.inverse.likelihood_search import Prior, climb, reach
 from impc.inverse.person_coordinates import PersonCoordinates
 from impc.inverse.residuals import residual_only
 from impc.inverse.structured_search import PriceCoordinates
@@ -44,23 +34,6 @@ __all__ = ["PersonFit", "fit_person"]
 # The likeliest is taken. On a seat whose recorder has a thirtieth of the residual the search had
 # not ended after 40 steps (docs/noisy-people.md).
 _STARTS = ((0.7, 0.5, 0.3), (0.3, 0.3, 0.9), (0.7, 0.1, 0.3), (0.1, 0.1, 1.0))
-# A search ends when a step promises less: a hundredth of a deviation along any direction.
-_SETTLED = 1e-4
-# A level that slides to zero, or a sense to one that is not used, has no end: along what is so flat
-# a step of ten is as far as a promise is believed.
-_FLAT = 1e-2
-# A level is held within a factor of e^9, some thousands, of where its search begins: there it is
-# none, or the sense is not used, and beyond it a filter is not told from rounding.
-_REACH = 9.0
-# Longest step of any coordinate.
-_STEP = 1.0
-# The likelihood jumps by hundredths where a later stage of a plan meets a bound, so that a search
-# may stand before a cliff. It has ended when no step longer than this climbs, and what the whole
-# step promises is less than the jumps.
-_SMALLEST, _JUMPS = 1e-4, 0.25
-# Nats for each factor of e by which a gain near the border of those that stabilise lets noise
-# grow: on the seat the largest likelihood without it is on that border, and a search creeps there.
-_BARRIER = 0.5
 # Recorded exactly, a residual has no size: its levels begin at this share of the outputs.
 _LEAST = 1e-6
 
@@ -91,9 +64,12 @@ class PersonFit(Frozen):
         Filters of all recordings with derivatives.
     theta : Array
         The unknowns, in the coordinates of `space` (count,).
-    space : PersonCoordinates
     told : Told
         What the recordings say there.
+    prior : Prior
+        What the search was held by.
+    box : pair of Array
+        Between which values it was held (count,).
     """
 
     K: Array
@@ -107,8 +83,14 @@ class PersonFit(Frozen):
     converged: bool
     evaluations: int
     theta: Array
-    space: PersonCoordinates
     told: Told
+    prior: Prior
+    box: tuple[Array, Array]
+
+    @property
+    def space(self) -> PersonCoordinates:
+        """The coordinates of the search."""
+        return self.prior.space
 
     @property
     def criterion(self) -> float:
@@ -187,7 +169,9 @@ def fit_person(
         log = np.log(np.concatenate([levels, recorded * size.recorder])[first.moving])
         starts.append(np.concatenate([space.start, log]))
     theta = _best(first, starts)
-    theta, told, spent, settled = _climb(first, theta, _Prior(first, spread), max_evaluations)
+    prior = Prior(first, spread)
+    box = reach(first, theta)
+    theta, told, spent, settled = climb(prior, theta, box, max_evaluations)
     person = first.unpack(theta)
     prices = space.unknowns(theta[: first.own]) if isinstance(space, PriceCoordinates) else None
     return PersonFit(
@@ -202,8 +186,9 @@ def fit_person(
         settled,
         spent,
         frozen(theta),
-        first,
         told,
+        prior,
+        box,
     )
 
 
@@ -264,71 +249,3 @@ def _best(space: PersonCoordinates, starts: list[Array]) -> Array:
     if max(values) == -np.inf:
         raise SolverError("person", f"no start has a likelihood: {reason}", "give other levels")
     return starts[int(np.argmax(values))]
-
-
-class _Prior:
-    """What keeps directions of the gain that nothing tells, as a share of a log-likelihood.
-
-    A normal number about the start for each coordinate but the levels, and a barrier before gains
-    that do not stabilise.
-    """
-
-    def __init__(self, space: PersonCoordinates, spread: float) -> None:
-        self.space = space
-        self.weights = np.where(np.arange(len(space.start)) < space.own, spread**-2.0, 0.0)
-        self.barrier = _BARRIER if np.isfinite(spread) else 0.0
-
-    def value(self, theta: Array) -> float:
-        away = float(self.weights @ (theta - self.space.start) ** 2) / 2
-        return -away - (self.barrier * self.space.wandering(theta)[0] if self.barrier else 0.0)
-
-    def slopes(self, theta: Array) -> tuple[Array, Array]:
-        """Gradient (q,) and what is taken for the negative of the second derivatives (q, q)."""
-        gradient = -self.weights * (theta - self.space.start)
-        if not self.barrier:
-            return gradient, np.diag(self.weights)
-        _, slope = self.space.wandering(theta)
-        # As that of the logarithm of a distance.
-        return gradient - self.barrier * slope, np.diag(self.weights) + self.barrier * np.outer(
-            slope, slope
-        )
-
-
-def _climb(
-    space: PersonCoordinates, theta: Array, prior: _Prior, budget: int
-) -> tuple[Array, Told, int, bool]:
-    """The largest likelihood near theta, times the prior."""
-    told, radius, spent = space.told(theta), _STEP, 1
-    reach = np.where(np.arange(len(theta)) < space.own, np.inf, _REACH)
-    low, high = theta - reach, theta + reach
-    while True:
-        slope, bend = prior.slopes(theta)
-        gradient = told.gradient + slope
-        curvature = told.information + bend + _FLAT * np.eye(len(theta))
-        step, promised = _boxed(gradient, curvature, low - theta, high - theta)
-        if promised < _SETTLED:
-            return theta, told, spent, True
-        gain = -np.inf
-        while not gain > 0:
-            if radius < _SMALLEST or spent >= budget:
-                return theta, told, spent, radius < _SMALLEST and promised < _JUMPS
-            box = np.maximum(low - theta, -radius), np.minimum(high - theta, radius)
-            step, within = _boxed(gradient, curvature, *box)
-            there, length = theta + step, float(np.max(np.abs(step)))
-            try:
-                gain = space.value(there) + prior.value(there) - told.value - prior.value(theta)
-            except ImpcError:  # no filter there: a shorter step
-                gain = -np.inf
-            if gain < within / 4:
-                radius = length / 4
-            elif gain > within * 0.75:
-                radius = min(max(radius, 2 * length), _STEP)
-        theta, told, spent = there, space.told(there), spent + 1
-
-
-def _boxed(gradient: Array, curvature: Array, low: Array, high: Array) -> tuple[Array, float]:
-    """The step within a box that promises most, by a quadratic model, and what it promises."""
-    root = np.linalg.cholesky(curvature)
-    goal = solve_triangular(root, gradient, lower=True)
-    step = np.asarray(lsq_linear(root.T, goal, (low, high), method="bvls").x)
-    return step, float(gradient @ step - step @ curvature @ step / 2)
