@@ -23,7 +23,7 @@ import numpy as np
 from experiments.noisy_people import BODIES, NOISES, recorded, subject
 from impc.assess.covariance import gain_covariance
 from impc.assess.person_covariance import person_covariance
-from impc.assess.person_profile import level_interval
+from impc.assess.person_profile import level_intervals
 from impc.errors import ImpcError
 from impc.inverse.likelihood_fit import fit_person
 from impc.inverse.methods import estimate
@@ -112,12 +112,7 @@ def score(who: Subject, study: str, seed: int, *, weak: float = _WEAK) -> Score:
     robust, expected = (person_covariance(likely, kind) for kind in ("sandwich", "expected"))
     clock.append(time.process_time())
     values = np.exp(likely.theta[likely.space.own :])
-    profiles = [
-        level_interval(likely, k)
-        if expected.levels[k] > weak
-        else expected.level_interval(k, float(value))
-        for k, value in enumerate(values)
-    ]
+    profiles = level_intervals(likely, expected, weak=weak)
     clock.append(time.process_time())
     size = float(np.linalg.norm(truth @ least.T))
     return Score(
@@ -138,7 +133,7 @@ def score(who: Subject, study: str, seed: int, *, weak: float = _WEAK) -> Score:
         [*who.person.levels[who.person.levels > 0], *who.recorder],
         [float(value) for value in values],
         expected.levels.tolist(),
-        profiles,
+        profiles.tolist(),
         np.diff(clock).tolist(),
     )
 

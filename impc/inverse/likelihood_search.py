@@ -32,8 +32,8 @@ __all__ = ["Prior", "boxed_step", "climb", "reach"]
 # A search ends when a step promises less: a hundredth of a deviation along any direction.
 _SETTLED = 1e-4
 # The likelihood jumps by hundredths where a later stage of a plan meets a bound, so that a search
-# may stand before a cliff. It may fall by so many nats in all, and it stops where a step that did not
-# climb promised less than the others: settled, if the whole step promises less than the first.
+# may stand before a cliff. It may fall by so many nats in all, and it stops where a step that did
+# not climb promised less than the second: settled, if the whole step promises less than the first.
 _JUMPS, _UNSEEN = 0.25, 1e-2
 # A level that slides to zero, or a sense to one that is not used, has no end: along what is so flat
 # a step of ten is as far as a promise is believed.
