@@ -41,8 +41,6 @@ _NORMAL = 1.959964
 _LIMITS = {"cart": (5.0, 0.7), "seat": (70.0, 6.0)}
 # A direction of the gain is determined when its deviation is below this, in natural coordinates.
 _DETERMINED = 0.25
-# A level whose logarithm has a larger deviation is given a profile.
-_WEAK = 0.25
 # As far below the truth's own likelihood a search may end, nats.
 _ENDED = 0.5
 
@@ -74,7 +72,8 @@ class Score:
     level_deviations : list of float
         Of their logarithms, as expected.
     profiles : list of pairs
-        Intervals of 95 %: by profile for a level that is weakly told, else by the deviation.
+        Intervals of 95 %: by profile for a level that is weakly told, else by the
+        deviation; none where not asked for.
     seconds : list of float
         Of processor time: least squares, likelihood, profiles.
     """
@@ -98,8 +97,8 @@ class Score:
     seconds: list[float]
 
 
-def score(who: Subject, study: str, seed: int, *, weak: float = _WEAK) -> Score:
-    """Both fits of a subject; levels whose logarithms have deviations above `weak` get profiles."""
+def score(who: Subject, study: str, seed: int, *, profiled: bool = True) -> Score:
+    """Both fits of a subject, with deviations, and with profiles of levels that are weakly told."""
     trials, truth = recorded(who, seed), np.array(who.controller.K)
     clock = [time.process_time()]
     first = estimate(trials.problem)
@@ -112,7 +111,7 @@ def score(who: Subject, study: str, seed: int, *, weak: float = _WEAK) -> Score:
     robust, expected = (person_covariance(likely, kind) for kind in ("sandwich", "expected"))
     clock.append(time.process_time())
     values = np.exp(likely.theta[likely.space.own :])
-    profiles = level_intervals(likely, expected, weak=weak)
+    profiles = level_intervals(likely, expected) if profiled else np.zeros((0, 2))
     clock.append(time.process_time())
     size = float(np.linalg.norm(truth @ least.T))
     return Score(
@@ -189,7 +188,7 @@ def _run(given: argparse.Namespace) -> None:
                 continue
             try:
                 who = subject(given.body, seed, noise, share, limit)
-                line = asdict(score(who, study, seed, weak=_WEAK if given.profiles else np.inf))
+                line = asdict(score(who, study, seed, profiled=given.profiles))
             except ImpcError as error:  # counted: most are of the first fit, of a cart that ran off
                 line = {"study": study, "seed": seed, "reason": str(error)}
             file.write(json.dumps(line) + "\n")
@@ -198,39 +197,37 @@ def _run(given: argparse.Namespace) -> None:
 
 def _summed(scores: list[Score]) -> str:
     """One row of the table."""
-    percent = [100 * np.mean([one.saturated for one in scores])]
-    ended = [one.above >= -_ENDED for one in scores]
-    cells = [scores[0].study, str(len(scores)), f"{percent[0]:.0f}", f"{sum(ended)}"]
+    ended = sum(one.above >= -_ENDED for one in scores)
+    cells = [
+        scores[0].study,
+        str(len(scores)),
+        f"{100 * np.mean([one.saturated for one in scores]):.0f}",
+        f"{ended}",
+        f"{sum(one.converged for one in scores)}",
+    ]
     for name in ("least", "likely"):
-        errors = np.array([getattr(one, f"{name}_error") for one in scores])
-        cells.append(f"{100 * np.median(errors):.1f}")
-        cells.append(_bias([getattr(one, name) for one in scores]))
-        cells.append(_holds([getattr(one, name) for one in scores]))
+        pairs = [getattr(one, name) for one in scores]
+        cells.append(f"{100 * np.median([getattr(one, f'{name}_error') for one in scores]):.1f}")
+        cells += [_bias(pairs), _holds(pairs)]
     cells.append(_holds([one.expected for one in scores]))
-    true = [np.log(one.levels) for one in scores]
-    errors = [np.log(one.found) - level for one, level in zip(scores, true, strict=True)]
-    cells.append(
-        _holds(
-            [
-                list(zip(error, one.level_deviations, strict=True))
-                for error, one in zip(errors, scores, strict=True)
-            ]
-        )
-    )
-    cells.append(
-        _shares(
-            [
-                [
-                    low <= level <= high
-                    for level, (low, high) in zip(one.levels, one.profiles, strict=True)
-                ]
-                for one in scores
-            ]
-        )
-    )
-    times = np.median([one.seconds for one in scores], axis=0)
+    cells.append(_holds([_of_levels(one) for one in scores]))
+    profiled = [one for one in scores if one.profiles]
+    cells.append(f"{_shares([_inside(one) for one in profiled])} ({len(profiled)})")
+    times = np.median([one.seconds[:2] for one in scores], axis=0)
     cells.append(", ".join(f"{value:.1f}" for value in times))
     return "| " + " | ".join(cells) + " |"
+
+
+def _of_levels(one: Score) -> list[tuple[float, float]]:
+    """Errors and deviations of the logarithms of the levels."""
+    errors = np.log(one.found) - np.log(one.levels)
+    return list(zip(errors.tolist(), one.level_deviations, strict=True))
+
+
+def _inside(one: Score) -> list[bool]:
+    """Which levels are inside their profiles."""
+    both = zip(one.levels, one.profiles, strict=True)
+    return [low <= level <= high for level, (low, high) in both]
 
 
 def _bias(pairs: list[list[tuple[float, float]]]) -> str:
@@ -262,10 +259,10 @@ def _shares(holds: list[list[bool]]) -> str:
 
 def _sum(given: argparse.Namespace) -> None:
     heads = (
-        "people", "count", "at the limit %", "ended at the truth's likelihood or above",
+        "people", "count", "at the limit %", "ended at the truth's likelihood or above", "settled",
         "least squares: error %", "bias / deviation", "95 % holds %",
         "likelihood: error %", "bias / deviation", "95 % holds % (sandwich)", "(expected)",
-        "levels hold % (expected)", "(profile)", "seconds: least squares, likelihood, profiles",
+        "levels hold % (expected)", "(profile)", "seconds: least squares, likelihood",
     )  # fmt: skip
     print("| " + " | ".join(heads) + " |")
     print("|" + "---|" * len(heads))
