@@ -125,7 +125,9 @@ def score(who: Subject, study: str, seed: int, *, profiled: bool = True) -> Scor
         float(np.linalg.norm((gain - truth) @ least.T)) / size,
         float(np.linalg.norm((likely.K - truth) @ least.T)) / size,
         _pairs(
-            least.directions, least.deviations, np.linalg.solve(least.G, (gain - truth) @ least.T)
+            least.directions,
+            least.deviations,
+            np.asarray(np.linalg.solve(least.G, (gain - truth) @ least.T)),
         ),
         _steps(likely, robust, truth),
         _steps(likely, expected, truth),

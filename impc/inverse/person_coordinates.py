@@ -188,7 +188,7 @@ class PersonCoordinates:
         if not is_stable(closed, discrete=True):
             return np.inf, gradient
         X = lyapunov_series(closed, (plant.B @ space.G @ space.G.T @ plant.B.T)[None])[0]
-        weight = np.linalg.inv(space.T @ space.T.T)
+        weight = np.asarray(np.linalg.inv(space.T @ space.T.T))
         Y = lyapunov_series(closed.T, weight[None])[0]
         size = float(np.sum(weight * X))
         dK, _ = space.changes(here, theta[: self.own])
