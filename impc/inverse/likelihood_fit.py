@@ -1,7 +1,8 @@
 """A person who senses with noise, by maximum likelihood.
 
 The search starts from a fit that takes all that it does not explain for noise in the recorder, with
-levels that what this leaves suggests, and climbs from there (`likelihood_search`).
+levels that what this leaves suggests, and climbs from there (`likelihood_search`;
+docs/noisy-people.md).
 """
 
 from __future__ import annotations

@@ -72,9 +72,17 @@ class Prior:
         return -away - (self.barrier * self.space.wandering(theta)[0] if self.barrier else 0.0)
 
     def slopes(self, theta: Array) -> tuple[Array, Array]:
-        """Gradient (q,), and what is taken for minus the second derivatives (q, q).
+        """Derivatives at theta; the barrier is taken to bend as the logarithm of a distance does.
 
-        The barrier bends as the logarithm of a distance does.
+        Parameters
+        ----------
+        theta : Array
+            (q,).
+
+        Returns
+        -------
+        gradient, bend : Array
+            (q,), and what is taken for minus the second derivatives (q, q).
         """
         gradient, bend = -self.weights * (theta - self.space.start), np.diag(self.weights)
         if not self.barrier:
@@ -84,7 +92,19 @@ class Prior:
 
 
 def reach(space: PersonCoordinates, theta: Array) -> tuple[Array, Array]:
-    """Between which values a search from theta is held (q,): levels within a factor of e^9."""
+    """Between which values a search is held: levels within a factor of e^9.
+
+    Parameters
+    ----------
+    space : PersonCoordinates
+    theta : Array
+        Where it begins (q,).
+
+    Returns
+    -------
+    low, high : Array
+        (q,) each.
+    """
     far = np.where(np.arange(len(theta)) < space.own, np.inf, _REACH)
     return theta - far, theta + far
 
@@ -107,8 +127,8 @@ def climb(
     Returns
     -------
     theta, told, spent, settled : Array, Told, int, bool
-        Where it ends, what the recordings say there, likelihoods with derivatives, and whether it
-        ended by itself.
+        Where it ends (q,), what the recordings say there, likelihoods with derivatives, and
+        whether it ended by itself.
 
     Raises
     ------
@@ -144,9 +164,19 @@ def climb(
 
 
 def boxed_step(gradient: Array, curvature: Array, low: Array, high: Array) -> tuple[Array, float]:
-    """The step (q,) within a box that promises most, g's - s'C s / 2, and what it promises.
+    """The step within a box that promises most, g's - s'C s / 2.
 
-    A coordinate with low = high = 0 is held.
+    Parameters
+    ----------
+    gradient, curvature : Array
+        g (q,) and C (q, q), positive definite.
+    low, high : Array
+        The box (q,); a coordinate with low = high = 0 is held.
+
+    Returns
+    -------
+    step, promised : Array, float
+        (q,), and what it promises.
     """
     step, free = np.zeros(len(gradient)), low < high
     root = np.linalg.cholesky(curvature[np.ix_(free, free)])

@@ -171,10 +171,15 @@ class PersonCoordinates:
 
         It grows without end towards the border of gains that stabilise. Prices never meet it.
 
+        Parameters
+        ----------
+        theta : Array
+            (q,).
+
         Returns
         -------
         value : float
-            log tr(T^-1 X T^-T) / n, X = A_c X A_c' + B G G'B' at theta (q,), T and G of the start;
+            log tr(T^-1 X T^-T) / n, X = A_c X A_c' + B G G'B' at theta, T and G of the start;
             infinite beyond the border.
         gradient : Array
             Its derivatives (q,).
