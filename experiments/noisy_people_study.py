@@ -251,7 +251,9 @@ def _holds(pairs: list[list[tuple[float, float]]]) -> str:
 
 
 def _shares(holds: list[list[bool]]) -> str:
-    """Share of all, with its standard error, subjects being independent."""
+    """Share of all, %, with its standard error, subjects being independent; - of none."""
+    if not holds:
+        return "-"
     counts = np.array([[sum(each), len(each)] for each in holds], dtype=np.float64)
     share = counts[:, 0].sum() / max(counts[:, 1].sum(), 1)
     left = counts[:, 0] - share * counts[:, 1]

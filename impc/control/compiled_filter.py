@@ -593,7 +593,7 @@ def _spread(
             for c in range(k):
                 dP[i, j, c] += djoint.Q[i, j, c]
             dP[j, i] = dP[i, j]
-    return (P + P.T) / 2
+    return (P + P.T) / 2  # type: ignore[no-any-return]
 
 
 @njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
