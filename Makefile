@@ -127,9 +127,8 @@ numerics: .venv-oldest/.stamp .venv-newest/.stamp
 # Hundreds of simulated subjects: the table of docs/noisy-people.md.
 PEOPLE = $(PY) -m experiments.noisy_people_study
 noisy-people: env
-	for noise in motor sensory both; do for vaf in 90 70; do for limit in 5 0.7; do \
-	$(PEOPLE) run --noise $$noise --vaf $$vaf --limit $$limit --subjects 200 \
-	--out results/noisy-people.jsonl || exit 1; done; done; done
+	$(PEOPLE) run --subjects 200 --out results/noisy-people.jsonl
+	$(PEOPLE) run --body seat --subjects 20 --no-profiles --out results/noisy-people.jsonl
 	$(PEOPLE) sum results/noisy-people.jsonl
 
 # Hundreds of simulated subjects: the table of docs/structures.md.

@@ -1,61 +1,48 @@
 """People who sense with noise: the fit of least squares beside maximum likelihood, with coverage.
 
-A cart of two states under a push of three levels, whose person senses position and velocity. Noise
-is in the motor, in the senses, or in both, of a size that leaves the motion without noise a VAF of
-90 or 70 %; the limit of the command is far away, or met at a tenth of the samples and more. Prices
-are log-uniform within a factor of two. Each line that is written is a subject, so that a run can be
-ended at any time and be summed up:
+The people are those of `noisy_people`. Each line that is written is a subject, of each kind in
+turn, so that a run can be ended at any time, be gone on with, and be summed up:
 
-    python -m experiments.noisy_people_study run --noise motor --vaf 90 --subjects 200 --out a.jsonl
-    python -m experiments.noisy_people_study sum a.jsonl
+    python -m experiments.noisy_people_study run --subjects 200 --out a.jsonl
+    python -m experiments.noisy_people_study run --body seat --vaf 90 --subjects 20 --out b.jsonl
+    python -m experiments.noisy_people_study sum a.jsonl b.jsonl
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import control
 import numpy as np
 
+from experiments.noisy_people import BODIES, NOISES, recorded, subject
 from impc.assess.covariance import gain_covariance
 from impc.assess.person_covariance import person_covariance
-from impc.assess.variance_accounted_for import vaf
-from impc.control.closed_loop import scenario, simulate
-from impc.control.controller import Controller
-from impc.control.noisy_person import simulate_person
+from impc.assess.person_profile import level_intervals
 from impc.errors import ImpcError
 from impc.inverse.likelihood_fit import fit_person
 from impc.inverse.methods import estimate
-from impc.inverse.problem import Problem
-from impc.model.bounds import Bounds
-from impc.model.observer import Observer
-from impc.model.plant import Plant
-from impc.model.recordings import Recording
-from impc.model.weights import Weights
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
+    from experiments.noisy_people import Subject
     from impc.arrays import Array
+    from impc.assess.person_covariance import PersonCovariance
+    from impc.inverse.likelihood_fit import PersonFit
 
-__all__ = ["NOISES", "Score", "score", "subject"]
+__all__ = ["Score", "above_truth", "score"]
 
-#: Noise of each kind before it is scaled: motor (N), position (m), velocity (m/s).
-NOISES = {
-    "motor": (1.0, 0.005, 0.01),
-    "sensory": (0.05, 0.05, 0.1),
-    "both": (1.0, 0.05, 0.1),
-}
-_SAMPLES, _TRIALS, _DWELL = 600, 3, 10
-_PUSH, _HORIZON = 0.7, 5
-# Of the standard deviation of the recorded position.
-_RECORDER = 0.02
 _NORMAL = 1.959964
+# A limit that is not met, and one that is, of each body.
+_LIMITS = {"cart": (5.0, 0.7), "seat": (70.0, 6.0)}
+# A direction of the gain is determined when its deviation is below this, in natural coordinates.
+_DETERMINED = 0.25
+# As far below the truth's own likelihood a search may end, nats.
+_ENDED = 0.5
 
 
 @dataclass(frozen=True)
@@ -65,150 +52,145 @@ class Score:
     Attributes
     ----------
     study : str
-        Noise, VAF and limit.
+        Body, noise, VAF and limit.
     seed : int
     saturated : float
         Share of the samples at the limit.
     vaf : float
         Of the motion without noise, %.
-    truth, least, likely : list of float
-        Gain: that of the subject, of least squares and of maximum likelihood.
-    least_deviations, likely_deviations, expected_deviations : list of float
-        Their standard deviations; of the likelihood by the sandwich, and as expected.
-    levels, found, level_deviations : list of float
-        Motor, senses, recorder: true, found, and deviations of their logarithms.
+    above : float
+        Log-likelihood at the end of the search minus that of the truth, nats.
     converged : bool
+    evaluations : int
+    least_error, likely_error : float
+        Of the gain, as a share of it, in natural coordinates.
+    least, likely, expected : list of pairs
+        Error and deviation along each direction that the method tells, the best first: of least
+        squares, and of maximum likelihood by the sandwich and as expected.
+    levels, found : list of float
+        Motor, senses, recorder: true, and found.
+    level_deviations : list of float
+        Of their logarithms, as expected.
+    profiles : list of pairs
+        Intervals of 95 %: by profile for a level that is weakly told, else by the
+        deviation; none where not asked for.
     seconds : list of float
-        Of the two fits.
+        Of processor time: least squares, likelihood, profiles.
     """
 
     study: str
     seed: int
     saturated: float
     vaf: float
-    truth: list[float]
-    least: list[float]
-    likely: list[float]
-    least_deviations: list[float]
-    likely_deviations: list[float]
-    expected_deviations: list[float]
+    above: float
+    converged: bool
+    evaluations: int
+    least_error: float
+    likely_error: float
+    least: list[tuple[float, float]]
+    likely: list[tuple[float, float]]
+    expected: list[tuple[float, float]]
     levels: list[float]
     found: list[float]
     level_deviations: list[float]
-    converged: bool
+    profiles: list[tuple[float, float]]
     seconds: list[float]
 
 
-def cart() -> Plant:
-    """Mass on wheels, 20 samples a second."""
-    system = control.ss(
-        [[1, 0.05], [0, 0.98]], [[0, 0], [0.05, 0.05]], [[1, 0]], 0, 0.05,
-        states=["x", "v"], inputs=["u", "push"], outputs=["x"],
-    )  # fmt: skip
-    return Plant(system, ["u"])
-
-
-@dataclass(frozen=True)
-class Subject:
-    """A person, as simulated."""
-
-    controller: Controller
-    person: Observer
-    recorder: float
-    pushes: Sequence[Array]
-
-
-def subject(seed: int, noise: str, share: float, limit: float) -> Subject:
-    """A subject whose motion without noise has a VAF of about `share` %."""
-    rng = np.random.default_rng([seed, round(share), list(NOISES).index(noise), round(100 * limit)])
-    plant = cart()
-    prices = np.array([8.0, 1.0]) * np.exp(rng.uniform(-np.log(2), np.log(2), 2))
-    bounds = Bounds(plant, u_min=-limit, u_max=limit)
-    law = Controller(plant, Weights(np.diag(prices), 1), bounds, _HORIZON, terminal_set=False)
-    pushes = [
-        np.repeat(rng.choice([-_PUSH, 0.0, _PUSH], _SAMPLES // _DWELL), _DWELL)
-        for _ in range(_TRIALS)
-    ]
-    low, high = -4.0, 1.5
-    for _ in range(14):  # of the logarithm of the noise's size
-        middle = (low + high) / 2
-        if _agreement(law, _person(plant, noise, np.exp(middle)), pushes, rng) > share:
-            low = middle
-        else:
-            high = middle
-    found = _person(plant, noise, np.exp(low))
-    clean = simulate(law, scenario(plant, [0, 0], disturbance=pushes[0])).x[:, 0]
-    return Subject(law, found, float(_RECORDER * np.std(clean)), pushes)
-
-
-def _person(plant: Plant, noise: str, size: float) -> Observer:
-    motor, place, speed = np.array(NOISES[noise]) * size
-    return Observer(plant, ["x", "v"], motor=motor, sensory=[place, speed])
-
-
-def _agreement(
-    law: Controller, person: Observer, pushes: Sequence[Array], rng: np.random.Generator
-) -> float:
-    shares = []
-    for push in pushes:
-        clean = simulate(law, scenario(law.plant, [0, 0], disturbance=push)).x[:-1]
-        noisy = simulate_person(law, person, push, seed=int(rng.integers(2**31)))
-        shares.append(vaf(noisy.states[:, :1], clean[:, :1])[0])
-    return float(np.mean(shares))
-
-
-def score(who: Subject, study: str, seed: int) -> Score:
-    """Both fits of a subject, and their deviations."""
-    law, plant, trials = who.controller, who.controller.plant, []
-    met, shares = [], []
-    for number, push in enumerate(who.pushes):
-        found = simulate_person(law, who.person, push, recorder=who.recorder, seed=[seed, number])
-        clean = simulate(law, scenario(plant, [0, 0], disturbance=push)).x[:-1, :1]
-        met.append(np.mean(np.abs(found.u) >= law.bounds.u_max - 1e-9))
-        shares.append(vaf(found.states[:, :1], clean)[0])
-        trials.append(Recording(plant, found.outputs, push))
-    problem = Problem(plant, law.bounds, _HORIZON, trials, terminal_set=False, unknown_start=True)
-    started = time.perf_counter()
-    first = estimate(problem)
-    least = gain_covariance(
-        first.problem, np.array(first.gain), np.array(first.metric), curvature=True
-    )
-    middle = time.perf_counter()
-    likely = fit_person(first, who.person.with_levels(_sized(who.person)))
-    ended = time.perf_counter()
+def score(who: Subject, study: str, seed: int, *, profiled: bool = True) -> Score:
+    """Both fits of a subject, with deviations, and with profiles of levels that are weakly told."""
+    trials, truth = recorded(who, seed), np.array(who.controller.K)
+    clock = [time.process_time()]
+    first = estimate(trials.problem)
+    gain, metric = np.array(first.gain), np.array(first.metric)
+    least = gain_covariance(first.problem, gain, metric, curvature=True)
+    clock.append(time.process_time())
+    # Levels to start from that know nothing of the subject but which there are.
+    blind = who.person.with_levels(np.where(who.person.levels > 0, 0.1, 0.0))
+    likely = fit_person(first, blind)
     robust, expected = (person_covariance(likely, kind) for kind in ("sandwich", "expected"))
+    clock.append(time.process_time())
+    values = np.exp(likely.theta[likely.space.own :])
+    profiles = level_intervals(likely, expected) if profiled else np.zeros((0, 2))
+    clock.append(time.process_time())
+    size = float(np.linalg.norm(truth @ least.T))
     return Score(
         study,
         seed,
-        float(np.mean(met)),
-        float(np.mean(shares)),
-        law.K.ravel().tolist(),
-        np.ravel(first.gain).tolist(),
-        likely.K.ravel().tolist(),
-        least.entries.ravel().tolist(),
-        robust.entries.ravel().tolist(),
-        expected.entries.ravel().tolist(),
-        [*who.person.motor, *who.person.sensory, who.recorder],
-        [*likely.observer.motor, *likely.observer.sensory, *likely.recorder],
-        expected.levels.tolist(),
+        trials.saturated,
+        trials.vaf,
+        above_truth(likely, who),
         likely.converged,
-        [middle - started, ended - middle],
+        likely.evaluations,
+        float(np.linalg.norm((gain - truth) @ least.T)) / size,
+        float(np.linalg.norm((likely.K - truth) @ least.T)) / size,
+        _pairs(
+            least.directions,
+            least.deviations,
+            np.asarray(np.linalg.solve(least.G, (gain - truth) @ least.T)),
+        ),
+        _steps(likely, robust, truth),
+        _steps(likely, expected, truth),
+        [*who.person.levels[who.person.levels > 0], *who.recorder],
+        [float(value) for value in values],
+        expected.levels.tolist(),
+        profiles.tolist(),
+        np.diff(clock).tolist(),
     )
 
 
-def _sized(person: Observer) -> Array:
-    """Levels to start from that know nothing of the subject but which there are."""
-    return np.where(person.levels > 0, 0.1, 0.0)
+def above_truth(likely: PersonFit, who: Subject) -> float:
+    """Log-likelihood of the fit minus that of the subject as simulated, nats."""
+    space = likely.space
+    own, theta = space.space, np.array(space.start)
+    truth = own.natural(np.array(who.controller.K))
+    theta[: space.gain] = np.tensordot(own.natural(own.gains.gains), truth, 2)
+    starts = np.array([trial.x0 for trial in own.problem.recordings])
+    theta[space.shared : space.after] = np.ravel(-np.linalg.solve(own.start_unit, starts.T).T)
+    levels = np.concatenate([who.person.levels, who.recorder])
+    theta[space.own :] = np.log(levels[space.moving])
+    return likely.log_likelihood - space.value(theta)
+
+
+def _steps(
+    likely: PersonFit, covariance: PersonCovariance, truth: Array
+) -> list[tuple[float, float]]:
+    own, space = likely.space.space, likely.space
+    error = own.natural(np.array(likely.K) - truth)
+    along = np.tensordot(own.natural(own.gains.gains), error, 2)
+    return _pairs(covariance.directions, covariance.deviations, along[: space.gain])
+
+
+def _pairs(directions: Array, deviations: Array, error: Array) -> list[tuple[float, float]]:
+    """Errors and deviations along determined directions, each turned to where it is largest."""
+    found = []
+    for direction, deviation in sorted(
+        zip(directions, deviations, strict=True), key=lambda two: two[1]
+    ):
+        if deviation < _DETERMINED:
+            sign = np.sign(direction[np.argmax(np.abs(direction))])
+            found.append((float(sign * direction @ np.ravel(error)), float(deviation)))
+    return found
 
 
 def _run(given: argparse.Namespace) -> None:
-    study = f"{given.noise}, VAF {given.vaf:g}, limit {given.limit:g}"
-    Path(given.out).parent.mkdir(parents=True, exist_ok=True)
-    with Path(given.out).open("a", encoding="utf-8") as file:
-        for seed in range(given.first, given.first + given.subjects):
-            who = subject(seed, given.noise, given.vaf, given.limit)
+    path = Path(given.out)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    done = set()
+    if path.exists():
+        kept = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+        done = {(one["study"], one["seed"]) for one in kept}
+    limits = [_LIMITS[given.body][k] for k in given.met]
+    kinds = list(itertools.product(given.noise, given.vaf, limits))
+    with path.open("a", encoding="utf-8") as file:
+        for seed, (noise, share, limit) in itertools.product(range(given.subjects), kinds):
+            met = "met" if limit == _LIMITS[given.body][1] else "none met"
+            study = f"{given.body}, {noise}, VAF {share:g}, {met}"
+            if (study, seed) in done:
+                continue
             try:
-                line = asdict(score(who, study, seed))
+                who = subject(given.body, seed, noise, share, limit)
+                line = asdict(score(who, study, seed, profiled=given.profiles))
             except ImpcError as error:  # counted: most are of the first fit, of a cart that ran off
                 line = {"study": study, "seed": seed, "reason": str(error)}
             file.write(json.dumps(line) + "\n")
@@ -217,43 +199,74 @@ def _run(given: argparse.Namespace) -> None:
 
 def _summed(scores: list[Score]) -> str:
     """One row of the table."""
-    truth = np.array([one.truth for one in scores])
+    ended = sum(one.above >= -_ENDED for one in scores)
     cells = [
         scores[0].study,
         str(len(scores)),
         f"{100 * np.mean([one.saturated for one in scores]):.0f}",
+        f"{ended}",
+        f"{sum(one.converged for one in scores)}",
     ]
     for name in ("least", "likely"):
-        error = np.array([getattr(one, name) for one in scores]) - truth
-        bias = np.mean(error, axis=0) / np.std(error, axis=0, ddof=1)
-        size = np.sqrt(np.mean((error / truth) ** 2, axis=0))
-        cells += [_list(bias, 2), _list(100 * size, 0)]
-        for kind in ("least",) if name == "least" else ("likely", "expected"):
-            deviations = np.array([getattr(one, f"{kind}_deviations") for one in scores])
-            cells.append(_shares(np.abs(error) <= _NORMAL * deviations))
-    levels = np.array([np.log(one.found) - np.log(one.levels) for one in scores])
-    deviations = np.array([one.level_deviations for one in scores])
-    cells.append(_shares(np.abs(levels) <= _NORMAL * deviations))
-    cells.append(_list(np.median([one.seconds for one in scores], axis=0), 1))
+        pairs = [getattr(one, name) for one in scores]
+        cells.append(f"{100 * np.median([getattr(one, f'{name}_error') for one in scores]):.1f}")
+        cells += [_bias(pairs), _holds(pairs)]
+    cells.append(_holds([one.expected for one in scores]))
+    cells.append(_holds([_of_levels(one) for one in scores]))
+    profiled = [one for one in scores if one.profiles]
+    cells.append(f"{_shares([_inside(one) for one in profiled])} ({len(profiled)})")
+    times = np.median([one.seconds[:2] for one in scores], axis=0)
+    cells.append(", ".join(f"{value:.1f}" for value in times))
     return "| " + " | ".join(cells) + " |"
 
 
-def _shares(holds: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> str:
-    share = np.mean(holds, axis=0)
-    error = 100 * np.sqrt(np.max(share * (1 - share)) / len(holds))
-    return f"{_list(100 * share, 0)} (± {error:.1f})"
+def _of_levels(one: Score) -> list[tuple[float, float]]:
+    """Errors and deviations of the logarithms of the levels."""
+    errors = np.log(one.found) - np.log(one.levels)
+    return list(zip(errors.tolist(), one.level_deviations, strict=True))
 
 
-def _list(values: Array, digits: int) -> str:
-    return ", ".join(f"{float(item):.{digits}f}" for item in values)
+def _inside(one: Score) -> list[bool]:
+    """Which levels are inside their profiles."""
+    both = zip(one.levels, one.profiles, strict=True)
+    return [low <= level <= high for level, (low, high) in both]
+
+
+def _bias(pairs: list[list[tuple[float, float]]]) -> str:
+    """Mean error in deviations of each direction that most are told along, and the largest."""
+    means = []
+    for k in range(max(map(len, pairs))):
+        found = [each[k][0] / each[k][1] for each in pairs if len(each) > k]
+        if len(found) > len(pairs) / 2:
+            means.append(float(np.mean(found)))
+    if not means:
+        return "-"
+    if len(means) <= 2:
+        return ", ".join(f"{value:.2f}" for value in means)
+    return f"{min(means):.2f} to {max(means):.2f} ({len(means)})"
+
+
+def _holds(pairs: list[list[tuple[float, float]]]) -> str:
+    return _shares([[abs(e) <= _NORMAL * s for e, s in each] for each in pairs])
+
+
+def _shares(holds: list[list[bool]]) -> str:
+    """Share of all, %, with its standard error, subjects being independent; - of none."""
+    if not holds:
+        return "-"
+    counts = np.array([[sum(each), len(each)] for each in holds], dtype=np.float64)
+    share = counts[:, 0].sum() / max(counts[:, 1].sum(), 1)
+    left = counts[:, 0] - share * counts[:, 1]
+    error = np.sqrt(np.sum(left**2)) / max(counts[:, 1].sum(), 1)
+    return f"{100 * share:.0f} ± {100 * error:.0f}"
 
 
 def _sum(given: argparse.Namespace) -> None:
     heads = (
-        "study", "subjects", "at the limit %",
-        "least squares: bias / sd", "error %", "95 % holds %",
-        "likelihood: bias / sd", "error %", "sandwich holds %", "expected holds %",
-        "levels hold %", "seconds",
+        "people", "count", "at the limit %", "ended at the truth's likelihood or above", "settled",
+        "least squares: error %", "bias / deviation", "95 % holds %",
+        "likelihood: error %", "bias / deviation", "95 % holds % (sandwich)", "(expected)",
+        "levels hold % (expected)", "(profile)", "seconds: least squares, likelihood",
     )  # fmt: skip
     print("| " + " | ".join(heads) + " |")
     print("|" + "---|" * len(heads))
@@ -274,11 +287,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="People who sense with noise.")
     which = parser.add_subparsers(required=True)
     run = which.add_parser("run")
-    run.add_argument("--noise", choices=tuple(NOISES), required=True)
-    run.add_argument("--vaf", type=float, default=90.0)
-    run.add_argument("--limit", type=float, default=5.0)
+    run.add_argument("--body", choices=BODIES, default="cart")
+    run.add_argument("--noise", choices=tuple(NOISES), nargs="+", default=list(NOISES))
+    run.add_argument("--vaf", type=float, nargs="+", default=[90.0, 70.0])
+    run.add_argument("--met", type=int, nargs="+", choices=(0, 1), default=[0, 1])
     run.add_argument("--subjects", type=int, default=200)
-    run.add_argument("--first", type=int, default=0)
+    run.add_argument("--profiles", action=argparse.BooleanOptionalAction, default=True)
     run.add_argument("--out", required=True)
     run.set_defaults(run=_run)
     summed = which.add_parser("sum")

@@ -66,7 +66,7 @@ class PersonCovariance(Frozen):
 
     def level_interval(self, index: int, value: float) -> tuple[float, float]:
         """Interval of 95 % of a level by its `index`, about its `value`."""
-        factor = float(np.exp(1.959964 * self.levels[index]))
+        factor = float(np.exp(min(1.959964 * self.levels[index], 700.0)))  # still a number
         return value / factor, value * factor
 
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from impc.arrays import Array, Frozen, frozen
 from impc.assess.person_covariance import confusion, person_covariance
+from impc.assess.person_profile import level_intervals
 from impc.assess.variance_accounted_for import whiteness
 from impc.checking import replace
 from impc.control.closed_loop import prepare_loop
@@ -68,6 +69,8 @@ class PersonReport(Frozen):
         The first is the one that was asked for.
     covariance : PersonCovariance or None
         Of that, by the sandwich; None where it has no likelihood.
+    levels : Array
+        Intervals of 95 % of its levels (l, 2): by profile where a level is weakly told.
     confusion : Confusion or None
         What of gain and noise is told least apart.
     whiteness : Array
@@ -80,6 +83,7 @@ class PersonReport(Frozen):
 
     models: tuple[PersonModel, ...]
     covariance: PersonCovariance | None
+    levels: Array
     confusion: Confusion | None
     whiteness: Array
     ahead: tuple[int, ...]
@@ -110,11 +114,15 @@ def person_report(found: Estimate, asked: Observer, walk: Array) -> PersonReport
     fit = models[0].fit
     p = len(problem.plant.outputs)
     if fit is None:
-        return PersonReport(tuple(models), None, None, frozen([np.nan] * p), (), frozen([[]]))
+        nothing = frozen(np.zeros((0, 2)))
+        white = frozen([np.nan] * p)
+        return PersonReport(tuple(models), None, nothing, None, white, (), frozen([[]]))
     ahead = tuple(sorted({1 + round(time / problem.plant.dt) for time in _AHEAD}))
+    covariance = person_covariance(fit)
     return PersonReport(
         tuple(models),
-        person_covariance(fit),
+        covariance,
+        level_intervals(fit, covariance),
         confusion(fit),
         frozen(_white(fit)),
         ahead,

@@ -37,6 +37,9 @@ _LARGEST = 1e100
 # The covariance is taken for the stationary one when no entry differs by more than this, of the
 # deviations of its row and column; nor its derivative by more than the second.
 _STEADY, _STEADY_SLOPE = 1e-10, 1e-8
+# A first state is forgotten when none of its directions moves an innovation by more than this, of
+# its deviation.
+_FORGOTTEN = 1e-11
 
 
 class Steady(NamedTuple):
@@ -115,7 +118,8 @@ class FilterResult(NamedTuple):
 class _Update(NamedTuple):
     """What one sample of the outputs does to any expectation, of one covariance of z.
 
-    PC, S, S^-1, the gain, their derivatives, half of the information; and P after the sample.
+    PC, S, S^-1, the gain, their derivatives, half of the information; and P after the sample. Room
+    for the derivative of the next P, and for a product on the way to it.
     """
 
     PC: Buffer
@@ -128,6 +132,8 @@ class _Update(NamedTuple):
     half: Buffer
     P: Buffer
     dP: Buffer
+    ahead: Buffer
+    product: Buffer
 
 
 @njit(cache=True, nogil=True)
@@ -142,6 +148,7 @@ def run_filter(
     djoint: JointLoop,
     steady: Steady,
     at: int,
+    shared: int,
     outputs: Buffer,
     disturbance: Buffer,
     z: Buffer,
@@ -162,6 +169,9 @@ def run_filter(
         The stationary filter.
     at : int
         Where the estimate stands in z.
+    shared : int
+        How many directions, the first ones, move more than the first state. Covariances are
+        followed along these alone once the first state is forgotten.
     outputs, disturbance : Buffer
         (samples, p) and (samples, d).
     z, dz : Buffer
@@ -183,8 +193,14 @@ def run_filter(
     drift = np.zeros(k + 1)
     varies, settled, moves = bool(np.any(joint.share)), False, _moving(djoint.F)
     _weigh(joint, djoint, joint.P0, djoint.P0, here)
+    quiet = 0
     for t in range(len(outputs)):
-        _update(joint, djoint, here, outputs[t], z, dz, result, t)
+        forgotten = _update(joint, djoint, here, outputs[t], z, dz, result, t, shared)
+        quiet = quiet + 1 if forgotten else 0
+        if quiet > 2 * len(z) and k > shared:
+            k = shared
+            djoint, steady, here = _without_start(djoint, steady, here, k)
+            drift, moves = np.zeros(k + 1), _moving(djoint.F)
         u, x, dx = result.u[t], z[at : at + n], dz[at : at + n]
         status, _, _ = law(loop, dloop, rows, drows, unit, work, x, dx, lam, False, u, du)
         if status > _SOFTENED:
@@ -197,12 +213,12 @@ def run_filter(
             status, met = max(status, beyond), met or near
         result.status[t] = status
         if not settled or met:
-            P, dP = _spread(joint, djoint, moves, here, slope, dslope, at, u, du, drift)
-            settled = steady.known and not met and not varies and _near(P, dP, steady)
+            P = _spread(joint, djoint, moves, here, slope, dslope, at, u, du, drift)
+            settled = steady.known and not met and not varies and _near(P, here.ahead, steady)
             if settled:
                 _weigh(joint, djoint, steady.P, steady.dP, here)
             else:
-                _weigh(joint, djoint, P, dP, here)
+                _weigh(joint, djoint, P, here.ahead, here)
         _ahead(joint, djoint, moves, u, du, disturbance[t], z, dz)
         if not np.max(np.abs(z)) < _LARGEST:
             result.status[t] = _DIVERGED
@@ -212,11 +228,15 @@ def run_filter(
 
 @njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 def _moving(dF: Buffer) -> Buffer:
-    """Which entries move along any direction."""
-    found = np.zeros(dF.shape[:2], dtype=np.bool_)
+    """Between which directions each entry moves (z, z, 2); none where both are the same."""
+    found = np.zeros((dF.shape[0], dF.shape[1], 2), dtype=np.int64)
     for i in range(dF.shape[0]):
         for j in range(dF.shape[1]):
-            found[i, j] = np.any(dF[i, j])
+            for c in range(dF.shape[2]):
+                if dF[i, j, c] != 0.0:
+                    if found[i, j, 1] == 0:
+                        found[i, j, 0] = c
+                    found[i, j, 1] = c + 1
     return found
 
 
@@ -233,7 +253,40 @@ def _room(size: int, p: int, k: int) -> _Update:
         np.empty((k, k)),
         np.empty((size, size)),
         np.empty((size, size, k)),
+        np.empty((size, size, k)),
+        np.empty((size, size, k)),
     )
+
+
+@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+def _fewer(given: Buffer, k: int) -> Buffer:
+    """The first k directions of derivatives."""
+    return np.ascontiguousarray(given[..., :k])
+
+
+@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+def _without_start(
+    djoint: JointLoop, steady: Steady, here: _Update, k: int
+) -> tuple[JointLoop, Steady, _Update]:
+    """What a first state no longer moves: all of it along the first k directions only."""
+    fewer = JointLoop(
+        _fewer(djoint.F, k),
+        _fewer(djoint.B, k),
+        _fewer(djoint.E, k),
+        _fewer(djoint.G, k),
+        _fewer(djoint.C, k),
+        _fewer(djoint.Q, k),
+        _fewer(djoint.R, k),
+        _fewer(djoint.P0, k),
+        _fewer(djoint.share, k),
+    )
+    update = _room(len(here.P), len(here.S), k)
+    update.PC[:], update.S[:], update.inverse[:] = here.PC, here.S, here.inverse
+    update.gain[:], update.P[:] = here.gain, here.P
+    update.dPC[:], update.dS[:] = here.dPC[:, :, :k], here.dS[:, :, :k]
+    update.dgain[:], update.dP[:] = here.dgain[:, :, :k], here.dP[:, :, :k]
+    update.half[:] = here.half[:k, :k]
+    return fewer, Steady(steady.P, _fewer(steady.dP, k), steady.known), update
 
 
 @njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
@@ -376,8 +429,12 @@ def _update(
     dz: Buffer,
     result: FilterResult,
     t: int,
-) -> None:
-    """Likelihood and score of one sample; z and dz become those given the sample."""
+    shared: int,
+) -> bool:
+    """Likelihood and score of one sample; z and dz become those given the sample.
+
+    Returns whether directions from `shared` on move the innovation and its covariance by nothing.
+    """
     size, p, k, q = len(z), len(output), here.dS.shape[2], dz.shape[1]
     e, de = output - joint.C @ z, np.zeros((p, q))
     for a in range(p):
@@ -415,6 +472,14 @@ def _update(
             for c in range(k):
                 dz[i, c] += here.dgain[i, a, c] * e[a]
     result.filtered[t] = z
+    for a in range(p):
+        for c in range(shared, q):
+            if not abs(de[a, c]) <= _FORGOTTEN * np.sqrt(here.S[a, a]):
+                return False
+        for c in range(shared, k):
+            if not abs(here.dS[a, a, c]) <= _FORGOTTEN * here.S[a, a]:
+                return False
+    return True
 
 
 @njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
@@ -501,16 +566,17 @@ def _spread(
     u: Buffer,
     du: Buffer,
     drift: Buffer,
-) -> tuple[Buffer, Buffer]:
-    """Covariance of the next z, given the outputs so far, and its derivative."""
+) -> Buffer:
+    """Covariance of the next z, given the outputs so far; its derivative goes to here.ahead."""
     size, k, n = len(here.P), here.dP.shape[2], slope.shape[1]
     F = joint.F.copy()
     F[:, at : at + n] += joint.B @ slope
     ahead = here.P @ F.T
-    P = F @ ahead + joint.Q
-    half = np.dot(F, here.dP.reshape(size, size * k)).reshape(size, size, k)
-    turned = np.ascontiguousarray(half.transpose(1, 0, 2)).reshape(size, size * k)
-    dP = np.dot(F, turned).reshape(size, size, k) + djoint.Q
+    P, dP = F @ ahead + joint.Q, here.ahead
+    # What is symmetric is filled from its upper half, which is half of the work.
+    np.dot(F, here.dP.reshape(size, size * k), here.product.reshape(size, size * k))
+    for i in range(size):
+        np.dot(F[i:], here.product[i], dP[i, i:])
     _add_turns(joint, djoint, moves, slope, dslope, at, ahead, dP)
     for a in range(len(u)):
         if joint.share[a] != 0.0:
@@ -522,21 +588,31 @@ def _spread(
             _add_noise(joint.G[:, a], djoint.G[:, a], size_of**2, dvariance, P, dP)
     if drift[0] > 0.0:
         _add_noise(joint.B[:, 0], djoint.B[:, 0], drift[0], drift[1:], P, dP)
-    return (P + P.T) / 2, dP
+    for i in range(size):
+        for j in range(i, size):
+            for c in range(k):
+                dP[i, j, c] += djoint.Q[i, j, c]
+            dP[j, i] = dP[i, j]
+    return (P + P.T) / 2  # type: ignore[no-any-return]
 
 
 @njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 def _add_noise(
     column: Buffer, dcolumn: Buffer, variance: float, dvariance: Buffer, P: Buffer, dP: Buffer
 ) -> None:
-    """Add the covariance of noise that enters by a column, and its derivative."""
+    """Add the covariance of noise that enters by a column, and the upper half of its derivative."""
+    turns = bool(np.any(dcolumn))
     for i in range(len(P)):
         for j in range(len(P)):
             both = column[i] * column[j]
             P[i, j] += both * variance
-            for c in range(len(dvariance)):
-                moved = dcolumn[i, c] * column[j] + column[i] * dcolumn[j, c]
-                dP[i, j, c] += both * dvariance[c] + moved * variance
+            if both != 0.0 and j >= i:
+                for c in range(len(dvariance)):
+                    dP[i, j, c] += both * dvariance[c]
+            if turns and j >= i:
+                for c in range(len(dvariance)):
+                    moved = dcolumn[i, c] * column[j] + column[i] * dcolumn[j, c]
+                    dP[i, j, c] += moved * variance
 
 
 @njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
@@ -554,11 +630,12 @@ def _shrink(P: Buffer, dP: Buffer, here: _Update) -> None:
             for c in range(k):
                 weighed[i, a, c] -= here.dPC[i, a, c]
     for i in range(size):
-        for j in range(size):
+        for j in range(i, size):
             for a in range(p):
+                first, second = here.gain[j, a], here.gain[i, a]
                 for c in range(k):
-                    here.dP[i, j, c] += weighed[i, a, c] * here.gain[j, a]
-                    here.dP[i, j, c] += here.gain[i, a] * weighed[j, a, c]
+                    here.dP[i, j, c] += weighed[i, a, c] * first + second * weighed[j, a, c]
+            here.dP[j, i] = here.dP[i, j]
 
 
 @njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
@@ -572,15 +649,8 @@ def _add_turns(
     ahead: Buffer,
     dP: Buffer,
 ) -> None:
-    """Add dF P F' and its transpose to dP, with `ahead` = P F'."""
+    """Add dF P F' and its transpose to the upper half of dP, with `ahead` = P F'."""
     size, k, (m, n) = len(dP), dP.shape[2], slope.shape
-    turns = np.zeros((size, size, k))
-    for i in range(size):
-        for j in range(size):
-            if moves[i, j]:
-                for b in range(size):
-                    for c in range(k):
-                        turns[i, b, c] += djoint.F[i, j, c] * ahead[j, b]
     commanded, moved = np.zeros((m, size)), np.zeros((m, size, k))
     for a in range(m):
         for j in range(n):
@@ -588,20 +658,29 @@ def _add_turns(
                 commanded[a, b] += slope[a, j] * ahead[at + j, b]
                 for c in range(k):
                     moved[a, b, c] += dslope[a, j, c] * ahead[at + j, b]
+    turns = np.empty((size, k))
     for i in range(size):
+        turns[:] = 0.0
+        for j in range(size):
+            first, last = moves[i, j]
+            if last > first:
+                for b in range(size):
+                    for c in range(first, last):
+                        turns[b, c] += djoint.F[i, j, c] * ahead[j, b]
         for a in range(m):
             if joint.B[i, a] != 0.0:
                 for b in range(size):
                     for c in range(k):
-                        turns[i, b, c] += joint.B[i, a] * moved[a, b, c]
+                        turns[b, c] += joint.B[i, a] * moved[a, b, c]
             if np.any(djoint.B[i, a]):
                 for b in range(size):
                     for c in range(k):
-                        turns[i, b, c] += djoint.B[i, a, c] * commanded[a, b]
-    for i in range(size):
-        for j in range(size):
+                        turns[b, c] += djoint.B[i, a, c] * commanded[a, b]
+        for b in range(size):
+            low, high = min(i, b), max(i, b)
+            times = 2.0 if b == i else 1.0
             for c in range(k):
-                dP[i, j, c] += turns[i, j, c] + turns[j, i, c]
+                dP[low, high, c] += times * turns[b, c]
 
 
 @njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
@@ -639,9 +718,8 @@ def _ahead(
             if joint.F[i, j] != 0.0:
                 for c in range(dz.shape[1]):
                     dz[i, c] += joint.F[i, j] * dbefore[j, c]
-            if moves[i, j]:
-                for c in range(k):
-                    dz[i, c] += djoint.F[i, j, c] * before[j]
+            for c in range(moves[i, j, 0], moves[i, j, 1]):
+                dz[i, c] += djoint.F[i, j, c] * before[j]
         for a in range(len(u)):
             if joint.B[i, a] != 0.0:
                 for c in range(dz.shape[1]):

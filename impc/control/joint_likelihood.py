@@ -78,6 +78,8 @@ class PreparedFilter:
     steady : Steady
     at : int
         Where the estimate stands in z.
+    shared : int
+        How many of the directions, the first ones, move more than the first state.
     """
 
     law: PreparedLoop
@@ -86,6 +88,7 @@ class PreparedFilter:
     moves: JointLoop
     steady: Steady
     at: int
+    shared: int
 
 
 @dataclass(frozen=True)
@@ -161,7 +164,7 @@ def prepare_filter(
     moves = joint_directions(plant, person, recorder, PlantMoves(*first[:4]), first[4])
     at = plant.n if person.estimates else 0
     steady = _steady(controller, joint, moves, along.K[..., :count], at)
-    return PreparedFilter(law, clip, joint, moves, steady, at)
+    return PreparedFilter(law, clip, joint, moves, steady, at, noise.covariances)
 
 
 def joint_likelihood(
@@ -209,6 +212,7 @@ def joint_likelihood(
         prepared.moves,
         prepared.steady,
         prepared.at,
+        prepared.shared,
         np.array(outputs, order="C"),
         np.array(disturbance, order="C"),
         z,

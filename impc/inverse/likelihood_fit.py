@@ -1,13 +1,8 @@
 """A person who senses with noise, by maximum likelihood.
 
-The search starts from a fit that takes all that it does not explain for noise in the recorder. It
-climbs by Fisher's scoring: with s the gradient of the log-likelihood, I the expected information,
-
-    theta <- theta + (I + mu (diag I + 1))^-1 s
-
-with mu raised until the likelihood grows. Noisy recordings leave some directions of the gain all
-but free; a weak normal prior in natural coordinates keeps those where the first fit was, as in
-`gain_search` (docs/noisy-people.md).
+The search starts from a fit that takes all that it does not explain for noise in the recorder, with
+levels that what this leaves suggests, and climbs from there (`likelihood_search`;
+docs/noisy-people.md).
 """
 
 from __future__ import annotations
@@ -21,6 +16,7 @@ from impc.arrays import Array, Frozen, frozen
 from impc.checking import checked
 from impc.errors import ImpcError, SolverError
 from impc.inverse.coordinates import Coordinates
+from impc.inverse.likelihood_search import Prior, climb, reach
 from impc.inverse.person_coordinates import PersonCoordinates
 from impc.inverse.residuals import residual_only
 from impc.inverse.structured_search import PriceCoordinates
@@ -39,18 +35,6 @@ __all__ = ["PersonFit", "fit_person"]
 # The likeliest is taken. On a seat whose recorder has a thirtieth of the residual the search had
 # not ended after 40 steps (docs/noisy-people.md).
 _STARTS = ((0.7, 0.5, 0.3), (0.3, 0.3, 0.9), (0.7, 0.1, 0.3), (0.1, 0.1, 1.0))
-# A search ends when a step promises less: a hundredth of a deviation along any direction.
-_SETTLED = 1e-4
-# A level that slides to zero, or a sense to one that is not used, has no end: along what is so flat
-# a step of ten is as far as a promise is believed.
-_FLAT = 1e-2
-# A level is held within a factor of e^9, some thousands, of where its search begins: there it is
-# none, or the sense is not used, and beyond it a filter is not told from rounding.
-_REACH = 9.0
-_TINY = 1e-9
-# Longest step of a coordinate.
-_STEP = 1.0
-_LARGEST_MU = 1e12
 # Recorded exactly, a residual has no size: its levels begin at this share of the outputs.
 _LEAST = 1e-6
 
@@ -81,9 +65,12 @@ class PersonFit(Frozen):
         Filters of all recordings with derivatives.
     theta : Array
         The unknowns, in the coordinates of `space` (count,).
-    space : PersonCoordinates
     told : Told
         What the recordings say there.
+    prior : Prior
+        What the search was held by.
+    box : pair of Array
+        Between which values it was held (count,).
     """
 
     K: Array
@@ -97,8 +84,14 @@ class PersonFit(Frozen):
     converged: bool
     evaluations: int
     theta: Array
-    space: PersonCoordinates
     told: Told
+    prior: Prior
+    box: tuple[Array, Array]
+
+    @property
+    def space(self) -> PersonCoordinates:
+        """The coordinates of the search."""
+        return self.prior.space
 
     @property
     def criterion(self) -> float:
@@ -177,9 +170,9 @@ def fit_person(
         log = np.log(np.concatenate([levels, recorded * size.recorder])[first.moving])
         starts.append(np.concatenate([space.start, log]))
     theta = _best(first, starts)
-    weights = np.zeros(len(theta))
-    weights[: first.own] = 1 / spread**2
-    theta, told, spent, settled = _climb(first, theta, weights, max_evaluations)
+    prior = Prior(first, spread)
+    box = reach(first, theta)
+    theta, told, spent, settled = climb(prior, theta, box, max_evaluations)
     person = first.unpack(theta)
     prices = space.unknowns(theta[: first.own]) if isinstance(space, PriceCoordinates) else None
     return PersonFit(
@@ -194,8 +187,9 @@ def fit_person(
         settled,
         spent,
         frozen(theta),
-        first,
         told,
+        prior,
+        box,
     )
 
 
@@ -256,41 +250,3 @@ def _best(space: PersonCoordinates, starts: list[Array]) -> Array:
     if max(values) == -np.inf:
         raise SolverError("person", f"no start has a likelihood: {reason}", "give other levels")
     return starts[int(np.argmax(values))]
-
-
-def _climb(
-    space: PersonCoordinates, theta: Array, weights: Array, budget: int
-) -> tuple[Array, Told, int, bool]:
-    """The largest likelihood near theta, with a prior of such weights about the start."""
-    told, mu, spent = space.told(theta), 1e-3, 1
-    about, reach = space.start, np.full(len(theta), np.inf)
-    reach[space.own :] = _REACH
-    low, high = theta - reach, theta + reach
-    while True:
-        gradient = told.gradient - weights * (theta - about)
-        free = ~((theta <= low) & (gradient < 0) | (theta >= high) & (gradient > 0))
-        gradient = np.where(free, gradient, 0.0)
-        curvature = np.where(np.outer(free, free), told.information, 0.0) + np.diag(weights)
-        plain = np.linalg.solve(curvature + _FLAT * np.eye(len(theta)), gradient)
-        if gradient @ plain / 2 < _SETTLED:
-            return theta, told, spent, True
-        accepted = False
-        while not accepted and mu < _LARGEST_MU and spent < budget:
-            damped = curvature + mu * np.diag(np.diag(curvature) + 1) + _TINY * np.eye(len(theta))
-            step = np.linalg.solve(damped, gradient)
-            step *= min(1.0, _STEP / float(np.max(np.abs(step))))
-            there = np.clip(theta + step, low, high)
-            spent += 1
-            try:
-                new = space.told(there)
-            except ImpcError:  # no filter there: a shorter step
-                mu *= 10
-                continue
-            gain = new.value - told.value
-            gain -= float(weights @ ((there - about) ** 2 - (theta - about) ** 2)) / 2
-            accepted = gain > 0
-            promised = float(gradient @ step - step @ curvature @ step / 2)
-            mu = mu / 10 if gain > promised / 2 else mu * (2 if accepted else 10)
-        if not accepted:
-            return theta, told, spent, False
-        theta, told = there, new

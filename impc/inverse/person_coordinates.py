@@ -19,9 +19,10 @@ from impc.control.joint_likelihood import NoiseDirections, joint_likelihood, pre
 from impc.errors import SolverError
 from impc.inverse.coordinates import PARAMETER_UNIT
 from impc.inverse.problem import controller_for
+from impc.inverse.structured_search import PriceCoordinates
 from impc.model.bounds import bound_rows
 from impc.model.plant_family import plant_differential
-from impc.model.riccati import is_stable
+from impc.model.riccati import is_stable, lyapunov_series
 
 if TYPE_CHECKING:
     from impc.control.constraint_rows import Directions
@@ -164,6 +165,51 @@ class PersonCoordinates:
             scores.append(score)
         value = sum(item.value for item in trials)
         return Told(value, gradient, information, scores, trials)
+
+    def wandering(self, theta: Array) -> tuple[float, Array]:
+        """Logarithm of how far white noise at the inputs drives the loop, beside the start's.
+
+        It grows without end towards the border of gains that stabilise. Prices never meet it.
+
+        Parameters
+        ----------
+        theta : Array
+            (q,).
+
+        Returns
+        -------
+        value : float
+            log tr(T^-1 X T^-T) / n, X = A_c X A_c' + B G G'B' at theta, T and G of the start;
+            infinite beyond the border.
+        gradient : Array
+            Its derivatives (q,).
+        """
+        space, gradient = self.space, np.zeros(len(theta))
+        if isinstance(space, PriceCoordinates):
+            return 0.0, gradient
+        here = space.unpack(theta[: self.own])
+        plant = here.problem.plant
+        closed = plant.A - plant.B @ here.K
+        if not is_stable(closed, discrete=True):
+            return np.inf, gradient
+        X = lyapunov_series(closed, (plant.B @ space.G @ space.G.T @ plant.B.T)[None])[0]
+        weight = np.asarray(np.linalg.inv(space.T @ space.T.T))
+        Y = lyapunov_series(closed.T, weight[None])[0]
+        size = float(np.sum(weight * X))
+        dK, _ = space.changes(here, theta[: self.own])
+        moved = -plant.B @ dK
+        turned = np.zeros_like(moved)
+        family = here.problem.family
+        if family is not None:
+            differential = plant_differential(family, here.problem.logarithms)
+            mine = slice(self.own - len(family.names), self.own)
+            dB = PARAMETER_UNIT * np.moveaxis(differential.B, -1, 0)
+            moved[mine] += PARAMETER_UNIT * np.moveaxis(differential.A, -1, 0) - dB @ here.K
+            turned[mine] = dB @ space.G @ space.G.T @ plant.B.T
+        change = np.einsum("ij,kij->k", 2 * Y @ closed @ X, moved)
+        change += 2 * np.einsum("ij,kij->k", Y, turned)
+        gradient[: self.own] = change / size
+        return float(np.log(size / len(X))), gradient
 
     def _columns(self, trial: int) -> _Moved:
         """Which unknowns move one trial: its own initial state stands last."""

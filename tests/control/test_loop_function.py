@@ -196,7 +196,7 @@ def test_a_bilevel_program_of_ones_own_finds_the_weights(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     """The tutorial, whose answer is that of the dissertation's example: Q = I."""
-    runpy.run_path(str(ROOT / "docs/tutorials/tutorial_8_casadi.py"))
+    runpy.run_path(str(ROOT / "docs/tutorials/tutorial_08_casadi.py"))
     printed = capsys.readouterr().out
     assert "Q = [[1.0, 0.0], [0.0, 1.0]]\n" in printed
     assert "residual (3.10) below 1e-6: True" in printed

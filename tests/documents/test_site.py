@@ -24,5 +24,5 @@ def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr[-5000:]
     built = {path.relative_to(tmp_path / "html").as_posix() for path in tmp_path.rglob("*.html")}
     assert {"index.html", "start.html", "_figures.html", "reproduction/index.html"} <= built
-    assert len([name for name in built if name.startswith("_tutorials/tutorial_")]) == 8
+    assert len([name for name in built if name.startswith("_tutorials/tutorial_")]) == 10
     assert len([name for name in built if name.startswith("_api/")]) > 100

@@ -5,22 +5,33 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from experiments.noisy_people_study import score, subject
+from experiments.noisy_people import recorded, subject
+from experiments.noisy_people_study import score
 
 
 def test_a_subject_is_scored_against_its_truth() -> None:
-    found = score(subject(0, "motor", 90.0, 0.7), "carts", 0)
+    found = score(subject("cart", 0, "motor", 90.0, 0.7), "carts", 0, profiled=False)
     assert 80 < found.vaf < 97
     assert found.converged
-    error, deviation = np.array(found.likely) - found.truth, np.array(found.likely_deviations)
-    assert np.all(np.abs(error) < 4 * deviation)  # seed 0
+    assert found.above > 0
+    assert len(found.expected) == 2
+    for error, deviation in found.expected:
+        assert abs(error) < 4 * deviation  # seed 0
     assert np.log(found.found[0] / found.levels[0]) == pytest.approx(0, abs=0.3)
+
+
+def test_the_seat_is_held_at_its_limit() -> None:
+    trials = recorded(subject("seat", 0, "motor", 90.0, 6.0), 0)
+    assert 0.1 < trials.saturated < 0.4
+    assert 85 < trials.vaf < 95
 
 
 @pytest.mark.slow
 def test_intervals_of_the_likelihood_hold() -> None:
     """Of 40 at 95 % two miss: 8 or more have a probability of 0.1 %."""
-    people = [score(subject(seed, "motor", 90.0, 5.0), "carts", seed) for seed in range(40)]
-    errors = np.array([one.likely for one in people]) - [one.truth for one in people]
-    deviations = np.array([one.expected_deviations for one in people])
-    assert np.all(np.sum(np.abs(errors) > 1.96 * deviations, axis=0) < 8)
+    people = [
+        score(subject("cart", seed, "motor", 90.0, 5.0), "carts", seed, profiled=False)
+        for seed in range(40)
+    ]
+    pairs = np.array([one.expected for one in people])
+    assert np.all(np.sum(np.abs(pairs[..., 0]) > 1.96 * pairs[..., 1], axis=0) < 8)

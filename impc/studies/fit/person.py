@@ -156,7 +156,6 @@ def person_data(result: FitResult) -> dict[str, Any] | None:
     if fit is None or covariance is None or report.confusion is None:
         return data
     values = np.exp(fit.theta[fit.space.own :])
-    intervals = [covariance.level_interval(k, value) for k, value in enumerate(values)]
     return data | {
         "K": fit.K,
         "K_deviations": covariance.entries,
@@ -164,7 +163,7 @@ def person_data(result: FitResult) -> dict[str, Any] | None:
         "known": fit.observer.walk is None,
         "levels": {
             name: {"value": value, "low": low, "high": high}
-            for name, value, (low, high) in zip(fit.space.names, values, intervals, strict=True)
+            for name, value, (low, high) in zip(fit.space.names, values, report.levels, strict=True)
         },
         "confusion": report.confusion.correlation,
         "whiteness": report.whiteness,
@@ -201,8 +200,9 @@ def _models_table(report: PersonReport) -> TextTable:
 
 def _levels_table(plant: Plant, report: PersonReport) -> TextTable:
     return table_of(
-        "Levels of noise: standard deviations of one sample, with intervals of 95 % (sandwich). A "
-        "level whose interval reaches a factor of ten is only told to be at most its upper end.",
+        "Levels of noise: standard deviations of one sample, with intervals of 95 % (by the "
+        "sandwich, or by profile where a level is weakly told). A level whose interval reaches a "
+        "factor of ten is only told to be at most its upper end.",
         _levels(plant, report),
         {
             "noise": lambda item: item.name,
@@ -211,6 +211,8 @@ def _levels_table(plant: Plant, report: PersonReport) -> TextTable:
                 f"{number(item.low)} to {number(item.high)}"
                 if item.told
                 else f"at most {number(item.high)}"
+                if np.isfinite(item.high)
+                else "not told"
             ),
             "unit": lambda item: item.unit,
         },
@@ -255,14 +257,14 @@ def _left_table(result: FitResult, report: PersonReport) -> TextTable:
 
 
 def _levels(plant: Plant, report: PersonReport) -> list[_Level]:
-    fit, covariance = report.models[0].fit, report.covariance
-    if fit is None or covariance is None:
+    fit = report.models[0].fit
+    if fit is None:
         return []
     found = []
     for index, name in enumerate(fit.space.names):
         kind, signal = name.split(" ", 1)
         factor, unit = (100.0, "%") if kind == "share" else shown_unit(plant, signal)
         value = float(np.exp(fit.theta[fit.space.own + index]))
-        low, high = covariance.level_interval(index, value)
+        low, high = (float(end) for end in report.levels[index])
         found.append(_Level(name, unit, factor * value, factor * low, factor * high))
     return found

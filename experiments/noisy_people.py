@@ -1,0 +1,173 @@
+"""People of the study of noise, who sense positions and velocities: on a cart, and on the seat.
+
+A cart of two states under a push of three levels, or the linear seated subject under the ternary
+torque. Noise is in the motor, in the senses, or in both, of a size that leaves the motion without
+noise a VAF of 90 or 70 %; the limit of the command is far away, or met at a tenth of the samples
+and more. Prices are log-uniform within a factor of two.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import control
+import numpy as np
+
+import plants
+from experiments.benchmarks.workloads import seat
+from impc.assess.variance_accounted_for import vaf
+from impc.control.closed_loop import scenario, simulate
+from impc.control.controller import Controller
+from impc.control.noisy_person import simulate_person
+from impc.inverse.problem import Problem
+from impc.model.bounds import Bounds
+from impc.model.observer import Observer
+from impc.model.plant import Plant
+from impc.model.recordings import Recording
+from impc.model.weights import Weights
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from impc.arrays import Array
+
+__all__ = ["BODIES", "NOISES", "Recorded", "Subject", "recorded", "subject"]
+
+#: Noise of each kind before it is scaled, as shares of the sizes that a body has: motor, senses.
+NOISES = {"motor": (1.0, 0.1), "sensory": (0.05, 1.0), "both": (1.0, 1.0)}
+#: Who moves what.
+BODIES = ("cart", "seat")
+_TRIALS, _FACTOR = 3, 2.0
+# Of the standard deviation of the recorded motion.
+_RECORDER = 0.02
+# Bisections of the logarithm of the noise's size, and where it lies.
+_HALVINGS, _SIZES = 14, (-4.0, 1.5)
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A person, as simulated.
+
+    Attributes
+    ----------
+    controller : Controller
+    person : Observer
+    recorder : Array
+        Standard deviations of the recorder's noise (p,).
+    pushes : sequence of Array
+        Of each trial (samples,).
+    """
+
+    controller: Controller
+    person: Observer
+    recorder: Array
+    pushes: Sequence[Array]
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """What is recorded of a subject.
+
+    Attributes
+    ----------
+    problem : Problem
+        Initial states are not known.
+    saturated : float
+        Share of the samples at the limit.
+    vaf : float
+        Of the motion without noise, %, the mean of the outputs.
+    """
+
+    problem: Problem
+    saturated: float
+    vaf: float
+
+
+def subject(body: str, seed: int, noise: str, share: float, limit: float) -> Subject:
+    """A subject whose motion without noise has a VAF of about `share` %."""
+    kind = [BODIES.index(body), list(NOISES).index(noise)]
+    rng = np.random.default_rng([seed, round(share), *kind, round(100 * limit)])
+    law, pushes = (_on_cart if body == "cart" else _on_seat)(rng, limit)
+    low, high = _SIZES
+    for _ in range(_HALVINGS):
+        middle = (low + high) / 2
+        person = _person(body, law.plant, noise, np.exp(middle))
+        if _agreement(law, person, pushes, rng) > share:
+            low = middle
+        else:
+            high = middle
+    clean = simulate(law, scenario(law.plant, np.zeros(law.plant.n), disturbance=pushes[0])).x
+    recorder = _RECORDER * np.std(clean @ law.plant.C.T, axis=0)
+    return Subject(law, _person(body, law.plant, noise, np.exp(low)), recorder, pushes)
+
+
+def recorded(who: Subject, seed: int) -> Recorded:
+    """The trials of a subject."""
+    law, plant, trials, met, shares = who.controller, who.controller.plant, [], [], []
+    for number, push in enumerate(who.pushes):
+        found = simulate_person(law, who.person, push, recorder=who.recorder, seed=[seed, number])
+        met.append(np.mean(np.abs(found.u) >= law.bounds.u_max - 1e-9))
+        shares.append(_moved(law, found.states, push))
+        trials.append(Recording(plant, found.outputs, push))
+    problem = Problem(
+        plant, law.bounds, law.horizon, trials, terminal_set=False, unknown_start=True
+    )
+    return Recorded(problem, float(np.mean(met)), float(np.mean(shares)))
+
+
+def _on_cart(rng: np.random.Generator, limit: float) -> tuple[Controller, list[Array]]:
+    """Mass on wheels, 20 samples a second, 30 s a trial."""
+    system = control.ss(
+        [[1, 0.05], [0, 0.98]], [[0, 0], [0.05, 0.05]], [[1, 0]], 0, 0.05,
+        states=["x", "v"], inputs=["u", "push"], outputs=["x"],
+    )  # fmt: skip
+    plant = Plant(system, ["u"])
+    weights = Weights(np.diag(np.array([8.0, 1.0]) * _factors(rng, 2)), 1)
+    law = Controller(
+        plant, weights, Bounds(plant, u_min=-limit, u_max=limit), 5, terminal_set=False
+    )
+    return law, [np.repeat(rng.choice([-0.7, 0.0, 0.7], 60), 10) for _ in range(_TRIALS)]
+
+
+def _on_seat(rng: np.random.Generator, limit: float) -> tuple[Controller, list[Array]]:
+    """The seated subject of the benchmarks, 100 samples a second, 30 s a trial."""
+    work = seat(1, 2.0)
+    plant, factor = work.controller.plant, np.ones(work.controller.plant.n)
+    factor[:4] = np.sqrt(_factors(rng, 4))
+    weights = Weights(factor[:, None] * np.array(work.weights.Q) * factor, 1)
+    law = Controller(
+        plant, weights, Bounds(plant, u_min=-limit, u_max=limit), 20, terminal_set=False
+    )
+    seeds = rng.integers(2**31, size=_TRIALS)
+    return law, [plants.ternary_torque(duration=30.0, rate=100.0, seed=int(k)) for k in seeds]
+
+
+def _factors(rng: np.random.Generator, count: int) -> Array:
+    return np.exp(rng.uniform(-np.log(_FACTOR), np.log(_FACTOR), count))
+
+
+def _person(body: str, plant: Plant, noise: str, size: float) -> Observer:
+    motor, look = np.array(NOISES[noise]) * size
+    if body == "cart":  # 1 N, 5 cm, 10 cm/s
+        return Observer(plant, ["x", "v"], motor=motor, sensory=[0.05 * look, 0.1 * look])
+    angle = np.radians(look)  # 3 Nm, 1 deg, 10 deg/s
+    sensed = ["theta1", "theta2", "theta1_rate", "theta2_rate"]
+    return Observer(plant, sensed, motor=3 * motor, sensory=[angle, angle, 10 * angle, 10 * angle])
+
+
+def _agreement(
+    law: Controller, person: Observer, pushes: Sequence[Array], rng: np.random.Generator
+) -> float:
+    shares = []
+    for push in pushes:
+        noisy = simulate_person(law, person, push, seed=int(rng.integers(2**31)))
+        shares.append(_moved(law, noisy.states, push))
+    return float(np.mean(shares))
+
+
+def _moved(law: Controller, states: Array, push: Array) -> float:
+    """VAF of the motion without noise in the motion with it, the mean of the outputs, %."""
+    plant = law.plant
+    clean = simulate(law, scenario(plant, np.zeros(plant.n), disturbance=push)).x[:-1]
+    return float(np.mean(vaf(states @ plant.C.T, clean @ plant.C.T)))

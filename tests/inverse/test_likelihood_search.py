@@ -1,0 +1,76 @@
+"""The search for the largest likelihood: its step, its end, what slides beside it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from impc.control.controller import Controller
+from impc.inverse.likelihood_fit import PersonFit, fit_person
+from impc.inverse.likelihood_search import Prior, boxed_step, climb, reach
+from impc.inverse.methods import estimate
+from impc.model.observer import Observer
+from impc.model.weights import Weights
+from tests.inverse.test_likelihood_fit import cart, posed
+
+
+@pytest.fixture(scope="module")
+def sliding() -> PersonFit:
+    """Someone whose senses err so little that these levels are not told."""
+    person = Observer(cart(), ["x", "v"], motor=0.4, sensory=[0.002, 0.004])
+    return fit_person(
+        estimate(posed(person, 0.01, 0.9)), person.with_levels(np.array([0.1, 0, 0, 0, 0.1, 0.1]))
+    )
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_step_is_the_best_of_its_box(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    root, gradient = rng.normal(size=(6, 6)), 3 * rng.normal(size=6)
+    curvature, bound = root @ root.T + 0.1 * np.eye(6), rng.uniform(0.1, 1.0, 6)
+    bound[2] = 0.0  # held
+    step, promised = boxed_step(gradient, curvature, -bound, bound)
+    found = np.zeros(6)
+    for _ in range(2000):  # one coordinate after the other, each at its best
+        for k in range(6):
+            rest = gradient[k] - curvature[k] @ found + curvature[k, k] * found[k]
+            found[k] = np.clip(rest / curvature[k, k], -bound[k], bound[k])
+    assert step[2] == 0.0
+    np.testing.assert_allclose(step, found, atol=1e-9)
+    assert promised == pytest.approx(gradient @ found - found @ curvature @ found / 2, abs=1e-9)
+
+
+def test_levels_that_slide_do_not_hold_back_the_rest(sliding: PersonFit) -> None:
+    """A step that was scaled as a whole took more than 30 likelihoods here, and 100 on the seat."""
+    assert sliding.converged
+    assert sliding.evaluations < 20
+    space, theta = sliding.space, np.array(sliding.space.start)
+    truth = Controller(cart(), Weights(np.diag([8.0, 1.0]), 1), sliding.problem.bounds, 5).K
+    own = space.space
+    along = np.tensordot(own.natural(own.gains.gains), own.natural(np.array(truth)), 2)
+    theta[: space.gain] = along
+    starts = np.array([trial.x0 for trial in own.problem.recordings])
+    theta[space.shared : space.after] = -np.linalg.solve(own.start_unit, starts.T).T.ravel()
+    theta[space.own :] = np.log([0.4, 0.002, 0.004, 0.01])
+    assert sliding.log_likelihood > space.value(theta)
+
+
+def test_a_search_that_may_not_go_on_says_so(sliding: PersonFit) -> None:
+    space = sliding.space
+    theta, told, spent, settled = climb(
+        Prior(space, 1.0), space.start, reach(space, space.start), 2
+    )
+    assert (spent, settled) == (2, False)
+    assert told.value == space.told(theta).value < sliding.log_likelihood
+
+
+def test_the_prior_bends_as_it_says(sliding: PersonFit) -> None:
+    """The gradient against differences; without a spread it says nothing."""
+    space, theta = sliding.space, np.array(sliding.theta)
+    prior, step = Prior(space, 0.5), np.random.default_rng(0).normal(size=len(theta))
+    h = 1e-5
+    change = (prior.value(theta + h * step) - prior.value(theta - h * step)) / (2 * h)
+    assert prior.slopes(theta)[0] @ step == pytest.approx(change, rel=1e-6)
+    nothing = Prior(space, np.inf)
+    assert nothing.value(theta) == 0.0
+    assert not np.any(nothing.slopes(theta)[1])
