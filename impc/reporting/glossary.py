@@ -126,7 +126,7 @@ class Glossary:
 
 def used_words(page: str) -> tuple[tuple[str, str], ...]:
     """The words of the glossary that stand in the text of a `page`, with their meanings."""
-    text = unescape(re.sub(r"<style.*?</style>|<[^>]*>", " ", page, flags=re.DOTALL))
+    text = unescape(re.sub(r"<(style|script)\b.*?</\1>|<[^>]*>", " ", page, flags=re.DOTALL))
     found: set[str] = set()
     while True:  # what explains a word may use another
         new = {word for word in WORDS if word not in found and _pattern(word).search(text)}

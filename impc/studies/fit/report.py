@@ -12,6 +12,7 @@ from impc.assess.covariance import TOLD
 from impc.control.named_solver import described
 from impc.reporting.document import (
     Block,
+    Chart,
     Details,
     Heading,
     Lines,
@@ -25,6 +26,7 @@ from impc.reporting.document import (
     table_of,
 )
 from impc.reporting.rendering import number
+from impc.studies.charts import methods_chart, weights_chart
 from impc.studies.fit.csv_tables import fit_tables
 from impc.studies.fit.figures import fit_figures
 from impc.studies.fit.interval_figures import shown_statements
@@ -133,9 +135,11 @@ def fit_report(
             *([] if result.person is None else [person_section(result, result.person)]),
             Section("2. What may be said of the weights", _statements(result), "Weights"),
             Section("3. Inverse LQR on the same recordings", _methods(result), "Inverse LQR"),
-            Section("4. Recorded and simulated", _trajectories(result), "Trajectories"),
+            Section("4. Recorded and simulated", _trajectories(result, angles), "Trajectories"),
             Section("5. What is left", (_LEFT, _RESIDUALS), "What is left", folded=True),
-            Section("6. All weights with this gain", _intent(result), "Intent", folded=True),
+            Section(
+                "6. All weights with this gain", _weights(result, angles), "Intent", folded=True
+            ),
             Section("7. Checks of the recordings", (_checks(result),), "Checks", folded=True),
             Section("8. Settings and versions", _made(result, provenance), "Settings", folded=True),
         ],
@@ -182,7 +186,7 @@ def _methods(result: FitResult) -> list[Block]:
     ]
 
 
-def _trajectories(result: FitResult) -> list[Block]:
+def _trajectories(result: FitResult, angles: str) -> list[Block]:
     shown, trials = shown_trials(result), len(result.given.recordings)
     blocks: list[Block] = [_agreement(result)]
     if len(shown) < trials:
@@ -201,13 +205,15 @@ def _trajectories(result: FitResult) -> list[Block]:
         for index in shown
     ]
     others = [Details("The other trials", pictures[1:])] if len(pictures) > 1 else []
-    return [*blocks, *pictures[:1], *others]
+    data = methods_chart(result.given, result.methods[::-1], shown[0], angles)
+    return [*blocks, Chart(pictures[0], data), *others]
 
 
-def _intent(result: FitResult) -> list[Block]:
+def _weights(result: FitResult, angles: str) -> list[Block]:
+    moved = Chart(_INTENT, weights_chart(result.fitted.problem, result.intent, angles))
     plant, summary = result.fitted.problem.plant, result.certainty.weights
     missing = [f"Not available: {line}" for line in result.intent.missing]
-    blocks: list[Block] = [_readings(result), *missing, _INTENT]
+    blocks: list[Block] = [_readings(result), *missing, moved]
     if summary is not None:
         blocks += set_sentences(summary)
         ranges = (entries_table(summary), eigenvalues_table(summary))

@@ -79,7 +79,7 @@ def _how_sure(result: FitResult) -> str:
     return (
         f"Other weights with exactly the same behaviour turn that direction by up to "
         f"{result.widest_angle:.0f} degrees: so far it was chosen by a rule and not by the "
-        f"subject (section 4).{drawn}"
+        f"subject (section 6).{drawn}"
     )
 
 
