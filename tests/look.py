@@ -22,6 +22,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+from tests.cli.test_plan import PLAN
 from tests.support import easier_seat
 
 ROOT = Path(__file__).parents[1]
@@ -131,8 +132,17 @@ def _made(folder: Path) -> list[Path]:
     shorter = study.read_text(encoding="utf-8").replace("replicates = 200", "replicates = 20")
     study.write_text(shorter.replace("size = 5", "size = 9"), encoding="utf-8")
     _impc(folder, "select", "heads/study.toml", "--out", "select", "--workers", "1")
+    _impc(folder, "simulate", "head-tracking", "--out", "twice", "--subjects", "2", "--visits", "2",
+          "--trials", "1", "--duration", "6")  # fmt: skip
+    study = folder / "twice" / "study.toml"
+    short = study.read_text(encoding="utf-8").replace("replicates = 200", "replicates = 20")
+    study.write_text(f"{short}starts = 1\n", encoding="utf-8")
+    _impc(folder, "key-parameters", "twice/study.toml", "--out", "key", "--bound", "0.03",
+          "--workers", "1")  # fmt: skip
+    (folder / "plan.toml").write_text(PLAN, encoding="utf-8")
+    _impc(folder, "plan", "plan.toml", "--plant", "seated-balance", "--out", "plan")
     own = sorted((folder / "cohort" / "subjects").glob("*.html"))[:1]
-    commands = ("example", "fit", "compare", "reliability", "cohort", "select")
+    commands = ("example", "fit", "compare", "reliability", "cohort", "select", "key", "plan")
     return [*(folder / name / "report.html" for name in commands), *own]
 
 

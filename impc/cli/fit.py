@@ -38,6 +38,7 @@ def command(
     # Imported here: the libraries take seconds to load, and --help needs none.
     from impc.cli.consent import require_consent  # noqa: PLC0415
     from impc.cli.subject import read_subject  # noqa: PLC0415
+    from impc.reporting.shown_units import angles_in  # noqa: PLC0415
     from impc.reporting.writer import require_writable, write_files  # noqa: PLC0415
     from impc.studies.effort import fit_effort  # noqa: PLC0415
     from impc.studies.fit.memory import open_memory  # noqa: PLC0415
@@ -59,7 +60,8 @@ def command(
     with progress(stages(problem, settings) + 1, "stage", lambda _: memory.kept()) as done:
         told = FitProgress(done, memory.estimate, memory.replicate)
         result = fit_recordings(problem, settings, told)
-        content = fit_report(result, subject.provenance, truth, subject.angles).files()
+        with angles_in(subject.angles):
+            content = fit_report(result, subject.provenance, truth).files()
         done("page")
     written = write_files(out, content)
     memory.forget()

@@ -50,9 +50,7 @@ _DASHES = ("6 3", "2 2", "8 2 2 2", "")
 _RECORDED = {"label": "recorded", "color": "#8C8C8C", "dash": ""}
 
 
-def methods_chart(
-    problem: Problem, fits: Sequence[MethodFit], trial: int, angles: str = "degrees"
-) -> dict[str, Any]:
+def methods_chart(problem: Problem, fits: Sequence[MethodFit], trial: int) -> dict[str, Any]:
     """Every method's outputs and commands on one trial, beside what was recorded.
 
     Parameters
@@ -63,13 +61,11 @@ def methods_chart(
         Those without a gain are left out.
     trial : int
         Its place among the recordings.
-    angles : str
-        "degrees" or "radians".
     """
     drawn = [fit for fit in fits if fit.runs]
     plant, given = problem.plant, problem.recordings[trial]
     stride = -(-given.samples // _SAMPLES)
-    outputs = [given.outputs] + [fit.runs[trial].x @ plant.C.T for fit in drawn]
+    outputs = [given.outputs, *(np.asarray(fit.runs[trial].x @ plant.C.T) for fit in drawn)]
     commands = [np.full((given.samples, plant.m), np.nan)]
     commands += [_to_the_end(fit.runs[trial].u) for fit in drawn]
     for fit, y, u in zip(drawn, outputs[1:], commands[1:], strict=True):
@@ -80,11 +76,11 @@ def methods_chart(
         "label": "time (s)",
         "step": plant.dt * stride,
         "curves": [_RECORDED, *(_curve(METHODS[fit.name].label, k) for k, fit in enumerate(drawn))],
-        "panels": _panels(problem, outputs, commands, stride, angles),
+        "panels": _panels(problem, outputs, commands, stride),
     }
 
 
-def weights_chart(problem: Problem, found: Intent, angles: str = "degrees") -> dict[str, Any]:
+def weights_chart(problem: Problem, found: Intent) -> dict[str, Any]:
     """Weights with one gain, from each rule's to the next one's, and a trial simulated with each.
 
     Of weights with one gain every mixture has it too (docs/equivalent-weights.md), so the way from
@@ -95,8 +91,6 @@ def weights_chart(problem: Problem, found: Intent, angles: str = "degrees") -> d
     problem : Problem
         At the initial states and parameters that were found.
     found : Intent
-    angles : str
-        "degrees" or "radians".
     """
     plant, drive = problem.plant, scenarios(problem)[0]
     few = type(drive)(drive.x0, drive.disturbance[:_FEW])
@@ -105,7 +99,7 @@ def weights_chart(problem: Problem, found: Intent, angles: str = "degrees") -> d
     runs = [simulate(controller_for(problem, law.K, law.S), few) for law in laws]
     outputs = [run.x[:-1] @ plant.C.T for run in runs]
     commands = [run.u for run in runs]
-    own = _panels(problem, [outputs[0]] * 2, [commands[0]] * 2, _EACH, angles)
+    own = _panels(problem, [outputs[0]] * 2, [commands[0]] * 2, _EACH)
     largest = float(np.max(np.abs(commands[0])))
     sizes = np.asarray(found.sizes)
     scaled = np.array([one.Q * np.outer(sizes, sizes) for _, one in pairs])
@@ -113,7 +107,7 @@ def weights_chart(problem: Problem, found: Intent, angles: str = "degrees") -> d
     positions = []
     for place, ((label, _), y, u) in enumerate(zip(pairs, outputs, commands, strict=True)):
         moved = float(np.max(np.abs(u - commands[0]))) / largest if largest else 0.0
-        panels = _panels(problem, [y], [u], _EACH, angles)
+        panels = _panels(problem, [y], [u], _EACH)
         positions.append(
             {
                 "label": f"{label}.",
@@ -178,7 +172,7 @@ def _curve(label: str, place: int) -> dict[str, str]:
 
 
 def _panels(
-    problem: Problem, outputs: list[Array], commands: list[Array], stride: int, angles: str
+    problem: Problem, outputs: Sequence[Array], commands: Sequence[Array], stride: int
 ) -> list[dict[str, Any]]:
     plant, bounds = problem.plant, problem.bounds
     panels = []
@@ -187,11 +181,11 @@ def _panels(
         (plant.controls, commands, bounds.u_min, bounds.u_max),
     ):
         for column, name in enumerate(names):
-            factor = shown_unit(plant, name, angles)[0]
+            factor = shown_unit(plant, name)[0]
             limits = [] if low is None or high is None else [low[column], high[column]]
             panels.append(
                 {
-                    "label": axis_label(plant, name, angles),
+                    "label": axis_label(plant, name),
                     "bounds": [float(factor * one) for one in limits if np.isfinite(one)],
                     "curves": [_short(factor * part[::stride, column]) for part in curves],
                 }

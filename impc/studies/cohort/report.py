@@ -51,7 +51,8 @@ _CENTRE = (
 _GROUPS = Picture(
     "groups",
     "Measures of every unit by group",
-    "Every unit, by group; bars are means. The measures that differ most.",
+    "Every unit, by group, visits from left to right; a line joins those of one person. Bars are "
+    "means. The measures that differ most.",
 )
 
 

@@ -52,13 +52,12 @@ def compare_report(
     problem: Problem,
     compared: Sequence[MethodFit],
     provenance: Provenance,
-    angles: str = "degrees",
 ) -> Report:
-    """Page, result.json, methods.csv and the figure, with `angles` in "degrees" or "radians"."""
+    """Page, result.json, methods.csv and the figure."""
     subject = str(problem.recordings[0].label.subject) or "a subject"
     methods = [METHODS[item.name] for item in compared]
     with journal_style():
-        figures = drawn({"comparison": _figure(problem, compared, angles)})
+        figures = drawn({"comparison": _figure(problem, compared)})
     sections = [
         Section(
             "1. All methods on the same recordings",
@@ -166,7 +165,7 @@ def _weights(problem: Problem, compared: Sequence[MethodFit]) -> TextTable:
     )
 
 
-def _figure(problem: Problem, compared: Sequence[MethodFit], angles: str) -> Figure:
+def _figure(problem: Problem, compared: Sequence[MethodFit]) -> Figure:
     shown = [item for item in compared if item.estimate.K is not None][::-1]
     figure = new_figure(DOUBLE_COLUMN, 0.5 + 0.36 * max(len(shown), 2))
     left, right = figure.subplots(1, 2, sharey=True, width_ratios=(1.6, 1))
@@ -190,7 +189,7 @@ def _figure(problem: Problem, compared: Sequence[MethodFit], angles: str) -> Fig
     if np.isfinite(limit):
         right.axvline(limit, color=INK, linestyle=":", linewidth=1.2)
         right.set_xlim(0, min(1.05 * max(largest), 5 * limit))
-    right.set_xlabel(f"largest {axis_label(problem.plant, problem.plant.controls[0], angles)}")
+    right.set_xlabel(f"largest {axis_label(problem.plant, problem.plant.controls[0])}")
     return figure
 
 

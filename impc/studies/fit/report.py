@@ -104,7 +104,6 @@ def fit_report(
     result: FitResult,
     provenance: Provenance,
     truth: Array | None = None,
-    angles: str = "degrees",
 ) -> Report:
     """Page, result.json, tables and figures.
 
@@ -114,8 +113,6 @@ def fit_report(
     provenance : Provenance
     truth : Array, optional
         Gain (m, n) of a simulated subject: the page then compares with it.
-    angles : str
-        "degrees" or "radians": how figures show them.
     """
     told = () if truth is None else (Note("Truth.", truth_sentence(result, truth)),)
     subject = str(result.given.recordings[0].label.subject) or "a subject"
@@ -135,15 +132,13 @@ def fit_report(
             *([] if result.person is None else [person_section(result, result.person)]),
             Section("2. What may be said of the weights", _statements(result), "Weights"),
             Section("3. Inverse LQR on the same recordings", _methods(result), "Inverse LQR"),
-            Section("4. Recorded and simulated", _trajectories(result, angles), "Trajectories"),
+            Section("4. Recorded and simulated", _trajectories(result), "Trajectories"),
             Section("5. What is left", (_LEFT, _RESIDUALS), "What is left", folded=True),
-            Section(
-                "6. All weights with this gain", _weights(result, angles), "Intent", folded=True
-            ),
+            Section("6. All weights with this gain", _weights(result), "Intent", folded=True),
             Section("7. Checks of the recordings", (_checks(result),), "Checks", folded=True),
             Section("8. Settings and versions", _made(result, provenance), "Settings", folded=True),
         ],
-        figures=fit_figures(result, angles),
+        figures=fit_figures(result),
         tables=fit_tables(result),
         data={**fit_data(result, provenance), "truth": None if truth is None else {"K": truth}},
         provenance=provenance,
@@ -186,7 +181,7 @@ def _methods(result: FitResult) -> list[Block]:
     ]
 
 
-def _trajectories(result: FitResult, angles: str) -> list[Block]:
+def _trajectories(result: FitResult) -> list[Block]:
     shown, trials = shown_trials(result), len(result.given.recordings)
     blocks: list[Block] = [_agreement(result)]
     if len(shown) < trials:
@@ -205,12 +200,12 @@ def _trajectories(result: FitResult, angles: str) -> list[Block]:
         for index in shown
     ]
     others = [Details("The other trials", pictures[1:])] if len(pictures) > 1 else []
-    data = methods_chart(result.given, result.methods[::-1], shown[0], angles)
+    data = methods_chart(result.given, result.methods[::-1], shown[0])
     return [*blocks, Chart(pictures[0], data), *others]
 
 
-def _weights(result: FitResult, angles: str) -> list[Block]:
-    moved = Chart(_INTENT, weights_chart(result.fitted.problem, result.intent, angles))
+def _weights(result: FitResult) -> list[Block]:
+    moved = Chart(_INTENT, weights_chart(result.fitted.problem, result.intent))
     plant, summary = result.fitted.problem.plant, result.certainty.weights
     missing = [f"Not available: {line}" for line in result.intent.missing]
     blocks: list[Block] = [_readings(result), *missing, moved]

@@ -18,6 +18,7 @@ from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.recordings import Recording
 from impc.model.weights import Weights
+from impc.reporting.shown_units import angles_in
 from impc.studies.charts import methods_chart, weights_chart
 from impc.studies.fit.figures import trajectory_figure
 from impc.studies.fit.interval_figures import gain_figure, shown_statements, statements_figure
@@ -112,7 +113,8 @@ def test_angles_are_shown_as_is_asked() -> None:
         result.fitted, problem=replace(result.fitted.problem, plant=turned)
     ))  # fmt: skip
     for angles, label, factor in (("degrees", "deg", 180 / np.pi), ("radians", "rad", 1.0)):
-        ax = trajectory_figure(shown, 0, angles).axes[0]
+        with angles_in(angles):
+            ax = trajectory_figure(shown, 0).axes[0]
         assert ax.get_ylabel() == f"place ({label})"
         (line, _) = ax.lines
         recorded = factor * result.given.recordings[0].outputs[:, 0]
@@ -121,7 +123,7 @@ def test_angles_are_shown_as_is_asked() -> None:
 
 def test_curves_of_the_page_are_those_of_the_fit() -> None:
     result = fitted(1.0)
-    data = methods_chart(result.given, result.methods[::-1], 0, "radians")
+    data = methods_chart(result.given, result.methods[::-1], 0)
     assert [one["label"] for one in data["curves"]][:2] == ["recorded", "inverse MPC, direct (3.6)"]
     place, pull = data["panels"]
     assert (place["label"], pull["label"], pull["bounds"]) == ("place (m)", "pull (m/s^2)", [-1, 1])
@@ -136,7 +138,7 @@ def test_curves_of_the_page_are_those_of_the_fit() -> None:
 
 def test_weights_of_the_slider_move_prices_and_nothing_else() -> None:
     result = fitted(1.0)
-    data = weights_chart(result.fitted.problem, result.intent, "radians")
+    data = weights_chart(result.fitted.problem, result.intent)
     # Of this cart, a double integrator, only the mixed price is free: from 0 to 0.93, measured.
     prices = np.array([one["prices"] for one in data["positions"]])
     np.testing.assert_allclose(prices, np.tile(prices[0], (len(prices), 1)), rtol=1e-9)
