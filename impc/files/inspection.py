@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import json
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.files.table import Table
 
-__all__ = ["Wanted", "clock_column", "draft_configuration", "summary"]
+__all__ = ["Wanted", "clock_column", "draft_configuration", "open_places", "summary"]
 
 _CLOCKS = ("time", "t", "zeit", "temps", "tiempo", "timestamp", "clock", "seconds", "sec")
 # Units of a clock that tells none, and how many make a second: the first in which the steps are
@@ -29,6 +30,8 @@ _CLOCKS = ("time", "t", "zeit", "temps", "tiempo", "timestamp", "clock", "second
 _GUESSES = (("s", 1.0), ("ms", 1e3), ("us", 1e6), ("ns", 1e9))
 _SLOWEST = 0.2
 _HORIZON = 20
+# Arguments of a plant that are measured of every subject.
+_BODY = ("mass", "height")
 _ALIKE = 0.6  # theta1 and theta_2 are, push and perturbation are not
 
 
@@ -123,7 +126,11 @@ def _plant_lines(wanted: Wanted) -> list[str]:
     for name, value in wanted.arguments.items():
         if isinstance(value, bool | int | float | str):
             text = json.dumps(value, ensure_ascii=False)
-            lines.append(f"{name} = {text}" if value == FILL_IN else f"# {name} = {text}")
+            own = f"of the subject; without this line it is {text}, of a typical one"
+            if name in _BODY and value != FILL_IN:
+                lines.append(_line(f'{name} = "{FILL_IN}"', own))
+            else:
+                lines.append(f"{name} = {text}" if value == FILL_IN else f"# {name} = {text}")
     return lines
 
 
@@ -189,6 +196,11 @@ def _rate(values: Array) -> float | None:
 
 def _base(name: str) -> str:
     return name.rpartition(".")[2].rpartition("/")[2].strip().lower()
+
+
+def open_places(text: str) -> tuple[int, int]:
+    """How many guesses a draft holds, and how many places that are to be filled in."""
+    return len(re.findall("# a guess|# A GUESS", text)), text.count(f'= "{FILL_IN}"')
 
 
 def _line(setting: str, comment: str) -> str:

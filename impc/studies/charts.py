@@ -26,17 +26,26 @@ from impc.model.riccati import solve_lqr
 from impc.model.weights import Weights, normalised
 from impc.reporting.rendering import plain
 from impc.reporting.shown_units import axis_label, shown_unit
-from impc.reporting.style import BLUE, GREEN, VERMILLION
+from impc.reporting.style import (
+    BLUE,
+    DOUBLE_COLUMN,
+    GREEN,
+    INK,
+    VERMILLION,
+    new_figure,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
+    from matplotlib.figure import Figure
 
     from impc.arrays import Array
     from impc.assess.intent_rules import Intent
     from impc.assess.judged import MethodFit
     from impc.inverse.problem import Problem
 
-__all__ = ["methods_chart", "weights_chart"]
+__all__ = ["chart_figure", "methods_chart", "weights_chart"]
 
 # Samples that are drawn of a trial. Of the weights' chart, which has a curve a position: how many
 # are simulated, and each how many-th is drawn.
@@ -78,6 +87,30 @@ def methods_chart(problem: Problem, fits: Sequence[MethodFit], trial: int) -> di
         "curves": [_RECORDED, *(_curve(METHODS[fit.name].label, k) for k, fit in enumerate(drawn))],
         "panels": _panels(problem, outputs, commands, stride),
     }
+
+
+def chart_figure(data: dict[str, Any], shown: int) -> Figure:
+    """The first `shown` curves of a chart as a picture, for a page without scripts."""
+    figure = new_figure(DOUBLE_COLUMN, 0.6 + 1.3 * len(data["panels"]))
+    axes = figure.subplots(len(data["panels"]), 1, sharex=True, squeeze=False)[:, 0]
+    for ax, panel in zip(axes, data["panels"], strict=True):
+        for place, values in enumerate(panel["curves"][:shown]):
+            curve, numbers = data["curves"][place], np.array(values, dtype=np.float64)
+            dash = [float(part) for part in curve["dash"].split()]
+            ax.plot(
+                data["step"] * np.arange(len(numbers)),
+                numbers,
+                color=curve["color"],
+                linewidth=1.2 if place else 2.5,
+                linestyle=(0, dash) if dash else "-",
+                label=curve["label"],
+            )
+        for limit in panel["bounds"]:
+            ax.axhline(limit, color=INK, linewidth=0.8, linestyle=":")
+        ax.set_ylabel(panel["label"])
+    axes[0].legend(loc="lower left", ncols=3, bbox_to_anchor=(0.0, 1.0))
+    axes[-1].set_xlabel(data["label"])
+    return figure
 
 
 def weights_chart(problem: Problem, found: Intent) -> dict[str, Any]:
