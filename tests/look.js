@@ -54,7 +54,7 @@
     return (Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05) < 4.5;
   });
   const terms = [...document.querySelectorAll("dt")].map((one) => one.textContent.trim());
-  const prose = [...document.querySelectorAll("p, li, dd, figcaption, h1, h2, h3, summary, thead th")]
+  const prose = [...document.querySelectorAll("p, li, dd, figcaption, h1, h2, h3, summary, th")]
     .map((one) => {
       const copy = one.cloneNode(true);
       for (const code of copy.querySelectorAll("code")) code.remove();

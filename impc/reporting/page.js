@@ -23,7 +23,7 @@
   };
   addEventListener("hashchange", unfold);
   unfold();
-  const contents = document.querySelector("nav");
+  const contents = document.querySelector("nav") || document.querySelector("header");
   if (contents && parts.length) {
     const all = press("Open all", contents, () => {
       const open = all.textContent === "Open all";

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -30,7 +31,7 @@ def group_figure(units: pd.DataFrame, measures: Sequence[str]) -> Figure:
     groups = sorted(set(units["group"])) or [""]
     visits = list(dict.fromkeys(units["visit"]))
     rows = -(-len(measures) // _COLUMNS)
-    figure = new_figure(DOUBLE_COLUMN, 2.0 * rows)
+    figure = new_figure(DOUBLE_COLUMN, 2.2 * rows)
     axes = np.ravel(figure.subplots(rows, _COLUMNS, squeeze=False))
     for ax in axes[len(measures) :]:
         ax.set_visible(False)
@@ -48,7 +49,8 @@ def group_figure(units: pd.DataFrame, measures: Sequence[str]) -> Figure:
                     ax.hlines(mean, at - half, at + half, color=INK, linewidth=1.5)
         ax.set_xticks(range(len(groups)), [group or "all" for group in groups])
         ax.set_xlim(-0.6, len(groups) - 0.4)
-        ax.set_ylabel(f"{measure_words(name)} ({_unit(name)})")
+        ax.set_title(textwrap.fill(measure_words(name), 28), loc="left")
+        ax.set_ylabel(f"value ({_unit(name)})")
     return figure
 
 

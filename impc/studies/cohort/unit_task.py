@@ -36,6 +36,7 @@ from impc.studies.cohort.unit_digest import require_same_inputs, unit_digest
 from impc.studies.cohort.unit_structure import unit_structure
 from impc.studies.fit.settings import fit_settings
 from impc.studies.fit.subject import fit_problem, state_sizes
+from impc.studies.signal_words import signal_words
 
 if TYPE_CHECKING:
     from impc.arrays import Array
@@ -154,6 +155,7 @@ def _described(problem: Problem, fitted: Estimate, settings: FitSettings) -> dic
         "controls": plant.controls,
         "outputs": plant.outputs,
         "shown_units": [shown_unit(plant, name) for name in plant.outputs],
+        "words": signal_words(plant),
         "trials": len(problem.recordings),
         "samples": sum(trial.samples for trial in problem.recordings),
         "K": estimate.K,
