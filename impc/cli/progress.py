@@ -64,7 +64,8 @@ def progress(
                 left = (now - began) * (total - count) / (count - begun)
                 # The first step may have compiled what the others use: it tells nothing of them.
                 time_left = f", about {left:.0f} s left" if count - begun > 1 else ""
-                line = f"{count} of {total} {unit}s ({name}){time_left}"
+                which = f" ({name})" if name else ""
+                line = f"{count} of {total} {unit}s{which}{time_left}"
                 print(line, file=sys.stderr, flush=True)
 
         try:
