@@ -22,6 +22,16 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+from impc.control.controller import Controller
+from impc.inverse.estimates import Estimate
+from impc.inverse.methods import estimate
+from impc.inverse.problem import Problem
+from impc.model.bounds import Bounds
+from impc.model.plant import Plant
+from impc.model.recordings import Recording
+from impc.model.weights import Weights
+from impc.studies.estimate_page import report
+from plants import yalmip_example
 from tests.cli.test_plan import PLAN
 from tests.support import easier_seat
 
@@ -141,9 +151,19 @@ def _made(folder: Path) -> list[Path]:
           "--workers", "1")  # fmt: skip
     (folder / "plan.toml").write_text(PLAN, encoding="utf-8")
     _impc(folder, "plan", "plan.toml", "--plant", "seated-balance", "--out", "plan")
+    report(_estimate(), folder / "python")
     own = sorted((folder / "cohort" / "subjects").glob("*.html"))[:1]
-    commands = ("example", "fit", "compare", "reliability", "cohort", "select", "key", "plan")
+    commands = ("example", "fit", "compare", "reliability", "cohort", "select", "key", "plan",
+                "python")  # fmt: skip
     return [*(folder / name / "report.html" for name in commands), *own]
+
+
+def _estimate() -> Estimate:
+    """Of the smallest example: what `impc.report` writes from Python."""
+    plant = Plant(yalmip_example())
+    bounds = Bounds(plant, u_min=-1, u_max=1)
+    law = Controller(plant, Weights([[1, 0], [0, 1]], 1), bounds, 3)
+    return estimate(Problem(plant, bounds, 3, [Recording(plant, law.simulate([1, 3], 20).x)]))
 
 
 def _impc(folder: Path, *arguments: str) -> None:

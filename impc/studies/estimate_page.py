@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from markupsafe import Markup
 
 from impc.assess.judged import judge
 from impc.checking import checked
@@ -168,8 +169,10 @@ def _findings(fit: MethodFit) -> list[str]:
     lines += [f"{estimate.reason}."] if estimate.reason else []
     if estimate.weights is not None:
         lines.append(
-            "Other weights have the same gain and behave alike: impc.identifiability says how many "
-            "numbers the recordings tell."
+            Markup(
+                "Other weights have the same gain and behave alike: "
+                "<code>impc.identifiability</code> says how many numbers the recordings tell."
+            )
         )
     return lines
 
