@@ -43,6 +43,7 @@ def command(
     from impc.studies.effort import fit_effort  # noqa: PLC0415
     from impc.studies.fit.memory import open_memory  # noqa: PLC0415
     from impc.studies.fit.report import fit_report  # noqa: PLC0415
+    from impc.studies.fit.sentences import missing  # noqa: PLC0415
     from impc.studies.fit.subject import (  # noqa: PLC0415
         FitProgress,
         fit_recordings,
@@ -53,6 +54,9 @@ def command(
     require_writable(out)
     subject = read_subject("fit", files, plant_name, config, solver)
     problem, settings = subject.problem, subject.settings
+    unknown = missing(settings, subject.source)
+    if unknown:
+        click.echo(unknown, err=True)
     require_consent(fit_effort(problem, settings), yes)
     memory = open_memory(out, problem, settings, "fit", subject.inputs.digest)
     truth = read_truth(files, problem.plant)
@@ -61,7 +65,7 @@ def command(
         told = FitProgress(done, memory.estimate, memory.replicate)
         result = fit_recordings(problem, settings, told)
         with angles_in(subject.angles):
-            content = fit_report(result, subject.provenance, truth).files()
+            content = fit_report(result, subject.provenance, truth, unknown).files()
         done("page")
     written = write_files(out, content)
     memory.forget()

@@ -14,6 +14,7 @@ import numpy as np
 from impc.errors import InputError
 from impc.files.columns import in_columns
 from impc.files.configuration import FILL_IN
+from impc.files.plant_sources import OWN
 from impc.files.units import si_unit
 
 if TYPE_CHECKING:
@@ -30,8 +31,6 @@ _CLOCKS = ("time", "t", "zeit", "temps", "tiempo", "timestamp", "clock", "second
 _GUESSES = (("s", 1.0), ("ms", 1e3), ("us", 1e6), ("ns", 1e9))
 _SLOWEST = 0.2
 _HORIZON = 20
-# Arguments of a plant that are measured of every subject.
-_BODY = ("mass", "height")
 _ALIKE = 0.6  # theta1 and theta_2 are, push and perturbation are not
 
 
@@ -127,7 +126,7 @@ def _plant_lines(wanted: Wanted) -> list[str]:
         if isinstance(value, bool | int | float | str):
             text = json.dumps(value, ensure_ascii=False)
             own = f"of the subject; without this line it is {text}, of a typical one"
-            if name in _BODY and value != FILL_IN:
+            if name in OWN and value != FILL_IN:
                 lines.append(_line(f'{name} = "{FILL_IN}"', own))
             else:
                 lines.append(f"{name} = {text}" if value == FILL_IN else f"# {name} = {text}")
@@ -199,7 +198,7 @@ def _base(name: str) -> str:
 
 
 def open_places(text: str) -> tuple[int, int]:
-    """How many guesses a draft holds, and how many places that are to be filled in."""
+    """How many guesses the `text` of a draft holds, and how many places to be filled in."""
     return len(re.findall("# a guess|# A GUESS", text)), text.count(f'= "{FILL_IN}"')
 
 

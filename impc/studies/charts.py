@@ -9,7 +9,7 @@ A chart is a dictionary that `impc/reporting/page.js` reads:
                           the root of both (-1 to 1), values of the last curve in every panel
     prices, mixed         names of these numbers
 
-Long trials are drawn with every k-th sample.
+Long trials are drawn with every k-th sample (docs/results.md).
 """
 
 from __future__ import annotations
@@ -90,7 +90,15 @@ def methods_chart(problem: Problem, fits: Sequence[MethodFit], trial: int) -> di
 
 
 def chart_figure(data: dict[str, Any], shown: int) -> Figure:
-    """The first `shown` curves of a chart as a picture, for a page without scripts."""
+    """The first `shown` curves of a chart as a picture, for a page without scripts.
+
+    Parameters
+    ----------
+    data : dict
+        Of `methods_chart`.
+    shown : int
+        At least one.
+    """
     figure = new_figure(DOUBLE_COLUMN, 0.6 + 1.3 * len(data["panels"]))
     axes = figure.subplots(len(data["panels"]), 1, sharex=True, squeeze=False)[:, 0]
     for ax, panel in zip(axes, data["panels"], strict=True):

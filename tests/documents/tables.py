@@ -141,6 +141,17 @@ SMALLER = {
     ("docs/start.md", "impc simulate seated-balance --out results/subject"): Smaller(_SEAT, _SHORT),
     (
         "docs/recordings.md",
+        "impc inspect trial_1.csv --plant seated-balance --config subject.toml",
+    ): Smaller(
+        (
+            "edit subject.toml 'mass = \"?\"' 'mass = 79.7'",
+            "edit subject.toml 'height = \"?\"' 'height = 1.66'",
+            "impc inspect trial_1.csv --plant seated-balance --config subject.toml",
+        ),
+        "an editor fills in what is asked for",
+    ),
+    (
+        "docs/recordings.md",
         "impc fit trial_*.csv --plant seated-balance --config subject.toml",
     ): Smaller(
         (

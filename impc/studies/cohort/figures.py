@@ -24,7 +24,7 @@ _SOFT = "#8C8C8C"
 
 
 def group_figure(units: pd.DataFrame, measures: Sequence[str]) -> Figure:
-    """Measures of every unit of the table `units`, by group and visit; bars are means.
+    """The `measures` of every unit of the table `units`, by group and visit; bars are means.
 
     A line joins the visits of one subject in one condition.
     """

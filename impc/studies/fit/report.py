@@ -104,6 +104,7 @@ def fit_report(
     result: FitResult,
     provenance: Provenance,
     truth: Array | None = None,
+    missing: str = "",
 ) -> Report:
     """Page, result.json, tables and figures.
 
@@ -113,6 +114,8 @@ def fit_report(
     provenance : Provenance
     truth : Array, optional
         Gain (m, n) of a simulated subject: the page then compares with it.
+    missing : str
+        What was not given, of `missing`.
     """
     told = () if truth is None else (Note("Truth.", truth_sentence(result, truth)),)
     subject = str(result.given.recordings[0].label.subject) or "a subject"
@@ -122,6 +125,7 @@ def fit_report(
         (
             Verdict(verdict(result)),
             *(Note("Warning.", line.removeprefix("Warning: ")) for line in result.warnings),
+            *([Note("Not given:", missing.removeprefix("Not given: "))] if missing else []),
             *told,
             Lines(abstract(result)),
             Details("What stands behind these sentences", (Lines(remarks(result)),)),

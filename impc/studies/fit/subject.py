@@ -200,6 +200,10 @@ def fit_recordings(
             return fit_recordings(problem, settings, told)
     if not isinstance(progress, FitProgress):
         progress = FitProgress(progress) if callable(progress) else FitProgress()
+    return _fitted(problem, settings, progress)
+
+
+def _fitted(problem: Problem, settings: FitSettings, progress: FitProgress) -> FitResult:
     started = time.perf_counter()
     ground = NaturalUnits(problem, progress.estimate, settings.feedback_states)
     fitted = ground.fitted

@@ -14,6 +14,7 @@ from impc.assess.loop_noise import LoopNoise
 from impc.assess.residual_structure import ResidualStructure
 from impc.checking import replace
 from impc.control.controller import Controller
+from impc.files.plant_sources import plant_source
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.recordings import Recording
@@ -22,6 +23,7 @@ from impc.reporting.shown_units import angles_in
 from impc.studies.charts import methods_chart, weights_chart
 from impc.studies.fit.figures import trajectory_figure
 from impc.studies.fit.interval_figures import gain_figure, shown_statements, statements_figure
+from impc.studies.fit.sentences import missing
 from impc.studies.fit.settings import FitSettings
 from impc.studies.fit.subject import fit_problem, fit_recordings, stages
 from impc.studies.fit.verdict import abstract, verdict
@@ -97,6 +99,17 @@ def test_no_limit_and_a_limit_that_is_not_reached() -> None:
     )
     assert "without a limit" in abstract(fitted(np.inf))[0]
     assert "never reaches its bound" in verdict(replace(fitted(50.0), diagnostics=clear))
+
+
+def test_what_is_not_given_is_said_with_what_that_excludes() -> None:
+    source = plant_source("plants:seated_balance_for", {"mass": 70.0})
+    assert missing(FitSettings(), source) == (
+        "Not given: u_max: without a limit of the command inverse MPC is inverse LQR; "
+        "the subject's own height: the gains are those of height 1.66."
+    )
+    assert missing(FitSettings(u_max=6.0, free=["height"]), source) == ""
+    cursor = plant_source("plants:cursor_plant", {})
+    assert missing(FitSettings(u_max=6.0), cursor) == ""
 
 
 def bars(ax: Axes) -> list[Array]:
