@@ -75,7 +75,7 @@ def methods_chart(problem: Problem, fits: Sequence[MethodFit], trial: int) -> di
     plant, given = problem.plant, problem.recordings[trial]
     stride = -(-given.samples // _SAMPLES)
     outputs = [given.outputs, *(np.asarray(fit.runs[trial].x @ plant.C.T) for fit in drawn)]
-    commands = [np.full((given.samples, plant.m), np.nan)]
+    commands: list[Array] = [np.full((given.samples, plant.m), np.nan)]
     commands += [_to_the_end(fit.runs[trial].u) for fit in drawn]
     for fit, y, u in zip(drawn, outputs[1:], commands[1:], strict=True):
         end = fit.runs[trial].reached
