@@ -76,10 +76,12 @@ WORDS: dict[str, str] = {
     "price": "An entry on the diagonal of Q or R: what the square of a state or command costs.",
     "profile likelihood": "Interval of one number: how far it can be moved, all others fitted "
     "again, until the recordings object.",
+    "QR": "A factorisation of a matrix; pivoted, it takes first the columns that add most.",
     "RMS": "Root-mean-square: the size of a signal.",
     "SD": "Standard deviation.",
     "SEM": "Standard error of measurement: the scatter of one person's result.",
     "SI": "The international units: metre, kilogram, second, newton, radian.",
+    "SVD": "Singular value decomposition: a matrix as directions with a strength each.",
     "terminal set": "States from which the controller's law keeps all bounds for ever; the plan "
     "has to end there.",
     "trace": "Sum of the diagonal of a matrix.",
