@@ -178,7 +178,7 @@ $(LOCKED): requirements.lock
 	    "$$($(PYTHON) --version 2>/dev/null || echo 'not on the PATH'). Install one, or name it: make PYTHON=python3.12" >&2; \
 	  exit 1; \
 	fi; \
-	echo "Making $(VENV) with $$($$found --version): about a minute, and 1 GB."; \
+	echo "Making $(VENV) with $$($$found --version): about a minute, and 1.5 GB."; \
 	if ! "$$found" -m venv --clear $(VENV) >/dev/null 2>&1; then \
 	  echo "$$found cannot make a virtual environment. On Debian and Ubuntu:" \
 	    "apt install python$$($$found -c 'import sys; print("%d.%d" % sys.version_info[:2])')-venv" >&2; \

@@ -24,6 +24,7 @@ import math
 import numbers
 import re
 import sys
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, ParamSpec, TypeVar, cast, overload
 
 import numpy as np
@@ -32,7 +33,7 @@ from impc.arrays import Frozen, as_numbers, require_finite, with_shape
 from impc.errors import DataError, InputError, brief
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Container, Hashable, Mapping
+    from collections.abc import Callable, Container, Hashable
 
     Kind = Callable[[str, Any], Any]
     Rule = str | float | tuple[float, float]
@@ -304,6 +305,13 @@ def _mapping(name: str, value: Any) -> Any:
     return value
 
 
+def _numbers_or_names(name: str, value: Any) -> Any:
+    """Numbers, or a dictionary of them by the names of signals."""
+    if not isinstance(value, Mapping):
+        return as_numbers(name, value)
+    return {_text(name, key): _number(f"{name}[{key!r}]", item) for key, item in value.items()}
+
+
 def _instance(module: str, kind: str) -> Kind:
     """A value of the package. Its module is loaded if there is one."""
 
@@ -397,6 +405,7 @@ _KINDS: dict[str, Kind] = {
         _instance("impc.inverse.estimates", "Estimate"),
     ),
     "ArrayLike": as_numbers,
+    "ArrayLike | Mapping[str, float]": _numbers_or_names,
     "Array": _array,
     "IntArray": _as_it_is,
     "BoolArray": _as_it_is,

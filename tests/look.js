@@ -1,7 +1,31 @@
 // What a reader's eye would find on a page, as JSON for the page around it.
 (() => {
   const text = "p, li, dd, dt, td, th, h1, h2, h3, figcaption, summary, a, pre";
-  for (const one of document.querySelectorAll("details")) one.open = true;
+  const button = (words) => [...document.querySelectorAll("button")].find((one) => one.textContent === words);
+  const silent = [];
+  const folded = document.querySelectorAll("details");
+  if (folded.length) {
+    const open = button("Open all");
+    if (open) open.click();
+    if ([...folded].some((one) => !one.open)) silent.push("fold");
+  }
+  for (const one of folded) one.open = true;
+  for (const table of document.querySelectorAll("table.numbers")) {
+    const rows = [...table.tBodies[0].rows];
+    if (rows.length < 2) continue;
+    const head = table.tHead.querySelector("button");
+    if (!head) { silent.push("sort"); continue; }
+    head.click();
+    head.click();
+    if (head.parentElement.ariaSort !== "descending") silent.push("sort");
+    table.tBodies[0].append(...rows);
+  }
+  for (const holder of document.querySelectorAll("script.chart")) {
+    const open = holder.parentElement.querySelector("button");
+    if (open) open.click();
+    const drawn = holder.parentElement.querySelectorAll(".chart path");
+    if (!drawn.length || [...drawn].some((one) => /NaN|undefined/.test(one.getAttribute("d")))) silent.push("curves");
+  }
   const all = [...document.querySelectorAll(text)].filter((one) => one.offsetParent !== null);
   const said = (one) => one.textContent.trim().replace(/\s+/g, " ").slice(0, 60);
   const moves = (one) => one.closest(".scroll, figure.wide") !== null;
@@ -30,7 +54,7 @@
     return (Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05) < 4.5;
   });
   const terms = [...document.querySelectorAll("dt")].map((one) => one.textContent.trim());
-  const prose = [...document.querySelectorAll("p, li, dd, figcaption, h1, h2, h3, summary, thead th")]
+  const prose = [...document.querySelectorAll("p, li, dd, figcaption, h1, h2, h3, summary, th")]
     .map((one) => {
       const copy = one.cloneNode(true);
       for (const code of copy.querySelectorAll("code")) code.remove();
@@ -40,6 +64,7 @@
   const known = (word) => terms.some((term) => new RegExp(`(^|\\W)${word.replace(/\W/g, "\\$&")}(\\W|$)`).test(term));
   const found = {
     width: innerWidth,
+    "script that does nothing": silent,
     "more or fewer than one h1": document.querySelectorAll("h1").length === 1 ? [] : ["h1"],
     "page wider than its window":
       document.documentElement.scrollWidth > innerWidth + 1 ? [String(document.documentElement.scrollWidth)] : [],

@@ -83,6 +83,10 @@ def test_an_error_names_its_argument() -> None:
         (lambda: Weights([[1, 2], [3]], 1), "Q: expected real numbers, got list"),
         (lambda: Weights(np.eye(2) * 1j, 1), "Q: expected real numbers, got an array"),
         (lambda: Bounds(PLANT, u_max=["1"]), "u_max: expected real numbers, got an"),
+        (lambda: Bounds(PLANT, x_max={"v": 1.0}), "x_max: there is no 'v'; choose of "),
+        (lambda: Bounds(PLANT, x_max={PLANT.states[0]: "1"}), "']: got '1'; give a number"),  # type: ignore[dict-item]
+        (lambda: Recording(PLANT, np.r_[np.ones((3, 2)), np.full((2, 2), np.nan)]),
+         "outputs: end at sample 3, and NaN follows; a simulation that ended has no more"),
     ):  # fmt: skip
         with pytest.raises(InputError) as caught:
             call()
@@ -96,6 +100,9 @@ def test_what_means_the_same_is_welcome() -> None:
     for given in (outputs, outputs.tolist(), frame, np.ma.masked_array(outputs), tuple(outputs)):
         np.testing.assert_array_equal(Recording(PLANT, given).outputs, expected)
     np.testing.assert_array_equal(Recording(PLANT, frame.astype("Float32")).outputs, expected)
+    named = Bounds(PLANT, x_min={PLANT.states[1]: -2}, u_max={PLANT.controls[0]: 1})
+    np.testing.assert_array_equal(named.x_min, [-np.inf, -2])
+    np.testing.assert_array_equal(named.u_max, [1])
     one = Controller(PLANT, Weights(np.eye(2), 1), Bounds(PLANT, u_max=[1]), 4)
     other = Controller(
         PLANT,

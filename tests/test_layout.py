@@ -103,8 +103,10 @@ ELSEWHERE = {
         studies/cohort/figures.py studies/cohort/finding.py studies/cohort/names.py
         studies/cohort/sheet.py studies/cohort/tasks.py""",
     "studies/compare/test_subject.py": """
-        cli/compare.py inverse/estimates.py inverse/methods.py studies/compare/report.py""",
-    "studies/fit/test_verdict.py": "studies/fit/interval_figures.py studies/signal_words.py",
+        cli/compare.py inverse/estimates.py inverse/methods.py studies/compare/csv_tables.py
+        studies/compare/report.py""",
+    "studies/fit/test_verdict.py": """
+        studies/charts.py studies/fit/interval_figures.py studies/signal_words.py""",
     "studies/fit/test_subject.py": """
         inverse/delayed_feedback.py assess/held_out.py assess/intent_rules.py studies/fit/memory.py
         studies/fit/result.py""",

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import json
 import os
 import re
@@ -20,6 +22,7 @@ from impc.model.plant import Plant
 from impc.model.riccati import solve_lqr
 from impc.model.weights import Weights
 from impc.reporting.document import (
+    Chart,
     Details,
     Heading,
     Lines,
@@ -165,8 +168,20 @@ def test_the_style_ends_with_its_block() -> None:
 # The page
 
 
+def without_script(page: str) -> str:
+    """The page without its script, which is the one that its policy lets run."""
+    found = re.findall(r"<script>(.*?)</script>", page, re.DOTALL)
+    assert len(found) == 1
+    seal = base64.b64encode(hashlib.sha256(found[0].encode()).digest()).decode()
+    assert f"style-src 'unsafe-inline'; script-src 'sha256-{seal}'\">" in page
+    return page.replace(f"<script>{found[0]}</script>", "")
+
+
 def test_the_page_needs_nothing_else(page: str) -> None:
-    text = re.sub(r"data:image/png;base64,[^\"]*", "", page)
+    assert not re.search(
+        r"https?:|fetch\(|import|XMLHttp|\beval|innerHTML", page.split("<script>")[1]
+    )
+    text = without_script(re.sub(r"data:image/png;base64,[^\"]*", "", page))
     assert not re.search(r"https?:|//[a-z]|<script|<link|@import|url\(", text)
     assert all(source.startswith("data:image/png") for source in re.findall(r'src="([^"]*)', page))
     anchors = re.findall(r'href="#([^"]*)', page)
@@ -190,7 +205,7 @@ def test_the_page_escapes_what_it_is_given(case_a: CaseResult, provenance: Prove
     text = example_report(
         [replace(case_a, name=evil, branch=evil)], replace(provenance, plant_name=evil)
     ).page()
-    assert "<script" not in text
+    assert "<script" not in without_script(text)
     assert text.count("&lt;script&gt;") >= 3
 
 
@@ -217,6 +232,7 @@ def every_block() -> Report:
         Terms([(EVIL, lines)]),
         TextTable(EVIL, (EVIL, "=1"), [(EVIL, "2"), ("=1+1", EVIL)]),
         Picture(EVIL, EVIL, EVIL),
+        Chart(Picture(EVIL, EVIL, EVIL), {EVIL: f"</script>{EVIL}"}),
         Heading(EVIL),
         Note(EVIL, EVIL),
         Verdict(EVIL),
@@ -231,18 +247,24 @@ def every_block() -> Report:
 
 
 def test_every_block_is_escaped_and_there() -> None:
-    page = every_block().page()
+    page = without_script(every_block().page())
+    holder = r'<script type="application/json" class="chart">(.*?)</script>'
+    for chart in re.findall(holder, page):
+        assert not re.search("[<>&']", chart)
+        assert json.loads(chart) == {EVIL: f"</script>{EVIL}"}
+    page, count = re.subn(holder, "", page)
+    assert count == 2
     assert "<script" not in page
     assert "default-src 'none'; img-src data:; style-src 'unsafe-inline'" in page
     heads = re.findall(r"<(h1|h2|h3|ul|dl|table|figure|nav)[ >]", page)
-    both = ["ul", "dl", "table", "figure", "h3"]
+    both = ["ul", "dl", "table", "figure", "figure", "h3"]
     assert heads == ["h1", "nav", *both, "h2", *both, "h2"]
     shown = Texts()
     shown.feed(page)
     # Title, first heading and section; in each of two places: 2 paragraphs, 2 lines, 3 of the
-    # terms, caption, head and 2 cells, caption of the figure, heading, 2 of the note, the verdict,
+    # terms, caption, head and 2 cells, captions of 2 figures, heading, 2 of the note, the verdict,
     # what is folded and its summary.
-    assert sum(text.count(EVIL) for text in shown.found) == 3 + 2 * 18
+    assert sum(text.count(EVIL) for text in shown.found) == 3 + 2 * 19
     assert 'href="#in-short"' in page
     assert 'id="in-short"' in page
 

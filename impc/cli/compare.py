@@ -39,6 +39,7 @@ def command(
     # Imported here: the libraries take seconds to load, and --help needs none.
     from impc.cli.consent import require_consent  # noqa: PLC0415
     from impc.cli.subject import read_subject  # noqa: PLC0415
+    from impc.reporting.shown_units import angles_in  # noqa: PLC0415
     from impc.reporting.writer import require_writable, write_files  # noqa: PLC0415
     from impc.studies.compare.report import compare_report  # noqa: PLC0415
     from impc.studies.compare.subject import compare_recordings, stages  # noqa: PLC0415
@@ -58,9 +59,9 @@ def command(
     with progress(count, "estimate", lambda _: memory.kept()) as done:
         remember = replace(memory, done=done).estimate
         compared = compare_recordings(problem, settings.settle, remember, held_out=held_out)
-    written = write_files(
-        out, compare_report(problem, compared, subject.provenance, subject.angles).files()
-    )
+    with angles_in(subject.angles):
+        content = compare_report(problem, compared, subject.provenance).files()
+    written = write_files(out, content)
     memory.forget()
     click.echo(methods_table(compared).text())
     print_files(out, written)

@@ -40,10 +40,12 @@ def command(
     from impc.cli.consent import require_consent  # noqa: PLC0415
     from impc.cli.optimal_subject import fit_optimal  # noqa: PLC0415
     from impc.cli.subject import read_subject  # noqa: PLC0415
+    from impc.reporting.shown_units import angles_in  # noqa: PLC0415
     from impc.reporting.writer import require_writable, write_files  # noqa: PLC0415
     from impc.studies.effort import fit_effort  # noqa: PLC0415
     from impc.studies.fit.memory import open_memory  # noqa: PLC0415
     from impc.studies.fit.report import fit_report  # noqa: PLC0415
+    from impc.studies.fit.sentences import missing  # noqa: PLC0415
     from impc.studies.fit.subject import (  # noqa: PLC0415
         FitProgress,
         fit_recordings,
@@ -56,6 +58,9 @@ def command(
         return
     subject = read_subject("fit", files, plant_name, config, solver)
     problem, settings = subject.problem, subject.settings
+    unknown = missing(settings, subject.source)
+    if unknown:
+        click.echo(unknown, err=True)
     require_consent(fit_effort(problem, settings), yes)
     memory = open_memory(out, problem, settings, "fit", subject.inputs.digest)
     truth = read_truth(files, problem.plant)
@@ -63,7 +68,8 @@ def command(
     with progress(stages(problem, settings) + 1, "stage", lambda _: memory.kept()) as done:
         told = FitProgress(done, memory.estimate, memory.replicate)
         result = fit_recordings(problem, settings, told)
-        content = fit_report(result, subject.provenance, truth, subject.angles).files()
+        with angles_in(subject.angles):
+            content = fit_report(result, subject.provenance, truth, unknown).files()
         done("page")
     written = write_files(out, content)
     memory.forget()

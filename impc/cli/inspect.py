@@ -35,7 +35,7 @@ __all__ = ["command"]
 def command(file: Path, plant_name: str | None, out: Path | None, config: Path | None) -> None:
     """Show what a recording holds and write a commented configuration for it."""
     from impc.files.formats import read_table  # noqa: PLC0415  # libraries that --help needs not
-    from impc.files.inspection import summary  # noqa: PLC0415
+    from impc.files.inspection import open_places, summary  # noqa: PLC0415
 
     if config is not None:
         _check(file, config, plant_name)
@@ -48,7 +48,11 @@ def command(file: Path, plant_name: str | None, out: Path | None, config: Path |
         click.echo("\n" + text, nl=False)
     else:
         _write(out, text)
-        click.echo(f"\nWritten to {out}: fill in the units, then run impc fit with it.")
+        guesses, places = open_places(text)
+        click.echo(
+            f'\nWritten to {out}: {places} places with "?" to fill in, {guesses} guesses to check; '
+            "then run impc fit with it."
+        )
 
 
 def _draft(table: Table, plant_name: str | None) -> str:

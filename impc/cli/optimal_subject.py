@@ -19,6 +19,7 @@ from impc.files.optimal_reading import read_optimal_trials
 from impc.files.plant_sources import made_by
 from impc.inverse.optimal_control_fit import fit_optimal_control
 from impc.reporting.provenance import Provenance
+from impc.reporting.shown_units import angles_in
 from impc.reporting.writer import write_files
 from impc.studies.optimal_fit.report import optimal_report
 from impc.studies.optimal_fit.result import OptimalFit
@@ -76,7 +77,8 @@ def fit_optimal(
         line = f"impc fit {' '.join(names)} --plant {plant_name} --config {config.name}"
         line += "" if solver is None else f" --solver {solver}"
         provenance = Provenance(source.name, line, dict(source.arguments), names, inputs)
-        content = optimal_report(fit, provenance, configuration.report.angles).files()
+        with angles_in(configuration.report.angles):
+            content = optimal_report(fit, provenance).files()
         done("page")
     written = write_files(out, content)
     for sentence in (verdict(fit), *abstract(fit)):

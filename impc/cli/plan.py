@@ -44,6 +44,7 @@ def command(config: Path, plant_name: str, out: Path, yes: bool) -> None:
     from impc.files.configuration import read_configuration  # noqa: PLC0415
     from impc.files.inputs import gather_inputs  # noqa: PLC0415
     from impc.reporting.provenance import Provenance  # noqa: PLC0415
+    from impc.reporting.shown_units import angles_in  # noqa: PLC0415
     from impc.reporting.writer import require_writable, write_files  # noqa: PLC0415
     from impc.studies.fit.settings import fit_settings  # noqa: PLC0415
     from impc.studies.plan.report import plan_report  # noqa: PLC0415
@@ -64,9 +65,11 @@ def command(config: Path, plant_name: str, out: Path, yes: bool) -> None:
     line = f"impc plan {config.name} --plant {plant_name}"
     inputs = gather_inputs(recorded, config, source.name, source.arguments)
     names = tuple(path.name for path in recorded)
-    report = plan_report(plan, Provenance(source.name, line, dict(source.arguments), names, inputs))
-    written = write_files(out, report.files())
-    for sentence in plan_sentences(plan):
+    made = Provenance(source.name, line, dict(source.arguments), names, inputs)
+    with angles_in(configuration.report.angles):
+        content, said = plan_report(plan, made).files(), plan_sentences(plan)
+    written = write_files(out, content)
+    for sentence in said:
         click.echo(sentence)
     print_files(out, written)
 

@@ -62,7 +62,10 @@ def progress(
             if bar.disable and now - said >= _PAUSE:
                 said = now
                 left = (now - began) * (total - count) / (count - begun)
-                line = f"{count} of {total} {unit}s ({name}), about {left:.0f} s left"
+                # The first step may have compiled what the others use: it tells nothing of them.
+                time_left = f", about {left:.0f} s left" if count - begun > 1 else ""
+                which = f" ({name})" if name else ""
+                line = f"{count} of {total} {unit}s{which}{time_left}"
                 print(line, file=sys.stderr, flush=True)
 
         try:

@@ -41,6 +41,7 @@ def command(study_file: Path, plant_name: str | None, allowed: bool, out: Path, 
     The study file is that of `impc cohort`.
     """
     from impc.files.inputs import study_inputs  # noqa: PLC0415
+    from impc.reporting.shown_units import angles_in  # noqa: PLC0415
     from impc.reporting.writer import write_files  # noqa: PLC0415
     from impc.studies.cohort.study import read_study  # noqa: PLC0415
     from impc.studies.reliability.analysis import analyse  # noqa: PLC0415
@@ -54,7 +55,9 @@ def command(study_file: Path, plant_name: str | None, allowed: bool, out: Path, 
     inputs = study_inputs(units, study_file, "plant", source.name, source.arguments)
     result = analyse(trials)
     line = f"impc reliability {study_file.name} --plant {source.name} --last {last}"
-    written = write_files(out, reliability_report(trials, result, line, inputs).files())
+    with angles_in(study.configuration.report.angles):
+        content = reliability_report(trials, result, line, inputs).files()
+    written = write_files(out, content)
     for item in findings(result):
         click.echo(f"{'found' if item.found else 'not found'}: {item.statement} ({item.numbers})")
     for line in result.notes:

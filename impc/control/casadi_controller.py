@@ -65,7 +65,8 @@ class MpcSolver:
     name : str
         Name of the CasADi plugin.
     function : casadi.Function
-        The solver, taking the state as parameter ``p``.
+        The solver, taking the state as parameter ``p``. Rows are divided by their bounds: a
+        call of it needs ``lbg=-inf, ubg=1``, and slacks that are at least zero, as in `solve_mpc`.
     soft : BoolArray
         Which rows have a slack (r,).
     """

@@ -178,16 +178,17 @@ def require_solver(name: str) -> str:
     Parameters
     ----------
     name : str
-        "compiled", or one of `SOLVERS`.
+        "compiled", or one of `SOLVERS`, in small letters or capitals.
 
     Raises
     ------
     InputError
         When it is not one of them, or CasADi as it is installed has it not.
     """
+    given, name = name, name.lower()
     if name not in (COMPILED, *SOLVERS):
         known = ", ".join((COMPILED, *SOLVERS))
-        raise InputError("solver", f"got {name!r}", f"choose one of {known}")
+        raise InputError("solver", f"got {given!r}", f"choose one of {known}")
     if name != COMPILED and not _installed(name):
         raise InputError(
             "solver",

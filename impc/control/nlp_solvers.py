@@ -28,18 +28,20 @@ SOLVERS = ("ipopt", "sqpmethod", "fatrop")
 _SILENT: dict[str, Any] = {"print_time": False, "error_on_fail": False}
 
 
-def require_solver(name: str) -> None:
-    """Require that `name` is one of `SOLVERS`, and in CasADi's wheel.
+def require_solver(name: str) -> str:
+    """Return the name of one of `SOLVERS` that CasADi has; it may be given in capitals.
 
     Raises
     ------
     InputError
         When it is another.
     """
+    given, name = name, name.lower()
     if name not in SOLVERS:
-        raise InputError("solver", f"got {name!r:.40}", f"choose one of {', '.join(SOLVERS)}")
+        raise InputError("solver", f"got {given!r:.40}", f"choose one of {', '.join(SOLVERS)}")
     if not ca.has_nlpsol(name):
         raise InputError("solver", f"{name} is not in this CasADi", "choose ipopt")
+    return name
 
 
 def _options(name: str, problem: OptimalControlProblem, mu: float) -> dict[str, Any]:

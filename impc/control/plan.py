@@ -122,7 +122,7 @@ def solve_plan(
     SolverError
         When the search did not end.
     """
-    require_solver(solver)
+    solver = require_solver(solver)
     if not 1e-12 <= mu <= 1e6:
         raise InputError("mu", f"got {mu:g}", "give 1e-12 to 1e6")
     N = problem.horizon

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import json
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,6 +14,7 @@ import numpy as np
 from impc.errors import InputError
 from impc.files.columns import in_columns
 from impc.files.configuration import FILL_IN
+from impc.files.plant_sources import OWN
 from impc.files.units import si_unit
 
 if TYPE_CHECKING:
@@ -21,7 +23,7 @@ if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.files.table import Table
 
-__all__ = ["Wanted", "clock_column", "draft_configuration", "summary"]
+__all__ = ["Wanted", "clock_column", "draft_configuration", "open_places", "summary"]
 
 _CLOCKS = ("time", "t", "zeit", "temps", "tiempo", "timestamp", "clock", "seconds", "sec")
 # Units of a clock that tells none, and how many make a second: the first in which the steps are
@@ -123,7 +125,11 @@ def _plant_lines(wanted: Wanted) -> list[str]:
     for name, value in wanted.arguments.items():
         if isinstance(value, bool | int | float | str):
             text = json.dumps(value, ensure_ascii=False)
-            lines.append(f"{name} = {text}" if value == FILL_IN else f"# {name} = {text}")
+            own = f"of the subject; without this line it is {text}, of a typical one"
+            if name in OWN and value != FILL_IN:
+                lines.append(_line(f'{name} = "{FILL_IN}"', own))
+            else:
+                lines.append(f"{name} = {text}" if value == FILL_IN else f"# {name} = {text}")
     return lines
 
 
@@ -189,6 +195,11 @@ def _rate(values: Array) -> float | None:
 
 def _base(name: str) -> str:
     return name.rpartition(".")[2].rpartition("/")[2].strip().lower()
+
+
+def open_places(text: str) -> tuple[int, int]:
+    """How many guesses the `text` of a draft holds, and how many places to be filled in."""
+    return len(re.findall("# a guess|# A GUESS", text)), text.count(f'= "{FILL_IN}"')
 
 
 def _line(setting: str, comment: str) -> str:

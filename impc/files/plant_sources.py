@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from impc.arrays import Array
 
 __all__ = [
+    "OWN",
     "PlantSource",
     "import_function",
     "made_by",
@@ -42,6 +43,9 @@ __all__ = [
     "plant_source",
     "users_code",
 ]
+
+#: Arguments of a plant that are measured of every subject.
+OWN = ("mass", "height")
 
 
 @dataclass(frozen=True)
@@ -69,6 +73,12 @@ class PlantSource:
             if item.kind not in (item.VAR_POSITIONAL, item.VAR_KEYWORD):
                 found[name] = FILL_IN if item.default is item.empty else item.default
         return found
+
+    def assumed(self) -> dict[str, object]:
+        """What is measured of every subject, and stands here at the plant's typical value."""
+        defaults = {} if Path(self.name).suffix in SAVED else self.defaults()
+        left = (name for name in OWN if name in defaults and name not in self.arguments)
+        return {name: defaults[name] for name in left if defaults[name] != FILL_IN}
 
 
 @checked

@@ -261,7 +261,11 @@ def method_named(name: str) -> Method:
 
 
 @checked
-def estimate(problem: Problem, method: str = "inverse_mpc") -> Estimate:
+def estimate(
+    problem: Problem,
+    method: str = "inverse_mpc",
+    progress: Callable[[str], None] | None = None,
+) -> Estimate:
     """Find the controller behind recordings by one method.
 
     Parameters
@@ -269,6 +273,9 @@ def estimate(problem: Problem, method: str = "inverse_mpc") -> Estimate:
     problem : Problem
     method : str
         A key of `METHODS`.
+    progress : callable, optional
+        Told the name of each stage when it is done, such as `print`: every method but inverse MPC
+        begins with it.
 
     Raises
     ------
@@ -290,7 +297,14 @@ def estimate(problem: Problem, method: str = "inverse_mpc") -> Estimate:
     array([[1., 0.],
            [0., 1.]])
     """
-    return estimate_all(NaturalUnits(problem), [method_named(method).name])[method]
+    ground, name = NaturalUnits(problem), method_named(method).name
+    if progress is not None and name != "inverse_mpc":
+        _ = ground.fitted
+        progress("inverse_mpc")
+    found = estimate_all(ground, [name])[name]
+    if progress is not None:
+        progress(name)
+    return found
 
 
 def estimate_all(

@@ -185,7 +185,7 @@ def fit_optimal_control(
     >>> found.combinations.untold
     ()
     """
-    require_solver(solver)
+    solver = require_solver(solver)
     if not recordings:
         raise DataError("recordings", "there are none", "give at least one")
     if mu_steps is None:

@@ -8,6 +8,7 @@ upper, state lower, each in the order of the signals, so that a row can be named
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -18,8 +19,6 @@ from impc.checking import Value, checked
 from impc.errors import BoundsError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from numpy.typing import ArrayLike
 
     from impc.model.plant import Plant
@@ -35,9 +34,10 @@ class Bounds(Value):
     ----------
     plant : Plant
         Gives the sizes and the names.
-    x_min, x_max, u_min, u_max : array_like, optional
-        A number for all signals, or one for each, (n,) and (m,), in their units. The origin is
-        the equilibrium that is regulated to, so it must lie strictly inside.
+    x_min, x_max, u_min, u_max : array_like or mapping of str to float, optional
+        A number for all signals, or one for each, (n,) and (m,), in their units, or a dictionary of
+        those that have a bound, by name. The origin is the equilibrium that is regulated to, so it
+        must lie strictly inside.
 
     Attributes
     ----------
@@ -49,7 +49,8 @@ class Bounds(Value):
     Raises
     ------
     BoundsError
-        When a bound is NaN, has the wrong length, crosses its counterpart, or excludes the origin.
+        When a bound is NaN, has the wrong length, names a signal that the plant has not, crosses
+        its counterpart, or excludes the origin.
 
     Examples
     --------
@@ -58,6 +59,8 @@ class Bounds(Value):
     >>> plant = impc.Plant(control.ss([[2, -1], [1, 0.2]], [[1], [0]], [[1, 0]], 0, 1))
     >>> impc.Bounds(plant, u_min=-1, u_max=1).u_max
     array([1.])
+    >>> impc.Bounds(plant, x_max={"x[1]": 0.5}).x_max
+    array([inf, 0.5])
     """
 
     _rules: ClassVar[Mapping[str, Any]] = {
@@ -77,15 +80,15 @@ class Bounds(Value):
         self,
         plant: Plant,
         *,
-        x_min: ArrayLike | None = None,
-        x_max: ArrayLike | None = None,
-        u_min: ArrayLike | None = None,
-        u_max: ArrayLike | None = None,
+        x_min: ArrayLike | Mapping[str, float] | None = None,
+        x_max: ArrayLike | Mapping[str, float] | None = None,
+        u_min: ArrayLike | Mapping[str, float] | None = None,
+        u_max: ArrayLike | Mapping[str, float] | None = None,
     ) -> None:
-        lower_x = _side("x_min", x_min, plant.n, -np.inf)
-        upper_x = _side("x_max", x_max, plant.n, np.inf)
-        lower_u = _side("u_min", u_min, plant.m, -np.inf)
-        upper_u = _side("u_max", u_max, plant.m, np.inf)
+        lower_x = _side("x_min", x_min, plant.states, -np.inf)
+        upper_x = _side("x_max", x_max, plant.states, np.inf)
+        lower_u = _side("u_min", u_min, plant.controls, -np.inf)
+        upper_u = _side("u_max", u_max, plant.controls, np.inf)
         _check_pair("x_min, x_max", plant.states, lower_x, upper_x)
         _check_pair("u_min, u_max", plant.controls, lower_u, upper_u)
         self._fill(x_min=lower_x, x_max=upper_x, u_min=lower_u, u_max=upper_u)
@@ -139,9 +142,20 @@ def bound_rows(bounds: Bounds, plant: Plant) -> BoundRows:
     )
 
 
-def _side(name: str, values: ArrayLike | None, size: int, default: float) -> Array:
+def _side(
+    name: str,
+    values: ArrayLike | Mapping[str, float] | None,
+    signals: tuple[str, ...],
+    default: float,
+) -> Array:
+    size = len(signals)
     if values is None:
         return np.full(size, default)
+    if isinstance(values, Mapping):
+        for key in values:
+            if key not in signals:
+                raise BoundsError(name, f"there is no {key!r}", f"choose of {', '.join(signals)}")
+        values = [values.get(signal, default) for signal in signals]
     try:
         side = np.array(np.broadcast_to(np.asarray(values, dtype=float), (size,)))
     except ValueError:

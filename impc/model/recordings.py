@@ -116,7 +116,9 @@ class Recording(Value):
         label: Label | None = None,
         findings: tuple[str, ...] = (),
     ) -> None:
-        y = finite_array("outputs", _columns(outputs), (None, len(plant.outputs)))
+        given = _columns(outputs)
+        _require_no_end(np.asarray(given))
+        y = finite_array("outputs", given, (None, len(plant.outputs)))
         if len(y) < 2:
             raise DataError("outputs", f"has {len(y)} samples", "give at least 2")
         width = plant.E.shape[1]
@@ -137,6 +139,20 @@ class Recording(Value):
     def samples(self) -> int:
         """Number of samples."""
         return len(self.outputs)
+
+
+def _require_no_end(values: Array) -> None:
+    """A simulation that no input could continue is NaN from there on, and is no recording."""
+    if values.ndim != 2:
+        return
+    finite = np.all(np.isfinite(values), axis=1)
+    end = int(np.count_nonzero(finite))
+    if 0 < end < len(finite) and np.all(finite[:end]) and np.all(np.isnan(values[end:])):
+        raise DataError(
+            "outputs",
+            f"end at sample {end}, and NaN follows",
+            "a simulation that ended has no more: start it elsewhere or widen its bounds",
+        )
 
 
 def _columns(values: ArrayLike) -> ArrayLike:

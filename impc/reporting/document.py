@@ -23,6 +23,7 @@ from impc.reporting.rendering import plain, render_template
 
 __all__ = [
     "Block",
+    "Chart",
     "Details",
     "Heading",
     "Lines",
@@ -105,6 +106,22 @@ class Picture:
     alternative: str
     caption: str
     narrow: bool = False
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A figure whose curves the page's script lets a reader move, zoom and switch on and off.
+
+    Attributes
+    ----------
+    picture : Picture
+        What is seen without scripts, in print, and before a reader asks for more.
+    data : mapping
+        The curves, as `impc.studies.charts` makes them.
+    """
+
+    picture: Picture
+    data: Mapping[str, Any]
 
 
 @dataclass(frozen=True)
@@ -192,7 +209,7 @@ class Details:
 
 
 #: What a section is made of; a str is a paragraph.
-Block = str | TextTable | Picture | Lines | Terms | Heading | Note | Verdict | Details
+Block = str | TextTable | Picture | Chart | Lines | Terms | Heading | Note | Verdict | Details
 
 
 @dataclass(frozen=True)

@@ -76,12 +76,14 @@ WORDS: dict[str, str] = {
     "price": "An entry on the diagonal of Q or R: what the square of a state or command costs.",
     "profile likelihood": "Interval of one number: how far it can be moved, all others fitted "
     "again, until the recordings object.",
+    "QR": "A factorisation of a matrix; pivoted, it takes first the columns that add most.",
     "RMS": "Root-mean-square: the size of a signal.",
     "SD": "Standard deviation.",
     "SEM": "Standard error of measurement: the scatter of one person's result.",
     "SI": "The international units: metre, kilogram, second, newton, radian.",
     "singular value": "How much recordings change along a combination of unknowns; the smaller it "
     "is, the less they tell of that combination.",
+    "SVD": "Singular value decomposition: a matrix as directions with a strength each.",
     "terminal set": "States from which the controller's law keeps all bounds for ever; the plan "
     "has to end there.",
     "trace": "Sum of the diagonal of a matrix.",
@@ -128,7 +130,7 @@ class Glossary:
 
 def used_words(page: str) -> tuple[tuple[str, str], ...]:
     """The words of the glossary that stand in the text of a `page`, with their meanings."""
-    text = unescape(re.sub(r"<style.*?</style>|<[^>]*>", " ", page, flags=re.DOTALL))
+    text = unescape(re.sub(r"<(style|script)\b.*?</\1>|<[^>]*>", " ", page, flags=re.DOTALL))
     found: set[str] = set()
     while True:  # what explains a word may use another
         new = {word for word in WORDS if word not in found and _pattern(word).search(text)}

@@ -1,26 +1,47 @@
 """In which unit a signal is shown: angles in degrees or radians, all else as the plant has it.
 
-Every page and figure asks here (docs/fitting.md).
+Every page and figure asks here; a command says once, with `angles_in`, what [report] angles asks
+for (docs/units.md).
 """
 
 from __future__ import annotations
 
 import math
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import TYPE_CHECKING
 
 from impc.model.signal_units import UNKNOWN
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from impc.model.plant import Plant
 
-__all__ = ["axis_label", "shown_as", "shown_unit"]
+__all__ = ["angles_in", "axis_label", "shown_angle", "shown_as", "shown_unit"]
 
 _DEGREES = {"rad": "deg", "rad/s": "deg/s", "rad/s^2": "deg/s^2"}
 # Of plants that say no units, angles are told by their names.
 _ANGLES = ("theta", "angle", "yaw", "pitch", "roll")
+_CHOSEN: ContextVar[str] = ContextVar("angles", default="degrees")
 
 
-def shown_unit(plant: Plant, name: str, angles: str = "degrees") -> tuple[float, str]:
+@contextmanager
+def angles_in(choice: str) -> Iterator[None]:
+    """Inside the block angles are shown in the unit of this `choice`, "degrees" or "radians"."""
+    token = _CHOSEN.set(choice)
+    try:
+        yield
+    finally:
+        _CHOSEN.reset(token)
+
+
+def shown_angle() -> tuple[float, str]:
+    """Factor from radians, and the unit in which angles are shown."""
+    return (math.degrees(1.0), "deg") if _CHOSEN.get() == "degrees" else (1.0, "rad")
+
+
+def shown_unit(plant: Plant, name: str) -> tuple[float, str]:
     """Factor from the plant's unit of a signal, and the unit that is shown.
 
     Parameters
@@ -28,39 +49,26 @@ def shown_unit(plant: Plant, name: str, angles: str = "degrees") -> tuple[float,
     plant : Plant
     name : str
         Of the signal.
-    angles : str
-        "degrees" or "radians", as [report] says.
     """
     unit = plant.unit(name)
     if unit == UNKNOWN and name.lower().startswith(_ANGLES):
         unit = "rad/s" if name.endswith("_rate") else "rad"
-    return shown_as(unit, angles)
+    return shown_as(unit)
 
 
-def shown_as(unit: str, angles: str = "degrees") -> tuple[float, str]:
+def shown_as(unit: str) -> tuple[float, str]:
     """Factor from a `unit` to the one that is shown, and that one.
 
     Parameters
     ----------
     unit : str
         SI.
-    angles : str
-        "degrees" or "radians".
     """
-    if unit in _DEGREES and angles == "degrees":
+    if unit in _DEGREES and _CHOSEN.get() == "degrees":
         return math.degrees(1.0), _DEGREES[unit]
     return 1.0, "-" if unit == "1" else unit
 
 
-def axis_label(plant: Plant, name: str, angles: str = "degrees") -> str:
-    """The name of a signal with the unit in which it is shown.
-
-    Parameters
-    ----------
-    plant : Plant
-    name : str
-        Of the signal.
-    angles : str
-        "degrees" or "radians".
-    """
-    return f"{name} ({shown_unit(plant, name, angles)[1]})"
+def axis_label(plant: Plant, name: str) -> str:
+    """The `name` of a signal of a `plant` with the unit in which it is shown."""
+    return f"{name} ({shown_unit(plant, name)[1]})"

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from markupsafe import Markup
 
 from impc.assess.judged import judge
 from impc.checking import checked
@@ -18,12 +19,22 @@ from impc.errors import InputError
 from impc.inverse.estimates import Estimate
 from impc.inverse.methods import METHODS
 from impc.inverse.optimal_control_fit import OptimalControlEstimate
-from impc.reporting.document import Lines, Picture, Report, Section, TextTable, Verdict
+from impc.reporting.document import (
+    Block,
+    Chart,
+    Lines,
+    Picture,
+    Report,
+    Section,
+    TextTable,
+    Verdict,
+)
 from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import number
 from impc.reporting.shown_units import axis_label, shown_unit
 from impc.reporting.style import BLUE, DOUBLE_COLUMN, INK, drawn, journal_style, new_figure
 from impc.reporting.writer import owned, write_files
+from impc.studies.charts import methods_chart
 from impc.studies.methods_table import column_terms, methods_data, methods_table
 from impc.studies.optimal_fit.report import optimal_report
 from impc.studies.optimal_fit.result import OptimalFit
@@ -111,6 +122,9 @@ def _document(fit: MethodFit) -> Report:
         )
         for index in shown
     ]
+    shown_blocks: list[Block] = list(pictures)
+    if pictures:
+        shown_blocks[0] = Chart(pictures[0], methods_chart(estimate.problem, [fit], 0))
     tables = {"gain": _gain(estimate), "vaf": _vaf(fit)}
     if estimate.weights is not None:
         tables["weights"] = _weights(estimate)
@@ -121,7 +135,7 @@ def _document(fit: MethodFit) -> Report:
         [
             Section(
                 "1. Recorded and simulated",
-                (methods_table([fit]), column_terms(), tables["vaf"], *pictures),
+                (methods_table([fit]), column_terms(), tables["vaf"], *shown_blocks),
                 together=True,
             ),
             Section(
@@ -170,8 +184,10 @@ def _findings(fit: MethodFit) -> list[str]:
     lines += [f"{estimate.reason}."] if estimate.reason else []
     if estimate.weights is not None:
         lines.append(
-            "Other weights have the same gain and behave alike: impc.identifiability says how many "
-            "numbers the recordings tell."
+            Markup(
+                "Other weights have the same gain and behave alike: "
+                "<code>impc.identifiability</code> says how many numbers the recordings tell."
+            )
         )
     return lines
 

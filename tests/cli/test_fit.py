@@ -178,12 +178,22 @@ def test_the_tables_are_those_of_result_json(fitted: tuple[Result, Path]) -> Non
     for index, first in enumerate(found["states"]):
         for column, second in enumerate(found["states"][: index + 1]):
             assert weights[first, second] == found["Q"][index][column]
+    told = found["weights_set"]["entries"][0]
+    first = tables["weights"].query("matrix == 'Q' and second == @told['second']")
+    assert set(first.query("first == @told['first']")[["low", "high"]].values[0]) == {
+        told["low"], told["high"]
+    }  # fmt: skip
     assert list(tables["methods"].method) == list(found["methods"])
     sway = tables["trajectories"].query("trial == 2")
     recorded, simulated = sway.theta1_recorded.to_numpy(), sway.theta1_simulated.to_numpy()
     share = 100 * (1 - np.sum((recorded - simulated) ** 2) / np.sum(recorded**2))
     assert share == pytest.approx(found["trials"][1]["vaf"][0])
     assert abs(sway.command_simulated).max() <= 6 * (1 + 1e-9)
+    for name, table in tables.items():
+        for head in table.columns:  # read.csv of R would change others, readtable of MATLAB too
+            assert re.fullmatch(r"(?!\d|_)[A-Za-z][A-Za-z0-9._]{0,62}", head), head
+        text = (fitted[1] / f"{name}.csv").read_text(encoding="utf-8").splitlines()
+        assert {line.count(",") for line in text if '"' not in line} == {len(table.columns) - 1}
     load: Any = scipy.io.loadmat
     workbook = openpyxl.load_workbook(fitted[1] / "tables.xlsx", read_only=True)
     for name, table in tables.items():

@@ -132,7 +132,7 @@ def test_a_wrong_answer_is_not_believed(
     assert run.status[0] == Status.UNSOLVED
 
 
-@pytest.mark.parametrize("name", ["gurobi", "", "DAQP", "osqp"])
+@pytest.mark.parametrize("name", ["gurobi", "", "DAQ", "OSQP"])
 def test_an_unknown_solver_is_one_line(name: str, example_plant: Plant) -> None:
     bounds = Bounds(example_plant, u_min=-1, u_max=1)
     weights = Weights(np.eye(2), 1)
@@ -145,6 +145,12 @@ def test_an_unknown_solver_is_one_line(name: str, example_plant: Plant) -> None:
         with pytest.raises(InputError, match=f"^solver: got '{name}'; choose one of") as caught:
             make()
         assert "\n" not in str(caught.value)
+
+
+def test_capitals_are_the_same_solver(example_plant: Plant) -> None:
+    bounds = Bounds(example_plant, u_min=-1, u_max=1)
+    controller = Controller(example_plant, Weights(np.eye(2), 1), bounds, 3, solver="DAQP")
+    assert controller.solver == "daqp"
 
 
 def test_a_solver_that_casadi_lacks_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

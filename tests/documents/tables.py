@@ -120,6 +120,8 @@ SMALLER = {
             "edit excel.toml [plant] '[plant]\ndelay_order = 1'",
             "edit excel.toml 'horizon = 20' 'held_out = false\nintent_draws = false\nhorizon = 4'",
             "edit excel.toml 'u_max = \"?\"' 'u_max = 6.0'",
+            "edit excel.toml 'mass = \"?\"' 'mass = 79.7'",
+            "edit excel.toml 'height = \"?\"' 'height = 1.66'",
             "impc fit results/subject/trial_1.xlsx results/subject/trial_2.xlsx"
             " --plant seated-balance --config excel.toml --out results/excel",
         ),
@@ -137,6 +139,17 @@ SMALLER = {
         _SHORT,
     ),
     ("docs/start.md", "impc simulate seated-balance --out results/subject"): Smaller(_SEAT, _SHORT),
+    (
+        "docs/recordings.md",
+        "impc inspect trial_1.csv --plant seated-balance --config subject.toml",
+    ): Smaller(
+        (
+            "edit subject.toml 'mass = \"?\"' 'mass = 79.7'",
+            "edit subject.toml 'height = \"?\"' 'height = 1.66'",
+            "impc inspect trial_1.csv --plant seated-balance --config subject.toml",
+        ),
+        "an editor fills in what is asked for",
+    ),
     (
         "docs/recordings.md",
         "impc fit trial_*.csv --plant seated-balance --config subject.toml",

@@ -12,6 +12,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from impc.cli.main import main
+from impc.cli.plant import find_plant
 from impc.errors import InputError
 from impc.files.configuration import FILL_IN, read_configuration
 from impc.files.formats import write_table
@@ -121,12 +122,17 @@ def test_a_column_is_not_taken_for_a_signal_of_another_kind(tmp_path: Path) -> N
 
 
 def test_settings_that_only_the_user_knows_are_asked_for(trial: Path, tmp_path: Path) -> None:
-    """The subject's own numbers stand as comments, what has no default is refused until given."""
+    """The subject's own numbers, and what has no default, are refused until given."""
     out = tmp_path / "new.toml"
-    assert inspect(trial, "--out", out, "--plant", "seated-balance").exit_code == 0
+    done = inspect(trial, "--out", out, "--plant", "seated-balance")
+    assert done.exit_code == 0
+    assert done.stdout.endswith("guesses to check; then run impc fit with it.\n")
+    with pytest.raises(InputError, match=r"\[plant\] mass: is still '\?'; fill it in"):
+        make_plant(find_plant("seated-balance", read_configuration(out).plant), ())
     text = out.read_text()
-    assert "# mass = 79.7" in text
-    assert "# height = 1.66" in text
+    assert 'mass = "?"                # of the subject; without this line it is 79.7' in text
+    assert 'height = "?"' in text
+    assert '# sex = "male"' in text
     assert "command in N m" in text
     assert "0.2 s" in text
     table = read_configuration(out).fit

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from impc.model.plant import Plant
-from impc.reporting.shown_units import axis_label, shown_unit
+from impc.reporting.shown_units import angles_in, axis_label, shown_angle, shown_unit
 from plants import cursor_plant, seated_balance_plant
 
 
@@ -23,9 +23,12 @@ def test_units_of_the_plants() -> None:
 
 def test_radians_where_they_are_asked_for() -> None:
     seat = Plant(seated_balance_plant())
-    assert shown_unit(seat, "theta1", "radians") == (1.0, "rad")
-    assert axis_label(seat, "theta2_rate", "radians") == "theta2_rate (rad/s)"
-    assert shown_unit(seat, "command", "radians") == shown_unit(seat, "command")
+    with angles_in("radians"):
+        assert shown_unit(seat, "theta1") == (1.0, "rad")
+        assert axis_label(seat, "theta2_rate") == "theta2_rate (rad/s)"
+        assert shown_unit(seat, "command") == (1.0, "N m")
+        assert shown_angle() == (1.0, "rad")
+    assert shown_unit(seat, "theta1")[1] == shown_angle()[1] == "deg"
 
 
 def test_of_a_plant_that_says_none_angles_are_told_by_their_names() -> None:

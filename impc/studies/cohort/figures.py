@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,6 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     import pandas as pd
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 __all__ = ["group_figure", "subject_figure"]
@@ -22,33 +24,53 @@ _SOFT = "#8C8C8C"
 
 
 def group_figure(units: pd.DataFrame, measures: Sequence[str]) -> Figure:
-    """The measures of every unit, by group, from the table `units`; a bar at a group's mean."""
+    """The `measures` of every unit of the table `units`, by group and visit; bars are means.
+
+    A line joins the visits of one subject in one condition.
+    """
     groups = sorted(set(units["group"])) or [""]
+    visits = list(dict.fromkeys(units["visit"]))
     rows = -(-len(measures) // _COLUMNS)
-    figure = new_figure(DOUBLE_COLUMN, 2.0 * rows)
+    figure = new_figure(DOUBLE_COLUMN, 2.2 * rows)
     axes = np.ravel(figure.subplots(rows, _COLUMNS, squeeze=False))
     for ax in axes[len(measures) :]:
         ax.set_visible(False)
+    reach = 0.3 if len(visits) > 1 else 0.0
+    offsets = dict(zip(visits, np.linspace(-reach, reach, len(visits)), strict=True))
     for ax, name in zip(axes, measures, strict=False):
         for place, group in enumerate(groups):
-            values = units.loc[units["group"] == group, name].to_numpy(dtype=float)
-            mark = STATE_MARKS[place % len(STATE_MARKS)]
-            # Side by side, in the order of the table: no two points hide each other.
-            spread = place + np.linspace(-0.25, 0.25, len(values)) if len(values) > 1 else [place]
-            ax.plot(
-                spread,
-                values,
-                linestyle="none",
-                marker=mark.marker,
-                color=mark.color,
-                markerfacecolor="white",
-                markersize=3.0,
-            )
-            ax.hlines(np.nanmean(values), place - 0.35, place + 0.35, color=INK, linewidth=1.5)
+            own = units[units["group"] == group]
+            _people(ax, own, name, place, offsets)
+            half = 0.35 if len(visits) == 1 else 0.5 * reach / (len(visits) - 1)
+            for visit, offset in offsets.items():
+                values = own.loc[own["visit"] == visit, name].to_numpy(dtype=float)
+                if np.any(np.isfinite(values)):
+                    at, mean = place + offset, np.nanmean(values)
+                    ax.hlines(mean, at - half, at + half, color=INK, linewidth=1.5)
         ax.set_xticks(range(len(groups)), [group or "all" for group in groups])
         ax.set_xlim(-0.6, len(groups) - 0.4)
-        ax.set_ylabel(f"{measure_words(name)} ({_unit(name)})")
+        ax.set_title(textwrap.fill(measure_words(name), 28), loc="left")
+        ax.set_ylabel(f"value ({_unit(name)})")
     return figure
+
+
+def _people(ax: Axes, own: pd.DataFrame, name: str, place: int, offsets: dict[str, float]) -> None:
+    """One group's units: a mark each, a line for each person who came more than once."""
+    mark = STATE_MARKS[place % len(STATE_MARKS)]
+    people = [part for _, part in own.groupby(["subject", "condition"], sort=False)]
+    # Side by side, in the order of the table: no two points hide each other.
+    wide = 0.25 if len(offsets) == 1 else 0.04
+    apart = np.linspace(-wide, wide, len(people)) if len(people) > 1 else [0.0]
+    for shift, part in zip(apart, people, strict=True):
+        ax.plot(
+            [place + shift + offsets[visit] for visit in part["visit"]],
+            part[name].to_numpy(dtype=float),
+            linewidth=0.5,
+            marker=mark.marker,
+            color=mark.color,
+            markerfacecolor="white",
+            markersize=3.0,
+        )
 
 
 def subject_figure(fit: dict[str, Any]) -> Figure:

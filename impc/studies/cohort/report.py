@@ -29,6 +29,8 @@ from impc.studies.cohort.tables import cohort_tables, table_bytes
 from impc.studies.cohort.words import measure_words
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from impc.studies.cohort.comparison import Comparison
     from impc.studies.cohort.engine import Failures
     from impc.studies.cohort.store import Store
@@ -51,7 +53,8 @@ _CENTRE = (
 _GROUPS = Picture(
     "groups",
     "Measures of every unit by group",
-    "Every unit, by group; bars are means. The measures that differ most.",
+    "Every unit, by group, visits from left to right; a line joins those of one person. Bars are "
+    "means. The measures that differ most.",
 )
 
 
@@ -104,6 +107,7 @@ def write_report(study: Study, store: Store, failures: Failures, command: str) -
         ],
         figures=figures,
         provenance=Provenance(command=command),
+        words=_words(study.units, store),
         data={
             "units": len(study.units),
             "fitted": len(units),
@@ -341,12 +345,35 @@ def _subject_files(
     report = Report(
         f"impc cohort: {subject}",
         f"Subject {subject}{group}",
-        (Markup('<a href="../report.html">The cohort</a>'),),
+        (*_subject_verdict(units, store), Markup('<a href="../report.html">The cohort</a>')),
         sections,
         figures=figures,
+        words=_words(units, store),
     )
     files = {f"sub-{safe_name(subject)}.html": report.page().encode(), **figures}
     return {f"subjects/{name}": content for name, content in files.items()}
+
+
+def _subject_verdict(units: list[Unit], store: Store) -> tuple[Verdict, ...]:
+    """What the fits of a subject explain, in one sentence."""
+    fits = [fit for unit in units if (fit := store.fit(unit.name)) is not None]
+    shares = [_nan(value) for fit in fits for value in fit["vaf"].values()]
+    if not fits or np.isnan(shares).any():
+        return (Verdict("Not every recording of this subject could be explained to its end."),)
+    at_bound = 100 * float(np.mean([fit["saturated"] for fit in fits]))
+    return (
+        Verdict(
+            f"Inverse MPC accounts for {min(shares):.2f} to {max(shares):.2f} % of the outputs; "
+            f"the command stands at its bound for {at_bound:.1f} % of the time."
+        ),
+    )
+
+
+def _words(units: Sequence[Unit], store: Store) -> list[tuple[str, str]]:
+    """What the signals are, as the first unit that was fitted tells."""
+    fits = (store.fit(unit.name) for unit in units)
+    first = next((fit for fit in fits if fit is not None), {})
+    return [(name, meaning) for name, meaning in first.get("words", ())]
 
 
 def _unit_blocks(unit: Unit, fit: dict[str, Any], failures: Failures) -> list[Block]:
@@ -401,7 +428,7 @@ def _gain_table(fit: dict[str, Any]) -> TextTable:
                 )
             )
     caption = (
-        "Gain with standard deviations (`not told`: the recordings tell this entry only together "
+        "Gain with standard deviations (not told: the recordings tell this entry only together "
         "with others), beside the gain of the reported weights; and prices of the weights of least "
         "condition number: a choice among all weights with the latter gain."
     )

@@ -31,11 +31,12 @@ from impc.files.reading import read_recordings
 from impc.inverse.noisy_fit import fit_controller
 from impc.model.weights import Weights
 from impc.reporting.rendering import plain
-from impc.reporting.shown_units import shown_unit
+from impc.reporting.shown_units import angles_in, shown_unit
 from impc.studies.cohort.unit_digest import require_same_inputs, unit_digest
 from impc.studies.cohort.unit_structure import unit_structure
 from impc.studies.fit.settings import fit_settings
 from impc.studies.fit.subject import fit_problem, state_sizes
+from impc.studies.signal_words import signal_words
 
 if TYPE_CHECKING:
     from impc.arrays import Array
@@ -81,7 +82,8 @@ def fit_unit(task: FitTask) -> dict[str, Any]:
     try:
         problem, settings = unit_problem(task)
         fitted = fit_controller(problem)
-        content = _described(problem, fitted, settings, task.configuration.report.angles)
+        with angles_in(task.configuration.report.angles):
+            content = _described(problem, fitted, settings)
     except ImpcError as error:
         return {"reason": str(error)}
     content["seconds"] = time.perf_counter() - started
@@ -137,9 +139,7 @@ def unit_problem(task: FitTask) -> tuple[Problem, FitSettings]:
     return fit_problem(plant, recordings, settings, family), settings
 
 
-def _described(
-    problem: Problem, fitted: Estimate, settings: FitSettings, angles: str
-) -> dict[str, Any]:
+def _described(problem: Problem, fitted: Estimate, settings: FitSettings) -> dict[str, Any]:
     plant, K, weights = fitted.problem.plant, np.array(fitted.gain), fitted.stage_weights
     fit = judge(fitted, problem.bounds)
     fit = replace(fit, held_out=_held_out(problem, fitted, settings))
@@ -154,7 +154,8 @@ def _described(
         "states": plant.states,
         "controls": plant.controls,
         "outputs": plant.outputs,
-        "shown_units": [shown_unit(plant, name, angles) for name in plant.outputs],
+        "shown_units": [shown_unit(plant, name) for name in plant.outputs],
+        "words": signal_words(plant),
         "trials": len(problem.recordings),
         "samples": sum(trial.samples for trial in problem.recordings),
         "K": estimate.K,

@@ -11,6 +11,7 @@ from impc.assess.assessments import ASSESSMENTS
 from impc.control.named_solver import described
 from impc.inverse.methods import METHODS
 from impc.reporting.document import (
+    Chart,
     Lines,
     Picture,
     Report,
@@ -22,7 +23,9 @@ from impc.reporting.document import (
 from impc.reporting.rendering import number
 from impc.reporting.shown_units import axis_label
 from impc.reporting.style import BLUE, DOUBLE_COLUMN, INK, drawn, journal_style, new_figure
-from impc.studies.methods_table import column_terms, methods_data, methods_numbers, methods_table
+from impc.studies.charts import chart_figure, methods_chart
+from impc.studies.compare.csv_tables import compare_tables
+from impc.studies.methods_table import column_terms, methods_data, methods_table
 from impc.studies.signal_words import body_sentence, signal_words
 
 if TYPE_CHECKING:
@@ -48,21 +51,36 @@ _PICTURE = Picture(
 )
 
 
+# Curves in the picture of a trial: recorded, and the three methods that explain most.
+_CURVES = 4
+_TRAJECTORIES = Picture(
+    "trajectories",
+    "Outputs and commands of the first trial: recorded, and as the best three methods have them",
+    "The first trial: recorded (grey), and the three methods that explain most. Dotted: the "
+    "subject's bounds.",
+)
+
+
 def compare_report(
     problem: Problem,
     compared: Sequence[MethodFit],
     provenance: Provenance,
-    angles: str = "degrees",
 ) -> Report:
-    """Page, result.json, methods.csv and the figure, with `angles` in "degrees" or "radians"."""
+    """Page, result.json, tables and the figures."""
     subject = str(problem.recordings[0].label.subject) or "a subject"
     methods = [METHODS[item.name] for item in compared]
     with journal_style():
-        figures = drawn({"comparison": _figure(problem, compared, angles)})
+        curves = methods_chart(problem, _by_score(compared), 0)
+        figures = drawn(
+            {
+                "comparison": _figure(problem, compared),
+                "trajectories": chart_figure(curves, _CURVES),
+            }
+        )
     sections = [
         Section(
             "1. All methods on the same recordings",
-            (_PICTURE, methods_table(compared)),
+            (_PICTURE, methods_table(compared), Chart(_TRAJECTORIES, curves)),
             "Methods",
             together=True,
         ),
@@ -96,7 +114,7 @@ def compare_report(
         (Verdict(_verdict(compared)), Lines(_findings(compared))),
         sections,
         figures=figures,
-        tables={"methods": methods_numbers(compared)},
+        tables=compare_tables(problem, compared),
         data=_data(problem, compared),
         provenance=provenance,
         words=signal_words(problem.plant),
@@ -105,6 +123,12 @@ def compare_report(
 
 def _usable(compared: Sequence[MethodFit]) -> list[MethodFit]:
     return [item for item in compared if not np.any(np.isnan(item.vaf))]
+
+
+def _by_score(compared: Sequence[MethodFit]) -> list[MethodFit]:
+    """Those with a simulation, best first; those that fall are last."""
+    shown = [item for item in compared if item.runs]
+    return sorted(shown, key=lambda item: -np.nan_to_num(float(np.mean(_score(item))), nan=-np.inf))
 
 
 def _verdict(compared: Sequence[MethodFit]) -> str:
@@ -167,7 +191,7 @@ def _weights(problem: Problem, compared: Sequence[MethodFit]) -> TextTable:
     )
 
 
-def _figure(problem: Problem, compared: Sequence[MethodFit], angles: str) -> Figure:
+def _figure(problem: Problem, compared: Sequence[MethodFit]) -> Figure:
     shown = [item for item in compared if item.estimate.K is not None][::-1]
     figure = new_figure(DOUBLE_COLUMN, 0.5 + 0.36 * max(len(shown), 2))
     left, right = figure.subplots(1, 2, sharey=True, width_ratios=(1.6, 1))
@@ -191,7 +215,7 @@ def _figure(problem: Problem, compared: Sequence[MethodFit], angles: str) -> Fig
     if np.isfinite(limit):
         right.axvline(limit, color=INK, linestyle=":", linewidth=1.2)
         right.set_xlim(0, min(1.05 * max(largest), 5 * limit))
-    right.set_xlabel(f"largest {axis_label(problem.plant, problem.plant.controls[0], angles)}")
+    right.set_xlabel(f"largest {axis_label(problem.plant, problem.plant.controls[0])}")
     return figure
 
 

@@ -1,7 +1,8 @@
 """The numbers of a fit as tables for spreadsheets: gain, weights, methods, trajectories.
 
     gain.csv          a row a number and method: name, unit, value, ends, level, whether it is told
-    weights.csv       a row an entry of the reported Q and R, at R[0][0] = 1
+    weights.csv       a row an entry of the reported Q and R, at R[0][0] = 1, and its range over all
+                      weights with this gain, where it was computed
     trajectories.csv  a row a sample of the trials that the page draws: recorded and simulated
 
 Numbers are in the units of the plant (docs/results.md).
@@ -55,8 +56,20 @@ def _gain(result: FitResult) -> TextTable:
 
 def _weights(result: FitResult) -> TextTable:
     plant, weights = result.given.plant, result.intent.reported.weights
+    summary = result.certainty.weights
+    # At trace R = m: with one command the scale of the entries.
+    found = summary.entries if summary is not None and plant.m == 1 else ()
+    ranges = {frozenset((item.first, item.second)): (item.low, item.high) for item in found}
+    no_range = (np.nan, np.nan)
     rows = [
-        (which, one, other, price_unit(plant, one, other), float(matrix[i, j]))
+        (
+            which,
+            one,
+            other,
+            price_unit(plant, one, other),
+            float(matrix[i, j]),
+            *(ranges.get(frozenset((one, other)), no_range) if which == "Q" else no_range),
+        )
         for which, names, matrix in (
             ("Q", plant.states, weights.Q),
             ("R", plant.controls, weights.R),
@@ -64,7 +77,7 @@ def _weights(result: FitResult) -> TextTable:
         for i, one in enumerate(names)
         for j, other in enumerate(names[: i + 1])
     ]
-    return TextTable("", ("matrix", "first", "second", "unit", "value"), rows)
+    return TextTable("", ("matrix", "first", "second", "unit", "value", "low", "high"), rows)
 
 
 def _trajectories(result: FitResult) -> TextTable:

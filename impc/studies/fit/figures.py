@@ -46,25 +46,25 @@ _METHOD_LINES = {
 }
 
 
-def fit_figures(result: FitResult, angles: str = "degrees") -> dict[str, bytes]:
-    """Draw all figures: PNG and PDF by file name; `angles` in "degrees" or "radians"."""
+def fit_figures(result: FitResult) -> dict[str, bytes]:
+    """Draw all figures: PNG and PDF by file name."""
     with journal_style():
         figures = {
-            f"trajectories-trial-{index + 1}": trajectory_figure(result, index, angles)
+            f"trajectories-trial-{index + 1}": trajectory_figure(result, index)
             for index in shown_trials(result)
         }
         figures["gain"] = gain_figure(result)
         if shown_statements(result):
             figures["statements"] = statements_figure(result)
-        figures["residuals"] = _residuals(result, angles)
+        figures["residuals"] = _residuals(result)
         figures["intent"] = _intent(result)
-        figures["methods"] = _methods(result, angles)
+        figures["methods"] = _methods(result)
         if result.structures and result.structures[0].ratios:
             figures["structured-weights"] = price_figure(result)
         return drawn(figures)
 
 
-def trajectory_figure(result: FitResult, index: int, angles: str) -> Figure:
+def trajectory_figure(result: FitResult, index: int) -> Figure:
     """Outputs, command and disturbance of a trial, recorded and simulated.
 
     Parameters
@@ -72,8 +72,6 @@ def trajectory_figure(result: FitResult, index: int, angles: str) -> Figure:
     result : FitResult
     index : int
         Of the trial.
-    angles : str
-        "degrees" or "radians".
     """
     plant = result.fitted.problem.plant
     trial, run = result.given.recordings[index], result.inverse_mpc.runs[index]
@@ -82,7 +80,7 @@ def trajectory_figure(result: FitResult, index: int, angles: str) -> Figure:
     figure = new_figure(DOUBLE_COLUMN, 0.5 + 1.15 * rows)
     axes = np.atleast_1d(figure.subplots(rows, 1, sharex=True))
     for column, name in enumerate(plant.outputs):
-        factor, _ = shown_unit(plant, name, angles)
+        factor, _ = shown_unit(plant, name)
         ax = axes[column]
         ax.plot(
             time,
@@ -101,13 +99,13 @@ def trajectory_figure(result: FitResult, index: int, angles: str) -> Figure:
             linewidth=1.0,
             label="simulated",
         )
-        ax.set_ylabel(axis_label(plant, name, angles))
+        ax.set_ylabel(axis_label(plant, name))
     for column in range(plant.m):
-        _command(axes[len(plant.outputs) + column], result, index, (column, angles))
+        _command(axes[len(plant.outputs) + column], result, index, column)
     if np.any(trial.disturbance):
         ax = axes[-1]
         ax.plot(time, trial.disturbance, color=INK, linewidth=0.8, drawstyle="steps-post")
-        ax.set_ylabel(", ".join(axis_label(plant, name, angles) for name in plant.disturbances))
+        ax.set_ylabel(", ".join(axis_label(plant, name) for name in plant.disturbances))
     axes[0].set_title(trial_name(result, index), loc="right")
     axes[0].legend(loc="upper left", ncols=2, bbox_to_anchor=(0, 1.28))
     axes[-1].set_xlabel("time (s)")
@@ -115,8 +113,7 @@ def trajectory_figure(result: FitResult, index: int, angles: str) -> Figure:
     return figure
 
 
-def _command(ax: Axes, result: FitResult, index: int, shown: tuple[int, str]) -> None:
-    column, angles = shown
+def _command(ax: Axes, result: FitResult, index: int, column: int) -> None:
     name = result.given.plant.controls[column]
     dt = result.fitted.problem.plant.dt
     u = result.inverse_mpc.runs[index].u[:, column]
@@ -137,16 +134,16 @@ def _command(ax: Axes, result: FitResult, index: int, shown: tuple[int, str]) ->
                 step="post",
             )
     ax.plot(time, u, color=BLUE, linewidth=0.9, drawstyle="steps-post")
-    ax.set_ylabel(axis_label(result.given.plant, name, angles))
+    ax.set_ylabel(axis_label(result.given.plant, name))
 
 
-def _residuals(result: FitResult, angles: str) -> Figure:
+def _residuals(result: FitResult) -> Figure:
     plant = result.fitted.problem.plant
     count, p = min(len(result.given.recordings), MOST_TRIALS), len(plant.outputs)
     figure = new_figure(DOUBLE_COLUMN, 0.4 + 1.3 * p * 1.0)
     axes = np.array(figure.subplots(p, 2, width_ratios=[3, 1], squeeze=False, sharex="col"))
     for column, name in enumerate(plant.outputs):
-        factor, unit = shown_unit(plant, name, angles)
+        factor, unit = shown_unit(plant, name)
         series = [
             factor * (trial.outputs - run.x @ plant.C.T)[:, column]
             for trial, run in zip(result.given.recordings, result.inverse_mpc.runs, strict=True)
@@ -233,7 +230,7 @@ def _shade(index: int) -> str:
     return (VERMILLION, BLUE, GREEN, "#E69F00", "#CC79A7", "#BBBBBB")[index % 6]
 
 
-def _methods(result: FitResult, angles: str) -> Figure:
+def _methods(result: FitResult) -> Figure:
     """Ten seconds about the largest disagreement of inverse LQR, in the trial that has it."""
     plant = result.fitted.problem.plant
     shown = {item.name: item for item in result.methods if item.name in _METHOD_LINES and item.runs}
@@ -243,7 +240,7 @@ def _methods(result: FitResult, angles: str) -> Figure:
     time = np.arange(window.start, window.stop) * plant.dt
     figure = new_figure(DOUBLE_COLUMN, 3.4)
     above, below = figure.subplots(2, 1, sharex=True)
-    factor, _ = shown_unit(plant, plant.outputs[0], angles)
+    factor, _ = shown_unit(plant, plant.outputs[0])
     recorded = factor * trial.outputs[window, 0]
     above.plot(time, recorded, color=_SOFT, linewidth=1.8, label="recorded")
     for name, method in shown.items():
@@ -259,8 +256,8 @@ def _methods(result: FitResult, angles: str) -> Figure:
             below.axhline(limit, color=INK, linewidth=0.8, linestyle=":")
     reach = 1.6 * float(np.max(np.abs(recorded)))
     above.set_ylim(-reach, reach)
-    above.set_ylabel(axis_label(plant, plant.outputs[0], angles))
-    below.set_ylabel(axis_label(plant, plant.controls[0], angles))
+    above.set_ylabel(axis_label(plant, plant.outputs[0]))
+    below.set_ylabel(axis_label(plant, plant.controls[0]))
     largest = max(float(np.max(np.abs(item.runs[index].u[window, 0]))) for item in shown.values())
     below.set_ylim(-1.1 * largest, 1.1 * largest)
     below.set_xlabel("time (s)")

@@ -12,6 +12,7 @@ from impc.assess.covariance import TOLD
 from impc.control.named_solver import described
 from impc.reporting.document import (
     Block,
+    Chart,
     Details,
     Heading,
     Lines,
@@ -25,6 +26,7 @@ from impc.reporting.document import (
     table_of,
 )
 from impc.reporting.rendering import number
+from impc.studies.charts import methods_chart, weights_chart
 from impc.studies.fit.csv_tables import fit_tables
 from impc.studies.fit.figures import fit_figures
 from impc.studies.fit.interval_figures import shown_statements
@@ -102,7 +104,7 @@ def fit_report(
     result: FitResult,
     provenance: Provenance,
     truth: Array | None = None,
-    angles: str = "degrees",
+    missing: str = "",
 ) -> Report:
     """Page, result.json, tables and figures.
 
@@ -112,8 +114,8 @@ def fit_report(
     provenance : Provenance
     truth : Array, optional
         Gain (m, n) of a simulated subject: the page then compares with it.
-    angles : str
-        "degrees" or "radians": how figures show them.
+    missing : str
+        What was not given, of `missing`.
     """
     told = () if truth is None else (Note("Truth.", truth_sentence(result, truth)),)
     subject = str(result.given.recordings[0].label.subject) or "a subject"
@@ -123,6 +125,7 @@ def fit_report(
         (
             Verdict(verdict(result)),
             *(Note("Warning.", line.removeprefix("Warning: ")) for line in result.warnings),
+            *([Note("Not given:", missing.removeprefix("Not given: "))] if missing else []),
             *told,
             Lines(abstract(result)),
             Details("What stands behind these sentences", (Lines(remarks(result)),)),
@@ -135,11 +138,11 @@ def fit_report(
             Section("3. Inverse LQR on the same recordings", _methods(result), "Inverse LQR"),
             Section("4. Recorded and simulated", _trajectories(result), "Trajectories"),
             Section("5. What is left", (_LEFT, _RESIDUALS), "What is left", folded=True),
-            Section("6. All weights with this gain", _intent(result), "Intent", folded=True),
+            Section("6. All weights with this gain", _weights(result), "Intent", folded=True),
             Section("7. Checks of the recordings", (_checks(result),), "Checks", folded=True),
             Section("8. Settings and versions", _made(result, provenance), "Settings", folded=True),
         ],
-        figures=fit_figures(result, angles),
+        figures=fit_figures(result),
         tables=fit_tables(result),
         data={**fit_data(result, provenance), "truth": None if truth is None else {"K": truth}},
         provenance=provenance,
@@ -201,13 +204,15 @@ def _trajectories(result: FitResult) -> list[Block]:
         for index in shown
     ]
     others = [Details("The other trials", pictures[1:])] if len(pictures) > 1 else []
-    return [*blocks, *pictures[:1], *others]
+    data = methods_chart(result.given, result.methods[::-1], shown[0])
+    return [*blocks, Chart(pictures[0], data), *others]
 
 
-def _intent(result: FitResult) -> list[Block]:
+def _weights(result: FitResult) -> list[Block]:
+    moved = Chart(_INTENT, weights_chart(result.fitted.problem, result.intent))
     plant, summary = result.fitted.problem.plant, result.certainty.weights
     missing = [f"Not available: {line}" for line in result.intent.missing]
-    blocks: list[Block] = [_readings(result), *missing, _INTENT]
+    blocks: list[Block] = [_readings(result), *missing, moved]
     if summary is not None:
         blocks += set_sentences(summary)
         ranges = (entries_table(summary), eigenvalues_table(summary))

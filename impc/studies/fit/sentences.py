@@ -13,9 +13,11 @@ from impc.studies.fit.result import trial_name
 from impc.studies.fit.structures import structure_sentences
 
 if TYPE_CHECKING:
+    from impc.files.plant_sources import PlantSource
     from impc.studies.fit.result import FitResult
+    from impc.studies.fit.settings import FitSettings
 
-__all__ = ["direction_name", "limited", "remarks"]
+__all__ = ["direction_name", "limited", "missing", "remarks"]
 
 # Parts of a direction below this are not named.
 _NAMED = 0.15
@@ -33,6 +35,19 @@ def remarks(result: FitResult) -> tuple[str, ...]:
         _determined(result),
         *person_sentences(result),
     )
+
+
+def missing(settings: FitSettings, source: PlantSource) -> str:
+    """What was not given, and what that excludes, in one line; empty where nothing is missing."""
+    parts = []
+    if settings.u_max is None:
+        parts.append("u_max: without a limit of the command inverse MPC is inverse LQR")
+    typical = source.assumed()
+    own = [name for name in typical if name not in settings.free]
+    if own:
+        values = ", ".join(f"{name} {typical[name]}" for name in own)
+        parts.append(f"the subject's own {' and '.join(own)}: the gains are those of {values}")
+    return f"Not given: {'; '.join(parts)}." if parts else ""
 
 
 def limited(result: FitResult) -> bool:
@@ -79,7 +94,7 @@ def _how_sure(result: FitResult) -> str:
     return (
         f"Other weights with exactly the same behaviour turn that direction by up to "
         f"{result.widest_angle:.0f} degrees: so far it was chosen by a rule and not by the "
-        f"subject (section 4).{drawn}"
+        f"subject (section 6).{drawn}"
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import msgspec
@@ -285,8 +285,7 @@ def fit_settings(table: Mapping[str, Any]) -> FitSettings:
     _require_distinct(settings)
     for name in settings.methods:
         method_named(name)
-    require_solver(settings.solver)
-    return settings
+    return replace(settings, solver=require_solver(settings.solver))
 
 
 def _require_between(name: str, value: float, least: float, most: float) -> None:

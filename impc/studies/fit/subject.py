@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from tqdm.auto import tqdm
 
 from impc.arrays import Array, frozen
 from impc.assess.all_intervals import assess, count_stages
@@ -156,7 +157,7 @@ def fit_problem(
 def fit_recordings(
     problem: Problem,
     settings: FitSettings,
-    progress: FitProgress | Callable[[str], None] | None = None,
+    progress: FitProgress | Callable[[str], None] | bool | None = None,
 ) -> FitResult:
     """Fit a subject.
 
@@ -165,8 +166,9 @@ def fit_recordings(
     problem : Problem
         Of `fit_problem`.
     settings : FitSettings
-    progress : FitProgress or callable, optional
-        A callable is told the name of each stage when it is done: `progress=print`.
+    progress : FitProgress or callable or bool, optional
+        True draws a bar, in a notebook too; a callable is told the name of each stage when it is
+        done: `progress=print`.
 
     Raises
     ------
@@ -190,8 +192,20 @@ def fit_recordings(
     >>> bool(abs(found.estimate.K - law.K).max() < 0.1)
     True
     """
+    if progress is True:
+        with tqdm(total=stages(problem, settings), unit="stage") as bar:
+
+            def told(name: str) -> None:
+                bar.set_postfix_str(name, refresh=False)
+                bar.update()
+
+            return fit_recordings(problem, settings, told)
     if not isinstance(progress, FitProgress):
-        progress = FitProgress() if progress is None else FitProgress(progress)
+        progress = FitProgress(progress) if callable(progress) else FitProgress()
+    return _fitted(problem, settings, progress)
+
+
+def _fitted(problem: Problem, settings: FitSettings, progress: FitProgress) -> FitResult:
     started = time.perf_counter()
     ground = NaturalUnits(problem, progress.estimate, settings.feedback_states)
     fitted = ground.fitted

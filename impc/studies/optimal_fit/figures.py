@@ -40,11 +40,11 @@ _FURTHEST = 30.0
 _LONGEST = 45  # characters of a legend
 
 
-def optimal_figures(fit: OptimalFit, angles: str = "degrees") -> dict[str, bytes]:
-    """Draw all figures: PNG and PDF by file name; `angles` in "degrees" or "radians"."""
+def optimal_figures(fit: OptimalFit) -> dict[str, bytes]:
+    """Draw all figures: PNG and PDF by file name."""
     with journal_style():
         figures = {
-            f"trajectories-{index + 1}": _trajectories(fit, index, angles)
+            f"trajectories-{index + 1}": _trajectories(fit, index)
             for index in range(min(len(fit.trials), MOST_TRIALS))
         }
         if interval_rows(fit):
@@ -53,7 +53,7 @@ def optimal_figures(fit: OptimalFit, angles: str = "degrees") -> dict[str, bytes
         return drawn(figures)
 
 
-def _trajectories(fit: OptimalFit, index: int, angles: str) -> Figure:
+def _trajectories(fit: OptimalFit, index: int) -> Figure:
     estimate, names = fit.estimate, fit.names
     one, (x, u) = estimate.recordings[index], estimate.runs[index]
     limits = limits_of(estimate.problem, np.array(list(estimate.theta.values())))
@@ -65,7 +65,7 @@ def _trajectories(fit: OptimalFit, index: int, angles: str) -> Figure:
     for k, name in enumerate(names):
         recorded, run = (one.x, x) if k < len(x[0]) else (one.u, u)
         column = k if k < len(x[0]) else k - len(x[0])
-        factor, unit = shown_as(estimate.problem.signal_units.get(name, "-"), angles)
+        factor, unit = shown_as(estimate.problem.signal_units.get(name, "-"))
         time, ax = step * np.arange(len(run)), axes[k]
         ax.plot(
             time, factor * recorded[:, column], color=_SOFT, marker="o", markersize=2.5,

@@ -59,15 +59,13 @@ _TOLD = (
 )
 
 
-def optimal_report(fit: OptimalFit, provenance: Provenance, angles: str = "degrees") -> Report:
+def optimal_report(fit: OptimalFit, provenance: Provenance) -> Report:
     """Page, result.json, parameters.csv, combinations.csv, trajectories.csv and figures.
 
     Parameters
     ----------
     fit : OptimalFit
     provenance : Provenance
-    angles : str
-        "degrees" or "radians": how figures show them.
     """
     told: list[Block] = [_TOLD, _combinations(fit), _VALUES]
     return Report(
@@ -81,7 +79,7 @@ def optimal_report(fit: OptimalFit, provenance: Provenance, angles: str = "degre
             Section("4. Checks of the recordings", (_checks(fit),), "Checks", folded=True),
             Section("5. Settings and versions", _made(fit, provenance), "Settings", folded=True),
         ],
-        figures=optimal_figures(fit, angles),
+        figures=optimal_figures(fit),
         tables={
             "parameters": parameters_table(fit),
             "combinations": _combination_numbers(fit),

@@ -16,9 +16,11 @@ from impc.reporting.document import Lines, Picture, Report, Section, Terms, Text
 from impc.reporting.rendering import number
 from impc.reporting.shown_units import shown_unit
 from impc.reporting.style import drawn, journal_style
+from impc.studies.fit.tables import number_name
 from impc.studies.plan.figures import experiments_figure, prices_figure
 from impc.studies.plan.sentences import design_name, plan_sentences, told_as
 from impc.studies.plan.simulated_fits import spread
+from impc.studies.signal_words import signal_words
 
 if TYPE_CHECKING:
     from impc.reporting.provenance import Provenance
@@ -66,6 +68,7 @@ def plan_report(plan: Plan, provenance: Provenance) -> Report:
         tables={"experiments": _numbers(plan)},
         data=_data(plan),
         provenance=provenance,
+        words=signal_words(plan.person.controller.plant),
     )
 
 
@@ -91,7 +94,7 @@ def _best(plan: Plan) -> tuple[TextTable, ...]:
     plant, truth = plan.person.controller.plant, np.array(plan.person.controller.K)
     gains = [
         (
-            f"K.{control}.{state}",
+            number_name(plant, f"K.{control}.{state}"),
             number(truth[i, j]),
             number(1.96 * expected.gain.entries[i, j]),
             "yes" if expected.gain.told_entries[i, j] else "only with others",

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy.signal
 
+from impc.reporting.shown_units import shown_angle
 from impc.reporting.style import (
     BLUE,
     DOUBLE_COLUMN,
@@ -36,6 +37,7 @@ def reliability_figures(trials: Trials, result: Reliability) -> dict[str, bytes]
     first = (result.subjects[0], result.visits[0], result.conditions[0])
     with journal_style():
         figures = {
+            "visits": _visits(result),
             "time-series": _time_series(trials, result),
             "spectra": _spectra(trials, result),
             "transfer-visits": _responses(
@@ -48,6 +50,32 @@ def reliability_figures(trials: Trials, result: Reliability) -> dict[str, bytes]
         return drawn(figures)
 
 
+def _visits(result: Reliability) -> Figure:
+    """The root-mean-square score of every person, visit by visit, and the mean."""
+    shown = [item for item in result.measures if item.measure == "rms"]
+    factor, unit = shown_angle()
+    columns = len(result.outputs)
+    rows = -(-len(shown) // columns)
+    figure = new_figure(DOUBLE_COLUMN, 0.3 + 1.7 * rows)
+    axes = np.ravel(figure.subplots(rows, columns, squeeze=False, sharex=True))
+    order = sorted(shown, key=lambda item: result.conditions.index(item.condition))
+    across = np.arange(len(result.visits))
+    for ax, item in zip(axes, order, strict=False):
+        scores = factor * item.scores
+        for person in scores:
+            ax.plot(across, person, color=BLUE, linewidth=0.6, marker="o", markersize=2.5)
+        counted = [column[np.isfinite(column)] for column in scores.T]
+        means = [np.mean(known) if len(known) else np.nan for known in counted]
+        ax.plot(across, means, color=INK, linewidth=2.0)
+        ax.set_title(f"{item.output}, {item.condition}", loc="left")
+        ax.set_ylabel(f"root-mean-square ({unit})")
+        ax.set_xticks(across, result.visits)
+        ax.set_xlim(-0.3, len(across) - 0.7)
+    for ax in axes[-columns:]:
+        ax.set_xlabel("visit (-)")
+    return figure
+
+
 def _time_series(trials: Trials, result: Reliability) -> Figure:
     """Figure 2.3: input and outputs of one trial."""
     trial = next(iter(trials.cells.values()))[0]
@@ -55,12 +83,13 @@ def _time_series(trials: Trials, result: Reliability) -> Figure:
     rows = 1 + len(result.outputs)
     figure = new_figure(DOUBLE_COLUMN, 1.2 * rows + 0.4)
     axes = figure.subplots(rows, 1, sharex=True)
+    factor, unit = shown_angle()
     axes[0].step(time, trial.disturbance[:, 0], where="post", color=INK, linewidth=0.9)
     axes[0].set_ylabel("perturbation\n(N m)")
     for index, name in enumerate(result.outputs):
         ax = axes[1 + index]
-        ax.plot(time, np.degrees(trial.outputs[:, index]), color=BLUE, linewidth=1.0)
-        ax.set_ylabel(f"{name}\n(deg)")
+        ax.plot(time, factor * trial.outputs[:, index], color=BLUE, linewidth=1.0)
+        ax.set_ylabel(f"{name}\n({unit})")
     axes[-1].set_xlabel("time (s)")
     for place, ax in enumerate(axes):
         ax.set_title(f"({'ABCDEFG'[place]})", loc="left")
@@ -73,9 +102,10 @@ def _spectra(trials: Trials, result: Reliability) -> Figure:
     figure = new_figure(DOUBLE_COLUMN, 2.6)
     axes = figure.subplots(1, 1 + len(result.outputs))
     excited = result.band.excited
+    factor, angle = shown_angle()
     signals = [("perturbation", trial.disturbance[:, 0], "N²m²/Hz")]
     signals += [
-        (name, np.degrees(trial.outputs[:, index]), "deg²/Hz")
+        (name, factor * trial.outputs[:, index], f"{angle}²/Hz")
         for index, name in enumerate(result.outputs)
     ]
     for ax, (name, values, unit) in zip(axes, signals, strict=True):
@@ -96,12 +126,13 @@ def _responses(
     """Figures 2.5 and 2.6: amplitude and phase of the averaged estimates of several cells."""
     figure = new_figure(DOUBLE_COLUMN, 3.6)
     axes = figure.subplots(2, len(result.outputs), sharex=True, squeeze=False)
+    factor, unit = shown_angle()
     for (color, line), key in zip(_LINES, keys, strict=False):
         found = result.responses.get(key)
         if found is None:
             continue
         for index in range(len(result.outputs)):
-            response = np.degrees(1.0) * found.response[:, index]
+            response = factor * found.response[:, index]
             label = f"{word} {key[varied]}"
             axes[0, index].loglog(
                 found.frequency, np.abs(response), color=color, linestyle=line, label=label
@@ -111,7 +142,7 @@ def _responses(
     for index, name in enumerate(result.outputs):
         axes[0, index].set_title(f"({'AB'[index % 2]}) {name}", loc="left")
         axes[1, index].set_xlabel("frequency (Hz)")
-        axes[0, index].set_ylabel("amplitude (deg/(N m))")
+        axes[0, index].set_ylabel(f"amplitude ({unit}/(N m))")
         axes[1, index].set_ylabel("phase (deg)")
     axes[0, 0].legend(loc="lower left")
     return figure

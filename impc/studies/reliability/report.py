@@ -51,6 +51,14 @@ _PICTURES = (
 )
 
 
+_VISITS = Picture(
+    "visits",
+    "Root-mean-square of every person at every visit, one line a person",
+    "A line a person, thick the mean: where lines keep their order and their height from visit to "
+    "visit, the test is reliable.",
+)
+
+
 def reliability_report(trials: Trials, result: Reliability, command: str, inputs: Inputs) -> Report:
     """Page, result.json, tables and figures; they name the `command` and its `inputs`."""
     tables = reliability_tables(result)
@@ -68,7 +76,10 @@ def reliability_report(trials: Trials, result: Reliability, command: str, inputs
     # One visit has no reliability: a table of dashes says less than the sentence above it.
     shown = _TABLES if len(result.visits) > 1 else {"1. The visit": ("visits-rms", "visits-energy")}
     sections = [
-        *(Section(title, [tables[name] for name in names]) for title, names in shown.items()),
+        *(
+            Section(title, [*([] if number else [_VISITS]), *(tables[name] for name in names)])
+            for number, (title, names) in enumerate(shown.items())
+        ),
         Section("4. Pictures", _PICTURES),
         Section("5. The dissertation's findings, looked for here", (Lines(found),), folded=True),
         Section("6. Versions", (Markup("<code>{}</code>").format(command),), folded=True),

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from impc.reporting.shown_units import shown_angle
 from impc.studies.reliability.analysis import MEASURES
 
 if TYPE_CHECKING:
@@ -36,8 +37,9 @@ def interval_band(low: float, high: float) -> str:
 
 
 def shown_score(item: MeasureResult) -> tuple[float, str]:
-    """Factor and unit in which a score is shown: angles in degrees."""
-    return (np.degrees(1.0), "deg") if item.measure == "rms" else (np.degrees(1.0) ** 2, "deg²")
+    """Factor and unit in which a score is shown."""
+    factor, unit = shown_angle()
+    return (factor, unit) if item.measure == "rms" else (factor**2, f"{unit}²")
 
 
 def answer(result: Reliability) -> tuple[str, ...]:

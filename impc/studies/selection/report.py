@@ -115,9 +115,8 @@ def selection_table(model: ParametricModel, found: StudySelection) -> TextTable:
 def _findings(model: ParametricModel, found: StudySelection) -> list[str]:
     lines = []
     ranks = [item.information.rank for item in found.nominal.values()]
-    lines.append(
-        f"Of {model.size} parameters {min(ranks)} to {max(ranks)} directions are identifiable."
-    )
+    seen = f"{min(ranks)} to {max(ranks)}" if min(ranks) < max(ranks) else f"{ranks[0]}"
+    lines.append(f"Of {model.size} parameters {seen} directions are identifiable.")
     for names in dict.fromkeys(names for item in found.nominal.values() for names in item.scalings):
         lines.append(
             f"Scaling {', '.join(names)} together changes the outputs by less than their noise."
@@ -168,8 +167,8 @@ def _interval_table(model: ParametricModel, found: StudySelection) -> TextTable:
         rows.append(
             (
                 model.names[index], model.units[index],
-                f"{values.mean():.4g} ± {_sd(values):.2g}",
-                f"{widths.mean():.3g} ± {_sd(widths):.2g}",
+                f"{values.mean():.4g}{_spread(values)}",
+                f"{widths.mean():.3g}{_spread(widths)}",
                 f"{100 * widths.mean() / (2 * model.gain[index]):.1f}",
             )
         )  # fmt: skip
@@ -298,5 +297,6 @@ def names_of(model: ParametricModel, subset: Sequence[int]) -> str:
     return ", ".join(model.names[index] for index in subset)
 
 
-def _sd(values: np.ndarray[Any, np.dtype[np.float64]]) -> float:
-    return float(np.std(values, ddof=1)) if len(values) > 1 else float("nan")
+def _spread(values: np.ndarray[Any, np.dtype[np.float64]]) -> str:
+    """The deviation behind a mean; nothing for one subject."""
+    return f" ± {np.std(values, ddof=1):.2g}" if len(values) > 1 else ""

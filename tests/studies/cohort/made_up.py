@@ -43,7 +43,7 @@ def fit_of(seed: int) -> dict[str, Any]:
     weights = {"Q": [[1.0, 0.0], [0.0, 2.0]], "dominant": [0.6, 0.8], "angle": 1.0}
     return {
         "states": ["position", "position_rate"], "controls": ["force"], "outputs": ["position"],
-        "shown_units": [[1.0, "m"]],
+        "shown_units": [[1.0, "m"]], "words": [["position", "Of the hand, in m."]],
         "trials": 2, "samples": 100, "K": gain, "K_deviation": [[0.1, None]],
         "K_told": [[True, False]], "K_of_weights": gain, "S": [[1.0]],
         "Q": weights["Q"], "R": [[1.0]], "misfit": 0.1, "exact": True, "converged": True,

@@ -8,14 +8,21 @@ import re
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from click.testing import CliRunner
 
 from experiments.coverage import cart, noisy_trial, true_controller
 from impc.arrays import Array
 from impc.assess.judged import MethodFit
+from impc.checking import replace
 from impc.cli.main import main
-from impc.inverse.estimates import Estimate, decode_estimate, encode_estimate
+from impc.inverse import methods
+from impc.inverse.estimates import Estimate, Status, decode_estimate, encode_estimate
+from impc.inverse.problem import Problem
+from impc.model.bounds import Bounds
+from impc.model.plant import Plant
+from impc.model.recordings import Recording
 from impc.studies.compare.subject import (
     compare_recordings,
     compared_methods,
@@ -24,6 +31,7 @@ from impc.studies.compare.subject import (
 from impc.studies.fit.memory import open_memory
 from impc.studies.fit.settings import FitSettings
 from impc.studies.fit.subject import fit_problem
+from plants import yalmip_example
 from tests.support import easier_seat
 
 SETTINGS = FitSettings(horizon=10, u_max=1.0)
@@ -146,8 +154,9 @@ def test_the_command(tmp_path: Path) -> None:
     done = runner.invoke(main, ["compare", *files, *arguments, "--out", str(out)])
     assert done.exit_code == 0, done.stderr
     names = {path.name for path in out.iterdir()}
-    pictures = {"comparison.png", "comparison.pdf"}
-    tables = {"methods.csv", "tables.mat", "tables.xlsx"}
+    pictures = {"comparison.png", "comparison.pdf", "trajectories.png", "trajectories.pdf"}
+    tables = {"gain.csv", "weights.csv", "methods.csv", "trajectories.csv", "tables.mat",
+              "tables.xlsx"}  # fmt: skip
     assert names == {"report.html", "result.json", ".impc", *tables, *pictures}
     found = json.loads((out / "result.json").read_text())["methods"]
     assert list(found) == list(compared_methods())
@@ -156,10 +165,42 @@ def test_the_command(tmp_path: Path) -> None:
     for row in rows:
         told = found[row["method"]]["vaf"]["theta1"]
         assert row["vaf_theta1"] == ("" if told is None else repr(told))
+    gain, weights, sway = (pd.read_csv(out / f"{name}.csv")
+                           for name in ("gain", "weights", "trajectories"))  # fmt: skip
+    entry = gain.query("number == 'K.command.theta1'").set_index("method")
+    assert entry.loc["inverse_mpc", "unit"] == "N m/rad"
+    for name, method in found.items():
+        if method["K"] is not None:
+            assert entry.loc[name, "value"] == method["K"][0][0]
+        if method["Q"] is not None:
+            first = weights.query("matrix == 'Q' and method == @name").iloc[0]
+            assert first["value"] == method["Q"][0][0]
+    trial = sway.query("trial == 2")
+    left = trial.theta1_recorded - trial.theta1_inverse_mpc
+    share = 100 * (1 - np.sum(left**2) / np.sum(trial.theta1_recorded**2))
+    assert share == pytest.approx(found["inverse_mpc"]["trial_vaf"][1][0])
     page = (out / "report.html").read_text()
     assert not re.search("https?:", page)
     assert "inverse KKT" in page
     assert "inverse MPC, direct (3.6)" in done.stdout
+
+
+def test_a_printed_estimate_says_what_speaks_against_it(compared: dict[str, MethodFit]) -> None:
+    assert "leaves" not in str(compared["inverse_mpc"].estimate).split("noise.", 1)[1]
+    clipped = str(compared["inverse_lqr_output"].estimate)
+    assert "But another gain leaves less" in clipped
+    stopped = replace(compared["inverse_mpc"].estimate, status=Status.STOPPED)
+    assert "was stopped before it ended: the answer may be wrong" in str(stopped)
+    plant = Plant(yalmip_example())
+    still = np.random.default_rng(1).standard_normal((21, 2))
+    bounds = Bounds(plant, u_min=-1, u_max=1)
+    heard: list[str] = []
+    found = methods.estimate(
+        Problem(plant, bounds, 3, [Recording(plant, still)]), progress=heard.append
+    )
+    assert heard == ["inverse_mpc"]
+    share = found.misfit / np.sqrt(still.size)  # outputs are over their root-mean-square
+    assert f"It leaves {100 * share:.0f} % of the recordings." in str(found)
 
 
 def test_a_bad_file_ends_in_one_line(tmp_path: Path) -> None:

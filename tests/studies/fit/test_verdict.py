@@ -14,12 +14,16 @@ from impc.assess.loop_noise import LoopNoise
 from impc.assess.residual_structure import ResidualStructure
 from impc.checking import replace
 from impc.control.controller import Controller
+from impc.files.plant_sources import plant_source
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.recordings import Recording
 from impc.model.weights import Weights
+from impc.reporting.shown_units import angles_in
+from impc.studies.charts import methods_chart, weights_chart
 from impc.studies.fit.figures import trajectory_figure
 from impc.studies.fit.interval_figures import gain_figure, shown_statements, statements_figure
+from impc.studies.fit.sentences import missing
 from impc.studies.fit.settings import FitSettings
 from impc.studies.fit.subject import fit_problem, fit_recordings, stages
 from impc.studies.fit.verdict import abstract, verdict
@@ -97,6 +101,17 @@ def test_no_limit_and_a_limit_that_is_not_reached() -> None:
     assert "never reaches its bound" in verdict(replace(fitted(50.0), diagnostics=clear))
 
 
+def test_what_is_not_given_is_said_with_what_that_excludes() -> None:
+    source = plant_source("plants:seated_balance_for", {"mass": 70.0})
+    assert missing(FitSettings(), source) == (
+        "Not given: u_max: without a limit of the command inverse MPC is inverse LQR; "
+        "the subject's own height: the gains are those of height 1.66."
+    )
+    assert missing(FitSettings(u_max=6.0, free=["height"]), source) == ""
+    cursor = plant_source("plants:cursor_plant", {})
+    assert missing(FitSettings(u_max=6.0), cursor) == ""
+
+
 def bars(ax: Axes) -> list[Array]:
     """Both ends of each line, from below to above on the page."""
     found = [np.asarray(line.get_xdata(), dtype=np.float64) for line in ax.lines]
@@ -111,11 +126,42 @@ def test_angles_are_shown_as_is_asked() -> None:
         result.fitted, problem=replace(result.fitted.problem, plant=turned)
     ))  # fmt: skip
     for angles, label, factor in (("degrees", "deg", 180 / np.pi), ("radians", "rad", 1.0)):
-        ax = trajectory_figure(shown, 0, angles).axes[0]
+        with angles_in(angles):
+            ax = trajectory_figure(shown, 0).axes[0]
         assert ax.get_ylabel() == f"place ({label})"
         (line, _) = ax.lines
         recorded = factor * result.given.recordings[0].outputs[:, 0]
         np.testing.assert_allclose(np.asarray(line.get_ydata()), recorded)
+
+
+def test_curves_of_the_page_are_those_of_the_fit() -> None:
+    result = fitted(1.0)
+    data = methods_chart(result.given, result.methods[::-1], 0)
+    assert [one["label"] for one in data["curves"]][:2] == ["recorded", "inverse MPC, direct (3.6)"]
+    place, pull = data["panels"]
+    assert (place["label"], pull["label"], pull["bounds"]) == ("place (m)", "pull (m/s^2)", [-1, 1])
+    recorded, run = result.given.recordings[0].outputs[:, 0], result.inverse_mpc.runs[0]
+    # Five digits are kept.
+    np.testing.assert_allclose(place["curves"][0], recorded, rtol=1e-4)
+    np.testing.assert_allclose(place["curves"][1], run.x[:, 0][: len(recorded)], rtol=1e-4)
+    assert pull["curves"][0] == [None] * len(recorded)
+    np.testing.assert_allclose(pull["curves"][1][:-1], run.u[:, 0][: len(recorded) - 1], rtol=1e-4)
+    assert len({len(one) for panel in data["panels"] for one in panel["curves"]}) == 1
+
+
+def test_weights_of_the_slider_move_prices_and_nothing_else() -> None:
+    result = fitted(1.0)
+    data = weights_chart(result.fitted.problem, result.intent)
+    # Of this cart, a double integrator, only the mixed price is free: from 0 to 0.93, measured.
+    prices = np.array([one["prices"] for one in data["positions"]])
+    np.testing.assert_allclose(prices, np.tile(prices[0], (len(prices), 1)), rtol=1e-9)
+    assert data["mixed"] == ["place with speed"]
+    mixed = np.array([one["mixed"] for one in data["positions"]])
+    assert np.ptp(mixed) > 0.9
+    assert len(prices) == 4 * len(result.intent.readings) - 3
+    for one in data["positions"]:
+        for panel, values in zip(data["panels"], one["panels"], strict=True):
+            np.testing.assert_allclose(values, panel["curves"][0], rtol=1e-4, atol=1e-9)
 
 
 def test_bars_are_the_intervals() -> None:
