@@ -30,6 +30,7 @@ def auxiliary_weights(
     gain: Array,
     start: Weights | None,
     *,
+    metric: Array | None = None,
     condition_weight: float = AUXILIARY_CONDITION_WEIGHT,
 ) -> ConditionedFit:
     """Auxiliary problem (3.7): weights whose regulator is near the gain, and well conditioned.
@@ -42,6 +43,8 @@ def auxiliary_weights(
         (m, n).
     start : Weights or None
         Where the search begins; the identity for None.
+    metric : Array, optional
+        S (m, m), up to scale, of which the regulator's is to be near too.
     condition_weight : float
         Against 1 for the distance.
 
@@ -50,12 +53,19 @@ def auxiliary_weights(
     WeightsError
         When the start has no stabilising Riccati solution.
     """
-    size = gain.size
-    dK = np.eye(size).reshape(size, *gain.shape)
-    dS = np.zeros((size, plant.m, plant.m))
+    m, size = plant.m, gain.size
+    target = None if metric is None else m * metric / np.trace(metric)
+    rows = size if target is None else size + m * m
+    dK, dS = np.zeros((rows, *gain.shape)), np.zeros((rows, m, m))
+    dK[:size] = np.eye(size).reshape(size, *gain.shape)
+    dS[size:] = np.eye(m * m)[: rows - size].reshape(-1, m, m)
 
     def distance(solution: LqrSolution) -> Residual:
-        return Residual((solution.K - gain).ravel(), dK, dS, usable=True)
+        beyond = (solution.K - gain).ravel()
+        if target is not None:
+            S = m * solution.S / np.trace(solution.S)
+            beyond = np.concatenate([beyond, (S - target).ravel()])
+        return Residual(beyond, dK, dS, usable=True)
 
     begin = Weights(np.eye(plant.n), np.eye(plant.m)) if start is None else start
     return conditioned_fit(

@@ -9,7 +9,7 @@ from impc.inverse.nearest_regulator import AUXILIARY_CONDITION_WEIGHT, auxiliary
 from impc.model.plant import Plant
 from impc.model.riccati import solve_lqr
 from impc.model.weights import Weights, condition_number, weights_from_parameters
-from tests.support import nelder_mead
+from tests.support import nelder_mead, random_plant, random_weights
 
 IDENTITY = Weights(np.eye(2), 1)
 
@@ -38,3 +38,17 @@ def test_auxiliary_problem_reaches_what_a_derivative_free_search_reaches(
             2000,
         )
         assert best <= search + 1e-9
+
+
+def test_a_metric_is_come_near_too() -> None:
+    """Without a price on conditioning, weights of a known pair are found again: gain and metric."""
+    rng = np.random.default_rng(3)
+    plant = random_plant(rng, 3, 2, 0.9)
+    truth = solve_lqr(plant, Weights(random_weights(rng, 3), random_weights(rng, 2)))
+    found = auxiliary_weights(
+        plant, np.array(truth.K), None, metric=5 * np.array(truth.S), condition_weight=1e-9
+    ).solution
+    np.testing.assert_allclose(found.K, truth.K, atol=1e-6)
+    np.testing.assert_allclose(
+        np.array(found.S) / np.trace(found.S), np.array(truth.S) / np.trace(truth.S), atol=1e-6
+    )
