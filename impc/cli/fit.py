@@ -58,10 +58,10 @@ def command(
         return
     subject = read_subject("fit", files, plant_name, config, solver)
     problem, settings = subject.problem, subject.settings
+    require_consent(fit_effort(problem, settings), yes)
     unknown = missing(settings, subject.source)
     if unknown:
         click.echo(unknown, err=True)
-    require_consent(fit_effort(problem, settings), yes)
     memory = open_memory(out, problem, settings, "fit", subject.inputs.digest)
     truth = read_truth(files, problem.plant)
     # One more: the page with its figures takes ten seconds.

@@ -24,6 +24,7 @@ height = 1.66
 
 [fit]
 u_max = 6.0
+body = "linear"
 
 [fit.structure]
 Q = "diagonal"
