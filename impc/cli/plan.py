@@ -82,7 +82,7 @@ def _person(
     from impc.control.controller import Controller  # noqa: PLC0415
     from impc.errors import InputError  # noqa: PLC0415
     from impc.files.plant_sources import make_plant, plant_family_of  # noqa: PLC0415
-    from impc.studies.fit.settings import fit_bounds  # noqa: PLC0415
+    from impc.studies.fit.settings import fit_bounds, moving_body  # noqa: PLC0415
     from impc.studies.plan.designs import Person  # noqa: PLC0415
     from impc.studies.plan.settings import (  # noqa: PLC0415
         mechanical_stops,
@@ -91,7 +91,8 @@ def _person(
     )
 
     recorded = tuple(settings.perturbed or configuration.signals)
-    plant = make_plant(source, recorded)
+    family = plant_family_of(source, recorded, fit.free)
+    plant, family = moving_body(make_plant(source, recorded), family, fit)
     if not plant.disturbances:
         known = ", ".join(plant.controls)
         raise InputError("[plan] perturbed", "names no input of the plant", f"known: {known}")
@@ -110,7 +111,7 @@ def _person(
         noise_deviations(plant, settings),
         float(np.exp(-plant.dt / tau)) if tau > 0 else 0.0,
         mechanical_stops(plant, settings, configuration.signals),
-        plant_family_of(source, recorded, fit.free),
+        family,
     )
 
 

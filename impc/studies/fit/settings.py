@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
     from impc.arrays import Array
     from impc.model.plant import Plant
+    from impc.model.plant_family import PlantFamily
     from impc.model.recordings import Recording
 
 __all__ = [
@@ -33,6 +34,7 @@ __all__ = [
     "fit_observer",
     "fit_settings",
     "fit_structures",
+    "moving_body",
     "read_settings",
     "require_used",
 ]
@@ -364,6 +366,15 @@ def fit_structures(plant: Plant, settings: FitSettings) -> tuple[Structure, ...]
             raise InputError("[fit] structures", f"has {one.name!r} twice", "name each by itself")
         found.append(one)
     return tuple(found)
+
+
+def moving_body(
+    plant: Plant, family: PlantFamily | None, settings: FitSettings
+) -> tuple[Plant, PlantFamily | None]:
+    """The plant and its family with the body that the settings ask for."""
+    if settings.body != "linear":
+        return plant, family
+    return plant.linear(), None if family is None else family.linear()
 
 
 def fit_bounds(plant: Plant, settings: FitSettings, recordings: Sequence[Recording]) -> Bounds:

@@ -40,7 +40,13 @@ from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.problem import Problem, controller_for, scenarios
 from impc.inverse.structured_fit import fit_structured
 from impc.studies.fit.result import FitResult, FittedParameter
-from impc.studies.fit.settings import FitSettings, fit_bounds, fit_observer, fit_structures
+from impc.studies.fit.settings import (
+    FitSettings,
+    fit_bounds,
+    fit_observer,
+    fit_structures,
+    moving_body,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -138,8 +144,7 @@ def fit_problem(
             f"the shortest has {shortest} samples, {least} serve to find where it starts",
             "give longer ones, or lower [fit] settle",
         )
-    if settings.body == "linear":
-        plant, family = plant.linear(), None if family is None else family.linear()
+    plant, family = moving_body(plant, family, settings)
     return Problem(
         plant,
         fit_bounds(plant, settings, recordings),
