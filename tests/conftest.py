@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 from typing import TYPE_CHECKING, Any
 
 import control
@@ -19,6 +20,9 @@ from tests.support import SEARCH
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+
+# What a command says must not depend on how fast it was; tests of progress ask for it.
+os.environ["IMPC_QUIET"] = "1"
 
 # The same examples on every machine and no clock; `make search` draws new ones.
 settings.register_profile(

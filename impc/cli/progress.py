@@ -1,7 +1,11 @@
-"""One bar for all that takes long; lines where no bar can be drawn, as in a pipe or a log."""
+"""One bar for all that takes long; lines where no bar can be drawn, as in a pipe or a log.
+
+With IMPC_QUIET=1 in the environment there is neither, for scripts that read what is said.
+"""
 
 from __future__ import annotations
 
+import os
 import sys
 import threading
 import time
@@ -43,12 +47,18 @@ def progress(
     KeyboardInterrupt
         When the block is interrupted, with what `kept` says.
     """
+    quiet = os.environ.get("IMPC_QUIET", "") not in ("", "0")
     count = begun  # the bar's own stands still where there is no bar
     began = said = time.monotonic()
     # disable=None: no bar where stderr is a file.
     with (
         tqdm(
-            total=total, initial=begun, unit=unit, file=sys.stderr, disable=None, leave=False
+            total=total,
+            initial=begun,
+            unit=unit,
+            file=sys.stderr,
+            disable=quiet or None,
+            leave=False,
         ) as bar,
         _ticking(bar),
     ):
@@ -59,7 +69,7 @@ def progress(
             bar.set_postfix_str(name, refresh=False)
             bar.update()
             now = time.monotonic()
-            if bar.disable and now - said >= _PAUSE:
+            if bar.disable and not quiet and now - said >= _PAUSE:
                 said = now
                 left = (now - began) * (total - count) / (count - begun)
                 # The first step may have compiled what the others use: it tells nothing of them.

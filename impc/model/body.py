@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 __all__ = ["OPERATIONS", "Body", "read_body"]
 
-#: Names of the operations in CasADi, without OP_; the compiled loop knows them by their places.
+#: Names of the operations in CasADi, without ``OP_``; the compiled loop knows them by their places.
 OPERATIONS = (
     *("OUTPUT", "MUL", "ADD", "SUB", "DIV", "NEG", "SQ", "TWICE", "SIN", "COS", "TAN", "SQRT"),
     *("INV", "EXP", "LOG", "POW", "CONSTPOW", "FABS", "SIGN", "TANH", "SINH", "COSH", "ASIN"),

@@ -12,6 +12,12 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 
+@pytest.fixture(autouse=True)
+def said(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Other tests are quiet."""
+    monkeypatch.delenv("IMPC_QUIET")
+
+
 def interrupted(*given: Any) -> None:
     with progress(*given) as done:
         done("a")
@@ -59,3 +65,14 @@ def test_lines_stand_in_a_pipe_every_ten_seconds(
         "4 of 8 stages (step 4), about 16 s left",
         "7 of 8 stages (step 7), about 4 s left",
     ]
+
+
+def test_nothing_is_said_where_quiet_is_asked_for(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("IMPC_QUIET", "1")
+    times = iter(range(0, 1000, 20))
+    monkeypatch.setattr("impc.cli.progress.time.monotonic", lambda: next(times))
+    with progress(3, "step") as done:
+        done("a")
+    assert capsys.readouterr().err == ""
