@@ -32,8 +32,8 @@ def seat_figure(tilts: Array, from_rest: Mapping[str, Array], people: Sequence[A
         above.legend(loc="upper left")
         angles = [np.degrees(one.angle) for one in people]
         errors = [
-            ("gains: the largest error of four", [one.fitted.error for one in people]),
-            ("torque of the gain", [one.fitted.torque for one in people]),
+            ("gain: largest error of four entries", [one.fitted.error for one in people]),
+            ("torque by that gain", [one.fitted.torque for one in people]),
         ]
         for (name, values), (marker, line, color) in zip(errors, marks, strict=True):
             below.plot(
@@ -46,6 +46,6 @@ def seat_figure(tilts: Array, from_rest: Mapping[str, Array], people: Sequence[A
             )
         below.set_xlabel("largest angle of the recording (deg)")
         below.set_ylabel("error of the\nusual fit (%)")
-        below.set_ylim(0, None)
+        below.set_ylim(0, 140 * max(one.fitted.error for one in people))  # room for the legend
         below.legend(loc="upper left")
         return render(figure)["png"]
