@@ -5,7 +5,7 @@
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
-.PHONY: help env demo test full check docs architecture reproduce wheel slow coverage structures plans default-subjects noisy-people nonlinear look search numerics bench fuzz lock clean
+.PHONY: help env demo test full check docs architecture reproduce wheel slow coverage structures plans default-subjects noisy-people nonlinear nonlinear-seat look search numerics bench fuzz lock clean
 
 PYTHON ?= python3
 # Not to be set from outside: the environment is made with `venv --clear`.
@@ -48,6 +48,7 @@ help:
 	@echo 'make structures  coverage of prices, level and power of the test of a structure (hours)'
 	@echo 'make plans   do plans come true? fits of simulated recordings beside them (a quarter of an hour)'
 	@echo 'make nonlinear  the four systems of docs/nonlinear.md: starts, closed loops, noise (an hour)'
+	@echo 'make nonlinear-seat  people who predict with the full equations: does it matter? (minutes)'
 	@echo 'make default-subjects  is the truth of twenty simulated subjects found? (a quarter of an hour)'
 	@echo 'make search   new examples for the tests by hypothesis, from a seed that is printed'
 	@echo 'make numerics the numerical tests on other processors and dependencies (an hour; needs uv)'
@@ -159,6 +160,11 @@ nonlinear: env
 	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.peer_benchmark starts
 	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.peer_benchmark loops
 	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.peer_benchmark noise
+
+# The tables and the figure of docs/nonlinear-seat.md.
+nonlinear-seat: env
+	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.nonlinear_seat people
+	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.nonlinear_seat prices --amplitudes 5
 
 bench: env
 	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(PY) -m experiments.benchmarks

@@ -56,7 +56,7 @@ ELSEWHERE = {
     "control/test_optimal_control.py": """
         control/nlp_solvers.py control/optimal_recordings.py""",
     "control/test_plan.py": """
-        control/plan_derivatives.py control/receding_horizon.py control/relaxed_conditions.py""",
+        control/plan_derivatives.py control/relaxed_conditions.py""",
     "control/test_loop_function.py": "control/casadi_callback.py",
     "control/test_seat_workload.py": "assess/identified_directions.py",
     "control/test_terminal_set.py": "control/halfspaces.py control/polygon.py",

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 __all__ = ["NonlinearMpc", "build_nonlinear_mpc", "simulate_nonlinear"]
 
 _OPTIONS: dict[str, Any] = {
+    "expand": True,  # the functions of all samples in one list: half the time
     "print_time": False,
     "error_on_fail": False,
     "ipopt": {

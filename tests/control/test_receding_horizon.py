@@ -1,0 +1,121 @@
+"""Derivatives of closed loops against differences: the four systems of Safe-PDP, and the seat."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from experiments.peer_systems import SYSTEMS
+from experiments.seat_problem import DIRECTION, TRUTH, seat_problem
+from impc.arrays import Array
+from impc.control.optimal_control import OptimalControlProblem
+from impc.control.plan import Plan, nearby_plan
+from impc.control.plan_derivatives import differentiate_plan
+from impc.control.receding_horizon import ClosedLoop, closed_loop_from
+from impc.model.plant import Plant
+from impc.model.riccati import solve_lqr
+from impc.model.weights import Weights
+from plants import seated_balance_for
+from tests.support import extrapolated_slope
+
+STEPS = 5
+
+
+@dataclass(frozen=True)
+class Case:
+    """A loop: its problem, parameters (p,), first state (n,) and disturbance (steps, d)."""
+
+    problem: OptimalControlProblem
+    theta: Array
+    x0: Array
+    d: Array
+
+    def change(self, seed: int) -> Array:
+        """A random direction of the logarithms and of the first state (p + n,)."""
+        direction = np.random.default_rng(seed).normal(size=len(self.theta) + len(self.x0))
+        sizes = np.where(self.x0 == 0, 0.01, np.abs(self.x0))
+        return np.asarray(direction * np.r_[self.theta, sizes])
+
+
+def seat_case() -> Case:
+    """Tilted by four degrees: the torque is at its limit for a part of every plan."""
+    plant = Plant(seated_balance_for(), ["command"])
+    Q = np.zeros((plant.n, plant.n))
+    Q[:4, :4] = TRUTH["line"] * np.outer(DIRECTION, DIRECTION)
+    Q[0, 0] += TRUTH["angle1"]
+    Q[1, 1] += TRUTH["angle2"]
+    problem = seat_problem(np.array(solve_lqr(plant, Weights(Q, 1)).P))
+    x0 = np.zeros(plant.n)
+    x0[0] = np.radians(4)
+    return Case(problem, problem.values(TRUTH | {"limit": 40.0}), x0, np.full((STEPS, 1), 5.0))
+
+
+def case_of(name: str) -> Case:
+    if name == "seat":
+        return seat_case()
+    system = SYSTEMS[name]()
+    return Case(
+        system.problem, system.problem.values(system.truth), system.x0, np.zeros((STEPS, 0))
+    )
+
+
+@pytest.fixture(scope="module", params=[*SYSTEMS, "seat"])
+def case(request: pytest.FixtureRequest) -> Case:
+    return case_of(request.param)
+
+
+@pytest.fixture(scope="module")
+def loop(case: Case) -> ClosedLoop:
+    theta = dict(zip(case.problem.parameter_names, case.theta, strict=True))
+    return case.problem.closed_loop(theta, case.x0, STEPS, d=case.d)
+
+
+def active(plan: Plan) -> bool:
+    return bool(np.any(plan.point.lam > plan.point.s))
+
+
+def test_a_closed_loop_has_the_derivatives_of_differences(case: Case, loop: ClosedLoop) -> None:
+    """Along a random direction of all parameters and the first state, constraints active.
+
+    Largest difference found, over the largest of its signal: 6e-8 (rocket), 9e-11 of the others.
+    """
+    assert any(active(plan) for plan in loop.plans)
+    change, p = case.change(4), len(case.theta)
+
+    def moved(t: float) -> Array:
+        there = closed_loop_from(
+            loop.plans[0], case.theta + t * change[:p], case.x0 + t * change[p:], case.d, 1e-10,
+            "", loop,
+        )  # fmt: skip
+        assert isinstance(there, ClosedLoop)
+        return np.hstack([there.x[1:], there.u])
+
+    expected = extrapolated_slope(moved, 1e-4)
+    slope = np.concatenate([loop.dx[1:], loop.du], axis=1) @ change
+    for column, exact in zip(slope.T, expected.T, strict=True):
+        np.testing.assert_allclose(column, exact, atol=1e-6 * np.max(np.abs(exact)))
+
+
+def test_a_plan_of_the_seat_has_the_derivatives_of_differences() -> None:
+    """Its torque at the limit; 1e-10 was found. The other systems' plans are in test_plan.py."""
+    case = seat_case()
+    plan = case.problem.plan(
+        dict(zip(case.problem.parameter_names, case.theta, strict=True)), case.x0
+    )
+    assert active(plan)
+    change, p = case.change(5), len(case.theta)
+
+    def moved(t: float) -> Array:
+        there = nearby_plan(
+            plan, case.theta + t * change[:p], case.x0 + t * change[p:], 1e-10, (), ""
+        )
+        assert there is not None
+        return np.hstack([there.x[1:], there.u])
+
+    found = differentiate_plan(plan)
+    expected = extrapolated_slope(moved, 1e-4)
+    slope = np.concatenate([found.x[1:], found.u], axis=1) @ change
+    for column, exact in zip(slope.T, expected.T, strict=True):
+        np.testing.assert_allclose(column, exact, atol=1e-6 * np.max(np.abs(exact)))
