@@ -10,11 +10,13 @@ import click
 
 from impc.cli.numbers import Number
 from impc.cli.options import out_option, seed_option
+from impc.cli.output import print_next
 from impc.cli.seat import (
     HORIZON,
     SIGNALS,
     STEP,
     TORQUE,
+    between_samples,
     numbered,
     random_person,
     seat_controller,
@@ -51,6 +53,13 @@ _BETWEEN, _WITHIN = 0.2, 0.05
     type=Number(min=1, max=1e6),
     default=6.0,
     help="Largest lumbar torque of a subject, Nm.",
+)
+@click.option(
+    "--motor-noise",
+    type=Number(min=0, max=1e6),
+    default=0.0,
+    help="Standard deviation of the noise on the torque, Nm: what a fit takes for noise of the "
+    "recorder.",
 )
 @click.option("--replicates", type=click.IntRange(0, 1_000_000), default=20, help="In study.toml.")
 @seed_option
@@ -89,6 +98,7 @@ def cohort(out: Path, **given: Any) -> None:
     }
     write_files(out, {name: text.encode() for name, text in texts.items()})
     click.echo(f"{given['subjects']} subjects, {given['visits']} visits: {out / 'study.toml'}")
+    print_next("impc cohort {}", out, "study.toml")
 
 
 def _visit(
@@ -115,14 +125,14 @@ def _visit(
         trial = simulate_subject(
             controller,
             make,
-            pushed,
+            between_samples(pushed),
             rate=_RATE,
-            motor=0.3,
+            motor=given["motor_noise"],
             sensor=np.radians(0.1),
             seed=int(rng.integers(2**31)),
         )
         file = f"sub-{name}_ses-{visit}_task-seat_run-{run}_motion"
-        table = seat_table(file, np.degrees(trial.outputs), trial.disturbance[:, 0], _RATE)
+        table = seat_table(file, np.degrees(trial.outputs), pushed, _RATE)
         files[f"{file}.csv"] = encode_table(".csv", table)
     return files, np.array(controller.K).tolist()
 
