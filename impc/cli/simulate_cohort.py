@@ -16,7 +16,6 @@ from impc.cli.seat import (
     SIGNALS,
     STEP,
     TORQUE,
-    between_samples,
     numbered,
     random_person,
     seat_controller,
@@ -29,9 +28,13 @@ if TYPE_CHECKING:
 __all__ = ["cohort"]
 
 _RATE = 100.0
+# Steps of the body between two samples: a single one of 10 ms errs in the states of the delay.
+_WITHIN = 10
+# Of the angles, degrees: what a recorder of 0.1 degrees at 1000 samples a second leaves at 100.
+_NOISE = 0.03
 _STOP = "limit = 12.0\n"
 # Spread of the prices between subjects, and of one subject between visits: of their logarithm.
-_BETWEEN, _WITHIN = 0.2, 0.05
+_BETWEEN, _AGAIN = 0.2, 0.05
 
 
 @click.command("cohort")
@@ -87,7 +90,7 @@ def cohort(out: Path, **given: Any) -> None:
         factor *= float(np.exp(_BETWEEN * rng.standard_normal()))
         truth[name] = {"group": group, "gain": {}}
         for visit in range(1, given["visits"] + 1):
-            price = factor * float(np.exp(_WITHIN * rng.standard_normal()))
+            price = factor * float(np.exp(_AGAIN * rng.standard_normal()))
             files, gain = _visit(name, visit, person, price, given, rng)
             truth[name]["gain"][str(visit)] = gain
             write_files(out / f"sub-{name}" / f"ses-{visit}", files)
@@ -117,22 +120,23 @@ def _visit(
     from impc.studies.simulated_people import simulate_subject  # noqa: PLC0415
 
     controller = seat_controller(person, given["torque_limit"], price)
-    step = plant_source(STEP, person | {"sample_time": 1 / _RATE})
+    step = plant_source(STEP, person | {"sample_time": 1 / (_WITHIN * _RATE)})
     make, torque = step.make(**step.arguments), import_function(TORQUE)
     files = {}
     for run in range(1, given["trials"] + 1):
         pushed = torque(duration=given["duration"], rate=_RATE, seed=int(rng.integers(2**31)))
+        # Held: a recording on the controller's own clock is read as it stands.
         trial = simulate_subject(
             controller,
             make,
-            between_samples(pushed),
-            rate=_RATE,
+            np.repeat(pushed, _WITHIN),
+            rate=_WITHIN * _RATE,
             motor=given["motor_noise"],
-            sensor=np.radians(0.1),
+            sensor=np.radians(_NOISE),
             seed=int(rng.integers(2**31)),
         )
         file = f"sub-{name}_ses-{visit}_task-seat_run-{run}_motion"
-        table = seat_table(file, np.degrees(trial.outputs), pushed, _RATE)
+        table = seat_table(file, np.degrees(trial.outputs[::_WITHIN]), pushed, _RATE)
         files[f"{file}.csv"] = encode_table(".csv", table)
     return files, np.array(controller.K).tolist()
 

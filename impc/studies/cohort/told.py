@@ -24,8 +24,10 @@ _LARGEST = 2.0
 def not_told(units: pd.DataFrame) -> dict[str, int]:
     """How many units do not tell a gain, by its column; gains that all of them tell are in none.
 
-    A unit tells an entry where the entry can be told from the others and its standard deviation is
-    at most twice the median size of the entry over the units that can.
+    A unit tells an entry whose standard deviation is at most twice the median size of the entry
+    over the units that give a deviation. The deviation counts what the entry may owe to directions
+    that are not told (`GainCovariance.entries`), so that one told only with others is data too
+    where it is told well enough.
 
     Parameters
     ----------
@@ -43,18 +45,18 @@ def not_told(units: pd.DataFrame) -> dict[str, int]:
 def only_told(units: pd.DataFrame) -> pd.DataFrame:
     """The table `units` with NaN for each gain that its unit does not tell, as `not_told` has it.
 
-    A gain without columns `K_told` and `K_deviation` stays as it is.
+    A gain without a column `K_deviation` stays as it is.
     """
     kept = units.copy()
     for name in units.columns:
-        told, deviation = f"K_told{name[1:]}", f"K_deviation{name[1:]}"
-        if not name.startswith("K.") or not {told, deviation} <= set(units.columns):
+        beside = f"K_deviation{name[1:]}"
+        if not name.startswith("K.") or beside not in units.columns:
             continue
-        alone = units[told].to_numpy(dtype=bool)
-        sizes = np.abs(units[name].to_numpy(dtype=np.float64)[alone])
+        deviation = units[beside].to_numpy(dtype=np.float64)
+        given = np.isfinite(deviation)
+        sizes = np.abs(units[name].to_numpy(dtype=np.float64)[given])
         usual = float(np.median(sizes)) if len(sizes) else 0.0
-        within = units[deviation].to_numpy(dtype=np.float64) <= _LARGEST * usual
-        kept[name] = units[name].where(alone & within)
+        kept[name] = units[name].where(given & (deviation <= _LARGEST * usual))
     return kept
 
 
@@ -72,6 +74,6 @@ def not_told_sentences(counts: Mapping[str, int], of: int) -> list[str]:
         return []
     each = "; ".join(f"the {measure_words(name)} of {count}" for name, count in counts.items())
     return [
-        f"Gains that the recordings of a unit do not tell by themselves, or not to within twice "
-        f"their usual size, are not compared: of {of} units {each}."
+        "A gain whose standard deviation is more than twice its usual size is not told, and not "
+        f"compared: of {of} units {each}."
     ]

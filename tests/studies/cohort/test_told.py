@@ -21,21 +21,21 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-def gains(deviations: dict[int, float], alone: dict[int, bool]) -> pd.DataFrame:
-    """Ten units with a gain of 700 to 880, told to 20 but where it is said otherwise."""
+def gains(deviations: dict[int, float]) -> pd.DataFrame:
+    """Ten units with a gain of 700 to 880, and a deviation of 20 unless another is given."""
     rows = [
         (
             str(number), "1", "", "ab"[number % 2], 700.0 + 20 * number,
-            deviations.get(number, 20.0), alone.get(number, True),
+            deviations.get(number, 20.0),
         )
         for number in range(10)
     ]  # fmt: skip
-    heads = ["subject", "visit", "condition", "group", "K.u.x", "K_deviation.u.x", "K_told.u.x"]
+    heads = ["subject", "visit", "condition", "group", "K.u.x", "K_deviation.u.x"]
     return pd.DataFrame(rows, columns=heads)
 
 
 def test_a_gain_of_629_with_a_deviation_of_1700_is_not_tested() -> None:
-    units = gains({3: 1700.0}, {})
+    units = gains({3: 1700.0})
     units.loc[3, "K.u.x"] = 629.0
     (found,) = compare_cohort(units)
     rest = units.drop(index=3)
@@ -45,8 +45,8 @@ def test_a_gain_of_629_with_a_deviation_of_1700_is_not_tested() -> None:
     assert not_told(units) == {"K.u.x": 1}
 
 
-def test_a_gain_that_is_told_only_with_others_is_not_tested() -> None:
-    units = gains({}, {0: False, 5: False})
+def test_a_gain_without_a_deviation_is_not_tested() -> None:
+    units = gains({0: np.nan, 5: np.inf})
     (found,) = compare_cohort(units)
     assert found.n == 8
     assert not_told(units) == {"K.u.x": 2}
@@ -55,8 +55,8 @@ def test_a_gain_that_is_told_only_with_others_is_not_tested() -> None:
 
 
 def test_nothing_told_is_nothing_compared() -> None:
-    units = gains({}, dict.fromkeys(range(10), False))
-    (found,) = compare_cohort(pd.concat([units, units.assign(visit="2")])[:10])
+    units = gains(dict.fromkeys(range(10), np.nan))
+    (found,) = compare_cohort(units)
     assert np.isnan(found.p)
     assert found.note == "too few subjects (0)"
     both = compare_cohort(pd.concat([units, units.assign(visit="2")]))
@@ -64,7 +64,7 @@ def test_nothing_told_is_nothing_compared() -> None:
 
 
 def test_all_told_is_all_compared() -> None:
-    units = gains({}, {})
+    units = gains({})
     pd.testing.assert_frame_equal(only_told(units), units)
     assert not_told(units) == {}
     assert not_told_sentences({}, len(units)) == []
@@ -72,7 +72,7 @@ def test_all_told_is_all_compared() -> None:
 
 def test_a_gain_about_zero_is_told_where_all_are_told_as_well() -> None:
     """A deviation above the size of every entry is no reason: twenty draws about zero, seed 3."""
-    units = gains({}, {})
+    units = gains({})
     units["K.u.x"] = 20 * np.random.default_rng(3).standard_normal(10)
     assert not_told(units) == {}
 
