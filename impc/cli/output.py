@@ -34,7 +34,8 @@ def print_next(command: str, out: Path, *names: str) -> None:
     command : str
         With {} for each file.
     out : Path
-    names : str
+        The folder.
+    *names : str
         Of the files, in their order; they may be patterns.
     """
     folder = shlex.quote(one_line(out))
