@@ -60,7 +60,6 @@ ELSEWHERE = {
     "control/test_loop_function.py": "control/casadi_callback.py",
     "control/test_seat_workload.py": "assess/identified_directions.py",
     "control/test_terminal_set.py": "control/halfspaces.py control/polygon.py",
-    "documents/test_blocks.py": "cli/simulate_cohort.py",
     "files/test_apart.py": "files/reader_process.py",
     "files/test_digests.py": "studies/cohort/unit_digest.py",
     "files/test_faults.py": "files/writing.py",

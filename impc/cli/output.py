@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from typing import TYPE_CHECKING
 
 import click
@@ -12,7 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-__all__ = ["print_files"]
+__all__ = ["print_files", "print_next"]
 
 
 def print_files(out: Path, written: Sequence[Path]) -> None:
@@ -23,3 +24,19 @@ def print_files(out: Path, written: Sequence[Path]) -> None:
     click.echo(f"\nWritten to {one_line(out)}:")
     for stem, suffixes in kinds.items():
         click.echo(f"  {stem}{' '.join(suffixes)}")
+
+
+def print_next(command: str, out: Path, *names: str) -> None:
+    """Say in one line what to type next: `command` with files of the folder `out`.
+
+    Parameters
+    ----------
+    command : str
+        With {} for each file.
+    out : Path
+        The folder.
+    *names : str
+        Of the files, in their order; they may be patterns.
+    """
+    folder = shlex.quote(one_line(out))
+    click.echo(f"next: {command.format(*(f'{folder}/{name}' for name in names))}")

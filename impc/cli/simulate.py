@@ -10,7 +10,7 @@ import click
 
 from impc.cli.numbers import Number
 from impc.cli.options import out_option, seed_option
-from impc.cli.output import print_files
+from impc.cli.output import print_files, print_next
 from impc.cli.seat import (
     HORIZON,
     SIGNALS,
@@ -138,6 +138,10 @@ def seated_balance(out: Path, formats: str | None, **given: Any) -> None:
         share = 100 * trial.saturated
         click.echo(f"trial {number}: at the torque limit for {share:.1f} % of the time{fell}")
     print_files(out, written)
+    # Of several formats the first: the trials are the same in all.
+    ending = "_v73.mat" if wanted[0] == "mat73" else _ENDINGS[wanted[0]]
+    fit = "impc fit {} --plant seated-balance --config {}"
+    print_next(fit, out, f"trial_*{ending}", "subject.toml")
 
 
 def _wanted(formats: str | None) -> tuple[str, ...]:

@@ -10,6 +10,7 @@ import click
 
 from impc.cli.numbers import Number
 from impc.cli.options import out_option, seed_option
+from impc.cli.output import print_next
 from impc.cli.seat import (
     HORIZON,
     SIGNALS,
@@ -27,9 +28,13 @@ if TYPE_CHECKING:
 __all__ = ["cohort"]
 
 _RATE = 100.0
+# Steps of the body between two samples: a single one of 10 ms errs in the states of the delay.
+_WITHIN = 10
+# Of the angles, degrees: what a recorder of 0.1 degrees at 1000 samples a second leaves at 100.
+_NOISE = 0.03
 _STOP = "limit = 12.0\n"
 # Spread of the prices between subjects, and of one subject between visits: of their logarithm.
-_BETWEEN, _WITHIN = 0.2, 0.05
+_BETWEEN, _AGAIN = 0.2, 0.05
 
 
 @click.command("cohort")
@@ -51,6 +56,13 @@ _BETWEEN, _WITHIN = 0.2, 0.05
     type=Number(min=1, max=1e6),
     default=6.0,
     help="Largest lumbar torque of a subject, Nm.",
+)
+@click.option(
+    "--motor-noise",
+    type=Number(min=0, max=1e6),
+    default=0.0,
+    help="Standard deviation of the noise on the torque, Nm: what a fit takes for noise of the "
+    "recorder.",
 )
 @click.option("--replicates", type=click.IntRange(0, 1_000_000), default=20, help="In study.toml.")
 @seed_option
@@ -78,7 +90,7 @@ def cohort(out: Path, **given: Any) -> None:
         factor *= float(np.exp(_BETWEEN * rng.standard_normal()))
         truth[name] = {"group": group, "gain": {}}
         for visit in range(1, given["visits"] + 1):
-            price = factor * float(np.exp(_WITHIN * rng.standard_normal()))
+            price = factor * float(np.exp(_AGAIN * rng.standard_normal()))
             files, gain = _visit(name, visit, person, price, given, rng)
             truth[name]["gain"][str(visit)] = gain
             write_files(out / f"sub-{name}" / f"ses-{visit}", files)
@@ -89,6 +101,7 @@ def cohort(out: Path, **given: Any) -> None:
     }
     write_files(out, {name: text.encode() for name, text in texts.items()})
     click.echo(f"{given['subjects']} subjects, {given['visits']} visits: {out / 'study.toml'}")
+    print_next("impc cohort {}", out, "study.toml")
 
 
 def _visit(
@@ -107,22 +120,23 @@ def _visit(
     from impc.studies.simulated_people import simulate_subject  # noqa: PLC0415
 
     controller = seat_controller(person, given["torque_limit"], price)
-    step = plant_source(STEP, person | {"sample_time": 1 / _RATE})
+    step = plant_source(STEP, person | {"sample_time": 1 / (_WITHIN * _RATE)})
     make, torque = step.make(**step.arguments), import_function(TORQUE)
     files = {}
     for run in range(1, given["trials"] + 1):
         pushed = torque(duration=given["duration"], rate=_RATE, seed=int(rng.integers(2**31)))
+        # Held: a recording on the controller's own clock is read as it stands.
         trial = simulate_subject(
             controller,
             make,
-            pushed,
-            rate=_RATE,
-            motor=0.3,
-            sensor=np.radians(0.1),
+            np.repeat(pushed, _WITHIN),
+            rate=_WITHIN * _RATE,
+            motor=given["motor_noise"],
+            sensor=np.radians(_NOISE),
             seed=int(rng.integers(2**31)),
         )
         file = f"sub-{name}_ses-{visit}_task-seat_run-{run}_motion"
-        table = seat_table(file, np.degrees(trial.outputs), trial.disturbance[:, 0], _RATE)
+        table = seat_table(file, np.degrees(trial.outputs[::_WITHIN]), pushed, _RATE)
         files[f"{file}.csv"] = encode_table(".csv", table)
     return files, np.array(controller.K).tolist()
 

@@ -10,6 +10,7 @@ import click
 
 from impc.cli.numbers import Number
 from impc.cli.options import out_option, seed_option
+from impc.cli.output import print_next
 from impc.cli.seat import numbered
 
 __all__ = ["head_tracking"]
@@ -86,6 +87,7 @@ def head_tracking(out: Path, **given: Any) -> None:
     study = _STUDY.replace("AXIS", given["axis"])
     write_files(out, {"study.toml": study.encode(), "truth.json": text.encode()})
     click.echo(f"{given['subjects']} subjects, {given['visits']} visits: {out / 'study.toml'}")
+    print_next("impc select {}", out, "study.toml")
 
 
 _STUDY = """\

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from impc.cli.options import out_option, seed_option
+from impc.cli.output import print_next
 from impc.cli.seat import PLANT, SIGNALS, TORQUE, numbered, random_person, seat_table, seat_weights
 
 if TYPE_CHECKING:
@@ -89,6 +90,7 @@ def reliability_study(out: Path, **given: Any) -> None:
         },
     )
     click.echo(f"{given['subjects']} subjects, {given['visits']} visits: {out / 'study.toml'}")
+    print_next("impc reliability {}", out, "study.toml")
 
 
 def _cell(

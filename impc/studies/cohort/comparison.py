@@ -6,6 +6,7 @@
     all visits     a mixed model of prices within a structure: group, visit, a mean for each subject
     reliability    ICC(A,1) between visits
 
+A gain that the recordings of a unit do not tell is no datum (`impc.studies.cohort.told`).
 Several measures are tested at once: beside each p stands Holm's, over the measures of one question.
 """
 
@@ -23,6 +24,7 @@ from statsmodels.stats.multitest import multipletests
 
 from impc.checking import replace
 from impc.errors import DataError, one_line
+from impc.studies.cohort.told import only_told
 from impc.studies.reliability.icc import icc
 
 if TYPE_CHECKING:
@@ -100,7 +102,7 @@ def measures_of(units: pd.DataFrame) -> tuple[str, ...]:
 def compare_cohort(
     units: pd.DataFrame, measures: Sequence[str] | None = None
 ) -> tuple[Comparison, ...]:
-    """Answer every question that the units allow.
+    """Answer every question that the units allow; gains that a unit does not tell are left out.
 
     Parameters
     ----------
@@ -118,7 +120,7 @@ def compare_cohort(
         raise DataError("cohort", "has no unit with a result", "see the reasons in the report")
     chosen = measures_of(units) if measures is None else tuple(measures)
     found: list[Comparison] = []
-    for condition, part in units.groupby("condition", sort=True, dropna=False):
+    for condition, part in only_told(units).groupby("condition", sort=True, dropna=False):
         told = str(condition)
         groups = sorted(set(part["group"]) - {""})
         visits = list(dict.fromkeys(part["visit"]))

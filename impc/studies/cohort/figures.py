@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from impc.model.signal_units import UNKNOWN
 from impc.reporting.style import DOUBLE_COLUMN, INK, STATE_MARKS, VERMILLION, new_figure
 from impc.studies.cohort.words import measure_words
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     import pandas as pd
     from matplotlib.axes import Axes
@@ -23,10 +24,19 @@ _COLUMNS = 3
 _SOFT = "#8C8C8C"
 
 
-def group_figure(units: pd.DataFrame, measures: Sequence[str]) -> Figure:
-    """The `measures` of every unit of the table `units`, by group and visit; bars are means.
+def group_figure(units: pd.DataFrame, measures: Sequence[str], names: Mapping[str, str]) -> Figure:
+    """Measures of every unit by group and visit; bars are means.
 
     A line joins the visits of one subject in one condition.
+
+    Parameters
+    ----------
+    units : DataFrame
+        Table "units" of `cohort_tables`.
+    measures : sequence of str
+        Columns of it.
+    names : mapping of str to str
+        Units of the measures; those of prices within a structure and of VAF need not be there.
     """
     groups = sorted(set(units["group"])) or [""]
     visits = list(dict.fromkeys(units["visit"]))
@@ -50,7 +60,7 @@ def group_figure(units: pd.DataFrame, measures: Sequence[str]) -> Figure:
         ax.set_xticks(range(len(groups)), [group or "all" for group in groups])
         ax.set_xlim(-0.6, len(groups) - 0.4)
         ax.set_title(textwrap.fill(measure_words(name), 28), loc="left")
-        ax.set_ylabel(f"value ({_unit(name)})")
+        ax.set_ylabel(f"value ({_unit(name, names)})")
     return figure
 
 
@@ -97,9 +107,9 @@ def subject_figure(fit: dict[str, Any]) -> Figure:
     return figure
 
 
-def _unit(name: str) -> str:
+def _unit(name: str, names: Mapping[str, str]) -> str:
     if name.startswith(("vaf.", "held_out_vaf.")):
         return "%"
     if name.startswith("log_price."):
         return "-"
-    return "SI units"
+    return names.get(name, UNKNOWN)

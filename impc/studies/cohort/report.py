@@ -26,6 +26,7 @@ from impc.studies.cohort.comparison import compare_cohort, measures_of
 from impc.studies.cohort.figures import group_figure, subject_figure
 from impc.studies.cohort.study import safe_name
 from impc.studies.cohort.tables import cohort_tables, table_bytes
+from impc.studies.cohort.told import not_told, not_told_sentences, only_told
 from impc.studies.cohort.words import measure_words
 
 if TYPE_CHECKING:
@@ -89,8 +90,14 @@ def write_report(study: Study, store: Store, failures: Failures, command: str) -
     for subject, own in subjects.items():
         # One after the other: the figures of a thousand subjects would fill the memory.
         write_files(store.folder, _subject_files(subject, own, store, failures))
-    figures = _figures(units, compared)
-    said = [*_findings(compared), *_structure_lines(units), *_limits(units)]
+    figures = _figures(only_told(units), compared, _measure_units(study.units, store))
+    left_out = {name: n for name, n in not_told(units).items() if name in measures_of(units)}
+    said = [
+        *_findings(compared),
+        *_structure_lines(units),
+        *not_told_sentences(left_out, len(units)),
+        *_limits(units),
+    ]
     report = Report(
         "impc cohort",
         f"Groups and visits of {len(subjects)} subjects",
@@ -114,6 +121,7 @@ def write_report(study: Study, store: Store, failures: Failures, command: str) -
             "failed": failures.units,
             "failed_replicates": failures.replicates,
             "digests": store.digests,
+            "not_told": left_out,
             "comparisons": rows,
         },
     )
@@ -182,12 +190,19 @@ def _run(command: str) -> list[Block]:
     return [said]
 
 
-def _figures(units: pd.DataFrame, compared: tuple[Comparison, ...]) -> dict[str, bytes]:
+def _figures(
+    units: pd.DataFrame, compared: tuple[Comparison, ...], names: dict[str, str]
+) -> dict[str, bytes]:
     with journal_style():
-        shown = (
-            {"groups": group_figure(units, _most_telling(compared, units))} if len(units) else {}
-        )
-        return drawn(shown)
+        measures = _most_telling(compared, units) if len(units) else []
+        return drawn({"groups": group_figure(units, measures, names)} if measures else {})
+
+
+def _measure_units(units: Sequence[Unit], store: Store) -> dict[str, str]:
+    """Units of the columns of units.csv, as the first unit that was fitted tells."""
+    fits = (store.fit(unit.name) for unit in units)
+    first = next((fit for fit in fits if fit is not None), {})
+    return dict(first.get("units", {}))
 
 
 def _summary(
@@ -278,7 +293,7 @@ def _most_telling(compared: tuple[Comparison, ...], units: pd.DataFrame) -> list
         key=lambda item: item.p,
     )
     names = [item.measure for item in ranked] + list(measures_of(units))
-    return list(dict.fromkeys(names))[:6]
+    return [name for name in dict.fromkeys(names) if units[name].notna().any()][:6]
 
 
 def _comparison_tables(compared: tuple[Comparison, ...]) -> list[TextTable]:

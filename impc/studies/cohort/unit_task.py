@@ -29,6 +29,7 @@ from impc.errors import ImpcError
 from impc.files.plant_sources import make_plant, plant_family_of, plant_source
 from impc.files.reading import read_recordings
 from impc.inverse.noisy_fit import fit_controller
+from impc.model.signal_units import price_unit
 from impc.model.weights import Weights
 from impc.reporting.rendering import plain
 from impc.reporting.shown_units import angles_in, shown_unit
@@ -36,6 +37,7 @@ from impc.studies.cohort.unit_digest import require_same_inputs, unit_digest
 from impc.studies.cohort.unit_structure import unit_structure
 from impc.studies.fit.settings import fit_settings
 from impc.studies.fit.subject import fit_problem, state_sizes
+from impc.studies.fit.tables import number_units
 from impc.studies.signal_words import signal_words
 
 if TYPE_CHECKING:
@@ -44,6 +46,7 @@ if TYPE_CHECKING:
     from impc.files.configuration import Configuration
     from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
+    from impc.model.plant import Plant
     from impc.studies.fit.settings import FitSettings
 
 __all__ = ["FitTask", "fit_unit", "replicate_unit", "unit_problem"]
@@ -156,6 +159,7 @@ def _described(problem: Problem, fitted: Estimate, settings: FitSettings) -> dic
         "outputs": plant.outputs,
         "shown_units": [shown_unit(plant, name) for name in plant.outputs],
         "words": signal_words(plant),
+        "units": _units(plant),
         "trials": len(problem.recordings),
         "samples": sum(trial.samples for trial in problem.recordings),
         "K": estimate.K,
@@ -181,6 +185,14 @@ def _described(problem: Problem, fitted: Estimate, settings: FitSettings) -> dic
         "findings": [trial.findings for trial in problem.recordings],
         "trajectory": _trajectory(fit),
         "structure": unit_structure(problem, fitted, settings),
+    }
+
+
+def _units(plant: Plant) -> dict[str, str]:
+    """Units of the measures that a cohort compares, by their columns of units.csv."""
+    prices = {f"centre_price.{name}": price_unit(plant, name, name) for name in plant.states}
+    return {
+        name: "-" if unit == "1" else unit for name, unit in (number_units(plant) | prices).items()
     }
 
 

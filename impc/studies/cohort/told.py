@@ -1,0 +1,79 @@
+"""Gains that the recordings of a unit do not tell: no data of a comparison, and left out of it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.studies.cohort.words import measure_words
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    import pandas as pd
+
+__all__ = ["not_told", "not_told_sentences", "only_told"]
+
+# A deviation may be so many times the usual size of an entry. Small entries that are well told
+# stay: those of a gain whose truth is zero have a median size of 0.67 of their deviation. It is
+# not compared with the unit's own value, for what stayed would then be too large on average.
+_LARGEST = 2.0
+
+
+def not_told(units: pd.DataFrame) -> dict[str, int]:
+    """How many units do not tell a gain, by its column; gains that all of them tell are in none.
+
+    A unit tells an entry whose standard deviation is at most twice the median size of the entry
+    over the units that give a deviation. The deviation counts what the entry may owe to directions
+    that are not told (`GainCovariance.entries`), so that one told only with others is data too
+    where it is told well enough.
+
+    Parameters
+    ----------
+    units : DataFrame
+        Table "units" of `cohort_tables`.
+    """
+    kept = only_told(units)
+    return {
+        name: count
+        for name in units.columns
+        if name.startswith("K.") and (count := int((kept[name].isna() & units[name].notna()).sum()))
+    }
+
+
+def only_told(units: pd.DataFrame) -> pd.DataFrame:
+    """The table `units` with NaN for each gain that its unit does not tell, as `not_told` has it.
+
+    A gain without a column `K_deviation` stays as it is.
+    """
+    kept = units.copy()
+    for name in units.columns:
+        beside = f"K_deviation{name[1:]}"
+        if not name.startswith("K.") or beside not in units.columns:
+            continue
+        deviation = units[beside].to_numpy(dtype=np.float64)
+        given = np.isfinite(deviation)
+        sizes = np.abs(units[name].to_numpy(dtype=np.float64)[given])
+        usual = float(np.median(sizes)) if len(sizes) else 0.0
+        kept[name] = units[name].where(given & (deviation <= _LARGEST * usual))
+    return kept
+
+
+def not_told_sentences(counts: Mapping[str, int], of: int) -> list[str]:
+    """What is left out for it, in one sentence; none where nothing is.
+
+    Parameters
+    ----------
+    counts : mapping of str to int
+        Of `not_told`, of those that are compared.
+    of : int
+        Number of units.
+    """
+    if not counts:
+        return []
+    each = "; ".join(f"the {measure_words(name)} of {count}" for name, count in counts.items())
+    return [
+        "A gain whose standard deviation is more than twice its usual size is not told, and not "
+        f"compared: of {of} units {each}."
+    ]
