@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from impc.checking import replace
 from impc.control.closed_loop import simulate
 from impc.inverse.methods import METHODS
 from impc.inverse.problem import controller_for, scenarios
@@ -34,6 +35,7 @@ from impc.reporting.style import (
     VERMILLION,
     new_figure,
 )
+from impc.studies.methods_table import until_its_end
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -74,12 +76,9 @@ def methods_chart(problem: Problem, fits: Sequence[MethodFit], trial: int) -> di
     drawn = [fit for fit in fits if fit.runs]
     plant, given = problem.plant, problem.recordings[trial]
     stride = -(-given.samples // _SAMPLES)
-    outputs = [given.outputs, *(np.asarray(fit.runs[trial].x @ plant.C.T) for fit in drawn)]
-    commands: list[Array] = [np.full((given.samples, plant.m), np.nan)]
-    commands += [_to_the_end(fit.runs[trial].u) for fit in drawn]
-    for fit, y, u in zip(drawn, outputs[1:], commands[1:], strict=True):
-        end = fit.runs[trial].reached
-        y[end + 1 :], u[end:] = np.nan, np.nan
+    runs = [until_its_end(plant, fit.runs[trial]) for fit in drawn]
+    outputs = [given.outputs, *(y for y, _ in runs)]
+    commands = [np.full((given.samples, plant.m), np.nan), *(u for _, u in runs)]
     return {
         "title": f"Recorded, and simulated by {len(drawn)} methods",
         "label": "time (s)",
@@ -134,7 +133,7 @@ def weights_chart(problem: Problem, found: Intent) -> dict[str, Any]:
     found : Intent
     """
     plant, drive = problem.plant, scenarios(problem)[0]
-    few = type(drive)(drive.x0, drive.disturbance[:_FEW])
+    few = replace(drive, disturbance=drive.disturbance[:_FEW])
     pairs = _path(found)
     laws = [solve_lqr(plant, one) for _, one in pairs]
     runs = [simulate(controller_for(problem, law.K, law.S), few) for law in laws]
@@ -197,11 +196,6 @@ def _path(found: Intent) -> list[tuple[str, Weights]]:
             pairs.append((f"{100 * share:.0f} % of the way to: {other.rule}", normalised(mixed)))
         pairs.append((other.rule, other.weights))
     return pairs
-
-
-def _to_the_end(u: Array) -> Array:
-    """Commands (steps, m) with a last sample that has none."""
-    return np.vstack([u, np.full((1, u.shape[1]), np.nan)])
 
 
 def _curve(label: str, place: int) -> dict[str, str]:

@@ -13,6 +13,7 @@ import numpy as np
 from impc.arrays import Array, Frozen
 from impc.assess.assessments import ASSESSMENTS, assessed
 from impc.inverse.methods import METHODS
+from impc.model.signal_units import price_unit
 from impc.reporting.document import Terms, TextTable
 from impc.reporting.rendering import number
 
@@ -20,8 +21,18 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from impc.assess.judged import MethodFit
+    from impc.control.closed_loop import Simulation
+    from impc.model.plant import Plant
+    from impc.model.weights import Weights
 
-__all__ = ["column_terms", "methods_data", "methods_numbers", "methods_table"]
+__all__ = [
+    "column_terms",
+    "methods_data",
+    "methods_numbers",
+    "methods_table",
+    "until_its_end",
+    "weight_entries",
+]
 
 
 @dataclass(frozen=True)
@@ -100,3 +111,27 @@ def _data(fit: MethodFit) -> dict[str, Any]:
         "held_out_trial_vaf": fit.held_out,
         "fell": fit.fell,
     }
+
+
+def weight_entries(plant: Plant, weights: Weights) -> list[tuple[str, str, str, str, float]]:
+    """The lower triangles of Q and R, one row an entry: matrix, two names, unit, value."""
+    return [
+        (which, one, other, price_unit(plant, one, other), float(matrix[i, j]))
+        for which, names, matrix in (
+            ("Q", plant.states, weights.Q),
+            ("R", plant.controls, weights.R),
+        )
+        for i, one in enumerate(names)
+        for j, other in enumerate(names[: i + 1])
+    ]
+
+
+def until_its_end(plant: Plant, run: Simulation) -> tuple[Array, Array]:
+    """Outputs (steps + 1, p) and commands (steps + 1, m) of a run, NaN where it did not get.
+
+    The last sample has no command.
+    """
+    y, u = np.array(run.x @ plant.C.T), np.full((len(run.x), plant.m), np.nan)
+    y[run.reached + 1 :] = np.nan
+    u[: run.reached] = run.u[: run.reached]
+    return y, u

@@ -13,11 +13,22 @@ from experiments.coverage import cart, noisy_trial
 from impc.assess.assessments import ASSESSMENTS, Assessment
 from impc.assess.judged import MethodFit, judge
 from impc.checking import replace
+from impc.control.closed_loop import scenario, simulate
+from impc.control.controller import Controller
 from impc.inverse.methods import METHODS, estimate
+from impc.model.bounds import Bounds
+from impc.model.plant import Plant
+from impc.model.weights import Weights
 from impc.reporting.document import json_bytes
 from impc.studies.fit.settings import FitSettings
 from impc.studies.fit.subject import fit_problem
-from impc.studies.methods_table import column_terms, methods_data, methods_numbers, methods_table
+from impc.studies.methods_table import (
+    column_terms,
+    methods_data,
+    methods_numbers,
+    methods_table,
+    until_its_end,
+)
 
 
 @pytest.fixture(scope="module")
@@ -64,3 +75,17 @@ def test_an_assessment_more_is_a_column_more(
     assert methods_numbers(fits).heads[-3] == "trials"
     assert methods_data(fits)["feedback_gain"]["trials"] == 1
     assert ("trials", ("That were simulated.",)) in column_terms().terms
+
+
+def test_a_run_that_falls_has_numbers_only_as_far_as_it_got(example_plant: Plant) -> None:
+    bounds = Bounds(example_plant, u_min=-1, u_max=1)
+    law = Controller(example_plant, Weights(np.eye(2), 1), bounds, 3, terminal_set=False)
+    run = simulate(law, scenario(example_plant, [50.0, 50.0], 400))
+    y, u = until_its_end(example_plant, run)
+    end = run.reached
+    assert 0 < end < 400
+    assert len(y) == len(u) == 401
+    np.testing.assert_array_equal(y[: end + 1], (run.x @ example_plant.C.T)[: end + 1])
+    np.testing.assert_array_equal(u[:end], run.u[:end])
+    assert np.all(np.isnan(y[end + 1 :]))
+    assert np.all(np.isnan(u[end:]))

@@ -9,13 +9,13 @@ Numbers are in the units of the plant (docs/results.md); those of `impc fit` hav
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.model.signal_units import gain_unit, price_unit
+from impc.model.signal_units import gain_unit
 from impc.reporting.document import TextTable
-from impc.studies.methods_table import methods_numbers
+from impc.studies.methods_table import methods_numbers, until_its_end, weight_entries
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -50,16 +50,12 @@ def _gain(problem: Problem, compared: Sequence[MethodFit]) -> TextTable:
 
 def _weights(problem: Problem, compared: Sequence[MethodFit]) -> TextTable:
     plant = problem.plant
-    rows: list[tuple[Any, ...]] = []
-    for item in compared:
-        found = item.estimate.weights
-        if found is None:
-            continue
-        for which, names, matrix in (("Q", plant.states, found.Q), ("R", plant.controls, found.R)):
-            for i, one in enumerate(names):
-                for j, other in enumerate(names[: i + 1]):
-                    unit = price_unit(plant, one, other)
-                    rows.append((which, one, other, unit, item.name, float(matrix[i, j])))
+    rows = [
+        (*entry[:-1], item.name, entry[-1])
+        for item in compared
+        if item.estimate.weights is not None
+        for entry in weight_entries(plant, item.estimate.weights)
+    ]
     return TextTable("", ("matrix", "first", "second", "unit", "method", "value"), rows)
 
 
@@ -72,11 +68,7 @@ def _trajectories(problem: Problem, compared: Sequence[MethodFit]) -> TextTable:
         parts = [np.full((steps, 1), index + 1.0), plant.dt * np.arange(steps)[:, None]]
         parts += [np.asarray(trial.outputs), np.asarray(trial.disturbance)]
         for item in shown:
-            run = item.runs[index]
-            outputs, commands = run.x @ plant.C.T, np.full((steps, plant.m), np.nan)
-            outputs[run.reached + 1 :] = np.nan
-            commands[: run.reached] = run.u[: run.reached]
-            parts += [outputs[:steps], commands]
+            parts += until_its_end(plant, item.runs[index])
         blocks.append(np.hstack(parts))
     heads = ["trial", "time", *(f"{name}_recorded" for name in plant.outputs), *plant.disturbances]
     for item in shown:

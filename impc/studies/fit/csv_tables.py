@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.model.signal_units import UNKNOWN, price_unit
+from impc.model.signal_units import UNKNOWN
 from impc.reporting.document import TextTable
 from impc.studies.fit.result import shown_trials
 from impc.studies.fit.tables import number_units
-from impc.studies.methods_table import methods_numbers
+from impc.studies.methods_table import methods_numbers, until_its_end, weight_entries
 
 if TYPE_CHECKING:
     from impc.studies.fit.result import FitResult
@@ -62,20 +62,8 @@ def _weights(result: FitResult) -> TextTable:
     ranges = {frozenset((item.first, item.second)): (item.low, item.high) for item in found}
     no_range = (np.nan, np.nan)
     rows = [
-        (
-            which,
-            one,
-            other,
-            price_unit(plant, one, other),
-            float(matrix[i, j]),
-            *(ranges.get(frozenset((one, other)), no_range) if which == "Q" else no_range),
-        )
-        for which, names, matrix in (
-            ("Q", plant.states, weights.Q),
-            ("R", plant.controls, weights.R),
-        )
-        for i, one in enumerate(names)
-        for j, other in enumerate(names[: i + 1])
+        (*entry, *(ranges.get(frozenset(entry[1:3]), no_range) if entry[0] == "Q" else no_range))
+        for entry in weight_entries(plant, weights)
     ]
     return TextTable("", ("matrix", "first", "second", "unit", "value", "low", "high"), rows)
 
@@ -85,12 +73,11 @@ def _trajectories(result: FitResult) -> TextTable:
     for index in shown_trials(result):
         trial, run = result.given.recordings[index], result.inverse_mpc.runs[index]
         steps = trial.samples
-        commands = np.vstack([run.u, np.full((1, plant.m), np.nan)])
         number = np.full((steps, 1), index + 1.0)
         time = plant.dt * np.arange(steps)[:, None]
-        simulated = run.x @ plant.C.T
+        simulated, commands = until_its_end(plant, run)
         blocks.append(
-            np.hstack([number, time, trial.outputs, simulated, commands[:steps], trial.disturbance])
+            np.hstack([number, time, trial.outputs, simulated, commands, trial.disturbance])
         )
     heads = [
         "trial",
