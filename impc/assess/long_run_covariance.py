@@ -10,16 +10,33 @@ non-negative, with the bandwidth of Andrews (Econometrica 59, 1991, 817):
 The covariance of sum_t J_t' e_t is then
 
     sum_{t,s} W_t' Gamma_{t-s} W_s,        W_t = J_t + diag(a) W_{t+1}.
+
+Residuals of a fit are smaller than the noise, and most along what was fitted, which is slow: the
+lags that a fit takes away add up. With S the covariance of the noise and Z an orthonormal basis of
+what was fitted, e = (I - Z Z') noise has the covariance
+
+    S - (Z Z' S + S Z Z' - Z Z' S Z Z'),
+
+and what stands in brackets, for the S of the residuals themselves, is given back lag by lag
+(docs/fitting.md).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.signal
 
 from impc.arrays import Array, Frozen, frozen
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from impc.inverse.trial_span import TrialSpan
+
+    Taken = tuple[Array, Array]
 
 __all__ = ["ResidualNoise", "residual_noise", "spread_of_sum", "white_noise"]
 
@@ -27,6 +44,8 @@ __all__ = ["ResidualNoise", "residual_noise", "spread_of_sum", "white_noise"]
 _LARGEST_ROOT = 0.97
 # Samples before the first over which noise still has an effect: 0.97^250 is 5e-4.
 _BEFORE = 250
+# Of giving back what a fit takes, which is told by the colour that is sought.
+_ROUNDS = 3
 
 
 @dataclass(frozen=True)
@@ -50,43 +69,30 @@ class ResidualNoise(Frozen):
         return len(self.gammas) - 1
 
 
-def residual_noise(trials: list[Array], lost: int = 0) -> ResidualNoise:
+def residual_noise(trials: list[Array], fitted: TrialSpan | None = None) -> ResidualNoise:
     """Estimate the colour of residuals.
 
     Parameters
     ----------
     trials : list of Array
         Residuals (samples, p) of each trial.
-    lost : int
-        Number of fitted values: the residuals are that much too small.
+    fitted : TrialSpan or None
+        What was fitted to them; None if nothing was.
     """
-    root = _roots(trials)
-    whitened = [trial[1:] - root * trial[:-1] for trial in trials]
-    total = sum(len(part) for part in whitened)
-    bandwidth = min(_andrews(whitened, total), min(len(part) for part in whitened) // 4)
-    size = total * trials[0].shape[1]
-    grow = size / max(size - lost, 1)
-    gammas = [
-        grow * _parzen(lag / (bandwidth + 1)) * _lagged(whitened, lag) / total
-        for lag in range(bandwidth + 1)
-    ]
-    return ResidualNoise(frozen(root), frozen(gammas))
+    return _restored(_first_order, trials, fitted)
 
 
-def white_noise(trials: list[Array], lost: int = 0) -> ResidualNoise:
+def white_noise(trials: list[Array], fitted: TrialSpan | None = None) -> ResidualNoise:
     """As `residual_noise` if the residuals were white: outputs may be correlated, samples not.
 
     Parameters
     ----------
     trials : list of Array
         Residuals (samples, p) of each trial.
-    lost : int
-        Count of numbers that were fitted to them.
+    fitted : TrialSpan or None
+        What was fitted to them; None if nothing was.
     """
-    total = sum(len(part) for part in trials)
-    size = total * trials[0].shape[1]
-    gamma = _lagged(trials, 0) / total * size / max(size - lost, 1)
-    return ResidualNoise(frozen(np.zeros(trials[0].shape[1])), frozen(gamma[None]))
+    return _restored(_white, trials, fitted)
 
 
 def spread_of_sum(noise: ResidualNoise, columns: list[Array]) -> Array:
@@ -105,14 +111,84 @@ def spread_of_sum(noise: ResidualNoise, columns: list[Array]) -> Array:
     return (result + result.T) / 2
 
 
+def _restored(
+    model: Callable[[list[Array], list[Taken]], ResidualNoise],
+    trials: list[Array],
+    fitted: TrialSpan | None,
+) -> ResidualNoise:
+    found = model(trials, [])
+    if fitted is not None:
+        for _ in range(_ROUNDS):
+            found = model(trials, _taken(found, fitted, trials))
+    return found
+
+
+def _white(trials: list[Array], taken: list[Taken]) -> ResidualNoise:
+    total = sum(len(part) for part in trials)
+    gammas = (_lagged(trials, 0) + _given_back(taken, 0)) / total
+    return ResidualNoise(frozen(np.zeros(gammas.shape[1])), frozen(gammas))
+
+
+def _first_order(trials: list[Array], taken: list[Taken]) -> ResidualNoise:
+    root = _roots(trials, taken)
+    whitened = [_whitened(trial, root) for trial in trials]
+    total = sum(len(part) for part in whitened)
+    bandwidth = min(_andrews(whitened, total), min(len(part) for part in whitened) // 4)
+    window = _parzen(np.arange(bandwidth + 1) / (bandwidth + 1))[:, None, None]
+    moved = [(_whitened(one, root), _whitened(two, root)) for one, two in taken]
+    gammas = window * (_lagged(whitened, bandwidth) + _given_back(moved, bandwidth)) / total
+    return ResidualNoise(frozen(root), frozen(gammas))
+
+
+def _taken(noise: ResidualNoise, fitted: TrialSpan, trials: list[Array]) -> list[Taken]:
+    """What a fit takes of S, the covariance of the noise, trial by trial.
+
+    Z and M = S Z - Z (Z' S Z) / 2, (samples, p, k): in each trial Z M' + M Z' is taken.
+    """
+    root, parts, row = np.asarray(noise.root), [], 0
+    for own, trial in zip(fitted.own, trials, strict=True):
+        rows = slice(row, row + len(own))
+        row = rows.stop
+        basis = np.hstack([own, fitted.shared[rows]]).reshape(*trial.shape, -1)
+        moved = _to_innovations(basis, root)
+        image = _coloured(moved, np.asarray(noise.gammas))
+        spread = np.tensordot(moved, image, ((0, 1), (0, 1)))
+        parts.append((basis, _filtered(image, root)[-len(trial) :], spread, own.shape[1]))
+    total = np.sum([spread[first:, first:] for _, _, spread, first in parts], axis=0)
+    for _, _, spread, first in parts:
+        spread[first:, first:] = total
+    return [(basis, image - basis @ spread / 2) for basis, image, spread, _ in parts]
+
+
+def _given_back(taken: list[Taken], largest: int) -> Array:
+    """Sums of lagged products that a fit has taken, as `_lagged`."""
+    count = taken[0][0].shape[1] if taken else 1
+    result = np.zeros((largest + 1, count, count))
+    for one, two in taken:
+        for lag in range(largest + 1):
+            for ahead, behind in ((one, two), (two, one)):
+                last = len(one) - lag
+                result[lag] += np.tensordot(ahead[lag:], behind[:last], ((0, 2), (0, 2)))
+    return result
+
+
+def _whitened(part: Array, root: Array) -> Array:
+    """eps_t = part_t - root part_{t-1} of a part (samples, p, ...), but for the first sample."""
+    return np.asarray(part[1:] - root.reshape(-1, *[1] * (part.ndim - 2)) * part[:-1])
+
+
 def _to_innovations(columns: Array, root: Array) -> Array:
     """W_t = columns_t + diag(a) W_{t+1}, some samples before the first included."""
     before = np.zeros((_BEFORE if np.any(root) else 0, *columns.shape[1:]))
-    extended = np.concatenate([before, columns])[::-1]
-    moved = np.empty_like(extended)
+    return _filtered(np.concatenate([before, columns])[::-1], root)[::-1]
+
+
+def _filtered(columns: Array, root: Array) -> Array:
+    """y_t = columns_t + diag(a) y_{t-1}."""
+    moved = np.empty_like(columns)
     for output, a in enumerate(root):
-        moved[:, output] = scipy.signal.lfilter([1.0], [1.0, -a], extended[:, output], axis=0)
-    return moved[::-1]
+        moved[:, output] = scipy.signal.lfilter([1.0], [1.0, -a], columns[:, output], axis=0)
+    return moved
 
 
 def _coloured(columns: Array, gammas: Array) -> Array:
@@ -127,20 +203,29 @@ def _coloured(columns: Array, gammas: Array) -> Array:
     return result
 
 
-def _roots(trials: list[Array]) -> Array:
+def _roots(trials: list[Array], taken: list[Taken]) -> Array:
+    """Roots of the outputs of residuals, from which a fit has `taken`."""
     above = sum(np.sum(part[1:] * part[:-1], axis=0) for part in trials)
     below = sum(np.sum(part[:-1] ** 2, axis=0) for part in trials)
+    back = np.diagonal(_given_back(taken, 1), axis1=1, axis2=2)
+    above, below = above + back[1], below + back[0]
     root = np.divide(above, below, out=np.zeros_like(below), where=below > 0)
     return np.asarray(np.clip(root, -_LARGEST_ROOT, _LARGEST_ROOT))
 
 
-def _lagged(trials: list[Array], lag: int) -> Array:
-    return np.asarray(sum(part[lag:].T @ part[: len(part) - lag] for part in trials))
+def _lagged(trials: list[Array], largest: int) -> Array:
+    """Sums of part_{t+l} part_t', lags 0 to `largest`, (lags, p, p)."""
+    return np.array(
+        [
+            sum(part[lag:].T @ part[: len(part) - lag] for part in trials)
+            for lag in range(largest + 1)
+        ]
+    )
 
 
 def _andrews(trials: list[Array], total: int) -> int:
     """Bandwidth for Parzen's window: 2.6614 (alpha(2) T)^(1/5), Andrews 1991, (6.2) to (6.4)."""
-    rho = _roots(trials)
+    rho = _roots(trials, [])
     left = sum(np.sum((part[1:] - rho * part[:-1]) ** 2, axis=0) for part in trials)
     variance = np.asarray(left) / total
     below = float(np.sum(variance**2 / (1 - rho) ** 4))
@@ -149,5 +234,5 @@ def _andrews(trials: list[Array], total: int) -> int:
     return int(np.ceil(2.6614 * (alpha * total) ** 0.2))
 
 
-def _parzen(x: float) -> float:
-    return 1 - 6 * x**2 + 6 * x**3 if x <= 0.5 else 2 * (1 - x) ** 3
+def _parzen(x: Array) -> Array:
+    return np.where(x <= 0.5, 1 - 6 * x**2 + 6 * x**3, 2 * (1 - x) ** 3)

@@ -26,7 +26,6 @@ from impc.arrays import Frozen
 from impc.assess.covariance import TOLD, by_trial
 from impc.assess.long_run_covariance import residual_noise, spread_of_sum
 from impc.assess.near_fit import NearFit
-from impc.assess.structured_weights import fitted_beside
 from impc.inverse.gain_search import EXPLAINED
 from impc.inverse.problem import recorded_size
 from impc.model.riccati import solve_lqr
@@ -91,9 +90,8 @@ class StructureTest(Frozen):
 def structure_test(at: Tangent) -> StructureTest:
     """Test a structure at its fit, against all gains."""
     on_gain, on_metric = at.gain_columns()
-    beyond = at.without_nuisance(
-        np.hstack([on_gain, on_metric, at.found.dparameters]), np.array(at.on_prices[:, at.moving])
-    )
+    fitted = at.span(np.array(at.on_prices[:, at.moving]))
+    beyond = fitted.without(np.hstack([on_gain, on_metric, at.found.dparameters]))
     gain = beyond[:, : on_gain.shape[1]]
     left, sizes, _ = np.linalg.svd(gain, full_matrices=False)
     told = sizes > at.noise / TOLD
@@ -102,8 +100,7 @@ def structure_test(at: Tangent) -> StructureTest:
     if U.shape[1] == 0 or np.linalg.norm(at.residual) <= exact:
         return StructureTest(0.0, 0, 1.0, ())
     residuals = by_trial(at.problem, np.array(at.residual))
-    lost = at.structure.count + fitted_beside(at)
-    V = spread_of_sum(residual_noise(residuals, lost), by_trial(at.problem, U))
+    V = spread_of_sum(residual_noise(residuals, fitted), by_trial(at.problem, U))
     score = U.T @ at.residual
     statistic = float(score @ np.linalg.solve(V, score))
     freedom = U.shape[1]

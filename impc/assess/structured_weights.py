@@ -38,10 +38,11 @@ if TYPE_CHECKING:
 
     from impc.inverse.problem import Problem
     from impc.inverse.residuals import Evaluation
+    from impc.inverse.trial_span import TrialSpan
     from impc.model.riccati import LqrSolution
     from impc.model.structure import Structure
 
-    NoiseModel = Callable[[list[Array], int], ResidualNoise]
+    NoiseModel = Callable[[list[Array], TrialSpan], ResidualNoise]
 
 __all__ = ["TOLD_FACTOR", "PriceCovariance", "Tangent", "price_covariance", "tangent"]
 
@@ -106,9 +107,12 @@ class Tangent(Frozen):
         Array
             (r, a).
         """
+        return self.span(*beside).without(columns)
+
+    def span(self, *beside: Array) -> TrialSpan:
+        """What initial states, parameters and columns `beside` (r, b) can make up."""
         sizes = [trial.outputs.size for trial in self.problem.recordings]
-        shared = np.hstack([self.on_parameters, *beside])
-        return trial_span(self.found.dx0, sizes, shared).without(columns)
+        return trial_span(self.found.dx0, sizes, np.hstack([self.on_parameters, *beside]))
 
     def gain_columns(self) -> tuple[Array, Array]:
         """Derivatives with respect to gain and metric.
@@ -227,20 +231,22 @@ def price_covariance(
     ----------
     at : Tangent
     noise, white : callable
-        How the noise is estimated from the residuals, (samples, p) for each trial, and the count
-        of numbers fitted: with its colour, and as if it had none.
+        How the noise is estimated from the residuals, (samples, p) for each trial, and what was
+        fitted to them: with its colour, and as if it had none.
     """
     values, chain = at.structure.reported(at.prices)
     moving = at.moving
     slopes = np.linalg.inv(chain[np.ix_(moving, moving)])
-    seen = at.without_nuisance(at.on_prices[:, moving]) @ slopes
+    beside = at.span()
+    seen = beside.without(at.on_prices[:, moving]) @ slopes
     _, sizes, rows = np.linalg.svd(seen, full_matrices=False)
     usable = sizes > DETERMINED * np.max(sizes, initial=0.0)
     residuals = by_trial(at.problem, np.array(at.residual))
-    lost = int(np.count_nonzero(usable)) + fitted_beside(at)
-    colour = noise(residuals, lost)
-    along = by_trial(at.problem, seen @ rows[usable].T / sizes[usable] ** 2)
-    spread, plain = (spread_of_sum(kind, along) for kind in (colour, white(residuals, lost)))
+    unit = seen @ rows[usable].T / sizes[usable]
+    fitted = beside.plus(unit)
+    colour = noise(residuals, fitted)
+    along = by_trial(at.problem, unit / sizes[usable])
+    spread, plain = (spread_of_sum(kind, along) for kind in (colour, white(residuals, fitted)))
     deviations = np.full(len(sizes), np.inf)
     deviations[usable] = _roots(spread)
     directions = np.zeros((len(sizes), at.structure.count))
@@ -265,9 +271,3 @@ def price_covariance(
 
 def _roots(covariance: Array) -> Array:
     return np.asarray(np.sqrt(np.maximum(np.diag(covariance), 0.0)))
-
-
-def fitted_beside(at: Tangent) -> int:
-    """Count of the numbers that were fitted beside the unknowns: initial states, parameters."""
-    sizes = [trial.outputs.size for trial in at.problem.recordings]
-    return trial_span(at.found.dx0, sizes, np.array(at.on_parameters)).rank

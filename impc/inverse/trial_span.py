@@ -37,15 +37,14 @@ class TrialSpan:
     own: tuple[Array, ...]
     shared: Array
 
-    @property
-    def rank(self) -> int:
-        """Number of vectors."""
-        return sum(basis.shape[1] for basis in self.own) + int(self.shared.shape[1])
-
     def without(self, columns: Array) -> Array:
         """What the basis does not explain of `columns` (r, k), of that shape."""
         left = _without(self.own, columns)
         return np.asarray(left - self.shared @ (self.shared.T @ left))
+
+    def plus(self, columns: Array) -> TrialSpan:
+        """With orthonormal `columns` (r, k) that are orthogonal to this basis."""
+        return TrialSpan(self.own, np.hstack([self.shared, columns]))
 
 
 def trial_span(own: Array, sizes: Sequence[int], shared: Array) -> TrialSpan:

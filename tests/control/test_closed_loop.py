@@ -141,7 +141,7 @@ def check_jacobian(controller: Controller, drive: Scenario) -> None:
         errors = []
         # The longer differences may reach across a change of the active set, the shorter ones have
         # more rounding: one of them must agree.
-        for step in (1e-4, 1e-5, 1e-6, 1e-7):
+        for step in (1e-5, 1e-4, 1e-6, 1e-7):
             near, far = (
                 [moved(controller, drive, part, index, sign * s) for sign in (1, -1)]
                 for s in (step, 2 * step)
@@ -155,6 +155,8 @@ def check_jacobian(controller: Controller, drive: Scenario) -> None:
                 error = np.max(np.abs(getattr(exact, quantity)[..., column] - difference))
                 worst = max(worst, error / max(1.0, float(np.max(np.abs(difference)))))
             errors.append(worst)
+            if worst < 1e-6:
+                break
         assert min(errors) < 1e-6, f"{part}{index}: {errors}"
 
 

@@ -103,7 +103,7 @@ def test_a_span_of_trials_is_that_of_all_columns() -> None:
     left = left[:, values > 1e-10 * values[0]]
     columns = rng.standard_normal((75, 4))
     found = trial_span(own, sizes, shared)
-    assert found.rank == left.shape[1] == 10
+    assert sum(basis.shape[1] for basis in (*found.own, found.shared)) == left.shape[1] == 10
     np.testing.assert_allclose(
         found.without(columns), columns - left @ (left.T @ columns), atol=1e-12
     )

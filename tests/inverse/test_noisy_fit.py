@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import scipy.signal
 
 import plants
 from experiments.benchmarks.workloads import Workload, seat
 from experiments.simulated_subjects import simulated_subject
 from impc.assess.covariance import gain_covariance
 from impc.assess.judged import judge
-from impc.assess.long_run_covariance import ResidualNoise, residual_noise, spread_of_sum
 from impc.assess.printed_gain import gain_estimate
 from impc.checking import replace
 from impc.control.closed_loop import scenario, simulate
@@ -212,33 +210,6 @@ def test_diagonal_weights_come_near() -> None:
     found = evaluate(problem, solution.K, solution.S)
     samples = problem.recordings[0].outputs.size
     assert np.linalg.norm(found.residual) ** 2 / samples < 0.1
-
-
-def test_colour_of_a_first_order_process() -> None:
-    """Seed 5: the spread of a plain sum is N times the spectral density at zero, 1/(1 - a)^2."""
-    rng = np.random.default_rng(5)
-    noise = rng.standard_normal((40000, 1))
-    for a in (0.0, 0.5, 0.9):
-        series = scipy.signal.lfilter([1.0], [1.0, -a], noise, axis=0)
-        found = residual_noise([series])
-        assert found.root[0] == pytest.approx(a, abs=0.01)
-        spread = spread_of_sum(found, [np.ones((10000, 1, 1))])[0, 0]
-        assert spread / 10000 == pytest.approx(1 / (1 - a) ** 2, rel=0.05)
-
-
-def test_spread_of_a_weighted_sum_is_that_of_its_toeplitz_matrix() -> None:
-    """Known colour, two outputs: against the full covariance matrix of the noise."""
-    a, rng = np.array([0.6, -0.3]), np.random.default_rng(8)
-    mixing = np.array([[1.0, 0.4], [0.0, 0.8]])
-    found = ResidualNoise(a, (mixing @ mixing.T)[None])
-    samples, before = 30, 200
-    columns = rng.standard_normal((samples, 2, 3))
-    response = np.zeros((samples, 2, before + samples, 2))  # of e_t to eps_s
-    for t in range(samples):
-        for s in range(before + t + 1):
-            response[t, :, s, :] = np.diag(a ** (before + t - s)) @ mixing
-    weighted = np.tensordot(columns, response, ((0, 1), (0, 1))).reshape(3, -1)
-    np.testing.assert_allclose(spread_of_sum(found, [columns]), weighted @ weighted.T, rtol=1e-9)
 
 
 def test_standard_deviations_of_a_linear_model_are_those_of_theory() -> None:
