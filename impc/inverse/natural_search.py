@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from impc.inverse.solution_set import GainFibre
     from impc.model.riccati import LqrSolution
 
-__all__ = ["CONDITION_SHARE", "in_plant_units", "inverse_mpc_natural"]
+__all__ = ["CONDITION_SHARE", "WORST_START", "in_plant_units", "inverse_mpc_natural"]
 
 #: What the condition number of the start counts, in squared standard deviations of one sample's
 #: noise. It decides along directions that noise leaves open, and moves no other by as much as its
@@ -49,11 +49,11 @@ __all__ = ["CONDITION_SHARE", "in_plant_units", "inverse_mpc_natural"]
 CONDITION_SHARE = 1.0
 # A step that promises less than this, of the objective, is below what the noise decides.
 _TOLERANCE = 1e-5
-# Condition number, in natural coordinates, of the weights that a search begins with. Prices of a
-# diagonal start may lie at the edge of what any weights have (1e9 and more): the penalty, which is
-# relative to the start, then regularises nothing and the search stays at that edge. Of 15 random
-# plants with three inputs that ended short of the truth, 13 end at it from 1e3, 8 from 1e5.
-_WORST_START = 1e3
+#: Condition number, in natural coordinates, of the weights that a search begins with. Prices of a
+#: diagonal start may lie at the edge of what any weights have (1e9 and more): the penalty, which is
+#: relative to the start, then regularises nothing and the search stays at that edge. Of 15 random
+#: plants with three inputs that ended short of the truth, 13 end at it from 1e3, 8 from 1e5.
+WORST_START = 1e3
 # A start that leaves no more than this, of the noise, is where the search has to go.
 _FITS = 1.005
 
@@ -63,6 +63,7 @@ def inverse_mpc_natural(
     start: Weights,
     noise: float,
     *,
+    worst_start: float = WORST_START,
     condition_share: float = CONDITION_SHARE,
     max_iterations: int = 40,
 ) -> ConditionedFit:
@@ -73,10 +74,12 @@ def inverse_mpc_natural(
     problem : Problem
     start : Weights
         Positive definite. The search begins at the weights of least condition number with the same
-        gain and metric, in natural coordinates; where even those are worse conditioned than 1e3,
-        and leave more than noise, at these with a price on every direction that makes them so.
+        gain and metric, in natural coordinates.
     noise : float
         2-norm of the residual that no weights are asked to explain; positive.
+    worst_start : float
+        Where those are worse conditioned than this, and leave more than noise, the search begins at
+        these with a price on every direction that makes them so.
     condition_share : float
         What the condition number of the start counts, against the squared noise of one sample.
     max_iterations : int
@@ -105,7 +108,7 @@ def inverse_mpc_natural(
     best = _best_conditioned(fibre, member)
     residual = _residual(problem, T, G, noise)
     fits = np.linalg.norm(residual(solve_lqr(natural, best)).values) <= _FITS
-    begin = best if fits else _away_from_the_edge(best)
+    begin = best if fits else _away_from_the_edge(best, worst_start)
     samples = sum(trial.outputs.size for trial in problem.recordings)
     share = condition_share / samples / condition_number(best)
     objective = Objective(residual, 1.0, share, squared=True)
@@ -143,11 +146,11 @@ def _best_conditioned(fibre: GainFibre, member: Weights) -> Weights:
         return member
 
 
-def _away_from_the_edge(weights: Weights) -> Weights:
-    """The weights, if need be with a price on every direction, at most `_WORST_START` apart."""
-    if condition_number(weights) <= _WORST_START:
+def _away_from_the_edge(weights: Weights, worst: float) -> Weights:
+    """The weights, if need be with a price on every direction, at most `worst` apart."""
+    if condition_number(weights) <= worst:
         return weights
-    floor = float(np.linalg.eigvalsh(weights.block)[-1]) / _WORST_START
+    floor = float(np.linalg.eigvalsh(weights.block)[-1]) / worst
     n, size = len(weights.Q), len(weights.block)
     return split_blocks(weights.block + floor * np.eye(size), n)
 

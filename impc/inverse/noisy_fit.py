@@ -22,7 +22,7 @@ from impc.inverse.estimates import Estimate, Status
 from impc.inverse.explaining_weights import weights_behind
 from impc.inverse.gain_search import EXPLAINED, GainFit, describe_gain, fit_gain, refine_gain
 from impc.inverse.initial_states import with_fitted_starts
-from impc.inverse.natural_search import in_plant_units, inverse_mpc_natural
+from impc.inverse.natural_search import WORST_START, in_plant_units, inverse_mpc_natural
 from impc.inverse.nearest_regulator import auxiliary_weights
 from impc.inverse.one_step import one_step
 from impc.inverse.problem import recorded_size
@@ -44,6 +44,9 @@ _SPREAD = 1.0
 # Weights that leave this much more than the free gain are looked for again: a tenth of a point of
 # VAF where noise leaves 90 %.
 _POOR = 1.005
+# Condition number of the start from which they are looked for last, and steps.
+_EDGE = 1e5
+_LONG = 100
 # Of steps by themselves, for a start: half the searches of 20 plants end sooner.
 _STEP_EVALUATIONS = 30
 
@@ -81,7 +84,7 @@ def fit_controller(problem: Problem, start: Weights | None = None) -> Estimate:
         free = free_gain(free.problem, found.weights)
         found = inverse_mpc_natural(free.problem, found.weights, noise_of(free))
     if found.misfit > _POOR * free.misfit:  # the weights stand in one
-        found = _again(free, found)
+        found = _again(free, found, begin)
     settled = free.problem
     if problem.unknown_start:
         settled = with_fitted_starts(free.problem, found.solution.K, found.solution.S)
@@ -90,20 +93,33 @@ def fit_controller(problem: Problem, start: Weights | None = None) -> Estimate:
     )
 
 
-def _again(free: GainFit, found: ConditionedFit) -> ConditionedFit:
-    """The direct form from the weights whose regulator is nearest to the free gain, if better."""
+def _again(free: GainFit, found: ConditionedFit, begin: Weights) -> ConditionedFit:
+    """The direct form from other starts, one after the other until one leaves what noise does.
+
+    First the weights whose regulator is nearest to the free gain, then the start of all, let nearer
+    to the edge of what weights can have. Which leads on is chance: of 100 random plants with three
+    inputs three stood at 1.1 to 4.7 % too much after the first, and one after the second.
+    """
+    for start, worst in ((_nearest, WORST_START), (lambda _: begin, _EDGE)):
+        if found.misfit <= _POOR * free.misfit:
+            break
+        try:
+            other = inverse_mpc_natural(
+                free.problem, start(free), noise_of(free), worst_start=worst, max_iterations=_LONG
+            )
+        except (WeightsError, SolverError):  # no better start: the answer so far stands
+            continue
+        found = other if other.misfit < found.misfit else found
+    return found
+
+
+def _nearest(free: GainFit) -> Weights:
+    """The weights whose regulator is nearest to the free gain."""
     plant = free.problem.plant
-    if not free.stabilises:
-        return found
     T, G = natural_coordinates(plant, free.K)
     natural = change_coordinates(plant, T, G)
     gain, metric = np.asarray(np.linalg.solve(G, free.K @ T)), G.T @ free.S @ G
-    try:
-        near = auxiliary_weights(natural, gain, None, metric=metric).weights
-        other = inverse_mpc_natural(free.problem, in_plant_units(near, T, G), noise_of(free))
-    except (WeightsError, SolverError):  # no better start: the first answer stands
-        return found
-    return other if other.misfit < found.misfit else found
+    return in_plant_units(auxiliary_weights(natural, gain, None, metric=metric).weights, T, G)
 
 
 def _other_basin(problem: Problem, begin: Weights, found: GainFit) -> GainFit:
