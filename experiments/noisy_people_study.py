@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from impc.assess.person_covariance import PersonCovariance
     from impc.inverse.likelihood_fit import PersonFit
 
-__all__ = ["Score", "above_truth", "score"]
+__all__ = ["Score", "above_truth", "score", "true_unknowns"]
 
 _NORMAL = 1.959964
 # A limit that is not met, and one that is, of each body.
@@ -141,6 +141,11 @@ def score(who: Subject, study: str, seed: int, *, profiled: bool = True) -> Scor
 
 def above_truth(likely: PersonFit, who: Subject) -> float:
     """Log-likelihood of the fit minus that of the subject as simulated, nats."""
+    return likely.log_likelihood - likely.space.value(true_unknowns(likely, who))
+
+
+def true_unknowns(likely: PersonFit, who: Subject) -> Array:
+    """The subject as simulated, in the coordinates of the fit (q,)."""
     space = likely.space
     own, theta = space.space, np.array(space.start)
     truth = own.natural(np.array(who.controller.K))
@@ -149,7 +154,7 @@ def above_truth(likely: PersonFit, who: Subject) -> float:
     theta[space.shared : space.after] = np.ravel(-np.linalg.solve(own.start_unit, starts.T).T)
     levels = np.concatenate([who.person.levels, who.recorder])
     theta[space.own :] = np.log(levels[space.moving])
-    return likely.log_likelihood - space.value(theta)
+    return theta
 
 
 def _steps(

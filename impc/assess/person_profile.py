@@ -7,6 +7,10 @@ stays on the other. The interval of 95 % is where the largest likelihood with th
 
 and open to zero where that never falls: the level is then at most its upper end
 (docs/noisy-people.md).
+
+Where one level slid to none another took its part, and its own deviation is that of a person
+without the first. So all levels have a profile then, and with one of them held the slid ones are
+looked for from where they began, too.
 """
 
 from __future__ import annotations
@@ -15,7 +19,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.arrays import Array, frozen
+from impc.arrays import Array, BoolArray, frozen
 from impc.errors import ImpcError
 from impc.inverse.likelihood_search import climb
 
@@ -36,6 +40,8 @@ _TRIES, _BUDGET = 12, 15
 _FLAT = 1e-2
 # A level whose logarithm has a larger deviation is given a profile.
 _WEAK = 0.25
+# A level whose logarithm has a deviation as large is none: the likelihood does not answer to it.
+_NONE = 3.0
 
 
 def level_intervals(fit: PersonFit, covariance: PersonCovariance, *, weak: float = _WEAK) -> Array:
@@ -47,13 +53,15 @@ def level_intervals(fit: PersonFit, covariance: PersonCovariance, *, weak: float
     covariance : PersonCovariance
         Gives the intervals of levels that are well told.
     weak : float
-        A level whose logarithm has a larger deviation has its interval by profile.
+        A level whose logarithm has a larger deviation has its interval by profile; all have where
+        one slid to none.
     """
     values = np.exp(fit.theta[fit.space.own :])
+    slid = bool(np.any(_none(fit)))
     return frozen(
         [
             level_interval(fit, k)
-            if covariance.levels[k] > weak
+            if slid or covariance.levels[k] > weak
             else covariance.level_interval(k, float(value))
             for k, value in enumerate(values)
         ]
@@ -86,8 +94,7 @@ def _end(fit: PersonFit, held: int, side: int) -> float:
     next guess lies on a line.
     """
     theta, border = np.array(fit.theta), float(fit.box[(side + 1) // 2][held])
-    information = fit.told.information + fit.prior.slopes(theta)[1]
-    covariance = np.linalg.inv(information + _FLAT * np.eye(len(theta)))
+    covariance = _covariance(fit)
     tangent = covariance[:, held] / covariance[held, held]
     step = min(_NORMAL * float(np.sqrt(covariance[held, held])), _LONGEST)
     inside, outside = (float(theta[held]), 0.0), (np.nan, np.inf)
@@ -112,19 +119,37 @@ def _end(fit: PersonFit, held: int, side: int) -> float:
     return outside[0] if np.isfinite(outside[0]) else side * np.inf
 
 
+def _none(fit: PersonFit) -> BoolArray:
+    """Which unknowns are levels that slid to none (q,)."""
+    deviations = np.sqrt(np.diag(_covariance(fit)))
+    return np.asarray((deviations > _NONE) & (np.arange(len(deviations)) >= fit.space.own))
+
+
+def _covariance(fit: PersonFit) -> Array:
+    """Of all unknowns (q, q), at most ten squared along what nothing tells."""
+    information = fit.told.information + fit.prior.slopes(np.array(fit.theta))[1]
+    return np.linalg.inv(information + _FLAT * np.eye(len(information)))
+
+
 def _held(
     fit: PersonFit, theta: Array, tangent: Array, held: int, value: float
 ) -> tuple[Array, float]:
     """The best of all else with one unknown held at a value, and how far the likelihood fell."""
-    moved = np.clip(theta + tangent * (value - theta[held]), *fit.box)
-    # A straight line may leave the gains that stabilise.
-    start = moved if np.isfinite(fit.prior.value(moved)) else theta.copy()
-    start[held] = value
     low, high = (np.array(side) for side in fit.box)
     low[held] = high[held] = value
-    try:
-        found, told, _, _ = climb(fit.prior, start, (low, high), _BUDGET)
-    except ImpcError:  # no filter there: as far as an end may be
-        return theta, np.inf
-    top = fit.log_likelihood + fit.prior.value(fit.theta)
-    return found, top - told.value - fit.prior.value(found)
+    straight = np.clip(theta + tangent * (value - theta[held]), low, high)
+    # A straight line may leave the gains that stabilise.
+    starts = [straight if np.isfinite(fit.prior.value(straight)) else np.clip(theta, low, high)]
+    slid = _none(fit)
+    slid[held] = False
+    if np.any(slid):
+        starts.append(np.clip(np.where(slid, fit.space.start, starts[0]), low, high))
+    top, best = fit.log_likelihood + fit.prior.value(fit.theta), (theta, np.inf)
+    for start in starts:
+        try:
+            found, told, _, _ = climb(fit.prior, start, (low, high), _BUDGET)
+        except ImpcError:  # no filter there: as far as an end may be
+            continue
+        fallen = top - told.value - fit.prior.value(found)
+        best = (found, fallen) if fallen < best[1] else best
+    return best

@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 import scipy.optimize
 
+from experiments.noisy_people import recorded, subject
+from experiments.noisy_people_study import true_unknowns
 from impc.arrays import Array
 from impc.assess.person_covariance import person_covariance
 from impc.assess.person_profile import level_interval, level_intervals
 from impc.inverse.likelihood_fit import PersonFit, fit_person
+from impc.inverse.likelihood_search import climb, reach
 from impc.inverse.methods import estimate
 from impc.model.observer import Observer
 from tests.inverse.test_likelihood_fit import cart, posed
@@ -66,3 +69,39 @@ def test_a_level_that_may_be_none_is_told_on_one_side(fitted: PersonFit) -> None
     assert covariance.levels[index] > 0.25
     np.testing.assert_array_equal(intervals[index], [low, high])
     assert intervals.shape == (len(fitted.space.names), 2)
+
+
+def test_where_senses_slid_to_none_the_motor_level_is_told_less() -> None:
+    """A cart at its limit, seed 1: the truth is beyond the deviation of its motor noise.
+
+    The likelihood does not rule it out: with the true motor noise held, a search that begins at the
+    truth ends higher than where an interval of 95 % does.
+    """
+    who = subject("cart", 1, "both", 90.0, 0.7)
+    blind = who.person.with_levels(np.where(who.person.levels > 0, 0.1, 0.0))
+    fit = fit_person(estimate(recorded(who, 1).problem), blind)
+    expected, motor = person_covariance(fit, "expected"), float(who.person.levels[0])
+    found = float(np.exp(fit.theta[fit.space.own]))
+    assert not expected.level_interval(0, found)[0] < motor
+
+    truth = true_unknowns(fit, who)
+    box = reach(fit.space, truth)
+    for side in box:
+        side[fit.space.own] = np.log(motor)
+    there, told, _, _ = climb(fit.prior, truth, box, 30)
+    top = fit.log_likelihood + fit.prior.value(fit.theta)
+    assert top - told.value - fit.prior.value(there) < 1.920729
+
+    low, high = level_interval(fit, 0)
+    assert low < motor < found < high
+
+
+@pytest.mark.slow
+def test_all_levels_have_a_profile_where_one_slid_to_none() -> None:
+    """The same person, as the page prints it."""
+    who = subject("cart", 1, "both", 90.0, 0.7)
+    blind = who.person.with_levels(np.where(who.person.levels > 0, 0.1, 0.0))
+    fit = fit_person(estimate(recorded(who, 1).problem), blind)
+    true = [*who.person.levels[who.person.levels > 0], *who.recorder]
+    intervals = level_intervals(fit, person_covariance(fit, "expected"))
+    assert all(low < level < high for level, (low, high) in zip(true, intervals, strict=True))
