@@ -201,8 +201,8 @@ def _models_table(report: PersonReport) -> TextTable:
 def _levels_table(plant: Plant, report: PersonReport) -> TextTable:
     return table_of(
         "Levels of noise: standard deviations of one sample, with intervals of 95 % (by the "
-        "sandwich, or by profile where a level is weakly told or some level is none). A level whose "
-        "interval reaches a factor of ten is only told to be at most its upper end.",
+        "sandwich, or by profile where a level is weakly told or some level is none). A level "
+        "whose interval reaches a factor of ten is only told to be at most its upper end.",
         _levels(plant, report),
         {
             "noise": lambda item: item.name,
