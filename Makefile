@@ -106,7 +106,7 @@ slow: env
 	$(PY) -m pytest -m slow
 
 coverage: env
-	$(PY) -m experiments.printed_intervals --recordings 200
+	$(PY) -m experiments.printed_intervals --recordings 300
 
 # Twenty times the examples of `make test`, other ones each time; SEED=... repeats a search.
 SEED ?= $(shell date +%s)
