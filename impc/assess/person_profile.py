@@ -128,7 +128,7 @@ def _none(fit: PersonFit) -> BoolArray:
 def _covariance(fit: PersonFit) -> Array:
     """Of all unknowns (q, q), at most ten squared along what nothing tells."""
     information = fit.told.information + fit.prior.slopes(np.array(fit.theta))[1]
-    return np.linalg.inv(information + _FLAT * np.eye(len(information)))
+    return np.asarray(np.linalg.inv(information + _FLAT * np.eye(len(information))))
 
 
 def _held(
