@@ -33,8 +33,9 @@ if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.assess.person_covariance import PersonCovariance
     from impc.inverse.likelihood_fit import PersonFit
+    from impc.model.observer import Observer
 
-__all__ = ["Score", "above_truth", "score", "true_unknowns"]
+__all__ = ["Score", "above_truth", "blind", "score", "true_unknowns"]
 
 _NORMAL = 1.959964
 # A limit that is not met, and one that is, of each body.
@@ -105,9 +106,7 @@ def score(who: Subject, study: str, seed: int, *, profiled: bool = True) -> Scor
     gain, metric = np.array(first.gain), np.array(first.metric)
     least = gain_covariance(first.problem, gain, metric, curvature=True)
     clock.append(time.process_time())
-    # Levels to start from that know nothing of the subject but which there are.
-    blind = who.person.with_levels(np.where(who.person.levels > 0, 0.1, 0.0))
-    likely = fit_person(first, blind)
+    likely = fit_person(first, blind(who))
     robust, expected = (person_covariance(likely, kind) for kind in ("sandwich", "expected"))
     clock.append(time.process_time())
     values = np.exp(likely.theta[likely.space.own :])
@@ -137,6 +136,11 @@ def score(who: Subject, study: str, seed: int, *, profiled: bool = True) -> Scor
         profiles.tolist(),
         np.diff(clock).tolist(),
     )
+
+
+def blind(who: Subject) -> Observer:
+    """Levels to start from that know nothing of the subject but which there are."""
+    return who.person.with_levels(np.where(who.person.levels > 0, 0.1, 0.0))
 
 
 def above_truth(likely: PersonFit, who: Subject) -> float:

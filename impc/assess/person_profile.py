@@ -57,7 +57,7 @@ def level_intervals(fit: PersonFit, covariance: PersonCovariance, *, weak: float
         one slid to none.
     """
     values = np.exp(fit.theta[fit.space.own :])
-    slid = bool(np.any(_none(fit)))
+    slid = bool(np.any(_slid(fit, _covariance(fit))))
     return frozen(
         [
             level_interval(fit, k)
@@ -95,13 +95,15 @@ def _end(fit: PersonFit, held: int, side: int) -> float:
     """
     theta, border = np.array(fit.theta), float(fit.box[(side + 1) // 2][held])
     covariance = _covariance(fit)
+    slid = _slid(fit, covariance)
+    slid[held] = False
     tangent = covariance[:, held] / covariance[held, held]
     step = min(_NORMAL * float(np.sqrt(covariance[held, held])), _LONGEST)
     inside, outside = (float(theta[held]), 0.0), (np.nan, np.inf)
     value = inside[0] + side * step
     for _ in range(_TRIES):
         value = border if side * (value - border) >= 0 else value
-        theta, fallen = _held(fit, theta, tangent, held, value)
+        theta, fallen = _held(fit, theta, tangent, slid, held, value)
         root = float(np.sqrt(max(fallen, 0.0)))
         if abs(root - _FALLEN) < _CLOSE:
             return value
@@ -119,9 +121,9 @@ def _end(fit: PersonFit, held: int, side: int) -> float:
     return outside[0] if np.isfinite(outside[0]) else side * np.inf
 
 
-def _none(fit: PersonFit) -> BoolArray:
+def _slid(fit: PersonFit, covariance: Array) -> BoolArray:
     """Which unknowns are levels that slid to none (q,)."""
-    deviations = np.sqrt(np.diag(_covariance(fit)))
+    deviations = np.sqrt(np.diag(covariance))
     return np.asarray((deviations > _NONE) & (np.arange(len(deviations)) >= fit.space.own))
 
 
@@ -132,7 +134,7 @@ def _covariance(fit: PersonFit) -> Array:
 
 
 def _held(
-    fit: PersonFit, theta: Array, tangent: Array, held: int, value: float
+    fit: PersonFit, theta: Array, tangent: Array, slid: BoolArray, held: int, value: float
 ) -> tuple[Array, float]:
     """The best of all else with one unknown held at a value, and how far the likelihood fell."""
     low, high = (np.array(side) for side in fit.box)
@@ -140,8 +142,6 @@ def _held(
     straight = np.clip(theta + tangent * (value - theta[held]), low, high)
     # A straight line may leave the gains that stabilise.
     starts = [straight if np.isfinite(fit.prior.value(straight)) else np.clip(theta, low, high)]
-    slid = _none(fit)
-    slid[held] = False
     if np.any(slid):
         starts.append(np.clip(np.where(slid, fit.space.start, starts[0]), low, high))
     top, best = fit.log_likelihood + fit.prior.value(fit.theta), (theta, np.inf)

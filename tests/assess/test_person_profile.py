@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from experiments.noisy_people import recorded, subject
-from experiments.noisy_people_study import true_unknowns
+from experiments.noisy_people import Subject, recorded, subject
+from experiments.noisy_people_study import blind, true_unknowns
 from impc.arrays import Array
 from impc.assess.person_covariance import person_covariance
 from impc.assess.person_profile import level_interval, level_intervals
@@ -23,6 +23,13 @@ def fitted() -> PersonFit:
     """Motor noise is well told; the sense of a state that is recorded too is not."""
     person = Observer(cart(), ["x"], motor=0.4, sensory=0.01)
     return fit_person(estimate(posed(person, 0.01, 3.0)), person)
+
+
+@pytest.fixture(scope="module")
+def slid() -> tuple[Subject, PersonFit]:
+    """A cart at its limit, seed 1, and a fit in which both senses slid to none."""
+    who = subject("cart", 1, "both", 90.0, 0.7)
+    return who, fit_person(estimate(recorded(who, 1).problem), blind(who))
 
 
 def test_a_level_that_is_well_told_has_the_interval_of_its_deviation(fitted: PersonFit) -> None:
@@ -71,15 +78,15 @@ def test_a_level_that_may_be_none_is_told_on_one_side(fitted: PersonFit) -> None
     assert intervals.shape == (len(fitted.space.names), 2)
 
 
-def test_where_senses_slid_to_none_the_motor_level_is_told_less() -> None:
-    """A cart at its limit, seed 1: the truth is beyond the deviation of its motor noise.
+def test_where_senses_slid_to_none_the_motor_level_is_told_less(
+    slid: tuple[Subject, PersonFit],
+) -> None:
+    """The truth is beyond the deviation of the motor noise.
 
     The likelihood does not rule it out: with the true motor noise held, a search that begins at the
     truth ends higher than where an interval of 95 % does.
     """
-    who = subject("cart", 1, "both", 90.0, 0.7)
-    blind = who.person.with_levels(np.where(who.person.levels > 0, 0.1, 0.0))
-    fit = fit_person(estimate(recorded(who, 1).problem), blind)
+    who, fit = slid
     expected, motor = person_covariance(fit, "expected"), float(who.person.levels[0])
     found = float(np.exp(fit.theta[fit.space.own]))
     assert not expected.level_interval(0, found)[0] < motor
@@ -97,11 +104,11 @@ def test_where_senses_slid_to_none_the_motor_level_is_told_less() -> None:
 
 
 @pytest.mark.slow
-def test_all_levels_have_a_profile_where_one_slid_to_none() -> None:
+def test_all_levels_have_a_profile_where_one_slid_to_none(
+    slid: tuple[Subject, PersonFit],
+) -> None:
     """The same person, as the page prints it."""
-    who = subject("cart", 1, "both", 90.0, 0.7)
-    blind = who.person.with_levels(np.where(who.person.levels > 0, 0.1, 0.0))
-    fit = fit_person(estimate(recorded(who, 1).problem), blind)
+    who, fit = slid
     true = [*who.person.levels[who.person.levels > 0], *who.recorder]
     intervals = level_intervals(fit, person_covariance(fit, "expected"))
     assert all(low < level < high for level, (low, high) in zip(true, intervals, strict=True))
