@@ -25,7 +25,7 @@ import plants
 from experiments.printed_intervals import carts, with_noise
 from impc.assess.price_profiles import PriceProfiles
 from impc.assess.structure_test import structure_test
-from impc.assess.structured_weights import price_covariance, tangent
+from impc.assess.structured_weights import Tangent, price_covariance, tangent
 from impc.control.controller import Controller
 from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.structured_fit import fit_structure
@@ -151,7 +151,6 @@ def score(person: Person, study: str, seed: int, *, intervals: bool = True) -> S
     problem, structure = person.problem, person.structure
     near = fit_controller(problem)
     end = fit_structure(near.problem, structure, np.array(near.gain), np.array(near.metric))
-    samples = sum(trial.outputs.size for trial in problem.recordings)
     at = tangent(structure, end.problem, np.array(end.prices))
     found, tested = price_covariance(at), structure_test(at)
     prices = np.array(end.prices)
@@ -162,7 +161,8 @@ def score(person: Person, study: str, seed: int, *, intervals: bool = True) -> S
     made, excess = [], float("nan")
     if intervals:
         best = search_from(near.problem, structure, person.prices)
-        excess = samples * (end.misfit**2 - best.misfit**2) / best.misfit**2
+        least = _misfit(tangent(structure, best.problem, np.array(best.prices)))
+        excess = len(at.residual) * (_misfit(at) - least) / least
         profiles = PriceProfiles(at, found)
         rows = np.eye(structure.count)
         made = [
@@ -182,6 +182,11 @@ def score(person: Person, study: str, seed: int, *, intervals: bool = True) -> S
         tested.freedom,
         max(powers, default=0.0),
     )
+
+
+def _misfit(at: Tangent) -> float:
+    """Square of the misfit, with initial states as free as the intervals take them to be."""
+    return float(np.sum(at.without_nuisance(np.array(at.residual)[:, None]) ** 2))
 
 
 def _summed(scores: list[Score]) -> str:

@@ -5,7 +5,7 @@ This package knows nothing of `impc`; either can be used without the other.
 
 from plants.actuation import LinearSystem, delayed_muscle, pade_delay
 from plants.anthropometry import SeatLayout, from_anthropometry
-from plants.cursor import cursor_plant
+from plants.cursor import cursor_plant, pursuit_plant
 from plants.head_neck import (
     HEAD_NECK_FIXED,
     HEAD_NECK_PARAMETERS,
@@ -62,6 +62,7 @@ __all__ = [
     "maximal_recurrence",
     "nonlinear_dynamics",
     "pade_delay",
+    "pursuit_plant",
     "runge_kutta_step",
     "seated_balance_for",
     "seated_balance_plant",

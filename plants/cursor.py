@@ -1,6 +1,7 @@
-"""Following a target with a cursor: the tracking error as a plant.
+"""Following a target with a cursor: the tracking error as a plant, in two ways.
 
-The hand moves the cursor with an acceleration that answers the command after a delay and a lag,
+In `cursor_plant` the hand moves the cursor with an acceleration that answers the command after a
+delay and a lag,
 
     c'' = a,    tau_m a' + a = u(t - tau_d),    e = c - target,    e' = c' - target',
 
@@ -10,9 +11,17 @@ States: error (px), velocity of the cursor (px/s), the states of the delay
 (px/s), which is held between samples: give it the increments of the target over the sample time.
 Output: error (px). Any unit of length may stand for the pixel.
 
-Its parameters were not measured by anybody: delay and lag are fitted, the defaults are where a fit
-starts. A bound on the command is a bound on the acceleration before delay and lag. The recordings
-that it was made for are described in docs/cursor-tracking.md.
+In `pursuit_plant` the hand's velocity answers, and the delay is one of whole samples, exactly:
+
+    c' = v,    tau v' + v = u(t - N T).
+
+States: error (px), velocity of the cursor (px/s), the commands that are on their way, the next one
+first (px/s). Input: command (px/s). There noise in the command is drift of the hand, which fades as
+a movement does.
+
+Their parameters were not measured by anybody: delay and lag are fitted, the defaults are where a
+fit starts. A bound on the command is one before delay and lag. The recordings that they were made
+for are described in docs/cursor-tracking.md.
 """
 
 from __future__ import annotations
@@ -27,7 +36,7 @@ from plants._checks import finite_number
 from plants._units import with_units
 from plants.actuation import delayed_muscle
 
-__all__ = ["cursor_plant"]
+__all__ = ["cursor_plant", "pursuit_plant"]
 
 
 def cursor_plant(
@@ -101,3 +110,66 @@ def cursor_plant(
         "target_rate": "velocity of the target",
     }
     return with_units(system, units, words)
+
+
+def pursuit_plant(
+    delay: int = 11, lag: float = 0.03, sample_time: float = 1 / 60, length: str = "px"
+) -> Any:
+    """Return the linear plant whose velocity is commanded, sampled with its inputs held.
+
+    Parameters
+    ----------
+    delay : int
+        N: whole samples from a command to what the hand does, at least 1. Chosen; to be fitted.
+    lag : float
+        tau in s: first-order lag of the hand's velocity. Chosen; to be fitted.
+    sample_time : float
+        T in s; a screen of 60 Hz by default.
+    length : str
+        The unit in which the recordings have the error.
+
+    Returns
+    -------
+    control.StateSpace
+        Discrete, ``2 + delay`` states; order and units in the module's text.
+
+    Raises
+    ------
+    ValueError
+        When an argument is out of range.
+    """
+    sample_time = finite_number("sample_time", sample_time, "give it in seconds", above=0.0)
+    lag = finite_number("lag", lag, "give it in seconds", above=0.0)
+    if isinstance(delay, bool) or not isinstance(delay, int) or delay < 1:
+        raise ValueError(f"delay: got {delay!r}; give whole samples, at least 1")
+    kept = np.exp(-sample_time / lag)
+    # The integral of an answer exp(-t/lag) over a sample: from a velocity to a distance.
+    moved = lag * (1 - kept)
+    n = 2 + delay
+    A, B = np.zeros((n, n)), np.zeros((n, 2))
+    A[0, :3] = 1.0, moved, sample_time - moved
+    A[1, 1:3] = kept, 1 - kept
+    A[2:-1, 3:] = np.eye(delay - 1)
+    B[-1, 0] = 1.0
+    B[0, 1] = -sample_time
+    commands = [f"command_{k}" for k in range(1, delay + 1)]
+    speeds = dict.fromkeys(["velocity", *commands, "command", "target_rate"], f"{length}/s")
+    system = control.ss(
+        A,
+        B,
+        np.eye(1, n),
+        np.zeros((1, 2)),
+        dt=sample_time,
+        name="pursuit",
+        states=["error", "velocity", *commands],
+        inputs=["command", "target_rate"],
+        outputs=["error"],
+    )
+    words = {
+        "error": "distance of the cursor from the target",
+        "velocity": "velocity of the cursor",
+        **{name: f"command of the hand in {k} samples" for k, name in enumerate(commands)},
+        "command": "velocity that the person asks for",
+        "target_rate": "velocity of the target",
+    }
+    return with_units(system, {"error": length, **speeds}, words)

@@ -3,10 +3,11 @@
 The recordings tell a gain; what is far from linear is the way from prices to gains. So near a fit
 the misfit is taken as a quadratic form of gain and metric, known from one simulation,
 
-    m^2(z) = |q + R (k(z) - k)|^2 + const,       k = (G^-1 K T, S),
+    m^2(z) = |q + R (k(z) - k)|^2 + rest,       k = (G^-1 K T, S),
 
 R and q the triangle and the residual in the columns of k, without what initial states and
-parameters can make up for, these to first order (docs/structures.md).
+parameters can make up for, these to first order; `rest` is what no gain near by makes up
+(docs/structures.md).
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import scipy.optimize
 from impc.arrays import Array
 from impc.errors import WeightsError
 from impc.inverse.consistent_pairs import scaled_changes
+from impc.inverse.solution_set import natural_coordinates
 from impc.inverse.structured_search import regulator_slopes
 from impc.model.riccati import solve_lqr
 
@@ -45,15 +47,19 @@ class NearFit:
         self.at = at
         size, m = len(at.residual), at.problem.plant.m
         # In natural units of the gain, so that the triangle is as well conditioned as can be.
+        T, G = natural_coordinates(at.problem.plant, np.array(at.solution.K))
+        self.right, self.left = T, np.linalg.inv(G)
         units = np.eye(at.solution.K.size).reshape(-1, *at.solution.K.shape)
-        unit = np.linalg.inv(at.natural(units).reshape(len(units), -1))
+        unit = np.linalg.inv(self._natural(units).reshape(len(units), -1))
         columns = [at.found.dK.reshape(size, -1) @ unit.T]
         columns += [at.found.dS.reshape(size, -1)] if m > 1 else []
         seen = at.without_nuisance(np.hstack(columns))
         self.triangle: Array = np.asarray(np.linalg.qr(seen, mode="r"), dtype=np.float64)
         self.here = self._place(at.solution)
         # R'q = (columns)'residual: what of the residual lies in the columns.
-        self.rest = np.linalg.pinv(self.triangle.T) @ (seen.T @ np.array(at.residual))
+        residual = at.without_nuisance(np.array(at.residual)[:, None])[:, 0]
+        self.inside = np.linalg.pinv(self.triangle.T) @ (seen.T @ residual)
+        self.rest = float(residual @ residual - self.inside @ self.inside)
 
     def least(self, z: Array, along: Array, aim: LqrSolution | None = None) -> tuple[float, Array]:
         """Least m^2 from z along columns, and the unknowns there.
@@ -70,12 +76,14 @@ class NearFit:
         Returns
         -------
         float
-            m^2, up to its constant.
+            m^2.
         Array
             Unknowns (count,).
         """
         moving = np.isfinite(z)
-        offset = self.rest if aim is None else self.triangle @ (self.here - self._place(aim))
+        offset, rest = self.inside, self.rest
+        if aim is not None:
+            offset, rest = self.triangle @ (self.here - self._place(aim)), 0.0
         weight = self.at.noise / _SPREAD
         kept: dict[bytes, tuple[Array, Array]] = {}
 
@@ -106,11 +114,15 @@ class NearFit:
                 residual, step, jac=derivative, ftol=1e-6, max_nfev=_TRIES
             ).x
         data = residual(step)[: len(self.triangle)]
-        return float(data @ data), _moved(z, moving, along @ step)
+        return float(data @ data) + rest, _moved(z, moving, along @ step)
+
+    def _natural(self, gains: Array) -> Array:
+        """G^-1 K T, (..., m, n), of gains (..., m, n)."""
+        return np.asarray(self.left @ gains @ self.right)
 
     def _place(self, solution: LqrSolution) -> Array:
         """k of a regulator."""
-        gain = self.at.natural(np.array(solution.K)).ravel()
+        gain = self._natural(np.array(solution.K)).ravel()
         if solution.plant.m == 1:
             return np.asarray(gain)
         S = np.array(solution.S)
@@ -121,7 +133,7 @@ class NearFit:
         problem, structure = self.at.problem.known(), self.at.structure
         solution = solve_lqr(problem.plant, structure.weights(z))
         dK, dS = regulator_slopes(problem, structure, z, solution)
-        slopes = self.at.natural(dK[moving]).reshape(int(np.sum(moving)), -1)
+        slopes = self._natural(dK[moving]).reshape(int(np.sum(moving)), -1)
         if problem.plant.m > 1:
             turned = scaled_changes(np.array(solution.S), dS[moving])
             slopes = np.hstack([slopes, turned.reshape(len(slopes), -1)])

@@ -1,7 +1,8 @@
 """Intervals of prices, and of ratios of two, by profile likelihood.
 
-With a combination a'z of the unknowns held at v, all other prices are fitted again, near the fit
-(`near_fit`). With m(v) the least misfit,
+With a combination a'z of the unknowns held at v, all other prices are fitted again: in the
+quadratic form of the gain near the fit (`near_fit`), then in that near the end. With m(v) the
+least misfit,
 
     D(v) = (m^2(v) - m^2(v*)) / (s^2 f),
 
@@ -12,8 +13,9 @@ be zero: the answer is "at most" (docs/structures.md).
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -22,6 +24,7 @@ import scipy.stats
 from impc.arrays import Array
 from impc.assess.intervals import LEVEL
 from impc.assess.near_fit import NearFit
+from impc.assess.structured_weights import tangent
 
 if TYPE_CHECKING:
     from impc.assess.structured_weights import PriceCovariance, Tangent
@@ -33,6 +36,8 @@ _FARTHEST = 12.0
 # Of a deviation: how near to its end an interval ends.
 _END = 2e-2
 _TRIES = 12
+# An end stays when new recordings there move it by less than this share of a deviation.
+_STAYS, _ROUNDS = 0.05, 4
 # D where there is no regulator.
 _HUGE = 1e12
 
@@ -62,7 +67,7 @@ class PriceInterval:
 
 
 class PriceProfiles:
-    """Intervals from the misfit near a fit.
+    """Intervals from the misfit near a fit, and near each end.
 
     Parameters
     ----------
@@ -90,13 +95,13 @@ class PriceProfiles:
         """
         deviation, wider = self.covariance.spread(combination)
         quantile = float(scipy.stats.chi2.ppf(level, 1)) * wider**2
-        moving = self.at.moving
-        value = float(combination[moving] @ self.at.prices[moving])
+        moving, prices = self.at.moving, np.array(self.at.prices)
+        value = float(combination[moving] @ prices[moving])
         if not np.isfinite(deviation):
             return PriceInterval(value, -np.inf, np.inf, level)
         step = min(max(deviation, 1e-9), 1.0)
         low, high = (
-            self._walk(combination, np.array(self.at.prices), (value, sign * step), quantile)
+            self._end(_Line(combination, prices, value, sign * step), quantile)
             for sign in (-1.0, 1.0)
         )
         return PriceInterval(value, low, high, level)
@@ -113,9 +118,8 @@ class PriceProfiles:
         """
         near = np.array(self.at.prices)
         near[index] = self._smallest_seen(index)
-        row = np.eye(len(near))[index]
-        quantile = float(scipy.stats.chi2.ppf(level, 1))
-        high = self._walk(row, near, (float(near[index]), 0.5), quantile)
+        line = _Line(np.eye(len(near))[index], near, float(near[index]), 0.5)
+        high = self._end(line, float(scipy.stats.chi2.ppf(level, 1)))
         return PriceInterval(-np.inf, -np.inf, high, level)
 
     def _smallest_seen(self, index: int) -> float:
@@ -124,56 +128,99 @@ class PriceProfiles:
         size = max(float(np.linalg.norm(column)), 1e-300)
         return float(np.log(0.1 * self.at.noise / size))
 
-    def _walk(self, row: Array, near: Array, begin: tuple[float, float], quantile: float) -> float:
-        """Where D passes the quantile on the way from a value in growing steps, or infinity."""
-        inside, step = begin
-        here, before = near, 0.0
-        while abs(inside - begin[0]) < _FARTHEST:
-            outside = inside + step
-            distance, there = self._distance(row, outside, here)
-            if distance > quantile:
-                return self._crossing(row, here, ((inside, before), (outside, distance)), quantile)
-            inside, here, before, step = outside, there, distance, 1.6 * step
-        return float(np.sign(step) * np.inf)
+    def _end(self, line: _Line, quantile: float) -> float:
+        """Where D passes the quantile along a line, or infinity.
+
+        Recordings answer a gain that is far from the fit's otherwise than one that is near: they
+        are simulated again where the end is found, until it stays.
+        """
+        end, there = self._passing(self.near, line, (line.value, line.prices), quantile)
+        for _ in range(_ROUNDS):
+            before, value = end, float(line.row[np.isfinite(there)] @ there[np.isfinite(there)])
+            form = NearFit(self._simulated(there))
+            end, there = self._passing(form, line, (value, there), quantile)
+            if end == before or abs(end - before) < _STAYS * abs(line.step):
+                break
+        return end
+
+    def _simulated(self, prices: Array) -> Tangent:
+        """The recordings at other prices, with the noise of the fit."""
+        there = tangent(self.at.structure, self.at.problem, prices)
+        return dataclasses.replace(there, noise=self.at.noise)
+
+    def _passing(
+        self, form: NearFit, line: _Line, begin: tuple[float, Array], quantile: float
+    ) -> tuple[float, Array]:
+        """Where D of a form passes the quantile, looked for from a place in growing steps.
+
+        Away from the fit where D is less there, towards it where it is more.
+        """
+        value, here = begin
+        distance, here = self._distance(form, line.row, value, here)
+        outwards = distance <= quantile
+        step = line.step if outwards else -line.step
+        while not outwards or abs(value - line.value) < _FARTHEST:
+            beyond = value + step
+            if not outwards and (beyond - line.value) * line.step <= 0:
+                further, there, beyond = 0.0, line.prices, line.value
+            else:
+                further, there = self._distance(form, line.row, beyond, here)
+            if (further > quantile) == outwards:
+                ends = ((value, distance, here), (beyond, further, there))
+                inside, outside = ends if outwards else ends[::-1]
+                return self._crossing(form, line.row, (inside, outside), quantile)
+            value, here, distance, step = beyond, there, further, 1.6 * step
+        return float(np.sign(line.step) * np.inf), here
 
     def _crossing(
         self,
+        form: NearFit,
         row: Array,
-        near: Array,
-        bracket: tuple[tuple[float, float], tuple[float, float]],
+        bracket: tuple[tuple[float, float, Array], tuple[float, float, Array]],
         quantile: float,
-    ) -> float:
+    ) -> tuple[float, Array]:
         """Where D passes the quantile between two values: its root is all but linear."""
-        (inside, less), (outside, more) = bracket
+        (inside, less, near), (outside, more, _) = bracket
         wanted, step = np.sqrt(quantile), abs(outside - inside)
         for _ in range(_TRIES):
             roots = np.sqrt(max(less, 0.0)), np.sqrt(min(more, _HUGE))
             share = float(np.clip((wanted - roots[0]) / (roots[1] - roots[0]), 0.1, 0.9))
             middle = inside + share * (outside - inside)
-            distance, there = self._distance(row, middle, near)
+            distance, there = self._distance(form, row, middle, near)
             if abs(np.sqrt(max(distance, 0.0)) - wanted) < _END:
-                return middle
+                return middle, there
             if distance > quantile:
                 outside, more = middle, distance
             else:
                 inside, less, near = middle, distance, there
             if abs(outside - inside) < _END * step:
                 break
-        return inside
+        return inside, near
 
-    def _distance(self, row: Array, value: float, near: Array) -> tuple[float, Array]:
+    def _distance(
+        self, form: NearFit, row: Array, value: float, near: Array
+    ) -> tuple[float, Array]:
         """D for white residuals with the combination held, and the unknowns there."""
         moving = np.isfinite(near)
         own = row[moving]
         z = near.copy()
         z[moving] += (value - float(own @ near[moving])) / float(own @ own) * own
-        best, there = self.near.least(z, scipy.linalg.null_space(own[None]))
+        best, there = form.least(z, scipy.linalg.null_space(own[None]))
         for index in np.flatnonzero(~moving[: len(self.at.structure.labels)]):
             # A price of zero may be worth having once another is held elsewhere.
             other = z.copy()
             other[index] = self._smallest_seen(int(index))
             free = row[np.isfinite(other)]
-            found, place = self.near.least(other, scipy.linalg.null_space(free[None]))
+            found, place = form.least(other, scipy.linalg.null_space(free[None]))
             if found < best:
                 best, there = found, place
         return (best - self.base) / self.variance, there
+
+
+class _Line(NamedTuple):
+    """A combination of unknowns (count,), these and its value in the fit, a step to an end."""
+
+    row: Array
+    prices: Array
+    value: float
+    step: float

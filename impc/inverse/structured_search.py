@@ -29,7 +29,7 @@ from impc.inverse.consistent_pairs import scaled_changes
 from impc.inverse.coordinates import PARAMETER_UNIT, Compressed, Coordinates, Point
 from impc.inverse.many_trials import has_many_trials, search_many
 from impc.inverse.problem import recorded_size
-from impc.inverse.residuals import unusable
+from impc.inverse.residuals import evaluate, unusable
 from impc.model.plant_family import plant_differential
 from impc.model.riccati import LqrSolution, regulator_changes, solve_lqr
 
@@ -56,6 +56,8 @@ _EVALUATIONS = 60
 # Of the last search, in misfit: 2e-4 of chi-squared on 18000 samples.
 _FINE = 1e-8
 _ENDLESS = 1e6
+# Of chi-squared's units: a misfit that falls by less when the prior is begun anew was not held.
+_PULL = 0.1
 
 
 def regulator_slopes(
@@ -233,7 +235,8 @@ def search_from(
     space = PriceCoordinates(problem, structure, prices)
     z, spent, settled = _rounds(space, max_evaluations)
     here = _Place(problem, structure, space.unknowns(z), space.unpack(z).problem)
-    return _with_zeros(_polished(here, spent, settled), here, max_evaluations)
+    end = _with_zeros(_polished(here, spent, settled), here, max_evaluations)
+    return _without_pull(_without_zeros(end, here, max_evaluations), structure, max_evaluations)
 
 
 @dataclass(frozen=True)
@@ -269,15 +272,14 @@ def _rounds(space: PriceCoordinates, budget: int) -> tuple[Array, int, bool]:
 
 
 def _polished(place: _Place, spent: int, settled: bool) -> StructuredEnd:
-    """Without the prior along what the recordings tell of the prices."""
+    """Without the prior along what the recordings tell of the prices, with one about here."""
     space, z = place.space()
     noise = _misfit(space, z) / np.sqrt(_samples(space.problem))
     rows, deviations = space.deviations(z, noise)
     count = int(space.ends[0])
-    told = rows[deviations < _FREE]
-    along = scipy.linalg.block_diag(told.T, np.eye(len(z) - count))
-    weights = np.full(along.shape[1], noise)
-    weights[: len(told)] = 0.0
+    along = scipy.linalg.block_diag(rows.T, np.eye(len(z) - count))
+    weights = np.full(len(z), noise)
+    weights[:count] *= (deviations >= _FREE) / _SPREAD
     z, more = _descend(space, z, along, weights, _FINE, _EVALUATIONS)
     here = space.unpack(z)
     return StructuredEnd(
@@ -341,6 +343,47 @@ def _with_zeros(end: StructuredEnd, place: _Place, budget: int) -> StructuredEnd
             continue
         if without.misfit <= end.misfit * (1 + _NOISY_TOLERANCE):
             end = without
+    return end
+
+
+def _without_zeros(end: StructuredEnd, place: _Place, budget: int) -> StructuredEnd:
+    """The same with a price where zero was not the best: other prices had to move for it."""
+    for index in np.flatnonzero(np.isneginf(end.prices) & np.isfinite(place.prices)):
+        if end.evaluations >= budget:
+            break
+        prices = np.array(end.prices)
+        prices[index] = _seen_from(end, place, int(index))
+        here = replace(place, prices=prices, there=end.problem)
+        found = _polished(here, end.evaluations, end.settled)
+        if found.misfit < end.misfit * (1 - _NOISY_TOLERANCE):
+            end = found
+    return end
+
+
+def _seen_from(end: StructuredEnd, place: _Place, index: int) -> float:
+    """Logarithm of the price that moves the outputs by one deviation, all else held."""
+    solution = solve_lqr(end.problem.plant, place.structure.weights(np.array(end.prices)))
+    dK, dS = regulator_slopes(end.problem, place.structure, np.array(end.prices), solution)
+    found = evaluate(end.problem, np.array(solution.K), np.array(solution.S))
+    size = len(found.residual)
+    column = found.dK.reshape(size, -1) @ dK[index].ravel()
+    column += found.dS.reshape(size, -1) @ scaled_changes(np.array(solution.S), dS)[index].ravel()
+    return float(np.log(end.misfit / np.sqrt(size) / max(np.linalg.norm(column), 1e-300)))
+
+
+def _without_pull(end: StructuredEnd, structure: Structure, budget: int) -> StructuredEnd:
+    """The same where the prior, begun anew about the end, has nothing more to hold back."""
+    samples = _samples(end.problem)
+    for _ in range(_ROUNDS):
+        if end.evaluations >= budget:
+            break
+        here = _Place(end.problem, structure, np.array(end.prices), end.problem)
+        found = _polished(here, end.evaluations, end.settled)
+        fell = samples * (1 - (found.misfit / end.misfit) ** 2)
+        if fell > 0:
+            end = found
+        if fell < _PULL:
+            break
     return end
 
 

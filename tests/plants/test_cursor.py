@@ -49,3 +49,24 @@ def test_a_step_command_gives_the_position_of_a_delayed_lag() -> None:
 def test_bad_arguments(arguments: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=next(iter(arguments)).replace("delay_order", "order")):
         plants.cursor_plant(**arguments)  # type: ignore[arg-type]
+
+
+def test_the_pursued_hand_answers_whole_samples_late() -> None:
+    """c(t) of lag v' + v = 1 from the sample at which the command arrives, by its closed form."""
+    delay, lag, dt = 7, 0.04, 1 / 60
+    system = plants.pursuit_plant(delay, lag, dt)
+    time = np.arange(60) * dt
+    inputs = np.vstack([np.ones_like(time), np.zeros_like(time)])
+    response = control.forced_response(system, time, inputs)
+    since = np.maximum(time - delay * dt, 0.0)
+    exact = since - lag * (1 - np.exp(-since / lag))
+    np.testing.assert_allclose(response.outputs[0], exact, atol=1e-14)
+    np.testing.assert_array_equal(system.B[:, 1], [-dt, *np.zeros(delay + 1)])
+
+
+@pytest.mark.parametrize(
+    "arguments", [{"delay": 0}, {"delay": 1.5}, {"delay": True}, {"lag": 0}, {"sample_time": -1}]
+)
+def test_bad_arguments_of_the_pursued_hand(arguments: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match=next(iter(arguments))):
+        plants.pursuit_plant(**arguments)  # type: ignore[arg-type]
