@@ -3,9 +3,9 @@
 Straub and Rothkopf (eLife 11:e76635, 2022) infer costs and noise of linear-quadratic Gaussian
 regulators. Their two models of tracking are fitted here by their own `conditional_moments` and
 gains, to the log-likelihood of the cursor given target and past, for the same halves of the trials
-and the same samples. As there the target is shifted by whole samples; the delay that tells the fitted
-trials best is taken of three. Everything else is searched to the maximum, which their Adam steps
-do not reach, and an offset beside the target is searched too: `lqg` has none.
+and the same samples. As there the target is shifted by 12 samples. Everything else is searched to
+the maximum, which their Adam steps do not reach, and an offset beside the target is searched too:
+`lqg` has none.
 
 It needs the extra `bench`, without which it says so:
 
@@ -37,8 +37,8 @@ if TYPE_CHECKING:
 
 __all__ = ["PeerRow", "peer_half"]
 
-# 12 samples is the delay of their data; where their levels begin, in pixels and pixels a second.
-_DELAYS = (10, 12, 14)
+# Samples: the delay of their data. Then where their levels begin, in pixels and pixels a second.
+_DELAY = 12
 _STARTS = {
     "BoundedActor": {
         "action_variability": 0.5,
@@ -68,30 +68,20 @@ class PeerRow:
     half: int
     inside: float
     outside: float
-    delay: int
     offset: float
     numbers: dict[str, float]
     evaluations: int
 
 
 def peer_half(condition: Condition, half: int, model: str) -> PeerRow:
-    """The best of the delays for a half of the trials of a condition."""
+    """A half of the trials of a condition by one of their models, judged on the other half."""
     every = np.arange(len(condition.target))
-    mine, others = every[half::2], every[1 - half :: 2]
-    return max(
-        (_fitted(condition, (mine, others), half, model, delay) for delay in _DELAYS),
-        key=lambda row: row.inside,
-    )
-
-
-def _fitted(
-    condition: Condition, parts: tuple[IntArray, IntArray], half: int, model: str, delay: int
-) -> PeerRow:
+    parts = every[half::2], every[1 - half :: 2]
     jax = importlib.import_module("jax")
     jax.config.update("jax_enable_x64", True)
-    mine, others = (_shifted(condition, part, delay) for part in parts)
+    mine, others = (_shifted(condition, part) for part in parts)
     steps = np.diff(condition.target[parts[0]], axis=1)
-    told = _told(jax, model, delay, float(np.std(steps)))
+    told = _told(jax, model, float(np.std(steps)))
     slopes = jax.jit(jax.value_and_grad(lambda theta: -told(theta, mine)))
 
     def objective(theta: Array) -> tuple[float, Array]:
@@ -114,20 +104,19 @@ def _fitted(
         half,
         -float(found.fun),
         float(told(found.x, others)),
-        delay,
         float(found.x[-1] * _PIXELS),
         dict(zip(_STARTS[model], np.exp(found.x[:-1]).tolist(), strict=True)),
         int(found.nfev),
     )
 
 
-def _shifted(condition: Condition, which: IntArray, delay: int) -> Array:
+def _shifted(condition: Condition, which: IntArray) -> Array:
     """Target and cursor (trials, samples, 2), the cursor's own delay taken off."""
     target, response = condition.target[which], condition.response[which]
-    return np.stack([target[:, :-delay], response[:, delay:]], axis=-1)
+    return np.stack([target[:, :-_DELAY], response[:, _DELAY:]], axis=-1)
 
 
-def _told(jax: Any, model: str, delay: int, steps: float) -> Callable[[Any, Array], Any]:
+def _told(jax: Any, model: str, steps: float) -> Callable[[Any, Array], Any]:
     """Mean log-likelihood of the cursor from sample FIRST on, at theta (q,)."""
     jnp = jax.numpy
     make = getattr(importlib.import_module("lqg.tracking"), model)
@@ -145,7 +134,7 @@ def _told(jax: Any, model: str, delay: int, steps: float) -> Callable[[Any, Arra
         left = error[:, :, 1] - slope * error[:, :, 0]
         variance = spread[:, :, 1, 1] - slope * spread[:, :, 1, 0]
         each = -(jnp.log(2 * jnp.pi * variance) + left**2 / variance) / 2
-        return jnp.mean(each[:, FIRST - delay - 1 :])
+        return jnp.mean(each[:, FIRST - _DELAY - 1 :])
 
     return told
 

@@ -1,12 +1,13 @@
 """People following a blurred target as people who sense with noise, judged on trials left out.
 
 The hand's velocity follows a command that arrives whole samples late (`plants.pursuit_plant`). The
-person sees the error with noise, feels the speed of the hand with noise, does not know how the
-target goes on and takes its velocity for a random walk; commands follow from the estimate, by
-the price of the error beside that of the command. Motor noise enters with the command, and what
-moves the cursor beside is white from sample to sample. Everything but the delay is searched by
-maximum likelihood (docs/noisy-people.md), for each of some delays; people sit a few pixels beside
-the target, so the mean error is taken off, and then what the likelihood would rather have.
+person sees the error with noise, feels the speed of the hand with noise, and knows how the target
+moves: by steps that no step before tells, of the size that they have. Commands follow from the
+estimate, by the price of the error beside that of the command. Motor noise enters with the command,
+and what moves the cursor beside is white from sample to sample. Everything but the delay is
+searched by maximum likelihood (docs/noisy-people.md), for each of some delays; people sit a few
+pixels beside the target, so the mean error is taken off, and then what the likelihood would rather
+have.
 
 Of each blur the even trials are fitted and the odd ones judged, and the other way round: by the
 mean log-likelihood, in nats a sample, of the next position of the cursor given all before and the
@@ -30,6 +31,7 @@ from tqdm import tqdm
 
 import plants
 from experiments.cursor_data import RATE, Condition, data_file, read_conditions
+from experiments.cursor_steps import Expected, fit_steps, step_nats
 from impc.assess.person_covariance import person_covariance
 from impc.assess.person_models import prediction_errors
 from impc.assess.person_profile import level_intervals
@@ -59,7 +61,7 @@ DELAYS = (6, 8, 10, 12, 14)
 FIRST = 180
 _LAG = 0.03
 # Where levels begin: px, px/s. A search from others ends at the same (tests).
-_BESIDE, _MOTOR, _SEEN, _FELT, _WALK, _RECORDER = 0.3, 60.0, 10.0, 20.0, 20.0, 0.2
+_BESIDE, _MOTOR, _SEEN, _FELT, _RECORDER = 0.3, 60.0, 10.0, 20.0, 0.2
 # Logarithm of the price about that of least squares.
 _SPREAD = 5.0
 
@@ -123,9 +125,16 @@ def _fitted(condition: Condition, which: IntArray, delay: int, offset: float) ->
         motor=_MOTOR,
         process=beside,
         sensory=[_SEEN, _FELT],
-        walk=_WALK,
+        walk=float(np.std([trial.disturbance for trial in problem.recordings])),
+        persistence=0.0,
     )
-    return fit_person(least_squares, person, recorder=np.array([_RECORDER]), spread=_SPREAD)
+    return fit_person(
+        least_squares,
+        person,
+        recorder=np.array([_RECORDER]),
+        spread=_SPREAD,
+        held=["walk"],
+    )
 
 
 def judged(follower: Follower, condition: Condition, which: IntArray) -> PersonFit:
@@ -167,6 +176,7 @@ class _Row:
     half: int
     inside: float
     outside: float
+    steps: float
     delay: int
     offset: float
     price: float
@@ -179,6 +189,7 @@ class _Row:
 
 
 _AHEAD = (1, 6, 12, 30)
+_TOLD = ("outside", "steps")
 
 
 def _half(condition: Condition, half: int) -> _Row:
@@ -186,22 +197,34 @@ def _half(condition: Condition, half: int) -> _Row:
     mine, others = every[half::2], every[1 - half :: 2]
     follower = fit_follower(condition, mine)
     there = judged(follower, condition, others)
+    steps = fit_steps(_expected(follower.fit, condition, mine))
+    told = nats(there), step_nats(steps, _expected(there, condition, others))
     ahead = prediction_errors(there, _AHEAD)[:, 0].tolist()
-    return _row(condition.blur, half, follower, nats(there), {}, ahead)
+    return _row(condition.blur, half, follower, told, {}, ahead)
+
+
+def _expected(fit: PersonFit, condition: Condition, which: IntArray) -> Expected:
+    """What the filter expects of the cursor, from the first sample that is judged."""
+    position = condition.response[which]
+    off = np.array([trial.innovations[:, 0] for trial in fit.told.trials])
+    spread = np.array([trial.spreads[:, 0, 0] for trial in fit.told.trials])
+    parts = position, np.roll(position, 1, axis=1), position - off, np.sqrt(spread)
+    return Expected(*(part[:, FIRST:].ravel() for part in parts))
 
 
 def _whole(condition: Condition, delays: tuple[int, ...]) -> _Row:
     follower = fit_follower(condition, np.arange(len(condition.target)), delays)
     intervals = level_intervals(follower.fit, person_covariance(follower.fit))
     named = dict(zip(follower.fit.space.names, intervals.tolist(), strict=True))
-    return _row(condition.blur, -1, follower, float("nan"), named, [])
+    nothing = float("nan"), float("nan")
+    return _row(condition.blur, -1, follower, nothing, named, [])
 
 
 def _row(
     blur: float,
     half: int,
     follower: Follower,
-    outside: float,
+    outside: tuple[float, float],
     intervals: dict[str, list[float]],
     ahead: list[float],
 ) -> _Row:
@@ -213,7 +236,7 @@ def _row(
         blur,
         half,
         nats(fit),
-        outside,
+        *outside,
         follower.delay,
         follower.offset,
         float(np.exp(fit.prices[0])),
@@ -229,21 +252,21 @@ def _row(
 def _table(rows: list[_Row]) -> str:
     """Halves: how well the other half is told."""
     lines = [
-        "| blur, px | nats a sample, even, odd trials left out | mean "
+        "| blur, px | nats a sample, even, odd trials left out | mean | with steps and rests "
         "| errors 1, 6, 12, 30 samples ahead, px |",
-        "|---|---|---|---|",
+        "|---|---|---|---|---|",
     ]
     for blur in sorted({row.blur for row in rows}):
         pair = sorted(
             (row for row in rows if row.blur == blur), key=lambda row: -row.half
         )  # half 1 leaves the even trials out
         each = ", ".join(f"{row.outside:.4f}" for row in pair)
-        mean = np.mean([row.outside for row in pair])
+        mean, steps = (np.mean([getattr(row, name) for row in pair]) for name in _TOLD)
         ahead = np.sqrt(np.mean(np.square([row.ahead for row in pair]), axis=0))
         far = ", ".join(f"{value:.2f}" for value in ahead)
-        lines.append(f"| {blur:.0f} | {each} | {mean:.4f} | {far} |")
-    mean = np.mean([row.outside for row in rows])
-    return "\n".join([*lines, f"| mean | | {mean:.4f} | |"])
+        lines.append(f"| {blur:.0f} | {each} | {mean:.4f} | {steps:.4f} | {far} |")
+    mean, steps = (np.mean([getattr(row, name) for row in rows]) for name in _TOLD)
+    return "\n".join([*lines, f"| mean | | {mean:.4f} | {steps:.4f} | |"])
 
 
 def _numbers(rows: list[_Row]) -> str:

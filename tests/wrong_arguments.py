@@ -183,6 +183,7 @@ def calls() -> list[Call]:
                 "process": size,
                 "sensory": 0.1,
                 "walk": 0.2,
+                "persistence": 0.5,
             },
         ),
         (lqr.solve_lqr, {"plant": v["plant"], "weights": v["weights"]}),

@@ -37,7 +37,7 @@ _FARTHEST = 12.0
 _END = 2e-2
 _TRIES = 12
 # An end stays when new recordings there move it by less than this share of a deviation.
-_STAYS, _ROUNDS = 0.05, 4
+_STAYS, _ROUNDS = 0.05, 12
 # D where there is no regulator.
 _HUGE = 1e12
 
@@ -132,13 +132,25 @@ class PriceProfiles:
         """Where D passes the quantile along a line, or infinity.
 
         Recordings answer a gain that is far from the fit's otherwise than one that is near: they
-        are simulated again where the end is found, until it stays.
+        are simulated again where the end is found, until it stays, between places with less and
+        with more. Where the body falls is more.
         """
-        end, there = self._passing(self.near, line, (line.value, line.prices), quantile)
+        inside, outside = line.prices, None
+        end, there = self._passing(self.near, line, line.prices, quantile)
         for _ in range(_ROUNDS):
-            before, value = end, float(line.row[np.isfinite(there)] @ there[np.isfinite(there)])
-            form = NearFit(self._simulated(there))
-            end, there = self._passing(form, line, (value, there), quantile)
+            before, again = end, self._simulated(there)
+            more, further = True, None
+            if not again.found.reason:
+                form = NearFit(again)
+                distance, there = self._distance(form, line.row, line.at(there), there)
+                more = distance > quantile
+                end, further = self._passing(form, line, there, quantile)
+            inside, outside = (inside, there) if more else (there, outside)
+            if further is None or not line.between(inside, end, outside):
+                assert outside is not None
+                further = _middle(inside, outside)
+                end = line.at(further)
+            there = further
             if end == before or abs(end - before) < _STAYS * abs(line.step):
                 break
         return end
@@ -149,13 +161,13 @@ class PriceProfiles:
         return dataclasses.replace(there, noise=self.at.noise)
 
     def _passing(
-        self, form: NearFit, line: _Line, begin: tuple[float, Array], quantile: float
+        self, form: NearFit, line: _Line, here: Array, quantile: float
     ) -> tuple[float, Array]:
         """Where D of a form passes the quantile, looked for from a place in growing steps.
 
         Away from the fit where D is less there, towards it where it is more.
         """
-        value, here = begin
+        value = line.at(here)
         distance, here = self._distance(form, line.row, value, here)
         outwards = distance <= quantile
         step = line.step if outwards else -line.step
@@ -224,3 +236,20 @@ class _Line(NamedTuple):
     prices: Array
     value: float
     step: float
+
+    def at(self, prices: Array) -> float:
+        """Value of the combination elsewhere."""
+        finite = np.isfinite(prices)
+        return float(self.row[finite] @ prices[finite])
+
+    def between(self, inside: Array, value: float, outside: Array | None) -> bool:
+        """Whether a value lies between those of two places; with one, beyond that."""
+        side = np.sign(self.step)
+        nearest = side * self.at(inside) <= side * value
+        return bool(nearest and (outside is None or side * value < side * self.at(outside)))
+
+
+def _middle(one: Array, other: Array) -> Array:
+    """Half-way between unknowns; as in the first where one of the two is no number."""
+    both = np.isfinite(one) & np.isfinite(other)
+    return np.where(both, (one + np.where(both, other, 0.0)) / 2, one)

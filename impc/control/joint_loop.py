@@ -9,7 +9,7 @@ where nothing but u depends on the controller. An error that nobody commands kee
 
     e+  = (A - L C_s) e - E dh + E d + B w + p - L v      (with a known perturbation: without E)
     xh+ = A xh + E dh + B u + L C_s e + L v
-    dh+ = dh + L_d C_s e + L_d v
+    dh+ = r dh + L_d C_s e + L_d v      (r the persistence that is believed, 1 for a random walk)
 
 At the first sample the estimate is a value to be given, and the error has the covariance that it
 keeps: the person has been at it for some time (docs/noisy-people.md).
@@ -230,7 +230,7 @@ def _transition(plant: Plant, person: Observer, L: Array) -> tuple[Array, Array]
     else:
         E[rows.error] = plant.E
         F[rows.error, rows.walk], F[rows.estimate, rows.walk] = -plant.E, plant.E
-        F[rows.walk, rows.walk] = np.eye(plant.E.shape[1])
+        F[rows.walk, rows.walk] = np.diag(person.persistence)
     return F, E
 
 

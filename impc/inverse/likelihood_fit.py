@@ -14,7 +14,7 @@ import numpy as np
 
 from impc.arrays import Array, Frozen, frozen
 from impc.checking import checked
-from impc.errors import ImpcError, SolverError
+from impc.errors import ImpcError, InputError, SolverError
 from impc.inverse.coordinates import Coordinates
 from impc.inverse.likelihood_search import Prior, climb, reach
 from impc.inverse.person_coordinates import PersonCoordinates
@@ -24,6 +24,8 @@ from impc.model.observer import LEVELS
 from impc.model.riccati import lyapunov_series
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from impc.inverse.estimates import Estimate
     from impc.inverse.person_coordinates import Told
     from impc.inverse.problem import Problem
@@ -107,6 +109,7 @@ def fit_person(
     recorder: Array | None = None,
     spread: float = 1.0,
     max_evaluations: int = 100,
+    held: Sequence[str] = (),
 ) -> PersonFit:
     """Fit gain or prices, levels of noise, initial states and parameters by maximum likelihood.
 
@@ -125,6 +128,9 @@ def fit_person(
         of gain, initial states and parameters, or of each price's logarithm; infinite for none.
     max_evaluations : int
         Filters of all recordings with derivatives, at most.
+    held : sequence of str
+        Kinds of levels that are not searched but known: of "motor", "share", "process", "sensory"
+        and "walk".
 
     Returns
     -------
@@ -132,6 +138,8 @@ def fit_person(
 
     Raises
     ------
+    InputError
+        When a kind of levels is none of these.
     SolverError
         When no start has a likelihood.
 
@@ -157,13 +165,15 @@ def fit_person(
     >>> likely.converged, bool(0.4 < likely.observer.motor[0] < 0.6)
     (True, True)
     """
+    if unknown := [kind for kind in held if kind not in LEVELS]:
+        raise InputError("held", f"got {unknown[0]!r}", f"give some of {', '.join(LEVELS)}")
     space = _space(found)
     plant = found.problem.plant
     residual = residual_only(found.problem, found.gain, found.metric)
     size = _sizes(found, residual.reshape(-1, len(plant.outputs)) * found.problem.output_scale)
     starts = []
     white = size.recorder if recorder is None else np.asarray(recorder)
-    first = PersonCoordinates(space, observer, white)
+    first = PersonCoordinates(space, observer, white, held)
     starts = [first.start]
     for inside, sensed, recorded in _STARTS if recorder is None else ():
         levels = _suggested(observer, size, inside, sensed)

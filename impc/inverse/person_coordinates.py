@@ -2,8 +2,8 @@
 
     theta = (coordinates of `Coordinates` or `PriceCoordinates` | logarithms of the levels)
 
-A level of zero stays zero, all others are searched: of the person's noise, and of the recorder's
-(docs/noisy-people.md).
+A level of zero stays zero and one that is held stays as it is, all others are searched: of the
+person's noise, and of the recorder's (docs/noisy-people.md).
 """
 
 from __future__ import annotations
@@ -21,10 +21,13 @@ from impc.inverse.coordinates import PARAMETER_UNIT
 from impc.inverse.problem import controller_for
 from impc.inverse.structured_search import PriceCoordinates
 from impc.model.bounds import bound_rows
+from impc.model.observer import LEVELS
 from impc.model.plant_family import plant_differential
 from impc.model.riccati import is_stable, lyapunov_series
 
 if TYPE_CHECKING:
+    from collections.abc import Collection
+
     from impc.control.constraint_rows import Directions
     from impc.control.controller import Controller
     from impc.control.joint_likelihood import Likelihood
@@ -88,12 +91,22 @@ class PersonCoordinates:
         Levels where the search begins.
     recorder : Array
         The recorder's (p,), positive.
+    held : collection of str
+        Kinds of the person's levels that are not searched, of `LEVELS`.
     """
 
-    def __init__(self, space: Coordinates, observer: Observer, recorder: Array) -> None:
+    def __init__(
+        self,
+        space: Coordinates,
+        observer: Observer,
+        recorder: Array,
+        held: Collection[str] = (),
+    ) -> None:
         self.space, self.observer = space, observer
         self.first = np.concatenate([observer.levels, recorder])
-        self.moving = np.flatnonzero(self.first)
+        kinds = [kind for kind in LEVELS for _ in observer.level(kind)]
+        free = np.array([*(kind not in held for kind in kinds), *[True] * len(recorder)])
+        self.moving = np.flatnonzero((self.first > 0) & free)
         self.start = np.concatenate([space.start, np.log(self.first[self.moving])])
         #: How many coordinates gain or prices have, where initial states begin and end, and how
         #: many unknowns are not levels.

@@ -388,11 +388,11 @@ def _without_pull(end: StructuredEnd, structure: Structure, budget: int) -> Stru
 
 
 def _widest(place: _Place, misfit: float, tried: set[int]) -> int | None:
-    """The price of a state with the widest deviation, if it is wide and was not tried."""
+    """The price of a state with the widest deviation, if it is wide, not the last, and untried."""
     structure = place.structure
-    if structure.coupled:
-        return None
     space, z = place.space()
+    if structure.coupled or np.count_nonzero(space.moving[: len(structure.labels)]) < 2:
+        return None
     rows, along = space.deviations(z, misfit / np.sqrt(_samples(space.problem)))
     own = np.full(structure.count, -np.inf)
     own[space.moving] = np.sqrt((rows**2).T @ np.minimum(along, _ENDLESS) ** 2)

@@ -7,8 +7,9 @@
 
 All noise is white from sample to sample and independent; a level is the standard deviation of one
 sample. A perturbation is known, dh = d, or believed to be a random walk whose steps have the
-deviation `walk`, and is estimated too: dh+ = dh + L_d (s - C_s xh). L is the stationary Kalman gain
-of what the person believes of plant and levels. A share of the command is left out there, so that
+deviation `walk`, and is estimated too: dh+ = r dh + L_d (s - C_s xh), with r = 1; with a
+`persistence` r below one it is believed to fade. L is the stationary Kalman gain of what the person
+believes of plant and levels. A share of the command is left out there, so that
 the gain stays the same. Who senses nothing in particular sees every state as it is: xh = x
 (docs/noisy-people.md).
 """
@@ -56,6 +57,8 @@ class Observer(Value):
         See the attributes; one number stands for all.
     walk : array_like, optional
         Left out, the perturbation is known.
+    persistence : array_like
+        See the attributes.
 
     Attributes
     ----------
@@ -74,11 +77,15 @@ class Observer(Value):
     walk : Array or None
         Standard deviation of the steps that each perturbation is believed to make (d,), in its
         unit; None when it is known.
+    persistence : Array
+        Share of each perturbation that is believed to be left a sample later (d,), where it is not
+        known: 1 for a random walk, 0 for one that is new at every sample, of the deviation `walk`.
 
     Raises
     ------
     InputError
-        When a signal is not known, a level is negative, or sensed signals have no noise.
+        When a signal is not known, a level is negative, sensed signals have no noise, or a
+        persistence is not between 0 and 1.
 
     Examples
     --------
@@ -98,6 +105,7 @@ class Observer(Value):
         "process": "n",
         "sensory": "*",
         "walk": "d",
+        "persistence": "d",
     }
 
     sensed: tuple[str, ...]
@@ -107,6 +115,7 @@ class Observer(Value):
     process: Array
     sensory: Array
     walk: Array | None
+    persistence: Array
 
     @checked
     def __init__(
@@ -119,6 +128,7 @@ class Observer(Value):
         process: ArrayLike = 0.0,
         sensory: ArrayLike = 0.0,
         walk: ArrayLike | None = None,
+        persistence: ArrayLike = 1.0,
     ) -> None:
         plant.require_discrete()
         rows = _sensed_rows(plant, sensed)
@@ -133,7 +143,11 @@ class Observer(Value):
             process=_levels("process", process, plant.n),
             sensory=_levels("sensory", sensory, len(rows)),
             walk=None if walk is None else _levels("walk", walk, d),
+            persistence=_levels("persistence", persistence, d),
         )
+        if np.any(self.persistence > 1):
+            got = self.persistence.tolist()
+            raise InputError("persistence", f"got {got}", "give shares between 0 and 1")
         if np.any(self.sensory == 0):
             raise InputError("sensory", "has a zero", "give each sensed signal some noise")
 
@@ -179,7 +193,7 @@ def believed_matrices(plant: Plant, person: Observer) -> tuple[Array, Array, Arr
     """
     unknown = person.walk is not None
     d = plant.E.shape[1] if unknown else 0
-    F = scipy.linalg.block_diag(plant.A, np.eye(d))
+    F = scipy.linalg.block_diag(plant.A, np.diag(person.persistence[:d]))
     F[: plant.n, plant.n :] = plant.E[:, :d]
     moved = plant.B @ np.diag(person.motor**2) @ plant.B.T + np.diag(person.process**2)
     steps = np.zeros(0) if person.walk is None else np.asarray(person.walk)

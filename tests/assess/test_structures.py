@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 
+import control
 import numpy as np
 import pytest
 import scipy.optimize
@@ -16,6 +17,7 @@ from impc.assess.price_profiles import PriceProfiles
 from impc.assess.structure_test import structure_test
 from impc.assess.structured_weights import Tangent, price_covariance, tangent
 from impc.checking import replace
+from impc.control.closed_loop import scenario, simulate
 from impc.control.controller import Controller
 from impc.inverse.problem import Problem
 from impc.inverse.residuals import residual_only
@@ -126,6 +128,42 @@ def test_an_interval_ends_where_the_recordings_say_and_not_where_a_line_does() -
     for value in (found.low, found.high):
         grown = (rows - rank) * (_least(at, 0, value) / best - 1)
         assert grown == pytest.approx(3.84 * covariance.spread(row)[1] ** 2, rel=0.1)
+
+
+def test_an_interval_ends_where_the_body_all_but_falls() -> None:
+    """An unstable plant near its limit, so noisy that a line sees no price that is too low.
+
+    Its misfit grows without end towards the price at which it falls.
+    """
+    system = control.ss(
+        [[1.2]], [[1, 1]], [[1]], 0, 1, inputs=["u", "d"], states=["x"], outputs=["x"]
+    )
+    plant = Plant(system, ["u"])
+    structure, bounds = Structure(plant, ["x"]), Bounds(plant, u_min=-1.8, u_max=1.8)
+    law = Controller(plant, structure.weights(np.zeros(1)), bounds, 5, terminal_set=False)
+    push = np.repeat([1.0, -1.0, 0.0, 1.0, 0.0, -1.0], 40)
+    x = law.simulate([0.0], disturbance=push).x[:-1]
+    outputs = x + 8.0 * np.random.default_rng(0).standard_normal(x.shape)
+    trial = Recording(plant, outputs, push)
+    end = search_from(
+        Problem(plant, bounds, 5, [trial], terminal_set=False), structure, np.zeros(1)
+    )
+    at = tangent(structure, end.problem, np.array(end.prices))
+    covariance = price_covariance(at)
+    found = PriceProfiles(at, covariance).interval(np.eye(1)[0])
+
+    def misfit(price: float) -> float:
+        other = Controller(
+            plant, structure.weights(np.array([price])), bounds, 5, terminal_set=False
+        )
+        run = simulate(other, scenario(plant, [0.0], disturbance=push))
+        return float(np.sum((run.x[:-1] - outputs) ** 2)) if run.complete else np.inf
+
+    best = misfit(float(end.prices[0]))
+    grown = (len(x) - covariance.rank) * (misfit(found.low) / best - 1)
+    assert grown == pytest.approx(3.84 * covariance.spread(np.eye(1)[0])[1] ** 2, rel=0.1)
+    assert misfit(found.low - 2.0) == np.inf
+    assert found.high == np.inf
 
 
 def _least(at: Tangent, index: int, value: float) -> float:

@@ -27,7 +27,7 @@ from impc.control.joint_loop import joint_loop
 from impc.control.noisy_person import PersonTrial, simulate_person
 from impc.errors import SolverError
 from impc.model.bounds import Bounds
-from impc.model.observer import Observer
+from impc.model.observer import Observer, believed_filter
 from impc.model.plant import Plant
 from tests.support import extrapolated_slope
 
@@ -50,6 +50,7 @@ class Someone(NamedTuple):
     process: float = 0.01
     sensory: tuple[float, ...] = (0.02, 0.05)
     walk: float | None = None
+    persistence: float = 1.0
     recorder: float = 0.02
     limit: float = np.inf
     horizon: int = 5
@@ -71,7 +72,7 @@ class Someone(NamedTuple):
         sensed = ["x", "v"][: len(self.sensory)]
         return Observer(
             self.plant(), sensed, motor=self.motor, share=self.share, process=self.process,
-            sensory=self.sensory, walk=self.walk,
+            sensory=self.sensory, walk=self.walk, persistence=self.persistence,
         )  # fmt: skip
 
     def moved(self, step: Array) -> Someone:
@@ -134,6 +135,7 @@ def likelihood(
 SENSES = [
     Someone(),
     Someone(walk=0.2),
+    Someone(walk=0.2, persistence=0.6),
     Someone(sensory=(0.02,)),
     Someone(sensory=()),
     Someone(sensory=(), motor=0.0),
@@ -168,6 +170,7 @@ SATURATING = Someone(limit=0.6)
 PEOPLE = [
     Someone(),
     Someone(walk=0.2),
+    Someone(walk=0.2, persistence=0.6),
     Someone(share=0.3),
     SATURATING,
     SATURATING._replace(walk=0.2),
@@ -190,6 +193,16 @@ def test_derivatives_equal_differences(who: Someone) -> None:
         exact = found.score.sum(axis=0) @ step
         # Differences of a sum of size 300 carry 1e-9 of rounding at these steps.
         assert exact == pytest.approx(slope[0], rel=1e-6, abs=1e-6)
+
+
+def test_a_perturbation_that_does_not_persist_is_noise_to_the_person() -> None:
+    """The person's gain is that of process noise E walk^2 E', and nothing is expected of it."""
+    fades = Someone(process=0.0, walk=0.2, persistence=0.0)
+    plant = fades.plant()
+    moved = Observer(plant, ["x", "v"], motor=np.hypot(0.3, 0.2), sensory=[0.02, 0.05])
+    found = believed_filter(plant, fades.observer()).L
+    np.testing.assert_allclose(found[:2], believed_filter(plant, moved).L, rtol=1e-10)
+    np.testing.assert_allclose(found[2:], 0, atol=1e-14)
 
 
 def test_the_stationary_covariance_changes_nothing() -> None:

@@ -9,7 +9,7 @@ import pytest
 from impc.arrays import Array
 from impc.control.controller import Controller
 from impc.control.noisy_person import simulate_person
-from impc.errors import ImpcError
+from impc.errors import ImpcError, InputError
 from impc.inverse.estimates import Estimate
 from impc.inverse.gain_search import fit_gain
 from impc.inverse.likelihood_fit import PersonFit, fit_person
@@ -114,6 +114,17 @@ def test_a_level_of_zero_is_not_searched(noisy: tuple[Observer, Estimate]) -> No
     assert seeing.observer.share[0] == 0
     assert np.all(seeing.observer.process == 0)
     assert seeing.space.names == ["motor u", "recorder x"]
+
+
+def test_a_level_that_is_known_is_not_searched(noisy: tuple[Observer, Estimate]) -> None:
+    held = fit_person(noisy[1], noisy[0], held=["sensory"])
+    assert held.observer.sensory[0] == noisy[0].sensory[0]
+    assert held.space.names == ["motor u", "recorder x"]
+    free = fit_person(noisy[1], noisy[0])
+    assert free.count == held.count + 1
+    assert 0 <= free.log_likelihood - held.log_likelihood < 4  # chi-squared's, of one number
+    with pytest.raises(InputError, match="held: got 'noise'; give some of motor, share"):
+        fit_person(noisy[1], noisy[0], held=["noise"])
 
 
 def test_without_noise_in_the_loop_it_is_the_fit_of_least_squares() -> None:

@@ -44,6 +44,7 @@ def test_levels_are_read_and_written_in_one_order() -> None:
         ({"sensed": ["x"], "sensory": 0}, "sensory: has a zero"),
         ({"motor": -1}, "motor: got"),
         ({"walk": 1}, "walk: is given, but every state is seen"),
+        ({"persistence": 1.1}, "persistence: got \\[1.1\\]; give shares between 0 and 1"),
     ],
 )
 def test_what_cannot_be_meant_is_refused(given: dict[str, object], message: str) -> None:

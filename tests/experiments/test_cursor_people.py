@@ -1,0 +1,82 @@
+"""Followers of a target who sense with noise: simulated ones, whose numbers are known."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+import pytest
+
+import plants
+from experiments.cursor_data import RATE, Condition
+from experiments.cursor_people import FIRST, Follower, fit_follower, judged, nats
+from impc.control.controller import Controller
+from impc.control.noisy_person import simulate_person
+from impc.model.bounds import Bounds
+from impc.model.observer import Observer
+from impc.model.plant import Plant
+from impc.model.structure import Structure
+
+DELAY, LAG, OFFSET, PRICE = 8, 0.03, 3.0, 20.0
+LEVELS = {"motor command": 50.0, "sensory error": 10.0}
+
+
+@functools.cache
+def simulated() -> Condition:
+    """Four trials of 15 s; the target walks at random, by one pixel a sample."""
+    plant = Plant(plants.pursuit_plant(DELAY, LAG), ["command"])
+    law = Controller(
+        plant,
+        Structure(plant, ["error"]).weights(np.log([PRICE])),
+        Bounds(plant),
+        20,
+        terminal_set=False,
+    )
+    person = Observer(
+        plant, ["error", "velocity"], motor=50.0, sensory=[10.0, 20.0], walk=RATE, persistence=0
+    )
+    targets, responses = [], []
+    for seed in range(4):
+        rate = RATE * np.random.default_rng([seed, 1]).standard_normal(900)
+        run = simulate_person(law, person, rate, recorder=0.2, seed=seed)
+        target = np.concatenate([[0.0], np.cumsum(rate[:-1]) / RATE])
+        targets.append(target)
+        responses.append(run.outputs[:, 0] + target + OFFSET)
+    return Condition(13.0, np.array(targets), np.array(responses))
+
+
+@functools.cache
+def fitted() -> Follower:
+    return fit_follower(simulated(), np.arange(4), (DELAY,))
+
+
+def test_what_a_follower_senses_is_found() -> None:
+    follower = fitted()
+    levels = np.exp(follower.fit.theta[follower.fit.space.own :])
+    found = dict(zip(follower.fit.space.names, levels, strict=True))
+    assert follower.offset == pytest.approx(OFFSET, abs=1.0)
+    for name, value in LEVELS.items():
+        assert abs(np.log(found[name] / value)) < 0.4, name
+    assert found["process error"] < 0.1
+    assert follower.fit.converged
+
+
+def test_trials_are_judged_as_they_were_fitted() -> None:
+    follower = fitted()
+    again = judged(follower, simulated(), np.arange(4))
+    assert nats(again) == pytest.approx(nats(follower.fit), rel=1e-12)
+    one = judged(follower, simulated(), np.array([2]))
+    assert nats(one) == pytest.approx(float(np.mean(follower.fit.told.trials[2].told[FIRST:])))
+
+
+def test_the_offset_is_the_likeliest() -> None:
+    """Moved by half a pixel either way the likelihood is less; it is a parabola in the offset."""
+    follower = fitted()
+    values = []
+    for away in (-0.5, 0.0, 0.5):
+        moved = Follower(follower.delay, follower.offset + away, follower.fit)
+        values.append(nats(judged(moved, simulated(), np.arange(4))))
+    assert values[1] > max(values[0], values[2])
+    best = 0.25 * (values[0] - values[2]) / (values[0] - 2 * values[1] + values[2])
+    # The offset was the likeliest of the fit before the last.
+    assert abs(best) < 0.1
