@@ -198,9 +198,11 @@ def _summed(scores: list[Score]) -> str:
     refused = [one.probability < 0.05 for one in scores]
     reached = [one.excess < _GLOBAL for one in scores if np.isfinite(one.excess)]
     whole = [one.holds for one in scores if one.holds]
+    at_zero = [item for one in scores if None in one.errors for item in one.holds]
     each = [np.mean([one[i] for one in whole]) for i in range(len(whole[0]) if whole else 0)]
     return (
-        f"| {scores[0].study} | {count} | {_share(holds)} ({_list(each)}) | {_share(sided)} | "
+        f"| {scores[0].study} | {count} | {_share(holds)} ({_list(each)}) | "
+        f"{_share(at_zero)} | {_share(sided)} | "
         f"{_share(normal)} | {_share(refused)} | {_share(reached)} | "
         f"{100 * np.median([one.power for one in scores]):.0f} |"
     )
@@ -254,9 +256,10 @@ def main() -> None:
 
 
 def _sum(given: argparse.Namespace) -> None:
-    print("| study | subjects | profile intervals hold % (each) | one-sided % | normal ones hold % "
+    print("| study | subjects | profile intervals hold % (each) | where a price is zero % "
+          "| one-sided % | normal ones hold % "
           "| refused at 5 % | global misfit % | power foreseen % |")  # fmt: skip
-    print("|---|---|---|---|---|---|---|---|")
+    print("|---|---|---|---|---|---|---|---|---|")
     by_study: dict[str, list[Score]] = {}
     for name in given.files:
         for line in Path(name).read_text(encoding="utf-8").splitlines():

@@ -25,6 +25,7 @@ from impc.arrays import Array
 from impc.assess.intervals import LEVEL
 from impc.assess.near_fit import NearFit
 from impc.assess.structured_weights import tangent
+from impc.errors import WeightsError
 
 if TYPE_CHECKING:
     from impc.assess.structured_weights import PriceCovariance, Tangent
@@ -133,15 +134,14 @@ class PriceProfiles:
 
         Recordings answer a gain that is far from the fit's otherwise than one that is near: they
         are simulated again where the end is found, until it stays, between places with less and
-        with more. Where the body falls is more.
+        with more. Where the body falls, or there is no regulator, is more.
         """
         inside, outside = line.prices, None
         end, there = self._passing(self.near, line, line.prices, quantile)
         for _ in range(_ROUNDS):
-            before, again = end, self._simulated(there)
+            before, form = end, self._form(there)
             more, further = True, None
-            if not again.found.reason:
-                form = NearFit(again)
+            if form is not None:
                 distance, there = self._distance(form, line.row, line.at(there), there)
                 more = distance > quantile
                 end, further = self._passing(form, line, there, quantile)
@@ -155,10 +155,15 @@ class PriceProfiles:
                 break
         return end
 
-    def _simulated(self, prices: Array) -> Tangent:
-        """The recordings at other prices, with the noise of the fit."""
-        there = tangent(self.at.structure, self.at.problem, prices)
-        return dataclasses.replace(there, noise=self.at.noise)
+    def _form(self, prices: Array) -> NearFit | None:
+        """The quadratic form elsewhere, in the noise of the fit; None where there is none."""
+        try:
+            there = tangent(self.at.structure, self.at.problem, prices)
+        except WeightsError:
+            return None
+        if there.found.reason:
+            return None
+        return NearFit(dataclasses.replace(there, noise=self.at.noise))
 
     def _passing(
         self, form: NearFit, line: _Line, here: Array, quantile: float

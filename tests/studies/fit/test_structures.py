@@ -67,8 +67,19 @@ def test_statements_within_a_structure_that_holds() -> None:
     assert sum(held) >= 4  # of 95 % each
 
 
+def test_a_price_of_zero_makes_the_intervals_less_sure() -> None:
+    result = fitted(0.0)
+    found = result.structures[0]
+    assert found.estimate is not None
+    assert not any("best price is zero" in line for line in structure_sentences(result))
+    prices = np.array(found.estimate.prices)
+    prices[3] = -np.inf
+    zero = replace(found, estimate=replace(found.estimate, prices=prices))
+    lines = structure_sentences(replace(result, structures=(zero, *result.structures[1:])))
+    assert any(line.startswith("Where the best price is zero") for line in lines)
+
+
 def test_a_refusal_may_be_the_fault_of_the_model() -> None:
-    """On a nonlinear body the true structure of the simulated subject is refused too."""
     result = fitted(0.5)
     assert not any("not be the structure's fault" in line for line in structure_sentences(result))
     error = result.diagnostics.structure
