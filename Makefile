@@ -5,7 +5,7 @@
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
-.PHONY: help env demo test full check docs architecture reproduce wheel slow coverage structures plans default-subjects noisy-people nonlinear nonlinear-seat look search numerics bench fuzz lock clean
+.PHONY: help env demo test full check docs architecture reproduce wheel slow coverage structures followers plans default-subjects noisy-people nonlinear nonlinear-seat look search numerics bench fuzz lock clean
 
 PYTHON ?= python3
 # Not to be set from outside: the environment is made with `venv --clear`.
@@ -141,6 +141,12 @@ structures: env
 	$(STUDY) run carts --test-only --root 0.8 --subjects 400 --out results/structures-carts.jsonl
 	$(STUDY) run carts --test-only --cross 0.5 --subjects 100 --out results/structures-carts.jsonl
 	$(STUDY) sum results/structures-seat.jsonl results/structures-carts.jsonl
+
+# People who follow a target, and the package lqg beside them: the tables of docs/cursor-tracking.md.
+followers: env
+	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.cursor_people_study
+	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.cursor_peer SubjectiveActor
+	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.cursor_peer BoundedActor
 
 # A hundred fits of every experiment: the table of docs/planning.md.
 plans: env

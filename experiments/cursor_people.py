@@ -9,32 +9,21 @@ searched by maximum likelihood (docs/noisy-people.md), for each of some delays; 
 pixels beside the target, so the mean error is taken off, and then what the likelihood would rather
 have.
 
-Of each blur the even trials are fitted and the odd ones judged, and the other way round: by the
-mean log-likelihood, in nats a sample, of the next position of the cursor given all before and the
-target, the first three seconds left out.
-
-    python -m experiments.cursor_people --out results/cursor-people
+A person is judged by the mean log-likelihood, in nats a sample, of the next position of the cursor
+given all before and the target, the first three seconds left out; beside stands what a linear
+prediction with every coefficient free tells. `experiments.cursor_people_study` is the comparison.
 """
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
-import json
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from tqdm import tqdm
 
 import plants
-from experiments.cursor_data import RATE, Condition, data_file, read_conditions
-from experiments.cursor_steps import Expected, fit_steps, step_nats
-from impc.assess.person_covariance import person_covariance
-from impc.assess.person_models import prediction_errors
-from impc.assess.person_profile import level_intervals
+from experiments.cursor_data import RATE, Condition
 from impc.checking import replace
 from impc.inverse.likelihood_fit import PersonFit, fit_person
 from impc.inverse.noisy_fit import fit_controller
@@ -46,7 +35,6 @@ from impc.model.plant import Plant
 from impc.model.plant_family import PlantFamily
 from impc.model.recordings import Recording
 from impc.model.structure import Structure
-from impc.reporting.writer import write_files
 from impc.studies.fit.settings import FitSettings
 from impc.studies.fit.subject import fit_problem
 
@@ -54,7 +42,16 @@ if TYPE_CHECKING:
     from impc.arrays import Array, IntArray
     from impc.inverse.problem import Problem
 
-__all__ = ["DELAYS", "FIRST", "Follower", "fit_follower", "follower_problem", "judged", "nats"]
+__all__ = [
+    "DELAYS",
+    "FIRST",
+    "Follower",
+    "fit_follower",
+    "follower_problem",
+    "judged",
+    "nats",
+    "regression_nats",
+]
 
 #: Delays that are tried, samples of 1/60 s; and the first sample that is judged.
 DELAYS = (6, 8, 10, 12, 14)
@@ -168,154 +165,31 @@ def _beside(follower: Follower, condition: Condition, which: IntArray) -> float:
     return -float(np.sum(slope * first / spread) / np.sum(slope**2 / spread))
 
 
-@dataclass(frozen=True)
-class _Row:
-    """One half of a blur, fitted and judged on the other; or all trials of it, with intervals."""
-
-    blur: float
-    half: int
-    inside: float
-    outside: float
-    steps: float
-    delay: int
-    offset: float
-    price: float
-    lag: float
-    levels: dict[str, float]
-    intervals: dict[str, list[float]]
-    ahead: list[float]
-    evaluations: int
-    converged: bool
+# Of a free regression on what was before.
+_POSITIONS, _TARGETS = 20, 60
 
 
-_AHEAD = (1, 6, 12, 30)
-_TOLD = ("outside", "steps")
+def regression_nats(condition: Condition, mine: IntArray, others: IntArray) -> float:
+    """What a free linear prediction tells of trials left out, nats a sample.
 
+    A regression on 20 positions before, 60 of the target and a constant, fitted to the trials
+    `mine` (k,) and judged on others (j,) as a person is.
+    """
 
-def _half(condition: Condition, half: int) -> _Row:
-    every = np.arange(len(condition.target))
-    mine, others = every[half::2], every[1 - half :: 2]
-    follower = fit_follower(condition, mine)
-    there = judged(follower, condition, others)
-    steps = fit_steps(_expected(follower.fit, condition, mine))
-    told = nats(there), step_nats(steps, _expected(there, condition, others))
-    ahead = prediction_errors(there, _AHEAD)[:, 0].tolist()
-    return _row(condition.blur, half, follower, told, {}, ahead)
+    def tables(which: IntArray) -> tuple[Array, Array]:
+        rows = []
+        for target, response in zip(
+            condition.target[which], condition.response[which], strict=True
+        ):
+            windows = np.lib.stride_tricks.sliding_window_view
+            before = windows(response, _POSITIONS)[FIRST - _POSITIONS : -1]
+            seen = windows(target, _TARGETS)[FIRST - _TARGETS + 1 :]
+            rows.append(np.hstack([before, seen, np.ones((len(before), 1))]))
+        return np.concatenate(rows), condition.response[which][:, FIRST:].ravel()
 
-
-def _expected(fit: PersonFit, condition: Condition, which: IntArray) -> Expected:
-    """What the filter expects of the cursor, from the first sample that is judged."""
-    position = condition.response[which]
-    off = np.array([trial.innovations[:, 0] for trial in fit.told.trials])
-    spread = np.array([trial.spreads[:, 0, 0] for trial in fit.told.trials])
-    parts = position, np.roll(position, 1, axis=1), position - off, np.sqrt(spread)
-    return Expected(*(part[:, FIRST:].ravel() for part in parts))
-
-
-def _whole(condition: Condition, delays: tuple[int, ...]) -> _Row:
-    follower = fit_follower(condition, np.arange(len(condition.target)), delays)
-    intervals = level_intervals(follower.fit, person_covariance(follower.fit))
-    named = dict(zip(follower.fit.space.names, intervals.tolist(), strict=True))
-    nothing = float("nan"), float("nan")
-    return _row(condition.blur, -1, follower, nothing, named, [])
-
-
-def _row(
-    blur: float,
-    half: int,
-    follower: Follower,
-    outside: tuple[float, float],
-    intervals: dict[str, list[float]],
-    ahead: list[float],
-) -> _Row:
-    fit = follower.fit
-    assert fit.prices is not None
-    assert fit.problem.family is not None
-    levels = np.exp(fit.theta[fit.space.own :])
-    return _Row(
-        blur,
-        half,
-        nats(fit),
-        *outside,
-        follower.delay,
-        follower.offset,
-        float(np.exp(fit.prices[0])),
-        float(fit.problem.family.nominal[0] * np.exp(fit.problem.logarithms[0])),
-        dict(zip(fit.space.names, levels.tolist(), strict=True)),
-        intervals,
-        ahead,
-        fit.evaluations,
-        fit.converged,
-    )
-
-
-def _table(rows: list[_Row]) -> str:
-    """Halves: how well the other half is told."""
-    lines = [
-        "| blur, px | nats a sample, even, odd trials left out | mean | with steps and rests "
-        "| errors 1, 6, 12, 30 samples ahead, px |",
-        "|---|---|---|---|---|",
-    ]
-    for blur in sorted({row.blur for row in rows}):
-        pair = sorted(
-            (row for row in rows if row.blur == blur), key=lambda row: -row.half
-        )  # half 1 leaves the even trials out
-        each = ", ".join(f"{row.outside:.4f}" for row in pair)
-        mean, steps = (np.mean([getattr(row, name) for row in pair]) for name in _TOLD)
-        ahead = np.sqrt(np.mean(np.square([row.ahead for row in pair]), axis=0))
-        far = ", ".join(f"{value:.2f}" for value in ahead)
-        lines.append(f"| {blur:.0f} | {each} | {mean:.4f} | {steps:.4f} | {far} |")
-    mean, steps = (np.mean([getattr(row, name) for row in rows]) for name in _TOLD)
-    return "\n".join([*lines, f"| mean | | {mean:.4f} | {steps:.4f} | |"])
-
-
-def _numbers(rows: list[_Row]) -> str:
-    """Whole blurs: every number of the model, with its interval where it has one."""
-    names = list(rows[0].levels)
-    lines = [
-        "| blur, px | delay, ms | lag, ms | beside, px | price of the error, 1/s^2 | "
-        + " | ".join(names)
-        + " |",
-        "|" + "---|" * (5 + len(names)),
-    ]
-    for row in rows:
-        levels = (_spanned(row.levels[name], row.intervals[name]) for name in names)
-        lines.append(
-            f"| {row.blur:.0f} | {1e3 * row.delay / RATE:.0f} | {1e3 * row.lag:.0f} "
-            f"| {row.offset:.1f} | {row.price:.3g} | " + " | ".join(levels) + " |"
-        )
-    return "\n".join(lines)
-
-
-def _spanned(value: float, ends: list[float]) -> str:
-    if ends[0] == 0:
-        return f"at most {ends[1]:.3g}"
-    return f"{value:.3g} ({ends[0]:.3g} to {ends[1]:.3g})"
-
-
-def main() -> None:
-    """Fit every half and every blur; print the tables, write result.json."""
-    parser = argparse.ArgumentParser(description="People who sense a blurred target with noise.")
-    parser.add_argument("--out", type=Path, default=Path("results", "cursor-people"))
-    given = parser.parse_args()
-    if not data_file().exists():
-        print(f"{data_file().name} is not there: nothing to fit. IMPC_CURSOR_DATA may name it.")
-        return
-    conditions = read_conditions(data_file())
-    jobs = [(condition, half) for condition in conditions for half in (0, 1)]
-    with ProcessPoolExecutor(2) as pool:
-        found = list(tqdm(pool.map(_half, *zip(*jobs, strict=True)), total=len(jobs)))
-        delays = [_both(found, condition.blur) for condition in conditions]
-        whole = list(tqdm(pool.map(_whole, conditions, delays), total=len(conditions)))
-    print(_table(found), _numbers(whole), sep="\n\n")
-    rows = [dataclasses.asdict(row) for row in (*found, *whole)]
-    write_files(given.out, {"result.json": json.dumps(rows, indent=1).encode()})
-
-
-def _both(rows: list[_Row], blur: float) -> tuple[int, ...]:
-    """The delays that the halves of a blur have chosen."""
-    return tuple(sorted({row.delay for row in rows if row.blur == blur}))
-
-
-if __name__ == "__main__":
-    main()
+    columns, position = tables(mine)
+    found = np.linalg.lstsq(columns, position, rcond=None)[0]
+    variance = float(np.mean((position - columns @ found) ** 2))
+    columns, position = tables(others)
+    left = (position - columns @ found) ** 2 / variance
+    return -float(np.mean(np.log(2 * np.pi * variance) + left)) / 2

@@ -6,10 +6,11 @@ import functools
 
 import numpy as np
 import pytest
+import scipy.stats
 
 import plants
 from experiments.cursor_data import RATE, Condition
-from experiments.cursor_people import FIRST, Follower, fit_follower, judged, nats
+from experiments.cursor_people import FIRST, Follower, fit_follower, judged, nats, regression_nats
 from impc.control.controller import Controller
 from impc.control.noisy_person import simulate_person
 from impc.model.bounds import Bounds
@@ -67,6 +68,28 @@ def test_trials_are_judged_as_they_were_fitted() -> None:
     assert nats(again) == pytest.approx(nats(follower.fit), rel=1e-12)
     one = judged(follower, simulated(), np.array([2]))
     assert nats(one) == pytest.approx(float(np.mean(follower.fit.told.trials[2].told[FIRST:])))
+
+
+def test_a_free_regression_is_that_of_its_normal_equations() -> None:
+    """Against rows written out one by one; and no better than the truth can be."""
+    condition, mine, others = simulated(), np.array([0, 1]), np.array([2, 3])
+
+    def row(trial: int, t: int) -> list[float]:
+        before = condition.response[trial, t - 20 : t]
+        return [*before, *condition.target[trial, t - 59 : t + 1], 1.0]
+
+    def table(which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        pairs = [(row(k, t), condition.response[k, t]) for k in which for t in range(FIRST, 900)]
+        return np.array([pair[0] for pair in pairs]), np.array([pair[1] for pair in pairs])
+
+    X, y = table(mine)
+    found = np.linalg.solve(X.T @ X, X.T @ y)
+    deviation = float(np.sqrt(np.mean((y - X @ found) ** 2)))
+    X, y = table(others)
+    expected = float(np.mean(scipy.stats.norm(X @ found, deviation).logpdf(y)))
+    told = regression_nats(condition, mine, others)
+    assert told == pytest.approx(expected, abs=1e-6)
+    assert told < nats(judged(fitted(), condition, others))
 
 
 def test_the_offset_is_the_likeliest() -> None:
