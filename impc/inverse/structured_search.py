@@ -236,6 +236,8 @@ def search_from(
     z, spent, settled = _rounds(space, max_evaluations)
     here = _Place(problem, structure, space.unknowns(z), space.unpack(z).problem)
     end = _with_zeros(_polished(here, spent, settled), here, max_evaluations)
+    if end.misfit <= _EXACT * recorded_size(problem):
+        return end
     return _without_pull(_without_zeros(end, here, max_evaluations), structure, max_evaluations)
 
 
@@ -354,7 +356,10 @@ def _without_zeros(end: StructuredEnd, place: _Place, budget: int) -> Structured
         prices = np.array(end.prices)
         prices[index] = _seen_from(end, place, int(index))
         here = replace(place, prices=prices, there=end.problem)
-        found = _polished(here, end.evaluations, end.settled)
+        try:
+            found = _polished(here, end.evaluations, end.settled)
+        except WeightsError:  # on the edge of what has a regulator
+            continue
         if found.misfit < end.misfit * (1 - _NOISY_TOLERANCE):
             end = found
     return end
