@@ -57,7 +57,7 @@ __all__ = [
 DELAYS = (6, 8, 10, 12, 14)
 FIRST = 180
 _LAG = 0.03
-# Where levels begin: px, px/s. A search from others ends at the same (tests).
+# Where levels begin: px, px/s. Under a blur of 17 px a search from others can end lower.
 _BESIDE, _MOTOR, _SEEN, _FELT, _RECORDER = 0.3, 60.0, 10.0, 20.0, 0.2
 # Logarithm of the price about that of least squares.
 _SPREAD = 5.0

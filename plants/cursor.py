@@ -83,33 +83,10 @@ def cursor_plant(
     # exp([A B; 0 0] T) = [Ad Bd; 0 I]: exact also where A is singular, as here.
     held = scipy.linalg.expm(np.block([[A, B], [np.zeros((2, n + 2))]]) * sample_time)
     delays = [f"delay_{k}" for k in range(1, delay_order + 1)]
-    acceleration = f"{length}/s^2"
-    units = {
-        "error": length,
-        "velocity": f"{length}/s",
-        **dict.fromkeys([*delays, "acceleration", "command"], acceleration),
-        "target_rate": f"{length}/s",
-    }
-    system = control.ss(
-        held[:n, :n],
-        held[:n, n:],
-        np.eye(1, n),
-        np.zeros((1, 2)),
-        dt=sample_time,
-        name="cursor",
-        states=["error", "velocity", *delays, "acceleration"],
-        inputs=["command", "target_rate"],
-        outputs=["error"],
-    )
-    words = {
-        "error": "distance of the cursor from the target",
-        "velocity": "velocity of the cursor",
-        **{name: f"stage {k} of the delay of the nerves" for k, name in enumerate(delays, 1)},
-        "acceleration": "acceleration of the cursor",
-        "command": "acceleration that the person asks for",
-        "target_rate": "velocity of the target",
-    }
-    return with_units(system, units, words)
+    stages = {name: f"stage {k} of the delay of the nerves" for k, name in enumerate(delays, 1)}
+    stages["acceleration"] = "acceleration of the cursor"
+    command = f"{length}/s^2", "acceleration that the person asks for"
+    return _tracking("cursor", (held[:n, :n], held[:n, n:]), sample_time, length, stages, command)
 
 
 def pursuit_plant(
@@ -153,23 +130,42 @@ def pursuit_plant(
     B[-1, 0] = 1.0
     B[0, 1] = -sample_time
     commands = [f"command_{k}" for k in range(1, delay + 1)]
-    speeds = dict.fromkeys(["velocity", *commands, "command", "target_rate"], f"{length}/s")
+    stages = {name: f"command of the hand in {k} samples" for k, name in enumerate(commands)}
+    command = f"{length}/s", "velocity that the person asks for"
+    return _tracking("pursuit", (A, B), sample_time, length, stages, command)
+
+
+def _tracking(
+    name: str,
+    matrices: tuple[Any, Any],
+    sample_time: float,
+    length: str,
+    stages: dict[str, str],
+    command: tuple[str, str],
+) -> Any:
+    """The system of A and B whose states are error, velocity and stages, with their words.
+
+    The stages are in the unit of the command, which comes with its words.
+    """
+    A, B = matrices
+    unit, asked = command
+    speed = f"{length}/s"
     system = control.ss(
         A,
         B,
-        np.eye(1, n),
+        np.eye(1, len(A)),
         np.zeros((1, 2)),
         dt=sample_time,
-        name="pursuit",
-        states=["error", "velocity", *commands],
+        name=name,
+        states=["error", "velocity", *stages],
         inputs=["command", "target_rate"],
         outputs=["error"],
     )
+    units = {"error": length, "velocity": speed, "target_rate": speed, "command": unit}
     words = {
         "error": "distance of the cursor from the target",
         "velocity": "velocity of the cursor",
-        **{name: f"command of the hand in {k} samples" for k, name in enumerate(commands)},
-        "command": "velocity that the person asks for",
+        "command": asked,
         "target_rate": "velocity of the target",
     }
-    return with_units(system, {"error": length, **speeds}, words)
+    return with_units(system, {**units, **dict.fromkeys(stages, unit)}, {**words, **stages})

@@ -44,7 +44,7 @@ __all__ = ["ResidualNoise", "residual_noise", "spread_of_sum", "white_noise"]
 _LARGEST_ROOT = 0.97
 # Samples before the first over which noise still has an effect: 0.97^250 is 5e-4.
 _BEFORE = 250
-# Lags up to which sums by shifts take less time than Fourier transforms: with three, a third.
+# Lags up to which sums by shifts take less time than Fourier transforms: with three, a fifth.
 _FEW_LAGS = 8
 # Of giving back what a fit takes, which is told by the colour that is sought.
 _ROUNDS = 3

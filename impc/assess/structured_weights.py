@@ -135,11 +135,6 @@ class Tangent(Frozen):
         )
         return np.asarray(on_gain + tied), np.asarray(own)
 
-    def natural(self, gains: Array) -> Array:
-        """G^-1 K T, (..., m, n), of gains (..., m, n)."""
-        T, G = natural_coordinates(self.problem.plant, np.array(self.solution.K))
-        return np.asarray(np.linalg.solve(G, gains @ T))
-
 
 def tangent(structure: Structure, problem: Problem, prices: Array) -> Tangent:
     """Residual and derivatives at unknowns `prices` (count,) and a problem's other unknowns."""
