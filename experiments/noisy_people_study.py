@@ -23,7 +23,7 @@ import numpy as np
 from experiments.noisy_people import BODIES, NOISES, recorded, subject
 from impc.assess.covariance import gain_covariance
 from impc.assess.person_covariance import person_covariance
-from impc.assess.person_profile import level_intervals
+from impc.assess.person_profile import fallen, level_intervals
 from impc.errors import ImpcError
 from impc.inverse.likelihood_fit import fit_person
 from impc.inverse.methods import estimate
@@ -37,7 +37,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Score", "above_truth", "blind", "score", "true_unknowns"]
 
-_NORMAL = 1.959964
+# And half of its square, nats.
+_NORMAL, _LOWER = 1.959964, 1.920729
 # A limit that is not met, and one that is, of each body.
 _LIMITS = {"cart": (5.0, 0.7), "seat": (70.0, 6.0)}
 # A direction of the gain is determined when its deviation is below this, in natural coordinates.
@@ -68,6 +69,9 @@ class Score:
     least, likely, expected : list of pairs
         Error and deviation along each direction that the method tells, the best first: of least
         squares, and of maximum likelihood by the sandwich and as expected.
+    fell : list of float
+        By how many nats the likelihood falls with each of the directions of `likely` held at the
+        truth.
     levels, found : list of float
         Motor, senses, recorder: true, and found.
     level_deviations : list of float
@@ -76,7 +80,7 @@ class Score:
         Intervals of 95 %: by profile for a level that is weakly told, else by the
         deviation; none where not asked for.
     seconds : list of float
-        Of processor time: least squares, likelihood, profiles.
+        Of processor time: least squares, likelihood, what falls, profiles of levels.
     """
 
     study: str
@@ -91,6 +95,7 @@ class Score:
     least: list[tuple[float, float]]
     likely: list[tuple[float, float]]
     expected: list[tuple[float, float]]
+    fell: list[float]
     levels: list[float]
     found: list[float]
     level_deviations: list[float]
@@ -110,6 +115,8 @@ def score(who: Subject, study: str, seed: int, *, profiled: bool = True) -> Scor
     robust, expected = (person_covariance(likely, kind) for kind in ("sandwich", "expected"))
     clock.append(time.process_time())
     values = np.exp(likely.theta[likely.space.own :])
+    fell = _fell(likely, robust, true_unknowns(likely, who))
+    clock.append(time.process_time())
     profiles = level_intervals(likely, expected) if profiled else np.zeros((0, 2))
     clock.append(time.process_time())
     size = float(np.linalg.norm(truth @ least.T))
@@ -130,6 +137,7 @@ def score(who: Subject, study: str, seed: int, *, profiled: bool = True) -> Scor
         ),
         _steps(likely, robust, truth),
         _steps(likely, expected, truth),
+        fell,
         [*who.person.levels[who.person.levels > 0], *who.recorder],
         [float(value) for value in values],
         expected.levels.tolist(),
@@ -168,6 +176,16 @@ def _steps(
     error = own.natural(np.array(likely.K) - truth)
     along = np.tensordot(own.natural(own.gains.gains), error, 2)
     return _pairs(covariance.directions, covariance.deviations, along[: space.gain])
+
+
+def _fell(likely: PersonFit, covariance: PersonCovariance, truth: Array) -> list[float]:
+    """What the likelihood falls by along each determined direction, the best told first, nats."""
+    found, along = [], np.zeros(len(truth))
+    for direction, deviation in zip(covariance.directions, covariance.deviations, strict=True):
+        if deviation < _DETERMINED:
+            along[: likely.space.gain] = direction
+            found.append(fallen(likely, along, float(along @ truth)))
+    return found
 
 
 def _pairs(directions: Array, deviations: Array, error: Array) -> list[tuple[float, float]]:
@@ -221,6 +239,7 @@ def _summed(scores: list[Score]) -> str:
         cells.append(f"{100 * np.median([getattr(one, f'{name}_error') for one in scores]):.1f}")
         cells += [_bias(pairs), _holds(pairs)]
     cells.append(_holds([one.expected for one in scores]))
+    cells.append(_shares([[nats <= _LOWER for nats in one.fell] for one in scores]))
     cells.append(_holds([_of_levels(one) for one in scores]))
     profiled = [one for one in scores if one.profiles]
     cells.append(f"{_shares([_inside(one) for one in profiled])} ({len(profiled)})")
@@ -275,6 +294,7 @@ def _sum(given: argparse.Namespace) -> None:
         "people", "count", "at the limit %", "ended at the truth's likelihood or above", "settled",
         "least squares: error %", "bias / deviation", "95 % holds %",
         "likelihood: error %", "bias / deviation", "95 % holds % (sandwich)", "(expected)",
+        "(profile)",
         "levels hold % (expected)", "(profile)", "seconds: least squares, likelihood",
     )  # fmt: skip
     print("| " + " | ".join(heads) + " |")

@@ -15,7 +15,7 @@ import numpy as np
 
 from impc.arrays import Array, Frozen, frozen
 from impc.assess.person_covariance import confusion, person_covariance
-from impc.assess.person_profile import level_intervals
+from impc.assess.person_profile import entry_intervals, level_intervals
 from impc.assess.variance_accounted_for import whiteness
 from impc.checking import replace
 from impc.control.closed_loop import prepare_loop
@@ -71,6 +71,9 @@ class PersonReport(Frozen):
         Of that, by the sandwich; None where it has no likelihood.
     levels : Array
         Intervals of 95 % of its levels (l, 2): by profile where a level is weakly told.
+    entries : Array
+        The same of the entries of its gain (m n, 2), all by profile; NaN where an entry is not told
+        by itself.
     confusion : Confusion or None
         What of gain and noise is told least apart.
     whiteness : Array
@@ -84,6 +87,7 @@ class PersonReport(Frozen):
     models: tuple[PersonModel, ...]
     covariance: PersonCovariance | None
     levels: Array
+    entries: Array
     confusion: Confusion | None
     whiteness: Array
     ahead: tuple[int, ...]
@@ -116,13 +120,14 @@ def person_report(found: Estimate, asked: Observer, walk: Array) -> PersonReport
     if fit is None:
         nothing = frozen(np.zeros((0, 2)))
         white = frozen([np.nan] * p)
-        return PersonReport(tuple(models), None, nothing, None, white, (), frozen([[]]))
+        return PersonReport(tuple(models), None, nothing, nothing, None, white, (), frozen([[]]))
     ahead = tuple(sorted({1 + round(time / problem.plant.dt) for time in _AHEAD}))
     covariance = person_covariance(fit)
     return PersonReport(
         tuple(models),
         covariance,
         level_intervals(fit, covariance),
+        entry_intervals(fit, covariance),
         confusion(fit),
         frozen(_white(fit)),
         ahead,

@@ -1,16 +1,14 @@
-"""Profiles of a person's levels of noise: intervals that hold where a level is all but none.
+"""Profiles of a person's levels of noise and of the gain: intervals that need no parabola.
 
-The logarithm of a level that is weakly told is not normal: its likelihood falls on one side and
-stays on the other. The interval of 95 % is where the largest likelihood with the level held there,
+The logarithm of a level that is weakly told is not normal, for its likelihood falls on one side and
+stays on the other; and where half of a gain is hardly told the other half bends with it, by many of
+its deviations. The interval of 95 % of v'theta is where, with v'theta held,
 
-    2 (max log L - max_held log L) <= 1.96^2
+    2 (max F - max_held F) <= 1.96^2
 
-and open to zero where that never falls: the level is then at most its upper end
+F is what the search makes largest, but that of a level that is held nothing is expected: it is
+open to zero where F never falls, and the level is then at most its upper end
 (docs/noisy-people.md).
-
-Where one level slid to none another took its part, and its own deviation is that of a person
-without the first. So all levels have a profile then, and with one of them held the slid ones are
-looked for from where they began, too.
 """
 
 from __future__ import annotations
@@ -18,8 +16,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy.linalg
 
-from impc.arrays import Array, BoolArray, frozen
+from impc.arrays import Array, frozen
 from impc.errors import ImpcError
 from impc.inverse.likelihood_search import climb
 
@@ -27,21 +26,22 @@ if TYPE_CHECKING:
     from impc.assess.person_covariance import PersonCovariance
     from impc.inverse.likelihood_fit import PersonFit
 
-__all__ = ["level_interval", "level_intervals"]
+__all__ = ["entry_intervals", "fallen", "level_interval", "level_intervals", "profile"]
 
-# Root of half of 1.96^2, of nats, and how near to it an end of an interval is found.
+# Half of 1.96^2, nats; its root, and how near to that an end of an interval is found.
+_LOWER = 1.920729
 _FALLEN, _CLOSE = 1.385903, 0.04
 _NORMAL = 1.959964
-# A step is no longer than this, of the logarithm of a level.
-_LONGEST = 2.0
-# Searches for one end, and likelihoods with derivatives in each.
+# A first step is no longer than this, and no end is looked for farther away: some thousands of a
+# level, which is then none, or that of a sense which is not used.
+_LONGEST, _FARTHEST = 2.0, 9.0
+# Places at which an end is looked for, and likelihoods with derivatives at each.
 _TRIES, _BUDGET = 12, 15
 # Keeps a covariance finite: of a coordinate that nothing tells the deviation is ten.
 _FLAT = 1e-2
-# A level whose logarithm has a larger deviation is given a profile.
+# A level whose logarithm has a larger deviation is given a profile, an entry of the gain that has
+# one is not told by itself: of a natural coordinate (`Coordinates`).
 _WEAK = 0.25
-# A level whose logarithm has a deviation as large is none: the likelihood does not answer to it.
-_NONE = 3.0
 
 
 def level_intervals(fit: PersonFit, covariance: PersonCovariance, *, weak: float = _WEAK) -> Array:
@@ -53,19 +53,44 @@ def level_intervals(fit: PersonFit, covariance: PersonCovariance, *, weak: float
     covariance : PersonCovariance
         Gives the intervals of levels that are well told.
     weak : float
-        A level whose logarithm has a larger deviation has its interval by profile; all have where
-        one slid to none.
+        A level whose logarithm has a larger deviation has its interval by profile.
     """
     values = np.exp(fit.theta[fit.space.own :])
-    slid = bool(np.any(_slid(fit, _covariance(fit))))
     return frozen(
         [
             level_interval(fit, k)
-            if slid or covariance.levels[k] > weak
+            if covariance.levels[k] > weak
             else covariance.level_interval(k, float(value))
             for k, value in enumerate(values)
         ]
     )
+
+
+def entry_intervals(fit: PersonFit, covariance: PersonCovariance) -> Array:
+    """Intervals of 95 % of the entries of the gain (m n, 2) by profile, in their units.
+
+    Parameters
+    ----------
+    fit : PersonFit
+        Where prices were searched, an entry is held along its slope.
+    covariance : PersonCovariance
+        An entry whose deviation is more than a quarter of a coordinate has no numbers, NaN: the
+        recordings do not tell it by itself.
+    """
+    dK, _ = fit.space.changes(fit.theta)
+    found = []
+    for value, slopes, deviation in zip(
+        np.ravel(fit.K), dK.reshape(len(dK), -1).T, np.ravel(covariance.entries), strict=True
+    ):
+        length = float(np.linalg.norm(slopes))
+        if not deviation < _WEAK * length:
+            found.append((np.nan, np.nan))
+            continue
+        along = np.zeros(len(fit.theta))
+        along[: len(dK)] = slopes / length
+        ends = np.array(profile(fit, along)) - float(along @ fit.theta)
+        found.append(tuple(value + length * ends))
+    return frozen(found)
 
 
 def level_interval(fit: PersonFit, index: int) -> tuple[float, float]:
@@ -83,28 +108,61 @@ def level_interval(fit: PersonFit, index: int) -> tuple[float, float]:
         In the level's unit; 0 or infinite where the likelihood does not fall as far as a level is
         searched.
     """
-    low, high = (float(np.exp(_end(fit, fit.space.own + index, side))) for side in (-1, 1))
+    low, high = profile(fit, np.eye(len(fit.theta))[fit.space.own + index])
+    return float(np.exp(low)), float(np.exp(high))
+
+
+def profile(fit: PersonFit, along: Array) -> tuple[float, float]:
+    """Interval of 95 % of along'theta by profile.
+
+    Parameters
+    ----------
+    fit : PersonFit
+    along : Array
+        A direction of the unknowns of the fit (q,), of length one.
+
+    Returns
+    -------
+    low, high : float
+        Infinite where the likelihood does not fall as far as is searched.
+    """
+    low, high = (_end(fit, along, side) for side in (-1, 1))
     return low, high
 
 
-def _end(fit: PersonFit, held: int, side: int) -> float:
-    """Logarithm of the level at which the profile has fallen by enough on one side.
+def fallen(fit: PersonFit, along: Array, value: float) -> float:
+    """By how much the likelihood falls with along'theta held at a value, all else at its best.
+
+    Parameters
+    ----------
+    fit : PersonFit
+    along : Array
+        As in `profile` (q,).
+    value : float
+
+    Returns
+    -------
+    float
+        Nats; infinite where nothing was found.
+    """
+    return _held(fit, np.array(fit.theta), along, value)[1]
+
+
+def _end(fit: PersonFit, along: Array, side: int) -> float:
+    """Where the profile has fallen by enough on one side.
 
     The root of what has fallen is straight where the likelihood is that of a normal number, so the
     next guess lies on a line.
     """
-    theta, border = np.array(fit.theta), float(fit.box[(side + 1) // 2][held])
-    covariance = _covariance(fit)
-    slid = _slid(fit, covariance)
-    slid[held] = False
-    tangent = covariance[:, held] / covariance[held, held]
-    step = min(_NORMAL * float(np.sqrt(covariance[held, held])), _LONGEST)
-    inside, outside = (float(theta[held]), 0.0), (np.nan, np.inf)
-    value = inside[0] + side * step
+    theta, spread = np.array(fit.theta), float(np.sqrt(along @ _covariance(fit) @ along))
+    begin = float(along @ theta)
+    border, step = begin + side * _FARTHEST, min(_NORMAL * spread, _LONGEST)
+    inside, outside = (begin, 0.0), (np.nan, np.inf)
+    value = begin + side * step
     for _ in range(_TRIES):
         value = border if side * (value - border) >= 0 else value
-        theta, fallen = _held(fit, theta, tangent, slid, held, value)
-        root = float(np.sqrt(max(fallen, 0.0)))
+        theta, nats = _held(fit, theta, along, value)
+        root = float(np.sqrt(max(nats, 0.0)))
         if abs(root - _FALLEN) < _CLOSE:
             return value
         if root < _FALLEN and value == border:
@@ -121,35 +179,32 @@ def _end(fit: PersonFit, held: int, side: int) -> float:
     return outside[0] if np.isfinite(outside[0]) else side * np.inf
 
 
-def _slid(fit: PersonFit, covariance: Array) -> BoolArray:
-    """Which unknowns are levels that slid to none (q,)."""
-    deviations = np.sqrt(np.diag(covariance))
-    return np.asarray((deviations > _NONE) & (np.arange(len(deviations)) >= fit.space.own))
-
-
 def _covariance(fit: PersonFit) -> Array:
     """Of all unknowns (q, q), at most ten squared along what nothing tells."""
     information = fit.told.information + fit.prior.slopes(np.array(fit.theta))[1]
     return np.asarray(np.linalg.inv(information + _FLAT * np.eye(len(information))))
 
 
-def _held(
-    fit: PersonFit, theta: Array, tangent: Array, slid: BoolArray, held: int, value: float
-) -> tuple[Array, float]:
-    """The best of all else with one unknown held at a value, and how far the likelihood fell."""
-    low, high = (np.array(side) for side in fit.box)
-    low[held] = high[held] = value
-    straight = np.clip(theta + tangent * (value - theta[held]), low, high)
-    # A straight line may leave the gains that stabilise.
-    starts = [straight if np.isfinite(fit.prior.value(straight)) else np.clip(theta, low, high)]
-    if np.any(slid):
-        starts.append(np.clip(np.where(slid, fit.space.start, starts[0]), low, high))
-    top, best = fit.log_likelihood + fit.prior.value(fit.theta), (theta, np.inf)
-    for start in starts:
-        try:
-            found, told, _, _ = climb(fit.prior, start, (low, high), _BUDGET)
-        except ImpcError:  # no filter there: as far as an end may be
-            continue
-        fallen = top - told.value - fit.prior.value(found)
-        best = (found, fallen) if fallen < best[1] else best
-    return best
+def _held(fit: PersonFit, theta: Array, along: Array, value: float) -> tuple[Array, float]:
+    """The best of all else with along'theta at a value, and how far the likelihood fell."""
+    spread = _covariance(fit) @ along
+    off = value - float(along @ theta)
+    # A straight line along the ridge may leave the gains that stabilise.
+    starts = (theta + spread * (off / float(along @ spread)), theta + along * off)
+    start = next((each for each in starts if np.isfinite(fit.prior.value(each))), starts[1])
+    try:
+        found, _, _ = climb(fit.prior, start, _BUDGET, _across(along))
+    except ImpcError:  # no filter there: as far as an end may be
+        return theta, np.inf
+    # Of a level that is held nothing is expected.
+    level = np.abs(along[fit.space.own :])
+    freed = fit.prior.unlike(np.array(fit.theta)) - fit.prior.unlike(found.theta)
+    return found.theta, fit.value - found.value + float(level @ freed)
+
+
+def _across(along: Array) -> Array:
+    """All that is orthogonal to a direction (q, q - 1), coordinates that it leaves alone as such."""
+    mine = np.flatnonzero(along)
+    turned = np.zeros((len(along), len(mine) - 1))
+    turned[mine] = scipy.linalg.null_space(along[None, mine])
+    return np.hstack([np.delete(np.eye(len(along)), mine, axis=1), turned])

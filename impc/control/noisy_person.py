@@ -168,6 +168,9 @@ def run_joint(
 
 
 def _root(covariance: Array) -> Array:
-    """A with A A' the covariance, which need not be definite."""
+    """The symmetric A with A A' the covariance, which need not be definite.
+
+    There is one, so that what is drawn is the same everywhere; eigenvectors are not.
+    """
     values, vectors = np.linalg.eigh(covariance)
-    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+    return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T)

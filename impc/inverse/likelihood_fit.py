@@ -16,7 +16,7 @@ from impc.arrays import Array, Frozen, frozen
 from impc.checking import checked
 from impc.errors import ImpcError, InputError, SolverError
 from impc.inverse.coordinates import Coordinates
-from impc.inverse.likelihood_search import Prior, climb, reach
+from impc.inverse.likelihood_search import Prior, climb
 from impc.inverse.person_coordinates import PersonCoordinates
 from impc.inverse.residuals import residual_only
 from impc.inverse.structured_search import PriceCoordinates
@@ -71,8 +71,6 @@ class PersonFit(Frozen):
         What the recordings say there.
     prior : Prior
         What the search was held by.
-    box : pair of Array
-        Between which values it was held (count,).
     """
 
     K: Array
@@ -88,12 +86,17 @@ class PersonFit(Frozen):
     theta: Array
     told: Told
     prior: Prior
-    box: tuple[Array, Array]
 
     @property
     def space(self) -> PersonCoordinates:
         """The coordinates of the search."""
         return self.prior.space
+
+    @property
+    def value(self) -> float:
+        """What the search made largest: likelihood times prior, less what levels lose, nats."""
+        theta = np.array(self.theta)
+        return self.told.value + self.prior.value(theta) - self.prior.lost(theta, self.told)
 
     @property
     def criterion(self) -> float:
@@ -180,9 +183,9 @@ def fit_person(
         log = np.log(np.concatenate([levels, recorded * size.recorder])[first.moving])
         starts.append(np.concatenate([space.start, log]))
     theta = _best(first, starts)
-    prior = Prior(first, spread)
-    box = reach(first, theta)
-    theta, told, spent, settled = climb(prior, theta, box, max_evaluations)
+    alone = np.concatenate([_suggested(observer, size, 1.0, 1.0), size.recorder])
+    prior = Prior(first, spread, np.log(alone[first.moving]))
+    (theta, told, _), spent, settled = climb(prior, theta, max_evaluations)
     person = first.unpack(theta)
     prices = space.unknowns(theta[: first.own]) if isinstance(space, PriceCoordinates) else None
     return PersonFit(
@@ -199,7 +202,6 @@ def fit_person(
         frozen(theta),
         told,
         prior,
-        box,
     )
 
 

@@ -10,12 +10,15 @@ back by what slides, and crept for hundreds of rounds on the seat (docs/noisy-pe
 
 Noisy recordings leave some directions of the gain all but free. A weak normal prior in natural
 coordinates keeps those where the first fit was, as in `gain_search`, and a barrier keeps gains that
-stabilise from the border of those that do not.
+stabilise from the border of those that do not. Levels are those of the largest restricted
+likelihood, and a level is half-Cauchy (Gelman 2006): without either the likelihood of several
+levels is often largest where one of them is zero, and others are too large in its place (Chung et
+al. 2013).
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -27,49 +30,114 @@ if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.inverse.person_coordinates import PersonCoordinates, Told
 
-__all__ = ["Prior", "boxed_step", "climb", "reach"]
+__all__ = ["Prior", "boxed_step", "climb"]
 
-# A search ends when a step promises less: a hundredth of a deviation along any direction.
-_SETTLED = 1e-4
-# The likelihood jumps by hundredths where a later stage of a plan meets a bound, so that a search
-# may stand before a cliff. It may fall by so many nats in all, and it stops where a step that did
-# not climb promised less than the second: settled, if the whole step promises less than the first.
-_JUMPS, _UNSEEN = 0.25, 1e-2
-# A level that slides to zero, or a sense to one that is not used, has no end: along what is so flat
-# a step of ten is as far as a promise is believed.
+# A search ends when a step promises less, nats: a hundredth of a deviation along any direction
+# without a prior, a tenth with it, for the slope of what levels lose is not known better.
+_SETTLED, _ENOUGH = 1e-4, 5e-3
+# The likelihood jumps where a later stage of a plan meets a bound, a seat's at its limit by half a
+# nat in a step of a deviation. A step is judged as of a function known to so much (Sun and Nocedal
+# 2023), and a search ends after so many steps that found nothing higher: settled, if from the
+# highest place no more than that is promised.
+_ROUGH, _PATIENCE = 0.5, 4
+# Without a prior a level that slides to zero, or a sense to one that is not used, has no end: along
+# what is so flat a step of ten is as far as a promise is believed.
 _FLAT = 1e-2
-# A level is held within a factor of e^9, some thousands, of where its search begins: there it is
-# none, or the sense is not used, and beyond it a filter is not told from rounding.
-_REACH = 9.0
-# Longest step of any coordinate.
-_STEP = 1.0
+# Where a loop all but runs away the information of its first state has 35 digits: what of it is not
+# rounding is still a matrix of its kind, with so much of each diagonal added.
+_ROUNDING = 1e-12
+# Step of the differences along a level, of its logarithm; square of one that teaches half.
+_DIFFERENCE, _DAMPING = 0.05, 0.1
+# Longest and shortest step of any coordinate.
+_STEP, _SHORTEST = 1.0, 1e-3
 # Nats for each factor of e by which a gain near the border of those that stabilise lets noise
 # grow: on the seat the largest likelihood without it is on that border, and a search creeps there.
 _BARRIER = 0.5
 
 
+class Place(NamedTuple):
+    """A point of a search.
+
+    Attributes
+    ----------
+    theta : Array
+        (q,).
+    told : Told
+        What the recordings say there.
+    value : float
+        What is to be largest, nats.
+    """
+
+    theta: Array
+    told: Told
+    value: float
+
+
 class Prior:
-    """What holds directions of the gain that nothing tells, as a share of a log-likelihood.
+    """What holds directions that nothing tells, as a share of a log-likelihood.
 
     A normal number about the start for each coordinate but the levels, and a barrier before gains
-    that do not stabilise.
+    that do not stabilise. With x a level over its scale the density of its logarithm is that of a
+    half-Cauchy level, x / (1 + x^2): one nat for each factor of e, far away on either side.
 
     Parameters
     ----------
     space : PersonCoordinates
     spread : float
         Standard deviation; infinite for no prior, and no barrier either.
+    scales : Array
+        Logarithm of the size that each level is expected to have (levels,).
     """
 
-    def __init__(self, space: PersonCoordinates, spread: float) -> None:
-        self.space = space
+    def __init__(self, space: PersonCoordinates, spread: float, scales: Array) -> None:
+        self.space, self.scales = space, scales
         self.weights = np.where(np.arange(len(space.start)) < space.own, spread**-2.0, 0.0)
-        self.barrier = _BARRIER if np.isfinite(spread) else 0.0
+        self.used = bool(np.isfinite(spread))
+
+    def at(self, theta: Array) -> Place:
+        """What is to be largest, at theta (q,): likelihood times prior, less what levels lose.
+
+        Raises
+        ------
+        ImpcError
+            When there is no likelihood there.
+        """
+        told = self.space.told(theta)
+        return Place(theta, told, told.value + self.value(theta) - self.lost(theta, told))
+
+    def losing(self, here: Place) -> Array:
+        """Slope of `lost` along the levels (levels,), by differences: a filter for each."""
+        if not self.used:
+            return np.zeros(len(self.scales))
+        steps = _DIFFERENCE * np.eye(len(here.theta))[self.space.own :]
+        there = [self.lost(here.theta + step, self.space.told(here.theta + step)) for step in steps]
+        return (np.array(there) - self.lost(here.theta, here.told)) / _DIFFERENCE
+
+    def lost(self, theta: Array, told: Told) -> float:
+        """What levels lose because all else is fitted to the same noise, nats.
+
+        The likelihood of the levels alone, all else integrated out, is by Laplace's method the
+        largest over all else, less half of the logarithm of the determinant of the information on
+        that (restricted likelihood: Patterson and Thompson 1971, Cox and Reid 1987).
+        """
+        if not self.used:
+            return 0.0
+        own = slice(0, self.space.own)
+        information = told.information[own, own] + self.slopes(theta)[1][own, own]
+        return float(np.linalg.slogdet(information)[1]) / 2
 
     def value(self, theta: Array) -> float:
         """At theta (q,), nats; minus infinity where a gain does not stabilise."""
+        if not self.used:
+            return 0.0
         away = float(self.weights @ (theta - self.space.start) ** 2) / 2
-        return -away - (self.barrier * self.space.wandering(theta)[0] if self.barrier else 0.0)
+        unlike = float(np.sum(self.unlike(theta)))
+        return -away - unlike - _BARRIER * self.space.wandering(theta)[0]
+
+    def unlike(self, theta: Array) -> Array:
+        """What each level costs (levels,), nats: log cosh of its distance, none where expected."""
+        off = np.abs(theta[self.space.own :] - self.scales)
+        return np.asarray(off + np.log1p(np.exp(-2 * off)) - np.log(2))
 
     def slopes(self, theta: Array) -> tuple[Array, Array]:
         """Derivatives at theta; the barrier is taken to bend as the logarithm of a distance does.
@@ -84,102 +152,114 @@ class Prior:
         gradient, bend : Array
             (q,), and what is taken for minus the second derivatives (q, q).
         """
-        gradient, bend = -self.weights * (theta - self.space.start), np.diag(self.weights)
-        if not self.barrier:
-            return gradient, bend
+        if not self.used:
+            return np.zeros(len(theta)), np.zeros((len(theta), len(theta)))
+        gradient, bend = -self.weights * (theta - self.space.start), np.array(self.weights)
+        turned = np.tanh(theta[self.space.own :] - self.scales)
+        gradient[self.space.own :] -= turned
+        bend[self.space.own :] += 1 - turned**2
         slope = self.space.wandering(theta)[1]
-        return gradient - self.barrier * slope, bend + self.barrier * np.outer(slope, slope)
-
-
-def reach(space: PersonCoordinates, theta: Array) -> tuple[Array, Array]:
-    """Between which values a search is held: levels within a factor of e^9.
-
-    Parameters
-    ----------
-    space : PersonCoordinates
-    theta : Array
-        Where it begins (q,).
-
-    Returns
-    -------
-    low, high : Array
-        (q,) each.
-    """
-    far = np.where(np.arange(len(theta)) < space.own, np.inf, _REACH)
-    return theta - far, theta + far
+        return gradient - _BARRIER * slope, np.diag(bend) + _BARRIER * np.outer(slope, slope)
 
 
 def climb(
-    prior: Prior, theta: Array, box: tuple[Array, Array], budget: int
-) -> tuple[Array, Told, int, bool]:
-    """The largest likelihood near theta, times the prior.
+    prior: Prior, theta: Array, budget: int, along: Array | None = None
+) -> tuple[Place, int, bool]:
+    """The largest likelihood near theta, times the prior and less what levels lose.
 
     Parameters
     ----------
     prior : Prior
     theta : Array
         Where it begins (q,).
-    box : pair of Array
-        Least and largest values (q,).
     budget : int
-        Likelihoods with derivatives, at most.
+        Likelihoods with derivatives, about.
+    along : Array, optional
+        Orthonormal directions in which it may move (q, r); all by default.
 
     Returns
     -------
-    theta, told, spent, settled : Array, Told, int, bool
-        Where it ends (q,), what the recordings say there, likelihoods with derivatives, and
-        whether it ended by itself.
+    place, spent, settled : Place, int, bool
+        The highest place, likelihoods with derivatives, and whether the search ended by itself.
 
     Raises
     ------
     ImpcError
         When there is no likelihood at theta.
     """
-    space = prior.space
-    told, radius, spent, slack = space.told(theta), _STEP, 1, _JUMPS
+    way, own = np.eye(len(theta)) if along is None else along, prior.space.own
+    enough = _ENOUGH if prior.used else _SETTLED
+    here = best = prior.at(theta)
+    losing = np.zeros(len(prior.scales))
+    known: Place | None = None
+    radius, spent, stale, left = _STEP, 1, 0, np.inf
     while True:
-        slope, bend = prior.slopes(theta)
-        gradient = told.gradient + slope
-        curvature = told.information + bend + _FLAT * np.eye(len(theta))
-        step, promised = boxed_step(gradient, curvature, box[0] - theta, box[1] - theta)
-        if promised < _SETTLED:
-            return theta, told, spent, True
-        gain, within = -np.inf, np.inf
-        while not gain > -slack / 4:
-            if within < _UNSEEN or spent >= budget:
-                return theta, told, spent, within < _UNSEEN and promised < _JUMPS
-            low, high = np.maximum(box[0] - theta, -radius), np.minimum(box[1] - theta, radius)
-            step, within = boxed_step(gradient, curvature, low, high)
-            there, length = theta + step, float(np.max(np.abs(step)))
-            try:
-                gain = space.value(there) + prior.value(there) - told.value - prior.value(theta)
-            except ImpcError:  # no filter there: a shorter step
-                gain = -np.inf
-            if gain < (within - slack) / 4:
-                radius = length / 4
-            elif gain > within * 0.75 - slack / 4:
-                radius = min(max(radius, 2 * length), _STEP)
-        slack += min(gain, 0.0)
-        theta, told, spent = there, space.told(there), spent + 1
+        slope, bend = prior.slopes(here.theta)
+        gradient = here.told.gradient + slope
+        gradient[own:] -= losing
+        down, curvature = way.T @ gradient, way.T @ (here.told.information + bend) @ way
+        curvature += _FLAT * np.eye(len(down))
+        promised = boxed_step(down, curvature, np.inf)[1]
+        if here is best:
+            left = promised
+        if promised < enough or stale == _PATIENCE or radius < _SHORTEST or spent >= budget:
+            if known is best or spent >= budget or not prior.used:
+                return best, spent, left < _ROUGH
+            here, losing, known = best, prior.losing(best), best
+            radius, spent, stale = _STEP, spent + len(losing), 0
+            continue
+        step, within = boxed_step(down, curvature, radius)
+        length = float(np.max(np.abs(step)))
+        there, spent = _place(prior, here.theta + way @ step), spent + 1
+        # What came true of the promise, both as if they were larger by what is not smooth.
+        share = -1.0 if there is None else (there.value - here.value + _ROUGH) / (within + _ROUGH)
+        if there is None or share < 0.25:
+            radius = length / 4
+            continue
+        if share > 0.75:
+            radius = min(max(radius, 2 * length), _STEP)
+        stale = 0 if there.value > best.value + enough else stale + 1
+        best = there if there.value > best.value else best
+        losing = _learned(prior, losing, here, there)
+        here = there
 
 
-def boxed_step(gradient: Array, curvature: Array, low: Array, high: Array) -> tuple[Array, float]:
-    """The step within a box that promises most, g's - s'C s / 2.
+def _learned(prior: Prior, losing: Array, here: Place, there: Place) -> Array:
+    """Slope of what levels lose by Broyden's update, damped: short steps tell of all else."""
+    own = prior.space.own
+    moved = (there.theta - here.theta)[own:]
+    missed = prior.lost(*there[:2]) - prior.lost(*here[:2]) - float(losing @ moved)
+    learned = losing + missed * moved / (float(moved @ moved) + _DAMPING)
+    # Twice the noise are half the deviations, and no level is more than all of it.
+    return np.clip(learned, -float(own), 0.0)
+
+
+def _place(prior: Prior, theta: Array) -> Place | None:
+    """The place, or None where there is no likelihood, or none that is a number."""
+    try:
+        there = prior.at(theta)
+    except ImpcError:
+        return None
+    return there if np.isfinite(there.value) else None
+
+
+def boxed_step(gradient: Array, curvature: Array, radius: float) -> tuple[Array, float]:
+    """The step that promises most, g's - s'C s / 2, and moves no coordinate by more than a radius.
 
     Parameters
     ----------
     gradient, curvature : Array
         g (q,) and C (q, q), positive definite.
-    low, high : Array
-        The box (q,); a coordinate with low = high = 0 is held.
+    radius : float
 
     Returns
     -------
     step, promised : Array, float
         (q,), and what it promises.
     """
-    step, free = np.zeros(len(gradient)), low < high
-    root = np.linalg.cholesky(curvature[np.ix_(free, free)])
-    goal = solve_triangular(root, gradient[free], lower=True)
-    step[free] = lsq_linear(root.T, goal, (low[free], high[free]), method="bvls").x
+    unit = 1 / np.sqrt(np.diag(curvature))
+    scaled = unit[:, None] * curvature * unit + _ROUNDING * np.eye(len(unit))
+    root = np.linalg.cholesky(scaled)
+    goal = solve_triangular(root, unit * gradient, lower=True)
+    step = unit * lsq_linear(root.T, goal, (-radius / unit, radius / unit), method="bvls").x
     return step, float(gradient @ step - step @ curvature @ step / 2)

@@ -27,7 +27,7 @@ import numpy as np
 import scipy.linalg
 
 from impc.arrays import Array, Frozen, frozen
-from impc.errors import SolverError
+from impc.errors import SolverError, WeightsError
 from impc.inverse.proximal_step import StepProgram, block_basis, solve_step
 from impc.model.riccati import gain_gradients, metric_gradients, solve_lqr
 from impc.model.weights import Weights, condition_number, normalised
@@ -288,7 +288,11 @@ def _linearise(here: _Point, objective: Objective) -> StepProgram:
 
 
 def _try(plant: Plant, objective: Objective, here: _Point, step: Array) -> _Point | None:
-    """The point at the end of a step, or None when it leaves the cone of definite weights."""
+    """The point at the end of a step, or None when there is no regulator.
+
+    A step may leave the cone of definite weights, or come so near to its edge that no Riccati
+    solution is found.
+    """
     n = plant.n
     X = here.weights.block
     L = np.linalg.cholesky(X)
@@ -296,4 +300,7 @@ def _try(plant: Plant, objective: Objective, here: _Point, step: Array) -> _Poin
     moved = (moved + moved.T) / 2
     if scipy.linalg.eigvalsh(moved)[0] <= 0:
         return None
-    return _point(plant, objective, Weights(frozen(moved[:n, :n]), frozen(moved[n:, n:])))
+    try:
+        return _point(plant, objective, Weights(frozen(moved[:n, :n]), frozen(moved[n:, n:])))
+    except WeightsError:
+        return None

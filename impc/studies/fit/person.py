@@ -158,7 +158,7 @@ def person_data(result: FitResult) -> dict[str, Any] | None:
     values = np.exp(fit.theta[fit.space.own :])
     return data | {
         "K": fit.K,
-        "K_deviations": covariance.entries,
+        "K_intervals": report.entries.reshape(*fit.K.shape, 2),
         "sensed": fit.observer.sensed,
         "known": fit.observer.walk is None,
         "levels": {
@@ -201,7 +201,7 @@ def _models_table(report: PersonReport) -> TextTable:
 def _levels_table(plant: Plant, report: PersonReport) -> TextTable:
     return table_of(
         "Levels of noise: standard deviations of one sample, with intervals of 95 % (by the "
-        "sandwich, or by profile where a level is weakly told or some level is none). A level "
+        "sandwich, or by profile where a level is weakly told). A level "
         "whose interval reaches a factor of ten is only told to be at most its upper end.",
         _levels(plant, report),
         {
@@ -220,22 +220,25 @@ def _levels_table(plant: Plant, report: PersonReport) -> TextTable:
 
 
 def _gain_table(result: FitResult, report: PersonReport) -> TextTable:
-    fit, covariance = report.models[0].fit, report.covariance
+    fit = report.models[0].fit
     assert fit is not None
-    assert covariance is not None
     names = entry_names(fit.problem.plant)
-    least = np.ravel(result.estimate.K)
-    own, deviations = np.ravel(fit.K), np.ravel(covariance.entries)
+    least, own = np.ravel(result.estimate.K), np.ravel(fit.K)
     return table_of(
-        "The gain of this person with deviations by the sandwich, beside that of least squares.",
+        "The gain of this person with intervals of 95 % by profile, beside that of least squares. "
+        "An entry that the recordings do not tell by itself has none.",
         range(len(names)),
         {
             "entry": lambda k: names[k],
             "maximum likelihood": lambda k: number(float(own[k]), 4),
-            "deviation": lambda k: number(float(deviations[k]), 2),
+            "95 %": lambda k: _interval(*(float(end) for end in report.entries[k])),
             "least squares": lambda k: number(float(least[k]), 4),
         },
     )
+
+
+def _interval(low: float, high: float) -> str:
+    return "not told by itself" if np.isnan(low) else f"{number(low)} to {number(high)}"
 
 
 def _left_table(result: FitResult, report: PersonReport) -> TextTable:
