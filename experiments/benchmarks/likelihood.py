@@ -1,10 +1,12 @@
 """The likelihood of a person on the seat who senses with noise, against simulations with Jacobian.
 
-Told alone, in a minute: python -m experiments.benchmarks.likelihood
+These rows alone, in a minute: python -m experiments.benchmarks.likelihood
 """
 
 from __future__ import annotations
 
+import json
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
@@ -50,4 +52,4 @@ def likelihood_rows(runs: int, _: Path) -> list[Row]:
 
 if __name__ == "__main__":
     for row in likelihood_rows(7, Path()):
-        print(f"{row.what} | {row.compared} | {row.value:.3g} | {row.note}")
+        print(json.dumps(asdict(row), indent=1))

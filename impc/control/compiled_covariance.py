@@ -106,11 +106,12 @@ class Moves(NamedTuple):
 
 
 @njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
-def covariance(size: int, p: int, k: int) -> Covariance:
-    """Room for z of a `size`, p outputs and k directions."""
+def covariance(P: Buffer, dP: Buffer, p: int) -> Covariance:
+    """P and dP (z, z, k), copied, and room for what follows from them for p outputs."""
+    size, k = len(P), dP.shape[2]
     return Covariance(
-        np.empty((size, size)),
-        np.empty((size, size, k)),
+        P.copy(),
+        dP.copy(),
         np.empty((p, size)),
         np.empty((p, p)),
         np.empty((p, p)),

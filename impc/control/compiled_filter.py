@@ -34,7 +34,7 @@ __all__ = ["COMPILED_WITH", "FilterResult", "Steady", "run_filter", "run_person"
 #: First digits of the SHA-256 of each file whose functions are called.
 COMPILED_WITH = {
     "compiled_clip": "4b317b8d6c67db13",
-    "compiled_covariance": "e8d8451d454e8966",
+    "compiled_covariance": "d39e8551933b0dfb",
     "compiled_loop": "7ac3d621e593d752",
     "compiled_products": "8b16c783fa8da574",
     "compiled_slope": "f94e9ea06c51ce30",
@@ -147,23 +147,20 @@ def run_filter(
         Samples before the one at which the law has no answer or the state leaves every range; all
         when there is none.
     """
-    n, m, q = loop.K.shape[1], loop.K.shape[0], dz.shape[1]
-    k = djoint.F.shape[2]
+    (m, n), q, k, p = loop.K.shape, dz.shape[1], djoint.F.shape[2], outputs.shape[1]
     work = workspace(rows, m, q)
     lam, du = np.zeros(len(rows.b)), np.empty((m, q))
     noise, dnoise = np.zeros((2, m)), np.zeros((2, m, k))
-    here, moves = covariance(len(z), outputs.shape[1], k), moves_of(djoint, k)
-    here.P[:], here.dP[:] = joint.P0, djoint.P0
+    here, moves = covariance(joint.P0, djoint.P0, p), moves_of(djoint, k)
     weigh(joint, djoint, moves, here)
-    varies, settled, quiet = bool(np.any(joint.share)), False, 0
+    settled, quiet = False, 0
     for t in range(len(outputs)):
         forgotten = _update(joint, djoint, moves, here, outputs[t], z, dz, result, t, shared)
         quiet = quiet + 1 if forgotten else 0
         if quiet > 2 * len(z) and k > shared:
             k = shared
-            before, here = here, covariance(len(z), outputs.shape[1], k)
-            here.P[:], here.dP[:] = before.P, before.dP[:, :, :k]
-            moves, dnoise = moves_of(djoint, k), np.zeros((2, m, k))
+            here, moves = covariance(here.P, here.dP[:, :, :k], p), moves_of(djoint, k)
+            dnoise = np.zeros((2, m, k))
             weigh(joint, djoint, moves, here)
         u, x, dx = result.u[t], z[at : at + n], dz[at : at + n]
         status, _, _ = law(loop, dloop, rows, drows, unit, work, x, dx, lam, False, u, du)
@@ -179,14 +176,9 @@ def run_filter(
             status, met = max(status, beyond), met or near
         result.status[t] = status
         if not settled or met:
-            for a in range(m):
-                size = joint.share[a] * u[a]
-                noise[1, a] = size**2
-                for c in range(k):
-                    change = joint.share[a] * du[a, c] + djoint.share[a, c] * u[a]
-                    dnoise[1, a, c] = 2 * size * change
+            _share(joint.share, djoint.share, u, du, noise[1], dnoise[1])
             advance(joint, djoint, moves, here, slope, dslope, at, noise, dnoise)
-            settled = steady.known and not met and not varies and _near(here, steady)
+            settled = steady.known and not met and _near(here, steady)
             if settled:
                 here.P[:], here.dP[:] = steady.P, steady.dP[:, :, :k]
             weigh(joint, djoint, moves, here)
@@ -195,6 +187,18 @@ def run_filter(
             result.status[t] = _DIVERGED
             return t
     return len(outputs)
+
+
+@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+def _share(
+    share: Buffer, dshare: Buffer, u: Buffer, du: Buffer, noise: Buffer, dnoise: Buffer
+) -> None:
+    """Write the variance of noise that is a share of the commands, and its derivatives."""
+    for a in range(len(u)):
+        noise[a] = (share[a] * u[a]) ** 2
+        for c in range(dnoise.shape[1]):
+            change = share[a] * du[a, c] + dshare[a, c] * u[a]
+            dnoise[a, c] = 2 * share[a] * u[a] * change
 
 
 @njit(cache=True, inline="always")
