@@ -51,7 +51,9 @@ ELSEWHERE = {
     "control/test_closed_loop.py": """
         control/compiled_loop.py control/constraint_rows.py""",
     "control/test_joint_likelihood.py": """
-        control/compiled_filter.py control/joint_loop.py control/noisy_person.py""",
+        control/compiled_clip.py control/compiled_covariance.py control/compiled_filter.py
+        control/compiled_products.py control/compiled_slope.py control/joint_loop.py
+        control/noisy_person.py""",
     "control/test_hard_plants.py": "control/infeasibility.py control/saturated.py",
     "control/test_optimal_control.py": """
         control/nlp_solvers.py control/optimal_recordings.py""",

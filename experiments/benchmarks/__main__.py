@@ -2,7 +2,7 @@
 
     python -m experiments.benchmarks [--runs 7]
 
-Every figure is a ratio of medians measured side by side in this run. About seven minutes.
+Every figure is a ratio of medians measured side by side in this run. About eight minutes.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from tqdm import tqdm
 from experiments.benchmarks.fits import fit_rows
 from experiments.benchmarks.growth import growth_rows
 from experiments.benchmarks.layers import layer_rows
+from experiments.benchmarks.likelihood import likelihood_rows
 from experiments.benchmarks.routes import route_rows
 from experiments.benchmarks.search import search_rows
 from experiments.benchmarks.simulation import simulation_rows
@@ -29,6 +30,7 @@ _PARTS = {
     "search": search_rows,
     "routes": route_rows,
     "layers": layer_rows,
+    "likelihood": likelihood_rows,
 }
 
 

@@ -28,7 +28,8 @@ import numpy as np
 
 from impc.arrays import Array, Frozen, frozen
 from impc.control.closed_loop import Status, prepare_loop
-from impc.control.compiled_filter import Clip, FilterResult, Steady, run_filter
+from impc.control.compiled_clip import Clip
+from impc.control.compiled_filter import FilterResult, Steady, run_filter
 from impc.control.constraint_rows import RowDirections, Rows
 from impc.control.joint_loop import PlantMoves, joint_directions, joint_loop
 from impc.errors import SolverError

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+import inspect
+import re
 from dataclasses import replace as replaced
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -12,9 +14,8 @@ import numpy as np
 import pytest
 from statsmodels.tsa.statespace.kalman_filter import KalmanFilter
 
-import impc.control.compiled_loop
+from impc.control import compiled_covariance, compiled_filter, compiled_slope
 from impc.control.closed_loop import scenario, simulate
-from impc.control.compiled_filter import COMPILED_WITH
 from impc.control.constraint_rows import directions
 from impc.control.controller import Controller
 from impc.control.joint_likelihood import (
@@ -32,13 +33,22 @@ from impc.model.plant import Plant
 from tests.support import extrapolated_slope
 
 if TYPE_CHECKING:
+    from types import ModuleType
+
     from impc.arrays import Array
 
 
-def test_the_filter_is_compiled_with_the_loop_that_is_there() -> None:
-    """numba would go on running the loop as it was: write this digest into compiled_filter.py."""
-    source = Path(impc.control.compiled_loop.__file__).read_bytes()
-    assert hashlib.sha256(source).hexdigest()[:16] == COMPILED_WITH
+@pytest.mark.parametrize("file", [compiled_covariance, compiled_slope, compiled_filter])
+def test_the_filter_is_compiled_with_what_is_there(file: ModuleType) -> None:
+    """numba would go on running what is called as it was: write these digests into the file."""
+    folder = Path(file.__file__ or "").parent
+    found = {
+        name: hashlib.sha256((folder / f"{name}.py").read_bytes()).hexdigest()[:16]
+        for name in re.findall(
+            r"from impc\.control\.(compiled_\w+) import", inspect.getsource(file)
+        )
+    }
+    assert found == file.COMPILED_WITH
 
 
 class Someone(NamedTuple):

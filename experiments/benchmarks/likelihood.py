@@ -1,0 +1,55 @@
+"""The likelihood of a person on the seat who senses with noise, against simulations with Jacobian.
+
+These rows alone, in a minute: python -m experiments.benchmarks.likelihood
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from experiments.benchmarks.table import Row, compare
+from experiments.benchmarks.timing import side_by_side
+from experiments.benchmarks.workloads import seat
+from experiments.noisy_people import recorded, subject
+from impc.checking import replace
+from impc.inverse.coordinates import Coordinates
+from impc.inverse.person_coordinates import PersonCoordinates
+from impc.inverse.residuals import evaluate
+
+__all__ = ["likelihood_rows"]
+
+
+def likelihood_rows(runs: int, _: Path) -> list[Row]:
+    """Three trials of 30 s, at the limit; gain and initial states are searched in all cases."""
+    who, work = subject("seat", 0, "both", 90.0, 6.0), seat(3)
+    law, problem = who.controller, recorded(who, 0).problem
+    own = Coordinates(problem, np.array(law.K), np.array(law.S))
+    space = PersonCoordinates(own, who.person, who.recorder)
+    known = np.array(work.controller.K), np.array(work.controller.S)
+    timings = side_by_side(
+        {
+            "told": partial(space.told, space.start),
+            "value": partial(space.value, space.start),
+            "W2": partial(evaluate, replace(work.problem, unknown_start=True), *known),
+            "person": partial(evaluate, problem, np.array(law.K), np.array(law.S)),
+        },
+        4 * runs,
+    )
+    what = "likelihood of a person on the seat, gradient and information"
+    met = "W2 simulation + exact Jacobian (gain, initial states), three trials"
+    return [
+        compare(what, met, timings["told"], timings["W2"], 10.0),
+        compare(what, "the person's own, who meets no limit without noise",
+                timings["told"], timings["person"], None),
+        compare("the likelihood alone", met, timings["value"], timings["W2"], None),
+    ]  # fmt: skip
+
+
+if __name__ == "__main__":
+    for row in likelihood_rows(7, Path()):
+        print(json.dumps(asdict(row), indent=1))

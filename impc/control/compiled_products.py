@@ -1,0 +1,136 @@
+"""Compiled code: sums of rows and other products, of matrices with derivatives along k directions.
+
+The last axis of a derivative, its directions, and the one before are taken as one: a processor then
+works on many numbers at a time. Everything is a plain array, for numba counts who uses an array
+whenever a slice is made or a tuple of arrays handed over, which took half of the time.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from impc.arrays import Buffer
+from impc.jit import njit
+
+__all__ = [
+    "add_outer",
+    "add_transposed",
+    "both_sides",
+    "combine",
+    "invert",
+    "noise_products",
+    "turn",
+]
+
+
+@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+def combine(weights: Buffer, rows: Buffer, step: int, result: Buffer) -> None:
+    """Write weights (i, j) times rows (j, w): of line i the first (i + 1) step, all if step is 0.
+
+    Four rows at a time, and none that has no weight. Indices begin at 0: where one might be
+    negative numba takes one number at a time.
+    """
+    (lines, count), width = weights.shape, rows.shape[1]
+    for i in range(lines):
+        end = width if step == 0 else (i + 1) * step
+        for b in range(end):
+            result[i, b] = 0.0
+        for j in range(0, count - 3, 4):
+            w, x, y, z = weights[i, j], weights[i, j + 1], weights[i, j + 2], weights[i, j + 3]
+            if w != 0.0 or x != 0.0 or y != 0.0 or z != 0.0:
+                for b in range(end):
+                    two = w * rows[j, b] + x * rows[j + 1, b]
+                    result[i, b] += two + y * rows[j + 2, b] + z * rows[j + 3, b]
+        for j in range(count - count % 4, count):
+            if weights[i, j] != 0.0:
+                for b in range(end):
+                    result[i, b] += weights[i, j] * rows[j, b]
+
+
+@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+def both_sides(G: Buffer, dP: Buffer, product: Buffer) -> None:
+    """The lower half of G dP G', half of its diagonal and zeros above take the place of dP."""
+    size, k = len(G), dP.shape[2]
+    flat, room = dP.reshape(size, size * k), product.reshape(size, size * k)
+    combine(G, flat, 0, room)
+    for i in range(size):  # so that the other G stands on the left, too
+        for j in range(i):
+            for c in range(k):
+                product[i, j, c], product[j, i, c] = product[j, i, c], product[i, j, c]
+    combine(G, room, k, flat)
+    for i in range(size):
+        for c in range(k):
+            dP[i, i, c] /= 2
+        for j in range(i + 1, size):
+            for c in range(k):
+                dP[i, j, c] = 0.0
+
+
+@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+def turn(changes: Buffer, rows: Buffer, turned: Buffer) -> None:
+    """Add sum_j rows_j changes_j' to what is turned (z, k)."""
+    for j in range(len(rows)):
+        for b in range(len(turned)):
+            for c in range(turned.shape[1]):
+                turned[b, c] += rows[j, b] * changes[j, c]
+
+
+@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+def add_outer(column: Buffer, turned: Buffer, dP: Buffer) -> None:
+    """Add column_i turned to each row i of dP; turned is zero afterwards."""
+    flat, line = dP.reshape(len(dP), turned.size), turned.reshape(turned.size)
+    for i in range(len(column)):
+        if column[i] != 0.0:
+            for b in range(len(line)):
+                flat[i, b] += column[i] * line[b]
+    turned[:] = 0.0
+
+
+@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+def add_transposed(dP: Buffer) -> None:
+    """Add to each entry that on the other side of the diagonal."""
+    size, k = len(dP), dP.shape[2]
+    for i in range(size):
+        for j in range(i, size):
+            for c in range(k):
+                both = dP[i, j, c] + dP[j, i, c]
+                dP[i, j, c] = both
+                dP[j, i, c] = both
+
+
+@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+def noise_products(inverse: Buffer, dS: Buffer, half: Buffer) -> None:
+    """Write tr(S^-1 dS S^-1 dS) / 2 for each pair of directions."""
+    p, k = len(inverse), dS.shape[2]
+    told = np.zeros((p, p, k))
+    for a in range(p):
+        for b in range(p):
+            for j in range(p):
+                for c in range(k):
+                    told[a, b, c] += inverse[a, j] * dS[j, b, c]
+    half[:] = 0.0
+    for a in range(p):
+        for b in range(p):
+            for c in range(k):
+                for d in range(k):
+                    half[c, d] += told[a, b, c] * told[b, a, d] / 2
+
+
+@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+def invert(S: Buffer, inverse: Buffer) -> float:
+    """Write the inverse of a covariance, one pivot after the other; return log det S."""
+    inverse[:] = S
+    p, volume = len(S), 0.0
+    for a in range(p):
+        pivot = inverse[a, a]
+        volume += np.log(pivot)
+        inverse[a, a] = 1.0
+        for c in range(p):
+            inverse[a, c] /= pivot
+        for b in range(p):
+            if b != a:
+                factor = inverse[b, a]
+                inverse[b, a] = 0.0
+                for c in range(p):
+                    inverse[b, c] -= factor * inverse[a, c]
+    return volume
