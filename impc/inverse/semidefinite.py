@@ -142,9 +142,10 @@ def solve_semidefinite(
     settings = clarabel.DefaultSettings()
     settings.verbose = False
     settings.max_threads = 1
-    # Who knows the reach has scaled the program: over 150 random plants Clarabel's own scaling took
-    # a fourth more steps then, and left the dual bound farther away.
-    settings.equilibrate_enable = reach is None
+    # Who knows the reach has scaled the program. On the seat it takes half of the time then without
+    # Clarabel's own scaling, and without refining each linear system; over 200 random plants ends
+    # at 1e-10 lay as near to their proved bounds as with both, and a tenth as far as with both at 1e-8.
+    settings.equilibrate_enable = settings.iterative_refinement_enable = reach is None
     settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = tolerance
     count = len(objective)
     quadratic = (count, count) if squares is None else np.diag(2 * squares)
