@@ -58,7 +58,7 @@ class _Program(click.Group):
 
         if args or kwargs:  # called from Python
             sys.exit(ended(work))
-        # The libraries' million objects stay: looking through them for garbage every 700 that are made
+        # The libraries' million objects stay: looking through them for garbage with every 700 more
         # took a fifth of the drawing, and a twentieth of `impc fit`.
         gc.set_threshold(50_000)
         with own_process():
