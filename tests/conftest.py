@@ -53,6 +53,7 @@ def blank_figures(monkeypatch: pytest.MonkeyPatch) -> None:
         stream.write(b"blank")
 
     monkeypatch.setattr(Figure, "savefig", blank)
+    monkeypatch.setattr(Figure, "draw_without_rendering", lambda _: None)
 
 
 @pytest.fixture

@@ -53,7 +53,7 @@ __all__ = [
 
 
 # Relative gap of the programs, and halvings that draw their points inside.
-_GAP, _HALVINGS = 1e-8, 50
+_GAP, _HALVINGS = 1e-10, 36
 
 
 @dataclass(frozen=True)

@@ -75,21 +75,6 @@ class Kept:
             )
         return found["content"]
 
-    def recall(self, name: str, digest: str) -> Any:
-        """As `find`, but None for what is damaged or of another run: it is done again.
-
-        Parameters
-        ----------
-        name : str
-            Which result.
-        digest : str
-            Of what it is to be made of.
-        """
-        try:
-            return self.find(name, digest)
-        except InputError:
-            return None
-
     def recall_all(self, digest: str) -> dict[str, Any]:
         """All that runs with that `digest` kept, name -> content, oldest first."""
         found = {}

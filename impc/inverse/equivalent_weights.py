@@ -8,6 +8,7 @@ of states and inputs, the second does (docs/equivalent-weights.md, section 2).
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -87,6 +88,7 @@ class EquivalentWeights(Frozen):
 
 
 @checked
+@functools.lru_cache(maxsize=1)  # whoever looks for one member of a fibre looks for others next
 def weights_margin(fibre: GainFibre) -> WeightsMargin:
     """Say whether any weights have the gain: max t such that X >= t I, mean eigenvalue of X is 1.
 

@@ -55,7 +55,7 @@ RANK = 1e-10
 _STATE_FLOOR, _INPUT_FLOOR = 1e-8, 1e-3
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)  # a fibre is itself only: what is found of it may be kept by it
 class GainFibre(Frozen):
     """The linear space of the pairs (Q, R) for which the gain is stationary.
 

@@ -16,7 +16,9 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 import psutil
 import pytest
+from click.testing import CliRunner, Result
 
+from impc.cli.main import main
 from impc.studies.cohort.store import open_store
 from tests.studies.cohort.carts import write_study
 from tests.studies.cohort.test_cluster import certificates
@@ -41,6 +43,11 @@ def run(study: Path, out: Path, *more: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         command(study, out, *more), cwd=ROOT, capture_output=True, text=True, check=False
     )
+
+
+def run_here(study: Path, out: Path, *more: str) -> Result:
+    """The same in this process, which has loaded its libraries; its workers are others."""
+    return CliRunner().invoke(main, command(study, out, *more)[3:])
 
 
 @pytest.fixture(scope="module")
@@ -137,8 +144,8 @@ def test_workers_and_client_may_die(
 
 def test_going_on_repeats_nothing(study: Path, undisturbed: Path) -> None:
     stamps = {path: path.stat().st_mtime_ns for path in undisturbed.rglob("units/**/*.json")}
-    done = run(study, undisturbed, "--workers", "1")
-    assert done.returncode == 0, done.stderr
+    done = run_here(study, undisturbed, "--workers", "1")
+    assert done.exit_code == 0, done.stderr
     assert {path: path.stat().st_mtime_ns for path in stamps} == stamps
 
 
@@ -215,8 +222,8 @@ def test_a_killed_scheduler_is_one_line_and_the_run_goes_on(
 
 
 def test_no_scheduler_is_one_line(study: Path, tmp_path: Path) -> None:
-    done = run(study, tmp_path / "out", "--scheduler", "tcp://127.0.0.1:9")
-    assert done.returncode == 2
+    done = run_here(study, tmp_path / "out", "--scheduler", "tcp://127.0.0.1:9")
+    assert done.exit_code == 2
     assert len(done.stderr.strip().splitlines()) == 1
     assert "does not answer" in done.stderr
 
@@ -244,8 +251,8 @@ def test_damaged_recordings_stop_nobody_else(
     names[1].write_bytes(whole[names[1]][:2000] + b"abc,def,ghi\n")
     names[2].write_bytes(whole[names[2]].replace(b"position", b"elsewhere"))
     out = tmp_path / "out"
-    done = run(study, out, "--workers", "1")
-    assert done.returncode == 1, done.stderr
+    done = run_here(study, out, "--workers", "1")
+    assert done.exit_code == 1, done.stderr
     found = json.loads((out / "result.json").read_text())
     assert found["fitted"] == subjects - 3
     assert set(found["failed"]) == {f"sub-{number:02d}_ses-1" for number in damaged}
@@ -255,8 +262,8 @@ def test_damaged_recordings_stop_nobody_else(
     assert f"{subjects - 3} of {subjects} units fitted" in done.stdout
     for path, content in whole.items():
         path.write_bytes(content)
-    again = run(study, out, "--workers", "1")
-    assert again.returncode == 0, again.stderr
+    again = run_here(study, out, "--workers", "1")
+    assert again.exit_code == 0, again.stderr
     assert len(pd.read_csv(out / "units.csv")) == subjects
 
 
@@ -264,8 +271,8 @@ def test_other_settings_are_refused(study: Path, undisturbed: Path) -> None:
     text = study.read_text()
     try:
         study.write_text(text.replace("horizon = 10", "horizon = 5"))
-        done = run(study, undisturbed, "--workers", "1")
+        done = run_here(study, undisturbed, "--workers", "1")
     finally:
         study.write_text(text)
-    assert done.returncode == 2
+    assert done.exit_code == 2
     assert "other recordings or with other settings" in done.stderr

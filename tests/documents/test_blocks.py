@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
-from matplotlib.figure import Figure
 
 from tests.documents.blocks import PAGES, blocks, command_lines
 from tests.documents.settings import require_valid
@@ -37,10 +36,7 @@ def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.usefixtures("blank_figures")
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page)])
-def test_the_blocks_run(
-    page: str, kept: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(Figure, "draw_without_rendering", lambda _: None)
+def test_the_blocks_run(page: str, kept: Path, tmp_path: Path) -> None:
     names: dict[str, object] = {"__name__": "page"}
     with working_in(tmp_path):
         for line in PREPARED.get(page, ()):

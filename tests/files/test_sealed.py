@@ -23,7 +23,7 @@ def test_what_is_kept_reads_the_same(tmp_path: Path) -> None:
     kept.keep("a/b", "d", content)
     assert kept.find("a/b", "d") == content
     assert kept.recall_all("d") == {"a/b": content}
-    assert kept.recall("a/b", "other") is None
+    assert kept.recall_all("other") == {}
     with pytest.raises(InputError, match="other recordings"):
         kept.find("a/b", "other")
     kept.forget()
@@ -34,7 +34,8 @@ def test_what_is_kept_reads_the_same(tmp_path: Path) -> None:
 def test_names_that_fall_together_are_told_apart(tmp_path: Path) -> None:
     kept = Kept(tmp_path)
     kept.keep("trial 1", "d", 1)
-    assert kept.recall("trial-1", "d") is None
+    with pytest.raises(InputError, match="other recordings"):
+        kept.find("trial-1", "d")
     assert kept.recall_all("d") == {"trial 1": 1}
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from impc.errors import InputError
-from impc.files.units import is_unit, si_unit
+from impc.files.units import USUAL, as_pint_says, is_unit, si_unit
 
 
 @pytest.mark.parametrize(
@@ -66,3 +66,8 @@ def test_units_that_cannot_be_used(written: str, phrase: str) -> None:
 def test_what_in_brackets_is_a_unit() -> None:
     assert all(is_unit(text) for text in ("deg", "N*m", "g", "ms"))
     assert not any(is_unit(text) for text in ("", "left", "channel 3", "raw"))
+
+
+@pytest.mark.parametrize("written", USUAL)
+def test_the_usual_units_are_as_pint_has_them(written: str) -> None:
+    assert as_pint_says(written) == USUAL[written]
