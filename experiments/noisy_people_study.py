@@ -43,7 +43,7 @@ _NORMAL, _LOWER = 1.959964, 1.920729
 _LIMITS = {"cart": (5.0, 0.7), "seat": (70.0, 6.0)}
 # A direction of the gain is determined when its deviation is below this, in natural coordinates.
 _DETERMINED = 0.25
-# As far below the truth's own likelihood a search may end, nats.
+# As far below the truth a search may end, nats.
 _ENDED = 0.5
 
 
@@ -61,7 +61,7 @@ class Score:
     vaf : float
         Of the motion without noise, %.
     above : float
-        Log-likelihood at the end of the search minus that of the truth, nats.
+        What the search makes largest, at its end minus at the truth, nats.
     converged : bool
     evaluations : int
     least_error, likely_error : float
@@ -152,8 +152,8 @@ def blind(who: Subject) -> Observer:
 
 
 def above_truth(likely: PersonFit, who: Subject) -> float:
-    """Log-likelihood of the fit minus that of the subject as simulated, nats."""
-    return likely.log_likelihood - likely.space.value(true_unknowns(likely, who))
+    """What the search makes largest, at the fit minus at the subject as simulated, nats."""
+    return likely.value - likely.prior.at(true_unknowns(likely, who)).value
 
 
 def true_unknowns(likely: PersonFit, who: Subject) -> Array:
@@ -291,7 +291,7 @@ def _shares(holds: list[list[bool]]) -> str:
 
 def _sum(given: argparse.Namespace) -> None:
     heads = (
-        "people", "count", "at the limit %", "ended at the truth's likelihood or above", "settled",
+        "people", "count", "at the limit %", "ended at the truth or above", "settled",
         "least squares: error %", "bias / deviation", "95 % holds %",
         "likelihood: error %", "bias / deviation", "95 % holds % (sandwich)", "(expected)",
         "(profile)",

@@ -203,7 +203,7 @@ def _held(fit: PersonFit, theta: Array, along: Array, value: float) -> tuple[Arr
 
 
 def _across(along: Array) -> Array:
-    """All that is orthogonal to a direction (q, q - 1), coordinates that it leaves alone as such."""
+    """All that is orthogonal to a direction (q, q - 1); coordinates it leaves alone, as such."""
     mine = np.flatnonzero(along)
     turned = np.zeros((len(along), len(mine) - 1))
     turned[mine] = scipy.linalg.null_space(along[None, mine])

@@ -11,9 +11,8 @@ back by what slides, and crept for hundreds of rounds on the seat (docs/noisy-pe
 Noisy recordings leave some directions of the gain all but free. A weak normal prior in natural
 coordinates keeps those where the first fit was, as in `gain_search`, and a barrier keeps gains that
 stabilise from the border of those that do not. Levels are those of the largest restricted
-likelihood, and a level is half-Cauchy (Gelman 2006): without either the likelihood of several
-levels is often largest where one of them is zero, and others are too large in its place (Chung et
-al. 2013).
+likelihood, and are expected to have a size: without either the likelihood of several levels is
+often largest where one of them is zero, and others are too large in its place (Chung et al. 2013).
 """
 
 from __future__ import annotations
@@ -53,6 +52,9 @@ _STEP, _SHORTEST = 1.0, 1e-3
 # Nats for each factor of e by which a gain near the border of those that stabilise lets noise
 # grow: on the seat the largest likelihood without it is on that border, and a search creeps there.
 _BARRIER = 0.5
+# Nats for each factor of e by which a level lies far from the size that is expected. With one nat
+# people all but without noise in the senses had some: two deviations too much on the cart.
+_UNLIKE = 0.25
 
 
 class Place(NamedTuple):
@@ -77,8 +79,9 @@ class Prior:
     """What holds directions that nothing tells, as a share of a log-likelihood.
 
     A normal number about the start for each coordinate but the levels, and a barrier before gains
-    that do not stabilise. With x a level over its scale the density of its logarithm is that of a
-    half-Cauchy level, x / (1 + x^2): one nat for each factor of e, far away on either side.
+    that do not stabilise. With x a level over its scale the density of its logarithm is a power of
+    that of a half-Cauchy level (Gelman 2006), x / (1 + x^2): far away, a quarter of a nat for each
+    factor of e on either side.
 
     Parameters
     ----------
@@ -135,9 +138,9 @@ class Prior:
         return -away - unlike - _BARRIER * self.space.wandering(theta)[0]
 
     def unlike(self, theta: Array) -> Array:
-        """What each level costs (levels,), nats: log cosh of its distance, none where expected."""
+        """What each level costs (levels,), nats: from log cosh of its distance to the scale."""
         off = np.abs(theta[self.space.own :] - self.scales)
-        return np.asarray(off + np.log1p(np.exp(-2 * off)) - np.log(2))
+        return np.asarray(_UNLIKE * (off + np.log1p(np.exp(-2 * off)) - np.log(2)))
 
     def slopes(self, theta: Array) -> tuple[Array, Array]:
         """Derivatives at theta; the barrier is taken to bend as the logarithm of a distance does.
@@ -156,8 +159,8 @@ class Prior:
             return np.zeros(len(theta)), np.zeros((len(theta), len(theta)))
         gradient, bend = -self.weights * (theta - self.space.start), np.array(self.weights)
         turned = np.tanh(theta[self.space.own :] - self.scales)
-        gradient[self.space.own :] -= turned
-        bend[self.space.own :] += 1 - turned**2
+        gradient[self.space.own :] -= _UNLIKE * turned
+        bend[self.space.own :] += _UNLIKE * (1 - turned**2)
         slope = self.space.wandering(theta)[1]
         return gradient - _BARRIER * slope, np.diag(bend) + _BARRIER * np.outer(slope, slope)
 
@@ -190,7 +193,7 @@ def climb(
     way, own = np.eye(len(theta)) if along is None else along, prior.space.own
     enough = _ENOUGH if prior.used else _SETTLED
     here = best = prior.at(theta)
-    losing = np.zeros(len(prior.scales))
+    losing: Array = np.zeros(len(prior.scales))
     known: Place | None = None
     radius, spent, stale, left = _STEP, 1, 0, np.inf
     while True:
