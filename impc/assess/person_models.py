@@ -72,8 +72,8 @@ class PersonReport(Frozen):
     levels : Array
         Intervals of 95 % of its levels (l, 2): by profile where a level is weakly told.
     entries : Array
-        The same of the entries of its gain (m n, 2), all by profile; NaN where an entry is not told
-        by itself.
+        The same of the entries of its gain (entries, 2), all by profile; NaN where an entry is not
+        told by itself.
     confusion : Confusion or None
         What of gain and noise is told least apart.
     whiteness : Array

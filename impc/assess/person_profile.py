@@ -67,7 +67,7 @@ def level_intervals(fit: PersonFit, covariance: PersonCovariance, *, weak: float
 
 
 def entry_intervals(fit: PersonFit, covariance: PersonCovariance) -> Array:
-    """Intervals of 95 % of the entries of the gain (m n, 2) by profile, in their units.
+    """Intervals of 95 % of the entries of the gain (entries, 2) by profile, in their units.
 
     Parameters
     ----------
@@ -139,6 +139,7 @@ def fallen(fit: PersonFit, along: Array, value: float) -> float:
     along : Array
         As in `profile` (q,).
     value : float
+        In the coordinates of the fit.
 
     Returns
     -------

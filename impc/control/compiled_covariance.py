@@ -10,7 +10,7 @@ slope among it, is of the sample; k directions are the last axis of every deriva
 
 The two products with G are most of what a likelihood costs (`compiled_products`). numba's cache
 does not look there: `COMPILED_WITH` must change with it, which
-tests/control/test_joint_likelihood.py asks for.
+tests/control/test_joint_likelihood.py asks for (docs/noisy-people.md).
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ __all__ = [
 ]
 
 #: First digits of the SHA-256 of each file whose functions are called.
-COMPILED_WITH = {"compiled_products": "8b16c783fa8da574"}
+COMPILED_WITH = {"compiled_products": "ee0758fa1bef7e67"}
 
 
 class Covariance(NamedTuple):
@@ -214,6 +214,7 @@ def advance(
     slope, dslope : Buffer
         Of the commands with the estimate, which stands at `at` in z: (m, n) and (m, n, k).
     at : int
+        Of the first entry of the estimate.
     noise, dnoise : Buffer
         Variance of noise that enters with each command, by B and by G, (2, m), and its derivatives
         (2, m, k).

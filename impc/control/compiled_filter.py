@@ -34,10 +34,10 @@ __all__ = ["COMPILED_WITH", "FilterResult", "Steady", "run_filter", "run_person"
 #: First digits of the SHA-256 of each file whose functions are called.
 COMPILED_WITH = {
     "compiled_clip": "4b317b8d6c67db13",
-    "compiled_covariance": "d39e8551933b0dfb",
+    "compiled_covariance": "c9253729b72d5cf5",
     "compiled_loop": "7ac3d621e593d752",
-    "compiled_products": "8b16c783fa8da574",
-    "compiled_slope": "f94e9ea06c51ce30",
+    "compiled_products": "ee0758fa1bef7e67",
+    "compiled_slope": "a7ab729ed84ccf9e",
 }
 
 _SOFTENED, _DIVERGED = 2, 5

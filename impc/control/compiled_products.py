@@ -2,7 +2,8 @@
 
 The last axis of a derivative, its directions, and the one before are taken as one: a processor then
 works on many numbers at a time. Everything is a plain array, for numba counts who uses an array
-whenever a slice is made or a tuple of arrays handed over, which took half of the time.
+whenever a slice is made or a tuple of arrays handed over, which took half of the time
+(docs/noisy-people.md).
 """
 
 from __future__ import annotations
@@ -29,6 +30,15 @@ def combine(weights: Buffer, rows: Buffer, step: int, result: Buffer) -> None:
 
     Four rows at a time, and none that has no weight. Indices begin at 0: where one might be
     negative numba takes one number at a time.
+
+    Parameters
+    ----------
+    weights, rows : Buffer
+        (i, j) and (j, w).
+    step : int
+        By how many numbers each line is longer than the one before; 0 for all of each.
+    result : Buffer
+        Written (i, w).
     """
     (lines, count), width = weights.shape, rows.shape[1]
     for i in range(lines):
@@ -49,7 +59,15 @@ def combine(weights: Buffer, rows: Buffer, step: int, result: Buffer) -> None:
 
 @njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 def both_sides(G: Buffer, dP: Buffer, product: Buffer) -> None:
-    """The lower half of G dP G', half of its diagonal and zeros above take the place of dP."""
+    """The lower half of G dP G', half of its diagonal and zeros above take the place of dP.
+
+    Parameters
+    ----------
+    G : Buffer
+        (z, z).
+    dP, product : Buffer
+        (z, z, k); the second is room on the way.
+    """
     size, k = len(G), dP.shape[2]
     flat, room = dP.reshape(size, size * k), product.reshape(size, size * k)
     combine(G, flat, 0, room)
@@ -68,7 +86,13 @@ def both_sides(G: Buffer, dP: Buffer, product: Buffer) -> None:
 
 @njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 def turn(changes: Buffer, rows: Buffer, turned: Buffer) -> None:
-    """Add sum_j rows_j changes_j' to what is turned (z, k)."""
+    """Add sum_j rows_j changes_j' to what is turned.
+
+    Parameters
+    ----------
+    changes, rows, turned : Buffer
+        (j, k), (j, z) and (z, k).
+    """
     for j in range(len(rows)):
         for b in range(len(turned)):
             for c in range(turned.shape[1]):
@@ -77,7 +101,13 @@ def turn(changes: Buffer, rows: Buffer, turned: Buffer) -> None:
 
 @njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 def add_outer(column: Buffer, turned: Buffer, dP: Buffer) -> None:
-    """Add column_i turned to each row i of dP; turned is zero afterwards."""
+    """Add column_i turned to each row i of dP; turned is zero afterwards.
+
+    Parameters
+    ----------
+    column, turned, dP : Buffer
+        (z,), (z, k) and (z, z, k).
+    """
     flat, line = dP.reshape(len(dP), turned.size), turned.reshape(turned.size)
     for i in range(len(column)):
         if column[i] != 0.0:
@@ -88,7 +118,7 @@ def add_outer(column: Buffer, turned: Buffer, dP: Buffer) -> None:
 
 @njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 def add_transposed(dP: Buffer) -> None:
-    """Add to each entry that on the other side of the diagonal."""
+    """Add to each entry of dP (z, z, k) that on the other side of the diagonal."""
     size, k = len(dP), dP.shape[2]
     for i in range(size):
         for j in range(i, size):
@@ -100,7 +130,15 @@ def add_transposed(dP: Buffer) -> None:
 
 @njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 def noise_products(inverse: Buffer, dS: Buffer, half: Buffer) -> None:
-    """Write tr(S^-1 dS S^-1 dS) / 2 for each pair of directions."""
+    """Write tr(S^-1 dS S^-1 dS) / 2 for each pair of directions.
+
+    Parameters
+    ----------
+    inverse, dS : Buffer
+        S^-1 (p, p), and the derivatives of S (p, p, k).
+    half : Buffer
+        Written (k, k).
+    """
     p, k = len(inverse), dS.shape[2]
     told = np.zeros((p, p, k))
     for a in range(p):
@@ -118,7 +156,13 @@ def noise_products(inverse: Buffer, dS: Buffer, half: Buffer) -> None:
 
 @njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 def invert(S: Buffer, inverse: Buffer) -> float:
-    """Write the inverse of a covariance, one pivot after the other; return log det S."""
+    """Write the inverse of a covariance, one pivot after the other; return log det S.
+
+    Parameters
+    ----------
+    S, inverse : Buffer
+        (p, p); the second is written.
+    """
     inverse[:] = S
     p, volume = len(S), 0.0
     for a in range(p):

@@ -1,7 +1,8 @@
 """Compiled code: the slope of the command with the state, at the active set of one sample.
 
 It calls the least-distance problem of `compiled_loop`, at which numba's cache does not look:
-`COMPILED_WITH` must change with it, which tests/control/test_joint_likelihood.py asks for.
+`COMPILED_WITH` must change with it, which tests/control/test_joint_likelihood.py asks for
+(docs/noisy-people.md).
 """
 
 from __future__ import annotations

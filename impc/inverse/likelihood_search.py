@@ -109,7 +109,7 @@ class Prior:
         return Place(theta, told, told.value + self.value(theta) - self.lost(theta, told))
 
     def losing(self, here: Place) -> Array:
-        """Slope of `lost` along the levels (levels,), by differences: a filter for each."""
+        """Slope of `lost` along the levels (levels,) from `here`, by differences."""
         if not self.used:
             return np.zeros(len(self.scales))
         steps = _DIFFERENCE * np.eye(len(here.theta))[self.space.own :]
@@ -117,7 +117,9 @@ class Prior:
         return (np.array(there) - self.lost(here.theta, here.told)) / _DIFFERENCE
 
     def lost(self, theta: Array, told: Told) -> float:
-        """What levels lose because all else is fitted to the same noise, nats.
+        """What levels lose because all else is fitted to the same noise, nats, at theta (q,).
+
+        `told` is what the recordings say there.
 
         The likelihood of the levels alone, all else integrated out, is by Laplace's method the
         largest over all else, less half of the logarithm of the determinant of the information on
@@ -138,7 +140,7 @@ class Prior:
         return -away - unlike - _BARRIER * self.space.wandering(theta)[0]
 
     def unlike(self, theta: Array) -> Array:
-        """What each level costs (levels,), nats: from log cosh of its distance to the scale."""
+        """What each level costs (levels,) at theta (q,), nats: log cosh of how far it is off."""
         off = np.abs(theta[self.space.own :] - self.scales)
         return np.asarray(_UNLIKE * (off + np.log1p(np.exp(-2 * off)) - np.log(2)))
 
@@ -254,6 +256,7 @@ def boxed_step(gradient: Array, curvature: Array, radius: float) -> tuple[Array,
     gradient, curvature : Array
         g (q,) and C (q, q), positive definite.
     radius : float
+        Infinite for none.
 
     Returns
     -------
