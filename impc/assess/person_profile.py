@@ -28,8 +28,7 @@ if TYPE_CHECKING:
 
 __all__ = ["entry_intervals", "fallen", "level_interval", "level_intervals", "profile"]
 
-# Half of 1.96^2, nats; its root, and how near to that an end of an interval is found.
-_LOWER = 1.920729
+# Root of half of 1.96^2, of nats, and how near to it an end of an interval is found.
 _FALLEN, _CLOSE = 1.385903, 0.04
 _NORMAL = 1.959964
 # A first step is no longer than this, and no end is looked for farther away: some thousands of a
@@ -146,7 +145,8 @@ def fallen(fit: PersonFit, along: Array, value: float) -> float:
     float
         Nats; infinite where nothing was found.
     """
-    return _held(fit, np.array(fit.theta), along, value)[1]
+    ridge = _covariance(fit) @ along
+    return _held(fit, np.array(fit.theta), along, ridge, value)[1]
 
 
 def _end(fit: PersonFit, along: Array, side: int) -> float:
@@ -155,14 +155,15 @@ def _end(fit: PersonFit, along: Array, side: int) -> float:
     The root of what has fallen is straight where the likelihood is that of a normal number, so the
     next guess lies on a line.
     """
-    theta, spread = np.array(fit.theta), float(np.sqrt(along @ _covariance(fit) @ along))
+    theta, ridge = np.array(fit.theta), _covariance(fit) @ along
+    spread = float(np.sqrt(along @ ridge))
     begin = float(along @ theta)
     border, step = begin + side * _FARTHEST, min(_NORMAL * spread, _LONGEST)
     inside, outside = (begin, 0.0), (np.nan, np.inf)
     value = begin + side * step
     for _ in range(_TRIES):
         value = border if side * (value - border) >= 0 else value
-        theta, nats = _held(fit, theta, along, value)
+        theta, nats = _held(fit, theta, along, ridge, value)
         root = float(np.sqrt(max(nats, 0.0)))
         if abs(root - _FALLEN) < _CLOSE:
             return value
@@ -186,12 +187,13 @@ def _covariance(fit: PersonFit) -> Array:
     return np.asarray(np.linalg.inv(information + _FLAT * np.eye(len(information))))
 
 
-def _held(fit: PersonFit, theta: Array, along: Array, value: float) -> tuple[Array, float]:
+def _held(
+    fit: PersonFit, theta: Array, along: Array, ridge: Array, value: float
+) -> tuple[Array, float]:
     """The best of all else with along'theta at a value, and how far the likelihood fell."""
-    spread = _covariance(fit) @ along
     off = value - float(along @ theta)
     # A straight line along the ridge may leave the gains that stabilise.
-    starts = (theta + spread * (off / float(along @ spread)), theta + along * off)
+    starts = (theta + ridge * (off / float(along @ ridge)), theta + along * off)
     start = next((each for each in starts if np.isfinite(fit.prior.value(each))), starts[1])
     try:
         found, _, _ = climb(fit.prior, start, _BUDGET, _across(along))

@@ -59,6 +59,8 @@ class PersonFit(Frozen):
         Unknowns of the problem's structure, where it has one (count,).
     log_likelihood : float
         Of all samples of all trials, nats; without the prior.
+    value : float
+        What the search made largest: likelihood times prior, less what levels lose, nats.
     count : int
         How many numbers were searched.
     converged : bool
@@ -80,6 +82,7 @@ class PersonFit(Frozen):
     recorder: Array
     prices: Array | None
     log_likelihood: float
+    value: float
     count: int
     converged: bool
     evaluations: int
@@ -91,12 +94,6 @@ class PersonFit(Frozen):
     def space(self) -> PersonCoordinates:
         """The coordinates of the search."""
         return self.prior.space
-
-    @property
-    def value(self) -> float:
-        """What the search made largest: likelihood times prior, less what levels lose, nats."""
-        theta = np.array(self.theta)
-        return self.told.value + self.prior.value(theta) - self.prior.lost(theta, self.told)
 
     @property
     def criterion(self) -> float:
@@ -174,7 +171,6 @@ def fit_person(
     plant = found.problem.plant
     residual = residual_only(found.problem, found.gain, found.metric)
     size = _sizes(found, residual.reshape(-1, len(plant.outputs)) * found.problem.output_scale)
-    starts = []
     white = size.recorder if recorder is None else np.asarray(recorder)
     first = PersonCoordinates(space, observer, white, held)
     starts = [first.start]
@@ -185,7 +181,7 @@ def fit_person(
     theta = _best(first, starts)
     alone = np.concatenate([_suggested(observer, size, 1.0, 1.0), size.recorder])
     prior = Prior(first, spread, np.log(alone[first.moving]))
-    (theta, told, _), spent, settled = climb(prior, theta, max_evaluations)
+    (theta, told, value, _), spent, settled = climb(prior, theta, max_evaluations)
     person = first.unpack(theta)
     prices = space.unknowns(theta[: first.own]) if isinstance(space, PriceCoordinates) else None
     return PersonFit(
@@ -196,6 +192,7 @@ def fit_person(
         person.recorder,
         None if prices is None else frozen(prices),
         told.value,
+        value,
         len(theta),
         settled,
         spent,

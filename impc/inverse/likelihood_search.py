@@ -68,11 +68,14 @@ class Place(NamedTuple):
         What the recordings say there.
     value : float
         What is to be largest, nats.
+    lost : float
+        What levels lose there (`Prior.lost`), nats.
     """
 
     theta: Array
     told: Told
     value: float
+    lost: float
 
 
 class Prior:
@@ -106,7 +109,8 @@ class Prior:
             When there is no likelihood there.
         """
         told = self.space.told(theta)
-        return Place(theta, told, told.value + self.value(theta) - self.lost(theta, told))
+        lost = self.lost(theta, told)
+        return Place(theta, told, told.value + self.value(theta) - lost, lost)
 
     def losing(self, here: Place) -> Array:
         """Slope of `lost` along the levels (levels,) from `here`, by differences."""
@@ -114,7 +118,7 @@ class Prior:
             return np.zeros(len(self.scales))
         steps = _DIFFERENCE * np.eye(len(here.theta))[self.space.own :]
         there = [self.lost(here.theta + step, self.space.told(here.theta + step)) for step in steps]
-        return (np.array(there) - self.lost(here.theta, here.told)) / _DIFFERENCE
+        return (np.array(there) - here.lost) / _DIFFERENCE
 
     def lost(self, theta: Array, told: Told) -> float:
         """What levels lose because all else is fitted to the same noise, nats, at theta (q,).
@@ -225,15 +229,13 @@ def climb(
             radius = min(max(radius, 2 * length), _STEP)
         stale = 0 if there.value > best.value + enough else stale + 1
         best = there if there.value > best.value else best
-        losing = _learned(prior, losing, here, there)
-        here = there
+        losing, here = _learned(own, losing, here, there), there
 
 
-def _learned(prior: Prior, losing: Array, here: Place, there: Place) -> Array:
+def _learned(own: int, losing: Array, here: Place, there: Place) -> Array:
     """Slope of what levels lose by Broyden's update, damped: short steps tell of all else."""
-    own = prior.space.own
     moved = (there.theta - here.theta)[own:]
-    missed = prior.lost(*there[:2]) - prior.lost(*here[:2]) - float(losing @ moved)
+    missed = there.lost - here.lost - float(losing @ moved)
     learned = losing + missed * moved / (float(moved @ moved) + _DAMPING)
     # Twice the noise are half the deviations, and no level is more than all of it.
     return np.clip(learned, -float(own), 0.0)

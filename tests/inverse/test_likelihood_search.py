@@ -59,7 +59,7 @@ def test_levels_that_slide_do_not_hold_back_the_rest(sliding: PersonFit) -> None
 def test_a_search_that_may_not_go_on_says_so(sliding: PersonFit) -> None:
     space = sliding.space
     prior = Prior(space, 1.0, space.start[space.own :])
-    (theta, told, _), spent, settled = climb(prior, space.start, 2)
+    (theta, told, _, _), spent, settled = climb(prior, space.start, 2)
     assert (spent, settled) == (2, False)
     assert told.value == space.told(theta).value < sliding.log_likelihood
 
