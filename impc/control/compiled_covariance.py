@@ -44,7 +44,7 @@ __all__ = [
 ]
 
 #: First digits of the SHA-256 of each file whose functions are called.
-COMPILED_WITH = {"compiled_products": "ee0758fa1bef7e67"}
+COMPILED_WITH = {"compiled_products": "2494e893c692e072"}
 
 
 class Covariance(NamedTuple):

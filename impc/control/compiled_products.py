@@ -28,8 +28,9 @@ __all__ = [
 def combine(weights: Buffer, rows: Buffer, step: int, result: Buffer) -> None:
     """Write weights (i, j) times rows (j, w): of line i the first (i + 1) step, all if step is 0.
 
-    Four rows at a time, and none that has no weight. Indices begin at 0: where one might be
-    negative numba takes one number at a time.
+    Four lines at a time, so that a number that is loaded serves four, and beyond what is asked of
+    the first three. Indices begin at 0: where one might be negative numba takes one number at a
+    time.
 
     Parameters
     ----------
@@ -40,21 +41,60 @@ def combine(weights: Buffer, rows: Buffer, step: int, result: Buffer) -> None:
     result : Buffer
         Written (i, w).
     """
-    (lines, count), width = weights.shape, rows.shape[1]
-    for i in range(lines):
-        end = width if step == 0 else (i + 1) * step
-        for b in range(end):
-            result[i, b] = 0.0
-        for j in range(0, count - 3, 4):
-            w, x, y, z = weights[i, j], weights[i, j + 1], weights[i, j + 2], weights[i, j + 3]
-            if w != 0.0 or x != 0.0 or y != 0.0 or z != 0.0:
-                for b in range(end):
-                    two = w * rows[j, b] + x * rows[j + 1, b]
-                    result[i, b] += two + y * rows[j + 2, b] + z * rows[j + 3, b]
-        for j in range(count - count % 4, count):
-            if weights[i, j] != 0.0:
-                for b in range(end):
-                    result[i, b] += weights[i, j] * rows[j, b]
+    lines, width = len(weights), rows.shape[1]
+    whole = lines - lines % 4
+    for i in range(0, whole, 4):
+        _four_lines(weights, rows, i, width if step == 0 else (i + 4) * step, result)
+    for i in range(whole, lines):
+        _line(weights, rows, i, width if step == 0 else (i + 1) * step, result)
+
+
+@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+def _four_lines(weights: Buffer, rows: Buffer, i: int, end: int, result: Buffer) -> None:
+    """Write `end` numbers of lines i to i + 3; four rows at a time, and none without a weight."""
+    count = len(rows)
+    one, two, three, four = result[i], result[i + 1], result[i + 2], result[i + 3]
+    result[i : i + 4, :end] = 0.0
+    for j in range(0, count - 3, 4):
+        w, x = _four(weights[i], j), _four(weights[i + 1], j)
+        y, z = _four(weights[i + 2], j), _four(weights[i + 3], j)
+        if _any(w) or _any(x) or _any(y) or _any(z):
+            for b in range(end):
+                told = rows[j, b], rows[j + 1, b], rows[j + 2, b], rows[j + 3, b]
+                one[b] += _times(w, told)
+                two[b] += _times(x, told)
+                three[b] += _times(y, told)
+                four[b] += _times(z, told)
+    for j in range(count - count % 4, count):
+        for line in range(i, i + 4):
+            for b in range(end):
+                result[line, b] += weights[line, j] * rows[j, b]
+
+
+@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+def _line(weights: Buffer, rows: Buffer, i: int, end: int, result: Buffer) -> None:
+    """Write `end` numbers of line i, one row after the other that has a weight."""
+    one = result[i]
+    one[:end] = 0.0
+    for j in range(len(rows)):
+        if weights[i, j] != 0.0:
+            for b in range(end):
+                one[b] += weights[i, j] * rows[j, b]
+
+
+@njit(cache=True, inline="always")
+def _four(line: Buffer, j: int) -> tuple[float, float, float, float]:
+    return line[j], line[j + 1], line[j + 2], line[j + 3]
+
+
+@njit(cache=True, inline="always")
+def _any(w: tuple[float, float, float, float]) -> bool:
+    return w[0] != 0.0 or w[1] != 0.0 or w[2] != 0.0 or w[3] != 0.0
+
+
+@njit(cache=True, inline="always")
+def _times(w: tuple[float, float, float, float], x: tuple[float, float, float, float]) -> float:
+    return w[0] * x[0] + w[1] * x[1] + w[2] * x[2] + w[3] * x[3]
 
 
 @njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
