@@ -21,8 +21,7 @@ import numpy as np
 
 from impc.arrays import Buffer
 from impc.control.compiled_products import (
-    add_outer,
-    add_transposed,
+    add_both,
     both_sides,
     combine,
     invert,
@@ -44,7 +43,7 @@ __all__ = [
 ]
 
 #: First digits of the SHA-256 of each file whose functions are called.
-COMPILED_WITH = {"compiled_products": "2494e893c692e072"}
+COMPILED_WITH = {"compiled_products": "a0b2e54183eebe86"}
 
 
 class Covariance(NamedTuple):
@@ -242,40 +241,40 @@ def advance(
         return
     combine(L, joint.C, 0, LC)
     both_sides(F - LC, here.dP, here.product)
-    # Of all the rest a half is added: the next dP is what is written here, and its transpose.
-    dP, turned = here.dP, np.zeros((size, k))
-    _add_moves(moves, ahead, dP)
-    B, G, L = np.ascontiguousarray(B.T), np.ascontiguousarray(G.T), np.ascontiguousarray(L.T)
+    # Of all the rest a half is written, columns times changes: to dP go that and its transpose.
+    columns, rest = np.concatenate((B, G, L), axis=1), here.product
+    lines, changes = np.ascontiguousarray(columns.T), np.zeros((2 * m + p, size, k))
+    halves, estimate = lines / 2, np.ascontiguousarray(ahead[at : at + n].T)
     for a in range(m):
-        turn(dslope[a], ahead[at : at + n], turned)
-        turn(dnoise[0, a : a + 1], B[a : a + 1] / 2, turned)
-        add_outer(B[a], turned, dP)
+        combine(estimate, dslope[a], 0, changes[a])
+        turn(dnoise[0, a : a + 1], halves[a : a + 1], changes[a])
         if joint.share[a] != 0.0:
-            turn(dnoise[1, a : a + 1], G[a : a + 1] / 2, turned)
-            add_outer(G[a], turned, dP)
+            turn(dnoise[1, a : a + 1], halves[m + a : m + a + 1], changes[m + a])
+    for a in range(p):
+        turn(djoint.R[a], halves[2 * m :], changes[2 * m + a])
         if moves.plant:
-            commanded = slope[a] @ ahead[at : at + n] + noise[0, a] * B[a]
+            turn(djoint.C[a], -ahead, changes[2 * m + a])
+    combine(columns, changes.reshape(2 * m + p, size * k), 0, rest.reshape(size, size * k))
+    _add_moves(moves, ahead, rest)
+    if moves.plant:
+        for a in range(m):
+            commanded = slope[a] @ ahead[at : at + n] + noise[0, a] * lines[a]
             for i in range(size):
                 for b in range(size):
                     for c in range(k):
-                        dP[i, b, c] += djoint.B[i, a, c] * commanded[b]
-                        dP[i, b, c] += djoint.G[i, a, c] * noise[1, a] * G[a, b]
-    for a in range(p):
-        turn(djoint.R[a], L / 2, turned)
-        if moves.plant:
-            turn(djoint.C[a], -ahead, turned)
-        add_outer(L[a], turned, dP)
-    add_transposed(dP)
+                        rest[i, b, c] += djoint.B[i, a, c] * commanded[b]
+                        rest[i, b, c] += djoint.G[i, a, c] * noise[1, a] * lines[m + a, b]
+    add_both(rest, here.dP)
 
 
 @njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
-def _add_moves(moves: Moves, ahead: Buffer, dP: Buffer) -> None:
+def _add_moves(moves: Moves, ahead: Buffer, rest: Buffer) -> None:
     """Add dF P|t F' + dQ / 2."""
     row, along, Q, both = moves.row, moves.along, moves.Q, np.empty(moves.Q.shape)
     combine(np.ascontiguousarray(ahead[moves.column].T), moves.F, 0, both)
-    for b in range(len(dP)):
+    for b in range(len(rest)):
         for r in range(len(row)):
-            dP[row[r], b, along[r]] += both[b, r] + Q[b, r] / 2
+            rest[row[r], b, along[r]] += both[b, r] + Q[b, r] / 2
 
 
 @njit(cache=True, inline="always")

@@ -14,8 +14,7 @@ from impc.arrays import Buffer
 from impc.jit import njit
 
 __all__ = [
-    "add_outer",
-    "add_transposed",
+    "add_both",
     "both_sides",
     "combine",
     "invert",
@@ -42,23 +41,27 @@ def combine(weights: Buffer, rows: Buffer, step: int, result: Buffer) -> None:
         Written (i, w).
     """
     lines, width = len(weights), rows.shape[1]
-    whole = lines - lines % 4
+    whole = lines - lines % 4 if len(rows) > 3 else 0
     for i in range(0, whole, 4):
         _four_lines(weights, rows, i, width if step == 0 else (i + 4) * step, result)
     for i in range(whole, lines):
         _line(weights, rows, i, width if step == 0 else (i + 1) * step, result)
 
 
-@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, fastmath={"contract"})
 def _four_lines(weights: Buffer, rows: Buffer, i: int, end: int, result: Buffer) -> None:
     """Write `end` numbers of lines i to i + 3; four rows at a time, and none without a weight."""
     count = len(rows)
     one, two, three, four = result[i], result[i + 1], result[i + 2], result[i + 3]
-    result[i : i + 4, :end] = 0.0
     for j in range(0, count - 3, 4):
-        w, x = _four(weights[i], j), _four(weights[i + 1], j)
-        y, z = _four(weights[i + 2], j), _four(weights[i + 3], j)
-        if _any(w) or _any(x) or _any(y) or _any(z):
+        w, x = _four(weights, i, j), _four(weights, i + 1, j)
+        y, z = _four(weights, i + 2, j), _four(weights, i + 3, j)
+        if j == 0:
+            for b in range(end):
+                told = rows[0, b], rows[1, b], rows[2, b], rows[3, b]
+                one[b], two[b] = _times(w, told), _times(x, told)
+                three[b], four[b] = _times(y, told), _times(z, told)
+        elif _any(w) or _any(x) or _any(y) or _any(z):
             for b in range(end):
                 told = rows[j, b], rows[j + 1, b], rows[j + 2, b], rows[j + 3, b]
                 one[b] += _times(w, told)
@@ -83,8 +86,8 @@ def _line(weights: Buffer, rows: Buffer, i: int, end: int, result: Buffer) -> No
 
 
 @njit(cache=True, inline="always")
-def _four(line: Buffer, j: int) -> tuple[float, float, float, float]:
-    return line[j], line[j + 1], line[j + 2], line[j + 3]
+def _four(weights: Buffer, i: int, j: int) -> tuple[float, float, float, float]:
+    return weights[i, j], weights[i, j + 1], weights[i, j + 2], weights[i, j + 3]
 
 
 @njit(cache=True, inline="always")
@@ -99,7 +102,7 @@ def _times(w: tuple[float, float, float, float], x: tuple[float, float, float, f
 
 @njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 def both_sides(G: Buffer, dP: Buffer, product: Buffer) -> None:
-    """The lower half of G dP G', half of its diagonal and zeros above take the place of dP.
+    """The lower half of G dP G' takes the place of dP; what is above is left to `add_both`.
 
     Parameters
     ----------
@@ -116,12 +119,6 @@ def both_sides(G: Buffer, dP: Buffer, product: Buffer) -> None:
             for c in range(k):
                 product[i, j, c], product[j, i, c] = product[j, i, c], product[i, j, c]
     combine(G, room, k, flat)
-    for i in range(size):
-        for c in range(k):
-            dP[i, i, c] /= 2
-        for j in range(i + 1, size):
-            for c in range(k):
-                dP[i, j, c] = 0.0
 
 
 @njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
@@ -140,30 +137,13 @@ def turn(changes: Buffer, rows: Buffer, turned: Buffer) -> None:
 
 
 @njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
-def add_outer(column: Buffer, turned: Buffer, dP: Buffer) -> None:
-    """Add column_i turned to each row i of dP; turned is zero afterwards.
-
-    Parameters
-    ----------
-    column, turned, dP : Buffer
-        (z,), (z, k) and (z, z, k).
-    """
-    flat, line = dP.reshape(len(dP), turned.size), turned.reshape(turned.size)
-    for i in range(len(column)):
-        if column[i] != 0.0:
-            for b in range(len(line)):
-                flat[i, b] += column[i] * line[b]
-    turned[:] = 0.0
-
-
-@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
-def add_transposed(dP: Buffer) -> None:
-    """Add to each entry of dP (z, z, k) that on the other side of the diagonal."""
+def add_both(rest: Buffer, dP: Buffer) -> None:
+    """Add `rest` and its transpose to the lower half of dP, and write the upper; (z, z, k) each."""
     size, k = len(dP), dP.shape[2]
     for i in range(size):
-        for j in range(i, size):
+        for j in range(i + 1):
             for c in range(k):
-                both = dP[i, j, c] + dP[j, i, c]
+                both = dP[i, j, c] + (rest[i, j, c] + rest[j, i, c])
                 dP[i, j, c] = both
                 dP[j, i, c] = both
 
