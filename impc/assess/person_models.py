@@ -28,16 +28,20 @@ from impc.inverse.problem import controller_for
 from impc.model.bounds import bound_rows
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from impc.assess.person_covariance import Confusion, PersonCovariance
     from impc.inverse.estimates import Estimate
+    from impc.inverse.problem import Problem
     from impc.model.observer import Observer
 
-__all__ = ["PersonModel", "PersonReport", "person_report", "prediction_errors"]
+__all__ = ["PersonModel", "PersonReport", "person_report", "persons", "prediction_errors"]
 
 # Samples ahead of which predictions are judged, as seconds; and how many starts in a trial at most.
 _AHEAD, _STARTS = (0.0, 0.1, 0.5), 100
 # One second of lags tells a rhythm that was missed; fewer than ten tell nothing.
 _LEAST_LAGS = 10
+_NORMAL = 1.959964
 
 
 @dataclass(frozen=True)
@@ -69,11 +73,14 @@ class PersonReport(Frozen):
         The first is the one that was asked for.
     covariance : PersonCovariance or None
         Of that, by the sandwich; None where it has no likelihood.
+    profiled : bool
+        Whether intervals follow the likelihood.
     levels : Array
-        Intervals of 95 % of its levels (l, 2): by profile where a level is weakly told.
+        Intervals of 95 % of its levels (l, 2), in their units; where profiled, by profile for a
+        level that is weakly told, else by deviations.
     entries : Array
-        The same of the entries of its gain (entries, 2), all by profile; NaN where an entry is not
-        told by itself.
+        The same of the entries of its gain (entries, 2), in their units; where profiled, all by
+        profile, and NaN where an entry is not told by itself.
     confusion : Confusion or None
         What of gain and noise is told least apart.
     whiteness : Array
@@ -86,6 +93,7 @@ class PersonReport(Frozen):
 
     models: tuple[PersonModel, ...]
     covariance: PersonCovariance | None
+    profiled: bool
     levels: Array
     entries: Array
     confusion: Confusion | None
@@ -99,7 +107,14 @@ class PersonReport(Frozen):
         return self.models[0].fit
 
 
-def person_report(found: Estimate, asked: Observer, walk: Array) -> PersonReport:
+def person_report(
+    found: Estimate,
+    asked: Observer,
+    walk: Array,
+    *,
+    profiled: bool = False,
+    done: Callable[[str], None] = lambda _: None,
+) -> PersonReport:
     """Fit a person and the models beside, from a fit of least squares.
 
     Parameters
@@ -109,25 +124,42 @@ def person_report(found: Estimate, asked: Observer, walk: Array) -> PersonReport
         What is sensed, and which levels are searched.
     walk : Array
         Where the steps of an unknown perturbation begin to be searched (d,).
+    profiled : bool
+        Whether intervals of the gain and of levels that are weakly told follow the likelihood:
+        minutes on the seat.
+    done : callable
+        Told the name of each model once it is fitted, and "profiles".
     """
-    models = [_model(name, found, person) for name, person in _persons(asked, walk)]
-    problem = found.problem
-    if len(bound_rows(problem.bounds, problem.plant).b):
-        free = replace(found, problem=problem.without_bounds())
-        models.append(_model(f"{models[0].name}, no limit", free, asked))
+    models, problem = [], found.problem
+    for name, posed, person in persons(problem, asked, walk):
+        try:
+            models.append(PersonModel(name, fit_person(replace(found, problem=posed), person), ""))
+        except ImpcError as error:
+            models.append(PersonModel(name, None, str(error)))
+        done(name)
     fit = models[0].fit
     p = len(problem.plant.outputs)
     if fit is None:
         nothing = frozen(np.zeros((0, 2)))
         white = frozen([np.nan] * p)
-        return PersonReport(tuple(models), None, nothing, nothing, None, white, (), frozen([[]]))
-    ahead = tuple(sorted({1 + round(time / problem.plant.dt) for time in _AHEAD}))
+        return PersonReport(
+            tuple(models), None, profiled, nothing, nothing, None, white, (), frozen([[]])
+        )
     covariance = person_covariance(fit)
+    if profiled:
+        levels, entries = level_intervals(fit, covariance), entry_intervals(fit, covariance)
+        done("profiles")
+    else:
+        levels = level_intervals(fit, covariance, weak=np.inf)
+        about = _NORMAL * np.ravel(covariance.entries)[:, None] * [-1, 1]
+        entries = frozen(np.ravel(fit.K)[:, None] + about)
+    ahead = tuple(sorted({1 + round(time / problem.plant.dt) for time in _AHEAD}))
     return PersonReport(
         tuple(models),
         covariance,
-        level_intervals(fit, covariance),
-        entry_intervals(fit, covariance),
+        profiled,
+        levels,
+        entries,
         confusion(fit),
         frozen(_white(fit)),
         ahead,
@@ -135,27 +167,33 @@ def person_report(found: Estimate, asked: Observer, walk: Array) -> PersonReport
     )
 
 
-def _persons(asked: Observer, walk: Array) -> list[tuple[str, Observer]]:
+def persons(problem: Problem, asked: Observer, walk: Array) -> list[tuple[str, Problem, Observer]]:
+    """Each model that is compared: its name, the problem and the person; what is asked for first.
+
+    Parameters
+    ----------
+    problem : Problem
+    asked : Observer
+        What is sensed, and which levels are searched.
+    walk : Array
+        Where the steps of an unknown perturbation begin to be searched (d,).
+    """
     seeing = replace(asked, sensed=(), C=asked.C[:0], sensory=asked.sensory[:0], walk=None)
     quiet = replace(seeing, motor=0 * asked.motor, share=0 * asked.share, process=0 * asked.process)
     models = []
     if asked.estimates:
-        models += [("estimates, perturbation known", replace(asked, walk=None))]
+        models += [("estimates, perturbation known", problem, replace(asked, walk=None))]
         if len(walk):
             unknown = replace(asked, walk=walk if asked.walk is None else asked.walk)
-            models.append(("estimates, perturbation not known", unknown))
+            models.append(("estimates, perturbation not known", problem, unknown))
         if asked.walk is not None:
             models.reverse()
     if np.any(seeing.levels):
-        models.append(("sees every state, noise in the loop", seeing))
-    return [*models, ("sees every state, noise in the recorder alone", quiet)]
-
-
-def _model(name: str, found: Estimate, person: Observer) -> PersonModel:
-    try:
-        return PersonModel(name, fit_person(found, person), "")
-    except ImpcError as error:
-        return PersonModel(name, None, str(error))
+        models.append(("sees every state, noise in the loop", problem, seeing))
+    models.append(("sees every state, noise in the recorder alone", problem, quiet))
+    if len(bound_rows(problem.bounds, problem.plant).b):
+        models.append((f"{models[0][0]}, no limit", problem.without_bounds(), asked))
+    return models
 
 
 def _white(fit: PersonFit) -> Array:

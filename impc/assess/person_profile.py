@@ -23,21 +23,21 @@ from impc.errors import ImpcError
 from impc.inverse.likelihood_search import climb
 
 if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
     from impc.assess.person_covariance import PersonCovariance
     from impc.inverse.likelihood_fit import PersonFit
+    from impc.inverse.likelihood_search import Prior
 
 __all__ = ["entry_intervals", "fallen", "level_interval", "level_intervals", "profile"]
 
 # Root of half of 1.96^2, of nats, and how near to it an end of an interval is found.
 _FALLEN, _CLOSE = 1.385903, 0.04
-_NORMAL = 1.959964
-# A first step is no longer than this, and no end is looked for farther away: some thousands of a
-# level, which is then none, or that of a sense which is not used.
+# A step is no longer than this, and no end is looked for farther away: some thousands of a level,
+# which is then none, or that of a sense which is not used.
 _LONGEST, _FARTHEST = 2.0, 9.0
 # Places at which an end is looked for, and likelihoods with derivatives at each.
 _TRIES, _BUDGET = 12, 15
-# Keeps a covariance finite: of a coordinate that nothing tells the deviation is ten.
-_FLAT = 1e-2
 # A level whose logarithm has a larger deviation is given a profile, an entry of the gain that has
 # one is not told by itself: of a natural coordinate (`Coordinates`).
 _WEAK = 0.25
@@ -145,64 +145,60 @@ def fallen(fit: PersonFit, along: Array, value: float) -> float:
     float
         Nats; infinite where nothing was found.
     """
-    ridge = _covariance(fit) @ along
-    return _held(fit, np.array(fit.theta), along, ridge, value)[1]
+    prior, theta, losing = fit.prior.freed(along), np.array(fit.theta), np.array(fit.losing)
+    top = prior.placed(theta, fit.told)
+    ridge = np.linalg.solve(prior.parabola(top, losing)[1], along)
+    off = value - float(along @ theta)
+    start = _stable(prior, theta, ridge * (off / float(along @ ridge)), along * off)
+    try:
+        return top.value - climb(prior, start, _BUDGET, _across(along), losing)[0].value
+    except ImpcError:  # no filter there
+        return np.inf
 
 
 def _end(fit: PersonFit, along: Array, side: int) -> float:
     """Where the profile has fallen by enough on one side.
 
-    The root of what has fallen is straight where the likelihood is that of a normal number, so the
-    next guess lies on a line.
+    With all else at its best the slope along the value is that of the profile, and the information
+    its curvature: the next value is where a parabola with both has fallen by enough, and the next
+    search begins on its ridge.
     """
-    theta, ridge = np.array(fit.theta), _covariance(fit) @ along
-    spread = float(np.sqrt(along @ ridge))
-    begin = float(along @ theta)
-    border, step = begin + side * _FARTHEST, min(_NORMAL * spread, _LONGEST)
-    inside, outside = (begin, 0.0), (np.nan, np.inf)
-    value = begin + side * step
+    prior, begin = fit.prior.freed(along), float(along @ fit.theta)
+    here, losing = prior.placed(np.array(fit.theta), fit.told), np.array(fit.losing)
+    top, inside, outside, value = here.value, begin, side * np.inf, begin
     for _ in range(_TRIES):
-        value = border if side * (value - border) >= 0 else value
-        theta, nats = _held(fit, theta, along, ridge, value)
-        root = float(np.sqrt(max(nats, 0.0)))
+        gradient, curvature = prior.parabola(here, losing)
+        ridge = np.linalg.solve(curvature, along)
+        spread, peak = float(along @ ridge), value + float(ridge @ gradient)
+        # There the profile falls by (value - peak)^2 / (2 spread), of its largest.
+        room = 2 * spread * (_FALLEN**2 - top + here.value) + (value - peak) ** 2
+        goal = peak + side * np.sqrt(room) if room > 0 else inside
+        goal = side * min(side * goal, side * value + _LONGEST, side * begin + _FARTHEST)
+        if not side * inside < side * goal < side * outside:
+            goal = (inside + outside) / 2 if np.isfinite(outside) else inside + side * _LONGEST
+        start = _stable(prior, here.theta, (goal - value) * ridge / spread, (goal - value) * along)
+        try:
+            there, found, _, _ = climb(prior, start, _BUDGET, _across(along), losing)
+        except ImpcError:  # no filter there: as far as an end may be
+            outside = goal
+            continue
+        here, losing, value = there, found, goal
+        root = float(np.sqrt(max(top - here.value, 0.0)))
         if abs(root - _FALLEN) < _CLOSE:
             return value
-        if root < _FALLEN and value == border:
-            return side * np.inf
-        if root < _FALLEN:
-            inside = value, root
+        if root > _FALLEN:
+            outside = value
+        elif side * (value - begin) >= _FARTHEST:
+            break
         else:
-            outside = value, root
-        if np.isfinite(outside[0]):
-            share = (_FALLEN - inside[1]) / (outside[1] - inside[1])
-            value = inside[0] + min(max(share, 0.1), 0.9) * (outside[0] - inside[0])
-        else:
-            value += side * min(_LONGEST, step * max(_FALLEN / max(root, 0.3) - 1, 0.5))
-    return outside[0] if np.isfinite(outside[0]) else side * np.inf
+            inside = value
+    return outside
 
 
-def _covariance(fit: PersonFit) -> Array:
-    """Of all unknowns (q, q), at most ten squared along what nothing tells."""
-    information = fit.told.information + fit.prior.slopes(np.array(fit.theta))[1]
-    return np.asarray(np.linalg.inv(information + _FLAT * np.eye(len(information))))
-
-
-def _held(
-    fit: PersonFit, theta: Array, along: Array, ridge: Array, value: float
-) -> tuple[Array, float]:
-    """The best of all else with along'theta at a value, and how far the likelihood fell."""
-    off = value - float(along @ theta)
-    # A straight line along the ridge may leave the gains that stabilise.
-    starts = (theta + ridge * (off / float(along @ ridge)), theta + along * off)
-    start = next((each for each in starts if np.isfinite(fit.prior.value(each))), starts[1])
-    try:
-        found, _, _ = climb(fit.prior, start, _BUDGET, _across(along))
-    except ImpcError:  # no filter there: as far as an end may be
-        return theta, np.inf
-    # Of a level that is held nothing is expected.
-    level = np.abs(along[fit.space.own :])
-    freed = fit.prior.unlike(np.array(fit.theta)) - fit.prior.unlike(found.theta)
-    return found.theta, fit.value - found.value + float(level @ freed)
+def _stable(prior: Prior, theta: Array, *steps: ArrayLike) -> Array:
+    """After the first of some steps: a straight ridge may leave the gains that stabilise."""
+    starts = [theta + np.asarray(step) for step in steps]
+    return next((each for each in starts if np.isfinite(prior.value(each))), starts[-1])
 
 
 def _across(along: Array) -> Array:

@@ -71,6 +71,8 @@ class PersonFit(Frozen):
         The unknowns, in the coordinates of `space` (count,).
     told : Told
         What the recordings say there.
+    losing : Array
+        Slope of what levels lose because all else is fitted to the same noise (levels,), nats.
     prior : Prior
         What the search was held by.
     """
@@ -88,6 +90,7 @@ class PersonFit(Frozen):
     evaluations: int
     theta: Array
     told: Told
+    losing: Array
     prior: Prior
 
     @property
@@ -181,7 +184,7 @@ def fit_person(
     theta = _best(first, starts)
     alone = np.concatenate([_suggested(observer, size, 1.0, 1.0), size.recorder])
     prior = Prior(first, spread, np.log(alone[first.moving]))
-    (theta, told, value, _), spent, settled = climb(prior, theta, max_evaluations)
+    (theta, told, value, _), losing, spent, settled = climb(prior, theta, max_evaluations)
     person = first.unpack(theta)
     prices = space.unknowns(theta[: first.own]) if isinstance(space, PriceCoordinates) else None
     return PersonFit(
@@ -198,6 +201,7 @@ def fit_person(
         spent,
         frozen(theta),
         told,
+        frozen(losing),
         prior,
     )
 

@@ -17,6 +17,7 @@ often largest where one of them is zero, and others are too large in its place (
 
 from __future__ import annotations
 
+import copy
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -98,6 +99,7 @@ class Prior:
     def __init__(self, space: PersonCoordinates, spread: float, scales: Array) -> None:
         self.space, self.scales = space, scales
         self.weights = np.where(np.arange(len(space.start)) < space.own, spread**-2.0, 0.0)
+        self.unlikely = np.full(len(scales), _UNLIKE)
         self.used = bool(np.isfinite(spread))
 
     def at(self, theta: Array) -> Place:
@@ -108,9 +110,57 @@ class Prior:
         ImpcError
             When there is no likelihood there.
         """
-        told = self.space.told(theta)
+        return self.placed(theta, self.space.told(theta))
+
+    def placed(self, theta: Array, told: Told) -> Place:
+        """The same, with what the recordings say at theta (q,)."""
         lost = self.lost(theta, told)
         return Place(theta, told, told.value + self.value(theta) - lost, lost)
+
+    def tried(self, theta: Array) -> Place | None:
+        """The same, or None where there is no likelihood at theta (q,), or no number."""
+        try:
+            there = self.at(theta)
+        except ImpcError:
+            return None
+        return there if np.isfinite(there.value) else None
+
+    def freed(self, along: Array) -> Prior:
+        """A prior that expects nothing of the level that is held along a direction (q,)."""
+        freed = copy.copy(self)
+        freed.unlikely = self.unlikely * (1 - np.abs(along[self.space.own :]))
+        return freed
+
+    def parabola(self, here: Place, losing: Array) -> tuple[Array, Array]:
+        """Slope (q,) and curvature (q, q), positive definite, of what is to be largest.
+
+        Parameters
+        ----------
+        here : Place
+        losing : Array
+            What is taken for the slope of what levels lose (levels,).
+        """
+        slope, bend = self.slopes(here.theta)
+        gradient = here.told.gradient + slope
+        gradient[self.space.own :] -= losing
+        return gradient, here.told.information + bend + _FLAT * np.eye(len(gradient))
+
+    def learned(self, losing: Array, here: Place, there: Place) -> Array:
+        """Slope of what levels lose (levels,) by Broyden's update, damped: short steps tell little.
+
+        Parameters
+        ----------
+        losing : Array
+            What was taken for it (levels,).
+        here, there : Place
+            The two ends of a step.
+        """
+        own = self.space.own
+        moved = (there.theta - here.theta)[own:]
+        missed = there.lost - here.lost - float(losing @ moved)
+        learned = losing + missed * moved / (float(moved @ moved) + _DAMPING)
+        # Twice the noise are half the deviations, and no level is more than all of it.
+        return np.clip(learned, -float(own), 0.0)
 
     def losing(self, here: Place) -> Array:
         """Slope of `lost` along the levels (levels,) from `here`, by differences."""
@@ -146,7 +196,7 @@ class Prior:
     def unlike(self, theta: Array) -> Array:
         """What each level costs (levels,) at theta (q,), nats: log cosh of how far it is off."""
         off = np.abs(theta[self.space.own :] - self.scales)
-        return np.asarray(_UNLIKE * (off + np.log1p(np.exp(-2 * off)) - np.log(2)))
+        return np.asarray(self.unlikely * (off + np.log1p(np.exp(-2 * off)) - np.log(2)))
 
     def slopes(self, theta: Array) -> tuple[Array, Array]:
         """Derivatives at theta; the barrier is taken to bend as the logarithm of a distance does.
@@ -165,15 +215,19 @@ class Prior:
             return np.zeros(len(theta)), np.zeros((len(theta), len(theta)))
         gradient, bend = -self.weights * (theta - self.space.start), np.array(self.weights)
         turned = np.tanh(theta[self.space.own :] - self.scales)
-        gradient[self.space.own :] -= _UNLIKE * turned
-        bend[self.space.own :] += _UNLIKE * (1 - turned**2)
+        gradient[self.space.own :] -= self.unlikely * turned
+        bend[self.space.own :] += self.unlikely * (1 - turned**2)
         slope = self.space.wandering(theta)[1]
         return gradient - _BARRIER * slope, np.diag(bend) + _BARRIER * np.outer(slope, slope)
 
 
 def climb(
-    prior: Prior, theta: Array, budget: int, along: Array | None = None
-) -> tuple[Place, int, bool]:
+    prior: Prior,
+    theta: Array,
+    budget: int,
+    along: Array | None = None,
+    losing: Array | None = None,
+) -> tuple[Place, Array, int, bool]:
     """The largest likelihood near theta, times the prior and less what levels lose.
 
     Parameters
@@ -185,41 +239,43 @@ def climb(
         Likelihoods with derivatives, about.
     along : Array, optional
         Orthonormal directions in which it may move (q, r); all by default.
+    losing : Array, optional
+        What is taken for the slope of what levels lose (levels,), learned on the way; by default it
+        is found by differences where the search ends, and the search goes on from there.
 
     Returns
     -------
-    place, spent, settled : Place, int, bool
-        The highest place, likelihoods with derivatives, and whether the search ended by itself.
+    place, losing, spent, settled : Place, Array, int, bool
+        The highest place, slope of what levels lose (levels,), likelihoods with derivatives, and
+        whether the search ended by itself.
 
     Raises
     ------
     ImpcError
         When there is no likelihood at theta.
     """
-    way, own = np.eye(len(theta)) if along is None else along, prior.space.own
+    way = np.eye(len(theta)) if along is None else along
     enough = _ENOUGH if prior.used else _SETTLED
     here = best = prior.at(theta)
-    losing: Array = np.zeros(len(prior.scales))
+    differences = prior.used and losing is None
+    losing = np.zeros(len(prior.scales)) if losing is None else losing
     known: Place | None = None
     radius, spent, stale, left = _STEP, 1, 0, np.inf
     while True:
-        slope, bend = prior.slopes(here.theta)
-        gradient = here.told.gradient + slope
-        gradient[own:] -= losing
-        down, curvature = way.T @ gradient, way.T @ (here.told.information + bend) @ way
-        curvature += _FLAT * np.eye(len(down))
+        gradient, curvature = prior.parabola(here, losing)
+        down, curvature = way.T @ gradient, way.T @ curvature @ way
         promised = boxed_step(down, curvature, np.inf)[1]
         if here is best:
             left = promised
         if promised < enough or stale == _PATIENCE or radius < _SHORTEST or spent >= budget:
-            if known is best or spent >= budget or not prior.used:
-                return best, spent, left < _ROUGH
+            if known is best or spent >= budget or not differences:
+                return best, losing, spent, left < _ROUGH
             here, losing, known = best, prior.losing(best), best
             radius, spent, stale = _STEP, spent + len(losing), 0
             continue
         step, within = boxed_step(down, curvature, radius)
         length = float(np.max(np.abs(step)))
-        there, spent = _place(prior, here.theta + way @ step), spent + 1
+        there, spent = prior.tried(here.theta + way @ step), spent + 1
         # What came true of the promise, both as if they were larger by what is not smooth.
         share = -1.0 if there is None else (there.value - here.value + _ROUGH) / (within + _ROUGH)
         if there is None or share < 0.25:
@@ -229,25 +285,7 @@ def climb(
             radius = min(max(radius, 2 * length), _STEP)
         stale = 0 if there.value > best.value + enough else stale + 1
         best = there if there.value > best.value else best
-        losing, here = _learned(own, losing, here, there), there
-
-
-def _learned(own: int, losing: Array, here: Place, there: Place) -> Array:
-    """Slope of what levels lose by Broyden's update, damped: short steps tell of all else."""
-    moved = (there.theta - here.theta)[own:]
-    missed = there.lost - here.lost - float(losing @ moved)
-    learned = losing + missed * moved / (float(moved @ moved) + _DAMPING)
-    # Twice the noise are half the deviations, and no level is more than all of it.
-    return np.clip(learned, -float(own), 0.0)
-
-
-def _place(prior: Prior, theta: Array) -> Place | None:
-    """The place, or None where there is no likelihood, or none that is a number."""
-    try:
-        there = prior.at(theta)
-    except ImpcError:
-        return None
-    return there if np.isfinite(there.value) else None
+        losing, here = prior.learned(losing, here, there), there
 
 
 def boxed_step(gradient: Array, curvature: Array, radius: float) -> tuple[Array, float]:

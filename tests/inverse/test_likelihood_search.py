@@ -59,7 +59,7 @@ def test_levels_that_slide_do_not_hold_back_the_rest(sliding: PersonFit) -> None
 def test_a_search_that_may_not_go_on_says_so(sliding: PersonFit) -> None:
     space = sliding.space
     prior = Prior(space, 1.0, space.start[space.own :])
-    (theta, told, _, _), spent, settled = climb(prior, space.start, 2)
+    (theta, told, _, _), _, spent, settled = climb(prior, space.start, 2)
     assert (spent, settled) == (2, False)
     assert told.value == space.told(theta).value < sliding.log_likelihood
 
@@ -88,7 +88,7 @@ def test_what_levels_lose_is_that_of_the_gain_integrated_out() -> None:
     for factor in (1.0, 2.0):
         theta = np.array(fit.theta)
         theta[2] += np.log(factor)
-        here, _, _ = climb(prior, theta, 30, np.eye(len(theta))[:, :2])
+        here, _, _, _ = climb(prior, theta, 30, np.eye(len(theta))[:, :2])
         root = np.linalg.cholesky(np.linalg.inv(here.told.information[:2, :2]))
         top, total = here.told.value + prior.value(here.theta), 0.0
         for first, second in itertools.product(steps, steps):

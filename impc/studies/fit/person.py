@@ -158,6 +158,7 @@ def person_data(result: FitResult) -> dict[str, Any] | None:
     values = np.exp(fit.theta[fit.space.own :])
     return data | {
         "K": fit.K,
+        "profiled": report.profiled,
         "K_intervals": report.entries.reshape(*fit.K.shape, 2),
         "sensed": fit.observer.sensed,
         "known": fit.observer.walk is None,
@@ -200,9 +201,9 @@ def _models_table(report: PersonReport) -> TextTable:
 
 def _levels_table(plant: Plant, report: PersonReport) -> TextTable:
     return table_of(
-        "Levels of noise: standard deviations of one sample, with intervals of 95 % (by the "
-        "sandwich, or by profile where a level is weakly told). A level "
-        "whose interval reaches a factor of ten is only told to be at most its upper end.",
+        "Levels of noise: standard deviations of one sample, with intervals of 95 % "
+        f"({'by profile where a level is weakly told' if report.profiled else 'by deviations'}). "
+        "A level whose interval reaches a factor of ten is only told to be at most its upper end.",
         _levels(plant, report),
         {
             "noise": lambda item: item.name,
@@ -224,9 +225,14 @@ def _gain_table(result: FitResult, report: PersonReport) -> TextTable:
     assert fit is not None
     names = entry_names(fit.problem.plant)
     least, own = np.ravel(result.estimate.K), np.ravel(fit.K)
+    how = (
+        "by profile. An entry that the recordings do not tell by itself has none."
+        if report.profiled
+        else "by deviations, which are too narrow where half of a gain is hardly told: profiles = "
+        "true in [fit.observer] follows the likelihood instead, in minutes."
+    )
     return table_of(
-        "The gain of this person with intervals of 95 % by profile, beside that of least squares. "
-        "An entry that the recordings do not tell by itself has none.",
+        f"The gain of this person beside that of least squares, with intervals of 95 % {how}",
         range(len(names)),
         {
             "entry": lambda k: names[k],

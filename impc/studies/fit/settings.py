@@ -109,6 +109,9 @@ class ObserverSettings:
         Whether there is such noise; its size is searched.
     known : bool
         Whether the person knows the perturbation.
+    profiles : bool
+        Whether intervals of the gain and of levels that are weakly told follow the likelihood:
+        minutes on the seat.
     """
 
     sensed: list[str] = field(default_factory=list)
@@ -116,6 +119,7 @@ class ObserverSettings:
     share: bool = False
     process: bool = False
     known: bool = True
+    profiles: bool = False
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from impc.assess.identified_directions import identifiability
 from impc.assess.intent_draws import drawn_gains
 from impc.assess.intent_rules import intent
 from impc.assess.judged import judge
-from impc.assess.person_models import person_report
+from impc.assess.person_models import person_report, persons
 from impc.assess.printed_gain import gain_estimate
 from impc.assess.structures import assess_structure, no_structure
 from impc.assess.variance_accounted_for import agreement
@@ -94,8 +94,11 @@ def stages(problem: Problem, settings: FitSettings) -> int:
     trials = len(problem.recordings)
     left_out = trials if _leaves_out(trials, settings) else 0
     structures = (settings.structure is not None) + len(settings.structures)
-    others = structures + (settings.observer is not None)
-    return 1 + len(_beside(settings)) + left_out + others + count_stages(problem, settings)
+    asked = fit_observer(problem.plant, settings, problem.recordings)
+    models = 0 if asked is None else len(persons(problem, *asked))
+    profiles = settings.observer is not None and settings.observer.profiles
+    others = structures + models + profiles + count_stages(problem, settings)
+    return 1 + len(_beside(settings)) + left_out + others
 
 
 def _beside(settings: FitSettings) -> tuple[str, ...]:
@@ -269,9 +272,8 @@ def _person(
     asked = fit_observer(problem.plant, settings, problem.recordings)
     if asked is None:
         return None
-    found = person_report(fitted, *asked)
-    progress.done("person who senses with noise")
-    return found
+    profiled = settings.observer is not None and settings.observer.profiles
+    return person_report(fitted, *asked, profiled=profiled, done=progress.done)
 
 
 def _structures(
