@@ -20,7 +20,9 @@ PROJECT := $(VENV)/.stamp-project
 POLYTOPE := $(VENV)/.stamp-polytope
 POLYTOPE_LOG := $(VENV)/polytope-install.log
 
-PYTEST := OPENBLAS_NUM_THREADS=1 $(PY) -m pytest -n logical --maxprocesses 8 --dist loadfile --no-loadscope-reorder
+# Bytecode is kept whatever the environment says: without it each of the processes that tests start
+# compiles the package for itself.
+PYTEST := PYTHONDONTWRITEBYTECODE= OPENBLAS_NUM_THREADS=1 $(PY) -m pytest -n logical --maxprocesses 8 --dist loadfile --no-loadscope-reorder
 
 SUPPORTED := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))
 

@@ -54,6 +54,7 @@ def blank_figures(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(Figure, "savefig", blank)
     monkeypatch.setattr(Figure, "draw_without_rendering", lambda _: None)
+    monkeypatch.setattr("impc.reporting.style._set_literally", lambda _: None)
 
 
 @pytest.fixture

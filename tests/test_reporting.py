@@ -200,6 +200,7 @@ def test_the_page_says_what_a_reader_must_know(page: str, case_a: CaseResult) ->
     assert "condition weight" in page
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_the_page_escapes_what_it_is_given(case_a: CaseResult, provenance: Provenance) -> None:
     evil = "<script>alert(1)</script>"
     text = example_report(

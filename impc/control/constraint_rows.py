@@ -23,6 +23,7 @@ from impc.model.bounds import bound_rows
 if TYPE_CHECKING:
     from impc.control.controller import Controller
     from impc.model.body import Body
+    from impc.model.bounds import BoundRows
 
 __all__ = ["Directions", "RowDirections", "Rows", "build_rows", "differentiate_rows", "directions"]
 
@@ -159,9 +160,9 @@ def directions(controller: Controller, count: int, **given: Array) -> Directions
 
 def build_rows(controller: Controller) -> Rows:
     """Return the rows of the controller's problem."""
-    family, stage = _pairs(controller)
     bounds = bound_rows(controller.bounds, controller.plant)
-    powers = _powers(controller, int(stage.max(initial=0)))
+    family, stage = _pairs(controller, bounds)
+    powers = _powers(controller, bounds, int(stage.max(initial=0)))
     M = _inputs(controller, family, stage, powers @ controller.plant.B, bounds.F)
     m = controller.plant.m
     factor = np.linalg.cholesky(controller.S)
@@ -181,12 +182,12 @@ def differentiate_rows(controller: Controller, along: Directions) -> RowDirectio
     """
     plant, K = controller.plant, controller.K
     bounds = bound_rows(controller.bounds, plant)
-    family, stage = _pairs(controller)
+    family, stage = _pairs(controller, bounds)
     last = int(stage.max(initial=0))
     dK, dA, dB = (np.moveaxis(part, -1, 0) for part in (along.K, along.A, along.B))
     closed = plant.A - plant.B @ K
     dclosed = dA - dB @ K - plant.B @ dK
-    powers = _powers(controller, last)
+    powers = _powers(controller, bounds, last)
     dpowers = np.empty((last + 1, along.count, len(bounds.b), plant.n))
     dpowers[0] = -bounds.F @ dK
     for k in range(last):
@@ -198,13 +199,12 @@ def differentiate_rows(controller: Controller, along: Directions) -> RowDirectio
     return RowDirections(dT, dM, along.bounds[family])
 
 
-def _pairs(controller: Controller) -> tuple[IntArray, IntArray]:
+def _pairs(controller: Controller, bounds: BoundRows) -> tuple[IntArray, IntArray]:
     """The pairs (family, stage) in order: the horizon first, then the terminal set.
 
     A state bound at stage 0 cannot be influenced. It stays while it is hard, so that a state
     outside is reported; softened it would be a constant and is left out.
     """
-    bounds = bound_rows(controller.bounds, controller.plant)
     family, stage = np.meshgrid(np.arange(len(bounds.b)), np.arange(controller.horizon))
     keep = (stage > 0) | ~bounds.on_state[family] | (controller.softening is None)
     families, stages = [family[keep]], [stage[keep]]
@@ -214,10 +214,9 @@ def _pairs(controller: Controller) -> tuple[IntArray, IntArray]:
     return np.concatenate(families).astype(np.int64), np.concatenate(stages).astype(np.int64)
 
 
-def _powers(controller: Controller, last: int) -> Array:
+def _powers(controller: Controller, bounds: BoundRows, last: int) -> Array:
     """H Phi^k for k = 0..last: (last + 1, c, n)."""
     plant = controller.plant
-    bounds = bound_rows(controller.bounds, plant)
     closed = plant.A - plant.B @ controller.K
     powers = np.empty((last + 1, len(bounds.b), plant.n))
     powers[0] = bounds.E - bounds.F @ controller.K

@@ -118,27 +118,22 @@ class BoundRows(Value):
 @checked
 def bound_rows(bounds: Bounds, plant: Plant) -> BoundRows:
     """Return the finite bounds as rows."""
+    limits = np.concatenate([bounds.u_max, bounds.u_min, bounds.x_max, bounds.x_min])
+    sign = np.repeat([1.0, -1.0, 1.0, -1.0], [plant.m, plant.m, plant.n, plant.n])
+    signals = (*plant.controls, *plant.controls, *plant.states, *plant.states)
+    finite = np.isfinite(limits)
+    names = [
+        f"{signals[index]} {'<=' if sign[index] > 0 else '>='} {limits[index]:g}"
+        for index in np.flatnonzero(finite)
+    ]
     inputs, states = np.eye(plant.m), np.eye(plant.n)
-    sides = (
-        (bounds.u_max, 1.0, plant.controls, False),
-        (bounds.u_min, -1.0, plant.controls, False),
-        (bounds.x_max, 1.0, plant.states, True),
-        (bounds.x_min, -1.0, plant.states, True),
-    )
-    rows: list[tuple[Array, Array, float, bool, str]] = []
-    for limits, sign, names, on_state in sides:
-        for index, limit in enumerate(limits):
-            if np.isfinite(limit):
-                e = sign * states[index] if on_state else np.zeros(plant.n)
-                f = np.zeros(plant.m) if on_state else sign * inputs[index]
-                label = f"{names[index]} {'<=' if sign > 0 else '>='} {limit:g}"
-                rows.append((e, f, sign * float(limit), on_state, label))
+    on_input, on_state = np.zeros((2 * plant.n, plant.m)), np.zeros((2 * plant.m, plant.n))
     return BoundRows(
-        E=frozen(np.array([row[0] for row in rows]).reshape(len(rows), plant.n)),
-        F=frozen(np.array([row[1] for row in rows]).reshape(len(rows), plant.m)),
-        b=frozen([row[2] for row in rows]),
-        on_state=np.array([row[3] for row in rows], dtype=bool),
-        names=tuple(row[4] for row in rows),
+        E=frozen(np.vstack([on_state, states, -states])[finite]),
+        F=frozen(np.vstack([inputs, -inputs, on_input])[finite]),
+        b=frozen((sign * limits)[finite]),
+        on_state=np.repeat([False, True], [2 * plant.m, 2 * plant.n])[finite],
+        names=tuple(names),
     )
 
 

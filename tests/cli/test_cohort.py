@@ -142,6 +142,7 @@ def test_workers_and_client_may_die(
     assert len(finished) == len(set(finished)), "a replicate was written twice"
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_going_on_repeats_nothing(study: Path, undisturbed: Path) -> None:
     stamps = {path: path.stat().st_mtime_ns for path in undisturbed.rglob("units/**/*.json")}
     done = run_here(study, undisturbed, "--workers", "1")
@@ -236,6 +237,7 @@ def test_two_runs_into_one_folder_are_refused(study: Path, tmp_path: Path) -> No
     assert len(done.stderr.strip().splitlines()) == 1
 
 
+@pytest.mark.usefixtures("blank_figures")
 @pytest.mark.parametrize(
     ("subjects", "damaged"),
     [(5, (1, 3, 4)), pytest.param(30, (4, 11, 29), marks=pytest.mark.slow)],

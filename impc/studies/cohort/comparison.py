@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy.stats
 from statsmodels.regression.mixed_linear_model import MixedLM
-from statsmodels.stats.multitest import multipletests
 
+from impc.assess.several_tests import holm
 from impc.checking import replace
 from impc.errors import DataError, one_line
 from impc.studies.cohort.told import only_told
@@ -250,11 +250,8 @@ def _nothing(
 
 
 def _holm(found: list[Comparison]) -> list[Comparison]:
-    usable = [item for item in found if np.isfinite(item.p)]
-    if not usable:
-        return found
-    corrected = iter(multipletests([item.p for item in usable], method="holm")[1])
+    corrected = holm(np.array([item.p for item in found]))
     return [
-        replace(item, p_holm=float(next(corrected))) if np.isfinite(item.p) else item
-        for item in found
+        replace(item, p_holm=float(p)) if np.isfinite(p) else item
+        for item, p in zip(found, corrected, strict=True)
     ]

@@ -15,9 +15,9 @@ import numpy as np
 import pandas as pd
 import scipy.stats
 from statsmodels.stats.anova import AnovaRM
-from statsmodels.stats.multitest import multipletests
 
 from impc.arrays import Array
+from impc.assess.several_tests import holm
 from impc.errors import DataError
 
 if TYPE_CHECKING:
@@ -148,12 +148,8 @@ def paired_tests(scores: Array, visits: Sequence[str]) -> tuple[PairedTest, ...]
         test: Any = scipy.stats.ttest_rel(both[:, j], both[:, i])
         p = float(test.pvalue)
         rows.append((visits[i], visits[j], float(np.mean(both[:, j] - both[:, i])), p))
-    usable = [row[3] for row in rows if np.isfinite(row[3])]
-    corrected = iter(multipletests(usable, method="holm")[1] if usable else [])
-    return tuple(
-        PairedTest(*row, float(next(corrected)) if np.isfinite(row[3]) else float("nan"))
-        for row in rows
-    )
+    corrected = holm(np.array([row[3] for row in rows]))
+    return tuple(PairedTest(*row, float(p)) for row, p in zip(rows, corrected, strict=True))
 
 
 def learning_trend(scores: Array, level: float = 0.95) -> Trend:

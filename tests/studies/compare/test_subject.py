@@ -85,15 +85,8 @@ def test_exceeding_is_counted_sample_by_sample(compared: dict[str, MethodFit]) -
 
 
 def test_estimates_go_through_json(compared: dict[str, MethodFit]) -> None:
-    problem = fit_problem(cart(), [noisy_trial(21, 0.0)], SETTINGS)
-    kept: dict[str, Estimate] = {}
-
-    def remember(stage: str, compute) -> Estimate:  # type: ignore[no-untyped-def]
-        kept[stage] = compute()
-        return kept[stage]
-
-    compare_recordings(problem, 1.0, remember)
-    for estimate in kept.values():
+    problem = fit_problem(cart(), [noisy_trial(seed, 0.0) for seed in (21, 22)], SETTINGS)
+    for estimate in (item.estimate for item in compared.values()):
         seen = problem if estimate.method == "inverse_mpc" else estimate.problem
         again = decode_estimate(seen, json.loads(json.dumps(encode_estimate(estimate))))
         assert again.reason == estimate.reason
@@ -105,10 +98,9 @@ def test_estimates_go_through_json(compared: dict[str, MethodFit]) -> None:
             assert again.status is estimate.status
 
 
-def test_an_interrupted_comparison_goes_on(tmp_path: Path) -> None:
+def test_an_interrupted_comparison_goes_on(compared: dict[str, MethodFit], tmp_path: Path) -> None:
     """Interrupted in the middle: what is done is not done again, and the end is the same."""
     problem = fit_problem(cart(), [noisy_trial(seed, 0.0) for seed in (21, 22)], SETTINGS)
-    whole = compare_recordings(problem, 1.0)
     count = 0
 
     def broken(stage: str, compute) -> Estimate:  # type: ignore[no-untyped-def]
@@ -133,7 +125,7 @@ def test_an_interrupted_comparison_goes_on(tmp_path: Path) -> None:
 
     again = compare_recordings(problem, 1.0, going_on)
     assert len(computed) == stages(2) - 6
-    for one, other in zip(whole, again, strict=True):
+    for one, other in zip(compared.values(), again, strict=True):
         np.testing.assert_array_equal(one.vaf, other.vaf)
         np.testing.assert_array_equal(one.held_out, other.held_out)
 
