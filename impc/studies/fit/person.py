@@ -21,6 +21,8 @@ __all__ = ["person_data", "person_section", "person_sentences"]
 _TWO_SIDED = 1.959964
 # A level whose interval of 95 % ends beyond a factor of ten is not told.
 _TOLD = np.log(10)
+# Some thousands: what is told to no more than that is not told at all.
+_FARTHEST = 9.0
 # Gain and noise that go together by more than this are hardly told apart.
 _CONFUSED = 0.9
 # Criteria that differ by less do not decide (Burnham and Anderson 2002).
@@ -212,7 +214,7 @@ def _levels_table(plant: Plant, report: PersonReport) -> TextTable:
                 f"{number(item.low)} to {number(item.high)}"
                 if item.told
                 else f"at most {number(item.high)}"
-                if np.isfinite(item.high)
+                if np.log(item.high / item.value) < _FARTHEST
                 else "not told"
             ),
             "unit": lambda item: item.unit,

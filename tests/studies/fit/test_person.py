@@ -83,12 +83,34 @@ def test_the_section_and_result_json_have_the_same_numbers() -> None:
     np.testing.assert_allclose(kept["K"], result.person.models[0].fit.K)  # type: ignore[union-attr]
 
 
-def test_one_more_stage_is_told() -> None:
-    settings = fit_settings(TABLE)
+def test_each_model_is_a_stage_and_intervals_follow_the_likelihood_where_asked() -> None:
+    table = TABLE | {"observer": {"sensed": ["x", "v"], "profiles": True}}
+    settings = fit_settings(table)
     without = fit_settings({key: item for key, item in TABLE.items() if key != "observer"})
     problem = fit_problem(cart(), trials(), settings)
-    assert stages(problem, settings) == stages(problem, without) + 1
+    heard: list[str] = []
+    result = fit_recordings(problem, settings, heard.append)
+    quick = fitted()
+    assert result.person is not None
+    assert quick.person is not None
+    assert len(heard) == stages(problem, settings)
+    assert len(heard) - stages(problem, without) == len(result.person.models) + 1
+    assert stages(problem, fit_settings(TABLE)) == len(heard) - 1
     assert fit_observer(cart(), without, trials()) is None
+    kept, rough = person_data(result), person_data(quick)
+    assert kept is not None
+    assert rough is not None
+    assert (kept["profiled"], rough["profiled"]) == (True, False)
+    fit, covariance = quick.person.fit, quick.person.covariance
+    assert fit is not None
+    assert covariance is not None
+    about = np.asarray(fit.K)[..., None] + 1.959964 * covariance.entries[..., None] * [-1, 1]
+    np.testing.assert_allclose(rough["K_intervals"], about)
+    # The gain is well told: ends are half a width at most from those of deviations.
+    width = np.ptp(about, axis=-1, keepdims=True)
+    assert np.all(np.abs((kept["K_intervals"] - about) / width) < 0.5)
+    assert "follows the likelihood" in str(person_section(quick, quick.person))
+    assert "follows the likelihood" not in str(person_section(result, result.person))
 
 
 def test_settings_of_a_person() -> None:
