@@ -43,7 +43,7 @@ __all__ = [
 ]
 
 #: First digits of the SHA-256 of each file whose functions are called.
-COMPILED_WITH = {"compiled_products": "a0b2e54183eebe86"}
+COMPILED_WITH = {"compiled_products": "eca330d3b9dc679d"}
 
 
 class Covariance(NamedTuple):

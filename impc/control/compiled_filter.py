@@ -34,9 +34,9 @@ __all__ = ["COMPILED_WITH", "FilterResult", "Steady", "run_filter", "run_person"
 #: First digits of the SHA-256 of each file whose functions are called.
 COMPILED_WITH = {
     "compiled_clip": "4b317b8d6c67db13",
-    "compiled_covariance": "04f8d6a0646a91ef",
+    "compiled_covariance": "88834ae5def6476e",
     "compiled_loop": "7ac3d621e593d752",
-    "compiled_products": "a0b2e54183eebe86",
+    "compiled_products": "eca330d3b9dc679d",
     "compiled_slope": "a7ab729ed84ccf9e",
 }
 

@@ -138,7 +138,13 @@ def turn(changes: Buffer, rows: Buffer, turned: Buffer) -> None:
 
 @njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 def add_both(rest: Buffer, dP: Buffer) -> None:
-    """Add `rest` and its transpose to the lower half of dP, and write the upper; (z, z, k) each."""
+    """Add `rest` and its transpose to the lower half of dP, and write the upper.
+
+    Parameters
+    ----------
+    rest, dP : Buffer
+        (z, z, k); the second is overwritten.
+    """
     size, k = len(dP), dP.shape[2]
     for i in range(size):
         for j in range(i + 1):

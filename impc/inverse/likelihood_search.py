@@ -137,6 +137,7 @@ class Prior:
         Parameters
         ----------
         here : Place
+            Where they are asked for.
         losing : Array
             What is taken for the slope of what levels lose (levels,).
         """
