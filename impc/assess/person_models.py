@@ -126,7 +126,7 @@ def person_report(
         Where the steps of an unknown perturbation begin to be searched (d,).
     profiled : bool
         Whether intervals of the gain and of levels that are weakly told follow the likelihood:
-        minutes on the seat.
+        ten minutes and more on the seat.
     done : callable
         Told the name of each model once it is fitted, and "profiles".
     """

@@ -231,7 +231,7 @@ def _gain_table(result: FitResult, report: PersonReport) -> TextTable:
         "by profile. An entry that the recordings do not tell by itself has none."
         if report.profiled
         else "by deviations, which are too narrow where half of a gain is hardly told: profiles = "
-        "true in [fit.observer] follows the likelihood instead, in minutes."
+        "true in [fit.observer] follows the likelihood instead, on a seat for ten minutes and more."
     )
     return table_of(
         f"The gain of this person beside that of least squares, with intervals of 95 % {how}",
