@@ -28,6 +28,7 @@ __all__ = ["KINDS", "Confusion", "PersonCovariance", "confusion", "person_covari
 
 #: Ways to a covariance.
 KINDS = ("expected", "observed", "sandwich")
+_TWO_SIDED = 1.959964
 # Of a coordinate, which none leaves by much more than one: the prior that is left.
 _FARTHEST = 1e3
 # Step of the differences, of a coordinate: their error is the square of it, and rounding over it.
@@ -66,8 +67,19 @@ class PersonCovariance(Frozen):
 
     def level_interval(self, index: int, value: float) -> tuple[float, float]:
         """Interval of 95 % of a level by its `index`, about its `value`."""
-        factor = float(np.exp(min(1.959964 * self.levels[index], 700.0)))  # still a number
+        factor = float(np.exp(min(_TWO_SIDED * self.levels[index], 700.0)))  # still a number
         return value / factor, value * factor
+
+    def entry_intervals(self, K: Array) -> Array:
+        """Intervals of 95 % of the entries of a gain (entries, 2), in their units.
+
+        Parameters
+        ----------
+        K : Array
+            The gain they are about (m, n).
+        """
+        about = _TWO_SIDED * np.ravel(self.entries)[:, None] * [-1, 1]
+        return frozen(np.ravel(K)[:, None] + about)
 
 
 @dataclass(frozen=True)

@@ -41,7 +41,6 @@ __all__ = ["PersonModel", "PersonReport", "person_report", "persons", "predictio
 _AHEAD, _STARTS = (0.0, 0.1, 0.5), 100
 # One second of lags tells a rhythm that was missed; fewer than ten tell nothing.
 _LEAST_LAGS = 10
-_NORMAL = 1.959964
 
 
 @dataclass(frozen=True)
@@ -151,8 +150,7 @@ def person_report(
         done("profiles")
     else:
         levels = level_intervals(fit, covariance, weak=np.inf)
-        about = _NORMAL * np.ravel(covariance.entries)[:, None] * [-1, 1]
-        entries = frozen(np.ravel(fit.K)[:, None] + about)
+        entries = covariance.entry_intervals(fit.K)
     ahead = tuple(sorted({1 + round(time / problem.plant.dt) for time in _AHEAD}))
     return PersonReport(
         tuple(models),

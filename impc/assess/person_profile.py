@@ -23,19 +23,19 @@ from impc.errors import ImpcError
 from impc.inverse.likelihood_search import climb
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
     from impc.assess.person_covariance import PersonCovariance
     from impc.inverse.likelihood_fit import PersonFit
-    from impc.inverse.likelihood_search import Prior
+    from impc.inverse.likelihood_search import Place, Prior
 
-__all__ = ["entry_intervals", "fallen", "level_interval", "level_intervals", "profile"]
+__all__ = ["FARTHEST", "entry_intervals", "fallen", "level_interval", "level_intervals", "profile"]
 
 # Root of half of 1.96^2, of nats, and how near to it an end of an interval is found.
 _FALLEN, _CLOSE = 1.385903, 0.04
-# A step is no longer than this, and no end is looked for farther away: some thousands of a level,
-# which is then none, or that of a sense which is not used.
-_LONGEST, _FARTHEST = 2.0, 9.0
+#: No end is looked for farther away, and what is told to no more is not told: some thousands of a
+#: level, which is then none, or that of a sense which is not used.
+FARTHEST = 9.0
+# A step is no longer than this.
+_LONGEST = 2.0
 # Places at which an end is looked for, and likelihoods with derivatives at each.
 _TRIES, _BUDGET = 12, 15
 # A level whose logarithm has a larger deviation is given a profile, an entry of the gain that has
@@ -145,13 +145,12 @@ def fallen(fit: PersonFit, along: Array, value: float) -> float:
     float
         Nats; infinite where nothing was found.
     """
-    prior, theta, losing = fit.prior.freed(along), np.array(fit.theta), np.array(fit.losing)
-    top = prior.placed(theta, fit.told)
-    ridge = np.linalg.solve(prior.parabola(top, losing)[1], along)
-    off = value - float(along @ theta)
-    start = _stable(prior, theta, ridge * (off / float(along @ ridge)), along * off)
+    prior, losing = fit.prior.freed(along), np.array(fit.losing)
+    top = prior.placed(np.array(fit.theta), fit.told)
+    ridge = np.asarray(np.linalg.solve(prior.parabola(top, losing)[1], along), dtype=np.float64)
+    off = value - float(along @ top.theta)
     try:
-        return top.value - climb(prior, start, _BUDGET, _across(along), losing)[0].value
+        return top.value - _held(prior, top, along, off, ridge, losing)[0].value
     except ImpcError:  # no filter there
         return np.inf
 
@@ -168,37 +167,44 @@ def _end(fit: PersonFit, along: Array, side: int) -> float:
     top, inside, outside, value = here.value, begin, side * np.inf, begin
     for _ in range(_TRIES):
         gradient, curvature = prior.parabola(here, losing)
-        ridge = np.linalg.solve(curvature, along)
+        ridge = np.asarray(np.linalg.solve(curvature, along), dtype=np.float64)
         spread, peak = float(along @ ridge), value + float(ridge @ gradient)
         # There the profile falls by (value - peak)^2 / (2 spread), of its largest.
         room = 2 * spread * (_FALLEN**2 - top + here.value) + (value - peak) ** 2
         goal = peak + side * np.sqrt(room) if room > 0 else inside
-        goal = side * min(side * goal, side * value + _LONGEST, side * begin + _FARTHEST)
+        goal = side * min(side * goal, side * value + _LONGEST, side * begin + FARTHEST)
         if not side * inside < side * goal < side * outside:
             goal = (inside + outside) / 2 if np.isfinite(outside) else inside + side * _LONGEST
-        start = _stable(prior, here.theta, (goal - value) * ridge / spread, (goal - value) * along)
         try:
-            there, found, _, _ = climb(prior, start, _BUDGET, _across(along), losing)
+            here, losing = _held(prior, here, along, goal - value, ridge, losing)
         except ImpcError:  # no filter there: as far as an end may be
             outside = goal
             continue
-        here, losing, value = there, found, goal
+        value = goal
         root = float(np.sqrt(max(top - here.value, 0.0)))
         if abs(root - _FALLEN) < _CLOSE:
             return value
         if root > _FALLEN:
             outside = value
-        elif side * (value - begin) >= _FARTHEST:
+        elif side * (value - begin) >= FARTHEST:
             break
         else:
             inside = value
     return outside
 
 
-def _stable(prior: Prior, theta: Array, *steps: ArrayLike) -> Array:
-    """After the first of some steps: a straight ridge may leave the gains that stabilise."""
-    starts = [theta + np.asarray(step) for step in steps]
-    return next((each for each in starts if np.isfinite(prior.value(each))), starts[-1])
+def _held(
+    prior: Prior, here: Place, along: Array, off: float, ridge: Array, losing: Array
+) -> tuple[Place, Array]:
+    """The best of all else so far off, and the slope of what levels lose there.
+
+    The search begins on the ridge, or beside it: a straight ridge may leave the gains that
+    stabilise.
+    """
+    starts = [here.theta + off * step for step in (ridge / float(along @ ridge), along)]
+    start = next((each for each in starts if np.isfinite(prior.value(each))), starts[1])
+    found, losing, _, _ = climb(prior, start, _BUDGET, _across(along), losing)
+    return found, losing
 
 
 def _across(along: Array) -> Array:

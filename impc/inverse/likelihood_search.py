@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.inverse.person_coordinates import PersonCoordinates, Told
 
-__all__ = ["Prior", "boxed_step", "climb"]
+__all__ = ["Place", "Prior", "boxed_step", "climb"]
 
 # A search ends when a step promises less, nats: a hundredth of a deviation along any direction
 # without a prior, a tenth with it, for the slope of what levels lose is not known better.

@@ -104,7 +104,7 @@ def test_a_level_that_may_be_none_is_told_on_one_side() -> None:
     fit = fit_person(estimate(posed(person, 0.01, 3.0)), person)
     low, high = level_interval(fit, fit.space.names.index("sensory x"))
     assert low == 0.0
-    assert high > 1e-4
+    assert 1e-4 < high < 10.0  # metres: closed above, whatever is not expected of it
 
 
 @pytest.mark.parametrize("seed", [0, 3])

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from impc.assess.intervals import entry_names
+from impc.assess.person_profile import FARTHEST
 from impc.reporting.document import Block, Heading, Section, TextTable, table_of
 from impc.reporting.rendering import number
 from impc.reporting.shown_units import shown_unit
@@ -18,11 +19,8 @@ if TYPE_CHECKING:
 
 __all__ = ["person_data", "person_section", "person_sentences"]
 
-_TWO_SIDED = 1.959964
 # A level whose interval of 95 % ends beyond a factor of ten is not told.
 _TOLD = np.log(10)
-# Some thousands: what is told to no more than that is not told at all.
-_FARTHEST = 9.0
 # Gain and noise that go together by more than this are hardly told apart.
 _CONFUSED = 0.9
 # Criteria that differ by less do not decide (Burnham and Anderson 2002).
@@ -214,7 +212,7 @@ def _levels_table(plant: Plant, report: PersonReport) -> TextTable:
                 f"{number(item.low)} to {number(item.high)}"
                 if item.told
                 else f"at most {number(item.high)}"
-                if np.log(item.high / item.value) < _FARTHEST
+                if np.log(item.high / item.value) < FARTHEST
                 else "not told"
             ),
             "unit": lambda item: item.unit,

@@ -213,6 +213,11 @@ class FitSettings:
     solver: str = COMPILED
     observer: ObserverSettings | None = None
 
+    @property
+    def person_profiles(self) -> bool:
+        """Whether intervals of a person who senses with noise follow the likelihood."""
+        return self.observer is not None and self.observer.profiles
+
 
 def require_used(settings: FitSettings, used: Collection[str], command: str) -> None:
     """Refuse what is set and not used, so that nothing is left out without a word.

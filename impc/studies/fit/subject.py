@@ -96,8 +96,7 @@ def stages(problem: Problem, settings: FitSettings) -> int:
     structures = (settings.structure is not None) + len(settings.structures)
     asked = fit_observer(problem.plant, settings, problem.recordings)
     models = 0 if asked is None else len(persons(problem, *asked))
-    profiles = settings.observer is not None and settings.observer.profiles
-    others = structures + models + profiles + count_stages(problem, settings)
+    others = structures + models + settings.person_profiles + count_stages(problem, settings)
     return 1 + len(_beside(settings)) + left_out + others
 
 
@@ -272,8 +271,7 @@ def _person(
     asked = fit_observer(problem.plant, settings, problem.recordings)
     if asked is None:
         return None
-    profiled = settings.observer is not None and settings.observer.profiles
-    return person_report(fitted, *asked, profiled=profiled, done=progress.done)
+    return person_report(fitted, *asked, profiled=settings.person_profiles, done=progress.done)
 
 
 def _structures(
