@@ -3,7 +3,7 @@
 A cart of two states under a push of three levels, or the linear seated subject under the ternary
 torque. Noise is in the motor, in the senses, or in both, of a size that leaves the motion without
 noise a VAF of 90 or 70 %; the limit of the command is far away, or met at a tenth of the samples
-and more. Prices are log-uniform within a factor of two.
+and more. Prices are log-uniform within a factor of two. At the limit some on the seat fall.
 """
 
 from __future__ import annotations
@@ -77,11 +77,14 @@ class Recorded:
         Share of the samples at the limit.
     vaf : float
         Of the motion without noise, %, the mean of the outputs.
+    largest : float
+        Of the recorded outputs, in rad or m.
     """
 
     problem: Problem
     saturated: float
     vaf: float
+    largest: float
 
 
 def subject(body: str, seed: int, noise: str, share: float, limit: float) -> Subject:
@@ -113,7 +116,8 @@ def recorded(who: Subject, seed: int) -> Recorded:
     problem = Problem(
         plant, law.bounds, law.horizon, trials, terminal_set=False, unknown_start=True
     )
-    return Recorded(problem, float(np.mean(met)), float(np.mean(shares)))
+    largest = max(float(np.max(np.abs(one.outputs))) for one in trials)
+    return Recorded(problem, float(np.mean(met)), float(np.mean(shares)), largest)
 
 
 def _on_cart(rng: np.random.Generator, limit: float) -> tuple[Controller, list[Array]]:

@@ -24,6 +24,7 @@ import numpy as np
 import scipy.signal
 from tqdm import tqdm
 
+from impc.assess.covariance import TWO_SIDED
 from impc.assess.printed_gain import gain_estimate
 from impc.control.closed_loop import require_complete, scenario, simulate
 from impc.control.controller import Controller
@@ -54,7 +55,6 @@ __all__ = [
 ]
 
 _HORIZON, _SAMPLES, _HOLD, _BEFORE = 8, 800, 10, 500
-_TWO_SIDED = 1.959964
 
 
 @dataclass(frozen=True)
@@ -191,7 +191,7 @@ def score_random(seed: int, inputs: int, vaf: float) -> Scores:
 
 def shares(scores: Array) -> Array:
     """Share of the intervals of 95 % that hold the truth, for each column; NaN is left out."""
-    inside = np.where(np.isnan(scores), np.nan, np.abs(scores) <= _TWO_SIDED)
+    inside = np.where(np.isnan(scores), np.nan, np.abs(scores) <= TWO_SIDED)
     return np.asarray(np.nanmean(inside, axis=0))
 
 

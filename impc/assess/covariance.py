@@ -42,7 +42,15 @@ if TYPE_CHECKING:
     from impc.inverse.residuals import Evaluation
     from impc.inverse.trial_span import TrialSpan
 
-__all__ = ["DETERMINED", "FOREIGN", "TOLD", "GainCovariance", "by_trial", "gain_covariance"]
+__all__ = [
+    "DETERMINED",
+    "FOREIGN",
+    "TOLD",
+    "TWO_SIDED",
+    "GainCovariance",
+    "by_trial",
+    "gain_covariance",
+]
 
 #: A direction whose singular value is below this, of the largest, is not determined at all.
 DETERMINED = 1e-6
@@ -53,6 +61,8 @@ TOLD = 0.2
 #: deviation, were it wrong by the natural size of a gain. Of 275 intervals of carts with three
 #: inputs (VAF 70 %) for which that share was .2 to .25, and not in the deviation, 90 % held.
 FOREIGN = 0.2
+#: An interval of 95 % of a normal number is so many deviations on either side.
+TWO_SIDED = 1.959964
 # Of an entry's natural size: a smaller share in a direction is rounding's.
 _SHARE = 1e-6
 _ROUNDING = 1e-10

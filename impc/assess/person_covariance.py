@@ -7,8 +7,10 @@ With I the information of all recordings about all that was searched, initial st
     sandwich   I^-1 cov(sum s_t) I^-1  s_t the score of a sample; its sum by Newey and West
 
 agree where the model is true. Where it is not, the last still tells how estimates scatter. The
-prior of the search is left out but for a trace: what is not told has a deviation of hundreds
-(docs/noisy-people.md).
+prior of the search is left out but for a trace: what is not told has a deviation of hundreds.
+
+To first order an unknown that is hardly told leaves alone what is told; to second order it bends
+it, on the seat by many deviations. `with_curvature` adds that (docs/noisy-people.md).
 """
 
 from __future__ import annotations
@@ -19,20 +21,34 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.arrays import Array, Frozen, frozen
+from impc.assess.covariance import TWO_SIDED
 from impc.errors import InputError
 
 if TYPE_CHECKING:
     from impc.inverse.likelihood_fit import PersonFit
 
-__all__ = ["KINDS", "Confusion", "PersonCovariance", "confusion", "person_covariance"]
+__all__ = [
+    "HARDLY",
+    "KINDS",
+    "Confusion",
+    "PersonCovariance",
+    "confusion",
+    "person_covariance",
+    "with_curvature",
+]
 
 #: Ways to a covariance.
 KINDS = ("expected", "observed", "sandwich")
-_TWO_SIDED = 1.959964
+#: A level whose logarithm has a larger deviation, or a direction of the gain in natural coordinates
+#: (`Coordinates`), is hardly told: there the curvature of the likelihood counts beside its slope.
+HARDLY = 0.25
 # Of a coordinate, which none leaves by much more than one: the prior that is left.
 _FARTHEST = 1e3
 # Step of the differences, of a coordinate: their error is the square of it, and rounding over it.
 _STEP = 1e-4
+# What is hardly told is moved by its deviation, by no more than this, and by these shares of it
+# where there is no likelihood so far away.
+_REACH, _SHARES = 1.0, (1.0, 0.5, 0.25, 0.125)
 
 
 @dataclass(frozen=True)
@@ -67,7 +83,7 @@ class PersonCovariance(Frozen):
 
     def level_interval(self, index: int, value: float) -> tuple[float, float]:
         """Interval of 95 % of a level by its `index`, about its `value`."""
-        factor = float(np.exp(min(_TWO_SIDED * self.levels[index], 700.0)))  # still a number
+        factor = float(np.exp(min(TWO_SIDED * self.levels[index], 700.0)))  # still a number
         return value / factor, value * factor
 
     def entry_intervals(self, K: Array) -> Array:
@@ -78,7 +94,7 @@ class PersonCovariance(Frozen):
         K : Array
             The gain they are about (m, n).
         """
-        about = _TWO_SIDED * np.ravel(self.entries)[:, None] * [-1, 1]
+        about = TWO_SIDED * np.ravel(self.entries)[:, None] * [-1, 1]
         return frozen(np.ravel(K)[:, None] + about)
 
 
@@ -120,7 +136,62 @@ def person_covariance(fit: PersonFit, kind: str = "sandwich") -> PersonCovarianc
     information = _observed(fit) if kind == "observed" else np.array(fit.told.information)
     values, vectors = np.linalg.eigh(information)
     bread = (vectors / np.maximum(values, _FARTHEST**-2)) @ vectors.T
-    covariance = bread @ _meat(fit) @ bread if kind == "sandwich" else bread
+    return _described(fit, kind, bread @ _meat(fit) @ bread if kind == "sandwich" else bread)
+
+
+def with_curvature(fit: PersonFit, found: PersonCovariance) -> PersonCovariance:
+    """The same covariance, with what unknowns that are hardly told do to all others.
+
+    Each of them, a direction of the gain or a level, is moved forth and back by its deviation, or
+    by one where that is less, and all else with it along the ridge of the parabola at the fit.
+    From the slope and the information there follows where all else belongs instead. Half of the sum
+    of the products of these shifts is added.
+
+    Parameters
+    ----------
+    fit : PersonFit
+    found : PersonCovariance
+        Of the fit, to first order.
+    """
+    shifts = [
+        _shift(fit, way, sign * min(deviation, _REACH))
+        for way, deviation in _hardly_told(fit, found)
+        for sign in (1.0, -1.0)
+    ]
+    if not shifts:
+        return found
+    moved = np.array(shifts)
+    return _described(fit, found.kind, found.covariance + moved.T @ moved / 2)
+
+
+def _hardly_told(fit: PersonFit, found: PersonCovariance) -> list[tuple[Array, float]]:
+    """What is hardly told: a direction of the unknowns (q,) of length one, and its deviation."""
+    ways = np.eye(len(fit.theta))
+    gains = found.directions @ ways[: fit.space.gain]
+    every = zip([*gains, *ways[fit.space.own :]], [*found.deviations, *found.levels], strict=True)
+    return [(way, float(deviation)) for way, deviation in every if deviation > HARDLY]
+
+
+def _shift(fit: PersonFit, way: Array, reach: float) -> Array:
+    """Where all else belongs (q,) with one unknown held so far off, beside the ridge.
+
+    Where no likelihood is so far away, of a share of the step, and over its square: to first order
+    there is no shift.
+    """
+    prior, losing, theta = fit.prior, np.array(fit.losing), np.array(fit.theta)
+    bend = prior.parabola(prior.placed(theta, fit.told), losing)[1]
+    ridge = np.linalg.solve(bend, way)
+    for share in _SHARES:
+        there = prior.tried(theta + share * reach * ridge / float(way @ ridge))
+        if there is not None:
+            slope, bend = prior.parabola(there, losing)
+            step, ridge = np.linalg.solve(bend, np.column_stack([slope, way])).T
+            return np.asarray((step - ridge * (way @ step) / (way @ ridge)) / share**2)
+    return np.zeros(len(theta))
+
+
+def _described(fit: PersonFit, kind: str, covariance: Array) -> PersonCovariance:
+    """What follows from a covariance (q, q) of all unknowns."""
     space, shared = fit.space, fit.space.gain
     dK, _ = space.changes(fit.theta)
     entries = np.einsum("iab,ij,jab->ab", dK, covariance[: len(dK), : len(dK)], dK)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.arrays import Array, Frozen, frozen
-from impc.assess.person_covariance import confusion, person_covariance
+from impc.assess.person_covariance import confusion, person_covariance, with_curvature
 from impc.assess.person_profile import entry_intervals, level_intervals
 from impc.assess.variance_accounted_for import whiteness
 from impc.checking import replace
@@ -144,7 +144,7 @@ def person_report(
         return PersonReport(
             tuple(models), None, profiled, nothing, nothing, None, white, (), frozen([[]])
         )
-    covariance = person_covariance(fit)
+    covariance = with_curvature(fit, person_covariance(fit))
     if profiled:
         levels, entries = level_intervals(fit, covariance), entry_intervals(fit, covariance)
         done("profiles")

@@ -19,6 +19,7 @@ import numpy as np
 import scipy.linalg
 
 from impc.arrays import Array, frozen
+from impc.assess.person_covariance import HARDLY
 from impc.errors import ImpcError
 from impc.inverse.likelihood_search import climb
 
@@ -38,12 +39,9 @@ FARTHEST = 9.0
 _LONGEST = 2.0
 # Places at which an end is looked for, and likelihoods with derivatives at each.
 _TRIES, _BUDGET = 12, 15
-# A level whose logarithm has a larger deviation is given a profile, an entry of the gain that has
-# one is not told by itself: of a natural coordinate (`Coordinates`).
-_WEAK = 0.25
 
 
-def level_intervals(fit: PersonFit, covariance: PersonCovariance, *, weak: float = _WEAK) -> Array:
+def level_intervals(fit: PersonFit, covariance: PersonCovariance, *, weak: float = HARDLY) -> Array:
     """Intervals of 95 % of all levels (l, 2), in their units.
 
     Parameters
@@ -82,7 +80,7 @@ def entry_intervals(fit: PersonFit, covariance: PersonCovariance) -> Array:
         np.ravel(fit.K), dK.reshape(len(dK), -1).T, np.ravel(covariance.entries), strict=True
     ):
         length = float(np.linalg.norm(slopes))
-        if not deviation < _WEAK * length:
+        if not deviation < HARDLY * length:
             found.append((np.nan, np.nan))
             continue
         along = np.zeros(len(fit.theta))

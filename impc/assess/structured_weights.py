@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.arrays import Array, BoolArray, Frozen, frozen
-from impc.assess.covariance import DETERMINED, by_trial
+from impc.assess.covariance import DETERMINED, TWO_SIDED, by_trial
 from impc.assess.long_run_covariance import (
     ResidualNoise,
     residual_noise,
@@ -48,7 +48,6 @@ __all__ = ["TOLD_FACTOR", "PriceCovariance", "Tangent", "price_covariance", "tan
 
 #: A combination of logarithms is told when its interval of 95 % ends within this factor.
 TOLD_FACTOR = 10.0
-_TWO_SIDED = 1.959964
 # Of an unknown: a smaller share in a direction without a value is rounding's.
 _SHARE = 1e-3
 
@@ -203,7 +202,7 @@ class PriceCovariance(Frozen):
     @property
     def told(self) -> BoolArray:
         """Which directions the recordings tell to a factor of `TOLD_FACTOR` at 95 % (a,)."""
-        return np.asarray(_TWO_SIDED * self.deviations < np.log(TOLD_FACTOR))
+        return np.asarray(TWO_SIDED * self.deviations < np.log(TOLD_FACTOR))
 
     def spread(self, combination: Array) -> tuple[float, float]:
         """Deviation of a combination of unknowns (count,), and over that for white residuals."""

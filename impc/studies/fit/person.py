@@ -228,8 +228,9 @@ def _gain_table(result: FitResult, report: PersonReport) -> TextTable:
     how = (
         "by profile. An entry that the recordings do not tell by itself has none."
         if report.profiled
-        else "by deviations, which are too narrow where half of a gain is hardly told: profiles = "
-        "true in [fit.observer] follows the likelihood instead, on a seat for ten minutes and more."
+        else "by deviations, with what numbers that are hardly told may do to the others. "
+        "profiles = true in [fit.observer] follows the likelihood instead, on a seat for ten "
+        "minutes and more."
     )
     return table_of(
         f"The gain of this person beside that of least squares, with intervals of 95 % {how}",

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from impc.assess.covariance import TWO_SIDED
 from impc.assess.long_run_covariance import residual_noise
 from impc.assess.other_models import residuals_of
 from impc.assess.structured_weights import TOLD_FACTOR
@@ -30,7 +31,6 @@ __all__ = [
     "structure_sentences",
 ]
 
-_TWO_SIDED = 1.959964
 # A test that refuses a departure less often than this has not looked.
 _BLIND = 0.1
 _WIDTH = 4.2  # inches, so that its words can be read on a phone
@@ -219,7 +219,7 @@ def _told(found: StructureFit) -> str:
     blind = [
         label
         for label, own in zip(structure.unknowns, covariance.each, strict=True)
-        if _TWO_SIDED * own >= np.log(TOLD_FACTOR)
+        if TWO_SIDED * own >= np.log(TOLD_FACTOR)
     ]
     if blind:
         text += f" By themselves they do not tell {', '.join(blind)}."
@@ -252,7 +252,7 @@ def _best_pair(found: StructureFit) -> str:
 
 def _to(deviation: float) -> str:
     """How far a logarithm is told, at 95 %."""
-    reach = _TWO_SIDED * deviation
+    reach = TWO_SIDED * deviation
     if not reach < np.log(TOLD_FACTOR):
         return "not at all"
     factor = float(np.exp(reach))

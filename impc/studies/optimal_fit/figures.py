@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from impc.assess.covariance import TWO_SIDED
 from impc.reporting.shown_units import shown_as
 from impc.reporting.style import (
     BLUE,
@@ -34,7 +35,6 @@ __all__ = ["interval_rows", "optimal_figures"]
 
 _SOFT = "#8C8C8C"
 _ONE_COLUMN = 6  # signals above each other; more stand in two columns
-_TWO_SIDED = 1.959964
 # Factors beyond which an interval is drawn with an arrow.
 _FURTHEST = 30.0
 _LONGEST = 45  # characters of a legend
@@ -103,7 +103,7 @@ def interval_rows(fit: OptimalFit) -> list[tuple[str, float, float]]:
     found = []
     for one in fit.estimate.combinations.told:
         if not one.difference:
-            factor = float(np.exp(np.minimum(_TWO_SIDED * one.deviation, 100.0)))
+            factor = float(np.exp(np.minimum(TWO_SIDED * one.deviation, 100.0)))
             found.append((one.name, 1 / factor, factor))
     return found
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from markupsafe import Markup
 
+from impc.assess.covariance import TWO_SIDED
 from impc.reporting.document import (
     Block,
     Details,
@@ -36,7 +37,6 @@ __all__ = ["METHOD", "optimal_report", "parameters_table"]
 #: Under which name its numbers stand among the methods of result.json.
 METHOD = "nonlinear_inverse_mpc"
 _LEVEL = 0.95
-_TWO_SIDED = 1.959964
 _INTERVALS = Picture(
     "parameters",
     "Intervals of the parameters and products of parameters that the recordings tell",
@@ -157,9 +157,9 @@ def _combination_numbers(fit: OptimalFit) -> TextTable:
 def _ends(one: Combination) -> tuple[float, float]:
     """Both ends of a told product; any positive number for one that is not."""
     if one.difference:
-        return one.value - _TWO_SIDED * one.deviation, one.value + _TWO_SIDED * one.deviation
+        return one.value - TWO_SIDED * one.deviation, one.value + TWO_SIDED * one.deviation
     with np.errstate(over="ignore"):
-        factor = float(np.exp(_TWO_SIDED * one.deviation))
+        factor = float(np.exp(TWO_SIDED * one.deviation))
     return one.value / factor, one.value * factor
 
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from impc.assess.covariance import TWO_SIDED
 from impc.reporting.style import BLUE, DOUBLE_COLUMN, GREEN, INK, VERMILLION, new_figure
 
 if TYPE_CHECKING:
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
 __all__ = ["experiments_figure", "prices_figure"]
 
 _LINES = ((BLUE, "o", "-"), (VERMILLION, "s", "--"), (GREEN, "^", ":"), (INK, "D", "-."))
-_TWO_SIDED = 1.959964
 # Beyond this factor a price is not told, whatever its interval.
 _LARGEST = 100.0
 _COLUMNS = 3
@@ -73,7 +73,7 @@ def experiments_figure(plan: Plan) -> Figure:
 def _factor(index: int, item: Outcome) -> float:
     if item.expected is None:
         return math.nan
-    half = _TWO_SIDED * float(item.expected.deviations[index])
+    half = TWO_SIDED * float(item.expected.deviations[index])
     return math.exp(half) if half < math.log(_LARGEST) else math.nan
 
 
