@@ -18,6 +18,7 @@ often largest where one of them is zero, and others are too large in its place (
 from __future__ import annotations
 
 import copy
+import itertools
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -39,7 +40,7 @@ _SETTLED, _ENOUGH = 1e-4, 5e-3
 # nat in a step of a deviation. A step is judged as of a function known to so much (Sun and Nocedal
 # 2023), and a search ends after so many steps that found nothing higher: settled, if from the
 # highest place no more than that is promised.
-_ROUGH, _PATIENCE = 0.5, 4
+_ROUGH, _PATIENCE, _PROGRESS = 0.5, 4, 0.05
 # Without a prior a level that slides to zero, or a sense to one that is not used, has no end: along
 # what is so flat a step of ten is as far as a promise is believed.
 _FLAT = 1e-2
@@ -47,7 +48,9 @@ _FLAT = 1e-2
 # rounding is still a matrix of its kind, with so much of each diagonal added.
 _ROUNDING = 1e-12
 # Step of the differences along a level, of its logarithm; square of one that teaches half.
-_DIFFERENCE, _DAMPING = 0.05, 0.1
+_DIFFERENCE, _DAMPING = 0.1, 0.1
+# A place is beside the ridge of all but the levels when a step onto it promises more, nats.
+_BESIDE = 0.05
 # Longest and shortest step of any coordinate.
 _STEP, _SHORTEST = 1.0, 1e-3
 # Nats for each factor of e by which a gain near the border of those that stabilise lets noise
@@ -164,12 +167,22 @@ class Prior:
         return np.clip(learned, -float(own), 0.0)
 
     def losing(self, here: Place) -> Array:
-        """Slope of `lost` along the levels (levels,) from `here`, by differences."""
+        """Slope of `lost` along the levels (levels,) from `here`, by differences.
+
+        All else follows a level along its ridge, for `lost` changes along that too. Where neither
+        way has a likelihood the slope is taken for zero.
+        """
+        own, slopes = self.space.own, np.zeros(len(self.scales))
         if not self.used:
-            return np.zeros(len(self.scales))
-        steps = _DIFFERENCE * np.eye(len(here.theta))[self.space.own :]
-        there = [self.lost(here.theta + step, self.space.told(here.theta + step)) for step in steps]
-        return (np.array(there) - here.lost) / _DIFFERENCE
+            return slopes
+        information = here.told.information + self.slopes(here.theta)[1]
+        ridges = -np.linalg.solve(information[:own, :own], information[:own, own:])
+        ways = _DIFFERENCE * np.hstack([ridges.T, np.eye(len(slopes))])
+        for (index, way), sign in itertools.product(enumerate(ways), (1, -1)):
+            there = self.tried(here.theta + sign * way) if slopes[index] == 0.0 else None
+            if there is not None:
+                slopes[index] = sign * (there.lost - here.lost) / _DIFFERENCE
+        return slopes
 
     def lost(self, theta: Array, told: Told) -> float:
         """What levels lose because all else is fitted to the same noise, nats, at theta (q,).
@@ -256,7 +269,7 @@ def climb(
         When there is no likelihood at theta.
     """
     way = np.eye(len(theta)) if along is None else along
-    enough = _ENOUGH if prior.used else _SETTLED
+    enough, progress = (_ENOUGH, _PROGRESS) if prior.used else (_SETTLED, _SETTLED)
     here = best = prior.at(theta)
     differences = prior.used and losing is None
     losing = np.zeros(len(prior.scales)) if losing is None else losing
@@ -277,6 +290,9 @@ def climb(
         step, within = boxed_step(down, curvature, radius)
         length = float(np.max(np.abs(step)))
         there, spent = prior.tried(here.theta + way @ step), spent + 1
+        if there is not None and prior.used:
+            there, more = _followed(prior, there, way)
+            spent += more
         # What came true of the promise, both as if they were larger by what is not smooth.
         share = -1.0 if there is None else (there.value - here.value + _ROUGH) / (within + _ROUGH)
         if there is None or share < 0.25:
@@ -284,9 +300,26 @@ def climb(
             continue
         if share > 0.75:
             radius = min(max(radius, 2 * length), _STEP)
-        stale = 0 if there.value > best.value + enough else stale + 1
+        stale = 0 if there.value > best.value + progress else stale + 1
         best = there if there.value > best.value else best
         losing, here = prior.learned(losing, here, there), there
+
+
+def _followed(prior: Prior, here: Place, way: Array) -> tuple[Place, int]:
+    """All but the levels where the slope puts it, and likelihoods spent.
+
+    The ridge that all else makes bends with the levels, on the seat by many deviations. What levels
+    lose changes by nats beside it, so that places are compared on it.
+    """
+    others = way[:, ~np.any(way[prior.space.own :] != 0, axis=0)]
+    slope, bend = prior.parabola(here, np.zeros(len(prior.scales)))
+    step, promised = boxed_step(others.T @ slope, others.T @ bend @ others, _STEP)
+    if promised < _BESIDE:
+        return here, 0
+    there = prior.tried(here.theta + others @ step)
+    if there is None or there.value + there.lost < here.value + here.lost:
+        return here, 1
+    return there, 1
 
 
 def boxed_step(gradient: Array, curvature: Array, radius: float) -> tuple[Array, float]:
