@@ -37,7 +37,7 @@ COMPILED_WITH = {
     "compiled_covariance": "88834ae5def6476e",
     "compiled_loop": "4721c36aa6383398",
     "compiled_products": "eca330d3b9dc679d",
-    "compiled_slope": "a7ab729ed84ccf9e",
+    "compiled_slope": "bfa10fd29c2f5678",
 }
 
 _SOFTENED, _DIVERGED = 2, 5
