@@ -30,7 +30,7 @@ import numpy as np
 from impc.arrays import Array, BoolArray, Frozen, frozen
 from impc.assess.long_run_covariance import ResidualNoise, residual_noise, spread_of_sum
 from impc.inverse.consistent_pairs import gain_changes, metric_changes, scaled_changes
-from impc.inverse.residuals import evaluate, misfit_or_reason, residual_only
+from impc.inverse.residuals import evaluate, residual_only, residual_or_reason
 from impc.inverse.solution_set import natural_coordinates
 from impc.inverse.trial_span import trial_span
 from impc.model.plant_family import plant_differential
@@ -212,8 +212,9 @@ def _shifts(problem: Problem, gain: Array, metric: Array, steps: Array, metrics:
     for index, sign in itertools.product(range(len(steps)), (1.0, -1.0)):
         for share in _STEPS:
             there = gain + sign * share * steps[index], metric + sign * share * metrics[index]
-            if not misfit_or_reason(problem, *there)[1]:
-                shifts.append((residual_only(problem, *there) - here) / share**2)
+            moved, reason = residual_or_reason(problem, *there)
+            if not reason:
+                shifts.append((moved - here) / share**2)
                 break
     return np.array(shifts).reshape(-1, len(here))
 

@@ -35,9 +35,9 @@ __all__ = ["COMPILED_WITH", "FilterResult", "Steady", "run_filter", "run_person"
 COMPILED_WITH = {
     "compiled_clip": "4b317b8d6c67db13",
     "compiled_covariance": "88834ae5def6476e",
-    "compiled_loop": "7ac3d621e593d752",
+    "compiled_loop": "4721c36aa6383398",
     "compiled_products": "eca330d3b9dc679d",
-    "compiled_slope": "a7ab729ed84ccf9e",
+    "compiled_slope": "bfa10fd29c2f5678",
 }
 
 _SOFTENED, _DIVERGED = 2, 5

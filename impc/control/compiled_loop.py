@@ -50,7 +50,7 @@ __all__ = [
 ]
 
 #: First digits of the SHA-256 of compiled_body.py, at which numba's cache does not look.
-COMPILED_WITH = "b7a1c1ff1298a4c7"
+COMPILED_WITH = "7e4e5b9a21a8d467"
 #: What `solve_dual` says first: an answer, rows that exclude each other, none within its steps.
 CONVERGED, INCONSISTENT, UNSOLVED = 0, 1, 2
 
