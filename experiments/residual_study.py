@@ -64,8 +64,10 @@ SUBJECTS = {
 }
 
 
-def fitted_subject(kind: Kind, seed: int, order: int, horizon: int) -> Estimate:
-    """Simulate and fit a subject; `order` is that of the delay's approximant."""
+def fitted_subject(
+    kind: Kind, seed: int, order: int, horizon: int, duration: float = 30.0
+) -> Estimate:
+    """Simulate and fit a subject; `order` is that of the delay's approximant, trials in s."""
     system = plants.seated_balance_for(sample_time=0.01, delay_order=order)
     plant = Plant(system, ["command"]).linear()
     weights = _weights(plant)
@@ -75,7 +77,7 @@ def fitted_subject(kind: Kind, seed: int, order: int, horizon: int) -> Estimate:
     rng = np.random.default_rng([seed, 1])
     trials: list[Recording] = []
     for number, child in enumerate(np.random.SeedSequence(seed).spawn(3)):
-        torque = plants.ternary_torque(duration=30.0, rate=100.0, seed=100 * seed + number + 1)
+        torque = plants.ternary_torque(duration=duration, rate=100.0, seed=100 * seed + number + 1)
         run = simulate_subject(
             controller, step, torque, rate=100.0, motor=kind.motor, largest=0.5, seed=child
         )
@@ -85,9 +87,11 @@ def fitted_subject(kind: Kind, seed: int, order: int, horizon: int) -> Estimate:
     return fit_controller(fit_problem(plant, trials, settings), weights)
 
 
-def diagnosed(seed: int, name: str, order: int = 5, horizon: int = 20) -> ResidualDiagnostics:
-    """Both tests on one subject."""
-    fitted = fitted_subject(SUBJECTS[name], seed, order, horizon)
+def diagnosed(
+    seed: int, name: str, order: int = 5, horizon: int = 20, duration: float = 30.0
+) -> ResidualDiagnostics:
+    """Both tests on one subject, whose three trials last `duration` seconds each."""
+    fitted = fitted_subject(SUBJECTS[name], seed, order, horizon, duration)
     return residual_diagnostics(fitted.problem, np.array(fitted.gain), np.array(fitted.metric))
 
 

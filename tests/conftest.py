@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +14,7 @@ from matplotlib.figure import Figure
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from tests.labelled_axes import require_labels
-from tests.support import SEARCH
+from tests.support import SEARCH, leave_blank
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -48,13 +47,7 @@ def figures_have_units() -> Iterator[None]:
 @pytest.fixture
 def blank_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Files of figures with no picture: drawing takes most of some commands' time."""
-
-    def blank(_figure: Figure, stream: io.BytesIO, **_: Any) -> None:
-        stream.write(b"blank")
-
-    monkeypatch.setattr(Figure, "savefig", blank)
-    monkeypatch.setattr(Figure, "draw_without_rendering", lambda _: None)
-    monkeypatch.setattr("impc.reporting.style._set_literally", lambda _: None)
+    leave_blank(monkeypatch)
 
 
 @pytest.fixture

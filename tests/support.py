@@ -9,6 +9,7 @@ import control
 import numpy as np
 import scipy.optimize
 from hypothesis import settings
+from matplotlib.figure import Figure
 
 from impc.control.closed_loop import scenario, simulate
 from impc.control.controller import Controller
@@ -19,7 +20,10 @@ from impc.model.recordings import Recording
 from impc.model.weights import Weights
 
 if TYPE_CHECKING:
+    import io
     from collections.abc import Callable
+
+    import pytest
 
 
 #: How many times the examples of `make test` are drawn: 1, or what `make search` asks for.
@@ -29,6 +33,17 @@ SEARCH = int(os.environ.get("IMPC_SEARCH", "1"))
 def draws(count: int) -> settings:
     """So many examples of hypothesis, always the same; times SEARCH new ones in `make search`."""
     return settings(max_examples=count * SEARCH)
+
+
+def leave_blank(patch: pytest.MonkeyPatch) -> None:
+    """Files of figures with no picture: drawing takes most of some commands' time."""
+
+    def blank(_figure: Figure, stream: io.BytesIO, **_: Any) -> None:
+        stream.write(b"blank")
+
+    patch.setattr(Figure, "savefig", blank)
+    patch.setattr(Figure, "draw_without_rendering", lambda _: None)
+    patch.setattr("impc.reporting.style._set_literally", lambda _: None)
 
 
 def nelder_mead(objective: Callable[[Any], float], start: np.ndarray, budget: int) -> float:

@@ -93,14 +93,24 @@ def solve_saturated(
         _saturate(loop.A, loop.B, loop.K, low, high, x, u, at)
     else:
         u[:-1], at[:-1] = last.u[1:], last.at[1:]
-    return Plan(*_solve(loop.A, loop.B, loop.K, S, low, high, x, u, at))
+    gains = loop.A, loop.B, loop.K, S
+    u, ahead, held, L, P, q, H, gradient, noise, solved = _solve(*gains, low, high, x, u, at)
+    told = False
+    if solved:
+        # Beside `_solve` and not in it: inside, all of it would be compiled a second time.
+        doubt = _doubt(*gains, x, u, held, H, gradient, noise)
+        told = _told(*doubt, _open_curvature(*gains, N), low, high, u, held, H, gradient, noise)
+    return Plan(u, ahead, held, L, P, q, H, told)
 
 
 @njit(cache=True, nogil=True)
 def _solve(
     A: Buffer, B: Buffer, K: Buffer, S: Buffer, low: Buffer, high: Buffer, x0: Buffer, u: Buffer,
     at: Buffer,
-) -> tuple[Buffer, Buffer, Buffer, Buffer, Buffer, Buffer, Buffer, bool]:  # fmt: skip
+) -> tuple[
+    Buffer, Buffer, Buffer, Buffer, Buffer, Buffer, Buffer, Buffer, Buffer, bool
+]:  # fmt: skip
+    """The plan without `told`; the gradient and its rounding; whether a plan was found."""
     N, m, n = len(u), K.shape[0], K.shape[1]
     x = np.zeros((N + 1, n))
     L, P, q = np.zeros((N, m, n)), np.zeros((N + 1, n, n)), np.zeros((N + 1, n))
@@ -119,10 +129,9 @@ def _solve(
         u[:] = wanted
         k, j = _released(at, gradient, noise)
         if k < 0:
-            told = _told(A, B, K, S, low, high, x0, u, at, H, gradient, noise)
-            return u, x, at, L, P, q, H, told
+            return u, x, at, L, P, q, H, gradient, noise, True
         at[k, j] = 0
-    return u, x, at, L, P, q, H, False
+    return u, x, at, L, P, q, H, gradient, noise, False
 
 
 @njit(cache=True)
@@ -252,12 +261,10 @@ def _released(at: Buffer, gradient: Buffer, noise: Buffer) -> tuple[int, int]:
 
 @njit(cache=True)
 def _told(
-    A: Buffer, B: Buffer, K: Buffer, S: Buffer, low: Buffer, high: Buffer, x0: Buffer, u: Buffer,
+    energy: float, curvature: Buffer, alone: Buffer, low: Buffer, high: Buffer, u: Buffer,
     at: Buffer, H: Buffer, gradient: Buffer, noise: Buffer,
 ) -> bool:  # fmt: skip
-    """Whether rounding leaves every first input where it is."""
-    energy, curvature = _doubt(A, B, K, S, x0, u, at, H, gradient, noise)
-    alone = _open_curvature(A, B, K, S, len(u))
+    """Whether rounding leaves every first input where it is, by `_doubt` and `_open_curvature`."""
     for j in range(u.shape[1]):
         pull, rounding = at[0, j] * gradient[0, j] * H[0, j, j], noise[0, j] * H[0, j, j]
         held = pull > rounding + np.sqrt(alone[j, j] * energy)
@@ -268,7 +275,7 @@ def _told(
     return True
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _doubt(
     A: Buffer, B: Buffer, K: Buffer, S: Buffer, x0: Buffer, u: Buffer, at: Buffer, H: Buffer,
     gradient: Buffer, noise: Buffer,

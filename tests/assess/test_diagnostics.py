@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,7 +24,8 @@ from impc.studies.fit.settings import FitSettings
 from impc.studies.fit.subject import fit_problem
 
 SAMPLES, TRIALS = 1500, 2
-QUICK = {"order": 1, "horizon": 4}
+QUICK: dict[str, Any] = {"order": 1, "horizon": 4}
+SHORT = QUICK | {"duration": 15.0}
 
 
 def loop() -> tuple[Plant, Array]:
@@ -146,8 +148,8 @@ def test_false_alarms_of_structure(colour: float, most: float) -> None:
 
 
 def test_the_default_subject_is_told_from_the_same_on_a_linear_plant() -> None:
-    """Its body is nonlinear, the model's is not; six states for ten, seed 0."""
-    default, linear = (diagnosed(0, name, **QUICK) for name in ("default", "linear"))
+    """Its body is nonlinear, the model's is not; six states for ten, trials of 15 s, seed 0."""
+    default, linear = (diagnosed(0, name, **SHORT) for name in ("default", "linear"))
     assert default.structure is not None
     assert linear.structure is not None
     assert default.structure.found
@@ -159,13 +161,13 @@ def test_the_default_subject_is_told_from_the_same_on_a_linear_plant() -> None:
 
 def test_motor_noise_with_saturation_leads_the_page() -> None:
     """Motor noise of 1 Nm, at the limit for part of the time; noise on the angles is not told."""
-    found = diagnosed(0, "motor", **QUICK)
+    found = diagnosed(0, "motor", **SHORT)
     assert found.loop is not None
     assert found.loop.found
     told = residual_warnings(found, ("theta1", "theta2"), 0.12)
     assert "noise inside the loop and not in the recorder" in told[0]
     assert "stands at its bound for 12.0 %" in told[0]
-    recorder = diagnosed(0, "recorder", **QUICK)
+    recorder = diagnosed(0, "recorder", **SHORT)
     assert recorder.loop is not None
     assert not recorder.loop.found
     assert residual_warnings(recorder, ("theta1", "theta2"), 0.12) == ()

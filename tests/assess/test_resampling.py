@@ -58,6 +58,12 @@ def width(found: tuple[Interval, ...]) -> Array:
     return np.array([item.high - item.low for item in found])
 
 
+@pytest.mark.parametrize(
+    "fitted",
+    [0.9, pytest.param(0.0, marks=pytest.mark.full)],
+    ids=["coloured", "white"],
+    indirect=True,
+)
 def test_bootstrap_agrees_with_the_sandwich(fitted: Estimate) -> None:
     """30 replicates, seed 4: widths within a third of the sandwich's, for both ways to draw."""
     estimate = gain_estimate(fitted)

@@ -223,7 +223,7 @@ def test_a_plant_and_a_file_of_ones_own(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.chdir(tmp_path)
     Path("mine_to_fit.py").write_text(OWN_PLANT)
     rng = np.random.default_rng(0)
-    push = np.repeat(rng.choice([-0.85, 0.0, 0.85], 60), 10)
+    push = np.repeat(rng.choice([-0.85, 0.0, 0.85], 30), 10)
     x = np.zeros(2)
     lines = ["t;pos;push"]
     for index, value in enumerate(push):

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import importlib
 import io
 import os
@@ -26,8 +27,9 @@ if TYPE_CHECKING:
 
 __all__ = ["run_line", "working_in"]
 
-# `impc simulate` gives the same files for the same options: once is enough.
-_SIMULATED: dict[tuple[str, ...], tuple[Path, str]] = {}
+# `impc simulate` gives the same files for the same options, and `impc fit` for the same options
+# and files: once is enough.
+_MADE: dict[tuple[str, ...], tuple[Path, str]] = {}
 
 
 @contextlib.contextmanager
@@ -53,13 +55,14 @@ def run_line(line: str, kept: Path) -> str:
     ----------
     line : str
     kept : Path
-        Folder for what `impc simulate` made, for the lines that make the same.
+        Folder for what `impc simulate` and `impc fit` made, for the lines that make the same.
     """
     program, *arguments = shlex.split(line)
     importlib.invalidate_caches()
     if program in ("impc", ".venv/bin/impc"):
         given = [name for word in arguments for name in _expanded(word)]
-        return _simulate(given, kept) if given[:1] == ["simulate"] else _impc(given)
+        once = given[:1] == ["simulate"] or (given[:1] == ["fit"] and "--out" in given)
+        return _once(given, kept) if once else _impc(given)
     if program == "python" and not arguments[0].startswith("-"):
         printed = io.StringIO()
         sys.path.insert(0, "")
@@ -86,16 +89,21 @@ def _impc(arguments: list[str]) -> str:
     return done.stdout
 
 
-def _simulate(arguments: list[str], kept: Path) -> str:
+def _once(arguments: list[str], kept: Path) -> str:
     where = arguments.index("--out")
     out = Path(arguments[where + 1])
-    key = (*arguments[:where], *arguments[where + 2 :])
-    if key not in _SIMULATED:
-        made = kept / f"simulated-{len(_SIMULATED)}"
-        _SIMULATED[key] = made, _impc([*key, "--out", str(made)])
-    made, printed = _SIMULATED[key]
+    rest = arguments[:where] + arguments[where + 2 :]
+    key = *rest, *(_digest(Path(word)) for word in rest if Path(word).is_file())
+    if key not in _MADE:
+        made = kept / f"made-{len(_MADE)}"
+        _MADE[key] = made, _impc([*rest, "--out", str(made)])
+    made, printed = _MADE[key]
     shutil.copytree(made, out, dirs_exist_ok=True)
     return printed.replace(str(made), os.fspath(out))
+
+
+def _digest(file: Path) -> str:
+    return hashlib.sha256(file.read_bytes()).hexdigest()
 
 
 def _edit(name: str, old: str, new: str) -> None:

@@ -163,6 +163,25 @@ SMALLER = {
         ),
         _SHORT,
     ),
+    (
+        "docs/noisy-people.md",
+        "impc simulate seated-balance --observer --sensory-noise 0.2 --unknown-perturbation"
+        " --out subject",
+    ): Smaller(
+        (
+            "impc simulate seated-balance --observer --sensory-noise 0.2 --unknown-perturbation"
+            " --out subject --duration 4 --formats csv",
+        ),
+        "shorter trials in one format",
+    ),
+    ("docs/planning.md", "impc plan plan.toml --plant seated-balance --out results/plan"): Smaller(
+        (
+            "edit plan.toml [plant] '[plant]\ndelay_order = 1'",
+            "edit plan.toml 'horizon = 20' 'horizon = 4'",
+            "impc plan plan.toml --plant seated-balance --out results/plan",
+        ),
+        "six states for ten, and a shorter horizon",
+    ),
     ("docs/cohorts.md", "impc simulate cohort --out results/cohort-data"): Smaller(
         (
             "impc simulate cohort --out results/cohort-data"

@@ -83,7 +83,7 @@ def test_what_levels_lose_is_that_of_the_gain_integrated_out() -> None:
     person = Observer(cart(), ["x"], motor=0.4, sensory=0.05)
     problem = replace(posed(person, 0.01, 3.0, trials=1), unknown_start=False)
     fit = fit_person(estimate(problem), person)
-    space, prior, steps = fit.space, fit.prior, np.linspace(-5, 5, 21)
+    space, prior, steps = fit.space, fit.prior, np.linspace(-5, 5, 11)
     assert space.own == 2
     change = []
     for factor in (1.0, 2.0):
