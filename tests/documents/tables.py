@@ -210,8 +210,8 @@ SMALLER = {
         "one short subject for ten, 20 replicates for 200, a LASSO that ends sooner",
     ),
     ("docs/selection.md", "impc select results/head-data/study.toml --out results/select"): Smaller(
-        ("impc select results/head-data/study.toml --out results/select --workers 1",),
-        "one worker to start, whatever the cores",
+        ("impc select results/head-data/study.toml --out results/select --workers 1 --yes",),
+        "one worker to start, whatever the cores, and no question how long a busy machine takes",
     ),
     (
         "docs/selection.md",
@@ -230,9 +230,9 @@ SMALLER = {
     ): Smaller(
         (
             "impc key-parameters results/head-data-2/study.toml --out results/key"
-            " --bound 0.03 --workers 1",
+            " --bound 0.03 --workers 1 --yes",
         ),
-        "fewer subsets to refit: 0.03 is below the default bound",
+        "fewer subsets to refit: 0.03 is below the default bound; no question how long it takes",
     ),
 }
 
