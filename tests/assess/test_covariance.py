@@ -155,8 +155,8 @@ def test_told_directions_count_what_is_not_told_to_second_order() -> None:
 def test_printed_intervals_hold_the_truth(inputs: int, vaf: float, count: int) -> None:
     """Seeds from 0; all told entries and all told directions together, first-order noise (0.8).
 
-    With the 95 % that they say, fewer than 86 % of 50 or of 64 fall inside once in a hundred; the
-    scores have unit variance within their own spread. `experiments.printed_intervals` has 200.
+    With the 95 % that they say, fewer than 86 % of 50 or of 64 fall inside once in a hundred, of 32
+    once in forty; the scores have unit variance within their own spread. `experiments.printed_intervals` has 200.
     """
     found = [score_carts(seed, inputs, vaf, 0.8) for seed in range(count)]
     for scores in ([item.entries for item in found], [item.directions for item in found]):
