@@ -156,7 +156,8 @@ def test_printed_intervals_hold_the_truth(inputs: int, vaf: float, count: int) -
     """Seeds from 0; all told entries and all told directions together, first-order noise (0.8).
 
     With the 95 % that they say, fewer than 86 % of 50 or of 64 fall inside once in a hundred, of 32
-    once in forty; the scores have unit variance within their own spread. `experiments.printed_intervals` has 200.
+    once in forty; the scores have unit variance within their own spread.
+    `experiments.printed_intervals` has 200.
     """
     found = [score_carts(seed, inputs, vaf, 0.8) for seed in range(count)]
     for scores in ([item.entries for item in found], [item.directions for item in found]):
