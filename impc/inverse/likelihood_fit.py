@@ -183,7 +183,7 @@ def fit_person(
         starts.append(np.concatenate([space.start, log]))
     theta = _best(first, starts)
     alone = np.concatenate([_suggested(observer, size, 1.0, 1.0), size.recorder])
-    prior = Prior(first, spread, np.log(alone[first.moving]))
+    prior = Prior(first, spread, np.log(alone[first.moving]), size.sensory)
     (theta, told, value, _), losing, spent, settled = climb(prior, theta, max_evaluations)
     person = first.unpack(theta)
     prices = space.unknowns(theta[: first.own]) if isinstance(space, PriceCoordinates) else None

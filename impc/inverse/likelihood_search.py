@@ -85,8 +85,9 @@ class Place(NamedTuple):
 class Prior:
     """What holds directions that nothing tells, as a share of a log-likelihood.
 
-    A normal number about the start for each coordinate but the levels, and a barrier before gains
-    that do not stabilise. With x a level over its scale the density of its logarithm is a power of
+    A normal number about the start for each coordinate of gain, prices and parameters, and a
+    barrier before gains that do not stabilise. Initial states are as any other state of their
+    trials. With x a level over its scale the density of its logarithm is a power of
     that of a half-Cauchy level (Gelman 2006), x / (1 + x^2): far away, a quarter of a nat for each
     factor of e on either side.
 
@@ -97,11 +98,27 @@ class Prior:
         Standard deviation; infinite for no prior, and no barrier either.
     scales : Array
         Logarithm of the size that each level is expected to have (levels,).
+    driven : Array, optional
+        Covariance of the states that noise in the loop adds to what recorded perturbations drive
+        (n, n); none by default.
     """
 
-    def __init__(self, space: PersonCoordinates, spread: float, scales: Array) -> None:
-        self.space, self.scales = space, scales
-        self.weights = np.where(np.arange(len(space.start)) < space.own, spread**-2.0, 0.0)
+    def __init__(
+        self,
+        space: PersonCoordinates,
+        spread: float,
+        scales: Array,
+        driven: Array | None = None,
+    ) -> None:
+        self.space, self.scales, self.center = space, scales, space.start.copy()
+        self.weights = np.diag(np.where(np.arange(len(space.start)) < space.own, spread**-2.0, 0.0))
+        unit, size = space.space.start_unit, space.after - space.shared
+        for first in range(space.shared, space.shared + size, len(unit)):
+            mine = slice(first, first + len(unit))
+            trial = space.space.problem.recordings[(first - space.shared) // len(unit)]
+            self.center[mine] = -np.linalg.solve(unit, trial.x0)
+            if driven is not None:
+                self.weights[mine, mine] @= unit.T @ np.linalg.solve(unit @ unit.T + driven, unit)
         self.unlikely = np.full(len(scales), _UNLIKE)
         self.used = bool(np.isfinite(spread))
 
@@ -203,7 +220,7 @@ class Prior:
         """At theta (q,), nats; minus infinity where a gain does not stabilise."""
         if not self.used:
             return 0.0
-        away = float(self.weights @ (theta - self.space.start) ** 2) / 2
+        away = float((theta - self.center) @ self.weights @ (theta - self.center)) / 2
         unlike = float(np.sum(self.unlike(theta)))
         return -away - unlike - _BARRIER * self.space.wandering(theta)[0]
 
@@ -227,12 +244,13 @@ class Prior:
         """
         if not self.used:
             return np.zeros(len(theta)), np.zeros((len(theta), len(theta)))
-        gradient, bend = -self.weights * (theta - self.space.start), np.array(self.weights)
-        turned = np.tanh(theta[self.space.own :] - self.scales)
-        gradient[self.space.own :] -= self.unlikely * turned
-        bend[self.space.own :] += self.unlikely * (1 - turned**2)
-        slope = self.space.wandering(theta)[1]
-        return gradient - _BARRIER * slope, np.diag(bend) + _BARRIER * np.outer(slope, slope)
+        own, slope = self.space.own, self.space.wandering(theta)[1]
+        gradient = -self.weights @ (theta - self.center) - _BARRIER * slope
+        turned = np.tanh(theta[own:] - self.scales)
+        gradient[own:] -= self.unlikely * turned
+        bend = self.weights + _BARRIER * np.outer(slope, slope)
+        bend[own:, own:] += np.diag(self.unlikely * (1 - turned**2))
+        return gradient, bend
 
 
 def climb(
