@@ -51,8 +51,9 @@ _ROUNDING = 1e-12
 _DIFFERENCE, _DAMPING = 0.1, 0.1
 # A place is beside the ridge of all but the levels when a step onto it promises more, nats.
 _BESIDE = 0.05
-# Longest and shortest step of any coordinate.
-_STEP, _SHORTEST = 1.0, 1e-3
+# Longest and shortest step of any coordinate; those of initial states may be longer by a factor: of
+# them a likelihood without bounds is a parabola.
+_STEP, _SHORTEST, _AFAR = 1.0, 1e-3, 100.0
 # Nats for each factor of e by which a gain near the border of those that stabilise lets noise
 # grow: on the seat the largest likelihood without it is on that border, and a search creeps there.
 _BARRIER = 0.5
@@ -112,6 +113,8 @@ class Prior:
     ) -> None:
         self.space, self.scales, self.center = space, scales, space.start.copy()
         self.weights = np.diag(np.where(np.arange(len(space.start)) < space.own, spread**-2.0, 0.0))
+        self.reach = np.ones(len(space.start))
+        self.reach[space.shared : space.after] = _AFAR
         unit, size = space.space.start_unit, space.after - space.shared
         for first in range(space.shared, space.shared + size, len(unit)):
             mine = slice(first, first + len(unit))
@@ -287,6 +290,7 @@ def climb(
         When there is no likelihood at theta.
     """
     way = np.eye(len(theta)) if along is None else along
+    reach = np.max(prior.reach[:, None] * (way != 0), axis=0)
     enough, progress = (_ENOUGH, _PROGRESS) if prior.used else (_SETTLED, _SETTLED)
     here = best = prior.at(theta)
     differences = prior.used and losing is None
@@ -305,8 +309,8 @@ def climb(
             here, losing, known = best, prior.losing(best), best
             radius, spent, stale = _STEP, spent + len(losing), 0
             continue
-        step, within = boxed_step(down, curvature, radius)
-        length = float(np.max(np.abs(step)))
+        step, within = boxed_step(down, curvature, radius * reach)
+        length = float(np.max(np.abs(step) / reach))
         there, spent = prior.tried(here.theta + way @ step), spent + 1
         if there is not None and prior.used:
             there, more = _followed(prior, there, way)
@@ -331,7 +335,8 @@ def _followed(prior: Prior, here: Place, way: Array) -> tuple[Place, int]:
     """
     others = way[:, ~np.any(way[prior.space.own :] != 0, axis=0)]
     slope, bend = prior.parabola(here, np.zeros(len(prior.scales)))
-    step, promised = boxed_step(others.T @ slope, others.T @ bend @ others, _STEP)
+    reach = _STEP * np.max(prior.reach[:, None] * (others != 0), axis=0)
+    step, promised = boxed_step(others.T @ slope, others.T @ bend @ others, reach)
     if promised < _BESIDE:
         return here, 0
     there = prior.tried(here.theta + others @ step)
@@ -340,15 +345,15 @@ def _followed(prior: Prior, here: Place, way: Array) -> tuple[Place, int]:
     return there, 1
 
 
-def boxed_step(gradient: Array, curvature: Array, radius: float) -> tuple[Array, float]:
+def boxed_step(gradient: Array, curvature: Array, radius: Array | float) -> tuple[Array, float]:
     """The step that promises most, g's - s'C s / 2, and moves no coordinate by more than a radius.
 
     Parameters
     ----------
     gradient, curvature : Array
         g (q,) and C (q, q), positive definite.
-    radius : float
-        Infinite for none.
+    radius : Array or float
+        Of all or of each (q,); infinite for none.
 
     Returns
     -------
