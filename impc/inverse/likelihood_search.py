@@ -38,8 +38,8 @@ __all__ = ["Place", "Prior", "boxed_step", "climb"]
 _SETTLED, _ENOUGH = 1e-4, 5e-3
 # The likelihood jumps where a later stage of a plan meets a bound, a seat's at its limit by half a
 # nat in a step of a deviation. A step is judged as of a function known to so much (Sun and Nocedal
-# 2023), and a search ends after so many steps that found nothing higher: settled, if from the
-# highest place no more than that is promised.
+# 2023), and a search ends after so many steps that found nothing higher by so much: settled, if
+# from the highest place no more than half a nat is promised.
 _ROUGH, _PATIENCE, _PROGRESS = 0.5, 4, 0.05
 # Without a prior a level that slides to zero, or a sense to one that is not used, has no end: along
 # what is so flat a step of ten is as far as a promise is believed.

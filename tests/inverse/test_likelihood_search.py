@@ -78,6 +78,36 @@ def test_the_prior_bends_as_it_says(sliding: PersonFit) -> None:
     assert not np.any(nothing.losing(nothing.at(theta)))
 
 
+def test_initial_states_are_as_any_other_state(sliding: PersonFit) -> None:
+    """About zero, with second moments of the states and what noise in the loop adds."""
+    space = sliding.space
+    scales, driven = space.start[space.own :], np.diag([0.3, 0.2])
+    prior = Prior(space, 1.0, scales, driven)
+    begin = space.unpack(prior.center).point.problem
+    np.testing.assert_allclose([trial.x0 for trial in begin.recordings], 0, atol=1e-12)
+    theta, x0 = prior.center.copy(), np.array([0.4, -0.7])
+    unit = space.space.start_unit
+    theta[space.shared : space.shared + 2] += np.linalg.solve(unit, x0)
+    away = prior.value(prior.center) - prior.value(theta)
+    assert away == pytest.approx(x0 @ np.linalg.solve(unit @ unit.T + driven, x0) / 2)
+
+
+def test_the_slope_of_what_levels_lose_follows_the_ridge(sliding: PersonFit) -> None:
+    """Against searches of all else with a level a little lower and higher."""
+    prior, theta = sliding.prior, np.array(sliding.theta)
+    own = sliding.space.own
+    found, others, step = prior.losing(prior.at(theta)), np.eye(len(theta))[:, :own], 0.05
+    for index in (0, 3):  # those that are told: motor, recorder
+        lost = []
+        for sign in (-1, 1):
+            start = theta + sign * step * np.eye(len(theta))[own + index]
+            place, _, _, settled = climb(prior, start, 30, others, np.array(sliding.losing))
+            assert settled
+            lost.append(place.lost)
+        # Measured: .05 apart, for the first is a step of a tenth to one side.
+        assert found[index] == pytest.approx((lost[1] - lost[0]) / (2 * step), abs=0.1)
+
+
 def test_what_levels_lose_is_that_of_the_gain_integrated_out() -> None:
     """Against a grid over the gain, at the levels that were found and at twice the motor noise."""
     person = Observer(cart(), ["x"], motor=0.4, sensory=0.05)
