@@ -47,8 +47,8 @@ _FARTHEST = 1e3
 # Step of the differences, of a coordinate: their error is the square of it, and rounding over it.
 _STEP = 1e-4
 # What is hardly told is moved by its deviation, by no more than this, and by these shares of it
-# where there is no likelihood so far away.
-_REACH, _SHARES = 1.0, (1.0, 0.5, 0.25, 0.125)
+# where there is no likelihood so far away, or more nats are promised than a parabola is believed.
+_REACH, _SHARES, _BELIEVED = 1.0, (1.0, 0.5, 0.25, 0.125, 0.0625), 2.0
 
 
 @dataclass(frozen=True)
@@ -140,12 +140,13 @@ def person_covariance(fit: PersonFit, kind: str = "sandwich") -> PersonCovarianc
 
 
 def with_curvature(fit: PersonFit, found: PersonCovariance) -> PersonCovariance:
-    """The same covariance, with what unknowns that are hardly told do to all others.
+    """The same covariance, with what unknowns that are hardly told do to all but the levels.
 
     Each of them, a direction of the gain or a level, is moved forth and back by its deviation, or
     by one where that is less, and all else with it along the ridge of the parabola at the fit.
     From the slope and the information there follows where all else belongs instead. Half of the sum
-    of the products of these shifts is added.
+    of the products of these shifts is added. Logarithms of levels are left out: where a level is
+    all but none its logarithm has no second order to speak of.
 
     Parameters
     ----------
@@ -161,6 +162,7 @@ def with_curvature(fit: PersonFit, found: PersonCovariance) -> PersonCovariance:
     if not shifts:
         return found
     moved = np.array(shifts)
+    moved[:, fit.space.own :] = 0.0
     return _described(fit, found.kind, found.covariance + moved.T @ moved / 2)
 
 
@@ -175,19 +177,24 @@ def _hardly_told(fit: PersonFit, found: PersonCovariance) -> list[tuple[Array, f
 def _shift(fit: PersonFit, way: Array, reach: float) -> Array:
     """Where all else belongs (q,) with one unknown held so far off, beside the ridge.
 
-    Where no likelihood is so far away, of a share of the step, and over its square: to first order
-    there is no shift.
+    Where no likelihood is so far away, or a step onto the ridge promises more than a parabola is
+    believed to, of a share of the step, and over its square: to first order there is no shift.
     """
     prior, losing, theta = fit.prior, np.array(fit.losing), np.array(fit.theta)
     bend = prior.parabola(prior.placed(theta, fit.told), losing)[1]
     ridge = np.linalg.solve(bend, way)
+    shift = np.zeros(len(theta))
     for share in _SHARES:
         there = prior.tried(theta + share * reach * ridge / float(way @ ridge))
-        if there is not None:
-            slope, bend = prior.parabola(there, losing)
-            step, ridge = np.linalg.solve(bend, np.column_stack([slope, way])).T
-            return np.asarray((step - ridge * (way @ step) / (way @ ridge)) / share**2)
-    return np.zeros(len(theta))
+        if there is None:
+            continue
+        slope, bend = prior.parabola(there, losing)
+        step, across = np.linalg.solve(bend, np.column_stack([slope, way])).T
+        shift = step - across * (way @ step) / (way @ across)
+        shift /= share**2
+        if share**2 * float(slope @ shift) / 2 < _BELIEVED:
+            break
+    return shift
 
 
 def _described(fit: PersonFit, kind: str, covariance: Array) -> PersonCovariance:

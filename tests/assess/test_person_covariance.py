@@ -60,12 +60,14 @@ def test_curvature_is_where_searches_end_with_a_level_held(fitted: PersonFit) ->
         start = theta + sign * found.levels[1] * ridge
         place, _, _, settled = climb(prior, start, 20, others, losing)
         assert settled
-        added += np.outer(place.theta - start, place.theta - start) / 2
+        shift = (place.theta - start) * (np.arange(len(theta)) < fitted.space.own)
+        added += np.outer(shift, shift) / 2
     curved = with_curvature(fitted, found)
     units = np.sqrt(np.outer(np.diag(added), np.diag(added)))
     difference = np.abs(curved.covariance - found.covariance - added)
     assert np.all(difference <= 0.01 * units + 1e-12)  # a search ends at a tenth of a deviation
     assert np.all(curved.entries > found.entries)
+    np.testing.assert_array_equal(curved.levels, found.levels)
     assert curved.kind == "sandwich"
 
 
