@@ -154,14 +154,19 @@ def with_curvature(fit: PersonFit, found: PersonCovariance) -> PersonCovariance:
     found : PersonCovariance
         Of the fit, to first order.
     """
-    shifts = [
-        _shift(fit, way, sign * min(deviation, _REACH))
-        for way, deviation in _hardly_told(fit, found)
-        for sign in (1.0, -1.0)
-    ]
-    if not shifts:
+    hardly = _hardly_told(fit, found)
+    if not hardly:
         return found
-    moved = np.array(shifts)
+    here = fit.prior.placed(np.array(fit.theta), fit.told)
+    bend = fit.prior.parabola(here, np.array(fit.losing))[1]
+    ridges = np.linalg.solve(bend, np.array([way for way, _ in hardly]).T).T
+    moved = np.array(
+        [
+            _shift(fit, way, sign * min(deviation, _REACH) * ridge / float(way @ ridge))
+            for (way, deviation), ridge in zip(hardly, ridges, strict=True)
+            for sign in (1.0, -1.0)
+        ]
+    )
     moved[:, fit.space.own :] = 0.0
     return _described(fit, found.kind, found.covariance + moved.T @ moved / 2)
 
@@ -174,21 +179,18 @@ def _hardly_told(fit: PersonFit, found: PersonCovariance) -> list[tuple[Array, f
     return [(way, float(deviation)) for way, deviation in every if deviation > HARDLY]
 
 
-def _shift(fit: PersonFit, way: Array, reach: float) -> Array:
-    """Where all else belongs (q,) with one unknown held so far off, beside the ridge.
+def _shift(fit: PersonFit, way: Array, off: Array) -> Array:
+    """Where all else belongs (q,) with `way` held after a step (q,) along the ridge, beside it.
 
     Where no likelihood is so far away, or a step onto the ridge promises more than a parabola is
     believed to, of a share of the step, and over its square: to first order there is no shift.
     """
-    prior, losing, theta = fit.prior, np.array(fit.losing), np.array(fit.theta)
-    bend = prior.parabola(prior.placed(theta, fit.told), losing)[1]
-    ridge = np.linalg.solve(bend, way)
-    shift = np.zeros(len(theta))
+    shift = np.zeros(len(off))
     for share in _SHARES:
-        there = prior.tried(theta + share * reach * ridge / float(way @ ridge))
+        there = fit.prior.tried(fit.theta + share * off)
         if there is None:
             continue
-        slope, bend = prior.parabola(there, losing)
+        slope, bend = fit.prior.parabola(there, np.array(fit.losing))
         step, across = np.linalg.solve(bend, np.column_stack([slope, way])).T
         shift = step - across * (way @ step) / (way @ across)
         shift /= share**2

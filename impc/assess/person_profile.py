@@ -201,7 +201,7 @@ def _held(
     """
     starts = [here.theta + off * step for step in (ridge / float(along @ ridge), along)]
     start = next((each for each in starts if np.isfinite(prior.value(each))), starts[1])
-    found, losing, _, _ = climb(prior, start, _BUDGET, _across(along), losing)
+    found, losing, _, _ = climb(prior, prior.at(start), _BUDGET, _across(along), losing)
     return found, losing
 
 

@@ -188,9 +188,9 @@ def fit_person(
     alone = np.concatenate([_suggested(observer, size, 1.0, 1.0), size.recorder])
     prior = Prior(first, spread, np.log(alone[first.moving]), size.sensory)
     rest, none = np.eye(len(theta))[:, first.gain :], np.zeros(len(prior.scales))
-    place, _, begun, _ = climb(prior, theta, min(_FIRST, max_evaluations), rest, none)
+    place, _, begun, _ = climb(prior, prior.at(theta), min(_FIRST, max_evaluations), rest, none)
     (theta, told, value, _), losing, spent, settled = climb(
-        prior, place.theta, max_evaluations - begun
+        prior, place, max_evaluations - begun + 1
     )
     person = first.unpack(theta)
     prices = space.unknowns(theta[: first.own]) if isinstance(space, PriceCoordinates) else None
@@ -205,7 +205,7 @@ def fit_person(
         value,
         len(theta),
         settled,
-        begun + spent,
+        begun + spent - 1,
         frozen(theta),
         told,
         frozen(losing),

@@ -113,8 +113,6 @@ class Prior:
     ) -> None:
         self.space, self.scales, self.center = space, scales, space.start.copy()
         self.weights = np.diag(np.where(np.arange(len(space.start)) < space.own, spread**-2.0, 0.0))
-        self.reach = np.ones(len(space.start))
-        self.reach[space.shared : space.after] = _AFAR
         unit, size = space.space.start_unit, space.after - space.shared
         for first in range(space.shared, space.shared + size, len(unit)):
             mine = slice(first, first + len(unit))
@@ -124,6 +122,11 @@ class Prior:
                 self.weights[mine, mine] @= unit.T @ np.linalg.solve(unit @ unit.T + driven, unit)
         self.unlikely = np.full(len(scales), _UNLIKE)
         self.used = bool(np.isfinite(spread))
+
+    def reach(self, way: Array) -> Array:
+        """How much longer than others a step along each of some directions (q, r) may be (r,)."""
+        mine = way[self.space.shared : self.space.after]
+        return np.where(np.any(mine != 0, axis=0), _AFAR, 1.0)
 
     def at(self, theta: Array) -> Place:
         """What is to be largest, at theta (q,): likelihood times prior, less what levels lose.
@@ -258,20 +261,20 @@ class Prior:
 
 def climb(
     prior: Prior,
-    theta: Array,
+    begin: Place,
     budget: int,
     along: Array | None = None,
     losing: Array | None = None,
 ) -> tuple[Place, Array, int, bool]:
-    """The largest likelihood near theta, times the prior and less what levels lose.
+    """The largest likelihood near a place, times the prior and less what levels lose.
 
     Parameters
     ----------
     prior : Prior
-    theta : Array
-        Where it begins (q,).
+    begin : Place
+        Where it begins.
     budget : int
-        Likelihoods with derivatives, about.
+        Likelihoods with derivatives, about, that of `begin` among them.
     along : Array, optional
         Orthonormal directions in which it may move (q, r); all by default.
     losing : Array, optional
@@ -283,19 +286,16 @@ def climb(
     place, losing, spent, settled : Place, Array, int, bool
         The highest place, slope of what levels lose (levels,), likelihoods with derivatives, and
         whether the search ended by itself.
-
-    Raises
-    ------
-    ImpcError
-        When there is no likelihood at theta.
     """
-    way = np.eye(len(theta)) if along is None else along
-    reach = np.max(prior.reach[:, None] * (way != 0), axis=0)
+    way = np.eye(len(begin.theta)) if along is None else along
+    others = way[:, ~np.any(way[prior.space.own :] != 0, axis=0)]
+    reach = prior.reach(way)
     enough, progress = (_ENOUGH, _PROGRESS) if prior.used else (_SETTLED, _SETTLED)
-    here = best = prior.at(theta)
+    here = best = begin
     differences = prior.used and losing is None
     losing = np.zeros(len(prior.scales)) if losing is None else losing
-    known: Place | None = None
+    # What was won when the slope of what levels lose was asked for last, nats.
+    known = -np.inf
     radius, spent, stale, left = _STEP, 1, 0, np.inf
     while True:
         gradient, curvature = prior.parabola(here, losing)
@@ -304,16 +304,16 @@ def climb(
         if here is best:
             left = promised
         if promised < enough or stale == _PATIENCE or radius < _SHORTEST or spent >= budget:
-            if known is best or spent >= budget or not differences:
+            if best.value <= known + progress or spent >= budget or not differences:
                 return best, losing, spent, left < _ROUGH
-            here, losing, known = best, prior.losing(best), best
+            here, losing, known = best, prior.losing(best), best.value
             radius, spent, stale = _STEP, spent + len(losing), 0
             continue
         step, within = boxed_step(down, curvature, radius * reach)
         length = float(np.max(np.abs(step) / reach))
         there, spent = prior.tried(here.theta + way @ step), spent + 1
-        if there is not None and prior.used:
-            there, more = _followed(prior, there, way)
+        if there is not None and prior.used and spent < budget:
+            there, more = _followed(prior, there, others)
             spent += more
         # What came true of the promise, both as if they were larger by what is not smooth.
         share = -1.0 if there is None else (there.value - here.value + _ROUGH) / (within + _ROUGH)
@@ -327,16 +327,15 @@ def climb(
         losing, here = prior.learned(losing, here, there), there
 
 
-def _followed(prior: Prior, here: Place, way: Array) -> tuple[Place, int]:
-    """All but the levels where the slope puts it, and likelihoods spent.
+def _followed(prior: Prior, here: Place, others: Array) -> tuple[Place, int]:
+    """All but the levels (q, r) where the slope puts it, and likelihoods spent.
 
     The ridge that all else makes bends with the levels, on the seat by many deviations. What levels
     lose changes by nats beside it, so that places are compared on it.
     """
-    others = way[:, ~np.any(way[prior.space.own :] != 0, axis=0)]
     slope, bend = prior.parabola(here, np.zeros(len(prior.scales)))
-    reach = _STEP * np.max(prior.reach[:, None] * (others != 0), axis=0)
-    step, promised = boxed_step(others.T @ slope, others.T @ bend @ others, reach)
+    radius = _STEP * prior.reach(others)
+    step, promised = boxed_step(others.T @ slope, others.T @ bend @ others, radius)
     if promised < _BESIDE:
         return here, 0
     there = prior.tried(here.theta + others @ step)

@@ -58,7 +58,7 @@ def test_curvature_is_where_searches_end_with_a_level_held(fitted: PersonFit) ->
     added = np.zeros((len(theta), len(theta)))
     for sign in (1, -1):
         start = theta + sign * found.levels[1] * ridge
-        place, _, _, settled = climb(prior, start, 20, others, losing)
+        place, _, _, settled = climb(prior, prior.at(start), 20, others, losing)
         assert settled
         shift = (place.theta - start) * (np.arange(len(theta)) < fitted.space.own)
         added += np.outer(shift, shift) / 2

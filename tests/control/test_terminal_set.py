@@ -222,7 +222,7 @@ def cases(draw: st.DrawFn) -> Case:
     return plant, regulator(plant), bounds
 
 
-few = draws(15)
+few = draws(25)
 
 
 @few

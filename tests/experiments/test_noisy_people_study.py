@@ -6,11 +6,16 @@ import numpy as np
 import pytest
 
 from experiments.noisy_people import recorded, subject
-from experiments.noisy_people_study import score
+from experiments.noisy_people_study import Score, passed_over, score
+
+
+def scored(seed: int, limit: float) -> Score:
+    who = subject("cart", seed, "motor", 90.0, limit)
+    return score(who, recorded(who, seed), "carts", seed, profiled=False)
 
 
 def test_a_subject_is_scored_against_its_truth() -> None:
-    found = score(subject("cart", 0, "motor", 90.0, 0.7), "carts", 0, profiled=False)
+    found = scored(0, 0.7)
     assert 80 < found.vaf < 97
     assert found.converged
     assert found.above > 0
@@ -24,14 +29,20 @@ def test_the_seat_is_held_at_its_limit() -> None:
     trials = recorded(subject("seat", 0, "motor", 90.0, 6.0), 0)
     assert 0.1 < trials.saturated < 0.4
     assert 85 < trials.vaf < 95
+    assert not passed_over(trials, met=True)
+
+
+def test_who_falls_or_is_seldom_at_the_limit_is_no_subject() -> None:
+    assert passed_over(recorded(subject("seat", 5, "sensory", 90.0, 6.0), 5), met=True) == "fell"
+    seldom = recorded(subject("seat", 1, "sensory", 90.0, 6.0), 1)
+    assert seldom.saturated < 0.12
+    assert passed_over(seldom, met=True) == "not so often at the limit"
+    assert not passed_over(seldom, met=False)
 
 
 @pytest.mark.slow
 def test_intervals_of_the_likelihood_hold() -> None:
     """Of 40 at 95 % two miss: 8 or more have a probability of 0.1 %."""
-    people = [
-        score(subject("cart", seed, "motor", 90.0, 5.0), "carts", seed, profiled=False)
-        for seed in range(40)
-    ]
+    people = [scored(seed, 5.0) for seed in range(40)]
     pairs = np.array([one.expected for one in people])
     assert np.all(np.sum(np.abs(pairs[..., 0]) > 1.96 * pairs[..., 1], axis=0) < 8)

@@ -42,12 +42,9 @@ def test_a_step_is_the_best_of_its_box(seed: int) -> None:
 
 
 def test_levels_that_slide_do_not_hold_back_the_rest(sliding: PersonFit) -> None:
-    """A step that was scaled as a whole took more than 30 likelihoods here, and 100 on the seat.
-
-    Measured: 41, ten of them for all but the gain, and two a step where the ridge bends.
-    """
+    """A step that was scaled as a whole took more than 30 likelihoods here, and 100 on the seat."""
     assert sliding.converged
-    assert sliding.evaluations < 50
+    assert sliding.evaluations < 40
     space, theta = sliding.space, np.array(sliding.space.start)
     truth = Controller(cart(), Weights(np.diag([8.0, 1.0]), 1), sliding.problem.bounds, 5).K
     own = space.space
@@ -62,9 +59,8 @@ def test_levels_that_slide_do_not_hold_back_the_rest(sliding: PersonFit) -> None
 def test_a_search_that_may_not_go_on_says_so(sliding: PersonFit) -> None:
     space = sliding.space
     prior = Prior(space, 1.0, space.start[space.own :])
-    (theta, told, _, _), _, spent, settled = climb(prior, space.start, 2)
-    assert spent <= 3  # a step, and what follows it
-    assert not settled
+    (theta, told, _, _), _, spent, settled = climb(prior, prior.at(space.start), 2)
+    assert (spent, settled) == (2, False)
     assert told.value == space.told(theta).value < sliding.log_likelihood
 
 
@@ -104,7 +100,9 @@ def test_the_slope_of_what_levels_lose_follows_the_ridge(sliding: PersonFit) -> 
         lost = []
         for sign in (-1, 1):
             start = theta + sign * step * np.eye(len(theta))[own + index]
-            place, _, _, settled = climb(prior, start, 30, others, np.array(sliding.losing))
+            place, _, _, settled = climb(
+                prior, prior.at(start), 30, others, np.array(sliding.losing)
+            )
             assert settled
             lost.append(place.lost)
         # Measured: .05 apart, for the first is a step of a tenth to one side.
@@ -122,7 +120,7 @@ def test_what_levels_lose_is_that_of_the_gain_integrated_out() -> None:
     for factor in (1.0, 2.0):
         theta = np.array(fit.theta)
         theta[2] += np.log(factor)
-        here, _, _, _ = climb(prior, theta, 30, np.eye(len(theta))[:, :2])
+        here, _, _, _ = climb(prior, prior.at(theta), 30, np.eye(len(theta))[:, :2])
         root = np.linalg.cholesky(np.linalg.inv(here.told.information[:2, :2]))
         top, total = here.told.value + prior.value(here.theta), 0.0
         for first, second in itertools.product(steps, steps):
