@@ -25,6 +25,7 @@ from impc.model.bounds import Bounds
 from impc.model.observer import Observer
 from impc.model.plant import Plant
 from impc.model.recordings import Recording
+from impc.model.structure import Structure
 from impc.model.weights import Weights
 
 if TYPE_CHECKING:
@@ -114,7 +115,13 @@ def recorded(who: Subject, seed: int) -> Recorded:
         shares.append(_moved(law, found.states, push))
         trials.append(Recording(plant, found.outputs, push))
     problem = Problem(
-        plant, law.bounds, law.horizon, trials, terminal_set=False, unknown_start=True
+        plant,
+        law.bounds,
+        law.horizon,
+        trials,
+        terminal_set=False,
+        unknown_start=True,
+        structure=Structure(plant, "full", over=plant.states[:4]),
     )
     largest = max(float(np.max(np.abs(one.outputs))) for one in trials)
     return Recorded(problem, float(np.mean(met)), float(np.mean(shares)), largest)

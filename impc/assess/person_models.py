@@ -3,7 +3,8 @@
 Each is fitted by maximum likelihood to the same recordings, from the same first fit, so that
 Akaike's criterion compares them: noise in the recorder alone, which is least squares; a person who
 sees every state and has noise in the loop; who estimates, the perturbation known, and not known;
-and the one that was asked for without its limits (docs/noisy-people.md).
+the one that was asked for with any gain, where a structure says which there are; and the same
+without its limits (docs/noisy-people.md).
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from impc.control.noisy_person import run_joint
 from impc.errors import ImpcError
 from impc.inverse.likelihood_fit import PersonFit, fit_person
 from impc.inverse.problem import controller_for
+from impc.inverse.regulator_span import kept_to
 from impc.model.bounds import bound_rows
 
 if TYPE_CHECKING:
@@ -189,6 +191,8 @@ def persons(problem: Problem, asked: Observer, walk: Array) -> list[tuple[str, P
     if np.any(seeing.levels):
         models.append(("sees every state, noise in the loop", problem, seeing))
     models.append(("sees every state, noise in the recorder alone", problem, quiet))
+    if kept_to(problem) is not None:
+        models.append((f"{models[0][0]}, any gain", replace(problem, structure=None), asked))
     if len(bound_rows(problem.bounds, problem.plant).b):
         models.append((f"{models[0][0]}, no limit", problem.without_bounds(), asked))
     return models

@@ -29,6 +29,7 @@ from impc.control.closed_loop import simulate
 from impc.inverse.arrow import ArrowRows, triangular_rows
 from impc.inverse.consistent_pairs import consistent_gains, scaled_changes
 from impc.inverse.problem import controller_for, scenarios
+from impc.inverse.regulator_span import regulators_alone
 from impc.inverse.residuals import evaluate
 from impc.inverse.solution_set import floored_covariance, natural_coordinates
 from impc.model.plant_family import plant_differential
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
     from impc.control.terminal_set import TerminalSet
     from impc.inverse.problem import Problem
     from impc.inverse.residuals import Evaluation
+    from impc.model.structure import Structure
 
 __all__ = ["PARAMETER_UNIT", "Compressed", "Coordinates", "Point", "WithPrior", "start_unit"]
 
@@ -111,9 +113,14 @@ class Coordinates:
     problem : Problem
     gain, metric : Array
         K (m, n) and S (m, m) where the search begins.
+    structure : Structure, optional
+        With one input: the search keeps to the span of gains that weights over its features have,
+        and begins at the gain of that span next to the one given; any gain by default.
     """
 
-    def __init__(self, problem: Problem, gain: Array, metric: Array) -> None:
+    def __init__(
+        self, problem: Problem, gain: Array, metric: Array, structure: Structure | None = None
+    ) -> None:
         self.problem = problem
         plant = problem.plant
         self.m, self.n, self.trials = plant.m, plant.n, len(problem.recordings)
@@ -121,6 +128,8 @@ class Coordinates:
         self.start_unit = start_unit(problem, gain)
         self.first = np.linalg.cholesky(metric * (plant.m / np.trace(metric)))
         self.gains = consistent_gains(plant, self.first @ self.first.T, self.T, self.G)
+        if structure is not None:
+            self.gains = regulators_alone(self.gains, plant, structure, self.T)
         self.tril = np.tril_indices(self.m)
         self.refused: list[str] = []
         self.last: tuple[bytes, Compressed] | None = None

@@ -15,9 +15,10 @@ import numpy as np
 from impc.arrays import Array, Frozen, frozen
 from impc.checking import checked
 from impc.errors import ImpcError, InputError, SolverError
-from impc.inverse.coordinates import Coordinates
+from impc.inverse.coordinates import Coordinates, Point
 from impc.inverse.likelihood_search import Prior, climb
 from impc.inverse.person_coordinates import PersonCoordinates
+from impc.inverse.regulator_span import kept_to
 from impc.inverse.residuals import residual_only
 from impc.inverse.structured_search import PriceCoordinates
 from impc.model.observer import LEVELS
@@ -40,6 +41,9 @@ _STARTS = ((0.7, 0.5, 0.3), (0.3, 0.3, 0.9), (0.7, 0.1, 0.3), (0.1, 0.1, 1.0))
 # Likelihoods for all but the gain, or the prices, at first: while levels are far off the gain that
 # explains most is on the border of those that stabilise, and three searches of 21 ended there.
 _FIRST = 10
+# A search that ends farther from where it began, of the prior's deviation, begins anew from there:
+# coordinates and prior are those of a gain that is not the person's (docs/noisy-people.md).
+_NEAR, _ROUND = 0.5, 30
 # Recorded exactly, a residual has no size: its levels begin at this share of the outputs.
 _LEAST = 1e-6
 
@@ -114,7 +118,7 @@ def fit_person(
     *,
     recorder: Array | None = None,
     spread: float = 1.0,
-    max_evaluations: int = 100,
+    max_evaluations: int = 150,
     held: Sequence[str] = (),
 ) -> PersonFit:
     """Fit gain or prices, levels of noise, initial states and parameters by maximum likelihood.
@@ -123,6 +127,8 @@ def fit_person(
     ----------
     found : Estimate
         Where the search begins; of the method "structured", prices are searched and not a gain.
+        Of another method, where the problem has a structure that leaves states without a price and
+        no parameters are searched, the gain keeps to the span of gains that such weights have.
     observer : Observer
         What is sensed, and which noise there is: a level that is not zero is searched, from there
         and from what the residuals of the first fit suggest.
@@ -173,27 +179,34 @@ def fit_person(
     """
     if unknown := [kind for kind in held if kind not in LEVELS]:
         raise InputError("held", f"got {unknown[0]!r}", f"give some of {', '.join(LEVELS)}")
-    space = _space(found)
-    plant = found.problem.plant
-    residual = residual_only(found.problem, found.gain, found.metric)
-    size = _sizes(found, residual.reshape(-1, len(plant.outputs)) * found.problem.output_scale)
+    point = Point(np.array(found.gain), np.array(found.metric), found.problem)
+    size = _sizes(point)
     white = size.recorder if recorder is None else np.asarray(recorder)
-    first = PersonCoordinates(space, observer, white, held)
-    starts = [first.start]
+    space = PersonCoordinates(_space(point, found.prices), observer, white, held)
+    starts = [space.start]
     for inside, sensed, recorded in _STARTS if recorder is None else ():
         levels = _suggested(observer, size, inside, sensed)
-        log = np.log(np.concatenate([levels, recorded * size.recorder])[first.moving])
-        starts.append(np.concatenate([space.start, log]))
-    theta = _best(first, starts)
-    alone = np.concatenate([_suggested(observer, size, 1.0, 1.0), size.recorder])
-    prior = Prior(first, spread, np.log(alone[first.moving]), size.sensory)
-    rest, none = np.eye(len(theta))[:, first.gain :], np.zeros(len(prior.scales))
-    place, _, begun, _ = climb(prior, prior.at(theta), min(_FIRST, max_evaluations), rest, none)
-    (theta, told, value, _), losing, spent, settled = climb(
-        prior, place, max_evaluations - begun + 1
-    )
-    person = first.unpack(theta)
-    prices = space.unknowns(theta[: first.own]) if isinstance(space, PriceCoordinates) else None
+        log = np.log(np.concatenate([levels, recorded * size.recorder])[space.moving])
+        starts.append(np.concatenate([space.space.start, log]))
+    prior = _prior(space, observer, size, spread)
+    place = prior.at(_best(space, starts))
+    rest, none = np.eye(len(place.theta))[:, space.gain :], np.zeros(len(prior.scales))
+    place, _, spent, _ = climb(prior, place, min(_FIRST, max_evaluations), rest, none)
+    while spent < max_evaluations and np.isfinite(spread):
+        place, _, more, _ = climb(prior, place, _ROUND, losing=none)
+        spent += more - 1
+        away = float(np.linalg.norm((place.theta - prior.center)[: space.gain]))
+        if away <= _NEAR * spread:
+            break
+        there, prices = space.unpack(place.theta), _prices(space, place.theta)
+        own = _space(there.point, prices)
+        space = PersonCoordinates(own, there.observer, there.recorder, held)
+        prior = _prior(space, observer, _sizes(there.point), spread)
+        place, spent = prior.at(space.start), spent + 1
+    place, losing, more, settled = climb(prior, place, max_evaluations - spent + 1)
+    spent += more - 1
+    theta, told = place.theta, place.told
+    person, prices = space.unpack(theta), _prices(space, theta)
     return PersonFit(
         frozen(person.point.K),
         frozen(person.point.S),
@@ -202,10 +215,10 @@ def fit_person(
         person.recorder,
         None if prices is None else frozen(prices),
         told.value,
-        value,
+        place.value,
         len(theta),
         settled,
-        begun + spent - 1,
+        spent,
         frozen(theta),
         told,
         frozen(losing),
@@ -213,11 +226,21 @@ def fit_person(
     )
 
 
-def _space(found: Estimate) -> Coordinates:
-    structure = found.problem.structure
-    if found.prices is not None and structure is not None:
-        return PriceCoordinates(found.problem, structure, np.array(found.prices))
-    return Coordinates(found.problem, np.array(found.gain), np.array(found.metric))
+def _space(point: Point, prices: Array | None) -> Coordinates:
+    structure = point.problem.structure
+    if prices is not None and structure is not None:
+        return PriceCoordinates(point.problem, structure, np.array(prices))
+    return Coordinates(point.problem, point.K, point.S, kept_to(point.problem))
+
+
+def _prices(space: PersonCoordinates, theta: Array) -> Array | None:
+    own = space.space
+    return own.unknowns(theta[: space.own]) if isinstance(own, PriceCoordinates) else None
+
+
+def _prior(space: PersonCoordinates, observer: Observer, size: _Sizes, spread: float) -> Prior:
+    alone = np.concatenate([_suggested(observer, size, 1.0, 1.0), size.recorder])
+    return Prior(space, spread, np.log(alone[space.moving]), size.sensory)
 
 
 @dataclass(frozen=True)
@@ -230,12 +253,12 @@ class _Sizes:
     recorder: Array
 
 
-def _sizes(found: Estimate, residual: Array) -> _Sizes:
-    plant, scale = found.problem.plant, found.problem.output_scale
-    recorder = np.sqrt(np.mean(residual**2, axis=0))
-    recorder = np.maximum(recorder, _LEAST * scale)
+def _sizes(point: Point) -> _Sizes:
+    plant, scale = point.problem.plant, point.problem.output_scale
+    residual = residual_only(point.problem, point.K, point.S).reshape(-1, len(plant.outputs))
+    recorder = scale * np.maximum(np.sqrt(np.mean(residual**2, axis=0)), _LEAST)
     target = float(np.sqrt(np.mean((recorder / scale) ** 2)))
-    closed = plant.A - plant.B @ found.gain
+    closed = plant.A - plant.B @ point.K
     columns = np.vstack([plant.B.T, np.eye(plant.n)])
     spread = lyapunov_series(closed, columns[:, :, None] * columns[:, None, :])
     seen = np.einsum("pi,kij,pj->kp", plant.C, spread, plant.C) / scale**2

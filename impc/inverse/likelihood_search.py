@@ -41,6 +41,8 @@ _SETTLED, _ENOUGH = 1e-4, 5e-3
 # 2023), and a search ends after so many steps that found nothing higher by so much: settled, if
 # from the highest place no more than half a nat is promised.
 _ROUGH, _PATIENCE, _PROGRESS = 0.5, 4, 0.05
+# A round with the slope of what levels lose as found by differences is the last when it wins less.
+_WON = 0.25
 # Without a prior a level that slides to zero, or a sense to one that is not used, has no end: along
 # what is so flat a step of ten is as far as a promise is believed.
 _FLAT = 1e-2
@@ -304,7 +306,7 @@ def climb(
         if here is best:
             left = promised
         if promised < enough or stale == _PATIENCE or radius < _SHORTEST or spent >= budget:
-            if best.value <= known + progress or spent >= budget or not differences:
+            if best.value <= known + _WON or spent >= budget or not differences:
                 return best, losing, spent, left < _ROUGH
             here, losing, known = best, prior.losing(best), best.value
             radius, spent, stale = _STEP, spent + len(losing), 0

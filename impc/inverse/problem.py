@@ -86,7 +86,8 @@ class Problem(Value):
     logarithms : Array
         Logarithms of the family's parameters over their nominal values at which `plant` is (k,).
     structure : Structure or None
-        What may be costed, for the method "structured"; other methods do not ask.
+        What may be costed, for the method "structured" and the gain of a person (`fit_person`);
+        other methods do not ask.
     solver : str
         What solves the controller's quadratic programs in every simulation of a search, see
         `Controller`.

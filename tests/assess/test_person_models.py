@@ -5,11 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from impc.assess.person_covariance import person_covariance
 from impc.assess.person_models import person_report, prediction_errors
 from impc.inverse.likelihood_fit import PersonFit, fit_person
 from impc.inverse.methods import estimate
 from impc.model.observer import Observer
+from impc.model.structure import Structure
 from tests.inverse.test_likelihood_fit import cart, posed
+from tests.inverse.test_regulator_span import late_body, late_problem
 
 
 @pytest.fixture(scope="module")
@@ -52,3 +55,19 @@ def test_who_cannot_estimate_has_a_reason() -> None:
     assert report.models[0].fit is None
     assert "no stationary gain" in report.models[0].reason
     assert report.covariance is None
+
+
+def test_a_structure_is_set_beside_any_gain() -> None:
+    """Behind a delay: the same recordings, with fewer numbers and hardly less likelihood."""
+    problem = late_problem(structure=Structure(late_body(), ["p", "v"]))
+    person = Observer(problem.plant, ["p", "v"], motor=0.1, sensory=[0.02, 0.02])
+    report = person_report(estimate(problem), person, np.zeros(0))
+    found = {item.name: item.fit for item in report.models}
+    kept, free = report.fit, found["estimates, perturbation known, any gain"]
+    assert kept is not None
+    assert free is not None
+    assert free.count == kept.count + 3
+    # Twice their difference is chi-squared of three, .5 for what is not the largest to the end.
+    assert -0.5 < free.log_likelihood - kept.log_likelihood < 6
+    assert report.covariance is not None
+    assert np.all(report.covariance.entries < person_covariance(free).entries)

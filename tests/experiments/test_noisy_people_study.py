@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 
 from experiments.noisy_people import recorded, subject
-from experiments.noisy_people_study import Score, passed_over, score
+from experiments.noisy_people_study import Score, blind, passed_over, score
+from impc.assess.person_covariance import person_covariance, with_curvature
+from impc.inverse.likelihood_fit import fit_person
+from impc.inverse.methods import estimate
 
 
 def scored(seed: int, limit: float) -> Score:
@@ -38,6 +41,24 @@ def test_who_falls_or_is_seldom_at_the_limit_is_no_subject() -> None:
     assert seldom.saturated < 0.12
     assert passed_over(seldom, met=True) == "not so often at the limit"
     assert not passed_over(seldom, met=False)
+
+
+@pytest.mark.full
+def test_on_the_seat_a_person_is_told_where_least_squares_is_far_off() -> None:
+    """Noise in the senses: least squares has five times the gain, in coordinates of its own."""
+    who = subject("seat", 2, "sensory", 90.0, 70.0)
+    trials, truth = recorded(who, 2), np.array(who.controller.K)
+    first = estimate(trials.problem)
+    assert np.array(first.gain)[0, 0] > 4 * truth[0, 0]
+    found = fit_person(first, blind(who))
+    assert found.converged
+    assert found.space.gain == 5
+    np.testing.assert_allclose(found.K[0, :4], truth[0, :4], rtol=0.2)
+    # The prior is that about a gain close by, in whose coordinates there are less than half units.
+    assert np.linalg.norm((np.array(found.theta) - found.prior.center)[:5]) < 0.5
+    covariance = with_curvature(found, person_covariance(found))
+    z = (np.array(found.K) - truth)[0] / np.array(covariance.entries)[0]
+    assert np.all(np.abs(z[:4]) < 1.96)
 
 
 @pytest.mark.slow

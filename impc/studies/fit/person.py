@@ -8,6 +8,7 @@ import numpy as np
 
 from impc.assess.intervals import entry_names
 from impc.assess.person_profile import FARTHEST
+from impc.inverse.regulator_span import kept_to
 from impc.reporting.document import Block, Heading, Section, TextTable, table_of
 from impc.reporting.rendering import number
 from impc.reporting.shown_units import shown_unit
@@ -232,8 +233,11 @@ def _gain_table(result: FitResult, report: PersonReport) -> TextTable:
         "profiles = true in [fit.observer] follows the likelihood instead, on a seat for ten "
         "minutes and more."
     )
+    kept = kept_to(fit.problem)
+    among = "" if kept is None else f", among those that weights over {kept.name} can have,"
     return table_of(
-        f"The gain of this person beside that of least squares, with intervals of 95 % {how}",
+        f"The gain of this person{among} beside that of least squares, with intervals of 95 % "
+        f"{how}",
         range(len(names)),
         {
             "entry": lambda k: names[k],
