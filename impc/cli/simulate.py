@@ -274,6 +274,11 @@ def _observer_table(given: dict[str, Any]) -> str:
 [fit.observer]
 sensed = {json.dumps(_SENSED)}
 known = {json.dumps(not given["unknown_perturbation"])}
+
+[fit.structure]              # what may have a price: not the delay, nor the muscle
+Q = "full"
+over = {json.dumps(_SENSED)}
+name = "posture"
 """
 
 

@@ -1,13 +1,14 @@
 """A person who senses with noise, by maximum likelihood.
 
-The search starts from a fit that takes all that it does not explain for noise in the recorder, with
-levels that what this leaves suggests, and climbs from there (`likelihood_search`;
-docs/noisy-people.md).
+The search starts from a fit that takes all that it does not explain for noise in the recorder, or
+from a regulator by Bryson's rule where that is likelier, with levels that what it leaves suggests,
+and climbs from there (`likelihood_search`; docs/noisy-people.md).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,6 +17,7 @@ from impc.arrays import Array, Frozen, frozen
 from impc.checking import checked
 from impc.errors import ImpcError, InputError, SolverError
 from impc.inverse.coordinates import Coordinates, Point
+from impc.inverse.gain_search import bryson_starts
 from impc.inverse.likelihood_search import Prior, climb
 from impc.inverse.person_coordinates import PersonCoordinates
 from impc.inverse.regulator_span import kept_to
@@ -41,7 +43,7 @@ _STARTS = ((0.7, 0.5, 0.3), (0.3, 0.3, 0.9), (0.7, 0.1, 0.3), (0.1, 0.1, 1.0))
 # Likelihoods for all but the gain, or the prices, at first: while levels are far off the gain that
 # explains most is on the border of those that stabilise, and three searches of 21 ended there.
 _FIRST = 10
-# A search that ends farther from where it began, of the prior's deviation, begins anew from there:
+# A search that comes farther in a round, of the prior's deviation, begins anew from there: its
 # coordinates and prior are those of a gain that is not the person's (docs/noisy-people.md).
 _NEAR, _ROUND = 0.5, 30
 # Recorded exactly, a residual has no size: its levels begin at this share of the outputs.
@@ -179,27 +181,22 @@ def fit_person(
     """
     if unknown := [kind for kind in held if kind not in LEVELS]:
         raise InputError("held", f"got {unknown[0]!r}", f"give some of {', '.join(LEVELS)}")
-    point = Point(np.array(found.gain), np.array(found.metric), found.problem)
-    size = _sizes(point)
-    white = size.recorder if recorder is None else np.asarray(recorder)
-    space = PersonCoordinates(_space(point, found.prices), observer, white, held)
-    starts = [space.start]
-    for inside, sensed, recorded in _STARTS if recorder is None else ():
-        levels = _suggested(observer, size, inside, sensed)
-        log = np.log(np.concatenate([levels, recorded * size.recorder])[space.moving])
-        starts.append(np.concatenate([space.space.start, log]))
+    problem = found.problem
+    points = [Point(np.array(found.gain), np.array(found.metric), problem)]
+    if found.prices is None:
+        points += [Point(K, S, problem) for K, S in bryson_starts(problem)]
+    space, size = _begun(points, found.prices, observer, recorder, held)
     prior = _prior(space, observer, size, spread)
-    place = prior.at(_best(space, starts))
+    place = prior.at(max(_guesses(space, observer, size, recorder), key=partial(_value, space)))
     rest, none = np.eye(len(place.theta))[:, space.gain :], np.zeros(len(prior.scales))
     place, _, spent, _ = climb(prior, place, min(_FIRST, max_evaluations), rest, none)
-    while spent < max_evaluations and np.isfinite(spread):
+    while spent < max_evaluations:
         place, _, more, _ = climb(prior, place, _ROUND, losing=none)
         spent += more - 1
-        away = float(np.linalg.norm((place.theta - prior.center)[: space.gain]))
-        if away <= _NEAR * spread:
+        if np.linalg.norm((place.theta - prior.center)[: space.gain]) <= _NEAR * spread:
             break
-        there, prices = space.unpack(place.theta), _prices(space, place.theta)
-        own = _space(there.point, prices)
+        there = space.unpack(place.theta)
+        own = _space(there.point, _prices(space, place.theta))
         space = PersonCoordinates(own, there.observer, there.recorder, held)
         prior = _prior(space, observer, _sizes(there.point), spread)
         place, spent = prior.at(space.start), spent + 1
@@ -224,6 +221,51 @@ def fit_person(
         frozen(losing),
         prior,
     )
+
+
+def _begun(
+    points: list[Point],
+    prices: Array | None,
+    observer: Observer,
+    recorder: Array | None,
+    held: Sequence[str],
+) -> tuple[PersonCoordinates, _Sizes]:
+    """Coordinates about the point whose first guess of the levels is the likeliest, and sizes."""
+    found, highest, reason = None, -np.inf, "no number"
+    for point in points:
+        try:
+            size = _sizes(point)
+            white = size.recorder if recorder is None else np.asarray(recorder)
+            space = PersonCoordinates(_space(point, prices), observer, white, held)
+            value = space.value(_guesses(space, observer, size, recorder)[0])
+        except ImpcError as error:
+            reason = str(error)
+            continue
+        if value > highest:
+            found, highest = (space, size), value
+    if found is None:
+        raise SolverError("person", f"no start has a likelihood: {reason}", "give other levels")
+    return found
+
+
+def _guesses(
+    space: PersonCoordinates, observer: Observer, size: _Sizes, recorder: Array | None
+) -> list[Array]:
+    """Unknowns (q,) where a search may begin: shares of what is left, then the levels given."""
+    guesses = []
+    for inside, sensed, recorded in _STARTS if recorder is None else ():
+        levels = _suggested(observer, size, inside, sensed)
+        log = np.log(np.concatenate([levels, recorded * size.recorder])[space.moving])
+        guesses.append(np.concatenate([space.space.start, log]))
+    return [*guesses, space.start]
+
+
+def _value(space: PersonCoordinates, theta: Array) -> float:
+    """Log-likelihood at theta (q,); minus infinity where there is none."""
+    try:
+        return space.value(theta)
+    except ImpcError:
+        return -np.inf
 
 
 def _space(point: Point, prices: Array | None) -> Coordinates:
@@ -280,16 +322,3 @@ def _suggested(observer: Observer, size: _Sizes, inside: float, sensed: float) -
     parts = [suggested.get(name, observer.level(name)) for name in LEVELS]
     levels: Array = np.concatenate(parts)
     return np.where(observer.levels > 0, levels, 0.0)
-
-
-def _best(space: PersonCoordinates, starts: list[Array]) -> Array:
-    values, reason = [], ""
-    for theta in starts:
-        try:
-            values.append(space.value(theta))
-        except ImpcError as error:
-            values.append(-np.inf)
-            reason = str(error)
-    if max(values) == -np.inf:
-        raise SolverError("person", f"no start has a likelihood: {reason}", "give other levels")
-    return starts[int(np.argmax(values))]

@@ -126,7 +126,18 @@ class Prior:
         self.used = bool(np.isfinite(spread))
 
     def reach(self, way: Array) -> Array:
-        """How much longer than others a step along each of some directions (q, r) may be (r,)."""
+        """How much longer than others a step along each of some directions may be.
+
+        Parameters
+        ----------
+        way : Array
+            The directions (q, r).
+
+        Returns
+        -------
+        Array
+            (r,).
+        """
         mine = way[self.space.shared : self.space.after]
         return np.where(np.any(mine != 0, axis=0), _AFAR, 1.0)
 

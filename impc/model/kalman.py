@@ -78,8 +78,20 @@ def stationary_filter(F: Array, C: Array, Q: Array, R: Array) -> StationaryFilte
     ------
     SolverError
         When F - L C is not stable: something that does not decay is not seen, or nothing
-        disturbs it.
+        disturbs it; or when double precision cannot hold the covariances together.
     """
+    try:
+        P = _doubled(F, C, Q, R)
+        S = C @ P @ C.T + R
+        L = np.linalg.solve(S, C @ P @ F.T).T
+    except np.linalg.LinAlgError:
+        raise _no_filter() from None
+    if not is_stable(F - L @ C, discrete=True):
+        raise _no_filter()
+    return StationaryFilter(P, np.asarray(L), S)
+
+
+def _doubled(F: Array, C: Array, Q: Array, R: Array) -> Array:
     eye = np.eye(len(F))
     A, G, P = F.T, C.T @ np.linalg.solve(R, C), np.array(Q)
     for _ in range(_DOUBLINGS):
@@ -90,11 +102,7 @@ def stationary_filter(F: Array, C: Array, Q: Array, R: Array) -> StationaryFilte
         A, G, P = left @ A, G + left @ G @ A.T, P + (change + change.T) / 2
         if np.max(np.abs(change)) <= _SETTLED * np.max(np.abs(P)):
             break
-    S = C @ P @ C.T + R
-    L = np.linalg.solve(S, C @ P @ F.T).T
-    if not is_stable(F - L @ C, discrete=True):
-        raise _no_filter()
-    return StationaryFilter(P, np.asarray(L), S)
+    return P
 
 
 def filter_changes(

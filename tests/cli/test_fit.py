@@ -107,6 +107,9 @@ def test_a_person_who_senses_with_noise_is_simulated_and_asked_for(tmp_path: Pat
     assert asked is not None
     assert asked.sensed == ["theta1", "theta2", "theta1_rate", "theta2_rate"]
     assert not asked.known
+    structure = fit_settings(configuration.fit).structure
+    assert structure is not None
+    assert structure.over == asked.sensed
     assert json.loads((tmp_path / "truth.json").read_text())["settings"]["observer"] is True
 
 

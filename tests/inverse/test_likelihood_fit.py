@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace as replaced
+
 import control
 import numpy as np
 import pytest
 
 from impc.arrays import Array
+from impc.assess.person_covariance import person_covariance
 from impc.control.controller import Controller
 from impc.control.noisy_person import simulate_person
 from impc.errors import ImpcError, InputError
@@ -137,6 +140,18 @@ def test_without_noise_in_the_loop_it_is_the_fit_of_least_squares() -> None:
         found = fit_person(start, person, recorder=np.array([0.01]), spread=np.inf)
         np.testing.assert_allclose(found.K, least.K, rtol=1e-6)
         np.testing.assert_allclose(found.problem.starts, least.problem.starts, atol=1e-6)
+
+
+@pytest.mark.parametrize(("along", "units"), [(0, 3.0), (1, 3.0), (1, 5.0)])
+def test_a_gain_that_cannot_be_the_persons_is_left_behind(
+    noisy: tuple[Observer, Estimate], fitted: PersonFit, along: int, units: float
+) -> None:
+    """From three natural units away a search had ended at ten times the gain, from five in none."""
+    far = np.array(noisy[1].gain) + units * fitted.space.space.gains.gains[along]
+    found = fit_person(replaced(noisy[1], K=far), noisy[0])
+    assert found.converged
+    deviations = np.array(person_covariance(fitted, "expected").entries)
+    assert np.all(np.abs(np.array(found.K) - fitted.K) < 0.1 * deviations)
 
 
 def test_prices_of_a_structure_are_searched() -> None:

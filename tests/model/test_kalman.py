@@ -62,3 +62,10 @@ def test_what_is_not_seen_and_does_not_decay_has_no_filter() -> None:
     # Seen, but never disturbed: the filter that forgets nothing is not stationary.
     with pytest.raises(SolverError, match="no stationary gain"):
         stationary_filter(F, np.eye(2), np.zeros((2, 2)), np.eye(2))
+
+
+def test_senses_that_cannot_be_told_apart_have_no_filter() -> None:
+    """Two all but equal signals, all but without noise: the covariance of both is singular."""
+    F, C = np.array([[1.0, 0.1], [0.0, 1.0]]), np.array([[1.0, 0.0], [1.0, 1e-12]])
+    with pytest.raises(SolverError, match="no stationary gain"):
+        stationary_filter(F, C, np.eye(2), 1e-40 * np.eye(2))

@@ -171,7 +171,8 @@ class FitSettings:
     methods : list of str
         Methods that are shown beside inverse MPC, by their names in `impc.inverse.methods`.
     structure : StructureSettings or None
-        What may be costed: the table [fit.structure]. None: any weights, and no word on it.
+        What may be costed: the table [fit.structure]. None: any weights, and no word on it. The
+        gain of a person who senses with noise keeps to gains of such weights.
     structures : list of StructureSettings
         Others, to compare it with.
     body : str
