@@ -41,6 +41,9 @@ __all__ = ["PersonModel", "PersonReport", "person_report", "persons", "predictio
 
 # Samples ahead of which predictions are judged, as seconds; and how many starts in a trial at most.
 _AHEAD, _STARTS = (0.0, 0.1, 0.5), 100
+# Likelihoods with derivatives of the model that was asked for, and of those beside it, whose page
+# says where that was not enough.
+_ASKED, _BESIDE = 150, 75
 # One second of lags tells a rhythm that was missed; fewer than ten tell nothing.
 _LEAST_LAGS = 10
 
@@ -134,7 +137,9 @@ def person_report(
     models, problem = [], found.problem
     for name, posed, person in persons(problem, asked, walk):
         try:
-            models.append(PersonModel(name, fit_person(replace(found, problem=posed), person), ""))
+            first = replace(found, problem=posed)
+            fitted = fit_person(first, person, max_evaluations=_BESIDE if models else _ASKED)
+            models.append(PersonModel(name, fitted, ""))
         except ImpcError as error:
             models.append(PersonModel(name, None, str(error)))
         done(name)
