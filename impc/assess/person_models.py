@@ -134,7 +134,8 @@ def person_report(
     done : callable
         Told the name of each model once it is fitted, and "profiles".
     """
-    models, problem = [], found.problem
+    models: list[PersonModel] = []
+    problem = found.problem
     for name, posed, person in persons(problem, asked, walk):
         try:
             first = replace(found, problem=posed)
