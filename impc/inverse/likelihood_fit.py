@@ -1,30 +1,33 @@
 """A person who senses with noise, by maximum likelihood.
 
 The search starts from a fit that takes all that it does not explain for noise in the recorder, or
-from a regulator by Bryson's rule where that is likelier, with levels that what it leaves suggests,
-and climbs from there (`likelihood_search`; docs/noisy-people.md).
+from a regulator by Bryson's rule where that is likelier once levels of both have been found, and
+climbs from there. One that does not settle is begun from the other too (`likelihood_start`,
+`likelihood_search`; docs/noisy-people.md).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from impc.arrays import Array, Frozen, frozen
 from impc.checking import checked
-from impc.errors import ImpcError, InputError, SolverError
-from impc.inverse.coordinates import Coordinates, Point
+from impc.errors import ImpcError, InputError
+from impc.inverse.coordinates import Point
 from impc.inverse.gain_search import bryson_starts
-from impc.inverse.likelihood_search import Prior, climb
+from impc.inverse.likelihood_search import Place, Prior, climb
+from impc.inverse.likelihood_start import (
+    Asked,
+    gain_space,
+    likeliest_start,
+    prices_at,
+    prior_about,
+)
 from impc.inverse.person_coordinates import PersonCoordinates
-from impc.inverse.regulator_span import kept_to
-from impc.inverse.residuals import residual_only
-from impc.inverse.structured_search import PriceCoordinates
 from impc.model.observer import LEVELS
-from impc.model.riccati import lyapunov_series
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -36,18 +39,12 @@ if TYPE_CHECKING:
 
 __all__ = ["PersonFit", "fit_person"]
 
-# Of the residual, shares that a search begins with: inside the loop, of the senses, the recorder's.
-# The likeliest is taken. On a seat whose recorder has a thirtieth of the residual the search had
-# not ended after 40 steps (docs/noisy-people.md).
-_STARTS = ((0.7, 0.5, 0.3), (0.3, 0.3, 0.9), (0.7, 0.1, 0.3), (0.1, 0.1, 1.0))
 # Likelihoods for all but the gain, or the prices, at first: while levels are far off the gain that
 # explains most is on the border of those that stabilise, and three searches of 21 ended there.
 _FIRST = 10
 # A search that comes farther in a round, of the prior's deviation, begins anew from there: its
 # coordinates and prior are those of a gain that is not the person's (docs/noisy-people.md).
 _NEAR, _ROUND = 0.5, 30
-# Recorded exactly, a residual has no size: its levels begin at this share of the outputs.
-_LEAST = 1e-6
 
 
 @dataclass(frozen=True)
@@ -120,7 +117,7 @@ def fit_person(
     *,
     recorder: Array | None = None,
     spread: float = 1.0,
-    max_evaluations: int = 150,
+    max_evaluations: int = 250,
     held: Sequence[str] = (),
 ) -> PersonFit:
     """Fit gain or prices, levels of noise, initial states and parameters by maximum likelihood.
@@ -182,28 +179,64 @@ def fit_person(
     if unknown := [kind for kind in held if kind not in LEVELS]:
         raise InputError("held", f"got {unknown[0]!r}", f"give some of {', '.join(LEVELS)}")
     problem = found.problem
-    points = [Point(np.array(found.gain), np.array(found.metric), problem)]
+    asked = Asked(observer, recorder, held, spread)
+    groups = [[Point(np.array(found.gain), np.array(found.metric), problem)]]
     if found.prices is None:
-        points += [Point(K, S, problem) for K, S in bryson_starts(problem)]
-    space, size = _begun(points, found.prices, observer, recorder, held)
-    prior = _prior(space, observer, size, spread)
-    place = prior.at(max(_guesses(space, observer, size, recorder), key=partial(_value, space)))
-    rest, none = np.eye(len(place.theta))[:, space.gain :], np.zeros(len(prior.scales))
-    place, _, spent, _ = climb(prior, place, min(_FIRST, max_evaluations), rest, none)
-    while spent < max_evaluations:
-        place, _, more, _ = climb(prior, place, _ROUND, losing=none)
-        spent += more - 1
-        if np.linalg.norm((place.theta - prior.center)[: space.gain]) <= _NEAR * spread:
+        groups.append([Point(K, S, problem) for K, S in bryson_starts(problem)])
+    begun, reasons = [], []
+    for points in groups:
+        try:
+            begun.append(_levelled(*likeliest_start(points, found.prices, asked), asked))
+        except ImpcError as error:
+            reasons.append(error)
+    if not begun:
+        raise reasons[0]
+    spent, ends = sum(one.spent for one in begun), []
+    for start in sorted(begun, key=lambda one: -one.place.told.value):
+        ends.append(_searched(start, asked, max_evaluations - spent))
+        spent += ends[-1].spent
+        if ends[-1].settled:
             break
-        there = space.unpack(place.theta)
-        own = _space(there.point, _prices(space, place.theta))
-        space = PersonCoordinates(own, there.observer, there.recorder, held)
-        prior = _prior(space, observer, _sizes(there.point), spread)
+    return _fitted(max(ends, key=lambda one: one.place.told.value), spent)
+
+
+class _End(NamedTuple):
+    """Where a search has come to from one start."""
+
+    prior: Prior
+    place: Place
+    losing: Array
+    spent: int
+    settled: bool
+
+
+def _levelled(space: PersonCoordinates, theta: Array, asked: Asked) -> _End:
+    """The first likelihoods from theta (q,), in which the gain stands."""
+    prior = prior_about(space, asked)
+    rest, none = np.eye(len(theta))[:, space.gain :], np.zeros(len(prior.scales))
+    return _End(prior, *climb(prior, prior.at(theta), _FIRST, rest, none))
+
+
+def _searched(start: _End, asked: Asked, budget: int) -> _End:
+    """Climb in rounds, coordinates and prior made anew where one went far, and then to the end."""
+    prior, place, losing, spent = start.prior, start.place, np.zeros_like(start.losing), 0
+    while spent < budget:
+        place, _, more, _ = climb(prior, place, _ROUND, losing=losing)
+        spent += more - 1
+        if np.linalg.norm((place.theta - prior.center)[: prior.space.gain]) <= _NEAR * asked.spread:
+            break
+        there, prices = prior.space.unpack(place.theta), prices_at(prior.space, place.theta)
+        own = gain_space(there.point, prices)
+        space = PersonCoordinates(own, there.observer, there.recorder, asked.held)
+        prior = prior_about(space, asked)
         place, spent = prior.at(space.start), spent + 1
-    place, losing, more, settled = climb(prior, place, max_evaluations - spent + 1)
-    spent += more - 1
-    theta, told = place.theta, place.told
-    person, prices = space.unpack(theta), _prices(space, theta)
+    place, losing, more, settled = climb(prior, place, budget - spent + 1)
+    return _End(prior, place, losing, spent + more - 1, settled)
+
+
+def _fitted(end: _End, spent: int) -> PersonFit:
+    space, place = end.prior.space, end.place
+    person, prices = space.unpack(place.theta), prices_at(space, place.theta)
     return PersonFit(
         frozen(person.point.K),
         frozen(person.point.S),
@@ -211,114 +244,13 @@ def fit_person(
         person.observer,
         person.recorder,
         None if prices is None else frozen(prices),
-        told.value,
+        place.told.value,
         place.value,
-        len(theta),
-        settled,
+        len(place.theta),
+        end.settled,
         spent,
-        frozen(theta),
-        told,
-        frozen(losing),
-        prior,
+        frozen(place.theta),
+        place.told,
+        frozen(end.losing),
+        end.prior,
     )
-
-
-def _begun(
-    points: list[Point],
-    prices: Array | None,
-    observer: Observer,
-    recorder: Array | None,
-    held: Sequence[str],
-) -> tuple[PersonCoordinates, _Sizes]:
-    """Coordinates about the point whose first guess of the levels is the likeliest, and sizes."""
-    found, highest, reason = None, -np.inf, "no number"
-    for point in points:
-        try:
-            size = _sizes(point)
-            white = size.recorder if recorder is None else np.asarray(recorder)
-            space = PersonCoordinates(_space(point, prices), observer, white, held)
-            value = space.value(_guesses(space, observer, size, recorder)[0])
-        except ImpcError as error:
-            reason = str(error)
-            continue
-        if value > highest:
-            found, highest = (space, size), value
-    if found is None:
-        raise SolverError("person", f"no start has a likelihood: {reason}", "give other levels")
-    return found
-
-
-def _guesses(
-    space: PersonCoordinates, observer: Observer, size: _Sizes, recorder: Array | None
-) -> list[Array]:
-    """Unknowns (q,) where a search may begin: shares of what is left, then the levels given."""
-    guesses = []
-    for inside, sensed, recorded in _STARTS if recorder is None else ():
-        levels = _suggested(observer, size, inside, sensed)
-        log = np.log(np.concatenate([levels, recorded * size.recorder])[space.moving])
-        guesses.append(np.concatenate([space.space.start, log]))
-    return [*guesses, space.start]
-
-
-def _value(space: PersonCoordinates, theta: Array) -> float:
-    """Log-likelihood at theta (q,); minus infinity where there is none."""
-    try:
-        return space.value(theta)
-    except ImpcError:
-        return -np.inf
-
-
-def _space(point: Point, prices: Array | None) -> Coordinates:
-    structure = point.problem.structure
-    if prices is not None and structure is not None:
-        return PriceCoordinates(point.problem, structure, np.array(prices))
-    return Coordinates(point.problem, point.K, point.S, kept_to(point.problem))
-
-
-def _prices(space: PersonCoordinates, theta: Array) -> Array | None:
-    own = space.space
-    return own.unknowns(theta[: space.own]) if isinstance(own, PriceCoordinates) else None
-
-
-def _prior(space: PersonCoordinates, observer: Observer, size: _Sizes, spread: float) -> Prior:
-    alone = np.concatenate([_suggested(observer, size, 1.0, 1.0), size.recorder])
-    return Prior(space, spread, np.log(alone[space.moving]), size.sensory)
-
-
-@dataclass(frozen=True)
-class _Sizes:
-    """Levels of which each alone would make residuals of the size that there is."""
-
-    motor: Array
-    process: Array
-    sensory: Array
-    recorder: Array
-
-
-def _sizes(point: Point) -> _Sizes:
-    plant, scale = point.problem.plant, point.problem.output_scale
-    residual = residual_only(point.problem, point.K, point.S).reshape(-1, len(plant.outputs))
-    recorder = scale * np.maximum(np.sqrt(np.mean(residual**2, axis=0)), _LEAST)
-    target = float(np.sqrt(np.mean((recorder / scale) ** 2)))
-    closed = plant.A - plant.B @ point.K
-    columns = np.vstack([plant.B.T, np.eye(plant.n)])
-    spread = lyapunov_series(closed, columns[:, :, None] * columns[:, None, :])
-    seen = np.einsum("pi,kij,pj->kp", plant.C, spread, plant.C) / scale**2
-    each = target / np.sqrt(np.maximum(np.mean(seen, axis=1), 1e-300))
-    sensed = np.mean(each[: plant.m, None, None] ** 2 * spread[: plant.m], axis=0)
-    return _Sizes(each[: plant.m], each[plant.m :], sensed, recorder)
-
-
-def _suggested(observer: Observer, size: _Sizes, inside: float, sensed: float) -> Array:
-    """Levels of the observer's kinds that share what the first fit leaves."""
-    moved = int(np.any(observer.motor)) + int(np.any(observer.process))
-    share = inside / np.sqrt(max(moved, 1))
-    signals = np.sqrt(np.einsum("si,ij,sj->s", observer.C, size.sensory, observer.C))
-    suggested = {
-        "motor": share * size.motor,
-        "process": share * size.process / np.sqrt(max(int(np.count_nonzero(observer.process)), 1)),
-        "sensory": sensed * signals,
-    }
-    parts = [suggested.get(name, observer.level(name)) for name in LEVELS]
-    levels: Array = np.concatenate(parts)
-    return np.where(observer.levels > 0, levels, 0.0)
