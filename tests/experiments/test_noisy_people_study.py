@@ -8,8 +8,10 @@ import pytest
 from experiments.noisy_people import recorded, subject
 from experiments.noisy_people_study import Score, blind, passed_over, score
 from impc.assess.person_covariance import person_covariance, with_curvature
+from impc.checking import replace
 from impc.inverse.likelihood_fit import fit_person
 from impc.inverse.methods import estimate
+from impc.model.structure import Structure
 
 
 def scored(seed: int, limit: float) -> Score:
@@ -59,6 +61,19 @@ def test_on_the_seat_a_person_is_told_where_least_squares_is_far_off() -> None:
     covariance = with_curvature(found, person_covariance(found))
     z = (np.array(found.K) - truth)[0] / np.array(covariance.entries)[0]
     assert np.all(np.abs(z[:4]) < 1.96)
+
+
+@pytest.mark.full
+def test_a_structure_that_is_wrong_is_seen() -> None:
+    """Prices on one angle and its rate alone: the same person with any gain is preferred."""
+    who = subject("seat", 1, "motor", 90.0, 70.0)
+    problem = recorded(who, 1).problem
+    shape = Structure(problem.plant, "full", over=["theta1", "theta1_rate"])
+    first = estimate(replace(problem, structure=shape))
+    kept = fit_person(first, blind(who))
+    free = fit_person(replace(first, problem=replace(problem, structure=None)), blind(who))
+    assert kept.space.gain < 5
+    assert kept.criterion - free.criterion > 4
 
 
 @pytest.mark.slow
