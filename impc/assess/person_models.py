@@ -43,7 +43,7 @@ __all__ = ["PersonModel", "PersonReport", "person_report", "persons", "predictio
 _AHEAD, _STARTS = (0.0, 0.1, 0.5), 100
 # Likelihoods with derivatives of the model that was asked for, and of those beside it, whose page
 # says where that was not enough.
-_ASKED, _BESIDE = 250, 100
+_ASKED, _BESIDE = 250, 60
 # One second of lags tells a rhythm that was missed; fewer than ten tell nothing.
 _LEAST_LAGS = 10
 
