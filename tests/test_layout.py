@@ -88,6 +88,7 @@ ELSEWHERE = {
         inverse/consistent_pairs.py inverse/explaining_weights.py inverse/one_step.py
         inverse/quiet_samples.py""",
     "inverse/test_likelihood_fit.py": "inverse/likelihood_start.py inverse/person_coordinates.py",
+    "inverse/test_likelihood_search.py": "inverse/person_prior.py",
     "inverse/test_arrow.py": "inverse/trial_span.py",
     "inverse/test_structured_fit.py": "inverse/structured_search.py",
     "inverse/test_optimal_control_fit.py": """

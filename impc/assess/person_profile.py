@@ -26,7 +26,7 @@ from impc.inverse.likelihood_search import climb
 if TYPE_CHECKING:
     from impc.assess.person_covariance import PersonCovariance
     from impc.inverse.likelihood_fit import PersonFit
-    from impc.inverse.likelihood_search import Place, Prior
+    from impc.inverse.person_prior import Place, Prior
 
 __all__ = ["FARTHEST", "entry_intervals", "fallen", "level_interval", "level_intervals", "profile"]
 

@@ -18,7 +18,7 @@ from impc.checking import checked
 from impc.errors import ImpcError, InputError
 from impc.inverse.coordinates import Point
 from impc.inverse.gain_search import bryson_starts
-from impc.inverse.likelihood_search import Place, Prior, climb
+from impc.inverse.likelihood_search import climb
 from impc.inverse.likelihood_start import (
     Asked,
     gain_space,
@@ -27,6 +27,7 @@ from impc.inverse.likelihood_start import (
     prior_about,
 )
 from impc.inverse.person_coordinates import PersonCoordinates
+from impc.inverse.person_prior import Place, Prior
 from impc.model.observer import LEVELS
 
 if TYPE_CHECKING:

@@ -14,8 +14,8 @@ import numpy as np
 from impc.arrays import Array
 from impc.errors import ImpcError, SolverError
 from impc.inverse.coordinates import Coordinates
-from impc.inverse.likelihood_search import Prior
 from impc.inverse.person_coordinates import PersonCoordinates
+from impc.inverse.person_prior import Prior
 from impc.inverse.regulator_span import kept_to
 from impc.inverse.residuals import residual_only
 from impc.inverse.structured_search import PriceCoordinates

@@ -10,8 +10,9 @@ import pytest
 from impc.checking import replace
 from impc.control.controller import Controller
 from impc.inverse.likelihood_fit import PersonFit, fit_person
-from impc.inverse.likelihood_search import Prior, boxed_step, climb
+from impc.inverse.likelihood_search import boxed_step, climb
 from impc.inverse.methods import estimate
+from impc.inverse.person_prior import Prior
 from impc.model.observer import Observer
 from impc.model.weights import Weights
 from tests.inverse.test_likelihood_fit import cart, posed
