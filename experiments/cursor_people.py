@@ -25,11 +25,12 @@ import numpy as np
 import plants
 from experiments.cursor_data import RATE, Condition
 from impc.checking import replace
+from impc.inverse.coordinates import Point
 from impc.inverse.likelihood_fit import PersonFit, fit_person
+from impc.inverse.likelihood_start import gain_space
 from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.person_coordinates import PersonCoordinates
 from impc.inverse.structured_fit import fit_structured
-from impc.inverse.structured_search import PriceCoordinates
 from impc.model.observer import Observer
 from impc.model.plant import Plant
 from impc.model.plant_family import PlantFamily
@@ -139,10 +140,8 @@ def judged(follower: Follower, condition: Condition, which: IntArray) -> PersonF
     fit = follower.fit
     other = follower_problem(condition, which, follower.delay, follower.offset)
     there = other.at(np.array(other.starts), np.array(fit.problem.logarithms))
-    structure = fit.problem.structure
-    assert structure is not None
-    assert fit.prices is not None
-    prices = PriceCoordinates(replace(there, structure=structure), structure, np.array(fit.prices))
+    posed = replace(there, structure=fit.problem.structure)
+    prices = gain_space(Point(np.array(fit.K), np.array(fit.S), posed), fit.prices)
     space = PersonCoordinates(prices, fit.observer, np.array(fit.recorder))
     told = space.told(space.start)
     return dataclasses.replace(fit, problem=there, told=told, log_likelihood=told.value)

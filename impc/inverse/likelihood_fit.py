@@ -139,7 +139,7 @@ def fit_person(
         Standard deviation of a normal prior about the start, of each coordinate (`Coordinates`)
         of gain, initial states and parameters, or of each price's logarithm; infinite for none.
     max_evaluations : int
-        Filters of all recordings with derivatives, at most.
+        Filters of all recordings with derivatives, about; those of both starts together.
     held : sequence of str
         Kinds of levels that are not searched but known: of "motor", "share", "process", "sensory"
         and "walk".
@@ -187,7 +187,8 @@ def fit_person(
     begun, reasons = [], []
     for points in groups:
         try:
-            begun.append(_levelled(*likeliest_start(points, found.prices, asked), asked))
+            prior, theta = likeliest_start(points, found.prices, asked)
+            begun.append(_levelled(prior, theta, min(_FIRST, max_evaluations)))
         except ImpcError as error:
             reasons.append(error)
     if not begun:
@@ -211,18 +212,17 @@ class _End(NamedTuple):
     settled: bool
 
 
-def _levelled(space: PersonCoordinates, theta: Array, asked: Asked) -> _End:
+def _levelled(prior: Prior, theta: Array, budget: int) -> _End:
     """The first likelihoods from theta (q,), in which the gain stands."""
-    prior = prior_about(space, asked)
-    rest, none = np.eye(len(theta))[:, space.gain :], np.zeros(len(prior.scales))
-    return _End(prior, *climb(prior, prior.at(theta), _FIRST, rest, none))
+    rest, none = np.eye(len(theta))[:, prior.space.gain :], np.zeros(len(prior.scales))
+    return _End(prior, *climb(prior, prior.at(theta), budget, rest, none))
 
 
 def _searched(start: _End, asked: Asked, budget: int) -> _End:
     """Climb in rounds, coordinates and prior made anew where one went far, and then to the end."""
     prior, place, losing, spent = start.prior, start.place, np.zeros_like(start.losing), 0
     while spent < budget:
-        place, _, more, _ = climb(prior, place, _ROUND, losing=losing)
+        place, _, more, _ = climb(prior, place, min(_ROUND, budget - spent + 1), losing=losing)
         spent += more - 1
         if np.linalg.norm((place.theta - prior.center)[: prior.space.gain]) <= _NEAR * asked.spread:
             break

@@ -76,15 +76,17 @@ def prices_at(space: PersonCoordinates, theta: Array) -> Array | None:
 
 def prior_about(space: PersonCoordinates, asked: Asked) -> Prior:
     """The prior about the start of some coordinates."""
-    start = space.space.start
-    size = _sizes(space.space.unpack(start))
+    return _prior(space, asked, _sizes(space.space.unpack(space.space.start)))
+
+
+def _prior(space: PersonCoordinates, asked: Asked, size: _Sizes) -> Prior:
     alone = np.concatenate([_suggested(asked.observer, size, 1.0, 1.0), size.recorder])
     return Prior(space, asked.spread, np.log(alone[space.moving]), size.sensory)
 
 
 def likeliest_start(
     points: Sequence[Point], prices: Array | None, asked: Asked
-) -> tuple[PersonCoordinates, Array]:
+) -> tuple[Prior, Array]:
     """Where a search begins, of several points.
 
     Parameters
@@ -96,8 +98,8 @@ def likeliest_start(
 
     Returns
     -------
-    space, theta : PersonCoordinates, Array
-        Coordinates about the point, and the unknowns there (q,).
+    prior, theta : Prior, Array
+        About the point, in coordinates of its own, and the unknowns there (q,).
 
     Raises
     ------
@@ -107,20 +109,21 @@ def likeliest_start(
     found, highest, reason = None, -np.inf, "no number"
     for point in points:
         try:
-            size = _sizes(point)
+            own = gain_space(point, prices)
+            size = _sizes(own.unpack(own.start))
             white = size.recorder if asked.recorder is None else np.asarray(asked.recorder)
-            space = PersonCoordinates(gain_space(point, prices), asked.observer, white, asked.held)
+            space = PersonCoordinates(own, asked.observer, white, asked.held)
             guesses = _guesses(space, asked, size)
             value = space.value(guesses[0])
         except ImpcError as error:
             reason = str(error)
             continue
         if value > highest:
-            found, highest = (space, guesses), value
+            found, highest = (space, size, guesses), value
     if found is None:
         raise SolverError("person", f"no start has a likelihood: {reason}", "give other levels")
-    space, guesses = found
-    return space, max(guesses, key=lambda theta: _value(space, theta))
+    space, size, guesses = found
+    return _prior(space, asked, size), max(guesses, key=lambda theta: _value(space, theta))
 
 
 def _guesses(space: PersonCoordinates, asked: Asked, size: _Sizes) -> list[Array]:

@@ -6,8 +6,8 @@ follows from what it does about the rest. On the seat the gains of all weights o
 rates make five dimensions of ten (docs/structures.md has the theorem).
 
 The space is computed: regulators at three sizes of the weights, in natural coordinates, and all
-their derivatives with respect to prices of products of features. With several inputs such gains
-fill no space but that of all gains.
+their derivatives with respect to prices of products of features. With several inputs there is no
+theorem, and with two the singular values fell without a gap: all gains are searched then.
 """
 
 from __future__ import annotations
