@@ -8,6 +8,7 @@ person's noise, and of the recorder's (docs/noisy-people.md).
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from impc.control.joint_likelihood import Likelihood
     from impc.inverse.coordinates import Coordinates, Point
     from impc.model.observer import Observer
+    from impc.model.recordings import Recording
 
 __all__ = ["Person", "PersonCoordinates", "Told"]
 
@@ -242,10 +244,13 @@ class PersonCoordinates:
         # The initial states of all trials have the same unit, so one law serves them all.
         along, noise = self._directions(theta, controller, person, columns[0])
         prepared = prepare_filter(controller, person.observer, person.recorder, along, noise)
-        return [
-            joint_likelihood(prepared, trial.outputs, trial.disturbance, trial.x0)
-            for trial in problem.recordings
-        ]
+
+        def one(trial: Recording) -> Likelihood:
+            return joint_likelihood(prepared, trial.outputs, trial.disturbance, trial.x0)
+
+        # The compiled filter lets other threads run.
+        with ThreadPoolExecutor(len(problem.recordings)) as pool:
+            return list(pool.map(one, problem.recordings))
 
     def _directions(
         self, theta: Array, controller: Controller, person: Person, moved: _Moved
