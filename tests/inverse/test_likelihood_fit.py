@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace as replaced
 
 import control
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from impc.arrays import Array
 from impc.assess.person_covariance import person_covariance
 from impc.control.controller import Controller
 from impc.control.noisy_person import simulate_person
 from impc.errors import ImpcError, InputError
+from impc.inverse import person_coordinates
 from impc.inverse.estimates import Estimate
 from impc.inverse.gain_search import fit_gain
 from impc.inverse.likelihood_fit import PersonFit, fit_person
@@ -72,6 +75,21 @@ def test_the_gradient_is_that_of_the_likelihood(noisy: tuple[Observer, Estimate]
 
         slope = extrapolated_slope(moved, 1e-3)
         assert told.gradient @ step == pytest.approx(slope[0], rel=1e-6)
+
+
+def test_trials_side_by_side_say_what_they_say_one_after_the_other(
+    noisy: tuple[Observer, Estimate], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem = posed(noisy[0], 0.01, 0.9, trials=6)
+    found = replaced(noisy[1], problem=problem)
+    space = fit_person(found, noisy[0], max_evaluations=1).space
+    beside = [space.told(space.start) for _ in range(5)]
+    monkeypatch.setattr(person_coordinates, "ThreadPoolExecutor", lambda _: ThreadPoolExecutor(1))
+    alone = space.told(space.start)
+    for told in beside:
+        assert told.value == alone.value
+        for ours, theirs in zip(told.scores, alone.scores, strict=True):
+            assert_array_equal(ours, theirs)
 
 
 def test_a_person_is_found_and_told_better_than_without_the_noise(
