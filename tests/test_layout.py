@@ -110,7 +110,7 @@ ELSEWHERE = {
     "studies/fit/test_verdict.py": """
         studies/charts.py studies/fit/interval_figures.py studies/signal_words.py""",
     "studies/fit/test_subject.py": """
-        inverse/delayed_feedback.py assess/held_out.py assess/intent_rules.py studies/fit/memory.py
+        inverse/delayed_feedback.py assess/held_out.py assess/intent_rules.py
         studies/fit/result.py""",
     "studies/reliability/test_anova.py": "studies/reliability/variance_components.py",
     "studies/reliability/test_transfer.py": """

@@ -9,6 +9,8 @@ without its limits (docs/noisy-people.md).
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -30,14 +32,20 @@ from impc.inverse.regulator_span import kept_to
 from impc.model.bounds import bound_rows
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from impc.assess.person_covariance import Confusion, PersonCovariance
     from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
     from impc.model.observer import Observer
 
-__all__ = ["PersonModel", "PersonReport", "person_report", "persons", "prediction_errors"]
+__all__ = [
+    "PersonModel",
+    "PersonReport",
+    "RememberPerson",
+    "afresh_person",
+    "person_report",
+    "persons",
+    "prediction_errors",
+]
 
 # Samples ahead of which predictions are judged, as seconds; and how many starts in a trial at most.
 _AHEAD, _STARTS = (0.0, 0.1, 0.5), 100
@@ -65,6 +73,17 @@ class PersonModel:
     name: str
     fit: PersonFit | None
     reason: str
+
+
+#: (name, problem, person, compute) -> the model: from memory, or computed now.
+RememberPerson = Callable[[str, "Problem", "Observer", Callable[[], PersonModel]], PersonModel]
+
+
+def afresh_person(
+    _name: str, _problem: Problem, _person: Observer, make: Callable[[], PersonModel]
+) -> PersonModel:
+    """`make` a model, whatever `_name`, `_problem` and `_person`: nothing is remembered."""
+    return make()
 
 
 @dataclass(frozen=True)
@@ -118,6 +137,7 @@ def person_report(
     *,
     profiled: bool = False,
     done: Callable[[str], None] = lambda _: None,
+    remember: RememberPerson = afresh_person,
 ) -> PersonReport:
     """Fit a person and the models beside, from a fit of least squares.
 
@@ -133,16 +153,16 @@ def person_report(
         ten minutes and more on the seat.
     done : callable
         Told the name of each model once it is fitted, and "profiles".
+    remember : callable
+        (name, problem, person, compute) -> the model, from memory when it is there.
     """
     models: list[PersonModel] = []
     problem = found.problem
     for name, posed, person in persons(problem, asked, walk):
-        try:
-            first = replace(found, problem=posed)
-            fitted = fit_person(first, person, max_evaluations=_BESIDE if models else _ASKED)
-            models.append(PersonModel(name, fitted, ""))
-        except ImpcError as error:
-            models.append(PersonModel(name, None, str(error)))
+        budget = _BESIDE if models else _ASKED
+        first = replace(found, problem=posed)
+        fit_one = functools.partial(_model, name, first, person, budget)
+        models.append(remember(name, posed, person, fit_one))
         done(name)
     fit = models[0].fit
     p = len(problem.plant.outputs)
@@ -171,6 +191,13 @@ def person_report(
         ahead,
         frozen(prediction_errors(fit, ahead)),
     )
+
+
+def _model(name: str, first: Estimate, person: Observer, budget: int) -> PersonModel:
+    try:
+        return PersonModel(name, fit_person(first, person, max_evaluations=budget), "")
+    except ImpcError as error:
+        return PersonModel(name, None, str(error))
 
 
 def persons(problem: Problem, asked: Observer, walk: Array) -> list[tuple[str, Problem, Observer]]:

@@ -66,7 +66,7 @@ def command(
     truth = read_truth(files, problem.plant)
     # One more: the page with its figures takes ten seconds.
     with progress(stages(problem, settings) + 1, "stage", lambda _: memory.kept()) as done:
-        told = FitProgress(done, memory.estimate, memory.replicate)
+        told = FitProgress(done, memory.estimate, memory.replicate, memory.person)
         result = fit_recordings(problem, settings, told)
         with angles_in(subject.angles):
             content = fit_report(result, subject.provenance, truth, unknown).files()

@@ -122,6 +122,8 @@ class Coordinates:
         self, problem: Problem, gain: Array, metric: Array, structure: Structure | None = None
     ) -> None:
         self.problem = problem
+        #: Gain and metric as they were given, before the gain was moved to the span.
+        self.given = gain, metric
         plant = problem.plant
         self.m, self.n, self.trials = plant.m, plant.n, len(problem.recordings)
         self.T, self.G = natural_coordinates(plant, gain)

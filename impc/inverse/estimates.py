@@ -214,7 +214,7 @@ def encode_estimate(estimate: Estimate) -> dict[str, Any]:
         "reason": estimate.reason,
         "evaluations": estimate.evaluations,
         "seconds": estimate.seconds,
-        "prices": None if estimate.prices is None else _finite(estimate.prices),
+        "prices": None if estimate.prices is None else encode_prices(estimate.prices),
     }
 
 
@@ -242,14 +242,15 @@ def decode_estimate(seen: Problem, kept: dict[str, Any]) -> Estimate:
         kept["reason"],
         kept["evaluations"],
         kept["seconds"],
-        None if kept["prices"] is None else _unknowns(kept["prices"]),
+        None if kept["prices"] is None else decode_prices(kept["prices"]),
     )
 
 
-def _finite(prices: Array) -> list[float | None]:
+def encode_prices(prices: Array) -> list[float | None]:
     """Unknowns as JSON has them: None for a price of zero."""
     return [float(item) if np.isfinite(item) else None for item in prices]
 
 
-def _unknowns(kept: list[float | None]) -> Array:
+def decode_prices(kept: list[float | None]) -> Array:
+    """Unknowns (count,) from what `encode_prices` made of them."""
     return frozen([-np.inf if item is None else item for item in kept])

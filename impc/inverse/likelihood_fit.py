@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from impc.inverse.problem import Problem
     from impc.model.observer import Observer
 
-__all__ = ["PersonFit", "fit_person"]
+__all__ = ["PersonFit", "fit_person", "person_at"]
 
 # Likelihoods for all but the gain, or the prices, at first: while levels are far off the gain that
 # explains most is on the border of those that stabilise, and three searches of 21 ended there.
@@ -199,7 +199,8 @@ def fit_person(
         spent += ends[-1].spent
         if ends[-1].settled:
             break
-    return _fitted(max(ends, key=lambda one: one.place.told.value), spent)
+    end = max(ends, key=lambda one: one.place.told.value)
+    return person_at(end.prior, end.place, end.losing, end.settled, spent)
 
 
 class _End(NamedTuple):
@@ -235,8 +236,23 @@ def _searched(start: _End, asked: Asked, budget: int) -> _End:
     return _End(prior, place, losing, spent + more - 1, settled)
 
 
-def _fitted(end: _End, spent: int) -> PersonFit:
-    space, place = end.prior.space, end.place
+def person_at(prior: Prior, place: Place, losing: Array, settled: bool, spent: int) -> PersonFit:
+    """What is said of a person where a search has come to.
+
+    Parameters
+    ----------
+    prior : Prior
+        What the search was held by.
+    place : Place
+        Where it ended.
+    losing : Array
+        Slope of what levels lose there (levels,), nats.
+    settled : bool
+        Whether it ended by itself.
+    spent : int
+        Likelihoods with derivatives.
+    """
+    space = prior.space
     person, prices = space.unpack(place.theta), prices_at(space, place.theta)
     return PersonFit(
         frozen(person.point.K),
@@ -248,10 +264,10 @@ def _fitted(end: _End, spent: int) -> PersonFit:
         place.told.value,
         place.value,
         len(place.theta),
-        end.settled,
+        settled,
         spent,
         frozen(place.theta),
         place.told,
-        frozen(end.losing),
-        end.prior,
+        frozen(losing),
+        prior,
     )

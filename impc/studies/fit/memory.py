@@ -9,11 +9,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from impc.arrays import Array
+from impc.assess.person_models import PersonModel
 from impc.assess.resampling import Replicate
 from impc.checking import replace
 from impc.files.digests import digest, versions
 from impc.files.sealed import Kept
 from impc.inverse.estimates import Estimate, decode_estimate, encode_estimate
+from impc.inverse.kept_person import decode_person, encode_person
 from impc.inverse.methods import METHODS, Method
 from impc.studies.cache import Cache, Codec, by_fields
 
@@ -22,6 +24,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from impc.inverse.problem import Problem
+    from impc.model.observer import Observer
     from impc.model.plant_family import PlantFamily
     from impc.studies.fit.settings import FitSettings
 
@@ -70,6 +73,38 @@ class FitMemory(Cache):
             When the file cannot be written.
         """
         return self.get(name, compute, by_fields(Replicate))
+
+    def person(
+        self, name: str, posed: Problem, observer: Observer, compute: Callable[[], PersonModel]
+    ) -> PersonModel:
+        """The person who senses with noise of the stage `name`, as `compute` makes it.
+
+        Parameters
+        ----------
+        name : str
+            What the model is called.
+        posed : Problem
+            Of that model.
+        observer : Observer
+            As it was asked for.
+        compute : callable
+            Without arguments.
+
+        Raises
+        ------
+        OutputError
+            When the file cannot be written.
+        """
+
+        def encode(model: PersonModel) -> dict[str, Any]:
+            fit = None if model.fit is None else encode_person(model.fit)
+            return {"fit": fit, "reason": model.reason}
+
+        def decode(kept: dict[str, Any]) -> PersonModel:
+            fit = None if kept["fit"] is None else decode_person(posed, observer, kept["fit"])
+            return PersonModel(name, fit, kept["reason"])
+
+        return self.get(name, compute, Codec(encode, decode))
 
 
 def open_memory(

@@ -25,7 +25,7 @@ from impc.assess.identified_directions import identifiability
 from impc.assess.intent_draws import drawn_gains
 from impc.assess.intent_rules import intent
 from impc.assess.judged import judge
-from impc.assess.person_models import person_report, persons
+from impc.assess.person_models import afresh_person, person_report, persons
 from impc.assess.printed_gain import gain_estimate
 from impc.assess.structures import assess_structure, no_structure
 from impc.assess.variance_accounted_for import agreement
@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from impc.assess.judged import MethodFit
-    from impc.assess.person_models import PersonReport
+    from impc.assess.person_models import PersonReport, RememberPerson
     from impc.assess.printed_gain import GainEstimate
     from impc.assess.resampling import Replicate
     from impc.assess.structures import StructureFit
@@ -82,11 +82,15 @@ class FitProgress:
         (`impc.studies.fit.memory`). By default every one is computed.
     replicate : callable
         (name of stage, compute) -> a bootstrap replicate, in the same way.
+    person : callable
+        (name of stage, problem, person, compute) -> a person who senses with noise, in the same
+        way.
     """
 
     done: Callable[[str], None] = lambda _: None
     estimate: Remember = afresh
     replicate: Callable[[str, Callable[[], Replicate]], Replicate] = lambda _, compute: compute()
+    person: RememberPerson = afresh_person
 
 
 def stages(problem: Problem, settings: FitSettings) -> int:
@@ -271,7 +275,13 @@ def _person(
     asked = fit_observer(problem.plant, settings, problem.recordings)
     if asked is None:
         return None
-    return person_report(fitted, *asked, profiled=settings.person_profiles, done=progress.done)
+    return person_report(
+        fitted,
+        *asked,
+        profiled=settings.person_profiles,
+        done=progress.done,
+        remember=progress.person,
+    )
 
 
 def _structures(
