@@ -5,7 +5,7 @@
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
-.PHONY: help env demo test full check docs architecture reproduce wheel slow coverage structures followers plans default-subjects noisy-people nonlinear nonlinear-seat look search numerics bench fuzz lock clean
+.PHONY: help env demo test long full check docs architecture reproduce wheel slow coverage structures followers plans default-subjects noisy-people nonlinear nonlinear-seat look search numerics bench fuzz lock clean
 
 PYTHON ?= python3
 # Not to be set from outside: the environment is made with `venv --clear`.
@@ -41,7 +41,8 @@ endif
 
 help:
 	@echo 'make demo    set up .venv and run the example:   impc example'
-	@echo 'make test    set up .venv, then check and pytest: all that matters, about ten minutes'
+	@echo 'make test    set up .venv, then check and pytest: all that matters, about five minutes'
+	@echo 'make long    documents that run, experiments, whole cohorts, mutated files: two minutes more'
 	@echo 'make full    the site, and studies in full size: five minutes more, before a merge'
 	@echo 'make check   ruff check, ruff format --check, mypy --strict'
 	@echo 'make slow    hundreds of recordings, fits and subjects: an hour'
@@ -74,7 +75,11 @@ demo: env
 test: env
 	@OPENBLAS_NUM_THREADS=1 $(PY) -m tests.warm & warm=$$!; \
 	$(MAKE) --no-print-directory check; checked=$$?; wait $$warm && exit $$checked
-	$(PYTEST) -m "not slow and not full"
+	$(PYTEST) -m "not long and not full and not slow"
+
+# Marks do not include each other: what is long but also full is full.
+long: env
+	$(PYTEST) -m "long and not full and not slow"
 
 # The site on one process, the studies on the other.
 full: env

@@ -150,7 +150,11 @@ def test_told_directions_count_what_is_not_told_to_second_order() -> None:
 
 @pytest.mark.parametrize(
     ("inputs", "vaf", "count"),
-    [(1, 70.0, 25), (2, 90.0, 4), pytest.param(2, 90.0, 8, marks=pytest.mark.full)],
+    [
+        (1, 70.0, 25),
+        pytest.param(2, 90.0, 4, marks=pytest.mark.long),
+        pytest.param(2, 90.0, 8, marks=pytest.mark.full),
+    ],
 )
 def test_printed_intervals_hold_the_truth(inputs: int, vaf: float, count: int) -> None:
     """Seeds from 0; all told entries and all told directions together, first-order noise (0.8).

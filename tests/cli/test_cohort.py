@@ -19,6 +19,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from impc.cli.main import main
+from impc.studies.cohort import cluster
 from impc.studies.cohort.store import open_store
 from tests.studies.cohort.carts import write_study
 from tests.studies.cohort.test_cluster import certificates
@@ -98,7 +99,13 @@ def workers_of(process: psutil.Process) -> list[psutil.Process]:
     ]
 
 
-@pytest.mark.parametrize("kills", [(1, 1), pytest.param((3, 2), marks=pytest.mark.full)])
+@pytest.mark.parametrize(
+    "kills",
+    [
+        pytest.param((1, 1), marks=pytest.mark.long),
+        pytest.param((3, 2), marks=pytest.mark.full),
+    ],
+)
 def test_workers_and_client_may_die(
     study: Path, undisturbed: Path, tmp_path: Path, kills: tuple[int, int]
 ) -> None:
@@ -226,7 +233,10 @@ def test_a_killed_scheduler_is_one_line_and_the_run_goes_on(
     same_tables(out, undisturbed)
 
 
-def test_no_scheduler_is_one_line(study: Path, tmp_path: Path) -> None:
+def test_no_scheduler_is_one_line(
+    study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cluster, "_PATIENCE", "1s")
     done = run_here(study, tmp_path / "out", "--scheduler", "tcp://127.0.0.1:9")
     assert done.exit_code == 2
     assert len(done.stderr.strip().splitlines()) == 1
@@ -244,7 +254,10 @@ def test_two_runs_into_one_folder_are_refused(study: Path, tmp_path: Path) -> No
 @pytest.mark.usefixtures("blank_figures")
 @pytest.mark.parametrize(
     ("subjects", "damaged"),
-    [(5, (1, 3, 4)), pytest.param(30, (4, 11, 29), marks=pytest.mark.slow)],
+    [
+        pytest.param(5, (1, 3, 4), marks=pytest.mark.long),
+        pytest.param(30, (4, 11, 29), marks=pytest.mark.slow),
+    ],
 )
 def test_damaged_recordings_stop_nobody_else(
     tmp_path: Path, subjects: int, damaged: tuple[int, ...]

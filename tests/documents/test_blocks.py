@@ -25,6 +25,8 @@ from tests.documents.tables import NOT_RUN, PREPARED, SMALLER
 if TYPE_CHECKING:
     from tests.documents.blocks import Block
 
+pytestmark = pytest.mark.long
+
 _SILENT = {"text", "bibtex", "matlab"}
 _NUMBER = re.compile(r"[-+]?\d+(\.\d*)?(e[-+]?\d+)?")
 

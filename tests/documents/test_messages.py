@@ -75,6 +75,8 @@ from tests.files.samples import csv_text, hdf5_mat, pushed_seat, settings
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+pytestmark = pytest.mark.long
+
 PAGE = PAGES["docs/troubleshooting.md"].read_text(encoding="utf-8")
 MESSAGES = re.findall(r"\*\*`([^`]+)`\*\*", PAGE)
 STUDY = """

@@ -7,6 +7,8 @@ import pytest
 
 from experiments.coverage import covered
 
+pytestmark = pytest.mark.long
+
 
 def shares(count: int, root: float) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
     """Share of recordings (seeds 0 to count - 1) whose 95 % interval holds each entry of K."""

@@ -19,6 +19,8 @@ from impc.model.observer import Observer
 from impc.model.plant import Plant
 from impc.model.structure import Structure
 
+pytestmark = pytest.mark.long
+
 DELAY, LAG, OFFSET, PRICE = 8, 0.03, 3.0, 20.0
 LEVELS = {"motor command": 50.0, "sensory error": 10.0}
 

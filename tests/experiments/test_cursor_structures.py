@@ -8,6 +8,8 @@ import pytest
 from experiments.cursor_data import data_file, read_conditions
 from experiments.cursor_structures import STRUCTURES, structure_rows
 
+pytestmark = pytest.mark.long
+
 
 @pytest.mark.slow
 @pytest.mark.skipif(not data_file().is_file(), reason="the recordings are not there")

@@ -13,6 +13,8 @@ from experiments.cursor_data import RATE, Condition, data_file, read_conditions
 from experiments.cursor_tracking import left_out_vaf
 from impc.errors import DataError
 
+pytestmark = pytest.mark.long
+
 #: Leave-one-trial-out VAF of a delayed second-order feedback, from the sharpest target on.
 REFERENCE = (86.7, 82.7, 84.3, 80.1, 57.8, 48.4)
 

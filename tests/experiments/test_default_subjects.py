@@ -8,6 +8,8 @@ import pytest
 
 from experiments.default_subjects import fitted_subject, simulated_files
 
+pytestmark = pytest.mark.long
+
 
 def test_the_truth_of_a_short_default_subject_is_found(tmp_path: Path) -> None:
     """Seed 0, a trial of 10 s: the nonlinear body explains what the linear plant cannot.

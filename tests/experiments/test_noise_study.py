@@ -12,6 +12,8 @@ from experiments.benchmarks.workloads import seat
 from experiments.noise_study import Cell, Outcome, study_cell
 from impc.studies.compare.subject import compared_methods
 
+pytestmark = pytest.mark.long
+
 
 def test_a_cell_with_saturation(monkeypatch: pytest.MonkeyPatch) -> None:
     """At 4.5 Nm and 1 % noise inverse MPC wins by more than a point over all without bounds.

@@ -13,6 +13,8 @@ from impc.inverse.likelihood_fit import fit_person
 from impc.inverse.methods import estimate
 from impc.model.structure import Structure
 
+pytestmark = pytest.mark.long
+
 
 def scored(seed: int, limit: float) -> Score:
     who = subject("cart", seed, "motor", 90.0, limit)

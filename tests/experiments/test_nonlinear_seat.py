@@ -13,6 +13,8 @@ from impc.control.optimal_control import OptimalControlProblem
 from impc.model.riccati import solve_lqr
 from plants import seated_balance_for, ternary_torque
 
+pytestmark = pytest.mark.long
+
 
 def test_the_first_torque_from_a_tilt_is_that_of_the_optimality_conditions() -> None:
     """IPOPT, shooting over the torques, beside Newton's method on all states at once.

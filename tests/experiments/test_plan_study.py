@@ -8,6 +8,8 @@ import pytest
 from experiments.plan_study import cart, compare, seat
 from impc.studies.plan.designs import try_design
 
+pytestmark = pytest.mark.long
+
 
 @pytest.mark.slow
 def test_deviations_are_those_of_a_hundred_fits_and_the_best_is_the_best() -> None:

@@ -12,6 +12,8 @@ from experiments.reproduction.entry import Chapter, Entry, Verdict
 from experiments.reproduction.example import controller_entries
 from experiments.reproduction.page import figure_name, page
 
+pytestmark = pytest.mark.long
+
 FOLDER = Path(__file__).parents[2] / "docs" / "reproduction"
 PAGE = (FOLDER / "index.md").read_text(encoding="utf-8")
 ROWS = [

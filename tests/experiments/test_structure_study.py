@@ -7,6 +7,8 @@ import pytest
 
 from experiments.structure_study import cart_person, score
 
+pytestmark = pytest.mark.long
+
 
 def test_a_subject_is_scored_against_its_truth() -> None:
     found = score(cart_person(0, 90.0, 0.0, 0.0), "carts", 0)

@@ -286,7 +286,9 @@ def test_a_noisy_fit_stays_where_it_ended() -> None:
         assert asymmetry(clean.plant, np.array(one.K), np.array(one.S)) < 1e-10
 
 
-@pytest.mark.parametrize("seed", [49, 82, 89, 92])
+@pytest.mark.parametrize(
+    "seed", [49, 82, *(pytest.param(seed, marks=pytest.mark.long) for seed in (89, 92))]
+)
 def test_a_start_at_the_edge_of_what_weights_can_have(seed: int) -> None:
     """Two fits ended with an error of the start's program, two 4 and 7 % above the truth."""
     assert short_of_truth(*random_recording(seed, 3, 90.0)) < 1

@@ -79,6 +79,7 @@ def test_a_price_of_zero_makes_the_intervals_less_sure() -> None:
     assert any(line.startswith("Where the best price is zero") for line in lines)
 
 
+@pytest.mark.long
 def test_a_refusal_may_be_the_fault_of_the_model() -> None:
     result = fitted(0.5)
     assert not any("not be the structure's fault" in line for line in structure_sentences(result))

@@ -126,6 +126,7 @@ def test_widths_of_table_4_3() -> None:
     assert sum(inside) >= 4
 
 
+@pytest.mark.long
 def test_head_tracking_from_files_to_files(tmp_path: Path) -> None:
     made = run("simulate", "head-tracking", "--out", str(tmp_path), "--subjects", "1",
                "--trials", "1", "--duration", "8")  # fmt: skip
@@ -184,6 +185,7 @@ replicates = 40
     return folder / "study.toml"
 
 
+@pytest.mark.long
 def test_a_model_from_another_field(tmp_path: Path) -> None:
     study = blood_study(tmp_path, 5, 2)
     done = run("select", str(study), *MINE, "--out", str(tmp_path / "select"), "--workers", "1")
