@@ -197,11 +197,11 @@ def _held(
     """The best of all else so far off, and the slope of what levels lose there.
 
     The search begins on the ridge, or beside it: a straight ridge may leave the gains that
-    stabilise.
+    stabilise, or the levels that have a filter.
     """
-    starts = [here.theta + off * step for step in (ridge / float(along @ ridge), along)]
-    start = next((each for each in starts if np.isfinite(prior.value(each))), starts[1])
-    found, losing, _, _ = climb(prior, prior.at(start), _BUDGET, _across(along), losing)
+    on_ridge, beside = (here.theta + off * way for way in (ridge / float(along @ ridge), along))
+    begin = prior.tried(on_ridge) or prior.at(beside)
+    found, losing, _, _ = climb(prior, begin, _BUDGET, _across(along), losing)
     return found, losing
 
 

@@ -38,6 +38,9 @@ if TYPE_CHECKING:
 
 __all__ = ["Person", "PersonCoordinates", "Told"]
 
+# Largest logarithm, either way, of a level whose square double precision can still multiply.
+_SQUARED = 300.0
+
 
 @dataclass(frozen=True)
 class Person:
@@ -124,9 +127,18 @@ class PersonCoordinates:
         return [every[index] for index in self.moving]
 
     def levels(self, theta: Array) -> Array:
-        """All levels (levels + p,) at theta (q,), those of zero among them."""
+        """All levels (levels + p,) at theta (q,), those of zero among them.
+
+        Raises
+        ------
+        SolverError
+            When one has no square in double precision.
+        """
+        logarithms = theta[self.own :]
+        if not np.all(np.abs(logarithms) <= _SQUARED):
+            raise SolverError("level of noise", "has no square in double precision", "begin nearer")
         found = self.first.copy()
-        found[self.moving] = np.exp(theta[self.own :])
+        found[self.moving] = np.exp(logarithms)
         return found
 
     def changes(self, theta: Array) -> tuple[Array, Array]:

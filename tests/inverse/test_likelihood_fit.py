@@ -14,7 +14,7 @@ from impc.arrays import Array
 from impc.assess.person_covariance import person_covariance
 from impc.control.controller import Controller
 from impc.control.noisy_person import simulate_person
-from impc.errors import ImpcError, InputError
+from impc.errors import ImpcError, InputError, SolverError
 from impc.inverse import person_coordinates
 from impc.inverse.estimates import Estimate
 from impc.inverse.gain_search import fit_gain
@@ -145,6 +145,19 @@ def test_a_level_that_is_known_is_not_searched(noisy: tuple[Observer, Estimate])
     assert 0 <= free.log_likelihood - held.log_likelihood < 4  # chi-squared's, of one number
     with pytest.raises(InputError, match="held: got 'noise'; give some of motor, share"):
         fit_person(noisy[1], noisy[0], held=["noise"])
+
+
+@pytest.mark.parametrize("logarithm", [400.0, -400.0, 1000.0, np.nan])
+def test_a_level_that_cannot_be_squared_has_no_likelihood(
+    fitted: PersonFit, logarithm: float
+) -> None:
+    """A profile came there along its ridge, and numpy's warning to the screen."""
+    space = fitted.space
+    theta = space.start.copy()
+    theta[space.own] = logarithm
+    for said in (space.told, space.value):
+        with pytest.raises(SolverError, match="level of noise: has no square"):
+            said(theta)
 
 
 def test_without_noise_in_the_loop_it_is_the_fit_of_least_squares() -> None:
