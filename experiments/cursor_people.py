@@ -9,9 +9,11 @@ searched by maximum likelihood (docs/noisy-people.md), for each of some delays; 
 pixels beside the target, so the mean error is taken off, and then what the likelihood would rather
 have.
 
-A person is judged by the mean log-likelihood, in nats a sample, of the next position of the cursor
-given all before and the target, the first three seconds left out; beside stands what a linear
-prediction with every coefficient free tells. `experiments.cursor_people_study` is the comparison.
+A trial begins with the cursor on the target and ends with a person who has been at it for long: the
+first three seconds are given, and neither fitted nor judged. A person is judged by the mean
+log-likelihood, in nats a sample, of the next position of the cursor given all before and the
+target; beside stands what a linear prediction with every coefficient free tells.
+`experiments.cursor_people_study` is the comparison.
 """
 
 from __future__ import annotations
@@ -60,8 +62,9 @@ FIRST = 180
 _LAG = 0.03
 # Where levels begin: px, px/s. Under a blur of 17 px a search from others can end lower.
 _BESIDE, _MOTOR, _SEEN, _FELT, _RECORDER = 0.3, 60.0, 10.0, 20.0, 0.2
-# Logarithm of the price about that of least squares.
-_SPREAD = 5.0
+# Logarithm of the price about that of least squares, and how far from it searches begin: a noisy
+# sense and a low price both answer late, and either may be where a search ends.
+_SPREAD, _FAR = 5.0, (0.0, 4.0)
 
 
 @dataclass(frozen=True)
@@ -98,18 +101,26 @@ def follower_problem(condition: Condition, which: IntArray, delay: int, offset: 
 
 
 def fit_follower(
-    condition: Condition, which: IntArray, delays: tuple[int, ...] = DELAYS
+    condition: Condition,
+    which: IntArray,
+    delays: tuple[int, ...] = DELAYS,
+    counted: int = FIRST,
 ) -> Follower:
-    """The likeliest person behind some trials (k,), of those with one of some delays."""
+    """The likeliest person behind some trials (k,), of those with one of some delays.
+
+    The first sample that is `counted` is told given those before it.
+    """
     error = (condition.response[which] - condition.target[which])[:, FIRST:]
     offset = float(np.mean(error))
-    tried = [(delay, _fitted(condition, which, delay, offset)) for delay in delays]
-    delay, found = max(tried, key=lambda one: nats(one[1]))
+    tried = [(delay, _fitted(condition, which, delay, offset, counted)) for delay in delays]
+    delay, found = max(tried, key=lambda one: one[1].log_likelihood)
     again = offset + _beside(Follower(delay, offset, found), condition, which)
-    return Follower(delay, again, _fitted(condition, which, delay, again))
+    return Follower(delay, again, _fitted(condition, which, delay, again, counted))
 
 
-def _fitted(condition: Condition, which: IntArray, delay: int, offset: float) -> PersonFit:
+def _fitted(
+    condition: Condition, which: IntArray, delay: int, offset: float, counted: int
+) -> PersonFit:
     problem = follower_problem(condition, which, delay, offset)
     near = fit_controller(problem)
     structure = Structure(near.problem.plant, ["error"])
@@ -126,13 +137,19 @@ def _fitted(condition: Condition, which: IntArray, delay: int, offset: float) ->
         walk=float(np.std([trial.disturbance for trial in problem.recordings])),
         persistence=0.0,
     )
-    return fit_person(
-        least_squares,
-        person,
-        recorder=np.array([_RECORDER]),
-        spread=_SPREAD,
-        held=["walk"],
-    )
+    starts = [replace(least_squares, prices=np.array(least_squares.prices) + far) for far in _FAR]
+    found = [
+        fit_person(
+            start,
+            person,
+            recorder=np.array([_RECORDER]),
+            spread=_SPREAD,
+            held=["walk"],
+            counted=counted,
+        )
+        for start in starts
+    ]
+    return max(found, key=lambda fit: fit.log_likelihood)
 
 
 def judged(follower: Follower, condition: Condition, which: IntArray) -> PersonFit:

@@ -20,7 +20,7 @@ import scipy.linalg
 
 from impc.arrays import Array, frozen
 from impc.assess.person_covariance import HARDLY
-from impc.errors import ImpcError
+from impc.errors import ImpcError, SolverError
 from impc.inverse.likelihood_search import climb
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ FARTHEST = 9.0
 # A step is no longer than this.
 _LONGEST = 2.0
 # Places at which an end is looked for, and likelihoods with derivatives at each.
-_TRIES, _BUDGET = 12, 15
+_TRIES, _BUDGET = 12, 25
 
 
 def level_intervals(fit: PersonFit, covariance: PersonCovariance, *, weak: float = HARDLY) -> Array:
@@ -196,11 +196,19 @@ def _held(
 ) -> tuple[Place, Array]:
     """The best of all else so far off, and the slope of what levels lose there.
 
-    The search begins on the ridge, or beside it: a straight ridge may leave the gains that
-    stabilise, or the levels that have a filter.
+    The search begins on the ridge or beside it, where it is the higher: a straight ridge may leave
+    the gains that stabilise, and moves a level that is all but none by many powers of e.
+
+    Raises
+    ------
+    SolverError
+        When neither has a likelihood.
     """
-    on_ridge, beside = (here.theta + off * way for way in (ridge / float(along @ ridge), along))
-    begin = prior.tried(on_ridge) or prior.at(beside)
+    ways = ridge / float(along @ ridge), along
+    starts = [place for way in ways if (place := prior.tried(here.theta + off * way))]
+    if not starts:
+        raise SolverError("profile", "has no likelihood there", "look nearer")
+    begin = max(starts, key=lambda place: place.value)
     found, losing, _, _ = climb(prior, begin, _BUDGET, _across(along), losing)
     return found, losing
 

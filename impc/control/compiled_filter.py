@@ -86,6 +86,9 @@ class FilterResult(NamedTuple):
         Command expected there (samples, m).
     status : Buffer
         Of each sample: the value of `closed_loop.Status` (samples,).
+    counted : int
+        The first sample that is told: those before it tell nothing, and are what the others are
+        told given.
     """
 
     told: Buffer
@@ -96,6 +99,7 @@ class FilterResult(NamedTuple):
     filtered: Buffer
     u: Buffer
     status: Buffer
+    counted: int
 
 
 @njit(cache=True, nogil=True)
@@ -291,13 +295,16 @@ def _update(
             for c in range(k):
                 score[c] += apart * dS[a, b, c]
                 moved[a, c] += dS[a, b, c] * weighed[b]
-    for c in range(q):
-        for a in range(p):
-            for d in range(q):
-                information[c, d] += de[a, c] * wde[a, d]
-    for c in range(k):
-        for d in range(k):
-            information[c, d] += half[c, d]
+    if t < result.counted:
+        result.told[t], score[:] = 0.0, 0.0
+    else:
+        for c in range(q):
+            for a in range(p):
+                for d in range(q):
+                    information[c, d] += de[a, c] * wde[a, d]
+        for c in range(k):
+            for d in range(k):
+                information[c, d] += half[c, d]
     # The gain is P C'S^-1: with w = S^-1 e it moves by (dP C' w - gain dS w) where it is applied.
     for i in range(size):
         for a in range(p):

@@ -169,7 +169,7 @@ def prepare_filter(
 
 
 def joint_likelihood(
-    prepared: PreparedFilter, outputs: Array, disturbance: Array, x0: Array
+    prepared: PreparedFilter, outputs: Array, disturbance: Array, x0: Array, counted: int = 0
 ) -> Likelihood:
     """Likelihood of one recording.
 
@@ -180,6 +180,9 @@ def joint_likelihood(
         (samples, p) and (samples, d).
     x0 : Array
         What the person takes for the state at the first sample (n,).
+    counted : int
+        The first sample that is told: the likelihood is that of it and the later ones given those
+        before it.
 
     Raises
     ------
@@ -201,6 +204,7 @@ def joint_likelihood(
         np.zeros((samples, size)),
         np.zeros((samples, m)),
         np.full(samples, Status.NOT_REACHED, dtype=np.int8),
+        counted,
     )
     reached = run_filter(
         law.matrices,

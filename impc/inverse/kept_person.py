@@ -31,7 +31,7 @@ def encode_person(fit: PersonFit) -> dict[str, Any]:
     Parameters
     ----------
     fit : PersonFit
-        Of `fit_person` with no kinds of levels held and a prior of spread 1.
+        Of `fit_person` with no kinds of levels held, a prior of spread 1 and every sample told.
     """
     own, space = fit.space.space, fit.space
     K, S = own.given
@@ -66,7 +66,7 @@ def decode_person(problem: Problem, observer: Observer, kept: dict[str, Any]) ->
     levels, split = np.array(kept["levels"]), len(observer.levels)
     own = gain_space(point, None if kept["prices"] is None else decode_prices(kept["prices"]))
     space = PersonCoordinates(own, observer.with_levels(levels[:split]), levels[split:])
-    prior = prior_about(space, Asked(observer, None, (), 1.0))
+    prior = prior_about(space, Asked(observer, None, (), 1.0, 0))
     place = prior.at(np.array(kept["theta"]))
     losing = np.array(kept["losing"])
     return person_at(prior, place, losing, kept["converged"], kept["evaluations"])

@@ -111,7 +111,7 @@ class PersonFit(Frozen):
         return 2 * self.count - 2 * self.log_likelihood
 
 
-@checked(spread=0, max_evaluations=1, recorder="p")
+@checked(spread=0, max_evaluations=1, recorder="p", counted=0)
 def fit_person(
     found: Estimate,
     observer: Observer,
@@ -120,6 +120,7 @@ def fit_person(
     spread: float = 1.0,
     max_evaluations: int = 250,
     held: Sequence[str] = (),
+    counted: int = 0,
 ) -> PersonFit:
     """Fit gain or prices, levels of noise, initial states and parameters by maximum likelihood.
 
@@ -143,6 +144,9 @@ def fit_person(
     held : sequence of str
         Kinds of levels that are not searched but known: of "motor", "share", "process", "sensory"
         and "walk".
+    counted : int
+        The first sample of each trial that is told: those before are given, so that how a person
+        began is not taken for how the person goes on.
 
     Returns
     -------
@@ -180,7 +184,7 @@ def fit_person(
     if unknown := [kind for kind in held if kind not in LEVELS]:
         raise InputError("held", f"got {unknown[0]!r}", f"give some of {', '.join(LEVELS)}")
     problem = found.problem
-    asked = Asked(observer, recorder, held, spread)
+    asked = Asked(observer, recorder, held, spread, counted)
     groups = [[Point(np.array(found.gain), np.array(found.metric), problem)]]
     if found.prices is None:
         groups.append([Point(K, S, problem) for K, S in bryson_starts(problem)])
@@ -229,9 +233,9 @@ def _searched(start: _End, asked: Asked, budget: int) -> _End:
             break
         there, prices = prior.space.unpack(place.theta), prices_at(prior.space, place.theta)
         own = gain_space(there.point, prices)
-        space = PersonCoordinates(own, there.observer, there.recorder, asked.held)
-        prior = prior_about(space, asked)
-        place, spent = prior.at(space.start), spent + 1
+        parts = there.observer, there.recorder, asked.held, asked.counted
+        prior = prior_about(PersonCoordinates(own, *parts), asked)
+        place, spent = prior.at(prior.space.start), spent + 1
     place, losing, more, settled = climb(prior, place, budget - spent + 1)
     return _End(prior, place, losing, spent + more - 1, settled)
 

@@ -52,12 +52,15 @@ class Asked:
         Kinds of levels that are not searched.
     spread : float
         Standard deviation of the prior.
+    counted : int
+        The first sample of each trial that is told.
     """
 
     observer: Observer
     recorder: Array | None
     held: Sequence[str]
     spread: float
+    counted: int
 
 
 def gain_space(point: Point, prices: Array | None) -> Coordinates:
@@ -112,7 +115,7 @@ def likeliest_start(
             own = gain_space(point, prices)
             size = _sizes(own.unpack(own.start))
             white = size.recorder if asked.recorder is None else np.asarray(asked.recorder)
-            space = PersonCoordinates(own, asked.observer, white, asked.held)
+            space = PersonCoordinates(own, asked.observer, white, asked.held, asked.counted)
             guesses = _guesses(space, asked, size)
             value = space.value(guesses[0])
         except ImpcError as error:

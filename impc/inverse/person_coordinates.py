@@ -98,6 +98,8 @@ class PersonCoordinates:
         The recorder's (p,), positive.
     held : collection of str
         Kinds of the person's levels that are not searched, of `LEVELS`.
+    counted : int
+        The first sample of each trial that is told, given those before it.
     """
 
     def __init__(
@@ -106,8 +108,9 @@ class PersonCoordinates:
         observer: Observer,
         recorder: Array,
         held: Collection[str] = (),
+        counted: int = 0,
     ) -> None:
-        self.space, self.observer = space, observer
+        self.space, self.observer, self.counted = space, observer, counted
         self.first = np.concatenate([observer.levels, recorder])
         kinds = [kind for kind in LEVELS for _ in observer.level(kind)]
         free = np.array([*(kind not in held for kind in kinds), *[True] * len(recorder)])
@@ -258,7 +261,9 @@ class PersonCoordinates:
         prepared = prepare_filter(controller, person.observer, person.recorder, along, noise)
 
         def one(trial: Recording) -> Likelihood:
-            return joint_likelihood(prepared, trial.outputs, trial.disturbance, trial.x0)
+            return joint_likelihood(
+                prepared, trial.outputs, trial.disturbance, trial.x0, self.counted
+            )
 
         # The compiled filter lets other threads run.
         with ThreadPoolExecutor(len(problem.recordings)) as pool:

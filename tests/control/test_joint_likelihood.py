@@ -114,7 +114,7 @@ def recorded(who: Someone, samples: int, seed: int = 1) -> PersonTrial:
 
 
 def likelihood(
-    who: Someone, outputs: Array, *, slopes: bool = False, steady: bool = True
+    who: Someone, outputs: Array, *, slopes: bool = False, steady: bool = True, counted: int = 0
 ) -> Likelihood:
     """Along gain (2), levels in their order, the recorder's, and the first state: `moved`."""
     person, q = who.observer(), 11 if slopes else 0
@@ -139,7 +139,8 @@ def likelihood(
     )
     if not steady:
         prepared = replaced(prepared, steady=prepared.steady._replace(known=False))
-    return joint_likelihood(prepared, outputs, push(len(outputs)), np.array(who.start))
+    trial = outputs, push(len(outputs)), np.array(who.start)
+    return joint_likelihood(prepared, *trial, counted)
 
 
 SENSES = [
@@ -225,6 +226,22 @@ def test_the_stationary_covariance_changes_nothing() -> None:
         np.testing.assert_allclose(
             short.score.sum(axis=0), gradient, rtol=0, atol=1e-8 * np.max(np.abs(gradient))
         )
+
+
+@pytest.mark.parametrize("limit", [0.8, 50.0])
+def test_samples_that_are_given_are_not_told(limit: float) -> None:
+    """What is left is the likelihood of all samples less that of the given ones."""
+    who = Someone(limit=limit)
+    outputs = recorded(who, 120).outputs
+    every, first = (likelihood(who, each, slopes=True) for each in (outputs, outputs[:40]))
+    rest = likelihood(who, outputs, slopes=True, counted=40)
+    assert rest.value == pytest.approx(every.value - first.value, rel=1e-12)
+    score = every.score.sum(axis=0) - first.score.sum(axis=0)
+    np.testing.assert_allclose(rest.score.sum(axis=0), score, rtol=1e-9, atol=1e-9)
+    information = every.information - first.information
+    np.testing.assert_allclose(rest.information, information, rtol=1e-9, atol=1e-6)
+    assert not rest.told[:40].any()
+    np.testing.assert_array_equal(rest.filtered, every.filtered)
 
 
 def test_scores_have_the_covariance_that_is_expected() -> None:
