@@ -74,8 +74,10 @@ def test_what_a_follower_senses_is_found() -> None:
 
 
 def test_an_interval_ends_where_a_level_that_is_all_but_none_lets_it() -> None:
-    """The ridge of the recorder's noise moves the cursor's own by many powers of e: searches that
-    began there and nowhere else ended a thousand nats low, and the interval a hundredth away."""
+    """By another search: the ridge of the recorder's noise moves that beside by many powers of e.
+
+    Searches that began there and nowhere else ended a thousand nats low, and the interval at once.
+    """
     fit = fitted().fit
     index = fit.space.own + fit.space.names.index("recorder error")
     value = float(np.log(level_interval(fit, index - fit.space.own)[0]))
