@@ -62,9 +62,8 @@ FIRST = 180
 _LAG = 0.03
 # Where levels begin: px, px/s. Under a blur of 17 px a search from others can end lower.
 _BESIDE, _MOTOR, _SEEN, _FELT, _RECORDER = 0.3, 60.0, 10.0, 20.0, 0.2
-# Logarithm of the price about that of least squares, and how far from it searches begin: a noisy
-# sense and a low price both answer late, and either may be where a search ends.
-_SPREAD, _FAR = 5.0, (0.0, 4.0)
+# Logarithm of the price about that where a search begins.
+_SPREAD = 5.0
 
 
 @dataclass(frozen=True)
@@ -137,19 +136,14 @@ def _fitted(
         walk=float(np.std([trial.disturbance for trial in problem.recordings])),
         persistence=0.0,
     )
-    starts = [replace(least_squares, prices=np.array(least_squares.prices) + far) for far in _FAR]
-    found = [
-        fit_person(
-            start,
-            person,
-            recorder=np.array([_RECORDER]),
-            spread=_SPREAD,
-            held=["walk"],
-            counted=counted,
-        )
-        for start in starts
-    ]
-    return max(found, key=lambda fit: fit.log_likelihood)
+    return fit_person(
+        least_squares,
+        person,
+        recorder=np.array([_RECORDER]),
+        spread=_SPREAD,
+        held=["walk"],
+        counted=counted,
+    )
 
 
 def judged(follower: Follower, condition: Condition, which: IntArray) -> PersonFit:

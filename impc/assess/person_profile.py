@@ -20,7 +20,7 @@ import scipy.linalg
 
 from impc.arrays import Array, frozen
 from impc.assess.person_covariance import HARDLY
-from impc.errors import ImpcError, SolverError
+from impc.errors import ImpcError
 from impc.inverse.likelihood_search import climb
 
 if TYPE_CHECKING:
@@ -198,17 +198,11 @@ def _held(
 
     The search begins on the ridge or beside it, where it is the higher: a straight ridge may leave
     the gains that stabilise, and moves a level that is all but none by many powers of e.
-
-    Raises
-    ------
-    SolverError
-        When neither has a likelihood.
     """
     ways = ridge / float(along @ ridge), along
     starts = [place for way in ways if (place := prior.tried(here.theta + off * way))]
-    if not starts:
-        raise SolverError("profile", "has no likelihood there", "look nearer")
-    begin = max(starts, key=lambda place: place.value)
+    high = max(starts, key=lambda place: place.value, default=None)
+    begin = high or prior.at(here.theta + off * along)  # which says why there is none
     found, losing, _, _ = climb(prior, begin, _BUDGET, _across(along), losing)
     return found, losing
 

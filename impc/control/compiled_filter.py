@@ -254,6 +254,18 @@ def _clip(
     return found.beyond, True
 
 
+@njit(cache=True, nogil=True)
+def _inform(information: Buffer, de: Buffer, wde: Buffer, half: Buffer) -> None:
+    """Add what one sample tells: of its mean de' S^-1 de, of its covariance `half`."""
+    for c in range(de.shape[1]):
+        for a in range(len(de)):
+            for d in range(de.shape[1]):
+                information[c, d] += de[a, c] * wde[a, d]
+    for c in range(len(half)):
+        for d in range(len(half)):
+            information[c, d] += half[c, d]
+
+
 @njit(cache=True, inline="always")
 def _update(
     joint: JointLoop,
@@ -272,7 +284,7 @@ def _update(
     Returns whether directions from `shared` on move the innovation and its covariance by nothing.
     """
     C, dC, S, inverse, gain = joint.C, djoint.C, here.S, here.inverse, here.gain
-    dCP, dS, half, information = here.dCP, here.dS, here.half, result.information
+    dCP, dS = here.dCP, here.dS
     size, p, k, q = len(z), len(output), dS.shape[2], dz.shape[1]
     e, de = output - C @ z, np.zeros((p, q))
     for a in range(p):
@@ -298,13 +310,7 @@ def _update(
     if t < result.counted:
         result.told[t], score[:] = 0.0, 0.0
     else:
-        for c in range(q):
-            for a in range(p):
-                for d in range(q):
-                    information[c, d] += de[a, c] * wde[a, d]
-        for c in range(k):
-            for d in range(k):
-                information[c, d] += half[c, d]
+        _inform(result.information, de, wde, here.half)
     # The gain is P C'S^-1: with w = S^-1 e it moves by (dP C' w - gain dS w) where it is applied.
     for i in range(size):
         for a in range(p):

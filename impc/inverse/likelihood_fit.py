@@ -2,8 +2,9 @@
 
 The search starts from a fit that takes all that it does not explain for noise in the recorder, or
 from a regulator by Bryson's rule where that is likelier once levels of both have been found, and
-climbs from there. One that does not settle is begun from the other too (`likelihood_start`,
-`likelihood_search`; docs/noisy-people.md).
+climbs from there. One that does not settle is begun from the other too, and one for prices of
+somebody who estimates always, from larger prices (`likelihood_start`, `likelihood_search`;
+docs/noisy-people.md).
 """
 
 from __future__ import annotations
@@ -46,6 +47,9 @@ _FIRST = 10
 # A search that comes farther in a round, of the prior's deviation, begins anew from there: its
 # coordinates and prior are those of a gain that is not the person's (docs/noisy-people.md).
 _NEAR, _ROUND = 0.5, 30
+# Logarithm by which prices are larger at the other start: a low price and a noisy sense both answer
+# late, and a search from least squares, which knows no such sense, may end at the first.
+_FAR = 4.0
 
 
 @dataclass(frozen=True)
@@ -185,13 +189,16 @@ def fit_person(
         raise InputError("held", f"got {unknown[0]!r}", f"give some of {', '.join(LEVELS)}")
     problem = found.problem
     asked = Asked(observer, recorder, held, spread, counted)
-    groups = [[Point(np.array(found.gain), np.array(found.metric), problem)]]
+    first = [Point(np.array(found.gain), np.array(found.metric), problem)]
+    starts: list[tuple[list[Point], Array | None]] = [(first, found.prices)]
     if found.prices is None:
-        groups.append([Point(K, S, problem) for K, S in bryson_starts(problem)])
+        starts.append(([Point(K, S, problem) for K, S in bryson_starts(problem)], None))
+    elif observer.estimates:
+        starts.append((first, np.array(found.prices) + _FAR))
     begun, reasons = [], []
-    for points in groups:
+    for points, prices in starts:
         try:
-            prior, theta = likeliest_start(points, found.prices, asked)
+            prior, theta = likeliest_start(points, prices, asked)
             begun.append(_levelled(prior, theta, min(_FIRST, max_evaluations)))
         except ImpcError as error:
             reasons.append(error)
@@ -201,7 +208,7 @@ def fit_person(
     for start in sorted(begun, key=lambda one: -one.place.told.value):
         ends.append(_searched(start, asked, max_evaluations - spent))
         spent += ends[-1].spent
-        if ends[-1].settled:
+        if ends[-1].settled and found.prices is None:
             break
     end = max(ends, key=lambda one: one.place.told.value)
     return person_at(end.prior, end.place, end.losing, end.settled, spent)
