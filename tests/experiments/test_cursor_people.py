@@ -10,7 +10,7 @@ import scipy.optimize
 import scipy.stats
 
 import plants
-from experiments.cursor_data import RATE, Condition
+from experiments.cursor_data import RATE, Condition, data_file, read_conditions
 from experiments.cursor_people import FIRST, Follower, fit_follower, judged, nats, regression_nats
 from impc.assess.person_covariance import person_covariance
 from impc.assess.person_profile import level_interval
@@ -94,6 +94,19 @@ def test_an_interval_ends_where_a_level_that_is_all_but_none_lets_it() -> None:
     )
     # Half of 1.96^2; the root of what has fallen is found to .04 of 1.39.
     assert found.fun == pytest.approx(1.92, abs=0.15)
+
+
+@pytest.mark.full
+@pytest.mark.recordings
+@pytest.mark.skipif(not data_file().exists(), reason=f"{data_file().name} is not there")
+def test_a_noisy_sense_is_not_taken_for_a_low_price() -> None:
+    """The most blurred target: from the price of least squares the search ends at 2, and 4 px."""
+    condition = read_conditions(data_file())[5]
+    found = fit_follower(condition, np.arange(len(condition.target)), (14,)).fit
+    levels = dict(zip(found.space.names, np.exp(found.theta[found.space.own :]), strict=True))
+    assert found.prices is not None
+    assert np.exp(found.prices[0]) > 20
+    assert levels["sensory error"] > 20
 
 
 def test_trials_are_judged_as_they_were_fitted() -> None:
