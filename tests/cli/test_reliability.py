@@ -20,6 +20,8 @@ from impc.studies.reliability.findings import QUOTED
 from impc.studies.reliability.icc import icc
 from impc.studies.reliability.verdict import band_of
 
+pytestmark = pytest.mark.long
+
 
 def run(*arguments: str) -> Result:
     return CliRunner().invoke(main, list(arguments))

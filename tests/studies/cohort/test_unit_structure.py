@@ -23,6 +23,8 @@ from impc.studies.cohort.unit_structure import structure_row
 from impc.studies.cohort.unit_task import fit_unit
 from tests.studies.cohort.carts import write_study
 
+pytestmark = pytest.mark.long
+
 STRUCTURE = '[fit.structure]\nQ = ["x[0]", "x[1]"]\n'
 
 

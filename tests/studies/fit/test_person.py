@@ -23,6 +23,8 @@ from impc.studies.fit.settings import FitSettings, fit_observer, fit_settings
 from impc.studies.fit.subject import fit_problem, fit_recordings, stages
 from tests.inverse.test_likelihood_fit import cart
 
+pytestmark = pytest.mark.long
+
 TABLE: dict[str, Any] = {
     "horizon": 5,
     "u_max": 0.9,

@@ -49,6 +49,7 @@ def fitted(cross: float) -> FitResult:
     return fit_recordings(fit_problem(plant, trials, settings), settings)
 
 
+@pytest.mark.long
 def test_statements_within_a_structure_that_holds() -> None:
     result = fitted(0.0)
     lines = structure_sentences(result)
