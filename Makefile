@@ -42,7 +42,7 @@ endif
 help:
 	@echo 'make demo    set up .venv and run the example:   impc example'
 	@echo 'make test    set up .venv, then check and pytest: all that matters, about five minutes'
-	@echo 'make long    documents that run, experiments, whole studies, mutated files: two minutes more'
+	@echo 'make long    documents that run, experiments, whole studies, mutated files: three minutes more'
 	@echo 'make full    the site, and studies in full size: five minutes more, before a merge'
 	@echo 'make check   ruff check, ruff format --check, mypy --strict'
 	@echo 'make slow    hundreds of recordings, fits and subjects: an hour'
