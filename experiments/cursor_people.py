@@ -153,7 +153,9 @@ def judged(follower: Follower, condition: Condition, which: IntArray) -> PersonF
     there = other.at(np.array(other.starts), np.array(fit.problem.logarithms))
     posed = replace(there, structure=fit.problem.structure)
     prices = gain_space(Point(np.array(fit.K), np.array(fit.S), posed), fit.prices)
-    space = PersonCoordinates(prices, fit.observer, np.array(fit.recorder))
+    space = PersonCoordinates(
+        prices, fit.observer, np.array(fit.recorder), counted=fit.space.counted
+    )
     told = space.told(space.start)
     return dataclasses.replace(fit, problem=there, told=told, log_likelihood=told.value)
 

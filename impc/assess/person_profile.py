@@ -20,7 +20,6 @@ import scipy.linalg
 
 from impc.arrays import Array, frozen
 from impc.assess.person_covariance import HARDLY
-from impc.errors import ImpcError
 from impc.inverse.likelihood_search import climb
 
 if TYPE_CHECKING:
@@ -147,10 +146,8 @@ def fallen(fit: PersonFit, along: Array, value: float) -> float:
     top = prior.placed(np.array(fit.theta), fit.told)
     ridge = np.asarray(np.linalg.solve(prior.parabola(top, losing)[1], along), dtype=np.float64)
     off = value - float(along @ top.theta)
-    try:
-        return top.value - _held(prior, top, along, off, ridge, losing)[0].value
-    except ImpcError:  # no filter there
-        return np.inf
+    found = _held(prior, top, along, off, ridge, losing)
+    return np.inf if found is None else top.value - found[0].value
 
 
 def _end(fit: PersonFit, along: Array, side: int) -> float:
@@ -173,12 +170,11 @@ def _end(fit: PersonFit, along: Array, side: int) -> float:
         goal = side * min(side * goal, side * value + _LONGEST, side * begin + FARTHEST)
         if not side * inside < side * goal < side * outside:
             goal = (inside + outside) / 2 if np.isfinite(outside) else inside + side * _LONGEST
-        try:
-            here, losing = _held(prior, here, along, goal - value, ridge, losing)
-        except ImpcError:  # no filter there: as far as an end may be
+        found = _held(prior, here, along, goal - value, ridge, losing)
+        if found is None:  # as far as an end may be
             outside = goal
             continue
-        value = goal
+        (here, losing), value = found, goal
         root = float(np.sqrt(max(top - here.value, 0.0)))
         if abs(root - _FALLEN) < _CLOSE:
             return value
@@ -193,16 +189,17 @@ def _end(fit: PersonFit, along: Array, side: int) -> float:
 
 def _held(
     prior: Prior, here: Place, along: Array, off: float, ridge: Array, losing: Array
-) -> tuple[Place, Array]:
-    """The best of all else so far off, and the slope of what levels lose there.
+) -> tuple[Place, Array] | None:
+    """The best of all else so far off, and the slope of what levels lose; None without a filter.
 
     The search begins on the ridge or beside it, where it is the higher: a straight ridge may leave
     the gains that stabilise, and moves a level that is all but none by many powers of e.
     """
     ways = ridge / float(along @ ridge), along
     starts = [place for way in ways if (place := prior.tried(here.theta + off * way))]
-    high = max(starts, key=lambda place: place.value, default=None)
-    begin = high or prior.at(here.theta + off * along)  # which says why there is none
+    if not starts:
+        return None
+    begin = max(starts, key=lambda place: place.value)
     found, losing, _, _ = climb(prior, begin, _BUDGET, _across(along), losing)
     return found, losing
 

@@ -131,7 +131,8 @@ def fit_person(
     Parameters
     ----------
     found : Estimate
-        Where the search begins; of the method "structured", prices are searched and not a gain.
+        Where the search begins; of the method "structured", prices are searched and not a gain, of
+        somebody who estimates from larger ones too.
         Of another method, where the problem has a structure that leaves states without a price and
         no parameters are searched, the gain keeps to the span of gains that such weights have.
     observer : Observer
@@ -159,7 +160,7 @@ def fit_person(
     Raises
     ------
     InputError
-        When a kind of levels is none of these.
+        When a kind of levels is none of these, or a trial has no sample that is told.
     SolverError
         When no start has a likelihood.
 
@@ -188,6 +189,10 @@ def fit_person(
     if unknown := [kind for kind in held if kind not in LEVELS]:
         raise InputError("held", f"got {unknown[0]!r}", f"give some of {', '.join(LEVELS)}")
     problem = found.problem
+    shortest = min(trial.samples for trial in problem.recordings)
+    if counted >= shortest:
+        left = f"got {counted}, and the shortest trial has {shortest} samples"
+        raise InputError("counted", left, "give fewer")
     asked = Asked(observer, recorder, held, spread, counted)
     first = [Point(np.array(found.gain), np.array(found.metric), problem)]
     starts: list[tuple[list[Point], Array | None]] = [(first, found.prices)]

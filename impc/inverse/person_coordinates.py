@@ -8,6 +8,7 @@ person's noise, and of the recorder's (docs/noisy-people.md).
 
 from __future__ import annotations
 
+import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -266,7 +267,7 @@ class PersonCoordinates:
             )
 
         # The compiled filter lets other threads run.
-        with ThreadPoolExecutor(len(problem.recordings)) as pool:
+        with ThreadPoolExecutor(min(len(problem.recordings), os.cpu_count() or 1)) as pool:
             return list(pool.map(one, problem.recordings))
 
     def _directions(

@@ -6,7 +6,6 @@ import functools
 
 import numpy as np
 import pytest
-import scipy.optimize
 import scipy.stats
 
 import plants
@@ -20,6 +19,8 @@ from impc.model.bounds import Bounds
 from impc.model.observer import Observer
 from impc.model.plant import Plant
 from impc.model.structure import Structure
+from tests.experiments.recordings import recorded
+from tests.support import nelder_mead
 
 pytestmark = pytest.mark.long
 
@@ -89,16 +90,12 @@ def test_an_interval_ends_where_a_level_that_is_all_but_none_lets_it() -> None:
 
     fit_value = prior.placed(np.array(fit.theta), fit.told).value
     rest = np.delete(np.array(fit.theta), index)
-    found = scipy.optimize.minimize(
-        lower, rest, method="Nelder-Mead", options={"maxfev": 400, "adaptive": True}
-    )
     # Half of 1.96^2; the root of what has fallen is found to .04 of 1.39.
-    assert found.fun == pytest.approx(1.92, abs=0.15)
+    assert nelder_mead(lower, rest, 400) == pytest.approx(1.92, abs=0.15)
 
 
 @pytest.mark.full
-@pytest.mark.recordings
-@pytest.mark.skipif(not data_file().exists(), reason=f"{data_file().name} is not there")
+@recorded
 def test_a_noisy_sense_is_not_taken_for_a_low_price() -> None:
     """The most blurred target: from the price of least squares the search ends at 2, and 4 px."""
     condition = read_conditions(data_file())[5]

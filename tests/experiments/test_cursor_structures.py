@@ -7,12 +7,13 @@ import pytest
 
 from experiments.cursor_data import data_file, read_conditions
 from experiments.cursor_structures import STRUCTURES, structure_rows
+from tests.experiments.recordings import recorded
 
 pytestmark = pytest.mark.long
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not data_file().is_file(), reason="the recordings are not there")
+@recorded
 def test_the_error_alone_predicts_as_well_as_any_weights() -> None:
     """At 13 px; a minute."""
     rows = structure_rows(read_conditions(data_file())[1])

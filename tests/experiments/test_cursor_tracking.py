@@ -12,18 +12,12 @@ from experiments.cursor_ceiling import fit_step_response, follow
 from experiments.cursor_data import RATE, Condition, data_file, read_conditions
 from experiments.cursor_tracking import left_out_vaf
 from impc.errors import DataError
+from tests.experiments.recordings import recorded
 
 pytestmark = pytest.mark.long
 
 #: Leave-one-trial-out VAF of a delayed second-order feedback, from the sharpest target on.
 REFERENCE = (86.7, 82.7, 84.3, 80.1, 57.8, 48.4)
-
-recorded = [
-    pytest.mark.recordings,
-    pytest.mark.skipif(
-        not data_file().exists(), reason=f"{data_file().name} is not there (IMPC_CURSOR_DATA)"
-    ),
-]
 
 
 def mean_left_out(condition: Condition) -> tuple[float, float]:
@@ -71,10 +65,9 @@ def test_an_absent_file_is_said(tmp_path: Path) -> None:
         read_conditions(tmp_path / "nothing.mat")
 
 
+@recorded
 @pytest.mark.parametrize("index", [5])
 class TestRecordings:
-    pytestmark = recorded
-
     def test_left_out_trials_are_predicted(self, index: int) -> None:
         """At least the reference less a point, and as well as our own delayed feedback."""
         ours, baseline = mean_left_out(read_conditions(data_file())[index])
@@ -82,11 +75,10 @@ class TestRecordings:
         assert ours >= baseline - 1.0
 
 
+@recorded
 @pytest.mark.slow
 @pytest.mark.parametrize("index", range(6))
 class TestAllRecordings:
-    pytestmark = recorded
-
     def test_left_out_trials_are_predicted(self, index: int) -> None:
         ours, baseline = mean_left_out(read_conditions(data_file())[index])
         assert ours >= REFERENCE[index] - 1.0

@@ -147,6 +147,12 @@ def test_a_level_that_is_known_is_not_searched(noisy: tuple[Observer, Estimate])
         fit_person(noisy[1], noisy[0], held=["noise"])
 
 
+def test_a_trial_of_which_nothing_is_told_is_refused(noisy: tuple[Observer, Estimate]) -> None:
+    """Everything would be given, and the prior taken for what was found."""
+    with pytest.raises(InputError, match="counted: got 400, and the shortest trial has 400"):
+        fit_person(noisy[1], noisy[0], counted=400)
+
+
 @pytest.mark.parametrize("logarithm", [400.0, -400.0, 1000.0, np.nan])
 def test_a_level_that_cannot_be_squared_has_no_likelihood(
     fitted: PersonFit, logarithm: float
