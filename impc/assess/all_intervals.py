@@ -20,8 +20,8 @@ from impc.assess.profiles import profile_likelihood
 from impc.assess.resampling import (
     DRAWS,
     bootstrap_intervals,
+    bootstrap_model,
     replicate,
-    simulated_outputs,
 )
 
 if TYPE_CHECKING:
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from impc.assess.weights_ranges import WeightsSummary
     from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
-    from impc.model.weights import Weights
 
 __all__ = ["Asked", "Certainty", "assess", "count_stages"]
 
@@ -158,7 +157,7 @@ def assess(
     alternatives: tuple[Alternative, ...] = ()
     if settings.horizons:
         alternatives = fit_alternatives(problem, fitted, settings.horizons, settings.settle, done)
-    intervals += _bootstrap(fitted.stage_weights, estimate, settings, done, remember)
+    intervals += _bootstrap(estimate, settings, done, remember)
     return Certainty(tuple(intervals), *weights, tuple(limits), alternatives)
 
 
@@ -167,7 +166,6 @@ def _limit_interval(found: LimitEstimate, control: str) -> Interval:
 
 
 def _bootstrap(
-    weights: Weights,
     estimate: GainEstimate,
     settings: Asked,
     done: Callable[[str], None],
@@ -175,12 +173,12 @@ def _bootstrap(
 ) -> tuple[Interval, ...]:
     if not settings.replicates:
         return ()
-    draw, problem = DRAWS[settings.bootstrap], estimate.problem
-    clean = simulated_outputs(problem, np.array(estimate.K), np.array(estimate.S))
+    draw = DRAWS[settings.bootstrap]
+    model = bootstrap_model(estimate.problem, np.array(estimate.K), np.array(estimate.S))
     found = []
     for index in range(settings.replicates):
         name = f"replicate {index + 1}"
-        compute = functools.partial(replicate, problem, clean, weights, index, settings.seed, draw)
+        compute = functools.partial(replicate, model, index, settings.seed, draw)
         found.append(remember(name, compute))
         done(name)
     return bootstrap_intervals(estimate, found, settings.bootstrap, LEVEL)

@@ -133,6 +133,7 @@ def gain_covariance(
     noise: Callable[[list[Array], TrialSpan], ResidualNoise] = residual_noise,
     *,
     curvature: bool = False,
+    evaluation: Evaluation | None = None,
 ) -> GainCovariance:
     """Covariance of a gain fitted by least squares, and of the parameters fitted with it.
 
@@ -148,10 +149,12 @@ def gain_covariance(
     curvature : bool
         Whether the deviations of told directions count what those that are not told do to them to
         second order, were these wrong by their deviation, or by the natural size of a gain.
+    evaluation : Evaluation, optional
+        Of the problem at this gain and metric, where it is known.
     """
     m, n = problem.plant.m, problem.plant.n
     T, G = natural_coordinates(problem.plant, gain)
-    found = evaluate(problem, gain, metric)
+    found = evaluation or evaluate(problem, gain, metric)
     in_units = np.kron(G, np.linalg.inv(T).T)
     on_gain = found.dK.reshape(-1, m * n) @ in_units
     with_gain, alone = metric_changes(problem.plant, gain, metric, T, G)

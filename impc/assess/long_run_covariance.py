@@ -30,6 +30,7 @@ import numpy as np
 import scipy.signal
 
 from impc.arrays import Array, Frozen, frozen
+from impc.assess.compiled_colour import coloured_nearby
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -44,8 +45,8 @@ __all__ = ["ResidualNoise", "residual_noise", "spread_of_sum", "white_noise"]
 _LARGEST_ROOT = 0.97
 # Samples before the first over which noise still has an effect: 0.97^250 is 5e-4.
 _BEFORE = 250
-# Lags up to which sums by shifts take less time than Fourier transforms: with three, a fifth.
-_FEW_LAGS = 8
+# Lags up to which plain sums take less time than Fourier transforms: with eight, a seventh.
+_FEW_LAGS = 32
 # Of giving back what a fit takes, which is told by the colour that is sought.
 _ROUNDS = 3
 
@@ -166,11 +167,13 @@ def _given_back(taken: list[Taken], largest: int) -> Array:
     """Sums of lagged products that a fit has taken, as `_lagged`."""
     count = taken[0][0].shape[1] if taken else 1
     result = np.zeros((largest + 1, count, count))
-    for one, two in taken:
-        for lag in range(largest + 1):
-            for ahead, behind in ((one, two), (two, one)):
-                last = len(one) - lag
-                result[lag] += np.tensordot(ahead[lag:], behind[:last], ((0, 2), (0, 2)))
+    for pair in taken:
+        # One output after the other: each sum is then over one piece of memory.
+        one, two = (np.ascontiguousarray(np.swapaxes(part, 0, 1)) for part in pair)
+        for ahead, behind in ((one, two), (two, one)):
+            for lag, i, j in np.ndindex(result.shape):
+                last = one.shape[1] - lag
+                result[lag, i, j] += np.vdot(ahead[i, lag:], behind[j, :last])
     return result
 
 
@@ -197,15 +200,7 @@ def _coloured(columns: Array, gammas: Array) -> Array:
     """sum_s Gamma_{t-s} columns_s for columns (samples, p, k), Gamma_{-l} = Gamma_l'."""
     if len(gammas) > _FEW_LAGS:
         return _convolved(columns, gammas)
-    samples, outputs = columns.shape[:2]
-    result = np.zeros_like(columns)
-    for lag, gamma in enumerate(gammas[:samples]):
-        ahead, behind = slice(lag, None), slice(None, samples - lag)
-        for i, j in np.ndindex(outputs, outputs):
-            result[ahead, i] += gamma[i, j] * columns[behind, j]
-            if lag:
-                result[behind, i] += gamma[j, i] * columns[ahead, j]
-    return result
+    return np.asarray(coloured_nearby(np.ascontiguousarray(columns), gammas))
 
 
 def _convolved(columns: Array, gammas: Array) -> Array:

@@ -9,6 +9,8 @@ The disturbance is known and the same in every replicate; only the residuals are
                     of its innovations drawn one by one, so that outputs keep their correlation
 
 Replicate k draws from the k-th child of the seed: the same numbers in any order, on any machine.
+Its search begins at the estimate and moves the gain alone (`told_gain`): fitting weights anew would
+take most of its time, and their gain is not what is printed.
 """
 
 from __future__ import annotations
@@ -25,7 +27,6 @@ from impc.assess.intervals import Interval, entry_names
 from impc.assess.printed_gain import told_gain
 from impc.checking import replace
 from impc.control.closed_loop import simulate
-from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.problem import controller_for, scenarios
 
 if TYPE_CHECKING:
@@ -33,18 +34,18 @@ if TYPE_CHECKING:
 
     from impc.assess.printed_gain import GainEstimate
     from impc.inverse.problem import Problem
-    from impc.model.weights import Weights
 
 __all__ = [
     "DRAWS",
+    "BootstrapModel",
     "Draw",
     "Replicate",
     "block_length",
     "block_residuals",
     "bootstrap_intervals",
+    "bootstrap_model",
     "model_residuals",
     "replicate",
-    "simulated_outputs",
 ]
 
 #: Draws residuals again: (residuals (samples, p) of each trial, generator) -> as many.
@@ -70,24 +71,55 @@ class Replicate(Frozen):
     parameters: Array
 
 
-def replicate(
-    problem: Problem,
-    clean: Sequence[Array],
-    start: Weights,
-    index: int,
-    seed: int,
-    resample: Draw,
-) -> Replicate:
-    """One replicate, by its number.
+@dataclass(frozen=True)
+class BootstrapModel(Frozen):
+    """The estimate that replicates are drawn from.
+
+    Attributes
+    ----------
+    problem : Problem
+        At its initial states and parameters.
+    K : Array
+        (m, n).
+    S : Array
+        (m, m).
+    outputs : tuple of Array
+        Simulated without noise, (samples, p) of each trial.
+    """
+
+    problem: Problem
+    K: Array
+    S: Array
+    outputs: tuple[Array, ...]
+
+
+def bootstrap_model(problem: Problem, gain: Array, metric: Array) -> BootstrapModel:
+    """Simulate an estimate once, for all replicates.
 
     Parameters
     ----------
     problem : Problem
         At the initial states and parameters of the estimate.
-    clean : sequence of Array
-        `simulated_outputs` of the estimate, (samples, p) each.
-    start : Weights
-        Where the fit begins.
+    gain, metric : Array
+        K (m, n) and S (m, m).
+
+    Raises
+    ------
+    InputError, SolverError
+        As `controller_for`.
+    """
+    controller = controller_for(problem, gain, metric)
+    runs = [simulate(controller, drive) for drive in scenarios(problem)]
+    outputs = tuple(frozen(run.x @ problem.plant.C.T) for run in runs)
+    return BootstrapModel(problem, frozen(gain), frozen(metric), outputs)
+
+
+def replicate(model: BootstrapModel, index: int, seed: int, resample: Draw) -> Replicate:
+    """One replicate, by its number.
+
+    Parameters
+    ----------
+    model : BootstrapModel
     index : int
         The child of the seed that it draws from, from 0.
     seed : int
@@ -97,20 +129,21 @@ def replicate(
 
     Raises
     ------
-    WeightsError, SolverError
+    SolverError
         When it cannot be fitted.
     """
+    recordings = model.problem.recordings
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index,)))
     residuals = [
         np.asarray(trial.outputs - outputs)
-        for trial, outputs in zip(problem.recordings, clean, strict=True)
+        for trial, outputs in zip(recordings, model.outputs, strict=True)
     ]
     drawn = resample(residuals, rng)
     trials = tuple(
         replace(trial, outputs=frozen(outputs + noise))
-        for trial, outputs, noise in zip(problem.recordings, clean, drawn, strict=True)
+        for trial, outputs, noise in zip(recordings, model.outputs, drawn, strict=True)
     )
-    again = told_gain(fit_controller(replace(problem, recordings=trials), start))
+    again = told_gain(replace(model.problem, recordings=trials), model.K, model.S)
     return Replicate(again.K, frozen(again.parameters))
 
 
@@ -214,16 +247,3 @@ def _autoregression(parts: list[Array]) -> Array:
         if criterion < best:
             best, chosen = criterion, np.append(1.0, -coefficients)
     return np.asarray(chosen)
-
-
-def simulated_outputs(problem: Problem, gain: Array, metric: Array) -> list[Array]:
-    """Outputs (samples, p) of every trial of a `problem` at a `gain` (m, n) and `metric` (m, m).
-
-    Raises
-    ------
-    InputError, SolverError
-        As `controller_for`.
-    """
-    controller = controller_for(problem, gain, metric)
-    runs = [simulate(controller, drive) for drive in scenarios(problem)]
-    return [np.asarray(run.x @ problem.plant.C.T) for run in runs]

@@ -134,7 +134,7 @@ class Coordinates:
             self.gains = regulators_alone(self.gains, plant, structure, self.T)
         self.tril = np.tril_indices(self.m)
         self.refused: list[str] = []
-        self.last: tuple[bytes, Compressed] | None = None
+        self.last: tuple[bytes, Evaluation, Compressed] | None = None
         self.near: TerminalSet | None = None
         sizes = (
             len(self.gains.gains),
@@ -171,15 +171,20 @@ class Coordinates:
 
     def at(self, z: Array) -> Compressed:
         """Residual and derivative at z (q,)."""
+        return self.evaluated(z)[1]
+
+    def evaluated(self, z: Array, known: Evaluation | None = None) -> tuple[Evaluation, Compressed]:
+        """The same at z (q,), as it was computed and compressed; `known` from another search."""
         key = z.tobytes()
         if self.last is None or self.last[0] != key:
+            self.last = None  # of hundreds of trials there is no room for two
             here = self.unpack(z)
-            evaluation = evaluate(here.problem, here.K, here.S, self.near)
-            self.near = evaluation.terminal or self.near
-            if evaluation.reason:
-                self.refused.append(evaluation.reason)
-            self.last = (key, self._compress(evaluation, *self.changes(here, z)))
-        return self.last[1]
+            found = known or evaluate(here.problem, here.K, here.S, self.near)
+            self.near = found.terminal or self.near
+            if found.reason:
+                self.refused.append(found.reason)
+            self.last = key, found, self._compress(found, *self.changes(here, z))
+        return self.last[1:]
 
     def with_prior(self, weight: float) -> WithPrior:
         """The residual followed by weight * (z - start); nothing follows for a weight of 0."""

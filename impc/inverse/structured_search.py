@@ -26,7 +26,7 @@ from impc.checking import replace
 from impc.errors import WeightsError
 from impc.inverse.arrow import Tolerances
 from impc.inverse.consistent_pairs import scaled_changes
-from impc.inverse.coordinates import PARAMETER_UNIT, Compressed, Coordinates, Point
+from impc.inverse.coordinates import PARAMETER_UNIT, Coordinates, Point
 from impc.inverse.many_trials import has_many_trials, search_many
 from impc.inverse.problem import recorded_size
 from impc.inverse.residuals import evaluate, unusable
@@ -35,7 +35,9 @@ from impc.model.riccati import LqrSolution, regulator_changes, solve_lqr
 
 if TYPE_CHECKING:
     from impc.arrays import BoolArray
+    from impc.inverse.coordinates import Compressed
     from impc.inverse.problem import Problem
+    from impc.inverse.residuals import Evaluation
     from impc.model.structure import Structure
 
 __all__ = ["PriceCoordinates", "StructuredEnd", "regulator_slopes", "search_from"]
@@ -142,16 +144,16 @@ class PriceCoordinates(Coordinates):
         found = self.solved[1]
         return Point(np.array(found.K), np.array(found.S), problem)
 
-    def at(self, z: Array) -> Compressed:
+    def evaluated(self, z: Array, known: Evaluation | None = None) -> tuple[Evaluation, Compressed]:
         """Residual and derivative at z (q,), a large residual where there is no regulator."""
         try:
-            return super().at(z)
+            return super().evaluated(z, known)
         except WeightsError as error:
             self.refused.append(str(error))
             nothing = np.zeros((len(z), self.m, self.n)), np.zeros((len(z), self.m, self.m))
-            found = self._compress(unusable(self.problem, str(error)), *nothing)
-            self.last = (z.tobytes(), found)
-            return found
+            found = unusable(self.problem, str(error))
+            self.last = z.tobytes(), found, self._compress(found, *nothing)
+            return self.last[1:]
 
     def changes(self, here: Point, z: Array) -> tuple[Array, Array]:
         """Change of K (q, m, n), and of S scaled to trace m (q, m, m), with each of z (q,)."""

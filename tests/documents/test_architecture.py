@@ -17,6 +17,8 @@ from tests.documents.blocks import PAGES, ROOT, blocks
 # says why it is no less.
 FLOORS = 20
 ORDER = list(ROOMS)
+# Files of users that docs/troubleshooting.md speaks of.
+_OF_USERS = {"control.py", "file.py"}
 CODE = [path for folder in ("impc", "plants", "experiments", "tests", "docs")
         for path in sorted((ROOT / folder).rglob("*.py"))
         if "_tutorials" not in path.parts]  # fmt: skip  # made by the site's build
@@ -121,7 +123,7 @@ def test_no_public_name_hides_a_module() -> None:
 
 @pytest.mark.parametrize("page", list(PAGES))
 def test_every_file_that_a_page_names_is_there(page: str) -> None:
-    """Paths of the code in full: impc/..., plants/..., tests/..., experiments/..., docs/...."""
+    """Paths of the code in full, impc/..., plants/... and so on, and names of modules alone."""
     text = PAGES[page].read_text(encoding="utf-8")
     prose = re.sub(r"^ *```.*?^ *```$", "", text, flags=re.MULTILINE | re.DOTALL)
     named = re.findall(
@@ -129,6 +131,8 @@ def test_every_file_that_a_page_names_is_there(page: str) -> None:
         prose,
     )
     new = {block.file for block in blocks(page)}
+    modules = {path.name for path in CODE} | new | _OF_USERS
+    assert set(re.findall(r"`(\w+\.py)`", prose)) <= modules
     assert [
         name
         for name in sorted(set(named))

@@ -23,14 +23,13 @@ from impc.assess.held_out import predict
 from impc.assess.intent_rules import intent
 from impc.assess.judged import judge
 from impc.assess.printed_gain import gain_estimate
-from impc.assess.resampling import DRAWS, replicate, simulated_outputs
+from impc.assess.resampling import DRAWS, bootstrap_model, replicate
 from impc.checking import replace
 from impc.errors import ImpcError
 from impc.files.plant_sources import make_plant, plant_family_of, plant_source
 from impc.files.reading import read_recordings
 from impc.inverse.noisy_fit import fit_controller
 from impc.model.signal_units import price_unit
-from impc.model.weights import Weights
 from impc.reporting.rendering import plain
 from impc.reporting.shown_units import angles_in, shown_unit
 from impc.studies.cohort.unit_digest import require_same_inputs, unit_digest
@@ -101,14 +100,8 @@ def replicate_unit(task: FitTask, fit: dict[str, Any], index: int) -> dict[str, 
     try:
         problem, settings = unit_problem(task)
         here = problem.at(np.array(fit["starts"]), np.array(fit["logarithms"]))
-        found = replicate(
-            here,
-            simulated_outputs(here, np.array(fit["K"]), np.array(fit["S"])),
-            Weights(fit["Q"], fit["R"]),
-            index,
-            settings.seed,
-            DRAWS[settings.bootstrap],
-        )
+        model = bootstrap_model(here, np.array(fit["K"]), np.array(fit["S"]))
+        found = replicate(model, index, settings.seed, DRAWS[settings.bootstrap])
     except ImpcError as error:
         return {"reason": str(error)}
     content = {

@@ -94,7 +94,8 @@ def simulated_fits(
         noisy = _measured(person, problem, np.random.default_rng([seed, number]))
         try:
             end = search_from(noisy, person.structure, truth)
-            gain = told_gain(structured_estimate(noisy, person.structure, end)).K
+            fitted = structured_estimate(noisy, person.structure, end)
+            gain = told_gain(fitted.problem, np.array(fitted.gain), np.array(fitted.metric)).K
         except ImpcError:  # counted, and told
             failed += 1
         else:

@@ -1,0 +1,24 @@
+"""Sums over nearby lags against the whole matrix of the noise's covariances."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from impc.assess.compiled_colour import coloured_nearby
+
+
+@pytest.mark.parametrize(("samples", "lags"), [(9, 1), (9, 4), (3, 5)])
+def test_sums_are_those_of_the_whole_covariance_matrix(samples: int, lags: int) -> None:
+    """Two outputs, whose covariances are not the same forth and back; more lags than samples."""
+    rng = np.random.default_rng(samples + lags)
+    columns = rng.standard_normal((samples, 2, 3))
+    gammas = rng.standard_normal((lags, 2, 2))
+    gammas[0] += gammas[0].T
+    whole = np.zeros((samples, 2, samples, 2))
+    for t, s in np.ndindex(samples, samples):
+        if abs(t - s) < lags:
+            whole[t, :, s, :] = gammas[t - s] if t >= s else gammas[s - t].T
+    np.testing.assert_allclose(
+        coloured_nearby(columns, gammas), np.tensordot(whole, columns, 2), atol=1e-13
+    )
