@@ -136,7 +136,7 @@ numerics: .venv-oldest/.stamp .venv-newest/.stamp
 PEOPLE = $(PY) -m experiments.noisy_people_study
 noisy-people: env
 	$(PEOPLE) run --subjects 200 --out results/noisy-people.jsonl
-	$(PEOPLE) run --body seat --subjects 20 --no-profiles --out results/noisy-people.jsonl
+	$(PEOPLE) run --body seat --subjects 20 --no-level-profiles --out results/noisy-people.jsonl
 	$(PEOPLE) sum results/noisy-people.jsonl
 
 # Hundreds of simulated subjects: the table of docs/structures.md.

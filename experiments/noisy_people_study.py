@@ -52,6 +52,8 @@ _LIMITS = {
 _SHARES, _FALLEN = (0.12, 0.40), 1.0
 # A direction of the gain is determined when its deviation is below this, in natural coordinates.
 _DETERMINED = 0.25
+# An entry is told when its deviation is below this share of it.
+_TOLD = 0.5
 # As far below the truth a search may end, nats.
 _ENDED = 0.5
 
@@ -78,9 +80,12 @@ class Score:
     least, likely, expected : list of pairs
         Error and deviation along each direction that the method tells, the best first: of least
         squares, and of maximum likelihood by the sandwich with curvature and as expected.
+    entries : list of pairs
+        Error and deviation of each entry of the gain, as shares of the entry, with the deviation
+        that is printed.
     fell : list of float
         By how many nats the likelihood falls with each of the directions of `likely` held at the
-        truth; none where not asked for.
+        truth.
     levels, found : list of float
         Motor, senses, recorder: true, and found.
     level_deviations : list of float
@@ -104,6 +109,7 @@ class Score:
     least: list[tuple[float, float]]
     likely: list[tuple[float, float]]
     expected: list[tuple[float, float]]
+    entries: list[tuple[float, float]]
     fell: list[float]
     levels: list[float]
     found: list[float]
@@ -112,8 +118,8 @@ class Score:
     seconds: list[float]
 
 
-def score(who: Subject, trials: Recorded, study: str, seed: int, *, profiled: bool = True) -> Score:
-    """Both fits of a subject, with deviations, and with profiles where they are asked for."""
+def score(who: Subject, trials: Recorded, study: str, seed: int, *, levels: bool = True) -> Score:
+    """Both fits of a subject, with profiles of the gain and, where asked for, of `levels`."""
     truth = np.array(who.controller.K)
     clock = [time.process_time()]
     first = estimate(trials.problem)
@@ -125,9 +131,9 @@ def score(who: Subject, trials: Recorded, study: str, seed: int, *, profiled: bo
     robust = with_curvature(likely, person_covariance(likely))
     clock.append(time.process_time())
     values = np.exp(likely.theta[likely.space.own :])
-    fell = _fell(likely, robust, true_unknowns(likely, who)) if profiled else []
+    fell = _fell(likely, robust, true_unknowns(likely, who))
     clock.append(time.process_time())
-    profiles = level_intervals(likely, expected) if profiled else np.zeros((0, 2))
+    profiles = level_intervals(likely, expected) if levels else np.zeros((0, 2))
     clock.append(time.process_time())
     size = float(np.linalg.norm(truth @ least.T))
     return Score(
@@ -147,6 +153,7 @@ def score(who: Subject, trials: Recorded, study: str, seed: int, *, profiled: bo
         ),
         _steps(likely, robust, truth),
         _steps(likely, expected, truth),
+        _of_entries(likely, robust, truth),
         fell,
         [*who.person.levels[who.person.levels > 0], *who.recorder],
         [float(value) for value in values],
@@ -186,6 +193,14 @@ def _steps(
     error = own.natural(np.array(likely.K) - truth)
     along = np.tensordot(own.natural(own.gains.gains), error, 2)
     return _pairs(covariance.directions, covariance.deviations, along[: space.gain])
+
+
+def _of_entries(
+    likely: PersonFit, covariance: PersonCovariance, truth: Array
+) -> list[tuple[float, float]]:
+    size = np.abs(truth)
+    errors = np.ravel((np.array(likely.K) - truth) / size)
+    return list(zip(errors.tolist(), np.ravel(covariance.entries / size).tolist(), strict=True))
 
 
 def _fell(likely: PersonFit, covariance: PersonCovariance, truth: Array) -> list[float]:
@@ -237,7 +252,7 @@ def _run(given: argparse.Namespace) -> None:
                 reason = passed_over(trials, met=met) if given.body == "seat" else ""
                 line = {"study": study, "seed": seed, "passed": reason}
                 if not reason:
-                    line = asdict(score(who, trials, study, seed, profiled=given.profiles))
+                    line = asdict(score(who, trials, study, seed, levels=given.level_profiles))
             except ImpcError as error:  # counted: most are of the first fit, of a cart that ran off
                 line = {"study": study, "seed": seed, "reason": str(error)}
             file.write(json.dumps(line) + "\n")
@@ -259,6 +274,8 @@ def _summed(scores: list[Score]) -> str:
         cells.append(f"{100 * np.median([getattr(one, f'{name}_error') for one in scores]):.1f}")
         cells += [_bias(pairs), _holds(pairs)]
     cells.append(_holds([one.expected for one in scores]))
+    told = [[pair for pair in one.entries if pair[1] < _TOLD] for one in scores]
+    cells.append(f"{_holds(told)} ({sum(map(len, told))}), {_holds([o.entries for o in scores])}")
     cells.append(_shares([[nats <= _LOWER for nats in one.fell] for one in scores if one.fell]))
     cells.append(_holds([_of_levels(one) for one in scores]))
     profiled = [one for one in scores if one.profiles]
@@ -314,6 +331,7 @@ def _sum(given: argparse.Namespace) -> None:
         "people", "count", "at the limit %", "ended at the truth or above", "settled",
         "least squares: error %", "bias / deviation", "95 % holds %",
         "likelihood: error %", "bias / deviation", "95 % holds % (sandwich)", "(expected)",
+        "entries told, all",
         "(profile)",
         "levels hold % (sandwich)", "(profile)", "seconds: least squares, likelihood",
     )  # fmt: skip
@@ -346,7 +364,7 @@ def main() -> None:
     run.add_argument("--vaf", type=float, nargs="+", default=[90.0, 70.0])
     run.add_argument("--met", type=int, nargs="+", choices=(0, 1), default=[0, 1])
     run.add_argument("--subjects", type=int, default=200)
-    run.add_argument("--profiles", action=argparse.BooleanOptionalAction, default=True)
+    run.add_argument("--level-profiles", action=argparse.BooleanOptionalAction, default=True)
     run.add_argument("--out", required=True)
     run.set_defaults(run=_run)
     summed = which.add_parser("sum")

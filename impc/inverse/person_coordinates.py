@@ -122,6 +122,9 @@ class PersonCoordinates:
         self.gain = int(space.ends[0])
         self.shared, self.after = int(space.ends[1]), int(space.ends[2])
         self.own = len(space.start)
+        sensed = np.array([*(kind == "sensory" for kind in kinds), *[False] * len(recorder)])
+        #: Which unknowns are levels of the senses.
+        self.senses = self.own + np.flatnonzero(sensed[self.moving])
 
     @property
     def names(self) -> list[str]:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from experiments.noisy_people import recorded, subject
-from experiments.noisy_people_study import Score, blind, passed_over, score
+from experiments.noisy_people_study import Score, above_truth, blind, passed_over, score
 from impc.assess.person_covariance import person_covariance, with_curvature
 from impc.checking import replace
 from impc.inverse.likelihood_fit import fit_person
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.long
 
 def scored(seed: int, limit: float) -> Score:
     who = subject("cart", seed, "motor", 90.0, limit)
-    return score(who, recorded(who, seed), "carts", seed, profiled=False)
+    return score(who, recorded(who, seed), "carts", seed, levels=False)
 
 
 def test_a_subject_is_scored_against_its_truth() -> None:
@@ -63,6 +63,17 @@ def test_on_the_seat_a_person_is_told_where_least_squares_is_far_off() -> None:
     covariance = with_curvature(found, person_covariance(found))
     z = (np.array(found.K) - truth)[0] / np.array(covariance.entries)[0]
     assert np.all(np.abs(z[:4]) < 1.96)
+
+
+@pytest.mark.full
+def test_a_search_leaves_somebody_who_knows_the_rates_exactly() -> None:
+    """The likeliest start leads there, 80 nats below the truth, and settles."""
+    who = subject("seat", 16, "motor", 70.0, 70.0)
+    found = fit_person(estimate(recorded(who, 16).problem), blind(who))
+    truth = np.array(who.controller.K)
+    assert found.converged
+    assert above_truth(found, who) > 0
+    np.testing.assert_allclose(found.K[0, :4], truth[0, :4], rtol=0.2)
 
 
 @pytest.mark.full
