@@ -194,7 +194,7 @@ def _held_out(problem: Problem, fitted: Estimate, settings: FitSettings) -> Arra
     count = len(problem.recordings)
     rows = np.empty((count if settings.held_out and count > 1 else 0, len(problem.plant.outputs)))
     for index in range(len(rows)):
-        other = fit_controller(problem.leaving_out(index), fitted.stage_weights)
+        other = fit_controller(fitted.problem.leaving_out(index), fitted.stage_weights)
         rows[index] = predict(problem, other, fitted, index, settings.settle).vaf
     return frozen(rows)
 

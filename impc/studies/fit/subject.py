@@ -342,12 +342,12 @@ def _threads() -> Iterator[ThreadPoolExecutor]:
 def _left_out(
     pool: ThreadPoolExecutor, ground: NaturalUnits, settings: FitSettings
 ) -> list[Future[Estimate]]:
-    """Controllers fitted to all trials but one, each from the weights that fit all."""
-    problem, start = ground.problem, ground.fitted.stage_weights
-    pending = []
-    for index in range(len(problem.recordings)):
-        if _leaves_out(len(problem.recordings), settings):
-            fit = functools.partial(fit_controller, problem.leaving_out(index), start)
+    """Controllers fitted to all trials but one, each from where the fit to all has ended."""
+    fitted, pending = ground.fitted, []
+    for index in range(len(fitted.problem.recordings)):
+        if _leaves_out(len(fitted.problem.recordings), settings):
+            others = fitted.problem.leaving_out(index)
+            fit = functools.partial(fit_controller, others, fitted.stage_weights)
             pending.append(pool.submit(ground.remember, _without(index), fit))
     return pending
 
