@@ -172,9 +172,10 @@ def person_report(
         return PersonReport(
             tuple(models), None, profiled, nothing, nothing, None, white, (), frozen([[]])
         )
-    covariance = with_curvature(fit, person_covariance(fit))
-    if profiled:
-        levels, entries = level_intervals(fit, covariance), entry_intervals(fit, covariance)
+    straight = person_covariance(fit)
+    covariance = with_curvature(fit, straight)
+    if profiled:  # a profile needs no parabola: of an entry that one tells, not what bends it
+        levels, entries = level_intervals(fit, covariance), entry_intervals(fit, straight)
         done("profiles")
     else:
         levels = level_intervals(fit, covariance, weak=np.inf)

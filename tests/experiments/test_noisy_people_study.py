@@ -8,6 +8,7 @@ import pytest
 from experiments.noisy_people import recorded, subject
 from experiments.noisy_people_study import Score, above_truth, blind, passed_over, score
 from impc.assess.person_covariance import person_covariance, with_curvature
+from impc.assess.person_profile import profile
 from impc.checking import replace
 from impc.inverse.likelihood_fit import fit_person
 from impc.inverse.methods import estimate
@@ -74,6 +75,22 @@ def test_a_search_leaves_somebody_who_knows_the_rates_exactly() -> None:
     assert found.converged
     assert above_truth(found, who) > 0
     np.testing.assert_allclose(found.K[0, :4], truth[0, :4], rtol=0.2)
+
+
+@pytest.mark.full
+def test_a_profile_tells_what_deviations_with_curvature_do_not() -> None:
+    """The first entry, N m/rad: by deviations 844 +- 33 700, by profile 678 to 1342; truth 970."""
+    who = subject("seat", 1, "both", 70.0, 70.0)
+    found = fit_person(estimate(recorded(who, 1).problem), blind(who))
+    truth, K = float(np.array(who.controller.K)[0, 0]), float(np.array(found.K)[0, 0])
+    straight = person_covariance(found)
+    assert with_curvature(found, straight).entries[0, 0] > 3 * K
+    slopes = found.space.changes(found.theta)[0][:, 0, 0]
+    length = float(np.linalg.norm(slopes))
+    along = np.zeros(len(found.theta))
+    along[: len(slopes)] = slopes / length
+    low, high = K + length * (np.array(profile(found, along)) - float(along @ found.theta))
+    assert 0.6 * truth < low < truth < high < 1.6 * truth
 
 
 @pytest.mark.full

@@ -249,7 +249,11 @@ def _gain_table(result: FitResult, report: PersonReport) -> TextTable:
 
 
 def _interval(low: float, high: float) -> str:
-    return "not told by itself" if np.isnan(low) else f"{number(low)} to {number(high)}"
+    if np.isnan(low) or np.isinf([low, high]).all():
+        return "not told by itself"
+    if np.isinf(low) or np.isinf(high):
+        return f"at most {number(high)}" if np.isinf(low) else f"at least {number(low)}"
+    return f"{number(low)} to {number(high)}"
 
 
 def _left_table(result: FitResult, report: PersonReport) -> TextTable:

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from impc.arrays import frozen
+from impc.checking import replace
 from impc.control.controller import Controller
 from impc.control.noisy_person import simulate_person
 from impc.errors import InputError
@@ -16,6 +18,7 @@ from impc.model.bounds import Bounds
 from impc.model.observer import Observer
 from impc.model.recordings import Recording
 from impc.model.weights import Weights
+from impc.reporting.document import TextTable
 from impc.reporting.rendering import plain
 from impc.studies.fit.person import person_data, person_section, person_sentences
 from impc.studies.fit.result import FitResult
@@ -113,6 +116,22 @@ def test_each_model_is_a_stage_and_intervals_follow_the_likelihood_where_asked()
     assert np.all(np.abs((kept["K_intervals"] - about) / width) < 0.5)
     assert "follows the likelihood" in str(person_section(quick, quick.person))
     assert "follows the likelihood" not in str(person_section(result, result.person))
+
+
+def test_an_interval_without_end_says_so() -> None:
+    result = fitted()
+    assert result.person is not None
+    for ends, words in (
+        ([-np.inf, 2.5], "at most 2.5"),
+        ([2.5, np.inf], "at least 2.5"),
+        ([-np.inf, np.inf], "not told by itself"),
+        ([np.nan, np.nan], "not told by itself"),
+        ([2.5, 3.5], "2.5 to 3.5"),
+    ):
+        entries = frozen([ends, ends])
+        section = person_section(result, replace(result.person, entries=entries))
+        tables = [block for block in section.blocks if isinstance(block, TextTable)]
+        assert {row[2] for row in tables[2].rows} == {words}
 
 
 def test_settings_of_a_person() -> None:
