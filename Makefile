@@ -135,8 +135,8 @@ numerics: .venv-oldest/.stamp .venv-newest/.stamp
 # Hundreds of simulated subjects: the table of docs/noisy-people.md.
 PEOPLE = $(PY) -m experiments.noisy_people_study
 noisy-people: env
-	$(PEOPLE) run --subjects 200 --out results/noisy-people.jsonl
-	$(PEOPLE) run --body seat --subjects 20 --no-level-profiles --out results/noisy-people.jsonl
+	$(PEOPLE) run --subjects 200 --profiles --out results/noisy-people.jsonl
+	$(PEOPLE) run --body seat --subjects 20 --out results/noisy-people.jsonl
 	$(PEOPLE) sum results/noisy-people.jsonl
 
 # Hundreds of simulated subjects: the table of docs/structures.md.

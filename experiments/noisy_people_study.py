@@ -23,8 +23,8 @@ import numpy as np
 
 from experiments.noisy_people import BODIES, NOISES, recorded, subject
 from impc.assess.covariance import TWO_SIDED, gain_covariance
-from impc.assess.person_covariance import person_covariance, with_curvature
-from impc.assess.person_profile import fallen, level_intervals
+from impc.assess.person_covariance import person_covariance
+from impc.assess.person_profile import entry_ways, hills, level_intervals, profiles
 from impc.errors import ImpcError
 from impc.inverse.likelihood_fit import fit_person
 from impc.inverse.methods import estimate
@@ -38,8 +38,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Score", "above_truth", "blind", "passed_over", "score", "true_unknowns"]
 
-# Nats by which a likelihood falls at either end of an interval of 95 %.
-_LOWER = TWO_SIDED**2 / 2
 # A limit that is not met, and one that is, of each body at each VAF.
 _LIMITS = {
     ("cart", 90.0): (5.0, 0.7),
@@ -79,22 +77,22 @@ class Score:
         Of the gain, as a share of it, in natural coordinates.
     least, likely, expected : list of pairs
         Error and deviation along each direction that the method tells, the best first: of least
-        squares, and of maximum likelihood by the sandwich with curvature and as expected.
+        squares, and of maximum likelihood by the sandwich and as expected.
     entries : list of pairs
-        Error and deviation of each entry of the gain, as shares of the entry, with the deviation
-        that is printed.
-    fell : list of float
-        By how many nats the likelihood falls with each of the directions of `likely` held at the
-        truth.
+        Error and deviation of each entry of the gain, as shares of the entry, by the sandwich.
+    along : list of pairs
+        Where asked for, the intervals by profile along the directions of `likely`, less the truth.
+    profiled : list of pairs
+        The same of the entries of the gain that are told, as shares of the entry.
     levels, found : list of float
         Motor, senses, recorder: true, and found.
     level_deviations : list of float
         Of their logarithms, by the sandwich.
     profiles : list of pairs
-        Intervals of 95 %: by profile for a level that is weakly told, else by the
+        Intervals of 95 % of levels: by profile for one that is weakly told, else by the
         deviation; none where not asked for.
     seconds : list of float
-        Of processor time: least squares, likelihood, what falls, profiles of levels.
+        Of processor time: least squares, likelihood, profiles of the gain, those of levels.
     """
 
     study: str
@@ -110,7 +108,8 @@ class Score:
     likely: list[tuple[float, float]]
     expected: list[tuple[float, float]]
     entries: list[tuple[float, float]]
-    fell: list[float]
+    along: list[tuple[float, float]]
+    profiled: list[tuple[float, float]]
     levels: list[float]
     found: list[float]
     level_deviations: list[float]
@@ -118,8 +117,10 @@ class Score:
     seconds: list[float]
 
 
-def score(who: Subject, trials: Recorded, study: str, seed: int, *, levels: bool = True) -> Score:
-    """Both fits of a subject, with profiles of the gain and, where asked for, of `levels`."""
+def score(
+    who: Subject, trials: Recorded, study: str, seed: int, *, profiled: bool = False
+) -> Score:
+    """Both fits of a subject and, where asked for, intervals by profile."""
     truth = np.array(who.controller.K)
     clock = [time.process_time()]
     first = estimate(trials.problem)
@@ -128,12 +129,12 @@ def score(who: Subject, trials: Recorded, study: str, seed: int, *, levels: bool
     clock.append(time.process_time())
     likely = fit_person(first, blind(who))
     expected = person_covariance(likely, "expected")
-    robust = with_curvature(likely, person_covariance(likely))
+    robust = person_covariance(likely)
     clock.append(time.process_time())
     values = np.exp(likely.theta[likely.space.own :])
-    fell = _fell(likely, robust, true_unknowns(likely, who))
+    along, entries = _profiles(likely, robust, true_unknowns(likely, who)) if profiled else ([], [])
     clock.append(time.process_time())
-    profiles = level_intervals(likely, expected) if levels else np.zeros((0, 2))
+    levels = level_intervals(likely, robust) if profiled else np.zeros((0, 2))
     clock.append(time.process_time())
     size = float(np.linalg.norm(truth @ least.T))
     return Score(
@@ -154,11 +155,12 @@ def score(who: Subject, trials: Recorded, study: str, seed: int, *, levels: bool
         _steps(likely, robust, truth),
         _steps(likely, expected, truth),
         _of_entries(likely, robust, truth),
-        fell,
+        along,
+        entries,
         [*who.person.levels[who.person.levels > 0], *who.recorder],
         [float(value) for value in values],
         robust.levels.tolist(),
-        profiles.tolist(),
+        levels.tolist(),
         np.diff(clock).tolist(),
     )
 
@@ -203,14 +205,20 @@ def _of_entries(
     return list(zip(errors.tolist(), np.ravel(covariance.entries / size).tolist(), strict=True))
 
 
-def _fell(likely: PersonFit, covariance: PersonCovariance, truth: Array) -> list[float]:
-    """What the likelihood falls by along each determined direction, the best told first, nats."""
-    found, along = [], np.zeros(len(truth))
-    for direction, deviation in zip(covariance.directions, covariance.deviations, strict=True):
-        if deviation < _DETERMINED:
-            along[: likely.space.gain] = direction
-            found.append(fallen(likely, along, float(along @ truth)))
-    return found
+def _profiles(
+    likely: PersonFit, covariance: PersonCovariance, truth: Array
+) -> tuple[list[tuple[float, float]], list[tuple[float, float]]]:
+    """Intervals along determined directions, the best told first, and of the entries told."""
+    told = covariance.directions[covariance.deviations < _DETERMINED]
+    along = np.zeros((len(told), len(truth)))
+    along[:, : likely.space.gain] = told
+    ways, lengths = entry_ways(likely, covariance)
+    entry = np.isfinite(lengths)
+    every = np.vstack([along, ways[entry]])
+    found = profiles(likely, every, hills(likely)) - (every @ truth)[:, None]
+    true = np.ravel(likely.K)[entry] + lengths[entry] * (ways[entry] @ (truth - likely.theta))
+    shares = found[len(told) :] * (lengths[entry] / np.abs(true))[:, None]
+    return found[: len(told)].tolist(), shares.tolist()
 
 
 def _pairs(directions: Array, deviations: Array, error: Array) -> list[tuple[float, float]]:
@@ -252,7 +260,7 @@ def _run(given: argparse.Namespace) -> None:
                 reason = passed_over(trials, met=met) if given.body == "seat" else ""
                 line = {"study": study, "seed": seed, "passed": reason}
                 if not reason:
-                    line = asdict(score(who, trials, study, seed, levels=given.level_profiles))
+                    line = asdict(score(who, trials, study, seed, profiled=given.profiles))
             except ImpcError as error:  # counted: most are of the first fit, of a cart that ran off
                 line = {"study": study, "seed": seed, "reason": str(error)}
             file.write(json.dumps(line) + "\n")
@@ -274,12 +282,13 @@ def _summed(scores: list[Score]) -> str:
         cells.append(f"{100 * np.median([getattr(one, f'{name}_error') for one in scores]):.1f}")
         cells += [_bias(pairs), _holds(pairs)]
     cells.append(_holds([one.expected for one in scores]))
+    profiled = [one for one in scores if one.profiles]
+    cells.append(f"{_around([one.along for one in profiled])} ({len(profiled)})")
     told = [[pair for pair in one.entries if pair[1] < _TOLD] for one in scores]
     cells.append(f"{_holds(told)} ({sum(map(len, told))}), {_holds([o.entries for o in scores])}")
-    cells.append(_shares([[nats <= _LOWER for nats in one.fell] for one in scores if one.fell]))
+    cells.append(_around([one.profiled for one in profiled]))
     cells.append(_holds([_of_levels(one) for one in scores]))
-    profiled = [one for one in scores if one.profiles]
-    cells.append(f"{_shares([_inside(one) for one in profiled])} ({len(profiled)})")
+    cells.append(_shares([_inside(one) for one in profiled]))
     times = np.median([one.seconds[:2] for one in scores], axis=0)
     cells.append(", ".join(f"{value:.1f}" for value in times))
     return "| " + " | ".join(cells) + " |"
@@ -315,6 +324,10 @@ def _holds(pairs: list[list[tuple[float, float]]]) -> str:
     return _shares([[abs(e) <= TWO_SIDED * s for e, s in each] for each in pairs])
 
 
+def _around(intervals: list[list[tuple[float, float]]]) -> str:
+    return _shares([[low <= 0 <= high for low, high in each] for each in intervals])
+
+
 def _shares(holds: list[list[bool]]) -> str:
     """Share of all, %, with its standard error, subjects being independent; - of none."""
     if not holds:
@@ -331,8 +344,7 @@ def _sum(given: argparse.Namespace) -> None:
         "people", "count", "at the limit %", "ended at the truth or above", "settled",
         "least squares: error %", "bias / deviation", "95 % holds %",
         "likelihood: error %", "bias / deviation", "95 % holds % (sandwich)", "(expected)",
-        "entries told, all",
-        "(profile)",
+        "(profile)", "entries told, all", "(profile)",
         "levels hold % (sandwich)", "(profile)", "seconds: least squares, likelihood",
     )  # fmt: skip
     print("| " + " | ".join(heads) + " |")
@@ -364,7 +376,7 @@ def main() -> None:
     run.add_argument("--vaf", type=float, nargs="+", default=[90.0, 70.0])
     run.add_argument("--met", type=int, nargs="+", choices=(0, 1), default=[0, 1])
     run.add_argument("--subjects", type=int, default=200)
-    run.add_argument("--level-profiles", action=argparse.BooleanOptionalAction, default=True)
+    run.add_argument("--profiles", action="store_true")
     run.add_argument("--out", required=True)
     run.set_defaults(run=_run)
     summed = which.add_parser("sum")

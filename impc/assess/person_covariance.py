@@ -8,9 +8,6 @@ With I the information of all recordings about all that was searched, initial st
 
 agree where the model is true. Where it is not, the last still tells how estimates scatter. The
 prior of the search is left out but for a trace: what is not told has a deviation of hundreds.
-
-To first order an unknown that is hardly told leaves alone what is told; to second order it bends
-it, on the seat by many deviations. `with_curvature` adds that (docs/noisy-people.md).
 """
 
 from __future__ import annotations
@@ -28,27 +25,19 @@ if TYPE_CHECKING:
     from impc.inverse.likelihood_fit import PersonFit
 
 __all__ = [
-    "HARDLY",
     "KINDS",
     "Confusion",
     "PersonCovariance",
     "confusion",
     "person_covariance",
-    "with_curvature",
 ]
 
 #: Ways to a covariance.
 KINDS = ("expected", "observed", "sandwich")
-#: A level whose logarithm has a larger deviation, or a direction of the gain in natural coordinates
-#: (`Coordinates`), is hardly told: there the curvature of the likelihood counts beside its slope.
-HARDLY = 0.25
 # Of a coordinate, which none leaves by much more than one: the prior that is left.
 _FARTHEST = 1e3
 # Step of the differences, of a coordinate: their error is the square of it, and rounding over it.
 _STEP = 1e-4
-# What is hardly told is moved by its deviation, by no more than this, and by these shares of it
-# where there is no likelihood so far away, or more nats are promised than a parabola is believed.
-_REACH, _SHARES, _BELIEVED = 1.0, (1.0, 0.5, 0.25, 0.125, 0.0625), 2.0
 
 
 @dataclass(frozen=True)
@@ -137,66 +126,6 @@ def person_covariance(fit: PersonFit, kind: str = "sandwich") -> PersonCovarianc
     values, vectors = np.linalg.eigh(information)
     bread = (vectors / np.maximum(values, _FARTHEST**-2)) @ vectors.T
     return _described(fit, kind, bread @ _meat(fit) @ bread if kind == "sandwich" else bread)
-
-
-def with_curvature(fit: PersonFit, found: PersonCovariance) -> PersonCovariance:
-    """The same covariance, with what unknowns that are hardly told do to all but the levels.
-
-    Each of them, a direction of the gain or a level, is moved forth and back by its deviation, or
-    by one where that is less, and all else with it along the ridge of the parabola at the fit.
-    From the slope and the information there follows where all else belongs instead. Half of the sum
-    of the products of these shifts is added. Logarithms of levels are left out: where a level is
-    all but none its logarithm has no second order to speak of.
-
-    Parameters
-    ----------
-    fit : PersonFit
-    found : PersonCovariance
-        Of the fit, to first order.
-    """
-    hardly = _hardly_told(fit, found)
-    if not hardly:
-        return found
-    here = fit.prior.placed(np.array(fit.theta), fit.told)
-    bend = fit.prior.parabola(here, np.array(fit.losing))[1]
-    ridges = np.linalg.solve(bend, np.array([way for way, _ in hardly]).T).T
-    moved = np.array(
-        [
-            _shift(fit, way, sign * min(deviation, _REACH) * ridge / float(way @ ridge))
-            for (way, deviation), ridge in zip(hardly, ridges, strict=True)
-            for sign in (1.0, -1.0)
-        ]
-    )
-    moved[:, fit.space.own :] = 0.0
-    return _described(fit, found.kind, found.covariance + moved.T @ moved / 2)
-
-
-def _hardly_told(fit: PersonFit, found: PersonCovariance) -> list[tuple[Array, float]]:
-    """What is hardly told: a direction of the unknowns (q,) of length one, and its deviation."""
-    ways = np.eye(len(fit.theta))
-    gains = found.directions @ ways[: fit.space.gain]
-    every = zip([*gains, *ways[fit.space.own :]], [*found.deviations, *found.levels], strict=True)
-    return [(way, float(deviation)) for way, deviation in every if deviation > HARDLY]
-
-
-def _shift(fit: PersonFit, way: Array, off: Array) -> Array:
-    """Where all else belongs (q,) with `way` held after a step (q,) along the ridge, beside it.
-
-    Where no likelihood is so far away, or a step onto the ridge promises more than a parabola is
-    believed to, of a share of the step, and over its square: to first order there is no shift.
-    """
-    shift = np.zeros(len(off))
-    for share in _SHARES:
-        there = fit.prior.tried(fit.theta + share * off)
-        if there is None:
-            continue
-        slope, bend = fit.prior.parabola(there, np.array(fit.losing))
-        step, across = np.linalg.solve(bend, np.column_stack([slope, way])).T
-        shift = step - across * (way @ step) / (way @ across)
-        shift /= share**2
-        if share**2 * float(slope @ shift) / 2 < _BELIEVED:
-            break
-    return shift
 
 
 def _described(fit: PersonFit, kind: str, covariance: Array) -> PersonCovariance:

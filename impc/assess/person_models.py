@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.arrays import Array, Frozen, frozen
-from impc.assess.person_covariance import confusion, person_covariance, with_curvature
+from impc.assess.person_covariance import confusion, person_covariance
 from impc.assess.person_profile import entry_intervals, level_intervals
 from impc.assess.variance_accounted_for import whiteness
 from impc.checking import replace
@@ -150,7 +150,7 @@ def person_report(
         Where the steps of an unknown perturbation begin to be searched (d,).
     profiled : bool
         Whether intervals of the gain and of levels that are weakly told follow the likelihood:
-        ten minutes and more on the seat.
+        several minutes on the seat.
     done : callable
         Told the name of each model once it is fitted, and "profiles".
     remember : callable
@@ -172,13 +172,13 @@ def person_report(
         return PersonReport(
             tuple(models), None, profiled, nothing, nothing, None, white, (), frozen([[]])
         )
-    straight = person_covariance(fit)
-    covariance = with_curvature(fit, straight)
-    if profiled:  # a profile needs no parabola: of an entry that one tells, not what bends it
-        levels, entries = level_intervals(fit, covariance), entry_intervals(fit, straight)
+    covariance = person_covariance(fit)
+    if profiled:
+        levels, entries = level_intervals(fit, covariance), entry_intervals(fit, covariance)
         done("profiles")
     else:
-        levels = level_intervals(fit, covariance, weak=np.inf)
+        values = np.exp(fit.theta[fit.space.own :])
+        levels = frozen([covariance.level_interval(k, float(v)) for k, v in enumerate(values)])
         entries = covariance.entry_intervals(fit.K)
     ahead = tuple(sorted({1 + round(time / problem.plant.dt) for time in _AHEAD}))
     return PersonReport(

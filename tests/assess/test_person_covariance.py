@@ -5,15 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from impc.assess.person_covariance import (
-    HARDLY,
-    confusion,
-    person_covariance,
-    with_curvature,
-)
+from impc.assess.person_covariance import confusion, person_covariance
 from impc.errors import InputError
 from impc.inverse.likelihood_fit import PersonFit, fit_person
-from impc.inverse.likelihood_search import climb
 from impc.inverse.methods import estimate
 from impc.model.observer import Observer
 from tests.inverse.test_likelihood_fit import cart, posed
@@ -44,39 +38,6 @@ def test_the_observed_information_is_the_curvature(fitted: PersonFit) -> None:
     curvature = -(values[0] - 2 * values[1] + values[2]) / h**2
     # Rounding of 1e-12 of 5000 nats over 1e-6, and h^2.
     assert step @ information @ step == pytest.approx(curvature, rel=1e-3)
-
-
-def test_curvature_is_where_searches_end_with_a_level_held(fitted: PersonFit) -> None:
-    """The noise of the sense is hardly told: all else is searched with it held, forth and back."""
-    found, prior, theta = person_covariance(fitted), fitted.prior, np.array(fitted.theta)
-    told = [*found.deviations, found.levels[0], found.levels[2]]
-    assert max(told) < HARDLY < found.levels[1]
-    others = np.delete(np.eye(len(theta)), fitted.space.own + 1, axis=1)
-    way, losing = np.eye(len(theta))[fitted.space.own + 1], np.array(fitted.losing)
-    bend = prior.parabola(prior.placed(theta, fitted.told), losing)[1]
-    ridge = -others @ np.linalg.solve(others.T @ bend @ others, others.T @ bend @ way) + way
-    added = np.zeros((len(theta), len(theta)))
-    for sign in (1, -1):
-        start = theta + sign * found.levels[1] * ridge
-        place, _, _, settled = climb(prior, prior.at(start), 20, others, losing)
-        assert settled
-        shift = (place.theta - start) * (np.arange(len(theta)) < fitted.space.own)
-        added += np.outer(shift, shift) / 2
-    curved = with_curvature(fitted, found)
-    units = np.sqrt(np.outer(np.diag(added), np.diag(added)))
-    difference = np.abs(curved.covariance - found.covariance - added)
-    assert np.all(difference <= 0.01 * units + 1e-12)  # a search ends at a tenth of a deviation
-    assert np.all(curved.entries > found.entries)
-    np.testing.assert_array_equal(curved.levels, found.levels)
-    assert curved.kind == "sandwich"
-
-
-def test_what_is_told_bends_nothing(fitted: PersonFit) -> None:
-    seeing = Observer(cart(), motor=0.4)
-    plain = fit_person(estimate(posed(seeing, 0.01, 3.0)), seeing)
-    found = person_covariance(plain)
-    assert max([*found.deviations, *found.levels]) < HARDLY
-    assert with_curvature(plain, found) is found
 
 
 def test_the_step_that_is_least_told_apart(fitted: PersonFit) -> None:

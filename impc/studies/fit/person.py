@@ -229,9 +229,8 @@ def _gain_table(result: FitResult, report: PersonReport) -> TextTable:
     how = (
         "by profile. An entry that the recordings do not tell by itself has none."
         if report.profiled
-        else "by deviations, with what numbers that are hardly told may do to the others. "
-        "profiles = true in [fit.observer] follows the likelihood instead, on a seat for ten "
-        "minutes and more."
+        else "by deviations. profiles = true in [fit.observer] follows the likelihood instead, on "
+        "a seat for some minutes."
     )
     kept = kept_to(fit.problem)
     among = "" if kept is None else f", among those that weights over {kept.name} can have,"
