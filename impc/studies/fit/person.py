@@ -251,8 +251,8 @@ def _interval(low: float, high: float) -> str:
     if np.isnan(low) or np.isinf([low, high]).all():
         return "not told by itself"
     if np.isinf(low) or np.isinf(high):
-        return f"at most {number(high)}" if np.isinf(low) else f"at least {number(low)}"
-    return f"{number(low)} to {number(high)}"
+        return f"at most {number(high, 4)}" if np.isinf(low) else f"at least {number(low, 4)}"
+    return f"{number(low, 4)} to {number(high, 4)}"
 
 
 def _left_table(result: FitResult, report: PersonReport) -> TextTable:

@@ -124,7 +124,7 @@ def fit_report(
         f"The controller behind the recordings of {subject}",
         (
             Verdict(verdict(result)),
-            *(Note("Warning.", line.removeprefix("Warning: ")) for line in result.warnings),
+            *(Note("Warning.", _sentence(line)) for line in result.warnings),
             *([Note("Not given:", missing.removeprefix("Not given: "))] if missing else []),
             *told,
             Lines(abstract(result)),
@@ -148,6 +148,12 @@ def fit_report(
         provenance=provenance,
         words=signal_words(result.given.plant),
     )
+
+
+def _sentence(warning: str) -> str:
+    """A warning of the command line without its first word, as a sentence of its own."""
+    said = warning.removeprefix("Warning: ")
+    return said[:1].upper() + said[1:]
 
 
 def _gain(result: FitResult, truth: Array | None) -> list[Block]:
