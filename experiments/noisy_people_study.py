@@ -23,8 +23,14 @@ import numpy as np
 
 from experiments.noisy_people import BODIES, NOISES, recorded, subject
 from impc.assess.covariance import TWO_SIDED, gain_covariance
+from impc.assess.likely_people import (
+    direction_intervals,
+    entry_intervals,
+    level_intervals,
+    people_as_likely,
+)
 from impc.assess.person_covariance import person_covariance
-from impc.assess.person_profile import entry_ways, hills, level_intervals, profiles
+from impc.assess.person_profile import fallen
 from impc.errors import ImpcError
 from impc.inverse.likelihood_fit import fit_person
 from impc.inverse.methods import estimate
@@ -38,6 +44,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Score", "above_truth", "blind", "passed_over", "score", "true_unknowns"]
 
+# Nats by which a likelihood falls at either end of an interval of 95 %.
+_LOWER = TWO_SIDED**2 / 2
 # A limit that is not met, and one that is, of each body at each VAF.
 _LIMITS = {
     ("cart", 90.0): (5.0, 0.7),
@@ -50,8 +58,8 @@ _LIMITS = {
 _SHARES, _FALLEN = (0.12, 0.40), 1.0
 # A direction of the gain is determined when its deviation is below this, in natural coordinates.
 _DETERMINED = 0.25
-# An entry is told when its deviation is below this share of it.
-_TOLD = 0.5
+# An entry is told when half of its interval is below this share of it.
+_TOLD = 1.0
 # As far below the truth a search may end, nats.
 _ENDED = 0.5
 
@@ -78,21 +86,22 @@ class Score:
     least, likely, expected : list of pairs
         Error and deviation along each direction that the method tells, the best first: of least
         squares, and of maximum likelihood by the sandwich and as expected.
-    entries : list of pairs
-        Error and deviation of each entry of the gain, as shares of the entry, by the sandwich.
     along : list of pairs
-        Where asked for, the intervals by profile along the directions of `likely`, less the truth.
-    profiled : list of pairs
-        The same of the entries of the gain that are told, as shares of the entry.
+        Intervals along the directions of `likely` of everybody as likely, less the truth, in
+        deviations.
+    entries : list of pairs
+        The same of the entries of the gain, less the truth, as shares of the entry: as printed.
+    people : int
+        How many are as likely.
+    fell : list of float
+        Where asked for, by how many nats the likelihood falls with each of the directions of
+        `likely` held at the truth.
     levels, found : list of float
         Motor, senses, recorder: true, and found.
-    level_deviations : list of float
-        Of their logarithms, by the sandwich.
-    profiles : list of pairs
-        Intervals of 95 % of levels: by profile for one that is weakly told, else by the
-        deviation; none where not asked for.
+    level_intervals : list of pairs
+        Of everybody as likely, as printed.
     seconds : list of float
-        Of processor time: least squares, likelihood, profiles of the gain, those of levels.
+        Of processor time: least squares, likelihood, everybody as likely, what falls.
     """
 
     study: str
@@ -107,20 +116,20 @@ class Score:
     least: list[tuple[float, float]]
     likely: list[tuple[float, float]]
     expected: list[tuple[float, float]]
-    entries: list[tuple[float, float]]
     along: list[tuple[float, float]]
-    profiled: list[tuple[float, float]]
+    entries: list[tuple[float, float]]
+    people: int
+    fell: list[float]
     levels: list[float]
     found: list[float]
-    level_deviations: list[float]
-    profiles: list[tuple[float, float]]
+    level_intervals: list[tuple[float, float]]
     seconds: list[float]
 
 
 def score(
     who: Subject, trials: Recorded, study: str, seed: int, *, profiled: bool = False
 ) -> Score:
-    """Both fits of a subject and, where asked for, intervals by profile."""
+    """Both fits of a subject, what holds for everybody as likely and, asked for, what falls."""
     truth = np.array(who.controller.K)
     clock = [time.process_time()]
     first = estimate(trials.problem)
@@ -132,9 +141,15 @@ def score(
     robust = person_covariance(likely)
     clock.append(time.process_time())
     values = np.exp(likely.theta[likely.space.own :])
-    along, entries = _profiles(likely, robust, true_unknowns(likely, who)) if profiled else ([], [])
+    people, unknowns = people_as_likely(likely), true_unknowns(likely, who)
+    directions, deviations = _told(robust)
+    aims = directions @ unknowns[: likely.space.gain]
+    along = (direction_intervals(people, directions) - aims[:, None]) / deviations[:, None]
+    entries = (entry_intervals(people) - np.ravel(truth)[:, None]) / np.abs(np.ravel(truth))[
+        :, None
+    ]
     clock.append(time.process_time())
-    levels = level_intervals(likely, robust) if profiled else np.zeros((0, 2))
+    fell = _fell(likely, directions, aims) if profiled else []
     clock.append(time.process_time())
     size = float(np.linalg.norm(truth @ least.T))
     return Score(
@@ -154,13 +169,13 @@ def score(
         ),
         _steps(likely, robust, truth),
         _steps(likely, expected, truth),
-        _of_entries(likely, robust, truth),
-        along,
-        entries,
+        along.tolist(),
+        entries.tolist(),
+        len(people),
+        fell,
         [*who.person.levels[who.person.levels > 0], *who.recorder],
         [float(value) for value in values],
-        robust.levels.tolist(),
-        levels.tolist(),
+        level_intervals(people).tolist(),
         np.diff(clock).tolist(),
     )
 
@@ -197,28 +212,19 @@ def _steps(
     return _pairs(covariance.directions, covariance.deviations, along[: space.gain])
 
 
-def _of_entries(
-    likely: PersonFit, covariance: PersonCovariance, truth: Array
-) -> list[tuple[float, float]]:
-    size = np.abs(truth)
-    errors = np.ravel((np.array(likely.K) - truth) / size)
-    return list(zip(errors.tolist(), np.ravel(covariance.entries / size).tolist(), strict=True))
+def _told(covariance: PersonCovariance) -> tuple[Array, Array]:
+    """Determined directions and their deviations, the best told first."""
+    told = covariance.deviations < _DETERMINED
+    return np.array(covariance.directions)[told], np.array(covariance.deviations)[told]
 
 
-def _profiles(
-    likely: PersonFit, covariance: PersonCovariance, truth: Array
-) -> tuple[list[tuple[float, float]], list[tuple[float, float]]]:
-    """Intervals along determined directions, the best told first, and of the entries told."""
-    told = covariance.directions[covariance.deviations < _DETERMINED]
-    along = np.zeros((len(told), len(truth)))
-    along[:, : likely.space.gain] = told
-    ways, lengths = entry_ways(likely, covariance)
-    entry = np.isfinite(lengths)
-    every = np.vstack([along, ways[entry]])
-    found = profiles(likely, every, hills(likely)) - (every @ truth)[:, None]
-    true = np.ravel(likely.K)[entry] + lengths[entry] * (ways[entry] @ (truth - likely.theta))
-    shares = found[len(told) :] * (lengths[entry] / np.abs(true))[:, None]
-    return found[: len(told)].tolist(), shares.tolist()
+def _fell(likely: PersonFit, directions: Array, aims: Array) -> list[float]:
+    """What the likelihood falls by along each direction held at its aim, nats."""
+    found, along = [], np.zeros(len(likely.theta))
+    for direction, aim in zip(directions, aims, strict=True):
+        along[: likely.space.gain] = direction
+        found.append(fallen(likely, along, float(aim)))
+    return found
 
 
 def _pairs(directions: Array, deviations: Array, error: Array) -> list[tuple[float, float]]:
@@ -282,27 +288,19 @@ def _summed(scores: list[Score]) -> str:
         cells.append(f"{100 * np.median([getattr(one, f'{name}_error') for one in scores]):.1f}")
         cells += [_bias(pairs), _holds(pairs)]
     cells.append(_holds([one.expected for one in scores]))
-    profiled = [one for one in scores if one.profiles]
-    cells.append(f"{_around([one.along for one in profiled])} ({len(profiled)})")
-    told = [[pair for pair in one.entries if pair[1] < _TOLD] for one in scores]
-    cells.append(f"{_holds(told)} ({sum(map(len, told))}), {_holds([o.entries for o in scores])}")
-    cells.append(_around([one.profiled for one in profiled]))
-    cells.append(_holds([_of_levels(one) for one in scores]))
-    cells.append(_shares([_inside(one) for one in profiled]))
-    times = np.median([one.seconds[:2] for one in scores], axis=0)
+    cells.append(_around([one.along for one in scores]))
+    cells.append(_shares([[nats <= _LOWER for nats in one.fell] for one in scores if one.fell]))
+    told = [[pair for pair in one.entries if pair[1] - pair[0] < 2 * _TOLD] for one in scores]
+    cells.append(f"{_around(told)} ({sum(map(len, told))}), {_around([o.entries for o in scores])}")
+    cells.append(_shares([_inside(one) for one in scores]))
+    times = np.median([one.seconds[:3] for one in scores], axis=0)
     cells.append(", ".join(f"{value:.1f}" for value in times))
     return "| " + " | ".join(cells) + " |"
 
 
-def _of_levels(one: Score) -> list[tuple[float, float]]:
-    """Errors and deviations of the logarithms of the levels."""
-    errors = np.log(one.found) - np.log(one.levels)
-    return list(zip(errors.tolist(), one.level_deviations, strict=True))
-
-
 def _inside(one: Score) -> list[bool]:
-    """Which levels are inside their profiles."""
-    both = zip(one.levels, one.profiles, strict=True)
+    """Which levels are inside their intervals."""
+    both = zip(one.levels, one.level_intervals, strict=True)
     return [low <= level <= high for level, (low, high) in both]
 
 
@@ -344,8 +342,8 @@ def _sum(given: argparse.Namespace) -> None:
         "people", "count", "at the limit %", "ended at the truth or above", "settled",
         "least squares: error %", "bias / deviation", "95 % holds %",
         "likelihood: error %", "bias / deviation", "95 % holds % (sandwich)", "(expected)",
-        "(profile)", "entries told, all", "(profile)",
-        "levels hold % (sandwich)", "(profile)", "seconds: least squares, likelihood",
+        "(everybody as likely)", "(profile)", "entries told, all", "levels hold %",
+        "seconds: least squares, likelihood, everybody",
     )  # fmt: skip
     print("| " + " | ".join(heads) + " |")
     print("|" + "---|" * len(heads))

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.arrays import Array, Frozen, frozen
+from impc.assess import likely_people, person_profile
 from impc.assess.person_covariance import confusion, person_covariance
-from impc.assess.person_profile import entry_intervals, level_intervals
 from impc.assess.variance_accounted_for import whiteness
 from impc.checking import replace
 from impc.control.closed_loop import prepare_loop
@@ -100,7 +100,7 @@ class PersonReport(Frozen):
         Whether intervals follow the likelihood.
     levels : Array
         Intervals of 95 % of its levels (l, 2), in their units; where profiled, by profile for a
-        level that is weakly told, else by deviations.
+        level that is weakly told, else of all people as likely.
     entries : Array
         The same of the entries of its gain (entries, 2), in their units; where profiled, all by
         profile, and NaN where an entry is not told by itself.
@@ -150,7 +150,7 @@ def person_report(
         Where the steps of an unknown perturbation begin to be searched (d,).
     profiled : bool
         Whether intervals of the gain and of levels that are weakly told follow the likelihood:
-        several minutes on the seat.
+        ten minutes and more on the seat.
     done : callable
         Told the name of each model once it is fitted, and "profiles".
     remember : callable
@@ -174,12 +174,13 @@ def person_report(
         )
     covariance = person_covariance(fit)
     if profiled:
-        levels, entries = level_intervals(fit, covariance), entry_intervals(fit, covariance)
+        levels = person_profile.level_intervals(fit, covariance)
+        entries = person_profile.entry_intervals(fit, covariance)
         done("profiles")
     else:
-        values = np.exp(fit.theta[fit.space.own :])
-        levels = frozen([covariance.level_interval(k, float(v)) for k, v in enumerate(values)])
-        entries = covariance.entry_intervals(fit.K)
+        people = likely_people.people_as_likely(fit)
+        levels = likely_people.level_intervals(people)
+        entries = likely_people.entry_intervals(people)
     ahead = tuple(sorted({1 + round(time / problem.plant.dt) for time in _AHEAD}))
     return PersonReport(
         tuple(models),

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.inverse.person_prior import Place, Prior
 
-__all__ = ["boxed_step", "climb", "longest"]
+__all__ = ["boxed_step", "climb"]
 
 # A search ends when a step promises less, nats: a hundredth of a deviation along any direction
 # without a prior, a tenth with it, for the slope of what levels lose is not known better.
@@ -50,7 +50,6 @@ def climb(
     budget: int,
     along: Array | None = None,
     losing: Array | None = None,
-    enough: float | None = None,
 ) -> tuple[Place, Array, int, bool]:
     """The largest likelihood near a place, times the prior and less what levels lose.
 
@@ -66,9 +65,6 @@ def climb(
     losing : Array, optional
         What is taken for the slope of what levels lose (levels,), learned on the way; by default it
         is found by differences where the search ends, and the search goes on from there.
-    enough : float, optional
-        A search ends when a step promises less, nats; by default a hundredth of a deviation, or a
-        tenth with a prior.
 
     Returns
     -------
@@ -78,9 +74,8 @@ def climb(
     """
     way = np.eye(len(begin.theta)) if along is None else along
     others = way[:, ~np.any(way[prior.space.own :] != 0, axis=0)]
-    reach = longest(prior, way)
-    least, progress = (_ENOUGH, _PROGRESS) if prior.used else (_SETTLED, _SETTLED)
-    enough = least if enough is None else enough
+    reach = _reach(prior, way)
+    enough, progress = (_ENOUGH, _PROGRESS) if prior.used else (_SETTLED, _SETTLED)
     here = best = begin
     differences = prior.used and losing is None
     losing = np.zeros(len(prior.scales)) if losing is None else losing
@@ -117,15 +112,8 @@ def climb(
         losing, here = prior.learned(losing, here, there), there
 
 
-def longest(prior: Prior, way: Array) -> Array:
-    """Longest step along each of some directions (q, r), of its coordinate (r,).
-
-    Parameters
-    ----------
-    prior : Prior
-    way : Array
-        Orthonormal.
-    """
+def _reach(prior: Prior, way: Array) -> Array:
+    """How much longer than others a step along each of some directions (q, r) may be (r,)."""
     mine = way[prior.space.shared : prior.space.after]
     return np.where(np.any(mine != 0, axis=0), _AFAR, 1.0)
 
@@ -137,7 +125,7 @@ def _followed(prior: Prior, here: Place, others: Array) -> tuple[Place, int]:
     lose changes by nats beside it, so that places are compared on it.
     """
     slope, bend = prior.parabola(here, np.zeros(len(prior.scales)))
-    radius = _STEP * longest(prior, others)
+    radius = _STEP * _reach(prior, others)
     step, promised = boxed_step(others.T @ slope, others.T @ bend @ others, radius)
     if promised < _BESIDE:
         return here, 0

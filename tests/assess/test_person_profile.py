@@ -14,10 +14,10 @@ from impc.arrays import Array
 from impc.assess.person_covariance import person_covariance
 from impc.assess.person_profile import (
     entry_intervals,
-    hills,
+    fallen,
     level_interval,
     level_intervals,
-    profiles,
+    profile,
 )
 from impc.inverse.likelihood_fit import PersonFit, fit_person
 from impc.inverse.methods import estimate
@@ -50,7 +50,7 @@ def test_at_its_end_the_likelihood_has_fallen(fitted: PersonFit, name: str, end:
     """By half of 1.96^2, all else being at its best by another search."""
     names, own = fitted.space.names, fitted.space.own
     index = own + names.index(name) if name in names else 0  # or the first coordinate of the gain
-    value = profiles(fitted, np.eye(len(fitted.theta))[[index]], hills(fitted)[:1])[0, end]
+    value = profile(fitted, np.eye(len(fitted.theta))[index])[end]
     free = np.delete(np.arange(len(fitted.theta)), index)
     information = np.array(fitted.told.information)[np.ix_(free, free)] + 0.1 * np.eye(len(free))
     root = np.linalg.inv(np.linalg.cholesky(information)).T  # steps of one are deviations
@@ -72,6 +72,9 @@ def test_at_its_end_the_likelihood_has_fallen(fitted: PersonFit, name: str, end:
         top += (prior.unlike(np.array(fitted.theta)) - prior.unlike(there))[index - own]
     # The root of what has fallen is found to 0.04 of 1.39.
     assert top + found.fun == pytest.approx(1.920729, abs=0.12)
+    assert fallen(fitted, np.eye(len(fitted.theta))[index], value) == pytest.approx(
+        top + found.fun, abs=0.02
+    )
 
 
 def test_entries_of_the_gain_that_are_told_have_intervals(fitted: PersonFit) -> None:

@@ -27,6 +27,7 @@ _CONFUSED = 0.9
 # Criteria that differ by less do not decide (Burnham and Anderson 2002).
 _UNDECIDED = 4.0
 _WHITE = 0.01
+_EVERYBODY = "from the lowest to the highest of all people found who explain the recordings as well"
 
 
 class _Level(NamedTuple):
@@ -201,9 +202,9 @@ def _models_table(report: PersonReport) -> TextTable:
 
 
 def _levels_table(plant: Plant, report: PersonReport) -> TextTable:
+    how = "by profile where a level is weakly told" if report.profiled else _EVERYBODY
     return table_of(
-        "Levels of noise: standard deviations of one sample, with intervals of 95 % "
-        f"({'by profile where a level is weakly told' if report.profiled else 'by deviations'}). "
+        f"Levels of noise: standard deviations of one sample, with intervals of 95 % {how}. "
         "A level whose interval reaches a factor of ten is only told to be at most its upper end.",
         _levels(plant, report),
         {
@@ -229,8 +230,8 @@ def _gain_table(result: FitResult, report: PersonReport) -> TextTable:
     how = (
         "by profile. An entry that the recordings do not tell by itself has none."
         if report.profiled
-        else "by deviations. profiles = true in [fit.observer] follows the likelihood instead, on "
-        "a seat for some minutes."
+        else f"{_EVERYBODY}. profiles = true in [fit.observer] follows the likelihood instead, on "
+        "a seat for ten minutes and more."
     )
     kept = kept_to(fit.problem)
     among = "" if kept is None else f", among those that weights over {kept.name} can have,"

@@ -111,7 +111,7 @@ class ObserverSettings:
         Whether the person knows the perturbation.
     profiles : bool
         Whether intervals of the gain and of levels that are weakly told follow the likelihood:
-        some minutes on the seat.
+        ten minutes and more on the seat.
     """
 
     sensed: list[str] = field(default_factory=list)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from impc.arrays import frozen
+from impc.assess.likely_people import entry_intervals, people_as_likely
 from impc.checking import replace
 from impc.control.controller import Controller
 from impc.control.noisy_person import simulate_person
@@ -109,8 +110,9 @@ def test_each_model_is_a_stage_and_intervals_follow_the_likelihood_where_asked()
     fit, covariance = quick.person.fit, quick.person.covariance
     assert fit is not None
     assert covariance is not None
+    every = entry_intervals(people_as_likely(fit)).reshape(*fit.K.shape, 2)
+    np.testing.assert_allclose(rough["K_intervals"], every)
     about = np.asarray(fit.K)[..., None] + 1.959964 * covariance.entries[..., None] * [-1, 1]
-    np.testing.assert_allclose(rough["K_intervals"], about)
     # The gain is well told: ends are half a width at most from those of deviations.
     width = np.ptp(about, axis=-1, keepdims=True)
     assert np.all(np.abs((kept["K_intervals"] - about) / width) < 0.5)

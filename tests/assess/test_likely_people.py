@@ -1,0 +1,83 @@
+"""People as likely: the sandwich of each, and the ends of all."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from impc.assess.likely_people import (
+    LikelyPerson,
+    direction_intervals,
+    entry_intervals,
+    level_intervals,
+    people_as_likely,
+)
+from impc.assess.person_covariance import person_covariance
+from impc.inverse.likelihood_fit import PersonFit, fit_person
+from impc.inverse.methods import estimate
+from impc.model.observer import Observer
+from tests.inverse.test_likelihood_fit import cart, posed
+
+
+@pytest.fixture(scope="module")
+def fitted() -> PersonFit:
+    """Position and speed are sensed; their noise is hardly told apart from six seconds."""
+    person = Observer(cart(), ["x", "v"], motor=0.4, sensory=[0.05, 0.05])
+    return fit_person(estimate(posed(person, 0.01, 3.0)), person)
+
+
+@pytest.fixture(scope="module")
+def people(fitted: PersonFit) -> list[LikelyPerson]:
+    return people_as_likely(fitted)
+
+
+def test_each_is_as_likely_as_a_number_inside_an_interval(
+    fitted: PersonFit, people: list[LikelyPerson]
+) -> None:
+    """By the likelihood anew; one is among them whose sense of position errs half as much."""
+    assert len(people) > 1
+    assert people[0].fit is fitted
+    values = [one.prior.at(np.array(one.theta)).value for one, _ in people]
+    assert_allclose(values, [one.value for one, _ in people], atol=1e-9)
+    assert max(values) - min(values) <= 1.920729
+    shares = [min(one.observer.sensory / fitted.observer.sensory) for one, _ in people[1:]]
+    assert min(shares) < 0.6
+
+
+def test_intervals_reach_from_the_lowest_end_to_the_highest(
+    fitted: PersonFit, people: list[LikelyPerson]
+) -> None:
+    ends = entry_intervals(people)
+    for k in range(fitted.K.size):
+        about = [(np.ravel(one.K)[k], np.ravel(told.entries)[k]) for one, told in people]
+        assert ends[k, 0] == pytest.approx(min(K - 1.959964 * s for K, s in about))
+        assert ends[k, 1] == pytest.approx(max(K + 1.959964 * s for K, s in about))
+    levels = level_intervals(people)
+    names = fitted.space.names
+    assert levels.shape == (len(names), 2)
+    values = [np.exp(one.theta[one.space.own :]) for one, _ in people]
+    for k in range(len(names)):
+        about = [
+            (v[k], np.exp(1.959964 * t.levels[k])) for v, (_, t) in zip(values, people, strict=True)
+        ]
+        assert levels[k, 0] == pytest.approx(min(v / factor for v, factor in about))
+        assert levels[k, 1] == pytest.approx(max(v * factor for v, factor in about))
+
+
+def test_along_an_entry_a_direction_has_the_interval_of_the_entry(
+    fitted: PersonFit, people: list[LikelyPerson]
+) -> None:
+    dK, _ = fitted.space.changes(fitted.theta)
+    ways = dK.reshape(len(dK), -1).T[:, : fitted.space.gain]
+    begin = np.ravel(fitted.K) - ways @ fitted.theta[: fitted.space.gain]
+    found = direction_intervals(people, ways) + begin[:, None]
+    assert_allclose(found, entry_intervals(people), rtol=1e-9)
+
+
+def test_who_sees_every_state_is_alone() -> None:
+    seeing = Observer(cart(), motor=0.4)
+    fit = fit_person(estimate(posed(seeing, 0.01, 3.0, trials=1)), seeing)
+    people = people_as_likely(fit)
+    assert [one.fit for one in people] == [fit]
+    assert_array_equal(entry_intervals(people), person_covariance(fit).entry_intervals(fit.K))
