@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
     from impc.studies.fit.result import FitResult
 
-__all__ = ["person_data", "person_section", "person_sentences"]
+__all__ = ["person_data", "person_section", "person_sentences", "preferred"]
 
 # A level whose interval of 95 % ends beyond a factor of ten is not told.
 _TOLD = np.log(10)
@@ -62,6 +62,14 @@ def person_sentences(result: FitResult) -> tuple[str, ...]:
         )
         lines.append(f"As one who {asked.name}: {each}, standard deviations of a sample (95 %).")
     return (*lines, *_apart(result, report), *_left(result, report))
+
+
+def preferred(report: PersonReport) -> bool:
+    """Whether the person that was asked for was found, and no other model is to be preferred."""
+    asked = report.models[0]
+    if asked.fit is None or not asked.fit.converged:
+        return False
+    return _criterion(asked) < min(map(_criterion, report.models)) + _UNDECIDED
 
 
 def _compared(report: PersonReport) -> str:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.reporting.rendering import number
+from impc.studies.fit.person import preferred
 from impc.studies.fit.sentences import limited
 from impc.studies.fit.structures import structure_sentences
 
@@ -37,7 +38,7 @@ def verdict(result: FitResult) -> str:
         (
             saturated and found.loop is not None and found.loop.found,
             "The controller agrees with the recordings, but what it leaves looks like noise inside "
-            "the loop: do not rely on its gain or its weights.",
+            f"the loop: do not rely on its gain or its weights{_instead(result)}.",
         ),
         (
             found.structure is not None and found.structure.found,
@@ -63,6 +64,14 @@ def verdict(result: FitResult) -> str:
         ),
     )
     return next(sentence for holds, sentence in cases if holds)
+
+
+def _instead(result: FitResult) -> str:
+    """Where a gain is that such noise does not bend."""
+    report = result.person
+    if report is None:
+        return ". [fit.observer] asks for a person who senses with noise"
+    return ". Go by that of the person who senses with noise" if preferred(report) else ""
 
 
 def abstract(result: FitResult) -> tuple[str, ...]:

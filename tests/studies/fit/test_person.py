@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 from impc.arrays import frozen
+from impc.assess.diagnostics import ResidualDiagnostics
 from impc.assess.likely_people import entry_intervals, people_as_likely
+from impc.assess.loop_noise import LoopNoise
 from impc.checking import replace
 from impc.control.controller import Controller
 from impc.control.noisy_person import simulate_person
@@ -21,10 +23,11 @@ from impc.model.recordings import Recording
 from impc.model.weights import Weights
 from impc.reporting.document import TextTable
 from impc.reporting.rendering import plain
-from impc.studies.fit.person import person_data, person_section, person_sentences
+from impc.studies.fit.person import person_data, person_section, person_sentences, preferred
 from impc.studies.fit.result import FitResult
 from impc.studies.fit.settings import FitSettings, fit_observer, fit_settings
 from impc.studies.fit.subject import fit_problem, fit_recordings, stages
+from impc.studies.fit.verdict import verdict
 from tests.inverse.test_likelihood_fit import cart
 
 pytestmark = pytest.mark.long
@@ -118,6 +121,26 @@ def test_each_model_is_a_stage_and_intervals_follow_the_likelihood_where_asked()
     assert np.all(np.abs((kept["K_intervals"] - about) / width) < 0.5)
     assert "follows the likelihood" in str(person_section(quick, quick.person))
     assert "follows the likelihood" not in str(person_section(result, result.person))
+
+
+def test_the_page_says_by_which_gain_to_go() -> None:
+    """By that of the person, where least squares leaves noise inside the loop."""
+    result = fitted()
+    loop = LoopNoise(np.array([0.5]), 50.0, 9.0, 0.0)
+    held = tuple(replace(item, saturated=0.2) for item in result.trials)
+    result = replace(result, diagnostics=ResidualDiagnostics(loop, None), trials=held)
+    report = result.person
+    assert report is not None
+    assert report.fit is not None
+    assert preferred(report)
+    assert verdict(result).endswith("Go by that of the person who senses with noise.")
+    unsettled = replace(report.models[0], fit=replace(report.fit, converged=False))
+    for first in (unsettled, replace(unsettled, fit=None)):
+        other = replace(report, models=(first, *report.models[1:]))
+        assert not preferred(other)
+        assert verdict(replace(result, person=other)).endswith("on its gain or its weights.")
+    best = replace(report.models[1], fit=replace(report.fit, log_likelihood=1e6))
+    assert not preferred(replace(report, models=(report.models[0], best)))
 
 
 def test_an_interval_without_end_says_so() -> None:

@@ -87,7 +87,9 @@ def test_noise_in_the_loop_and_another_body_are_said_first() -> None:
     plain = fitted(1.0)
     structure = ResidualStructure(1e-4, 1e-4, 0.3)
     inside = replace(plain, diagnostics=ResidualDiagnostics(loop(True), structure))
-    assert "noise inside the loop: do not rely on its gain" in verdict(inside)
+    said = verdict(inside)
+    assert "noise inside the loop: do not rely on its gain" in said
+    assert said.endswith("its weights. [fit.observer] asks for a person who senses with noise.")
     other = replace(plain, diagnostics=ResidualDiagnostics(loop(False), structure))
     assert "is not that of the model" in verdict(other)
 
