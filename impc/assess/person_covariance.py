@@ -7,7 +7,8 @@ With I the information of all recordings about all that was searched, initial st
     sandwich   I^-1 cov(sum s_t) I^-1  s_t the score of a sample; its sum by Newey and West
 
 agree where the model is true. Where it is not, the last still tells how estimates scatter. The
-prior of the search is left out but for a trace: what is not told has a deviation of hundreds.
+prior of the search is left out but for a trace: what is not told has a deviation of hundreds
+(docs/noisy-people.md).
 """
 
 from __future__ import annotations
