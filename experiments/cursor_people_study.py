@@ -102,7 +102,7 @@ def _row(
     fit = follower.fit
     assert fit.prices is not None
     assert fit.problem.family is not None
-    levels = np.exp(fit.theta[fit.space.own :])
+    levels = fit.levels
     return _Row(
         blur,
         half,

@@ -140,14 +140,12 @@ def score(
     expected = person_covariance(likely, "expected")
     robust = person_covariance(likely)
     clock.append(time.process_time())
-    values = np.exp(likely.theta[likely.space.own :])
     people, unknowns = people_as_likely(likely), true_unknowns(likely, who)
-    directions, deviations = _told(robust)
+    directions, deviations = _told(robust.directions, robust.deviations)
     aims = directions @ unknowns[: likely.space.gain]
     along = (direction_intervals(people, directions) - aims[:, None]) / deviations[:, None]
-    entries = (entry_intervals(people) - np.ravel(truth)[:, None]) / np.abs(np.ravel(truth))[
-        :, None
-    ]
+    true = truth.reshape(-1, 1)
+    entries = (entry_intervals(people) - true) / np.abs(true)
     clock.append(time.process_time())
     fell = _fell(likely, directions, aims) if profiled else []
     clock.append(time.process_time())
@@ -174,7 +172,7 @@ def score(
         len(people),
         fell,
         [*who.person.levels[who.person.levels > 0], *who.recorder],
-        [float(value) for value in values],
+        likely.levels.tolist(),
         level_intervals(people).tolist(),
         np.diff(clock).tolist(),
     )
@@ -212,10 +210,11 @@ def _steps(
     return _pairs(covariance.directions, covariance.deviations, along[: space.gain])
 
 
-def _told(covariance: PersonCovariance) -> tuple[Array, Array]:
+def _told(directions: Array, deviations: Array) -> tuple[Array, Array]:
     """Determined directions and their deviations, the best told first."""
-    told = covariance.deviations < _DETERMINED
-    return np.array(covariance.directions)[told], np.array(covariance.deviations)[told]
+    order = np.argsort(deviations, kind="stable")
+    order = order[deviations[order] < _DETERMINED]
+    return directions[order], deviations[order]
 
 
 def _fell(likely: PersonFit, directions: Array, aims: Array) -> list[float]:
@@ -230,12 +229,9 @@ def _fell(likely: PersonFit, directions: Array, aims: Array) -> list[float]:
 def _pairs(directions: Array, deviations: Array, error: Array) -> list[tuple[float, float]]:
     """Errors and deviations along determined directions, each turned to where it is largest."""
     found = []
-    for direction, deviation in sorted(
-        zip(directions, deviations, strict=True), key=lambda two: two[1]
-    ):
-        if deviation < _DETERMINED:
-            sign = np.sign(direction[np.argmax(np.abs(direction))])
-            found.append((float(sign * direction @ np.ravel(error)), float(deviation)))
+    for direction, deviation in zip(*_told(directions, deviations), strict=True):
+        sign = np.sign(direction[np.argmax(np.abs(direction))])
+        found.append((float(sign * direction @ np.ravel(error)), float(deviation)))
     return found
 
 

@@ -91,11 +91,7 @@ def level_intervals(people: Sequence[LikelyPerson]) -> Array:
     ----------
     people : sequence of LikelyPerson
     """
-    found = []
-    for one, covariance in people:
-        values = np.exp(one.theta[one.space.own :])
-        found.append([covariance.level_interval(k, float(v)) for k, v in enumerate(values)])
-    return _united([np.array(ends) for ends in found])
+    return _united([covariance.level_intervals(one.levels) for one, covariance in people])
 
 
 def direction_intervals(people: Sequence[LikelyPerson], ways: Array) -> Array:

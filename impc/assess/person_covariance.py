@@ -71,10 +71,16 @@ class PersonCovariance(Frozen):
     directions: Array
     deviations: Array
 
-    def level_interval(self, index: int, value: float) -> tuple[float, float]:
-        """Interval of 95 % of a level by its `index`, about its `value`."""
-        factor = float(np.exp(min(TWO_SIDED * self.levels[index], 700.0)))  # still a number
-        return value / factor, value * factor
+    def level_intervals(self, values: Array) -> Array:
+        """Intervals of 95 % of the levels (l, 2), in their units.
+
+        Parameters
+        ----------
+        values : Array
+            The levels they are about (l,).
+        """
+        factors = np.exp(np.minimum(TWO_SIDED * self.levels, 700.0))  # still numbers
+        return frozen(np.stack([values / factors, values * factors], axis=-1))
 
     def entry_intervals(self, K: Array) -> Array:
         """Intervals of 95 % of the entries of a gain (entries, 2), in their units.

@@ -51,15 +51,10 @@ def level_intervals(fit: PersonFit, covariance: PersonCovariance) -> Array:
     covariance : PersonCovariance
         Gives the intervals of levels that are well told.
     """
-    values = np.exp(fit.theta[fit.space.own :])
-    return frozen(
-        [
-            level_interval(fit, k)
-            if covariance.levels[k] > _HARDLY
-            else covariance.level_interval(k, float(value))
-            for k, value in enumerate(values)
-        ]
-    )
+    found = np.array(covariance.level_intervals(fit.levels))
+    for k in np.flatnonzero(covariance.levels > _HARDLY):
+        found[k] = level_interval(fit, int(k))
+    return frozen(found)
 
 
 def entry_intervals(fit: PersonFit, covariance: PersonCovariance) -> Array:

@@ -114,6 +114,11 @@ class PersonFit(Frozen):
         return self.prior.space
 
     @property
+    def levels(self) -> Array:
+        """The levels of noise that were searched (l,), as `space.names` calls them."""
+        return np.asarray(np.exp(self.theta[self.space.own :]))
+
+    @property
     def criterion(self) -> float:
         """Akaike's: 2 count - 2 log L; the smaller the better."""
         return 2 * self.count - 2 * self.log_likelihood

@@ -56,7 +56,7 @@ def test_intervals_reach_from_the_lowest_end_to_the_highest(
     levels = level_intervals(people)
     names = fitted.space.names
     assert levels.shape == (len(names), 2)
-    values = [np.exp(one.theta[one.space.own :]) for one, _ in people]
+    values = [one.levels for one, _ in people]
     for k in range(len(names)):
         about = [
             (v[k], np.exp(1.959964 * t.levels[k])) for v, (_, t) in zip(values, people, strict=True)

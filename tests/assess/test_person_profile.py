@@ -36,10 +36,10 @@ def test_a_level_that_is_well_told_has_the_interval_of_its_deviation(fitted: Per
     index = fitted.space.names.index("recorder x")
     expected = person_covariance(fitted, "expected")
     assert expected.levels[index] < 0.1
-    value = float(fitted.recorder[0])
+    assert fitted.levels[index] == pytest.approx(fitted.recorder[0])
     # Measured: 0.8 % below, 0.0 above, of a deviation of 2.8 %.
     np.testing.assert_allclose(
-        level_interval(fitted, index), expected.level_interval(index, value), rtol=0.01
+        level_interval(fitted, index), expected.level_intervals(fitted.levels)[index], rtol=0.01
     )
 
 
@@ -113,7 +113,7 @@ def test_a_sense_that_is_hardly_told_leaves_the_motor_noise_its_own(seed: int) -
     who = subject("cart", seed, "both", 90.0, 0.7)
     first, motor = estimate(recorded(who, seed).problem), float(who.person.levels[0])
     fit = fit_person(first, blind(who))
-    low, high = person_covariance(fit, "expected").level_interval(0, float(fit.observer.motor[0]))
+    low, high = person_covariance(fit, "expected").level_intervals(fit.levels)[0]
     assert low < motor < high
     free = fit_person(first, blind(who), spread=np.inf)
     deviations = person_covariance(free, "expected").levels

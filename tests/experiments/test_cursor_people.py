@@ -63,7 +63,7 @@ def fitted() -> Follower:
 
 def test_what_a_follower_senses_is_found() -> None:
     follower = fitted()
-    levels = np.exp(follower.fit.theta[follower.fit.space.own :])
+    levels = follower.fit.levels
     found = dict(zip(follower.fit.space.names, levels, strict=True))
     told = person_covariance(follower.fit, "expected")
     deviations = dict(zip(told.names, told.levels, strict=True))
@@ -100,7 +100,7 @@ def test_a_noisy_sense_is_not_taken_for_a_low_price() -> None:
     """The most blurred target: from the price of least squares the search ends at 2, and 4 px."""
     condition = read_conditions(data_file())[5]
     found = fit_follower(condition, np.arange(len(condition.target)), (14,)).fit
-    levels = dict(zip(found.space.names, np.exp(found.theta[found.space.own :]), strict=True))
+    levels = dict(zip(found.space.names, found.levels, strict=True))
     assert found.prices is not None
     assert np.exp(found.prices[0]) > 20
     assert levels["sensory error"] > 20

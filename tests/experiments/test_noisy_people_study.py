@@ -20,7 +20,7 @@ pytestmark = pytest.mark.long
 
 def scored(seed: int, limit: float) -> Score:
     who = subject("cart", seed, "motor", 90.0, limit)
-    return score(who, recorded(who, seed), "carts", seed)
+    return score(who, recorded(who, seed), "carts", seed, profiled=seed == 0)
 
 
 def test_a_subject_is_scored_against_its_truth() -> None:
@@ -28,7 +28,10 @@ def test_a_subject_is_scored_against_its_truth() -> None:
     assert 80 < found.vaf < 97
     assert found.converged
     assert found.above > 0
-    assert len(found.expected) == 2
+    assert len(found.expected) == len(found.along) == len(found.fell) == 2
+    # At a parabola's end of 95 % the likelihood has fallen by 1.92.
+    for (error, deviation), nats in zip(found.expected, found.fell, strict=True):
+        assert nats == pytest.approx((error / deviation) ** 2 / 2, abs=0.3)
     for error, deviation in found.expected:
         assert abs(error) < 4 * deviation  # seed 0
     assert np.log(found.found[0] / found.levels[0]) == pytest.approx(0, abs=0.3)

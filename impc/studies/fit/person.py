@@ -165,7 +165,6 @@ def person_data(result: FitResult) -> dict[str, Any] | None:
     }
     if fit is None or covariance is None or report.confusion is None:
         return data
-    values = np.exp(fit.theta[fit.space.own :])
     return data | {
         "K": fit.K,
         "profiled": report.profiled,
@@ -174,7 +173,9 @@ def person_data(result: FitResult) -> dict[str, Any] | None:
         "known": fit.observer.walk is None,
         "levels": {
             name: {"value": value, "low": low, "high": high}
-            for name, value, (low, high) in zip(fit.space.names, values, report.levels, strict=True)
+            for name, value, (low, high) in zip(
+                fit.space.names, fit.levels, report.levels, strict=True
+            )
         },
         "confusion": report.confusion.correlation,
         "whiteness": report.whiteness,
@@ -290,7 +291,7 @@ def _levels(plant: Plant, report: PersonReport) -> list[_Level]:
     for index, name in enumerate(fit.space.names):
         kind, signal = name.split(" ", 1)
         factor, unit = (100.0, "%") if kind == "share" else shown_unit(plant, signal)
-        value = float(np.exp(fit.theta[fit.space.own + index]))
+        value = float(fit.levels[index])
         low, high = (float(end) for end in report.levels[index])
         found.append(_Level(name, unit, factor * value, factor * low, factor * high))
     return found
