@@ -7,7 +7,7 @@ as likely as a number inside an interval is,
 
     F >= max F - 1.96^2 / 2
 
-each by the sandwich (docs/noisy-people.md).
+each by the sandwich, and of the one that was found, whoever is likelier (docs/noisy-people.md).
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class LikelyPerson(NamedTuple):
 
 
 def people_as_likely(fit: PersonFit) -> list[LikelyPerson]:
-    """The fit, and people as likely, found from it with one sense after the other all but exact.
+    """The fit, the first, and people as likely, from it with one sense after the other exact.
 
     Parameters
     ----------
@@ -71,7 +71,8 @@ def people_as_likely(fit: PersonFit) -> list[LikelyPerson]:
             place, lost, spent, settled = climb(prior, there, _LOOK, losing=losing)
             found.append(person_at(prior, place, lost, settled, spent))
     least = max(one.value for one in found) - TWO_SIDED**2 / 2
-    return [LikelyPerson(one, person_covariance(one)) for one in found if one.value >= least]
+    likely = [fit, *(one for one in found[1:] if one.value >= least)]
+    return [LikelyPerson(one, person_covariance(one)) for one in likely]
 
 
 def entry_intervals(people: Sequence[LikelyPerson]) -> Array:

@@ -172,13 +172,14 @@ def person_report(
         return PersonReport(
             tuple(models), None, profiled, nothing, nothing, None, white, (), frozen([[]])
         )
-    covariance = person_covariance(fit)
     if profiled:
+        covariance = person_covariance(fit)
         levels = person_profile.level_intervals(fit, covariance)
         entries = person_profile.entry_intervals(fit, covariance)
         done("profiles")
     else:
         people = likely_people.people_as_likely(fit)
+        covariance = people[0].covariance
         levels = likely_people.level_intervals(people)
         entries = likely_people.entry_intervals(people)
     ahead = tuple(sorted({1 + round(time / problem.plant.dt) for time in _AHEAD}))

@@ -14,7 +14,7 @@ from impc.assess.likely_people import (
     people_as_likely,
 )
 from impc.assess.person_covariance import person_covariance
-from impc.inverse.likelihood_fit import PersonFit, fit_person
+from impc.inverse.likelihood_fit import PersonFit, fit_person, person_at
 from impc.inverse.methods import estimate
 from impc.model.observer import Observer
 from tests.inverse.test_likelihood_fit import cart, posed
@@ -43,6 +43,20 @@ def test_each_is_as_likely_as_a_number_inside_an_interval(
     assert max(values) - min(values) <= 1.920729
     shares = [min(one.observer.sensory / fitted.observer.sensory) for one, _ in people[1:]]
     assert min(shares) < 0.6
+
+
+def test_the_one_that_was_found_is_inside_whoever_is_likelier(fitted: PersonFit) -> None:
+    """A search may end where another hill is higher: what is printed is in its intervals still."""
+    theta = np.array(fitted.theta)
+    theta[0] += 3 * np.array(person_covariance(fitted).covariance)[0, 0] ** 0.5
+    lower = person_at(fitted.prior, fitted.prior.at(theta), np.array(fitted.losing), False, 1)
+    people = people_as_likely(lower)
+    assert lower.value < max(one.value for one, _ in people) - 1.920729
+    low, high = entry_intervals(people).T
+    assert np.all((low < np.ravel(lower.K)) & (np.ravel(lower.K) < high))
+    assert np.all((low < np.ravel(fitted.K)) & (np.ravel(fitted.K) < high))
+    low, high = level_intervals(people).T
+    assert np.all((low < lower.levels) & (lower.levels < high))
 
 
 def test_intervals_reach_from_the_lowest_end_to_the_highest(

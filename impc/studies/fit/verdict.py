@@ -71,7 +71,7 @@ def _instead(result: FitResult) -> str:
     report = result.person
     if report is None:
         return ". [fit.observer] asks for a person who senses with noise"
-    return ". Go by that of the person who senses with noise" if preferred(report) else ""
+    return ". Go by the gain of the person who senses with noise" if preferred(report) else ""
 
 
 def abstract(result: FitResult) -> tuple[str, ...]:
