@@ -62,13 +62,13 @@ def people_as_likely(fit: PersonFit) -> list[LikelyPerson]:
     ----------
     fit : PersonFit
     """
-    prior, losing = fit.prior, np.array(fit.losing)
+    prior, unseen = fit.prior, np.array(fit.unseen)
     found = [fit]
     for index in fit.space.senses:
         exact = np.array(fit.theta)
         exact[index] = prior.scales[index - fit.space.own] - _EXACT
         if there := prior.tried(exact):
-            place, lost, spent, settled = climb(prior, there, _LOOK, losing=losing)
+            place, lost, spent, settled = climb(prior, there, _LOOK, unseen=unseen)
             found.append(person_at(prior, place, lost, settled, spent))
     least = max(one.value for one in found) - TWO_SIDED**2 / 2
     likely = [fit, *(one for one in found[1:] if one.value >= least)]

@@ -137,11 +137,11 @@ def fallen(fit: PersonFit, along: Array, value: float) -> float:
     float
         Nats; infinite where nothing was found.
     """
-    prior, losing = fit.prior.freed(along), np.array(fit.losing)
+    prior, unseen = fit.prior.freed(along), np.array(fit.unseen)
     top = prior.placed(np.array(fit.theta), fit.told)
-    ridge = np.asarray(np.linalg.solve(prior.parabola(top, losing)[1], along), dtype=np.float64)
+    ridge = np.asarray(np.linalg.solve(prior.parabola(top, unseen)[1], along), dtype=np.float64)
     off = value - float(along @ top.theta)
-    found = _held(prior, top, along, off, ridge, losing)
+    found = _held(prior, top, along, off, ridge, unseen)
     return np.inf if found is None else top.value - found[0].value
 
 
@@ -153,10 +153,10 @@ def _end(fit: PersonFit, along: Array, side: int) -> float:
     search begins on its ridge.
     """
     prior, begin = fit.prior.freed(along), float(along @ fit.theta)
-    here, losing = prior.placed(np.array(fit.theta), fit.told), np.array(fit.losing)
+    here, unseen = prior.placed(np.array(fit.theta), fit.told), np.array(fit.unseen)
     top, inside, outside, value = here.value, begin, side * np.inf, begin
     for _ in range(_TRIES):
-        gradient, curvature = prior.parabola(here, losing)
+        gradient, curvature = prior.parabola(here, unseen)
         ridge = np.asarray(np.linalg.solve(curvature, along), dtype=np.float64)
         spread, peak = float(along @ ridge), value + float(ridge @ gradient)
         # There the profile falls by (value - peak)^2 / (2 spread), of its largest.
@@ -165,11 +165,11 @@ def _end(fit: PersonFit, along: Array, side: int) -> float:
         goal = side * min(side * goal, side * value + _LONGEST, side * begin + FARTHEST)
         if not side * inside < side * goal < side * outside:
             goal = (inside + outside) / 2 if np.isfinite(outside) else inside + side * _LONGEST
-        found = _held(prior, here, along, goal - value, ridge, losing)
+        found = _held(prior, here, along, goal - value, ridge, unseen)
         if found is None:  # as far as an end may be
             outside = goal
             continue
-        (here, losing), value = found, goal
+        (here, unseen), value = found, goal
         root = float(np.sqrt(max(top - here.value, 0.0)))
         if abs(root - _FALLEN) < _CLOSE:
             return value
@@ -183,9 +183,9 @@ def _end(fit: PersonFit, along: Array, side: int) -> float:
 
 
 def _held(
-    prior: Prior, here: Place, along: Array, off: float, ridge: Array, losing: Array
+    prior: Prior, here: Place, along: Array, off: float, ridge: Array, unseen: Array
 ) -> tuple[Place, Array] | None:
-    """The best of all else so far off, and the slope of what levels lose; None without a filter.
+    """The best of all else so far off, and the slope unseen there; None without a filter.
 
     The search begins on the ridge or beside it, where it is the higher: a straight ridge may leave
     the gains that stabilise, and moves a level that is all but none by many powers of e.
@@ -195,8 +195,8 @@ def _held(
     if not starts:
         return None
     begin = max(starts, key=lambda place: place.value)
-    found, losing, _, _ = climb(prior, begin, _BUDGET, _across(along), losing)
-    return found, losing
+    found, unseen, _, _ = climb(prior, begin, _BUDGET, _across(along), unseen)
+    return found, unseen
 
 
 def _across(along: Array) -> Array:

@@ -43,7 +43,7 @@ def encode_person(fit: PersonFit) -> dict[str, Any]:
         "logarithms": own.problem.logarithms.tolist(),
         "levels": space.first.tolist(),
         "theta": fit.theta.tolist(),
-        "losing": fit.losing.tolist(),
+        "unseen": fit.unseen.tolist(),
         "converged": fit.converged,
         "evaluations": fit.evaluations,
     }
@@ -68,5 +68,5 @@ def decode_person(problem: Problem, observer: Observer, kept: dict[str, Any]) ->
     space = PersonCoordinates(own, observer.with_levels(levels[:split]), levels[split:])
     prior = prior_about(space, Asked(observer, None, (), 1.0, 0))
     place = prior.at(np.array(kept["theta"]))
-    losing = np.array(kept["losing"])
-    return person_at(prior, place, losing, kept["converged"], kept["evaluations"])
+    unseen = np.array(kept["unseen"])
+    return person_at(prior, place, unseen, kept["converged"], kept["evaluations"])

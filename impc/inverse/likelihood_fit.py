@@ -86,8 +86,8 @@ class PersonFit(Frozen):
         The unknowns, in the coordinates of `space` (count,).
     told : Told
         What the recordings say there.
-    losing : Array
-        Slope of what levels lose because all else is fitted to the same noise (levels,), nats.
+    unseen : Array
+        Slope that scores do not have (q,), nats: see `unseen_slope`.
     prior : Prior
         What the search was held by.
     """
@@ -105,7 +105,7 @@ class PersonFit(Frozen):
     evaluations: int
     theta: Array
     told: Told
-    losing: Array
+    unseen: Array
     prior: Prior
 
     @property
@@ -226,7 +226,7 @@ def fit_person(
         if ends[-1].settled and found.prices is None:
             break
     end = max(ends, key=lambda one: one.place.told.value)
-    return person_at(end.prior, end.place, end.losing, end.settled, spent)
+    return person_at(end.prior, end.place, end.unseen, end.settled, spent)
 
 
 class _End(NamedTuple):
@@ -234,14 +234,14 @@ class _End(NamedTuple):
 
     prior: Prior
     place: Place
-    losing: Array
+    unseen: Array
     spent: int
     settled: bool
 
 
 def _levelled(prior: Prior, theta: Array, budget: int) -> _End:
     """The first likelihoods from theta (q,), in which the gain stands."""
-    rest, none = np.eye(len(theta))[:, prior.space.gain :], np.zeros(len(prior.scales))
+    rest, none = np.eye(len(theta))[:, prior.space.gain :], np.zeros(len(theta))
     return _End(prior, *climb(prior, prior.at(theta), budget, rest, none))
 
 
@@ -259,18 +259,19 @@ def _looked_beside(end: _End, asked: Asked, budget: int) -> _End:
     there = prior.tried(theta) if len(senses) and budget > _LOOK else None
     if there is None:
         return end
-    there, losing, spent, _ = climb(prior, there, _LOOK, losing=end.losing)
+    there, unseen, spent, _ = climb(prior, there, _LOOK, unseen=end.unseen)
     if there.value <= end.place.value + _HIGHER:
         return end._replace(spent=end.spent + spent)
-    beside = _searched(_End(prior, there, losing, 0, False), asked, budget - spent)
+    beside = _searched(_End(prior, there, unseen, 0, False), asked, budget - spent)
     return beside._replace(spent=end.spent + spent + beside.spent)
 
 
 def _searched(start: _End, asked: Asked, budget: int) -> _End:
     """Climb in rounds, coordinates and prior made anew where one went far, and then to the end."""
-    prior, place, losing, spent = start.prior, start.place, np.zeros_like(start.losing), 0
+    prior, place, spent = start.prior, start.place, 0
     while spent < budget:
-        place, _, more, _ = climb(prior, place, min(_ROUND, budget - spent + 1), losing=losing)
+        none, part = np.zeros(len(place.theta)), min(_ROUND, budget - spent + 1)
+        place, _, more, _ = climb(prior, place, part, unseen=none)
         spent += more - 1
         if np.linalg.norm((place.theta - prior.center)[: prior.space.gain]) <= _NEAR * asked.spread:
             break
@@ -279,11 +280,11 @@ def _searched(start: _End, asked: Asked, budget: int) -> _End:
         parts = there.observer, there.recorder, asked.held, asked.counted
         prior = prior_about(PersonCoordinates(own, *parts), asked)
         place, spent = prior.at(prior.space.start), spent + 1
-    place, losing, more, settled = climb(prior, place, budget - spent + 1)
-    return _End(prior, place, losing, spent + more - 1, settled)
+    place, unseen, more, settled = climb(prior, place, budget - spent + 1)
+    return _End(prior, place, unseen, spent + more - 1, settled)
 
 
-def person_at(prior: Prior, place: Place, losing: Array, settled: bool, spent: int) -> PersonFit:
+def person_at(prior: Prior, place: Place, unseen: Array, settled: bool, spent: int) -> PersonFit:
     """What is said of a person where a search has come to.
 
     Parameters
@@ -292,8 +293,8 @@ def person_at(prior: Prior, place: Place, losing: Array, settled: bool, spent: i
         What the search was held by.
     place : Place
         Where it ended.
-    losing : Array
-        Slope of what levels lose there (levels,), nats.
+    unseen : Array
+        Slope that scores do not have (q,), nats.
     settled : bool
         Whether it ended by itself.
     spent : int
@@ -315,6 +316,6 @@ def person_at(prior: Prior, place: Place, losing: Array, settled: bool, spent: i
         spent,
         frozen(place.theta),
         place.told,
-        frozen(losing),
+        frozen(unseen),
         prior,
     )

@@ -18,6 +18,8 @@ import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.optimize import lsq_linear
 
+from impc.inverse.unseen_slope import learned_slope, unseen_slope
+
 if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.inverse.person_prior import Place, Prior
@@ -25,14 +27,14 @@ if TYPE_CHECKING:
 __all__ = ["boxed_step", "climb"]
 
 # A search ends when a step promises less, nats: a hundredth of a deviation along any direction
-# without a prior, a tenth with it, for the slope of what levels lose is not known better.
+# without a prior, a tenth with it, for the slope that scores do not have is known no better.
 _SETTLED, _ENOUGH = 1e-4, 5e-3
 # The likelihood jumps where a later stage of a plan meets a bound, a seat's at its limit by half a
 # nat in a step of a deviation. A step is judged as of a function known to so much (Sun and Nocedal
 # 2023), and a search ends after so many steps that found nothing higher by so much: settled, if
 # from the highest place no more than half a nat is promised.
 _ROUGH, _PATIENCE, _PROGRESS = 0.5, 4, 0.05
-# A round with the slope of what levels lose as found by differences is the last when it wins less.
+# A round with that slope as found by differences is the last when it wins less.
 _WON = 0.25
 # Where a loop all but runs away the information of its first state has 35 digits: what of it is not
 # rounding is still a matrix of its kind, with so much of each diagonal added.
@@ -49,7 +51,7 @@ def climb(
     begin: Place,
     budget: int,
     along: Array | None = None,
-    losing: Array | None = None,
+    unseen: Array | None = None,
 ) -> tuple[Place, Array, int, bool]:
     """The largest likelihood near a place, times the prior and less what levels lose.
 
@@ -62,14 +64,14 @@ def climb(
         Likelihoods with derivatives, about, that of `begin` among them.
     along : Array, optional
         Orthonormal directions in which it may move (q, r); all by default.
-    losing : Array, optional
-        What is taken for the slope of what levels lose (levels,), learned on the way; by default it
+    unseen : Array, optional
+        What is taken for the slope that scores do not have (q,), learned on the way; by default it
         is found by differences where the search ends, and the search goes on from there.
 
     Returns
     -------
-    place, losing, spent, settled : Place, Array, int, bool
-        The highest place, slope of what levels lose (levels,), likelihoods with derivatives, and
+    place, unseen, spent, settled : Place, Array, int, bool
+        The highest place, slope that scores do not have (q,), likelihoods with derivatives, and
         whether the search ended by itself.
     """
     way = np.eye(len(begin.theta)) if along is None else along
@@ -77,28 +79,28 @@ def climb(
     reach = _reach(prior, way)
     enough, progress = (_ENOUGH, _PROGRESS) if prior.used else (_SETTLED, _SETTLED)
     here = best = begin
-    differences = prior.used and losing is None
-    losing = np.zeros(len(prior.scales)) if losing is None else losing
-    # What was won when the slope of what levels lose was asked for last, nats.
+    differences = prior.used and unseen is None
+    unseen = np.zeros(len(begin.theta)) if unseen is None else unseen
+    # What was won when the slope that scores do not have was asked for last, nats.
     known = -np.inf
     radius, spent, stale, left = _STEP, 1, 0, np.inf
     while True:
-        gradient, curvature = prior.parabola(here, losing)
+        gradient, curvature = prior.parabola(here, unseen)
         down, curvature = way.T @ gradient, way.T @ curvature @ way
         promised = boxed_step(down, curvature, np.inf)[1]
         if here is best:
             left = promised
         if promised < enough or stale == _PATIENCE or radius < _SHORTEST or spent >= budget:
             if best.value <= known + _WON or spent >= budget or not differences:
-                return best, losing, spent, left < _ROUGH
-            here, losing, known = best, prior.losing(best), best.value
-            radius, spent, stale = _STEP, spent + len(losing), 0
+                return best, unseen, spent, left < _ROUGH
+            here, unseen, known = best, unseen_slope(prior, best), best.value
+            radius, spent, stale = _STEP, spent + len(prior.scales) + prior.space.gain, 0
             continue
         step, within = boxed_step(down, curvature, radius * reach)
         length = float(np.max(np.abs(step) / reach))
         there, spent = prior.tried(here.theta + way @ step), spent + 1
         if there is not None and prior.used and spent < budget:
-            there, more = _followed(prior, there, others)
+            there, more = _followed(prior, there, others, unseen)
             spent += more
         # What came true of the promise, both as if they were larger by what is not smooth.
         share = -1.0 if there is None else (there.value - here.value + _ROUGH) / (within + _ROUGH)
@@ -109,7 +111,7 @@ def climb(
             radius = min(max(radius, 2 * length), _STEP)
         stale = 0 if there.value > best.value + progress else stale + 1
         best = there if there.value > best.value else best
-        losing, here = prior.learned(losing, here, there), there
+        unseen, here = learned_slope(prior, unseen, here, there), there
 
 
 def _reach(prior: Prior, way: Array) -> Array:
@@ -118,13 +120,13 @@ def _reach(prior: Prior, way: Array) -> Array:
     return np.where(np.any(mine != 0, axis=0), _AFAR, 1.0)
 
 
-def _followed(prior: Prior, here: Place, others: Array) -> tuple[Place, int]:
+def _followed(prior: Prior, here: Place, others: Array, unseen: Array) -> tuple[Place, int]:
     """All but the levels (q, r) where the slope puts it, and likelihoods spent.
 
     The ridge that all else makes bends with the levels, on the seat by many deviations. What levels
     lose changes by nats beside it, so that places are compared on it.
     """
-    slope, bend = prior.parabola(here, np.zeros(len(prior.scales)))
+    slope, bend = prior.parabola(here, unseen)
     radius = _STEP * _reach(prior, others)
     step, promised = boxed_step(others.T @ slope, others.T @ bend @ others, radius)
     if promised < _BESIDE:

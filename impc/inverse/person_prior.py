@@ -11,7 +11,6 @@ docs/noisy-people.md).
 from __future__ import annotations
 
 import copy
-import itertools
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -27,8 +26,6 @@ __all__ = ["Place", "Prior"]
 # Without a prior a level that slides to zero, or a sense to one that is not used, has no end: along
 # what is so flat a step of ten is as far as a promise is believed.
 _FLAT = 1e-2
-# Step of the differences along a level, of its logarithm; square of one that teaches half.
-_DIFFERENCE, _DAMPING = 0.1, 0.1
 # Nats for each factor of e by which a gain near the border of those that stabilise lets noise
 # grow: on the seat the largest likelihood without it is on that border, and a search creeps there.
 _BARRIER = 0.5
@@ -127,55 +124,19 @@ class Prior:
         freed.unlikely = self.unlikely * (1 - np.abs(along[self.space.own :]))
         return freed
 
-    def parabola(self, here: Place, losing: Array) -> tuple[Array, Array]:
+    def parabola(self, here: Place, unseen: Array) -> tuple[Array, Array]:
         """Slope (q,) and curvature (q, q), positive definite, of what is to be largest.
 
         Parameters
         ----------
         here : Place
             Where they are asked for.
-        losing : Array
-            What is taken for the slope of what levels lose (levels,).
+        unseen : Array
+            What is taken for the slope that scores do not have (q,), see `unseen_slope`.
         """
         slope, bend = self.slopes(here.theta)
-        gradient = here.told.gradient + slope
-        gradient[self.space.own :] -= losing
+        gradient = here.told.gradient + slope + unseen
         return gradient, here.told.information + bend + _FLAT * np.eye(len(gradient))
-
-    def learned(self, losing: Array, here: Place, there: Place) -> Array:
-        """Slope of what levels lose (levels,) by Broyden's update, damped: short steps tell little.
-
-        Parameters
-        ----------
-        losing : Array
-            What was taken for it (levels,).
-        here, there : Place
-            The two ends of a step.
-        """
-        own = self.space.own
-        moved = (there.theta - here.theta)[own:]
-        missed = there.lost - here.lost - float(losing @ moved)
-        learned = losing + missed * moved / (float(moved @ moved) + _DAMPING)
-        # Twice the noise are half the deviations, and no level is more than all of it.
-        return np.clip(learned, -float(own), 0.0)
-
-    def losing(self, here: Place) -> Array:
-        """Slope of `lost` along the levels (levels,) from `here`, by differences.
-
-        All else follows a level along its ridge, for `lost` changes along that too. Where neither
-        way has a likelihood the slope is taken for zero.
-        """
-        own, slopes = self.space.own, np.zeros(len(self.scales))
-        if not self.used:
-            return slopes
-        information = here.told.information + self.slopes(here.theta)[1]
-        ridges = -np.linalg.solve(information[:own, :own], information[:own, own:])
-        ways = _DIFFERENCE * np.hstack([ridges.T, np.eye(len(slopes))])
-        for (index, way), sign in itertools.product(enumerate(ways), (1, -1)):
-            there = self.tried(here.theta + sign * way) if slopes[index] == 0.0 else None
-            if there is not None:
-                slopes[index] = sign * (there.lost - here.lost) / _DIFFERENCE
-        return slopes
 
     def lost(self, theta: Array, told: Told) -> float:
         """What levels lose because all else is fitted to the same noise, nats, at theta (q,).

@@ -49,7 +49,7 @@ def test_the_one_that_was_found_is_inside_whoever_is_likelier(fitted: PersonFit)
     """A search may end where another hill is higher: what is printed is in its intervals still."""
     theta = np.array(fitted.theta)
     theta[0] += 3 * np.array(person_covariance(fitted).covariance)[0, 0] ** 0.5
-    lower = person_at(fitted.prior, fitted.prior.at(theta), np.array(fitted.losing), False, 1)
+    lower = person_at(fitted.prior, fitted.prior.at(theta), np.array(fitted.unseen), False, 1)
     people = people_as_likely(lower)
     assert lower.value < max(one.value for one, _ in people) - 1.920729
     low, high = entry_intervals(people).T

@@ -21,6 +21,7 @@ from impc.assess.person_profile import (
 )
 from impc.inverse.likelihood_fit import PersonFit, fit_person
 from impc.inverse.methods import estimate
+from impc.inverse.unseen_slope import unseen_slope
 from impc.model.observer import Observer
 from tests.inverse.test_likelihood_fit import cart, posed
 
@@ -55,12 +56,11 @@ def test_at_its_end_the_likelihood_has_fallen(fitted: PersonFit, name: str, end:
     information = np.array(fitted.told.information)[np.ix_(free, free)] + 0.1 * np.eye(len(free))
     root = np.linalg.inv(np.linalg.cholesky(information)).T  # steps of one are deviations
     prior = fitted.prior
-    losing = np.zeros(len(fitted.theta))
-    losing[own:] = prior.losing(prior.at(np.insert(np.array(fitted.theta)[free], index, value)))
+    unseen = unseen_slope(prior, prior.at(np.insert(np.array(fitted.theta)[free], index, value)))
 
     def climbed(steps: Array) -> tuple[float, Array]:
         here = prior.at(np.insert(fitted.theta[free] + root @ steps, index, value))
-        gradient = here.told.gradient + prior.slopes(here.theta)[0] - losing
+        gradient = here.told.gradient + prior.slopes(here.theta)[0] + unseen
         return -here.value, -root.T @ gradient[free]
 
     found = scipy.optimize.minimize(

@@ -46,7 +46,7 @@ def test_it_is_the_one_that_was_fitted(make: object) -> None:
     fit = fit_person(found, person, max_evaluations=30)
     kept = json.loads(json.dumps(encode_person(fit)))
     again = decode_person(found.problem, person, kept)
-    for name in ("K", "S", "recorder", "theta", "losing"):
+    for name in ("K", "S", "recorder", "theta", "unseen"):
         assert_array_equal(getattr(again, name), getattr(fit, name))
     assert (again.value, again.log_likelihood) == (fit.value, fit.log_likelihood)
     assert (again.converged, again.evaluations) == (fit.converged, fit.evaluations)

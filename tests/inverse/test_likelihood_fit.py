@@ -21,6 +21,7 @@ from impc.inverse.gain_search import fit_gain
 from impc.inverse.likelihood_fit import PersonFit, fit_person
 from impc.inverse.methods import estimate
 from impc.inverse.problem import Problem
+from impc.inverse.unseen_slope import unseen_slope
 from impc.model.bounds import Bounds
 from impc.model.observer import Observer
 from impc.model.plant import Plant
@@ -101,10 +102,10 @@ def test_a_person_is_found_and_told_better_than_without_the_noise(
     np.testing.assert_allclose(fitted.observer.motor, person.motor, rtol=0.2)
     np.testing.assert_allclose(fitted.recorder, 0.01, rtol=0.1)
     np.testing.assert_allclose(fitted.K, truth, rtol=0.15)
-    # With the prior, and less what levels lose, its gradient is none, to a tenth of a deviation.
+    # With the prior, and what scores do not have, its gradient is none, to a tenth of a deviation.
     slope, bend = fitted.prior.slopes(np.array(fitted.theta))
-    gradient = fitted.told.gradient + slope
-    gradient[fitted.space.own :] -= fitted.prior.losing(fitted.prior.at(np.array(fitted.theta)))
+    unseen = unseen_slope(fitted.prior, fitted.prior.at(np.array(fitted.theta)))
+    gradient = fitted.told.gradient + slope + unseen
     assert gradient @ np.linalg.solve(fitted.told.information + bend, gradient) < 1e-2
 
 

@@ -13,6 +13,7 @@ from impc.inverse.likelihood_fit import PersonFit, fit_person
 from impc.inverse.likelihood_search import boxed_step, climb
 from impc.inverse.methods import estimate
 from impc.inverse.person_prior import Prior
+from impc.inverse.unseen_slope import unseen_slope
 from impc.model.observer import Observer
 from impc.model.weights import Weights
 from tests.inverse.test_likelihood_fit import cart, posed
@@ -77,7 +78,7 @@ def test_the_prior_bends_as_it_says(sliding: PersonFit) -> None:
     nothing = Prior(space, np.inf, scales)
     assert nothing.value(theta) == nothing.lost(theta, sliding.told) == 0.0
     assert not np.any(nothing.slopes(theta)[1])
-    assert not np.any(nothing.losing(nothing.at(theta)))
+    assert not np.any(unseen_slope(nothing, nothing.at(theta)))
 
 
 def test_initial_states_are_as_any_other_state(sliding: PersonFit) -> None:
@@ -92,24 +93,6 @@ def test_initial_states_are_as_any_other_state(sliding: PersonFit) -> None:
     theta[space.shared : space.shared + 2] += np.linalg.solve(unit, x0)
     away = prior.value(prior.center) - prior.value(theta)
     assert away == pytest.approx(x0 @ np.linalg.solve(unit @ unit.T + driven, x0) / 2)
-
-
-def test_the_slope_of_what_levels_lose_follows_the_ridge(sliding: PersonFit) -> None:
-    """Against searches of all else with a level a little lower and higher."""
-    prior, theta = sliding.prior, np.array(sliding.theta)
-    own = sliding.space.own
-    found, others, step = prior.losing(prior.at(theta)), np.eye(len(theta))[:, :own], 0.05
-    for index in (0, 3):  # those that are told: motor, recorder
-        lost = []
-        for sign in (-1, 1):
-            start = theta + sign * step * np.eye(len(theta))[own + index]
-            place, _, _, settled = climb(
-                prior, prior.at(start), 30, others, np.array(sliding.losing)
-            )
-            assert settled
-            lost.append(place.lost)
-        # Measured: .05 apart, for the first is a step of a tenth to one side.
-        assert found[index] == pytest.approx((lost[1] - lost[0]) / (2 * step), abs=0.1)
 
 
 def test_what_levels_lose_is_that_of_the_gain_integrated_out() -> None:
