@@ -94,6 +94,7 @@ def climb(
             if best.value <= known + _WON or spent >= budget or not differences:
                 return best, unseen, spent, left < _ROUGH
             here, unseen, known = best, unseen_slope(prior, best), best.value
+            # Two filters without derivatives count as one with them.
             radius, spent, stale = _STEP, spent + len(prior.scales) + prior.space.gain, 0
             continue
         step, within = boxed_step(down, curvature, radius * reach)

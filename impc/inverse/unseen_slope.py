@@ -29,6 +29,8 @@ __all__ = ["learned_slope", "unseen_slope"]
 
 # Step of the differences along a level, of its logarithm; square of one that teaches half.
 _DIFFERENCE, _DAMPING = 0.1, 0.1
+# A direction of the gain that is hardly told has no longer step, of a coordinate.
+_LONGEST = 0.25
 
 
 def unseen_slope(prior: Prior, here: Place) -> Array:
@@ -99,8 +101,8 @@ def _jumps(prior: Prior, here: Place) -> Array:
     variances, directions = np.linalg.eigh(covariance[:gain, :gain])
     step, slope = np.zeros(len(here.theta)), np.zeros(gain)
     for variance, direction in zip(variances, directions.T, strict=True):
-        deviation = np.sqrt(variance)
-        step[:own] = covariance[:, :gain] @ direction / deviation
+        length = min(np.sqrt(variance), _LONGEST)
+        step[:own] = length / variance * covariance[:, :gain] @ direction
         try:
             low, high = (
                 prior.space.value(there) + prior.value(there)
@@ -108,6 +110,6 @@ def _jumps(prior: Prior, here: Place) -> Array:
             )
         except ImpcError:
             continue
-        if np.isfinite(high - low):
-            slope += ((high - low) / 2 - float(gradient @ step)) / deviation * direction
+        if np.isfinite(low) and np.isfinite(high):
+            slope += ((high - low) / 2 - float(gradient @ step)) / length * direction
     return slope
