@@ -2,12 +2,15 @@
 
 What the noise of one sense explains that of another may explain as well, with another gain: beside
 the hill of the likelihood where a fit has ended there are others, for people one of whose senses is
-all but exact. An interval of 95 % is from the lowest to the highest end of those of all that are
-as likely as a number inside an interval is,
+all but exact. And a hill may be steep on one side and all but flat on the other: along the
+direction of the gain that is least told a person is looked for as far as one is as likely. An
+interval of 95 % is from the lowest to the highest end of those of all that are as likely as a
+number inside an interval is,
 
     F >= max F - 1.96^2 / 2
 
-each by the sandwich, and of the one that was found, whoever is likelier (docs/noisy-people.md).
+by the sandwich where a search has ended, and of the one that was found, whoever is likelier
+(docs/noisy-people.md).
 """
 
 from __future__ import annotations
@@ -18,7 +21,9 @@ import numpy as np
 
 from impc.arrays import Array, frozen
 from impc.assess.covariance import TWO_SIDED
+from impc.assess.held_person import held_person
 from impc.assess.person_covariance import person_covariance
+from impc.checking import replace
 from impc.inverse.likelihood_fit import person_at
 from impc.inverse.likelihood_search import climb
 
@@ -39,6 +44,10 @@ __all__ = [
 # Logarithm by which the noise of a sense that is all but exact is below what is expected, and
 # likelihoods of a search that begins there.
 _EXACT, _LOOK = 5.0, 15
+# A direction of the gain is told when its deviation is below this, of a coordinate. Who is as
+# likely farthest along it is looked for at so many places, by so many likelihoods at each, and is
+# found where as much of what may be lost is.
+_TOLD, _PLACES, _AT_EACH, _LOST = 0.25, 5, 10, 0.8
 
 
 class LikelyPerson(NamedTuple):
@@ -48,7 +57,7 @@ class LikelyPerson(NamedTuple):
     ----------
     fit : PersonFit
     covariance : PersonCovariance
-        By the sandwich.
+        By the sandwich; zero of somebody who is at the end of an interval.
     """
 
     fit: PersonFit
@@ -56,7 +65,7 @@ class LikelyPerson(NamedTuple):
 
 
 def people_as_likely(fit: PersonFit) -> list[LikelyPerson]:
-    """The fit, the first, and people as likely, from it with one sense after the other exact.
+    """The fit, the first, and people as likely: with one sense after the other exact, and far off.
 
     Parameters
     ----------
@@ -68,11 +77,50 @@ def people_as_likely(fit: PersonFit) -> list[LikelyPerson]:
         exact = np.array(fit.theta)
         exact[index] = prior.scales[index - fit.space.own] - _EXACT
         if there := prior.tried(exact):
-            place, lost, spent, settled = climb(prior, there, _LOOK, unseen=unseen)
-            found.append(person_at(prior, place, lost, settled, spent))
+            place, slope, spent, settled = climb(prior, there, _LOOK, unseen=unseen)
+            found.append(person_at(prior, place, slope, settled, spent))
     least = max(one.value for one in found) - TWO_SIDED**2 / 2
-    likely = [fit, *(one for one in found[1:] if one.value >= least)]
-    return [LikelyPerson(one, person_covariance(one)) for one in likely]
+    hills = [fit, *(one for one in found[1:] if one.value >= least)]
+    likely = [LikelyPerson(one, person_covariance(one)) for one in hills]
+    return [*likely, *_far_off(*likely[0], least)]
+
+
+def _far_off(fit: PersonFit, covariance: PersonCovariance, least: float) -> list[LikelyPerson]:
+    """Who is as likely farthest along the direction of the gain that is least told, either way."""
+    told = np.flatnonzero(covariance.deviations < _TOLD)
+    if not len(told):
+        return []
+    along = np.zeros(len(fit.theta))
+    along[: fit.space.gain] = covariance.directions[told[-1]]
+    step = TWO_SIDED * covariance.deviations[told[-1]]
+    parts = ("covariance", "levels", "entries", "deviations")
+    nothing = replace(covariance, **{name: 0 * getattr(covariance, name) for name in parts})
+    found = (_farthest(fit, along, side * step, least) for side in (-1, 1))
+    return [LikelyPerson(one, nothing) for one in found if one is not None]
+
+
+def _farthest(fit: PersonFit, along: Array, step: float, least: float) -> PersonFit | None:
+    """Who is as likely farthest along a direction (q,); None where the sandwich ends, `step` away.
+
+    With twice the distance a parabola falls by four times as much.
+    """
+    prior, here, unseen = fit.prior, fit.prior.placed(np.array(fit.theta), fit.told), fit.unseen
+    room, inside, outside, off = fit.value - least, 0.0, np.inf, step
+    for _ in range(_PLACES):
+        found = held_person(prior, here, along, off - inside, unseen, _AT_EACH)
+        if found is not None and found[0].value >= least:
+            (here, unseen), inside = found, off
+            lost = max((fit.value - here.value) / room, 0.25) if room > 0 else 1.0
+            if lost > _LOST:
+                break
+            off = inside / np.sqrt(lost)
+        elif inside == 0.0:
+            return None
+        else:
+            outside = off
+        if abs(off) >= abs(outside):
+            off = (inside + outside) / 2
+    return person_at(prior, here, unseen, True, 0)
 
 
 def entry_intervals(people: Sequence[LikelyPerson]) -> Array:

@@ -16,15 +16,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.linalg
 
 from impc.arrays import Array, frozen
-from impc.inverse.likelihood_search import climb
+from impc.assess.held_person import held_person
 
 if TYPE_CHECKING:
     from impc.assess.person_covariance import PersonCovariance
     from impc.inverse.likelihood_fit import PersonFit
-    from impc.inverse.person_prior import Place, Prior
 
 __all__ = ["FARTHEST", "entry_intervals", "fallen", "level_interval", "level_intervals", "profile"]
 
@@ -139,9 +137,7 @@ def fallen(fit: PersonFit, along: Array, value: float) -> float:
     """
     prior, unseen = fit.prior.freed(along), np.array(fit.unseen)
     top = prior.placed(np.array(fit.theta), fit.told)
-    ridge = np.asarray(np.linalg.solve(prior.parabola(top, unseen)[1], along), dtype=np.float64)
-    off = value - float(along @ top.theta)
-    found = _held(prior, top, along, off, ridge, unseen)
+    found = held_person(prior, top, along, value - float(along @ top.theta), unseen, _BUDGET)
     return np.inf if found is None else top.value - found[0].value
 
 
@@ -165,7 +161,7 @@ def _end(fit: PersonFit, along: Array, side: int) -> float:
         goal = side * min(side * goal, side * value + _LONGEST, side * begin + FARTHEST)
         if not side * inside < side * goal < side * outside:
             goal = (inside + outside) / 2 if np.isfinite(outside) else inside + side * _LONGEST
-        found = _held(prior, here, along, goal - value, ridge, unseen)
+        found = held_person(prior, here, along, goal - value, unseen, _BUDGET)
         if found is None:  # as far as an end may be
             outside = goal
             continue
@@ -180,28 +176,3 @@ def _end(fit: PersonFit, along: Array, side: int) -> float:
         else:
             inside = value
     return outside
-
-
-def _held(
-    prior: Prior, here: Place, along: Array, off: float, ridge: Array, unseen: Array
-) -> tuple[Place, Array] | None:
-    """The best of all else so far off, and the slope unseen there; None without a filter.
-
-    The search begins on the ridge or beside it, where it is the higher: a straight ridge may leave
-    the gains that stabilise, and moves a level that is all but none by many powers of e.
-    """
-    ways = ridge / float(along @ ridge), along
-    starts = [place for way in ways if (place := prior.tried(here.theta + off * way))]
-    if not starts:
-        return None
-    begin = max(starts, key=lambda place: place.value)
-    found, unseen, _, _ = climb(prior, begin, _BUDGET, _across(along), unseen)
-    return found, unseen
-
-
-def _across(along: Array) -> Array:
-    """All that is orthogonal to a direction (q, q - 1); coordinates it leaves alone, as such."""
-    mine = np.flatnonzero(along)
-    turned = np.zeros((len(along), len(mine) - 1))
-    turned[mine] = scipy.linalg.null_space(along[None, mine])
-    return np.hstack([np.delete(np.eye(len(along)), mine, axis=1), turned])

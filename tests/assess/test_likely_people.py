@@ -14,6 +14,7 @@ from impc.assess.likely_people import (
     people_as_likely,
 )
 from impc.assess.person_covariance import person_covariance
+from impc.assess.person_profile import profile
 from impc.inverse.likelihood_fit import PersonFit, fit_person, person_at
 from impc.inverse.methods import estimate
 from impc.model.observer import Observer
@@ -89,9 +90,31 @@ def test_along_an_entry_a_direction_has_the_interval_of_the_entry(
     assert_allclose(found, entry_intervals(people), rtol=1e-9)
 
 
-def test_who_sees_every_state_is_alone() -> None:
+def test_who_sees_every_state_has_one_hill() -> None:
+    """No sense can be exact instead: the sandwich about the fit, or farther along one direction."""
     seeing = Observer(cart(), motor=0.4)
     fit = fit_person(estimate(posed(seeing, 0.01, 3.0, trials=1)), seeing)
-    people = people_as_likely(fit)
-    assert [one.fit for one in people] == [fit]
-    assert_array_equal(entry_intervals(people), person_covariance(fit).entry_intervals(fit.K))
+    people, sandwich = people_as_likely(fit), person_covariance(fit)
+    assert [one for one, told in people if np.any(told.covariance)] == [fit]
+    low, high = entry_intervals(people[:1]).T
+    assert_array_equal(np.transpose([low, high]), sandwich.entry_intervals(fit.K))
+    wider = entry_intervals(people).T
+    assert np.all((wider[0] <= low) & (high <= wider[1]))
+    np.testing.assert_allclose(wider, (low, high), rtol=0.1)
+
+
+def test_where_a_hill_is_flat_an_interval_reaches_as_far_as_the_profile() -> None:
+    """Of the direction of the gain that is least told, with noisy senses at a limit."""
+    person = Observer(cart(), ["x", "v"], motor=0.05, sensory=[0.3, 0.6])
+    fit = fit_person(estimate(posed(person, 0.01, 0.6, trials=1)), person)
+    people, along = people_as_likely(fit), np.zeros(len(fit.theta))
+    sandwich, least = people[0].covariance, max(one.value for one, _ in people) - 1.920729
+    assert sandwich.deviations[-1] < 0.25
+    along[: fit.space.gain] = sandwich.directions[-1]
+    ends = (np.array(profile(fit, along)) - along @ fit.theta) / sandwich.deviations[-1]
+    far = [one for one, told in people if not np.any(told.covariance)]
+    off = np.array([along @ (one.theta - fit.theta) for one in far]) / sandwich.deviations[-1]
+    assert all(one.value >= least for one in far)
+    # Measured: -2.86 and 1.96, by profile -2.89 and 2.08; the sandwich ends at 1.96.
+    assert np.min(off) < -2.5
+    np.testing.assert_allclose([np.min(off), np.max(off)], ends, rtol=0.1)
