@@ -41,7 +41,7 @@ def held_person(
     Returns
     -------
     place, unseen : Place, Array
-        Where the search ended, and the slope that scores do not have there; None where neither
+        Where the search ended, and what scores do not have there (q,); None where neither
         start has a likelihood.
     """
     _, curvature = prior.parabola(here, unseen)
