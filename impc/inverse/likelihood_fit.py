@@ -81,7 +81,7 @@ class PersonFit(Frozen):
     converged : bool
         Whether the search ended by itself.
     evaluations : int
-        Filters of all recordings with derivatives.
+        Filters of all recordings with derivatives, about.
     theta : Array
         The unknowns, in the coordinates of `space` (count,).
     told : Told
