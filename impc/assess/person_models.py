@@ -152,7 +152,7 @@ def person_report(
         Whether intervals of the gain and of levels that are weakly told follow the likelihood:
         ten minutes and more on the seat.
     done : callable
-        Told the name of each model once it is fitted, and "profiles".
+        Told the name of each model once it is fitted, and "intervals of the person".
     remember : callable
         (name, problem, person, compute) -> the model, from memory when it is there.
     """
@@ -167,6 +167,7 @@ def person_report(
     fit = models[0].fit
     p = len(problem.plant.outputs)
     if fit is None:
+        done("intervals of the person")
         nothing = frozen(np.zeros((0, 2)))
         white = frozen([np.nan] * p)
         return PersonReport(
@@ -176,12 +177,12 @@ def person_report(
         covariance = person_covariance(fit)
         levels = person_profile.level_intervals(fit, covariance)
         entries = person_profile.entry_intervals(fit, covariance)
-        done("profiles")
     else:
         people = likely_people.people_as_likely(fit)
         covariance = people[0].covariance
         levels = likely_people.level_intervals(people)
         entries = likely_people.entry_intervals(people)
+    done("intervals of the person")
     ahead = tuple(sorted({1 + round(time / problem.plant.dt) for time in _AHEAD}))
     return PersonReport(
         tuple(models),

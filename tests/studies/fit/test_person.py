@@ -104,7 +104,7 @@ def test_each_model_is_a_stage_and_intervals_follow_the_likelihood_where_asked()
     assert quick.person is not None
     assert len(heard) == stages(problem, settings)
     assert len(heard) - stages(problem, without) == len(result.person.models) + 1
-    assert stages(problem, fit_settings(TABLE)) == len(heard) - 1
+    assert stages(problem, fit_settings(TABLE)) == len(heard)
     assert fit_observer(cart(), without, trials()) is None
     kept, rough = person_data(result), person_data(quick)
     assert kept is not None
