@@ -29,7 +29,7 @@ from impc.assess.likely_people import (
     level_intervals,
     people_as_likely,
 )
-from impc.assess.person_covariance import person_covariance
+from impc.assess.person_covariance import TOLD, person_covariance
 from impc.assess.person_profile import fallen
 from impc.errors import ImpcError
 from impc.inverse.likelihood_fit import fit_person
@@ -56,8 +56,6 @@ _LIMITS = {
 # Who falls is no subject, nor who on the seat is at a limit that is met in fewer samples, or more;
 # an angle, rad, that is a fall.
 _SHARES, _FALLEN = (0.12, 0.40), 1.0
-# A direction of the gain is determined when its deviation is below this, in natural coordinates.
-_DETERMINED = 0.25
 # An entry is told when half of its interval is below this share of it.
 _TOLD = 1.0
 # As far below the truth a search may end, nats.
@@ -213,7 +211,7 @@ def _steps(
 def _told(directions: Array, deviations: Array) -> tuple[Array, Array]:
     """Determined directions and their deviations, the best told first."""
     order = np.argsort(deviations, kind="stable")
-    order = order[deviations[order] < _DETERMINED]
+    order = order[deviations[order] < TOLD]
     return directions[order], deviations[order]
 
 

@@ -22,7 +22,7 @@ import numpy as np
 from impc.arrays import Array, frozen
 from impc.assess.covariance import TWO_SIDED
 from impc.assess.held_person import held_person
-from impc.assess.person_covariance import person_covariance
+from impc.assess.person_covariance import TOLD, person_covariance
 from impc.checking import replace
 from impc.inverse.likelihood_fit import person_at
 from impc.inverse.likelihood_search import climb
@@ -44,10 +44,9 @@ __all__ = [
 # Logarithm by which the noise of a sense that is all but exact is below what is expected, and
 # likelihoods of a search that begins there.
 _EXACT, _LOOK = 5.0, 15
-# A direction of the gain is told when its deviation is below this, of a coordinate. Who is as
-# likely farthest along it is looked for at so many places, by so many likelihoods at each, and is
-# found where as much of what may be lost is.
-_TOLD, _PLACES, _AT_EACH, _LOST = 0.25, 5, 10, 0.8
+# Who is as likely farthest along a direction is looked for at so many places, by so many
+# likelihoods at each, and is found where as much of what may be lost is.
+_PLACES, _AT_EACH, _LOST = 5, 10, 0.8
 
 
 class LikelyPerson(NamedTuple):
@@ -87,7 +86,7 @@ def people_as_likely(fit: PersonFit) -> list[LikelyPerson]:
 
 def _far_off(fit: PersonFit, covariance: PersonCovariance, least: float) -> list[LikelyPerson]:
     """Who is as likely farthest along the direction of the gain that is least told, either way."""
-    told = np.flatnonzero(covariance.deviations < _TOLD)
+    told = np.flatnonzero(covariance.deviations < TOLD)
     if not len(told):
         return []
     along = np.zeros(len(fit.theta))

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "KINDS",
+    "TOLD",
     "Confusion",
     "PersonCovariance",
     "confusion",
@@ -35,6 +36,8 @@ __all__ = [
 
 #: Ways to a covariance.
 KINDS = ("expected", "observed", "sandwich")
+#: A number of the gain is told by itself when its deviation is below this, of a coordinate.
+TOLD = 0.25
 # Of a coordinate, which none leaves by much more than one: the prior that is left.
 _FARTHEST = 1e3
 # Step of the differences, of a coordinate: their error is the square of it, and rounding over it.

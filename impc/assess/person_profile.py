@@ -19,6 +19,7 @@ import numpy as np
 
 from impc.arrays import Array, frozen
 from impc.assess.held_person import held_person
+from impc.assess.person_covariance import TOLD
 
 if TYPE_CHECKING:
     from impc.assess.person_covariance import PersonCovariance
@@ -26,8 +27,7 @@ if TYPE_CHECKING:
 
 __all__ = ["FARTHEST", "entry_intervals", "fallen", "level_interval", "level_intervals", "profile"]
 
-# A level whose logarithm has a larger deviation is weakly told, and an entry of the gain with one
-# in natural coordinates (`Coordinates`) not by itself.
+# A level whose logarithm has a larger deviation is weakly told.
 _HARDLY = 0.25
 # Root of half of 1.96^2, of nats, and how near to it an end of an interval is found.
 _FALLEN, _CLOSE = 1.385903, 0.04
@@ -72,7 +72,7 @@ def entry_intervals(fit: PersonFit, covariance: PersonCovariance) -> Array:
         np.ravel(fit.K), dK.reshape(len(dK), -1).T, np.ravel(covariance.entries), strict=True
     ):
         length = float(np.linalg.norm(slopes))
-        if not deviation < _HARDLY * length:
+        if not deviation < TOLD * length:
             found.append((np.nan, np.nan))
             continue
         along = np.zeros(len(fit.theta))

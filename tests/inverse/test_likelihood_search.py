@@ -19,13 +19,17 @@ from impc.model.weights import Weights
 from tests.inverse.test_likelihood_fit import cart, posed
 
 
-@pytest.fixture(scope="module")
-def sliding() -> PersonFit:
+def sliding_person() -> PersonFit:
     """Someone whose senses err so little that these levels are not told."""
     person = Observer(cart(), ["x", "v"], motor=0.4, sensory=[0.002, 0.004])
     return fit_person(
         estimate(posed(person, 0.01, 0.9)), person.with_levels(np.array([0.1, 0, 0, 0, 0.1, 0.1]))
     )
+
+
+@pytest.fixture(scope="module")
+def sliding() -> PersonFit:
+    return sliding_person()
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -20,15 +20,12 @@ from impc.model.observer import Observer
 from impc.model.recordings import Recording
 from impc.model.weights import Weights
 from tests.inverse.test_likelihood_fit import cart, posed
+from tests.inverse.test_likelihood_search import sliding_person
 
 
 @pytest.fixture(scope="module")
 def sliding() -> PersonFit:
-    """Someone whose senses err so little that these levels are not told."""
-    person = Observer(cart(), ["x", "v"], motor=0.4, sensory=[0.002, 0.004])
-    return fit_person(
-        estimate(posed(person, 0.01, 0.9)), person.with_levels(np.array([0.1, 0, 0, 0, 0.1, 0.1]))
-    )
+    return sliding_person()
 
 
 @pytest.fixture(scope="module")
