@@ -127,7 +127,7 @@ def prices(prepared: PreparedLoop, x: np.ndarray) -> np.ndarray:
         room, lam = min(count, width) + 1, np.zeros(count)
         solve_dual(
             rows.W, rows.gram, rows.b - rows.T @ x, rows.limit, 1e-13 * rows.b, lam,
-            np.empty(room, dtype=np.int64), np.empty((room, room)), np.empty((room, width)),
+            np.empty(room, dtype=np.int64), np.empty((room, room)), np.empty((room, width)), 0,
         )  # fmt: skip
         for r in np.flatnonzero(lam > 0):
             family, k = rows.family[r], rows.stage[r]

@@ -35,9 +35,9 @@ __all__ = ["COMPILED_WITH", "FilterResult", "Steady", "run_filter", "run_person"
 COMPILED_WITH = {
     "compiled_clip": "4b317b8d6c67db13",
     "compiled_covariance": "88834ae5def6476e",
-    "compiled_loop": "4721c36aa6383398",
+    "compiled_loop": "799fe6e5b71326f2",
     "compiled_products": "eca330d3b9dc679d",
-    "compiled_slope": "bfa10fd29c2f5678",
+    "compiled_slope": "14acc2cb2b155b86",
 }
 
 _SOFTENED, _DIVERGED = 2, 5

@@ -129,8 +129,9 @@ def solve_dual(
     free: Buffer,
     factor: Buffer,
     basis: Buffer,
+    begin: int,
 ) -> tuple[int, int]:
-    """Solve the dual from lam = 0.
+    """Solve the dual, from the free rows of a problem with the same rows and another slack.
 
     Parameters
     ----------
@@ -143,6 +144,8 @@ def solve_dual(
         Written: multipliers (r,), the rows with 0 < lam < limit in the order of the factor, and
         the lower factor of their Gram matrix. Sizes r, a + 1, (a + 1, a + 1) and (a + 1, N m) with
         a = min(r, N m).
+    begin : int
+        How many rows of `free` it begins with, whose factor is there; with 0, from lam = 0.
 
     Returns
     -------
@@ -158,7 +161,11 @@ def solve_dual(
     is_free = np.zeros(rows, dtype=np.bool_)
     step = np.empty(len(free))
     lam[:] = 0.0
-    count = 0
+    count = _begun(whitened, d, limit, lam, free, factor, basis, begin)
+    for i in range(count):
+        is_free[free[i]] = True
+        for r in range(rows):
+            slack[r] += gram[free[i], r] * lam[free[i]]
     for _ in range(50 * (rows + 10)):
         row, worst = -1, 0.0
         noise = _ROUNDING * _largest_pull(lengths, lam)
@@ -231,6 +238,41 @@ def solve_dual(
             lam[leaving] = limit[leaving] if at_limit[leaving] else 0.0
             count = _remove(whitened, free, count, blocked, factor, basis)
     return UNSOLVED, count
+
+
+@njit(cache=True)
+def _begun(
+    whitened: Buffer,
+    d: Buffer,
+    limit: Buffer,
+    lam: Buffer,
+    free: Buffer,
+    factor: Buffer,
+    basis: Buffer,
+    count: int,
+) -> int:
+    """Write the multipliers with which some rows are tight; return how many rows are left.
+
+    Rows whose multiplier is not positive are dropped, the most negative first: what is left is the
+    answer to a problem that has these rows only, from which the dual method may go on.
+    """
+    right = np.empty(count)
+    while count > 0:
+        for i in range(count):
+            right[i] = -d[free[i]]
+        substitute(factor, count, right)
+        place, worst = -1, np.inf
+        for i in range(count):
+            if right[i] > limit[free[i]]:
+                return 0
+            if right[i] < worst:
+                place, worst = i, right[i]
+        if worst > 0.0:
+            for i in range(count):
+                lam[free[i]] = right[i]
+            return count
+        count = _remove(whitened, free, count, place, factor, basis)
+    return 0
 
 
 @njit(cache=True)
@@ -322,6 +364,9 @@ class Workspace(NamedTuple):
         Columns of the rows, one after the other: (n, r) and (N m, r).
     active : Buffer
         How many rows are free at the last sample, (1,).
+    begin : Buffer
+        With how many of them the next problem begins (1,): the plan of a sample is much like that
+        of the one before.
     """
 
     slack: Buffer
@@ -335,6 +380,7 @@ class Workspace(NamedTuple):
     T: Buffer
     M: Buffer
     active: Buffer
+    begin: Buffer
 
 
 @njit(cache=True, nogil=True)  # trials left out are fitted side by side
@@ -407,17 +453,18 @@ def run(
             needs_qp, near = _look(T, rows.b, kept, x[t], slack)
             v[: u.shape[1]] = 0.0
             dv0[:] = 0.0
-            status[t] = _FREE
-            if needs_qp:
-                if gain_only:
-                    status[t], row = _UNSOLVED, -1
-                else:
-                    status[t], near, row = _solve(
-                        loop, dloop, rows, drows, unit, work, x[t], dx[t], lam
-                    )
-                if status[t] > _SOFTENED:
-                    _hold(x, dx, t)
-                    return weakly_active, row
+            status[t], row = _FREE, -1
+            if not needs_qp:
+                work.begin[0] = 0
+            elif gain_only:
+                status[t] = _UNSOLVED
+            else:
+                status[t], near, row = _solve(
+                    loop, dloop, rows, drows, unit, work, x[t], dx[t], lam
+                )
+            if status[t] > _SOFTENED:
+                _hold(x, dx, t)
+                return weakly_active, row
             weakly_active += near
             _apply(loop, dloop, v, dv0, x[t], dx[t], u[t], du[t])
         if len(body.code):
@@ -453,6 +500,7 @@ def workspace(rows: Rows, m: int, p: int) -> Workspace:
         np.zeros((m, p)),
         np.ascontiguousarray(rows.T.T),
         np.ascontiguousarray(rows.M.T),
+        np.zeros(1, dtype=np.int64),
         np.zeros(1, dtype=np.int64),
     )
 
@@ -503,7 +551,7 @@ def law(
         if status > _SOFTENED:
             return status, near, row
     else:
-        status = _FREE
+        status, work.begin[0] = _FREE, 0
     _apply(loop, dloop, v, work.dv0, x, dx, u, du)
     return status, near, -1
 
@@ -545,8 +593,18 @@ def _solve(
     """Write v and dv0 of one sample; return its status, whether its rows are weak, and a row."""
     slack, free, factor = work.slack, work.free, work.factor
     code, active = solve_dual(
-        rows.W, rows.gram, slack, rows.limit, work.kept, lam, free, factor, work.basis
+        rows.W,
+        rows.gram,
+        slack,
+        rows.limit,
+        work.kept,
+        lam,
+        free,
+        factor,
+        work.basis,
+        work.begin[0],
     )
+    work.begin[0] = active if code == CONVERGED else 0
     if code == INCONSISTENT:
         return _INFEASIBLE, False, active
     if code == UNSOLVED:

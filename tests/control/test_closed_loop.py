@@ -255,12 +255,9 @@ def test_dual_solver_calls_random_infeasible_rows_inconsistent() -> None:
         W, d = rng.normal(size=(rows, width)), rng.normal(size=rows) + 0.4
         if rng.random() < 0.3:
             W[-1] = -W[0]  # parallel rows, as a lower and an upper bound are
-        room = min(rows, width) + 1
-        lam = np.zeros(rows)
-        code, _ = solve_dual(
-            W, W @ W.T, d, np.full(rows, np.inf), np.full(rows, 1e-12), lam,
-            np.empty(room, dtype=np.int64), np.empty((room, room)), np.empty((room, width)),
-        )  # fmt: skip
+        lam, *others = dual_workspace(rows, width)
+        tight = np.full(rows, np.inf), np.full(rows, 1e-12)
+        code, _ = solve_dual(W, W @ W.T, d, *tight, lam, *others, 0)
         verdict = linprog(np.zeros(width), A_ub=W, b_ub=d, bounds=(None, None), method="highs")
         assert code == (INCONSISTENT if verdict.status == 2 else CONVERGED)
         seen.append(code)
@@ -270,3 +267,40 @@ def test_dual_solver_calls_random_infeasible_rows_inconsistent() -> None:
             assert np.all(lam >= 0)
             assert abs(lam @ (W @ v - d)) <= 1e-8
     assert 30 < seen.count(INCONSISTENT) < 270
+
+
+@pytest.mark.parametrize("price", [np.inf, 0.5])
+def test_dual_solver_finds_the_same_from_where_the_last_problem_ended(price: float) -> None:
+    """Rows at their limits are given up at some samples and kept at the next."""
+    rng, begun, limited = np.random.default_rng(8), 0, 0
+    for _ in range(40):
+        rows, width = int(rng.integers(3, 16)), int(rng.integers(4, 9))
+        W, d = rng.normal(size=(rows, width)), rng.normal(size=rows) + 0.4
+        given = W, W @ W.T, np.full(rows, price), np.full(rows, 1e-12)
+        warm, count = dual_workspace(rows, width), 0
+        for _ in range(20):
+            d = d + 0.1 * rng.normal(size=rows)
+            cold = dual_workspace(rows, width)
+            code, _ = solve_dual(*given[:2], d, *given[2:], *cold, 0)
+            begun += count > 0
+            found, count = solve_dual(*given[:2], d, *given[2:], *warm, count)
+            assert found == code
+            if code != CONVERGED:
+                count = 0
+                continue
+            limited += bool(np.any(cold[0] == price))
+            np.testing.assert_allclose(
+                W.T @ warm[0], W.T @ cold[0], rtol=0, atol=1e-9 * (1 + np.max(cold[0]))
+            )
+            assert sorted(warm[1][:count]) == list(
+                np.flatnonzero((warm[0] > 0) & (warm[0] < price))
+            )
+    assert begun > 300
+    assert limited > (100 if price < np.inf else -1)
+
+
+def dual_workspace(rows: int, width: int) -> tuple[Array, Array, Array, Array]:
+    """Multipliers, free rows, factor and basis of `solve_dual`."""
+    room = min(rows, width) + 1
+    free = np.empty(room, dtype=np.int64)
+    return np.zeros(rows), free, np.empty((room, room)), np.empty((room, width))
