@@ -43,7 +43,7 @@ __all__ = [
 ]
 
 #: First digits of the SHA-256 of each file whose functions are called.
-COMPILED_WITH = {"compiled_products": "eca330d3b9dc679d"}
+COMPILED_WITH = {"compiled_products": "19e7f22bf8fd60eb"}
 
 
 class Covariance(NamedTuple):
@@ -60,7 +60,7 @@ class Covariance(NamedTuple):
     dCP, dS : Buffer
         Derivatives of C P (p, z, k) and of S (p, p, k).
     half : Buffer
-        tr(S^-1 dS S^-1 dS) / 2 for each pair of directions (k, k).
+        tr(S^-1 dS S^-1 dS) / 2 for each pair of directions (k, k), the lower half.
     left : Buffer
         P|t, once the sample is known (z, z).
     product : Buffer

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from impc.arrays import Buffer
+from impc.borrowed import borrowed
 from impc.control.compiled_clip import Clip, clipped
 from impc.control.compiled_covariance import (
     Covariance,
@@ -22,21 +23,29 @@ from impc.control.compiled_covariance import (
     variance_changes,
     weigh,
 )
-from impc.control.compiled_loop import LoopMatrices, law, workspace
+from impc.control.compiled_loop import LoopMatrices, Workspace, law, workspace
 from impc.control.compiled_products import combine
 from impc.control.compiled_slope import slope_of_law
 from impc.control.constraint_rows import RowDirections, Rows
 from impc.control.joint_loop import JointLoop
 from impc.jit import njit
 
-__all__ = ["COMPILED_WITH", "FilterResult", "Steady", "run_filter", "run_person"]
+__all__ = [
+    "COMPILED_WITH",
+    "FilterResult",
+    "Room",
+    "Steady",
+    "filter_room",
+    "run_filter",
+    "run_person",
+]
 
 #: First digits of the SHA-256 of each file whose functions are called.
 COMPILED_WITH = {
     "compiled_clip": "4b317b8d6c67db13",
-    "compiled_covariance": "88834ae5def6476e",
+    "compiled_covariance": "3bb8c6da99fea449",
     "compiled_loop": "799fe6e5b71326f2",
-    "compiled_products": "eca330d3b9dc679d",
+    "compiled_products": "19e7f22bf8fd60eb",
     "compiled_slope": "14acc2cb2b155b86",
 }
 
@@ -77,7 +86,7 @@ class FilterResult(NamedTuple):
     score : Buffer
         Its derivatives along the q directions (samples, q).
     information : Buffer
-        Sum of their expected products (q, q).
+        Sum of their expected products (q, q), the lower half.
     innovation, spread : Buffer
         Recorded outputs minus what is expected (samples, p), and their covariance (samples, p, p).
     filtered : Buffer
@@ -102,6 +111,51 @@ class FilterResult(NamedTuple):
     counted: int
 
 
+class Room(NamedTuple):
+    """What a filter works in along q directions, of which the first k move covariances.
+
+    Attributes
+    ----------
+    work : Workspace
+        Of the law.
+    lam, du : Buffer
+        Multipliers (r,), and derivatives of the commands (m, q).
+    noise, dnoise : Buffer
+        Variances as in `advance` (2, m), and their derivatives (2, m, k).
+    here : Covariance
+        Of z, before the sample that is next.
+    moves : Moves
+        What the k directions move.
+    """
+
+    work: Workspace
+    lam: Buffer
+    du: Buffer
+    noise: Buffer
+    dnoise: Buffer
+    here: Covariance
+    moves: Moves
+
+
+@njit(cache=True)
+def filter_room(
+    rows: Rows, joint: JointLoop, djoint: JointLoop, P: Buffer, dP: Buffer, q: int
+) -> Room:
+    """Room for a filter of z with the covariance P (z, z), which moves by dP (z, z, k)."""
+    m, k = joint.B.shape[1], dP.shape[2]
+    here, moves = covariance(P, dP, len(joint.C)), moves_of(djoint, k)
+    weigh(joint, djoint, moves, here)
+    return Room(
+        workspace(rows, m, q),
+        np.zeros(len(rows.b)),
+        np.empty((m, q)),
+        np.zeros((2, m)),
+        np.zeros((2, m, k)),
+        here,
+        moves,
+    )
+
+
 @njit(cache=True, nogil=True)
 def run_filter(
     loop: LoopMatrices,
@@ -119,7 +173,9 @@ def run_filter(
     disturbance: Buffer,
     z: Buffer,
     dz: Buffer,
+    room: Room,
     result: FilterResult,
+    first: int,
 ) -> int:
     """Filter one recording; directions that move covariances stand first among all q.
 
@@ -136,36 +192,39 @@ def run_filter(
     at : int
         Where the estimate stands in z.
     shared : int
-        How many directions, the first ones, move more than the first state. Covariances are
-        followed along these alone once the first state is forgotten.
+        How many directions, the first ones, move more than the first state.
     outputs, disturbance : Buffer
         (samples, p) and (samples, d).
     z, dz : Buffer
-        Expected first state (z,) and its derivatives (z, q); overwritten.
+        Expected state at the first sample (z,) and its derivatives (z, q); overwritten.
+    room : Room
+        Overwritten.
     result : FilterResult
         Written.
+    first : int
+        The first sample.
 
     Returns
     -------
     int
-        Samples before the one at which the law has no answer or the state leaves every range; all
-        when there is none.
+        The sample at which it ended: all when it came to the end; one whose status has been
+        written, at which the law has no answer or the state leaves every range; or the first one
+        that remembers nothing of the first state, from which it may go on along `shared` directions.
     """
-    (m, n), q, k, p = loop.K.shape, dz.shape[1], djoint.F.shape[2], outputs.shape[1]
-    work = workspace(rows, m, q)
-    lam, du = np.zeros(len(rows.b)), np.empty((m, q))
-    noise, dnoise = np.zeros((2, m)), np.zeros((2, m, k))
-    here, moves = covariance(joint.P0, djoint.P0, p), moves_of(djoint, k)
-    weigh(joint, djoint, moves, here)
+    # The caller keeps all of these while this runs.
+    loop, dloop, rows, drows = borrowed(loop), borrowed(dloop), borrowed(rows), borrowed(drows)
+    joint, djoint, steady = borrowed(joint), borrowed(djoint), borrowed(steady)
+    unit, outputs, disturbance = borrowed(unit), borrowed(outputs), borrowed(disturbance)
+    z, dz, room, result = borrowed(z), borrowed(dz), borrowed(room), borrowed(result)
+    work, lam, du, here, moves = room.work, room.lam, room.du, room.here, room.moves
+    noise, dnoise = room.noise, room.dnoise
+    (m, n), k = loop.K.shape, here.dP.shape[2]
     settled, quiet = False, 0
-    for t in range(len(outputs)):
+    for t in range(first, len(outputs)):
+        if quiet > 2 * len(z) and dz.shape[1] > shared:
+            return t
         forgotten = _update(joint, djoint, moves, here, outputs[t], z, dz, result, t, shared)
         quiet = quiet + 1 if forgotten else 0
-        if quiet > 2 * len(z) and k > shared:
-            k = shared
-            here, moves = covariance(here.P, here.dP[:, :, :k], p), moves_of(djoint, k)
-            dnoise = np.zeros((2, m, k))
-            weigh(joint, djoint, moves, here)
         u, x, dx = result.u[t], z[at : at + n], dz[at : at + n]
         status, _, _ = law(loop, dloop, rows, drows, unit, work, x, dx, lam, False, u, du)
         if status > _SOFTENED:
@@ -256,13 +315,13 @@ def _clip(
 
 @njit(cache=True, nogil=True)
 def _inform(information: Buffer, de: Buffer, wde: Buffer, half: Buffer) -> None:
-    """Add what one sample tells: of its mean de' S^-1 de, of its covariance `half`."""
+    """Add what one sample tells, the lower half: of its mean de' S^-1 de, of its covariance."""
     for c in range(de.shape[1]):
         for a in range(len(de)):
-            for d in range(de.shape[1]):
+            for d in range(c + 1):
                 information[c, d] += de[a, c] * wde[a, d]
     for c in range(len(half)):
-        for d in range(len(half)):
+        for d in range(c + 1):
             information[c, d] += half[c, d]
 
 
@@ -299,7 +358,7 @@ def _update(
     result.innovation[t], result.spread[t] = e, S
     result.told[t] = -(np.dot(e, weighed) + here.volume[0] + p * np.log(2 * np.pi)) / 2
     wde = inverse @ de
-    score, moved = result.score[t], np.zeros((p, k))
+    score, moved = result.score[t, :q], np.zeros((p, k))
     score[:] = -(weighed @ de)
     for a in range(p):
         for b in range(p):

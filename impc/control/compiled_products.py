@@ -156,7 +156,7 @@ def add_both(rest: Buffer, dP: Buffer) -> None:
 
 @njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 def noise_products(inverse: Buffer, dS: Buffer, half: Buffer) -> None:
-    """Write tr(S^-1 dS S^-1 dS) / 2 for each pair of directions.
+    """Write tr(S^-1 dS S^-1 dS) / 2 for each pair of directions, the lower half.
 
     Parameters
     ----------
@@ -176,7 +176,7 @@ def noise_products(inverse: Buffer, dS: Buffer, half: Buffer) -> None:
     for a in range(p):
         for b in range(p):
             for c in range(k):
-                for d in range(k):
+                for d in range(c + 1):
                     half[c, d] += told[a, b, c] * told[b, a, d] / 2
 
 

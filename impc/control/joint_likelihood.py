@@ -29,7 +29,7 @@ import numpy as np
 from impc.arrays import Array, Frozen, frozen
 from impc.control.closed_loop import Status, prepare_loop
 from impc.control.compiled_clip import Clip
-from impc.control.compiled_filter import FilterResult, Steady, run_filter
+from impc.control.compiled_filter import FilterResult, Steady, filter_room, run_filter
 from impc.control.constraint_rows import RowDirections, Rows
 from impc.control.joint_loop import PlantMoves, joint_directions, joint_loop
 from impc.errors import SolverError
@@ -206,24 +206,8 @@ def joint_likelihood(
         np.full(samples, Status.NOT_REACHED, dtype=np.int8),
         counted,
     )
-    reached = run_filter(
-        law.matrices,
-        law.matrix_directions,
-        law.rows,
-        law.row_directions,
-        law.unit,
-        prepared.clip,
-        prepared.joint,
-        prepared.moves,
-        prepared.steady,
-        prepared.at,
-        prepared.shared,
-        np.array(outputs, order="C"),
-        np.array(disturbance, order="C"),
-        z,
-        dz,
-        result,
-    )
+    given = np.array(outputs, order="C"), np.array(disturbance, order="C")
+    reached = _filter(prepared, *given, z, dz, result)
     if reached < samples:
         status = Status(int(result.status[reached]))
         raise SolverError(
@@ -232,13 +216,55 @@ def joint_likelihood(
     return Likelihood(
         frozen(result.told),
         frozen(result.score),
-        frozen(result.information),
+        frozen(np.tril(result.information) + np.tril(result.information, -1).T),
         frozen(result.innovation),
         frozen(result.spread),
         frozen(result.filtered),
         frozen(result.u),
         result.status,
     )
+
+
+def _filter(
+    prepared: PreparedFilter,
+    outputs: Array,
+    disturbance: Array,
+    z: Array,
+    dz: Array,
+    result: FilterResult,
+) -> int:
+    """Write the result from the expected first state (z,) and its derivatives (z, q).
+
+    Once the first state is forgotten, all is followed along the directions that are left. Returns
+    the sample at which the filter ended, or how many there are.
+    """
+    law, joint, moves, shared = prepared.law, prepared.joint, prepared.moves, prepared.shared
+    P, dP, first = joint.P0, moves.P0, 0
+    while True:
+        room = filter_room(law.rows, joint, moves, P, dP, dz.shape[1])
+        first = run_filter(
+            law.matrices,
+            law.matrix_directions,
+            law.rows,
+            law.row_directions,
+            law.unit,
+            prepared.clip,
+            joint,
+            moves,
+            prepared.steady,
+            prepared.at,
+            shared,
+            outputs,
+            disturbance,
+            z,
+            dz,
+            room,
+            result,
+            first,
+        )
+        if first == len(outputs) or result.status[first] != Status.NOT_REACHED:
+            return int(first)
+        dz, P, dP = dz[:, :shared].copy(), room.here.P, room.here.dP[:, :, :shared].copy()
 
 
 def _unclipped(law: PreparedLoop) -> tuple[PreparedLoop, Clip]:
