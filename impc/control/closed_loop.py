@@ -28,7 +28,7 @@ import numpy as np
 from impc.arrays import Array, Frozen, as_numbers, finite_array, frozen
 from impc.checking import Value, checked
 from impc.control.body_steps import body_tape, pushes
-from impc.control.compiled_loop import LoopMatrices, answer_with, run
+from impc.control.compiled_loop import LoopMatrices, answer_with, run, workspace
 from impc.control.constraint_rows import RowDirections, build_rows, differentiate_rows, directions
 from impc.control.infeasibility import excluded_row, proves_infeasible
 from impc.control.named_solver import COMPILED, Program, active_set, build_program
@@ -348,6 +348,7 @@ def run_loop(
         body_tape(plant.body, p),
         _pushes(prepared, given),
         *(np.array(given.disturbance), _divergence(plant, given), prepared.unit),
+        workspace(prepared.rows, m, p),
     )
     written = (x, u, dx, du, status, multipliers)
     t, weakly_active = 0, 0

@@ -42,11 +42,12 @@ __all__ = [
 
 #: First digits of the SHA-256 of each file whose functions are called.
 COMPILED_WITH = {
+    "borrowed": "f2e859c8dbb8e871",
     "compiled_clip": "4b317b8d6c67db13",
     "compiled_covariance": "3bb8c6da99fea449",
-    "compiled_loop": "799fe6e5b71326f2",
+    "compiled_loop": "90e9a79fc0de92e9",
     "compiled_products": "19e7f22bf8fd60eb",
-    "compiled_slope": "14acc2cb2b155b86",
+    "compiled_slope": "78180c006248dc90",
 }
 
 _SOFTENED, _DIVERGED = 2, 5
@@ -209,16 +210,15 @@ def run_filter(
     int
         The sample at which it ended: all when it came to the end; one whose status has been
         written, at which the law has no answer or the state leaves every range; or the first one
-        that remembers nothing of the first state, from which it may go on along `shared` directions.
+        that remembers nothing of the first state, from where `shared` directions are enough.
     """
     # The caller keeps all of these while this runs.
-    loop, dloop, rows, drows = borrowed(loop), borrowed(dloop), borrowed(rows), borrowed(drows)
-    joint, djoint, steady = borrowed(joint), borrowed(djoint), borrowed(steady)
-    unit, outputs, disturbance = borrowed(unit), borrowed(outputs), borrowed(disturbance)
-    z, dz, room, result = borrowed(z), borrowed(dz), borrowed(room), borrowed(result)
+    loop, dloop, rows, drows, unit = borrowed((loop, dloop, rows, drows, unit))
+    joint, djoint, steady, room, result = borrowed((joint, djoint, steady, room, result))
+    outputs, disturbance, z, dz = borrowed((outputs, disturbance, z, dz))
     work, lam, du, here, moves = room.work, room.lam, room.du, room.here, room.moves
     noise, dnoise = room.noise, room.dnoise
-    (m, n), k = loop.K.shape, here.dP.shape[2]
+    n, k = loop.K.shape[1], here.dP.shape[2]
     settled, quiet = False, 0
     for t in range(first, len(outputs)):
         if quiet > 2 * len(z) and dz.shape[1] > shared:

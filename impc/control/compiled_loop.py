@@ -30,6 +30,7 @@ from typing import NamedTuple
 import numpy as np
 
 from impc.arrays import Buffer
+from impc.borrowed import borrowed
 from impc.control.compiled_body import BodyTape, move_body
 from impc.control.constraint_rows import RowDirections, Rows
 from impc.jit import njit
@@ -49,8 +50,8 @@ __all__ = [
     "workspace",
 ]
 
-#: First digits of the SHA-256 of compiled_body.py, at which numba's cache does not look.
-COMPILED_WITH = "7e4e5b9a21a8d467"
+#: First digits of the SHA-256 of each file whose functions are called: numba's cache does not look.
+COMPILED_WITH = {"borrowed": "f2e859c8dbb8e871", "compiled_body": "7e4e5b9a21a8d467"}
 #: What `solve_dual` says first: an answer, rows that exclude each other, none within its steps.
 CONVERGED, INCONSISTENT, UNSOLVED = 0, 1, 2
 
@@ -394,6 +395,7 @@ def run(
     disturbance: Buffer,
     divergence: float,
     unit: Buffer,
+    work: Workspace,
     first: int,
     x: Buffer,
     u: Buffer,
@@ -420,6 +422,8 @@ def run(
         Entry of a state, in its unit, at which the simulation ends.
     unit : Buffer
         What the error of each input is measured by (m,): its nearer bound.
+    work : Workspace
+        For the rows.
     first : int
         Where to begin. When `status` has an answer there, u and du have it too.
     x, u : Buffer
@@ -443,30 +447,21 @@ def run(
         Number of samples at which the active set is about to change; the row that proved the last
         problem inconsistent, or -1.
     """
+    # The caller keeps all of these while this runs.
+    loop, dloop, rows, drows, body = borrowed((loop, dloop, rows, drows, body))
+    pushes, disturbance, unit, work = borrowed((pushes, disturbance, unit, work))
+    x, u, dx, du, status, lam = borrowed((x, u, dx, du, status, lam))
     plant_moves = bool(np.any(dloop.A) or np.any(dloop.B) or np.any(dloop.E))
-    work = workspace(rows, du.shape[1], du.shape[2])
-    slack, kept, v, dv0, T = work.slack, work.kept, work.v, work.dv0, work.T
     weakly_active = 0
     for t in range(first, len(u)):
         if status[t] > _SOFTENED:
-            # As `law`, whose call would cost a fourth of a sample that the gain answers.
-            needs_qp, near = _look(T, rows.b, kept, x[t], slack)
-            v[: u.shape[1]] = 0.0
-            dv0[:] = 0.0
-            status[t], row = _FREE, -1
-            if not needs_qp:
-                work.begin[0] = 0
-            elif gain_only:
-                status[t] = _UNSOLVED
-            else:
-                status[t], near, row = _solve(
-                    loop, dloop, rows, drows, unit, work, x[t], dx[t], lam
-                )
+            status[t], near, row = law(
+                loop, dloop, rows, drows, unit, work, x[t], dx[t], lam, gain_only, u[t], du[t]
+            )
             if status[t] > _SOFTENED:
                 _hold(x, dx, t)
                 return weakly_active, row
             weakly_active += near
-            _apply(loop, dloop, v, dv0, x[t], dx[t], u[t], du[t])
         if len(body.code):
             move_body(body, x[t], u[t], disturbance[t], dx[t], du[t], x[t + 1], dx[t + 1])
             if len(pushes):
@@ -556,7 +551,7 @@ def law(
     return status, near, -1
 
 
-@njit(cache=True, inline="always")  # for most samples it is all there is to do
+@njit(cache=True)
 def _look(T: Buffer, b: Buffer, kept: Buffer, x: Buffer, slack: Buffer) -> tuple[bool, bool]:
     """Write the slack of the gain; whether a row is broken, and whether one is about to be."""
     broken, near = False, False

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-
 import casadi as ca
 import control
 import numpy as np
@@ -22,7 +20,6 @@ from impc.control.closed_loop import (
     simulate,
     simulate_and_differentiate,
 )
-from impc.control.compiled_loop import COMPILED_WITH
 from impc.control.constraint_rows import directions
 from impc.control.controller import Controller
 from impc.control.loop_function import closed_loop_function
@@ -36,17 +33,10 @@ from impc.model.weights import Weights
 from plants.seated_balance import nonlinear_dynamics
 from plants.seated_subject import seated_parameters_for
 from tests.control.hanging_body import linear_body, pendulum, pendulum_family
-from tests.documents.blocks import ROOT
 
 STEPS = 60
 PUSH = np.repeat(np.random.default_rng(3).choice([-1.0, 0.0, 1.0], STEPS // 6), 6)[:, None]
 START = np.array([0.6, -0.4])
-
-
-def test_the_loop_was_compiled_with_this_body() -> None:
-    """numba's cache of the loop does not see a change of the operations: COMPILED_WITH does."""
-    source = (ROOT / "impc" / "control" / "compiled_body.py").read_bytes()
-    assert hashlib.sha256(source).hexdigest()[:16] == COMPILED_WITH
 
 
 def law(plant: Plant, limit: float = 1.5, rate: float = np.inf) -> Controller:

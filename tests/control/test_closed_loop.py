@@ -255,9 +255,9 @@ def test_dual_solver_calls_random_infeasible_rows_inconsistent() -> None:
         W, d = rng.normal(size=(rows, width)), rng.normal(size=rows) + 0.4
         if rng.random() < 0.3:
             W[-1] = -W[0]  # parallel rows, as a lower and an upper bound are
-        lam, *others = dual_workspace(rows, width)
+        lam, free, factor, basis = dual_workspace(rows, width)
         tight = np.full(rows, np.inf), np.full(rows, 1e-12)
-        code, _ = solve_dual(W, W @ W.T, d, *tight, lam, *others, 0)
+        code, _ = solve_dual(W, W @ W.T, d, *tight, lam, free, factor, basis, 0)
         verdict = linprog(np.zeros(width), A_ub=W, b_ub=d, bounds=(None, None), method="highs")
         assert code == (INCONSISTENT if verdict.status == 2 else CONVERGED)
         seen.append(code)
@@ -299,7 +299,7 @@ def test_dual_solver_finds_the_same_from_where_the_last_problem_ended(price: flo
     assert limited > (100 if price < np.inf else -1)
 
 
-def dual_workspace(rows: int, width: int) -> tuple[Array, Array, Array, Array]:
+def dual_workspace(rows: int, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Multipliers, free rows, factor and basis of `solve_dual`."""
     room = min(rows, width) + 1
     free = np.empty(room, dtype=np.int64)

@@ -6,7 +6,6 @@ import hashlib
 import inspect
 import re
 from dataclasses import replace as replaced
-from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import control
@@ -14,7 +13,7 @@ import numpy as np
 import pytest
 from statsmodels.tsa.statespace.kalman_filter import KalmanFilter
 
-from impc.control import compiled_covariance, compiled_filter, compiled_slope
+from impc.control import compiled_covariance, compiled_filter, compiled_loop, compiled_slope
 from impc.control.closed_loop import scenario, simulate
 from impc.control.constraint_rows import directions
 from impc.control.controller import Controller
@@ -30,6 +29,7 @@ from impc.errors import SolverError
 from impc.model.bounds import Bounds
 from impc.model.observer import Observer, believed_filter
 from impc.model.plant import Plant
+from tests.documents.blocks import ROOT
 from tests.support import extrapolated_slope
 
 if TYPE_CHECKING:
@@ -38,16 +38,18 @@ if TYPE_CHECKING:
     from impc.arrays import Array
 
 
-@pytest.mark.parametrize("file", [compiled_covariance, compiled_slope, compiled_filter])
-def test_the_filter_is_compiled_with_what_is_there(file: ModuleType) -> None:
+@pytest.mark.parametrize(
+    "file", [compiled_loop, compiled_covariance, compiled_slope, compiled_filter]
+)
+def test_code_is_compiled_with_what_is_there(file: ModuleType) -> None:
     """numba would go on running what is called as it was: write these digests into the file."""
-    folder = Path(file.__file__ or "").parent
-    found = {
-        name: hashlib.sha256((folder / f"{name}.py").read_bytes()).hexdigest()[:16]
-        for name in re.findall(
-            r"from impc\.control\.(compiled_\w+) import", inspect.getsource(file)
-        )
-    }
+    called = re.findall(
+        r"from impc\.((?:control\.)?(?:compiled_\w+|borrowed)) import", inspect.getsource(file)
+    )
+    found = {}
+    for name in called:
+        source = (ROOT / "impc" / f"{name.replace('.', '/')}.py").read_bytes()
+        found[name.split(".")[-1]] = hashlib.sha256(source).hexdigest()[:16]
     assert found == file.COMPILED_WITH
 
 
