@@ -19,6 +19,17 @@ __all__ = ["borrowed"]
 
 
 def _borrowed(_: Any, value: Any) -> Any:
+    """The same array, or tuple of arrays and tuples, whose users compiled code does not count.
+
+    Whoever has the arrays must keep them until the last use of what is borrowed: what a compiled
+    function is given by its caller in Python is kept while it runs.
+
+    Parameters
+    ----------
+    value : Buffer or tuple
+        What is no array in it stays as it is.
+    """
+
     def generate(context: Any, builder: Any, signature: Any, given: Any) -> Any:
         return _without_owner(context, builder, signature.args[0], given[0])
 
@@ -43,7 +54,4 @@ def _without_owner(context: Any, builder: Any, kind: Any, value: Any) -> Any:
 
 _null: Callable[[Any], Any] = cgutils.get_null_value
 
-#: The same array, or tuple of arrays and tuples, whose users compiled code does not count. Whoever
-#: has the arrays must keep them until the last use of what is borrowed: what a compiled function is
-#: given by its caller in Python is kept while it runs.
 borrowed: Callable[[Any], Any] = cast("Any", intrinsic(_borrowed))

@@ -42,12 +42,12 @@ __all__ = [
 
 #: First digits of the SHA-256 of each file whose functions are called.
 COMPILED_WITH = {
-    "borrowed": "f2e859c8dbb8e871",
+    "borrowed": "cc35dd2dd7080826",
     "compiled_clip": "4b317b8d6c67db13",
     "compiled_covariance": "3bb8c6da99fea449",
-    "compiled_loop": "90e9a79fc0de92e9",
+    "compiled_loop": "c02fc6985543557e",
     "compiled_products": "19e7f22bf8fd60eb",
-    "compiled_slope": "78180c006248dc90",
+    "compiled_slope": "9d516737b94e4027",
 }
 
 _SOFTENED, _DIVERGED = 2, 5
@@ -142,7 +142,17 @@ class Room(NamedTuple):
 def filter_room(
     rows: Rows, joint: JointLoop, djoint: JointLoop, P: Buffer, dP: Buffer, q: int
 ) -> Room:
-    """Room for a filter of z with the covariance P (z, z), which moves by dP (z, z, k)."""
+    """Room for a filter.
+
+    Parameters
+    ----------
+    rows, joint, djoint
+        As in `run_filter`.
+    P, dP : Buffer
+        Covariance of z before the sample that is next (z, z), and its derivatives (z, z, k).
+    q : int
+        How many directions there are.
+    """
     m, k = joint.B.shape[1], dP.shape[2]
     here, moves = covariance(P, dP, len(joint.C)), moves_of(djoint, k)
     weigh(joint, djoint, moves, here)

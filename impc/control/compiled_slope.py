@@ -17,7 +17,7 @@ from impc.jit import njit
 __all__ = ["COMPILED_WITH", "slope_of_law"]
 
 #: First digits of the SHA-256 of each file whose functions are called.
-COMPILED_WITH = {"compiled_loop": "90e9a79fc0de92e9"}
+COMPILED_WITH = {"compiled_loop": "c02fc6985543557e"}
 
 
 @njit(cache=True, inline="always")
