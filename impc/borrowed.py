@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 __all__ = ["borrowed"]
 
 
-def _borrowed(_: Any, value: Any) -> Any:
+def _borrowed(context: Any, value: Any) -> Any:  # what numba calls it with
     """The same array, or tuple of arrays and tuples, whose users compiled code does not count.
 
     Whoever has the arrays must keep them until the last use of what is borrowed: what a compiled
@@ -26,6 +26,8 @@ def _borrowed(_: Any, value: Any) -> Any:
 
     Parameters
     ----------
+    context : Any
+        That of numba, which puts it there.
     value : Buffer or tuple
         What is no array in it stays as it is.
     """

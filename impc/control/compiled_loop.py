@@ -51,7 +51,7 @@ __all__ = [
 ]
 
 #: First digits of the SHA-256 of each file whose functions are called: numba's cache does not look.
-COMPILED_WITH = {"borrowed": "cc35dd2dd7080826", "compiled_body": "7e4e5b9a21a8d467"}
+COMPILED_WITH = {"borrowed": "40211199623d4028", "compiled_body": "7e4e5b9a21a8d467"}
 #: What `solve_dual` says first: an answer, rows that exclude each other, none within its steps.
 CONVERGED, INCONSISTENT, UNSOLVED = 0, 1, 2
 

@@ -17,7 +17,7 @@ from impc.jit import njit
 __all__ = ["COMPILED_WITH", "slope_of_law"]
 
 #: First digits of the SHA-256 of each file whose functions are called.
-COMPILED_WITH = {"compiled_loop": "c02fc6985543557e"}
+COMPILED_WITH = {"compiled_loop": "bb902d7d4fe454a6"}
 
 
 @njit(cache=True, inline="always")
