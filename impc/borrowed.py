@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 __all__ = ["borrowed"]
 
 
-def _borrowed(context: Any, value: Any) -> Any:  # what numba calls it with
+def _borrowed(context: Any, value: Any) -> Any:
     """The same array, or tuple of arrays and tuples, whose users compiled code does not count.
 
     Whoever has the arrays must keep them until the last use of what is borrowed: what a compiled

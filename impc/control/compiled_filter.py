@@ -42,12 +42,12 @@ __all__ = [
 
 #: First digits of the SHA-256 of each file whose functions are called.
 COMPILED_WITH = {
-    "borrowed": "40211199623d4028",
+    "borrowed": "f9ef79e3bd6dacdb",
     "compiled_clip": "4b317b8d6c67db13",
     "compiled_covariance": "3bb8c6da99fea449",
-    "compiled_loop": "bb902d7d4fe454a6",
+    "compiled_loop": "fc9b0a7c6756a03b",
     "compiled_products": "19e7f22bf8fd60eb",
-    "compiled_slope": "04326a6af5595886",
+    "compiled_slope": "45ec077bd8b6f7e9",
 }
 
 _SOFTENED, _DIVERGED = 2, 5

@@ -51,7 +51,7 @@ __all__ = [
 ]
 
 #: First digits of the SHA-256 of each file whose functions are called: numba's cache does not look.
-COMPILED_WITH = {"borrowed": "40211199623d4028", "compiled_body": "7e4e5b9a21a8d467"}
+COMPILED_WITH = {"borrowed": "f9ef79e3bd6dacdb", "compiled_body": "7e4e5b9a21a8d467"}
 #: What `solve_dual` says first: an answer, rows that exclude each other, none within its steps.
 CONVERGED, INCONSISTENT, UNSOLVED = 0, 1, 2
 
@@ -264,7 +264,7 @@ def _begun(
         substitute(factor, count, right)
         place, worst = -1, np.inf
         for i in range(count):
-            if right[i] > limit[free[i]]:
+            if not right[i] <= limit[free[i]]:  # nor where the slack is no number
                 return 0
             if right[i] < worst:
                 place, worst = i, right[i]

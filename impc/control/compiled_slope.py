@@ -17,7 +17,7 @@ from impc.jit import njit
 __all__ = ["COMPILED_WITH", "slope_of_law"]
 
 #: First digits of the SHA-256 of each file whose functions are called.
-COMPILED_WITH = {"compiled_loop": "bb902d7d4fe454a6"}
+COMPILED_WITH = {"compiled_loop": "fc9b0a7c6756a03b"}
 
 
 @njit(cache=True, inline="always")

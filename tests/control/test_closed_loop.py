@@ -299,6 +299,19 @@ def test_dual_solver_finds_the_same_from_where_the_last_problem_ended(price: flo
     assert limited > (100 if price < np.inf else -1)
 
 
+def test_dual_solver_begins_anew_where_the_slack_is_no_number() -> None:
+    W, tight = np.eye(2), (np.full(2, np.inf), np.full(2, 1e-12))
+    lam, free, factor, basis = dual_workspace(2, 2)
+    code, count = solve_dual(W, W, np.array([-1.0, -2.0]), *tight, lam, free, factor, basis, 0)
+    assert (code, count) == (CONVERGED, 2)
+    lost = np.array([np.nan, -2.0])
+    _, count = solve_dual(W, W, lost, *tight, lam, free, factor, basis, count)
+    assert np.all(np.isfinite(lam[1:]))
+    again, free, factor, basis = dual_workspace(2, 2)
+    assert solve_dual(W, W, lost, *tight, again, free, factor, basis, 0)[1] == count
+    np.testing.assert_array_equal(lam, again)
+
+
 def dual_workspace(rows: int, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Multipliers, free rows, factor and basis of `solve_dual`."""
     room = min(rows, width) + 1
