@@ -45,9 +45,9 @@ COMPILED_WITH = {
     "borrowed": "f9ef79e3bd6dacdb",
     "compiled_clip": "4b317b8d6c67db13",
     "compiled_covariance": "3bb8c6da99fea449",
-    "compiled_loop": "fc9b0a7c6756a03b",
+    "compiled_loop": "9f871626bc4c54b4",
     "compiled_products": "19e7f22bf8fd60eb",
-    "compiled_slope": "45ec077bd8b6f7e9",
+    "compiled_slope": "214c56a85ed59fe1",
 }
 
 _SOFTENED, _DIVERGED = 2, 5

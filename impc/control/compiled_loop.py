@@ -364,10 +364,8 @@ class Workspace(NamedTuple):
     T, M : Buffer
         Columns of the rows, one after the other: (n, r) and (N m, r).
     active : Buffer
-        How many rows are free at the last sample, (1,).
-    begin : Buffer
-        With how many of them the next problem begins (1,): the plan of a sample is much like that
-        of the one before.
+        How many rows are free at the last sample (1,). The problem of the next one begins with
+        them, for its plan is much like that of the one before.
     """
 
     slack: Buffer
@@ -381,7 +379,6 @@ class Workspace(NamedTuple):
     T: Buffer
     M: Buffer
     active: Buffer
-    begin: Buffer
 
 
 @njit(cache=True, nogil=True)  # trials left out are fitted side by side
@@ -496,7 +493,6 @@ def workspace(rows: Rows, m: int, p: int) -> Workspace:
         np.ascontiguousarray(rows.T.T),
         np.ascontiguousarray(rows.M.T),
         np.zeros(1, dtype=np.int64),
-        np.zeros(1, dtype=np.int64),
     )
 
 
@@ -538,15 +534,15 @@ def law(
     needs_qp, near = _look(work.T, rows.b, work.kept, x, work.slack)
     v[: len(u)] = 0.0
     work.dv0[:] = 0.0
-    work.active[0] = 0
+    begin, work.active[0] = work.active[0], 0
     if needs_qp:
         if gain_only:
             return _UNSOLVED, False, -1
-        status, near, row = _solve(loop, dloop, rows, drows, unit, work, x, dx, lam)
+        status, near, row = _solve(loop, dloop, rows, drows, unit, work, x, dx, lam, begin)
         if status > _SOFTENED:
             return status, near, row
     else:
-        status, work.begin[0] = _FREE, 0
+        status = _FREE
     _apply(loop, dloop, v, work.dv0, x, dx, u, du)
     return status, near, -1
 
@@ -584,6 +580,7 @@ def _solve(
     x: Buffer,
     dx: Buffer,
     lam: Buffer,
+    begin: int,
 ) -> tuple[int, bool, int]:
     """Write v and dv0 of one sample; return its status, whether its rows are weak, and a row."""
     slack, free, factor = work.slack, work.free, work.factor
@@ -597,9 +594,8 @@ def _solve(
         free,
         factor,
         work.basis,
-        work.begin[0],
+        begin,
     )
-    work.begin[0] = active if code == CONVERGED else 0
     if code == INCONSISTENT:
         return _INFEASIBLE, False, active
     if code == UNSOLVED:

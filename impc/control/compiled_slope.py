@@ -17,7 +17,7 @@ from impc.jit import njit
 __all__ = ["COMPILED_WITH", "slope_of_law"]
 
 #: First digits of the SHA-256 of each file whose functions are called.
-COMPILED_WITH = {"compiled_loop": "fc9b0a7c6756a03b"}
+COMPILED_WITH = {"compiled_loop": "9f871626bc4c54b4"}
 
 
 @njit(cache=True, inline="always")
