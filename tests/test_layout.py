@@ -52,6 +52,7 @@ ELSEWHERE = {
         control/compiled_loop.py control/constraint_rows.py""",
     "control/test_joint_likelihood.py": """
         control/compiled_clip.py control/compiled_covariance.py control/compiled_filter.py
+        control/compiled_person.py control/compiled_room.py control/compiled_sample.py
         control/compiled_products.py control/compiled_slope.py control/joint_loop.py
         control/noisy_person.py""",
     "control/test_hard_plants.py": "control/infeasibility.py control/saturated.py",

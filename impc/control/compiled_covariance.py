@@ -15,10 +15,6 @@ tests/control/test_joint_likelihood.py asks for (docs/noisy-people.md).
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
-import numpy as np
-
 from impc.arrays import Buffer
 from impc.control.compiled_products import (
     add_both,
@@ -28,123 +24,21 @@ from impc.control.compiled_products import (
     noise_products,
     turn,
 )
+from impc.control.compiled_room import Covariance, Moves, Way
 from impc.control.joint_loop import JointLoop
 from impc.jit import njit
 
-__all__ = [
-    "COMPILED_WITH",
-    "Covariance",
-    "Moves",
-    "advance",
-    "covariance",
-    "moves_of",
-    "variance_changes",
-    "weigh",
-]
+__all__ = ["COMPILED_WITH", "advance", "variance_changes", "weigh"]
 
 #: First digits of the SHA-256 of each file whose functions are called.
-COMPILED_WITH = {"compiled_products": "19e7f22bf8fd60eb"}
-
-
-class Covariance(NamedTuple):
-    """Covariance of z before a sample of the outputs is known, and what that sample does to it.
-
-    Attributes
-    ----------
-    P, dP : Buffer
-        Before the sample (z, z) and (z, z, k).
-    CP, S, inverse, gain : Buffer
-        C P (p, z), S and S^-1 (p, p), g (z, p).
-    volume : Buffer
-        log det S (1,).
-    dCP, dS : Buffer
-        Derivatives of C P (p, z, k) and of S (p, p, k).
-    half : Buffer
-        tr(S^-1 dS S^-1 dS) / 2 for each pair of directions (k, k), the lower half.
-    left : Buffer
-        P|t, once the sample is known (z, z).
-    product : Buffer
-        Room on the way (z, z, k).
-    """
-
-    P: Buffer
-    dP: Buffer
-    CP: Buffer
-    S: Buffer
-    inverse: Buffer
-    gain: Buffer
-    volume: Buffer
-    dCP: Buffer
-    dS: Buffer
-    half: Buffer
-    left: Buffer
-    product: Buffer
-
-
-class Moves(NamedTuple):
-    """What is not zero of dF and dQ: few directions move either, and few columns of F.
-
-    Attributes
-    ----------
-    row, along : Buffer
-        Which rows move, along which direction (r,) each.
-    column : Buffer
-        Which columns of F any direction moves (j,).
-    F, Q : Buffer
-        What is there in these columns, and in all of Q: (j, r) and (z, r).
-    plant : bool
-        Whether any direction moves B, C, E or G.
-    """
-
-    row: Buffer
-    along: Buffer
-    column: Buffer
-    F: Buffer
-    Q: Buffer
-    plant: bool
-
-
-@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
-def covariance(P: Buffer, dP: Buffer, p: int) -> Covariance:
-    """P and dP (z, z, k), copied, and room for what follows from them for p outputs."""
-    size, k = len(P), dP.shape[2]
-    return Covariance(
-        P.copy(),
-        dP.copy(),
-        np.empty((p, size)),
-        np.empty((p, p)),
-        np.empty((p, p)),
-        np.empty((size, p)),
-        np.empty(1),
-        np.empty((p, size, k)),
-        np.empty((p, p, k)),
-        np.empty((k, k)),
-        np.empty((size, size)),
-        np.empty((size, size, k)),
-    )
-
-
-@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
-def moves_of(djoint: JointLoop, k: int) -> Moves:
-    """What the first k directions move."""
-    size = len(djoint.F)
-    found = np.zeros((size, k), dtype=np.bool_)
-    for i in range(size):
-        for c in range(k):
-            found[i, c] = np.any(djoint.F[i, :, c]) or np.any(djoint.Q[i, :, c])
-    row, along = np.nonzero(found)
-    column = np.nonzero(np.array([np.any(djoint.F[:, j, :k]) for j in range(size)]))[0]
-    F, Q = np.empty((len(column), len(row))), np.empty((size, len(row)))
-    for r in range(len(row)):
-        for j in range(len(column)):
-            F[j, r] = djoint.F[row[r], column[j], along[r]]
-        Q[:, r] = djoint.Q[row[r], :, along[r]]
-    plant = np.any(djoint.B) or np.any(djoint.C) or np.any(djoint.E) or np.any(djoint.G)
-    return Moves(row, along, column, F, Q, bool(plant))
+COMPILED_WITH = {
+    "compiled_products": "a6f8f07dc8ac7460",
+    "compiled_room": "4260dbc6847bda9a",
+}
 
 
 @njit(cache=True, inline="always")
-def weigh(joint: JointLoop, djoint: JointLoop, moves: Moves, here: Covariance) -> None:
+def weigh(joint: JointLoop, djoint: JointLoop, moves: Moves, here: Covariance, way: Way) -> None:
     """Write all that follows from P and dP."""
     C, dC, dR, P, CP, S, dCP, dS = (
         joint.C, djoint.C, djoint.R, here.P, here.CP, here.S, here.dCP, here.dS
@@ -187,7 +81,7 @@ def weigh(joint: JointLoop, djoint: JointLoop, moves: Moves, here: Covariance) -
                 if moves.plant:
                     for c in range(k):
                         dS[a, b, c] += dC[a, i, c] * CP[b, i]
-    noise_products(inverse, dS, here.half)
+    noise_products(inverse, dS, way.told, here.half)
 
 
 @njit(cache=True, inline="always")
@@ -196,6 +90,7 @@ def advance(
     djoint: JointLoop,
     moves: Moves,
     here: Covariance,
+    way: Way,
     slope: Buffer,
     dslope: Buffer,
     at: int,
@@ -210,6 +105,8 @@ def advance(
         The system, its derivatives along k directions and more, and what the first k move.
     here : Covariance
         Of this sample.
+    way : Way
+        Overwritten.
     slope, dslope : Buffer
         Of the commands with the estimate, which stands at `at` in z: (m, n) and (m, n, k).
     at : int
@@ -218,17 +115,17 @@ def advance(
         Variance of noise that enters with each command, by B and by G, (2, m), and its derivatives
         (2, m, k).
     """
-    (m, n), p = slope.shape, len(joint.C)
-    size, k = len(here.P), here.dP.shape[2]
-    F, P, B, G = joint.F.copy(), here.P, joint.B, joint.G
+    (m, n), size = slope.shape, len(here.P)
+    P, B, G, F, FP, ahead = here.P, joint.B, joint.G, way.F, way.FP, way.ahead
     for i in range(size):
+        F[i] = joint.F[i]
         for a in range(m):
-            for j in range(n):
-                F[i, at + j] += B[i, a] * slope[a, j]
-    FP, L, LC = np.empty((size, size)), np.empty((size, p)), np.empty((size, size))
+            if B[i, a] != 0.0:
+                for j in range(n):
+                    F[i, at + j] += B[i, a] * slope[a, j]
     combine(F, here.left, 0, FP)
-    combine(F, here.gain, 0, L)
-    ahead = np.ascontiguousarray(FP.T)
+    combine(F, here.gain, 0, way.L)
+    ahead[:] = FP.T
     combine(F, ahead, 0, FP)
     for i in range(size):
         for j in range(i + 1):
@@ -237,25 +134,44 @@ def advance(
                 both += B[i, a] * B[j, a] * noise[0, a] + G[i, a] * G[j, a] * noise[1, a]
             P[i, j] = both
             P[j, i] = both
-    if k == 0:
-        return
-    combine(L, joint.C, 0, LC)
-    both_sides(F - LC, here.dP, here.product)
+    if here.dP.shape[2] > 0:
+        _move(joint, djoint, moves, here, way, slope, dslope, at, noise, dnoise)
+
+
+@njit(cache=True, inline="always")
+def _move(
+    joint: JointLoop,
+    djoint: JointLoop,
+    moves: Moves,
+    here: Covariance,
+    way: Way,
+    slope: Buffer,
+    dslope: Buffer,
+    at: int,
+    noise: Buffer,
+    dnoise: Buffer,
+) -> None:
+    """dP becomes that before the next sample; what `advance` has made is on the way."""
+    (m, n), (size, p), k, ahead = slope.shape, here.gain.shape, here.dP.shape[2], way.ahead
+    _enter(joint, way)
+    both_sides(way.G, here.dP, way.product)
     # Of all the rest a half is written, columns times changes: to dP go that and its transpose.
-    columns, rest = np.concatenate((B, G, L), axis=1), here.product
-    lines, changes = np.ascontiguousarray(columns.T), np.zeros((2 * m + p, size, k))
-    halves, estimate = lines / 2, np.ascontiguousarray(ahead[at : at + n].T)
+    lines, changes, rest = way.lines, way.changes, way.product
+    for i in range(size):
+        for j in range(n):
+            way.estimate[i, j] = ahead[at + j, i]
+    changes[m:] = 0.0
     for a in range(m):
-        combine(estimate, dslope[a], 0, changes[a])
-        turn(dnoise[0, a : a + 1], halves[a : a + 1], changes[a])
+        combine(way.estimate, dslope[a], 0, changes[a])
+        turn(0.5, dnoise[0, a : a + 1], lines[a : a + 1], changes[a])
         if joint.share[a] != 0.0:
-            turn(dnoise[1, a : a + 1], halves[m + a : m + a + 1], changes[m + a])
+            turn(0.5, dnoise[1, a : a + 1], lines[m + a : m + a + 1], changes[m + a])
     for a in range(p):
-        turn(djoint.R[a], halves[2 * m :], changes[2 * m + a])
+        turn(0.5, djoint.R[a], lines[2 * m :], changes[2 * m + a])
         if moves.plant:
-            turn(djoint.C[a], -ahead, changes[2 * m + a])
-    combine(columns, changes.reshape(2 * m + p, size * k), 0, rest.reshape(size, size * k))
-    _add_moves(moves, ahead, rest)
+            turn(-1.0, djoint.C[a], ahead, changes[2 * m + a])
+    combine(way.columns, changes.reshape(2 * m + p, size * k), 0, rest.reshape(size, size * k))
+    _add_moves(moves, way, rest)
     if moves.plant:
         for a in range(m):
             commanded = slope[a] @ ahead[at : at + n] + noise[0, a] * lines[a]
@@ -268,26 +184,56 @@ def advance(
 
 
 @njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
-def _add_moves(moves: Moves, ahead: Buffer, rest: Buffer) -> None:
+def _enter(joint: JointLoop, way: Way) -> None:
+    """Write F - L C, and the columns by which B, G and L let something enter."""
+    C, L, (size, m) = joint.C, way.L, joint.B.shape
+    way.G[:] = way.F
+    for i in range(size):
+        for a in range(len(C)):
+            for j in range(size):
+                way.G[i, j] -= L[i, a] * C[a, j]
+            way.columns[i, 2 * m + a] = L[i, a]
+        for a in range(m):
+            way.columns[i, a], way.columns[i, m + a] = joint.B[i, a], joint.G[i, a]
+    way.lines[:] = way.columns.T
+
+
+@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+def _add_moves(moves: Moves, way: Way, rest: Buffer) -> None:
     """Add dF P|t F' + dQ / 2."""
-    row, along, Q, both = moves.row, moves.along, moves.Q, np.empty(moves.Q.shape)
-    combine(np.ascontiguousarray(ahead[moves.column].T), moves.F, 0, both)
-    for b in range(len(rest)):
-        for r in range(len(row)):
-            rest[row[r], b, along[r]] += both[b, r] + Q[b, r] / 2
+    first, width, Q, both = moves.first, moves.width, moves.Q, way.moved
+    for j in range(len(moves.column)):
+        for i in range(len(both)):
+            way.picked[i, j] = way.ahead[moves.column[j], i]
+    combine(way.picked, moves.F, 0, both)
+    both += Q
+    moved = rest[:, :, first : first + width]
+    for i in range(len(rest)):
+        for b in range(len(rest)):
+            for c in range(width):
+                moved[i, b, c] += both[b, i * width + c]
 
 
 @njit(cache=True, inline="always")
 def variance_changes(
-    joint: JointLoop, djoint: JointLoop, moves: Moves, here: Covariance, seen: Buffer
+    joint: JointLoop,
+    djoint: JointLoop,
+    moves: Moves,
+    here: Covariance,
+    way: Way,
+    seen: Buffer,
 ) -> Buffer:
-    """Derivatives (k,) of seen' P|t seen, `seen` (z,) what is held."""
-    size, k, dR = len(seen), here.dP.shape[2], djoint.R
-    known = seen @ here.gain
-    before, turned, change = seen - known @ joint.C, np.empty((1, size * k)), np.empty((1, k))
-    combine(before.reshape(1, size), here.dP.reshape(size, size * k), 0, turned)
-    combine(before.reshape(1, size), turned.reshape(size, k), 0, change)
-    changes = change[0]
+    """Derivatives (k,) of seen' P|t seen, `seen` (z,) what is held; `way` keeps them."""
+    size, k, dR, known, before = len(seen), here.dP.shape[2], djoint.R, way.known, way.before
+    known[:], before[0] = 0.0, seen
+    for a in range(len(known)):
+        for i in range(size):
+            known[a] += seen[i] * here.gain[i, a]
+        for i in range(size):
+            before[0, i] -= known[a] * joint.C[a, i]
+    combine(before, here.dP.reshape(size, size * k), 0, way.turned)
+    combine(before, way.turned.reshape(size, k), 0, way.change)
+    changes = way.change[0]
     for a in range(len(known)):
         for b in range(len(known)):
             for c in range(k):

@@ -122,18 +122,20 @@ def both_sides(G: Buffer, dP: Buffer, product: Buffer) -> None:
 
 
 @njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
-def turn(changes: Buffer, rows: Buffer, turned: Buffer) -> None:
-    """Add sum_j rows_j changes_j' to what is turned.
+def turn(weight: float, changes: Buffer, rows: Buffer, turned: Buffer) -> None:
+    """Add weight times sum_j rows_j changes_j' to what is turned.
 
     Parameters
     ----------
+    weight : float
+        By which the sum is multiplied.
     changes, rows, turned : Buffer
         (j, k), (j, z) and (z, k).
     """
     for j in range(len(rows)):
         for b in range(len(turned)):
             for c in range(turned.shape[1]):
-                turned[b, c] += rows[j, b] * changes[j, c]
+                turned[b, c] += weight * rows[j, b] * changes[j, c]
 
 
 @njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
@@ -149,24 +151,26 @@ def add_both(rest: Buffer, dP: Buffer) -> None:
     for i in range(size):
         for j in range(i + 1):
             for c in range(k):
-                both = dP[i, j, c] + (rest[i, j, c] + rest[j, i, c])
-                dP[i, j, c] = both
-                dP[j, i, c] = both
+                dP[i, j, c] += rest[i, j, c] + rest[j, i, c]
+        for j in range(i):
+            dP[j, i] = dP[i, j]
 
 
 @njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
-def noise_products(inverse: Buffer, dS: Buffer, half: Buffer) -> None:
+def noise_products(inverse: Buffer, dS: Buffer, told: Buffer, half: Buffer) -> None:
     """Write tr(S^-1 dS S^-1 dS) / 2 for each pair of directions, the lower half.
 
     Parameters
     ----------
     inverse, dS : Buffer
         S^-1 (p, p), and the derivatives of S (p, p, k).
+    told : Buffer
+        Room (p, p, k).
     half : Buffer
         Written (k, k).
     """
     p, k = len(inverse), dS.shape[2]
-    told = np.zeros((p, p, k))
+    told[:] = 0.0
     for a in range(p):
         for b in range(p):
             for j in range(p):

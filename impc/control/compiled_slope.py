@@ -27,16 +27,31 @@ def slope_of_law(
     rows: Rows,
     drows: RowDirections,
     work: Workspace,
-    k: int,
-) -> tuple[Buffer, Buffer]:
-    """Slope of the input with the state (m, n), and its derivative (m, n, k): exact.
+    slope: Buffer,
+    dslope: Buffer,
+) -> None:
+    """Write the slope of the input with the state, and its derivative: exact.
 
     With the active rows a it is -K - (Gram_aa^-1 N_a0)' T_a, N_a0 the columns of the first stage.
+
+    Parameters
+    ----------
+    loop, dloop, rows, drows
+        As in `compiled_loop.run`.
+    work : Workspace
+        As the law has left it.
+    slope, dslope : Buffer
+        Written (m, n) and (m, n, k).
     """
     (m, n), active, free = loop.K.shape, work.active[0], work.free
-    slope, dslope = -loop.K, -dloop.K[:, :, :k].copy()
+    k = dslope.shape[2]
+    for i in range(m):
+        for j in range(n):
+            slope[i, j] = -loop.K[i, j]
+            for c in range(k):
+                dslope[i, j, c] = -dloop.K[i, j, c]
     if active == 0:
-        return slope, dslope
+        return
     first = np.empty((active, m))
     for a in range(active):
         first[a] = rows.N[free[a], :m]
@@ -49,7 +64,6 @@ def slope_of_law(
                 for c in range(k):
                     dslope[i, j, c] -= dfirst[a, i * k + c] * rows.T[free[a], j]
                     dslope[i, j, c] -= first[a, i] * drows.T[free[a], j, c]
-    return slope, dslope
 
 
 @njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)

@@ -29,7 +29,9 @@ import numpy as np
 from impc.arrays import Array, Frozen, frozen
 from impc.control.closed_loop import Status, prepare_loop
 from impc.control.compiled_clip import Clip
-from impc.control.compiled_filter import FilterResult, Steady, filter_room, run_filter
+from impc.control.compiled_filter import Steady, run_filter
+from impc.control.compiled_room import filter_room
+from impc.control.compiled_sample import FilterResult
 from impc.control.constraint_rows import RowDirections, Rows
 from impc.control.joint_loop import PlantMoves, joint_directions, joint_loop
 from impc.errors import SolverError
@@ -239,9 +241,10 @@ def _filter(
     the sample at which the filter ended, or how many there are.
     """
     law, joint, moves, shared = prepared.law, prepared.joint, prepared.moves, prepared.shared
+    n = law.controller.plant.n
     P, dP, first = joint.P0, moves.P0, 0
     while True:
-        room = filter_room(law.rows, joint, moves, P, dP, dz.shape[1])
+        room = filter_room(law.rows, joint, moves, P, dP, n, dz.shape[1])
         first = run_filter(
             law.matrices,
             law.matrix_directions,

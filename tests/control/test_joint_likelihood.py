@@ -13,7 +13,15 @@ import numpy as np
 import pytest
 from statsmodels.tsa.statespace.kalman_filter import KalmanFilter
 
-from impc.control import compiled_covariance, compiled_filter, compiled_loop, compiled_slope
+from impc.control import (
+    compiled_covariance,
+    compiled_filter,
+    compiled_loop,
+    compiled_person,
+    compiled_room,
+    compiled_sample,
+    compiled_slope,
+)
 from impc.control.closed_loop import scenario, simulate
 from impc.control.constraint_rows import directions
 from impc.control.controller import Controller
@@ -39,7 +47,16 @@ if TYPE_CHECKING:
 
 
 @pytest.mark.parametrize(
-    "file", [compiled_loop, compiled_covariance, compiled_slope, compiled_filter]
+    "file",
+    [
+        compiled_loop,
+        compiled_covariance,
+        compiled_slope,
+        compiled_room,
+        compiled_sample,
+        compiled_filter,
+        compiled_person,
+    ],
 )
 def test_code_is_compiled_with_what_is_there(file: ModuleType) -> None:
     """numba would go on running what is called as it was: write these digests into the file."""

@@ -1,0 +1,74 @@
+"""Compiled code: a person who senses with noise, simulated (docs/noisy-people.md).
+
+numba's cache looks at this file only: a change of another one whose functions are called must
+change `COMPILED_WITH` below, which tests/control/test_joint_likelihood.py asks for.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from impc.arrays import Buffer
+from impc.control.compiled_loop import LoopMatrices, law, workspace
+from impc.control.constraint_rows import RowDirections, Rows
+from impc.control.joint_loop import JointLoop
+from impc.jit import njit
+
+__all__ = ["COMPILED_WITH", "run_person"]
+
+#: First digits of the SHA-256 of each file whose functions are called.
+COMPILED_WITH = {"compiled_loop": "9f871626bc4c54b4"}
+
+_SOFTENED, _DIVERGED = 2, 5
+# A state beyond this ends the simulation.
+_LARGEST = 1e100
+
+
+@njit(cache=True, nogil=True)
+def run_person(
+    loop: LoopMatrices,
+    dloop: LoopMatrices,
+    rows: Rows,
+    drows: RowDirections,
+    unit: Buffer,
+    joint: JointLoop,
+    at: int,
+    disturbance: Buffer,
+    noise: Buffer,
+    shared: Buffer,
+    z: Buffer,
+    u: Buffer,
+    status: Buffer,
+) -> int:
+    """Simulate from z[0] with noise that has been drawn, without derivatives.
+
+    Parameters
+    ----------
+    loop, dloop, rows, drows, unit, joint, at
+        As in `run_filter`, along no direction; unit (m,).
+    disturbance, noise : Buffer
+        (samples, d), and what is added to the next z (samples, z).
+    shared : Buffer
+        Normal numbers (samples, m), for the noise that is a share of the command.
+    z, u, status : Buffer
+        Written: (samples + 1, z) after the first, (samples, m) and (samples,).
+
+    Returns
+    -------
+    int
+        Samples before the one at which the law has no answer; all when it always has.
+    """
+    n = loop.K.shape[1]
+    work = workspace(rows, u.shape[1], 0)
+    lam, dx, du = np.zeros(len(rows.b)), np.zeros((n, 0)), np.zeros((u.shape[1], 0))
+    for t in range(len(u)):
+        x = z[t, at : at + n]
+        status[t], _, _ = law(loop, dloop, rows, drows, unit, work, x, dx, lam, False, u[t], du)
+        if status[t] > _SOFTENED:
+            return t
+        z[t + 1] = joint.F @ z[t] + joint.B @ u[t] + joint.E @ disturbance[t] + noise[t]
+        z[t + 1] += joint.G @ (joint.share * u[t] * shared[t])
+        if not np.max(np.abs(z[t + 1])) < _LARGEST:
+            status[t] = _DIVERGED
+            return t
+    return len(u)
