@@ -32,7 +32,7 @@ COMPILED_WITH = {
     "compiled_covariance": "0277ea3c97bfba5f",
     "compiled_loop": "9f871626bc4c54b4",
     "compiled_room": "4260dbc6847bda9a",
-    "compiled_sample": "4165ab3df6f517c3",
+    "compiled_sample": "cf2665256366f61e",
     "compiled_slope": "ebb21b570b5b91ec",
 }
 

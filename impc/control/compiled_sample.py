@@ -33,7 +33,7 @@ COMPILED_WITH = {
 
 # A first state is forgotten when none of its directions moves an innovation by more than this, of
 # its deviation.
-_FORGOTTEN = 1e-8
+_FORGOTTEN = 1e-9
 
 
 class FilterResult(NamedTuple):
