@@ -24,7 +24,7 @@ from impc.control.compiled_products import (
     noise_products,
     turn,
 )
-from impc.control.compiled_room import Covariance, Moves, Way
+from impc.control.compiled_room import Moves, Room, Way
 from impc.control.joint_loop import JointLoop
 from impc.jit import njit
 
@@ -33,13 +33,22 @@ __all__ = ["COMPILED_WITH", "advance", "variance_changes", "weigh"]
 #: First digits of the SHA-256 of each file whose functions are called.
 COMPILED_WITH = {
     "compiled_products": "a6f8f07dc8ac7460",
-    "compiled_room": "4260dbc6847bda9a",
+    "compiled_room": "856e712d6be6d6bb",
 }
 
 
 @njit(cache=True, inline="always")
-def weigh(joint: JointLoop, djoint: JointLoop, moves: Moves, here: Covariance, way: Way) -> None:
-    """Write all that follows from P and dP."""
+def weigh(joint: JointLoop, djoint: JointLoop, room: Room) -> None:
+    """Write all that follows from P and dP, which are the room's.
+
+    Parameters
+    ----------
+    joint, djoint : JointLoop
+        The system, and its derivatives along k directions.
+    room : Room
+        Its covariance is completed.
+    """
+    here, plant = room.here, room.moves.plant
     C, dC, dR, P, CP, S, dCP, dS = (
         joint.C, djoint.C, djoint.R, here.P, here.CP, here.S, here.dCP, here.dS
     )  # fmt: skip
@@ -64,7 +73,7 @@ def weigh(joint: JointLoop, djoint: JointLoop, moves: Moves, here: Covariance, w
     if k == 0:
         return
     combine(C, here.dP.reshape(size, size * k), 0, dCP.reshape(p, size * k))
-    if moves.plant:
+    if plant:
         for a in range(p):
             for i in range(size):
                 for j in range(size):
@@ -78,43 +87,26 @@ def weigh(joint: JointLoop, djoint: JointLoop, moves: Moves, here: Covariance, w
                 if C[a, i] != 0.0:
                     for c in range(k):
                         dS[a, b, c] += C[a, i] * dCP[b, i, c]
-                if moves.plant:
+                if plant:
                     for c in range(k):
                         dS[a, b, c] += dC[a, i, c] * CP[b, i]
-    noise_products(inverse, dS, way.told, here.half)
+    noise_products(inverse, dS, room.way.told, here.half)
 
 
 @njit(cache=True, inline="always")
-def advance(
-    joint: JointLoop,
-    djoint: JointLoop,
-    moves: Moves,
-    here: Covariance,
-    way: Way,
-    slope: Buffer,
-    dslope: Buffer,
-    at: int,
-    noise: Buffer,
-    dnoise: Buffer,
-) -> None:
+def advance(joint: JointLoop, djoint: JointLoop, room: Room, at: int) -> None:
     """P and dP become those before the next sample.
 
     Parameters
     ----------
-    joint, djoint, moves
-        The system, its derivatives along k directions and more, and what the first k move.
-    here : Covariance
-        Of this sample.
-    way : Way
-        Overwritten.
-    slope, dslope : Buffer
-        Of the commands with the estimate, which stands at `at` in z: (m, n) and (m, n, k).
+    joint, djoint : JointLoop
+        The system, and its derivatives along k directions.
+    room : Room
+        Of this sample, with the slope of its commands and the noise that enters with them.
     at : int
-        Of the first entry of the estimate.
-    noise, dnoise : Buffer
-        Variance of noise that enters with each command, by B and by G, (2, m), and its derivatives
-        (2, m, k).
+        Where the estimate stands in z.
     """
+    here, way, slope, noise = room.here, room.way, room.slope, room.noise
     (m, n), size = slope.shape, len(here.P)
     P, B, G, F, FP, ahead = here.P, joint.B, joint.G, way.F, way.FP, way.ahead
     for i in range(size):
@@ -135,23 +127,15 @@ def advance(
             P[i, j] = both
             P[j, i] = both
     if here.dP.shape[2] > 0:
-        _move(joint, djoint, moves, here, way, slope, dslope, at, noise, dnoise)
+        _move(joint, djoint, room, at)
 
 
 @njit(cache=True, inline="always")
-def _move(
-    joint: JointLoop,
-    djoint: JointLoop,
-    moves: Moves,
-    here: Covariance,
-    way: Way,
-    slope: Buffer,
-    dslope: Buffer,
-    at: int,
-    noise: Buffer,
-    dnoise: Buffer,
-) -> None:
+def _move(joint: JointLoop, djoint: JointLoop, room: Room, at: int) -> None:
     """dP becomes that before the next sample; what `advance` has made is on the way."""
+    here, way, moves, slope, noise, dnoise = (
+        room.here, room.way, room.moves, room.slope, room.noise, room.dnoise
+    )  # fmt: skip
     (m, n), (size, p), k, ahead = slope.shape, here.gain.shape, here.dP.shape[2], way.ahead
     _enter(joint, way)
     both_sides(way.G, here.dP, way.product)
@@ -162,7 +146,7 @@ def _move(
             way.estimate[i, j] = ahead[at + j, i]
     changes[m:] = 0.0
     for a in range(m):
-        combine(way.estimate, dslope[a], 0, changes[a])
+        combine(way.estimate, room.dslope[a], 0, changes[a])
         turn(0.5, dnoise[0, a : a + 1], lines[a : a + 1], changes[a])
         if joint.share[a] != 0.0:
             turn(0.5, dnoise[1, a : a + 1], lines[m + a : m + a + 1], changes[m + a])
@@ -215,15 +199,17 @@ def _add_moves(moves: Moves, way: Way, rest: Buffer) -> None:
 
 
 @njit(cache=True, inline="always")
-def variance_changes(
-    joint: JointLoop,
-    djoint: JointLoop,
-    moves: Moves,
-    here: Covariance,
-    way: Way,
-    seen: Buffer,
-) -> Buffer:
-    """Derivatives (k,) of seen' P|t seen, `seen` (z,) what is held; `way` keeps them."""
+def variance_changes(joint: JointLoop, djoint: JointLoop, room: Room) -> Buffer:
+    """Derivatives (k,) of seen' P|t seen, what is seen held; the room's way keeps them.
+
+    Parameters
+    ----------
+    joint, djoint : JointLoop
+        The system, and its derivatives along k directions.
+    room : Room
+        With what is seen of z.
+    """
+    here, way, moves, seen = room.here, room.way, room.moves, room.seen
     size, k, dR, known, before = len(seen), here.dP.shape[2], djoint.R, way.known, way.before
     known[:], before[0] = 0.0, seen
     for a in range(len(known)):

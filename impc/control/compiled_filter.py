@@ -29,10 +29,10 @@ __all__ = ["COMPILED_WITH", "Steady", "run_filter"]
 COMPILED_WITH = {
     "borrowed": "f9ef79e3bd6dacdb",
     "compiled_clip": "4b317b8d6c67db13",
-    "compiled_covariance": "0277ea3c97bfba5f",
+    "compiled_covariance": "34088525583a65f5",
     "compiled_loop": "9f871626bc4c54b4",
-    "compiled_room": "4260dbc6847bda9a",
-    "compiled_sample": "cf2665256366f61e",
+    "compiled_room": "856e712d6be6d6bb",
+    "compiled_sample": "4dc84b13a2465f45",
     "compiled_slope": "ebb21b570b5b91ec",
 }
 
@@ -119,11 +119,10 @@ def run_filter(
     loop, dloop, rows, drows, unit = borrowed((loop, dloop, rows, drows, unit))
     joint, djoint, steady, room, result = borrowed((joint, djoint, steady, room, result))
     outputs, disturbance, z, dz = borrowed((outputs, disturbance, z, dz))
-    work, lam, du, here, moves = room.work, room.lam, room.du, room.here, room.moves
-    slope, dslope, noise, dnoise = room.slope, room.dslope, room.noise, room.dnoise
+    work, lam, du, here = room.work, room.lam, room.du, room.here
     n, k = loop.K.shape[1], here.dP.shape[2]
     settled, quiet = False, 0
-    weigh(joint, djoint, moves, here, room.way)
+    weigh(joint, djoint, room)
     for t in range(first, len(outputs)):
         if quiet > 2 * len(z) and dz.shape[1] > shared:
             return t
@@ -134,19 +133,19 @@ def run_filter(
         if status > _SOFTENED:
             result.status[t] = status
             return t
-        slope_of_law(loop, dloop, rows, drows, work, slope, dslope)
+        slope_of_law(loop, dloop, rows, drows, work, room.slope, room.dslope)
         met = status > 0
         if clip.used:
             beyond, near = clip_command(clip, joint, djoint, room, at, u)
             status, met = max(status, beyond), met or near
         result.status[t] = status
         if not settled or met:
-            share_noise(joint.share, djoint.share, u, du, noise[1], dnoise[1])
-            advance(joint, djoint, moves, here, room.way, slope, dslope, at, noise, dnoise)
+            share_noise(joint.share, djoint.share, u, du, room.noise[1], room.dnoise[1])
+            advance(joint, djoint, room, at)
             settled = steady.known and not met and _near(here, steady)
             if settled:
                 here.P[:], here.dP[:] = steady.P, steady.dP[:, :, :k]
-            weigh(joint, djoint, moves, here, room.way)
+            weigh(joint, djoint, room)
         ahead(joint, djoint, room, u, disturbance[t], z, dz)
         if not np.max(np.abs(z)) < _LARGEST:
             result.status[t] = _DIVERGED

@@ -136,7 +136,8 @@ class Room(NamedTuple):
     slope, dslope : Buffer
         Of the commands with the estimate (m, n), and its derivatives (m, n, k).
     noise, dnoise : Buffer
-        Variances as in `advance` (2, m), and their derivatives (2, m, k).
+        Variance of noise that enters with each command, by B and by G, (2, m), and its derivatives
+        (2, m, k).
     e, we : Buffer
         An innovation and S^-1 times it (p,).
     de, wde : Buffer

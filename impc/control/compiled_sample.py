@@ -26,9 +26,9 @@ __all__ = ["COMPILED_WITH", "FilterResult", "ahead", "clip_command", "share_nois
 #: First digits of the SHA-256 of each file whose functions are called.
 COMPILED_WITH = {
     "compiled_clip": "4b317b8d6c67db13",
-    "compiled_covariance": "0277ea3c97bfba5f",
+    "compiled_covariance": "34088525583a65f5",
     "compiled_products": "a6f8f07dc8ac7460",
-    "compiled_room": "4260dbc6847bda9a",
+    "compiled_room": "856e712d6be6d6bb",
 }
 
 # A first state is forgotten when none of its directions moves an innovation by more than this, of
@@ -245,7 +245,7 @@ def clip_command(
         return 0, False
     ds[:] = 0.0
     if found.inside_g != 0.0 or found.inside_s != 0.0:
-        changes = variance_changes(joint, djoint, room.moves, here, room.way, seen)
+        changes = variance_changes(joint, djoint, room)
         for c in range(k):
             ds[c] = changes[c] / (2 * s)
         for i in range(n):
