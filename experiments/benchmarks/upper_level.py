@@ -39,9 +39,9 @@ class Route:
 
 
 def prox_linear(problem: Problem, start: Weights) -> Route:
-    """The package's own route."""
+    """The package's own route, with the condition weight of the other."""
     begin = time.perf_counter()
-    fit = inverse_mpc(problem, start)
+    fit = inverse_mpc(problem, start, condition_weight=CONDITION_WEIGHT)
     return Route(fit.weights, fit.objective, fit.evaluations, time.perf_counter() - begin)
 
 

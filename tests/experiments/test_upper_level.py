@@ -1,0 +1,33 @@
+"""The two routes of the upper level make the same objective small."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from experiments.benchmarks.upper_level import Route, prox_linear, smooth_surrogate
+from experiments.benchmarks.workloads import example
+from impc.inverse.direct_and_reduced import CONDITION_WEIGHT
+from impc.inverse.residuals import evaluate
+from impc.model.riccati import solve_lqr
+from impc.model.weights import Weights, condition_number
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from impc.inverse.problem import Problem
+
+
+@pytest.mark.parametrize("route", [prox_linear, smooth_surrogate])
+def test_a_route_says_misfit_and_condition_number_with_one_weight(
+    route: Callable[[Problem, Weights], Route],
+) -> None:
+    """The package's own had another weight, of the outputs' size, so that 105 stood beside 1.9."""
+    problem = example().problem
+    found = route(problem, Weights(np.diag([2.0, 0.2]), 1))
+    solution = solve_lqr(problem.plant, found.weights)
+    misfit = np.linalg.norm(evaluate(problem, solution.K, solution.S).residual)
+    expected = misfit + CONDITION_WEIGHT * condition_number(found.weights)
+    assert found.objective == pytest.approx(expected, rel=1e-6)
