@@ -33,7 +33,7 @@ __all__ = ["COMPILED_WITH", "advance", "variance_changes", "weigh"]
 #: First digits of the SHA-256 of each file whose functions are called.
 COMPILED_WITH = {
     "compiled_products": "a6f8f07dc8ac7460",
-    "compiled_room": "856e712d6be6d6bb",
+    "compiled_room": "3078ad050055f537",
 }
 
 
@@ -169,7 +169,7 @@ def _move(joint: JointLoop, djoint: JointLoop, room: Room, at: int) -> None:
 
 @njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 def _enter(joint: JointLoop, way: Way) -> None:
-    """Write F - L C, and the columns by which B, G and L let something enter."""
+    """Write F - L C, and L among what lets something enter: B and G stand there."""
     C, L, (size, m) = joint.C, way.L, joint.B.shape
     way.G[:] = way.F
     for i in range(size):
@@ -177,9 +177,7 @@ def _enter(joint: JointLoop, way: Way) -> None:
             for j in range(size):
                 way.G[i, j] -= L[i, a] * C[a, j]
             way.columns[i, 2 * m + a] = L[i, a]
-        for a in range(m):
-            way.columns[i, a], way.columns[i, m + a] = joint.B[i, a], joint.G[i, a]
-    way.lines[:] = way.columns.T
+            way.lines[2 * m + a, i] = L[i, a]
 
 
 @njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)

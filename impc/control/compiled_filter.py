@@ -15,7 +15,7 @@ from impc.arrays import Buffer
 from impc.borrowed import borrowed
 from impc.control.compiled_clip import Clip
 from impc.control.compiled_covariance import advance, weigh
-from impc.control.compiled_loop import LoopMatrices, law
+from impc.control.compiled_loop import DIVERGED, LARGEST, SOFTENED, LoopMatrices, law
 from impc.control.compiled_room import Covariance, Room
 from impc.control.compiled_sample import FilterResult, ahead, clip_command, share_noise, update
 from impc.control.compiled_slope import slope_of_law
@@ -29,16 +29,13 @@ __all__ = ["COMPILED_WITH", "Steady", "run_filter"]
 COMPILED_WITH = {
     "borrowed": "f9ef79e3bd6dacdb",
     "compiled_clip": "4b317b8d6c67db13",
-    "compiled_covariance": "34088525583a65f5",
-    "compiled_loop": "9f871626bc4c54b4",
-    "compiled_room": "856e712d6be6d6bb",
-    "compiled_sample": "4dc84b13a2465f45",
-    "compiled_slope": "ebb21b570b5b91ec",
+    "compiled_covariance": "0a6dc9bc272f448a",
+    "compiled_loop": "3da1c86d54dea2fb",
+    "compiled_room": "3078ad050055f537",
+    "compiled_sample": "3aafcc63b986732e",
+    "compiled_slope": "6ca5cd98097b69a5",
 }
 
-_SOFTENED, _DIVERGED = 2, 5
-# An expectation beyond this ends the filter.
-_LARGEST = 1e100
 # The covariance is taken for the stationary one when no entry differs by more than this, of the
 # deviations of its row and column; nor its derivative by more than the second.
 _STEADY, _STEADY_SLOPE = 1e-10, 1e-8
@@ -130,7 +127,7 @@ def run_filter(
         quiet = quiet + 1 if forgotten else 0
         u, x, dx = result.u[t], z[at : at + n], dz[at : at + n]
         status, _, _ = law(loop, dloop, rows, drows, unit, work, x, dx, lam, False, u, du)
-        if status > _SOFTENED:
+        if status > SOFTENED:
             result.status[t] = status
             return t
         slope_of_law(loop, dloop, rows, drows, work, room.slope, room.dslope)
@@ -147,8 +144,8 @@ def run_filter(
                 here.P[:], here.dP[:] = steady.P, steady.dP[:, :, :k]
             weigh(joint, djoint, room)
         ahead(joint, djoint, room, u, disturbance[t], z, dz)
-        if not np.max(np.abs(z)) < _LARGEST:
-            result.status[t] = _DIVERGED
+        if not np.max(np.abs(z)) < LARGEST:
+            result.status[t] = DIVERGED
             return t
     return len(outputs)
 

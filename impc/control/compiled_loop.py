@@ -38,7 +38,10 @@ from impc.jit import njit
 __all__ = [
     "COMPILED_WITH",
     "CONVERGED",
+    "DIVERGED",
     "INCONSISTENT",
+    "LARGEST",
+    "SOFTENED",
     "UNSOLVED",
     "LoopMatrices",
     "Workspace",
@@ -325,7 +328,10 @@ def _refine(
 _KEPT = 1e-13
 _WEAK = 1e-8
 
-_FREE, _ACTIVE, _SOFTENED, _INFEASIBLE, _UNSOLVED, _DIVERGED = 0, 1, 2, 3, 4, 5
+#: Of `closed_loop.Status`, by which what is compiled says how a sample ended.
+_FREE, _ACTIVE, SOFTENED, _INFEASIBLE, _UNSOLVED, DIVERGED = 0, 1, 2, 3, 4, 5
+#: No entry of plant and estimate together goes beyond this: neither a state nor what is expected.
+LARGEST = 1e100
 
 
 class LoopMatrices(NamedTuple):
@@ -451,11 +457,11 @@ def run(
     plant_moves = bool(np.any(dloop.A) or np.any(dloop.B) or np.any(dloop.E))
     weakly_active = 0
     for t in range(first, len(u)):
-        if status[t] > _SOFTENED:
+        if status[t] > SOFTENED:
             status[t], near, row = law(
                 loop, dloop, rows, drows, unit, work, x[t], dx[t], lam, gain_only, u[t], du[t]
             )
-            if status[t] > _SOFTENED:
+            if status[t] > SOFTENED:
                 _hold(x, dx, t)
                 return weakly_active, row
             weakly_active += near
@@ -469,7 +475,7 @@ def run(
             dx[t + 1] = dx[0]
         size = np.max(np.abs(x[t + 1]))
         if not size < divergence:
-            status[t] = _DIVERGED
+            status[t] = DIVERGED
             _hold(x, dx, t)
             return weakly_active, -1
     return weakly_active, -1
@@ -539,7 +545,7 @@ def law(
         if gain_only:
             return _UNSOLVED, False, -1
         status, near, row = _solve(loop, dloop, rows, drows, unit, work, x, dx, lam, begin)
-        if status > _SOFTENED:
+        if status > SOFTENED:
             return status, near, row
     else:
         status = _FREE
@@ -628,7 +634,7 @@ def _answer(
         return _UNSOLVED, False
     if dx.shape[1]:
         _differentiate(loop, dloop, rows, drows, lam, work, active, x, dx)
-    return (_SOFTENED if soft else _ACTIVE), near
+    return (SOFTENED if soft else _ACTIVE), near
 
 
 @njit(cache=True, nogil=True)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from impc.arrays import Buffer
-from impc.control.compiled_loop import LoopMatrices, law, workspace
+from impc.control.compiled_loop import DIVERGED, LARGEST, SOFTENED, LoopMatrices, law, workspace
 from impc.control.constraint_rows import RowDirections, Rows
 from impc.control.joint_loop import JointLoop
 from impc.jit import njit
@@ -17,11 +17,7 @@ from impc.jit import njit
 __all__ = ["COMPILED_WITH", "run_person"]
 
 #: First digits of the SHA-256 of each file whose functions are called.
-COMPILED_WITH = {"compiled_loop": "9f871626bc4c54b4"}
-
-_SOFTENED, _DIVERGED = 2, 5
-# A state beyond this ends the simulation.
-_LARGEST = 1e100
+COMPILED_WITH = {"compiled_loop": "3da1c86d54dea2fb"}
 
 
 @njit(cache=True, nogil=True)
@@ -64,11 +60,11 @@ def run_person(
     for t in range(len(u)):
         x = z[t, at : at + n]
         status[t], _, _ = law(loop, dloop, rows, drows, unit, work, x, dx, lam, False, u[t], du)
-        if status[t] > _SOFTENED:
+        if status[t] > SOFTENED:
             return t
         z[t + 1] = joint.F @ z[t] + joint.B @ u[t] + joint.E @ disturbance[t] + noise[t]
         z[t + 1] += joint.G @ (joint.share * u[t] * shared[t])
-        if not np.max(np.abs(z[t + 1])) < _LARGEST:
-            status[t] = _DIVERGED
+        if not np.max(np.abs(z[t + 1])) < LARGEST:
+            status[t] = DIVERGED
             return t
     return len(u)

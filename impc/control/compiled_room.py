@@ -19,7 +19,7 @@ from impc.jit import njit
 __all__ = ["COMPILED_WITH", "Covariance", "Moves", "Room", "Way", "filter_room"]
 
 #: First digits of the SHA-256 of each file whose functions are called.
-COMPILED_WITH = {"compiled_loop": "9f871626bc4c54b4"}
+COMPILED_WITH = {"compiled_loop": "3da1c86d54dea2fb"}
 
 
 class Covariance(NamedTuple):
@@ -64,8 +64,8 @@ class Way(NamedTuple):
     L : Buffer
         F g (z, p).
     columns, lines, changes : Buffer
-        What enters by one column each, B, G and L (z, j), the same as lines (j, z), and how each
-        of the 2 m + p changes (j, z, k).
+        What enters by one column each, B, G and the L of the sample (z, j), the same as lines
+        (j, z), and how each of the 2 m + p changes (j, z, k).
     estimate : Buffer
         Of F P|t, the columns of the estimate (z, n).
     picked, moved : Buffer
@@ -241,16 +241,17 @@ def _covariance(P: Buffer, dP: Buffer, p: int) -> Covariance:
 @njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 def _way(joint: JointLoop, moves: Moves, n: int, k: int) -> Way:
     """Room for an estimate of n states, and k directions."""
-    size, p, columns = len(joint.F), len(joint.C), 2 * joint.B.shape[1] + len(joint.C)
+    size, p = len(joint.F), len(joint.C)
+    columns = np.concatenate((joint.B, joint.G, np.empty((size, p))), axis=1)
     return Way(
         np.empty((size, size)),
         np.empty((size, size)),
         np.empty((size, size)),
         np.empty((size, size)),
         np.empty((size, p)),
-        np.empty((size, columns)),
-        np.empty((columns, size)),
-        np.empty((columns, size, k)),
+        columns,
+        np.ascontiguousarray(columns.T),
+        np.empty((columns.shape[1], size, k)),
         np.empty((size, n)),
         np.empty((size, len(moves.column))),
         np.empty((size, size * moves.width)),

@@ -17,7 +17,7 @@ from impc.jit import njit
 __all__ = ["COMPILED_WITH", "slope_of_law"]
 
 #: First digits of the SHA-256 of each file whose functions are called.
-COMPILED_WITH = {"compiled_loop": "9f871626bc4c54b4"}
+COMPILED_WITH = {"compiled_loop": "3da1c86d54dea2fb"}
 
 
 @njit(cache=True, inline="always")
