@@ -24,7 +24,7 @@ from impc.control.closed_loop import (
     scenario,
     simulate,
 )
-from impc.control.compiled_loop import solve_dual
+from impc.control.compiled_dual import solve_dual
 from impc.control.constraint_rows import directions
 from impc.control.controller import Controller
 from impc.control.saturated import solve_saturated

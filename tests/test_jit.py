@@ -81,7 +81,7 @@ def test_the_library_compiles_in_memory_without_a_place_for_caches(tmp_path: Pat
     code = (
         "import impc.control.compiled_loop\n"
         "loop = impc.control.compiled_loop\n"
-        "print(type(loop.substitute._cache).__name__, loop.__file__)\n"
+        "print(type(loop.run._cache).__name__, loop.__file__)\n"
     )
     homeless = {"PYTHONPATH": str(tmp_path), "HOME": NOWHERE, "XDG_CACHE_HOME": NOWHERE}
     words = [sys.executable, "-P", "-c", code]

@@ -28,7 +28,9 @@ import numpy as np
 from impc.arrays import Array, Frozen, as_numbers, finite_array, frozen
 from impc.checking import Value, checked
 from impc.control.body_steps import body_tape, pushes
-from impc.control.compiled_loop import LoopMatrices, answer_with, run, workspace
+from impc.control.compiled_arrays import LoopMatrices, workspace
+from impc.control.compiled_law import answer_with
+from impc.control.compiled_loop import run
 from impc.control.constraint_rows import RowDirections, build_rows, differentiate_rows, directions
 from impc.control.infeasibility import excluded_row, proves_infeasible
 from impc.control.named_solver import COMPILED, Program, active_set, build_program

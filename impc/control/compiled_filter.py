@@ -13,9 +13,10 @@ import numpy as np
 
 from impc.arrays import Buffer
 from impc.borrowed import borrowed
+from impc.control.compiled_arrays import DIVERGED, LARGEST, SOFTENED, LoopMatrices
 from impc.control.compiled_clip import Clip
 from impc.control.compiled_covariance import advance, weigh
-from impc.control.compiled_loop import DIVERGED, LARGEST, SOFTENED, LoopMatrices, law
+from impc.control.compiled_law import law
 from impc.control.compiled_room import Covariance, Room
 from impc.control.compiled_sample import FilterResult, ahead, clip_command, share_noise, update
 from impc.control.compiled_slope import slope_of_law
@@ -29,11 +30,12 @@ __all__ = ["COMPILED_WITH", "Steady", "run_filter"]
 COMPILED_WITH = {
     "borrowed": "f9ef79e3bd6dacdb",
     "compiled_clip": "4b317b8d6c67db13",
-    "compiled_covariance": "0a6dc9bc272f448a",
-    "compiled_loop": "3da1c86d54dea2fb",
-    "compiled_room": "3078ad050055f537",
-    "compiled_sample": "3aafcc63b986732e",
-    "compiled_slope": "6ca5cd98097b69a5",
+    "compiled_covariance": "74cc1504dd8b6bb1",
+    "compiled_arrays": "e21cfdf5fb59a164",
+    "compiled_law": "c6623ede30290390",
+    "compiled_room": "74c6e4e3b886d60a",
+    "compiled_sample": "9b3b16dda43b705c",
+    "compiled_slope": "46e64f587f7ac9eb",
 }
 
 # The covariance is taken for the stationary one when no entry differs by more than this, of the

@@ -9,7 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from impc.arrays import Buffer
-from impc.control.compiled_loop import DIVERGED, LARGEST, SOFTENED, LoopMatrices, law, workspace
+from impc.control.compiled_arrays import DIVERGED, LARGEST, SOFTENED, LoopMatrices, workspace
+from impc.control.compiled_law import law
 from impc.control.constraint_rows import RowDirections, Rows
 from impc.control.joint_loop import JointLoop
 from impc.jit import njit
@@ -17,7 +18,7 @@ from impc.jit import njit
 __all__ = ["COMPILED_WITH", "run_person"]
 
 #: First digits of the SHA-256 of each file whose functions are called.
-COMPILED_WITH = {"compiled_loop": "3da1c86d54dea2fb"}
+COMPILED_WITH = {"compiled_arrays": "e21cfdf5fb59a164", "compiled_law": "c6623ede30290390"}
 
 
 @njit(cache=True, nogil=True)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from impc.arrays import Buffer
-from impc.control.compiled_loop import Workspace, workspace
+from impc.control.compiled_arrays import Workspace, workspace
 from impc.control.constraint_rows import Rows
 from impc.control.joint_loop import JointLoop
 from impc.jit import njit
@@ -19,7 +19,7 @@ from impc.jit import njit
 __all__ = ["COMPILED_WITH", "Covariance", "Moves", "Room", "Way", "filter_room"]
 
 #: First digits of the SHA-256 of each file whose functions are called.
-COMPILED_WITH = {"compiled_loop": "3da1c86d54dea2fb"}
+COMPILED_WITH = {"compiled_arrays": "e21cfdf5fb59a164"}
 
 
 class Covariance(NamedTuple):

@@ -1,6 +1,6 @@
 """Compiled code: the slope of the command with the state, at the active set of one sample.
 
-It calls the least-distance problem of `compiled_loop`, at which numba's cache does not look:
+It calls the least-distance problem of `compiled_dual`, at which numba's cache does not look:
 `COMPILED_WITH` must change with it, which tests/control/test_joint_likelihood.py asks for
 (docs/noisy-people.md).
 """
@@ -10,14 +10,15 @@ from __future__ import annotations
 import numpy as np
 
 from impc.arrays import Buffer
-from impc.control.compiled_loop import LoopMatrices, Workspace, substitute_all
+from impc.control.compiled_arrays import LoopMatrices, Workspace
+from impc.control.compiled_dual import substitute_all
 from impc.control.constraint_rows import RowDirections, Rows
 from impc.jit import njit
 
 __all__ = ["COMPILED_WITH", "slope_of_law"]
 
 #: First digits of the SHA-256 of each file whose functions are called.
-COMPILED_WITH = {"compiled_loop": "3da1c86d54dea2fb"}
+COMPILED_WITH = {"compiled_arrays": "e21cfdf5fb59a164", "compiled_dual": "5b203ad8caab6520"}
 
 
 @njit(cache=True, inline="always")

@@ -1,6 +1,6 @@
 """The least-distance problem of one sample, built and solved by CasADi with a solver by its name.
 
-`compiled_loop` has a method of its own for it (docs/theory.md, section 4). Any other finds the same
+`compiled_dual` has a method of its own for it (docs/theory.md, section 4). Any other finds the same
 answer, and is asked for what only a solver can tell: which rows hold. With those the input and its
 derivative follow from the equations of the active set (`closed_loop`), and a solver whose own
 answer is not that one, to 1e-4 of its size, is not believed. What a solver says of its success is
@@ -46,7 +46,7 @@ __all__ = [
     "silent",
 ]
 
-#: The package's own method, see `compiled_loop`.
+#: The package's own method, see `compiled_dual`.
 COMPILED = "compiled"
 _IPOPT: dict[str, Any] = {
     "print_time": False,
@@ -97,7 +97,7 @@ _SETTLED = 1e-7
 # differ from that of the equations by, relative to the larger of 1 and z. DAQP keeps rows to 1e-5
 # where a price of a million is paid. The answer of the equations is checked to 1e-9.
 _AGREES = 1e-4
-# A row is dependent on others when less than this share of its length is new (`compiled_loop`).
+# A row is dependent on others when less than this share of its length is new (`compiled_dual`).
 _DEPENDENT = 1e-9
 
 _own = threading.local()  # a CasADi function is not to be evaluated in two threads at a time

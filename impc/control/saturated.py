@@ -27,7 +27,7 @@ from impc.arrays import Array, Buffer
 from impc.jit import njit
 
 if TYPE_CHECKING:
-    from impc.control.compiled_loop import LoopMatrices
+    from impc.control.compiled_arrays import LoopMatrices
 
 __all__ = ["Plan", "differentiate_plan", "solve_saturated"]
 

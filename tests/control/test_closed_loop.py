@@ -18,7 +18,7 @@ from impc.control.closed_loop import (
     simulate,
     simulate_and_differentiate,
 )
-from impc.control.compiled_loop import CONVERGED, INCONSISTENT, solve_dual
+from impc.control.compiled_dual import CONVERGED, INCONSISTENT, solve_dual
 from impc.control.constraint_rows import Directions, directions
 from impc.control.controller import Controller
 from impc.errors import SolverError

@@ -14,8 +14,10 @@ import pytest
 from statsmodels.tsa.statespace.kalman_filter import KalmanFilter
 
 from impc.control import (
+    compiled_answer,
     compiled_covariance,
     compiled_filter,
+    compiled_law,
     compiled_loop,
     compiled_person,
     compiled_room,
@@ -49,6 +51,8 @@ if TYPE_CHECKING:
 @pytest.mark.parametrize(
     "file",
     [
+        compiled_answer,
+        compiled_law,
         compiled_loop,
         compiled_covariance,
         compiled_slope,

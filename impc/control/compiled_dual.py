@@ -1,0 +1,362 @@
+"""Compiled code: the least-distance problem, by a dual active-set method.
+
+The problem is that of docs/theory.md, section 4,
+
+    minimise  v'S v / 2 + sum_r limit_r s_r     subject to  M v <= d + s,  s >= 0
+
+(hard rows have limit = inf and no s). Its dual is a bounded least-squares problem in one
+multiplier a row,
+
+    minimise  lam' G lam / 2 + d' lam   subject to  0 <= lam <= limit,   G = M S^-1 M',
+
+with v = -S^-1 M' lam; the gradient d + G lam is the slack of the rows. The method is that of
+Goldfarb and Idnani (Math. Programming 27, 1983): start at v = 0, the answer without bounds, and
+raise the multiplier of the most violated row while the rows already active stay tight. A
+multiplier that would leave [0, limit] blocks the step; at its limit the row is given up softly. An
+unblocked step along which the slack of the violated row does not change proves the rows
+inconsistent.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from impc.arrays import Buffer
+from impc.jit import njit
+
+__all__ = [
+    "CONVERGED",
+    "DEPENDENT",
+    "INCONSISTENT",
+    "UNSOLVED",
+    "accept_row",
+    "append_row",
+    "refine",
+    "solve_dual",
+    "substitute",
+    "substitute_all",
+]
+
+#: What `solve_dual` says first: an answer, rows that exclude each other, none within its steps.
+CONVERGED, INCONSISTENT, UNSOLVED = 0, 1, 2
+#: A row is dependent on the active ones when less than this share of its length is new. The part is
+#: computed by orthogonalising twice, which leaves rounding of 1e-16; genuine neighbours in the
+#: terminal sets of tests/ differ by 1e-5 and more.
+DEPENDENT = 1e-9
+# Rounding of a slack, relative to the largest term in it. It matters where soft rows are given up:
+# their multipliers are the penalty, a million and more.
+_ROUNDING = 1e-14
+
+
+@njit(cache=True)
+def solve_dual(
+    whitened: Buffer,
+    gram: Buffer,
+    d: Buffer,
+    limit: Buffer,
+    tolerance: Buffer,
+    lam: Buffer,
+    free: Buffer,
+    factor: Buffer,
+    basis: Buffer,
+    begin: int,
+) -> tuple[int, int]:
+    """Solve the dual, from the free rows of a problem with the same rows and another slack.
+
+    Parameters
+    ----------
+    whitened, gram : Buffer
+        W = M L^-T with S = L L', (r, N m), and W W', (r, r).
+    d, limit, tolerance : Buffer
+        Slack of the rows at v = 0, upper limits, and the violation below which a row counts as
+        kept, (r,) each.
+    lam, free, factor, basis : Buffer
+        Written: multipliers (r,), the rows with 0 < lam < limit in the order of the factor, and
+        the lower factor of their Gram matrix. Sizes r, a + 1, (a + 1, a + 1) and (a + 1, N m) with
+        a = min(r, N m).
+    begin : int
+        How many rows of `free` it begins with, whose factor is there; with 0, from lam = 0.
+
+    Returns
+    -------
+    status, count : int
+        CONVERGED and the number of free rows, an answer to be checked; INCONSISTENT and the row at
+        which it was found, with the combination of rows that should prove it in `lam`; UNSOLVED.
+    """
+    rows = len(d)
+    slack, change, lengths = d.copy(), np.empty(len(d)), np.empty(len(d))
+    for r in range(rows):
+        lengths[r] = np.sqrt(gram[r, r])
+    at_limit = np.zeros(rows, dtype=np.bool_)
+    is_free = np.zeros(rows, dtype=np.bool_)
+    step = np.empty(len(free))
+    lam[:] = 0.0
+    count = _begun(whitened, d, limit, lam, free, factor, basis, begin)
+    for i in range(count):
+        is_free[free[i]] = True
+        for r in range(rows):
+            slack[r] += gram[free[i], r] * lam[free[i]]
+    for _ in range(50 * (rows + 10)):
+        row, worst = -1, 0.0
+        noise = _ROUNDING * _largest_pull(lengths, lam)
+        for r in range(rows):
+            if is_free[r]:
+                continue
+            wrong = slack[r] if at_limit[r] else -slack[r]
+            if wrong > tolerance[r] + noise * lengths[r]:
+                # Distance of v to the row, so that the choice does not depend on its scale.
+                distance = wrong / lengths[r] if lengths[r] > 0 else np.inf
+                if distance > worst:
+                    row, worst = r, distance
+        if row < 0:
+            refine(gram, d, limit, at_limit, lam, free, count, factor)
+            return CONVERGED, count
+        sign = -1.0 if at_limit[row] else 1.0
+        while True:
+            new = append_row(whitened, row, count, factor, basis)
+            for i in range(count - 1, -1, -1):
+                part = factor[count, i]
+                for k in range(i + 1, count):
+                    part -= factor[k, i] * step[k]
+                step[i] = part / factor[i, i]
+            length = np.inf
+            if new > DEPENDENT * lengths[row]:
+                length = -sign * slack[row] / new**2
+            blocked = -1
+            room = lam[row] if sign < 0 else limit[row] - lam[row]
+            if room <= length:
+                length, blocked = room, count
+            for i in range(count):
+                rate = -sign * step[i]
+                if rate < 0:
+                    room = lam[free[i]] / -rate
+                elif rate > 0:
+                    room = (limit[free[i]] - lam[free[i]]) / rate
+                else:
+                    continue
+                if room < length:
+                    length, blocked = room, i
+            if length == np.inf:
+                lam[:] = 0.0
+                lam[row] = 1.0
+                for i in range(count):
+                    lam[free[i]] = -step[i]
+                return INCONSISTENT, row
+            lam[row] += sign * length
+            # Row after row of the symmetric matrix, because memory is read in that order.
+            change[:] = gram[row]
+            for i in range(count):
+                for r in range(rows):
+                    change[r] -= gram[free[i], r] * step[i]
+            for r in range(rows):
+                slack[r] += sign * length * change[r]
+            for i in range(count):
+                lam[free[i]] -= sign * length * step[i]
+            if blocked < 0:
+                accept_row(count, new, factor, basis)
+                free[count] = row
+                is_free[row], at_limit[row] = True, False
+                count += 1
+                break
+            if blocked == count:
+                at_limit[row] = sign > 0
+                lam[row] = limit[row] if sign > 0 else 0.0
+                break
+            leaving = free[blocked]
+            is_free[leaving] = False
+            at_limit[leaving] = -sign * step[blocked] > 0
+            lam[leaving] = limit[leaving] if at_limit[leaving] else 0.0
+            count = _remove(whitened, free, count, blocked, factor, basis)
+    return UNSOLVED, count
+
+
+@njit(cache=True)
+def _begun(
+    whitened: Buffer,
+    d: Buffer,
+    limit: Buffer,
+    lam: Buffer,
+    free: Buffer,
+    factor: Buffer,
+    basis: Buffer,
+    count: int,
+) -> int:
+    """Write the multipliers with which some rows are tight; return how many rows are left.
+
+    Rows whose multiplier is not positive are dropped, the most negative first: what is left is the
+    answer to a problem that has these rows only, from which the dual method may go on.
+    """
+    right = np.empty(count)
+    while count > 0:
+        for i in range(count):
+            right[i] = -d[free[i]]
+        substitute(factor, count, right)
+        place, worst = -1, np.inf
+        for i in range(count):
+            if not right[i] <= limit[free[i]]:  # nor where the slack is no number
+                return 0
+            if right[i] < worst:
+                place, worst = i, right[i]
+        if worst > 0.0:
+            for i in range(count):
+                lam[free[i]] = right[i]
+            return count
+        count = _remove(whitened, free, count, place, factor, basis)
+    return 0
+
+
+@njit(cache=True)
+def _largest_pull(lengths: Buffer, lam: Buffer) -> float:
+    """Largest multiplier times the length of its row."""
+    largest = 0.0
+    for r in range(len(lam)):
+        largest = max(largest, abs(lam[r]) * lengths[r])
+    return largest
+
+
+@njit(cache=True)
+def _remove(
+    whitened: Buffer, free: Buffer, count: int, place: int, factor: Buffer, basis: Buffer
+) -> int:
+    """Drop the free row at `place` and factor the rows behind it again."""
+    for i in range(place, count - 1):
+        free[i] = free[i + 1]
+        accept_row(i, append_row(whitened, free[i], i, factor, basis), factor, basis)
+    return count - 1
+
+
+@njit(cache=True)
+def refine(
+    gram: Buffer,
+    d: Buffer,
+    limit: Buffer,
+    at_limit: Buffer,
+    lam: Buffer,
+    free: Buffer,
+    count: int,
+    factor: Buffer,
+) -> None:
+    """Solve once more for the final active set, so that the steps leave no rounding behind.
+
+    Parameters
+    ----------
+    gram : Buffer
+        W W' (r, r), as in `solve_dual`.
+    d, limit : Buffer
+        Slack of the rows at v = 0 and upper limits (r,).
+    at_limit : Buffer
+        Which multipliers are at their limits (r,).
+    lam : Buffer
+        Written: multipliers of the free rows, in (r,).
+    free : Buffer
+        Which rows are free (a + 1,).
+    count : int
+        How many.
+    factor : Buffer
+        The lower factor of their Gram matrix (a + 1, a + 1).
+    """
+    right = np.empty(count)
+    for i in range(count):
+        total = -d[free[i]]
+        for r in range(len(d)):
+            if at_limit[r]:
+                total -= gram[free[i], r] * limit[r]
+        right[i] = total
+    substitute(factor, count, right)
+    for i in range(count):
+        lam[free[i]] = right[i]
+
+
+@njit(cache=True)
+def append_row(whitened: Buffer, row: int, count: int, factor: Buffer, basis: Buffer) -> float:
+    """Write the coefficients of a row in the basis of the active ones; return what is new of it.
+
+    The new part itself goes to basis[count], not normalised. Working with the rows instead of their
+    Gram matrix keeps twice as many digits of it.
+
+    Parameters
+    ----------
+    whitened : Buffer
+        All rows (r, N m), as in `solve_dual`.
+    row, count : int
+        The one that is new, and how many are in the basis.
+    factor, basis : Buffer
+        Written at `count`: (a + 1, a + 1) and (a + 1, N m).
+    """
+    width = whitened.shape[1]
+    new = basis[count]
+    new[:] = whitened[row]
+    for i in range(count):
+        factor[count, i] = 0.0
+    for _ in range(2):
+        for i in range(count):
+            part = 0.0
+            for k in range(width):
+                part += basis[i, k] * new[k]
+            factor[count, i] += part
+            for k in range(width):
+                new[k] -= part * basis[i, k]
+    length = 0.0
+    for k in range(width):
+        length += new[k] ** 2
+    return np.sqrt(length)  # type: ignore[no-any-return]
+
+
+@njit(cache=True)
+def accept_row(count: int, length: float, factor: Buffer, basis: Buffer) -> None:
+    """Take the row of `append_row` into the basis.
+
+    Parameters
+    ----------
+    count : int
+        How many rows are in the basis without it.
+    length : float
+        What is new of it, in the unit of the whitened rows.
+    factor, basis : Buffer
+        Written at `count`: (a + 1, a + 1) and (a + 1, N m).
+    """
+    factor[count, count] = length
+    for k in range(basis.shape[1]):
+        basis[count, k] /= length
+
+
+@njit(cache=True)
+def substitute(factor: Buffer, count: int, right: Buffer) -> None:
+    """Solve L L' x = right in place.
+
+    Parameters
+    ----------
+    factor : Buffer
+        Its leading (count, count) is L, lower triangular.
+    count : int
+        How many equations.
+    right : Buffer
+        The right side, and the answer (count,).
+    """
+    for i in range(count):
+        total = right[i]
+        for k in range(i):
+            total -= factor[i, k] * right[k]
+        right[i] = total / factor[i, i]
+    for i in range(count - 1, -1, -1):
+        total = right[i]
+        for k in range(i + 1, count):
+            total -= factor[k, i] * right[k]
+        right[i] = total / factor[i, i]
+
+
+@njit(cache=True)
+def substitute_all(factor: Buffer, count: int, right: Buffer) -> None:
+    """`substitute` for every column of `right` (count, c) at once, with the `factor` (a, a)."""
+    for i in range(count):
+        for k in range(i):
+            for c in range(right.shape[1]):
+                right[i, c] -= factor[i, k] * right[k, c]
+        for c in range(right.shape[1]):
+            right[i, c] /= factor[i, i]
+    for i in range(count - 1, -1, -1):
+        for k in range(i + 1, count):
+            for c in range(right.shape[1]):
+                right[i, c] -= factor[k, i] * right[k, c]
+        for c in range(right.shape[1]):
+            right[i, c] /= factor[i, i]
