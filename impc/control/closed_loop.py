@@ -27,6 +27,7 @@ import numpy as np
 
 from impc.arrays import Array, Frozen, as_numbers, finite_array, frozen
 from impc.checking import Value, checked
+from impc.control import compiled_arrays
 from impc.control.body_steps import body_tape, pushes
 from impc.control.compiled_arrays import LoopMatrices, workspace
 from impc.control.compiled_law import answer_with
@@ -78,12 +79,12 @@ class Status(IntEnum):
     'a bound is active'
     """
 
-    FREE = 0
-    ACTIVE = 1
-    SOFTENED = 2
-    INFEASIBLE = 3
-    UNSOLVED = 4
-    DIVERGED = 5
+    FREE = compiled_arrays.FREE
+    ACTIVE = compiled_arrays.ACTIVE
+    SOFTENED = compiled_arrays.SOFTENED
+    INFEASIBLE = compiled_arrays.INFEASIBLE
+    UNSOLVED = compiled_arrays.UNSOLVED
+    DIVERGED = compiled_arrays.DIVERGED
     NOT_REACHED = 6
 
     @property

@@ -12,17 +12,22 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.arrays import Buffer
-from impc.control.compiled_arrays import ACTIVE, SOFTENED, UNTOLD, LoopMatrices, Workspace
+from impc.control.compiled_arrays import ACTIVE, SOFTENED, UNSOLVED, LoopMatrices, Workspace
 from impc.control.compiled_dual import substitute, substitute_all
+from impc.control.compiled_products import dot
 from impc.jit import njit
 
 if TYPE_CHECKING:
     from impc.control.constraint_rows import RowDirections, Rows
 
-__all__ = ["COMPILED_WITH", "WEAK", "answer", "dot"]
+__all__ = ["COMPILED_WITH", "WEAK", "answer"]
 
 #: First digits of the SHA-256 of each file whose functions are called: numba's cache does not look.
-COMPILED_WITH = {"compiled_arrays": "e21cfdf5fb59a164", "compiled_dual": "5b203ad8caab6520"}
+COMPILED_WITH = {
+    "compiled_arrays": "f9299fe715d0d2a3",
+    "compiled_dual": "c3376c1c32aa9492",
+    "compiled_products": "50101205237e0db3",
+}
 #: Share of its bound within which a row is about to become active, or to become free.
 WEAK = 1e-8
 # The answer must keep every row, and tell the first input, to this share of the bound, whatever the
@@ -67,7 +72,7 @@ def answer(
     Returns
     -------
     status, near : int, bool
-        ACTIVE, SOFTENED or UNTOLD; whether the active set is about to change.
+        ACTIVE, SOFTENED or UNSOLVED; whether the active set is about to change.
     """
     _recover(rows, lam, work)
     soft, near, told = _check(loop.K, rows, lam, work, active, x, unit)
@@ -75,7 +80,7 @@ def answer(
         _tighten(rows, work, active)
         soft, near, told = _check(loop.K, rows, lam, work, active, x, unit)
     if not told:
-        return UNTOLD, False
+        return UNSOLVED, False
     if dx.shape[1]:
         _differentiate(loop, dloop, rows, drows, lam, work, active, x, dx)
     return (SOFTENED if soft else ACTIVE), near
@@ -233,12 +238,3 @@ def _add_pulls(rows: Rows, drows: RowDirections, lam: Buffer, m: int, q: Buffer)
                 for i in range(len(q)):
                     for c in range(q.shape[1]):
                         q[i, c] -= rows.M[r, i] * lam[r] / rows.b[r] * drows.b[r, c]
-
-
-@njit(cache=True, inline="always")
-def dot(a: Buffer, b: Buffer) -> float:
-    """a'b, of two arrays of one length (k,)."""
-    total = 0.0
-    for i in range(len(a)):
-        total += a[i] * b[i]
-    return total

@@ -22,14 +22,14 @@ __all__ = [
     "INFEASIBLE",
     "LARGEST",
     "SOFTENED",
-    "UNTOLD",
+    "UNSOLVED",
     "LoopMatrices",
     "Workspace",
     "workspace",
 ]
 
 #: Of `closed_loop.Status`, by which what is compiled says how a sample ended.
-FREE, ACTIVE, SOFTENED, INFEASIBLE, UNTOLD, DIVERGED = 0, 1, 2, 3, 4, 5
+FREE, ACTIVE, SOFTENED, INFEASIBLE, UNSOLVED, DIVERGED = 0, 1, 2, 3, 4, 5
 #: No entry of plant and estimate together goes beyond this: neither a state nor what is expected.
 LARGEST = 1e100
 # A row is kept when it is exceeded by less than this share of its bound: a hundred times the

@@ -28,7 +28,7 @@ __all__ = [
     "CONVERGED",
     "DEPENDENT",
     "INCONSISTENT",
-    "UNSOLVED",
+    "UNFINISHED",
     "accept_row",
     "append_row",
     "refine",
@@ -38,7 +38,7 @@ __all__ = [
 ]
 
 #: What `solve_dual` says first: an answer, rows that exclude each other, none within its steps.
-CONVERGED, INCONSISTENT, UNSOLVED = 0, 1, 2
+CONVERGED, INCONSISTENT, UNFINISHED = 0, 1, 2
 #: A row is dependent on the active ones when less than this share of its length is new. The part is
 #: computed by orthogonalising twice, which leaves rounding of 1e-16; genuine neighbours in the
 #: terminal sets of tests/ differ by 1e-5 and more.
@@ -81,7 +81,7 @@ def solve_dual(
     -------
     status, count : int
         CONVERGED and the number of free rows, an answer to be checked; INCONSISTENT and the row at
-        which it was found, with the combination of rows that should prove it in `lam`; UNSOLVED.
+        which it was found, with the combination of rows that should prove it in `lam`; UNFINISHED.
     """
     rows = len(d)
     slack, change, lengths = d.copy(), np.empty(len(d)), np.empty(len(d))
@@ -167,7 +167,7 @@ def solve_dual(
             at_limit[leaving] = -sign * step[blocked] > 0
             lam[leaving] = limit[leaving] if at_limit[leaving] else 0.0
             count = _remove(whitened, free, count, blocked, factor, basis)
-    return UNSOLVED, count
+    return UNFINISHED, count
 
 
 @njit(cache=True)

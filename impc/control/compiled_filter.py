@@ -29,13 +29,13 @@ __all__ = ["COMPILED_WITH", "Steady", "run_filter"]
 #: First digits of the SHA-256 of each file whose functions are called.
 COMPILED_WITH = {
     "borrowed": "f9ef79e3bd6dacdb",
+    "compiled_arrays": "f9299fe715d0d2a3",
     "compiled_clip": "4b317b8d6c67db13",
-    "compiled_covariance": "74cc1504dd8b6bb1",
-    "compiled_arrays": "e21cfdf5fb59a164",
-    "compiled_law": "c6623ede30290390",
-    "compiled_room": "74c6e4e3b886d60a",
-    "compiled_sample": "9b3b16dda43b705c",
-    "compiled_slope": "46e64f587f7ac9eb",
+    "compiled_covariance": "7d75cf433740ec3c",
+    "compiled_law": "fb4d0617cbd31619",
+    "compiled_room": "45595e764d61fc2a",
+    "compiled_sample": "8872ef9655abd297",
+    "compiled_slope": "1be8607182549482",
 }
 
 # The covariance is taken for the stationary one when no entry differs by more than this, of the

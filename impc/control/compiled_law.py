@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.arrays import Buffer
-from impc.control.compiled_answer import WEAK, answer, dot
+from impc.control.compiled_answer import WEAK, answer
 from impc.control.compiled_arrays import (
     FREE,
     INFEASIBLE,
     SOFTENED,
-    UNTOLD,
+    UNSOLVED,
     LoopMatrices,
     Workspace,
     workspace,
@@ -25,12 +25,13 @@ from impc.control.compiled_arrays import (
 from impc.control.compiled_dual import (
     DEPENDENT,
     INCONSISTENT,
-    UNSOLVED,
+    UNFINISHED,
     accept_row,
     append_row,
     refine,
     solve_dual,
 )
+from impc.control.compiled_products import dot
 from impc.jit import njit
 
 if TYPE_CHECKING:
@@ -40,9 +41,10 @@ __all__ = ["COMPILED_WITH", "answer_with", "law"]
 
 #: First digits of the SHA-256 of each file whose functions are called: numba's cache does not look.
 COMPILED_WITH = {
-    "compiled_answer": "5f51dccc0fa8bbc9",
-    "compiled_arrays": "e21cfdf5fb59a164",
-    "compiled_dual": "5b203ad8caab6520",
+    "compiled_answer": "11ad4cd4c8ddf893",
+    "compiled_arrays": "f9299fe715d0d2a3",
+    "compiled_dual": "c3376c1c32aa9492",
+    "compiled_products": "50101205237e0db3",
 }
 
 
@@ -87,7 +89,7 @@ def law(
     begin, work.active[0] = work.active[0], 0
     if needs_qp:
         if gain_only:
-            return UNTOLD, False, -1
+            return UNSOLVED, False, -1
         status, near, row = _solve(loop, dloop, rows, drows, unit, work, x, dx, lam, begin)
         if status > SOFTENED:
             return status, near, row
@@ -133,23 +135,22 @@ def _solve(
     begin: int,
 ) -> tuple[int, bool, int]:
     """Write v and dv0 of one sample; return its status, whether its rows are weak, and a row."""
-    slack, free, factor = work.slack, work.free, work.factor
     code, active = solve_dual(
         rows.W,
         rows.gram,
-        slack,
+        work.slack,
         rows.limit,
         work.kept,
         lam,
-        free,
-        factor,
+        work.free,
+        work.factor,
         work.basis,
         begin,
     )
     if code == INCONSISTENT:
         return INFEASIBLE, False, active
-    if code == UNSOLVED:
-        return UNTOLD, False, -1
+    if code == UNFINISHED:
+        return UNSOLVED, False, -1
     work.active[0] = active
     status, near = answer(loop, dloop, rows, drows, unit, work, x, dx, lam, active)
     return status, near, -1
@@ -193,27 +194,27 @@ def answer_with(
     Returns
     -------
     status, weak : int, bool
-        ACTIVE or SOFTENED when the answer keeps what `answer` asks for, UNTOLD otherwise.
+        ACTIVE or SOFTENED when the answer keeps what `answer` asks for, UNSOLVED otherwise.
     """
     work, active = workspace(rows, du.shape[0], du.shape[1]), len(tight)
     if active >= len(work.free):
-        return UNTOLD, False
+        return UNSOLVED, False
     _fill_slack(work.T, rows.b, x, work.slack)
     for i in range(active):
         work.free[i] = tight[i]
         new = append_row(rows.W, tight[i], i, work.factor, work.basis)
         if not new > DEPENDENT * np.sqrt(rows.gram[tight[i], tight[i]]):
-            return UNTOLD, False
+            return UNSOLVED, False
         accept_row(i, new, work.factor, work.basis)
     for r in range(len(lam)):
         lam[r] = rows.limit[r] if given_up[r] else 0.0
     refine(rows.gram, work.slack, rows.limit, given_up, lam, work.free, active, work.factor)
     for i in range(active):
         if lam[tight[i]] > rows.limit[tight[i]]:
-            return UNTOLD, False
+            return UNSOLVED, False
     status, near = answer(loop, dloop, rows, drows, unit, work, x, dx, lam, active)
     v[:] = work.v
-    if status != UNTOLD:
+    if status != UNSOLVED:
         _apply(loop, dloop, work.v, work.dv0, x, dx, u, du)
     return status, near
 

@@ -12,10 +12,10 @@ import numpy as np
 
 from impc.arrays import Buffer
 from impc.borrowed import borrowed
-from impc.control.compiled_answer import dot
 from impc.control.compiled_arrays import DIVERGED, SOFTENED, LoopMatrices, Workspace
 from impc.control.compiled_body import BodyTape, move_body
 from impc.control.compiled_law import law
+from impc.control.compiled_products import dot
 from impc.jit import njit
 
 if TYPE_CHECKING:
@@ -26,10 +26,10 @@ __all__ = ["COMPILED_WITH", "run"]
 #: First digits of the SHA-256 of each file whose functions are called: numba's cache does not look.
 COMPILED_WITH = {
     "borrowed": "f9ef79e3bd6dacdb",
-    "compiled_answer": "5f51dccc0fa8bbc9",
-    "compiled_arrays": "e21cfdf5fb59a164",
+    "compiled_arrays": "f9299fe715d0d2a3",
     "compiled_body": "7e4e5b9a21a8d467",
-    "compiled_law": "c6623ede30290390",
+    "compiled_law": "fb4d0617cbd31619",
+    "compiled_products": "50101205237e0db3",
 }
 
 
@@ -85,7 +85,7 @@ def run(
         Written: the multipliers of the last problem (r,), or the combination of rows that should
         prove it inconsistent.
     gain_only : bool
-        Whether to end, UNTOLD, at the first sample where the gain breaks a bound.
+        Whether to end, UNSOLVED, at the first sample where the gain breaks a bound.
     local : bool
         Whether every sample has the directions dx[0] in place of what came of them: du is then the
         derivative of each input with respect to its own state and to what is common to all.

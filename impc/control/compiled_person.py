@@ -18,7 +18,7 @@ from impc.jit import njit
 __all__ = ["COMPILED_WITH", "run_person"]
 
 #: First digits of the SHA-256 of each file whose functions are called.
-COMPILED_WITH = {"compiled_arrays": "e21cfdf5fb59a164", "compiled_law": "c6623ede30290390"}
+COMPILED_WITH = {"compiled_arrays": "f9299fe715d0d2a3", "compiled_law": "fb4d0617cbd31619"}
 
 
 @njit(cache=True, nogil=True)

@@ -17,6 +17,7 @@ __all__ = [
     "add_both",
     "both_sides",
     "combine",
+    "dot",
     "invert",
     "noise_products",
     "turn",
@@ -208,3 +209,12 @@ def invert(S: Buffer, inverse: Buffer) -> float:
                 for c in range(p):
                     inverse[b, c] -= factor * inverse[a, c]
     return volume
+
+
+@njit(cache=True, inline="always")
+def dot(a: Buffer, b: Buffer) -> float:
+    """a'b, of two arrays of one length (k,)."""
+    total = 0.0
+    for i in range(len(a)):
+        total += a[i] * b[i]
+    return total

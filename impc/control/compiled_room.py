@@ -19,7 +19,7 @@ from impc.jit import njit
 __all__ = ["COMPILED_WITH", "Covariance", "Moves", "Room", "Way", "filter_room"]
 
 #: First digits of the SHA-256 of each file whose functions are called.
-COMPILED_WITH = {"compiled_arrays": "e21cfdf5fb59a164"}
+COMPILED_WITH = {"compiled_arrays": "f9299fe715d0d2a3"}
 
 
 class Covariance(NamedTuple):

@@ -26,9 +26,9 @@ __all__ = ["COMPILED_WITH", "FilterResult", "ahead", "clip_command", "share_nois
 #: First digits of the SHA-256 of each file whose functions are called.
 COMPILED_WITH = {
     "compiled_clip": "4b317b8d6c67db13",
-    "compiled_covariance": "74cc1504dd8b6bb1",
-    "compiled_products": "a6f8f07dc8ac7460",
-    "compiled_room": "74c6e4e3b886d60a",
+    "compiled_covariance": "7d75cf433740ec3c",
+    "compiled_products": "50101205237e0db3",
+    "compiled_room": "45595e764d61fc2a",
 }
 
 # A first state is forgotten when none of its directions moves an innovation by more than this, of

@@ -18,7 +18,7 @@ from impc.jit import njit
 __all__ = ["COMPILED_WITH", "slope_of_law"]
 
 #: First digits of the SHA-256 of each file whose functions are called.
-COMPILED_WITH = {"compiled_arrays": "e21cfdf5fb59a164", "compiled_dual": "5b203ad8caab6520"}
+COMPILED_WITH = {"compiled_arrays": "f9299fe715d0d2a3", "compiled_dual": "c3376c1c32aa9492"}
 
 
 @njit(cache=True, inline="always")

@@ -26,6 +26,7 @@ import numpy as np
 import scipy.optimize
 
 from impc.arrays import Array, BoolArray, IntArray
+from impc.control.compiled_dual import DEPENDENT
 from impc.errors import InputError
 
 if TYPE_CHECKING:
@@ -97,8 +98,6 @@ _SETTLED = 1e-7
 # differ from that of the equations by, relative to the larger of 1 and z. DAQP keeps rows to 1e-5
 # where a price of a million is paid. The answer of the equations is checked to 1e-9.
 _AGREES = 1e-4
-# A row is dependent on others when less than this share of its length is new (`compiled_dual`).
-_DEPENDENT = 1e-9
 
 _own = threading.local()  # a CasADi function is not to be evaluated in two threads at a time
 _printing = threading.Lock()
@@ -347,7 +346,7 @@ def _independent(A: Array, held: IntArray, multipliers: Array, pull: Array) -> I
         return held
     diagonal = np.abs(np.diagonal(np.linalg.qr(A[held].T, mode="r")))
     lengths = np.linalg.norm(A[held], axis=1)[: len(diagonal)]
-    if len(held) <= A.shape[1] and np.all(diagonal > _DEPENDENT * lengths):
+    if len(held) <= A.shape[1] and np.all(diagonal > DEPENDENT * lengths):
         return held
     order = held[np.argsort(-multipliers[held], kind="stable")]
     chosen, _ = scipy.optimize.nnls(A[order].T, pull)
