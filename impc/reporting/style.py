@@ -153,9 +153,11 @@ def render(figure: Figure, *, mathematics: bool = False) -> dict[str, bytes]:
     files = {}
     if not mathematics:
         _set_literally(figure)
-    # Once for both files: the layout is half of the time. Without an engine, since the one that
+    # Once for both files, and nothing is drawn for it. Without an engine, since the one that
     # "none" leaves behind has everything drawn once more before each file.
-    figure.draw_without_rendering()
+    engine = figure.get_layout_engine()
+    if engine is not None:
+        engine.execute(figure)
     figure.set_layout_engine(None)
     for kind, metadata in (("png", {"Software": None}), ("pdf", {"CreationDate": None})):
         stream = BytesIO()
