@@ -151,8 +151,10 @@ class Range:
 
 
 @checked
-def weights_set(fibre: GainFibre, ratio: float = 10.0) -> WeightsSet:
+def weights_set(fibre: GainFibre, ratio: float = 10.0, *, scaled: bool = False) -> WeightsSet:
     """Prepare the set of weights with condition number up to `ratio` times the least.
+
+    `scaled` as in `least_condition_weights`.
 
     Raises
     ------
@@ -163,7 +165,7 @@ def weights_set(fibre: GainFibre, ratio: float = 10.0) -> WeightsSet:
     """
     if not 1 < ratio < np.inf:
         raise InputError("ratio", f"got {ratio}", "give a number above 1")
-    least = least_condition_weights(fibre)
+    least = least_condition_weights(fibre, scaled=scaled)
     n, m = fibre.plant.n, fibre.plant.m
     try:
         centre = analytic_centre(fibre).weights
