@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 _CALLED = re.compile(r"^from impc\.((?:\w+\.)?(?:compiled_\w+|borrowed)) import", re.MULTILINE)
 _COMPILED = {
     str(path.relative_to(ROOT).with_suffix("")).replace("/", "."): _CALLED.findall(text)
-    for path in sorted((ROOT / "impc").rglob("*.py"))
+    for path in sorted([*(ROOT / "impc").rglob("*.py"), *(ROOT / "experiments").rglob("*.py")])
     if "@njit" in (text := path.read_text(encoding="utf-8"))
 }
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from experiments.noisy_people import recorded, subject
-from experiments.noisy_people_study import Score, above_truth, blind, passed_over, score
+from experiments.noisy_people_study import Score, above_truth, blind, falls, passed_over, score
 from impc.assess.likely_people import entry_intervals, people_as_likely
 from impc.assess.person_covariance import person_covariance
 from impc.assess.person_profile import profile
@@ -18,9 +18,23 @@ from impc.model.structure import Structure
 pytestmark = pytest.mark.long
 
 
-def scored(seed: int, limit: float) -> Score:
+def scored(seed: int, limit: float, *, particles: bool = False) -> Score:
     who = subject("cart", seed, "motor", 90.0, limit)
-    return score(who, recorded(who, seed), "carts", seed, profiled=seed == 0)
+    asked = {"profiled": seed == 0, "particles": particles}
+    return score(who, recorded(who, seed), "carts", seed, **asked)
+
+
+def test_what_particles_correct_is_judged_in_the_same_way() -> None:
+    found = scored(1, 0.7, particles=True)
+    own = found.by_particles
+    assert own is not None
+    assert own["changed"]
+    assert len(own["expected"]) == len(own["along"]) == len(found.along) == 2
+    assert len(own["entries"]) == 2
+    # A filter of a cart is all but exact: half a deviation is what paths are drawn to, and more.
+    for (one, _), (other, deviation) in zip(found.expected, own["expected"], strict=True):
+        assert one == pytest.approx(other, abs=deviation)
+    assert len(found.seconds) == 6
 
 
 def test_a_subject_is_scored_against_its_truth() -> None:
@@ -38,18 +52,31 @@ def test_a_subject_is_scored_against_its_truth() -> None:
 
 
 def test_the_seat_is_held_at_its_limit() -> None:
-    trials = recorded(subject("seat", 0, "motor", 90.0, 6.0), 0)
+    who = subject("seat", 5, "motor", 90.0, 6.0)
+    trials = recorded(who, 5)
     assert 0.1 < trials.saturated < 0.4
     assert 85 < trials.vaf < 95
-    assert not passed_over(trials, met=True)
+    assert not passed_over(who, trials, 5, met=True)
 
 
 def test_who_falls_or_is_seldom_at_the_limit_is_no_subject() -> None:
-    assert passed_over(recorded(subject("seat", 5, "sensory", 90.0, 6.0), 5), met=True) == "fell"
-    seldom = recorded(subject("seat", 1, "sensory", 90.0, 6.0), 1)
+    who = subject("seat", 5, "sensory", 90.0, 6.0)
+    assert passed_over(who, recorded(who, 5), 5, met=True) == "falls"
+    who = subject("seat", 1, "sensory", 90.0, 6.0)
+    seldom = recorded(who, 1)
     assert seldom.saturated < 0.12
-    assert passed_over(seldom, met=True) == "not so often at the limit"
-    assert not passed_over(seldom, met=False)
+    assert passed_over(who, seldom, 1, met=True) == "not so often at the limit"
+    assert not passed_over(who, seldom, 1, met=False)
+
+
+def test_who_falls_where_nobody_records_is_no_subject_either() -> None:
+    """None of three trials ends in a fall, of sixty others some do."""
+    who = subject("seat", 4, "sensory", 70.0, 9.0)
+    trials = recorded(who, 4)
+    assert trials.largest < 1
+    assert 0.12 < trials.saturated < 0.4
+    assert 1 <= falls(who, 4) < 20
+    assert passed_over(who, trials, 4, met=True) == "falls"
 
 
 @pytest.mark.full

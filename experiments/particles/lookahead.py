@@ -1,0 +1,151 @@
+"""Compiled code: what later outputs say of a state, for particles that are to know it.
+
+Particles of the past alone die of what comes: a command shows in the outputs only samples later.
+Those of `drawn_particles` are drawn and weighed with
+
+    psi_t(z) = exp(-z' L_t z / 2 + a_t' z),    about p(y_t, ..., y_T | z_t = z)
+
+which is that density where each command is replaced by a line, c + rho g and a variance beside, the
+best for what all outputs say of g (`compiled_clip`; posterior linearisation, García-Fernández et
+al. 2017; twisted particles, Guarniero, Johansen and Lee 2017). Whatever psi is the likelihood of
+the particles has no bias; it has the less noise the better psi is. numba's cache looks at this file
+only: a change of another one whose functions are called must change `COMPILED_WITH` below, which
+tests/control/test_joint_likelihood.py asks for.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from experiments.particles.clipped_regulator import ClippedRegulator
+from impc.arrays import Buffer
+from impc.control.compiled_clip import Clip, clipped
+from impc.jit import njit
+
+__all__ = ["COMPILED_WITH", "Twist", "twist"]
+
+#: First digits of the SHA-256 of each file whose functions are called.
+COMPILED_WITH = {"compiled_clip": "4b317b8d6c67db13"}
+
+
+class Twist(NamedTuple):
+    """What the outputs from a sample on say of its state.
+
+    Attributes
+    ----------
+    L, a : Buffer
+        (samples, z, z) and (samples, z).
+    """
+
+    L: Buffer
+    a: Buffer
+
+
+@njit(cache=True, nogil=True)
+def twist(
+    regulator: ClippedRegulator, outputs: Buffer, disturbance: Buffer, start: Buffer, rounds: int
+) -> Twist:
+    """What the outputs from each sample on say of its state.
+
+    Parameters
+    ----------
+    regulator : ClippedRegulator
+    outputs, disturbance : Buffer
+        (samples, p) and (samples, d).
+    start : Buffer
+        What is expected of the first state (z,).
+    rounds : int
+        How often each command is replaced by the line that is best for what all outputs say; the
+        first line is that for what earlier ones say.
+    """
+    samples, size = len(outputs), len(regulator.F)
+    lines = np.zeros((samples, 3))
+    means, spreads = np.zeros((samples, size)), np.zeros((samples, size, size))
+    found = Twist(np.zeros((samples, size, size)), np.zeros((samples, size)))
+    _expect(regulator, outputs, disturbance, start, True, lines, means, spreads)
+    for count in range(rounds):
+        if count > 0:
+            _expect(regulator, outputs, disturbance, start, False, lines, means, spreads)
+        _look_back(regulator, outputs, disturbance, lines, found)
+        _smooth(regulator, means, spreads, found, lines)
+    _look_back(regulator, outputs, disturbance, lines, found)
+    return found
+
+
+@njit(cache=True)
+def _line(regulator: ClippedRegulator, g: float, variance: float, line: Buffer) -> None:
+    """Write offset, slope and variance beside of a command of which g is wanted, about."""
+    clip = Clip(True, regulator.low, regulator.high, regulator.unit)
+    found = clipped(clip, g, math.sqrt(max(variance, 0.0)))
+    line[0], line[1], line[2] = found.value - found.inside * g, found.inside, found.variance
+
+
+@njit(cache=True)
+def _expect(
+    regulator: ClippedRegulator,
+    outputs: Buffer,
+    disturbance: Buffer,
+    start: Buffer,
+    own: bool,
+    lines: Buffer,
+    means: Buffer,
+    spreads: Buffer,
+) -> None:
+    """Write mean and covariance of each state before its output; `own` lines are written too."""
+    F, B, E, C, Q, _, R, P0, h, _, _, _ = regulator
+    z, P = start.copy(), P0.copy()
+    for t in range(len(outputs)):
+        means[t], spreads[t] = z, P
+        CP = C @ P
+        gain = np.linalg.solve(CP @ C.T + R, CP).T
+        z = z + gain @ (outputs[t] - C @ z)
+        P = P - gain @ CP
+        if own:
+            _line(regulator, h @ z, h @ (P @ h), lines[t])
+        moved = F + lines[t, 1] * np.outer(B, h)
+        z = moved @ z + B * lines[t, 0] + E @ disturbance[t]
+        P = moved @ P @ moved.T + Q + lines[t, 2] * np.outer(B, B)
+        P = (P + P.T) / 2
+
+
+@njit(cache=True)
+def _look_back(
+    regulator: ClippedRegulator, outputs: Buffer, disturbance: Buffer, lines: Buffer, found: Twist
+) -> None:
+    """Write psi of each sample, from the last to the first."""
+    F, B, E, C, _, root, R, _, h, _, _, _ = regulator
+    rank = root.shape[1]
+    seen = np.linalg.solve(R, C).T
+    here = seen @ C
+    noise = np.zeros((len(F), rank + 1))
+    noise[:, :rank] = root
+    L, a = here.copy(), seen @ outputs[-1]
+    found.L[-1], found.a[-1] = L, a
+    for t in range(len(outputs) - 2, -1, -1):
+        noise[:, rank] = B * math.sqrt(lines[t, 2])
+        turned = L @ noise
+        inner = np.eye(rank + 1) + noise.T @ turned
+        taken = np.linalg.solve(inner, np.ascontiguousarray(turned.T)).T
+        L, a = L - turned @ taken.T, a - taken @ (noise.T @ a)
+        moved = F + lines[t, 1] * np.outer(B, h)
+        a = moved.T @ (a - L @ (B * lines[t, 0] + E @ disturbance[t])) + seen @ outputs[t]
+        L = moved.T @ L @ moved + here
+        L = (L + L.T) / 2
+        found.L[t], found.a[t] = L, a
+
+
+@njit(cache=True)
+def _smooth(
+    regulator: ClippedRegulator, means: Buffer, spreads: Buffer, found: Twist, lines: Buffer
+) -> None:
+    """Write the line of each command for what all outputs say of it."""
+    h, size = regulator.h, len(regulator.h)
+    both = np.zeros((size, 2))
+    for t in range(len(means)):
+        P = spreads[t]
+        both[:, 0], both[:, 1] = means[t] + P @ found.a[t], P @ h
+        told = np.linalg.solve(np.eye(size) + P @ found.L[t], both)
+        _line(regulator, float(h @ told[:, 0].copy()), float(h @ told[:, 1].copy()), lines[t])

@@ -1,0 +1,101 @@
+"""Is the score at the truth without bias at a limit? By the filter, and by particles.
+
+People of the seat of `noisy_people` plan one sample ahead here, so that the command is a gain times
+the estimate, clipped, and particles have the likelihood with no approximation. Of fresh trials of
+each, falls left out, the difference of log-likelihoods at a gain a twentieth larger and smaller:
+
+    python -m experiments.particles.scores --noise sensory --vaf 70 --seeds 3 6 --trials 30
+"""
+
+from __future__ import annotations
+
+import argparse
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from experiments.noisy_people import NOISES, subject
+from experiments.noisy_people_study import FALLEN, LIMITS
+from experiments.particles.clipped_regulator import clipped_regulator, first_state
+from experiments.particles.likelihood import particle_likelihood
+from impc.control.constraint_rows import directions
+from impc.control.controller import Controller
+from impc.control.joint_likelihood import NoiseDirections, joint_likelihood, prepare_filter
+from impc.control.noisy_person import simulate_person
+
+if TYPE_CHECKING:
+    from experiments.noisy_people import Subject
+    from impc.arrays import Array
+
+__all__ = ["differences"]
+
+_APART, _PARTICLES = 0.05, 300
+
+
+def differences(who: Subject, trials: int) -> tuple[Array, int]:
+    """Of each trial that is no fall, by filter and by particles (kept, 2), nats; and falls.
+
+    Parameters
+    ----------
+    who : Subject
+        Of whom gain, levels and limit are taken.
+    trials : int
+    """
+    plant, K = who.controller.plant, np.array(who.controller.K)
+    ends = [_law(who, K * (1 + side * _APART)) for side in (1, -1)]
+
+    def one(number: int) -> list[float] | None:
+        push = who.pushes[number % len(who.pushes)]
+        made = simulate_person(_law(who, K), who.person, push, recorder=who.recorder, seed=number)
+        outputs = np.array(made.outputs)
+        if np.max(np.abs(outputs)) > FALLEN:
+            return None
+        driven = np.array(push, dtype=np.float64).reshape(len(push), -1)
+        values = []
+        for law in ends:
+            parts = np.array(law.K), law.bounds, who.person, who.recorder
+            own = clipped_regulator(plant, *parts)
+            start = first_state(plant, own, np.zeros(plant.n))
+            exact = particle_likelihood(own, outputs, driven, start, _PARTICLES, number)
+            values.append([_filtered(law, who, outputs, driven), exact])
+        return [up - down for up, down in zip(*values, strict=True)]
+
+    with ThreadPoolExecutor(2) as pool:
+        found = list(pool.map(one, range(trials)))
+    kept = [each for each in found if each is not None]
+    return np.array(kept), trials - len(kept)
+
+
+def _law(who: Subject, K: Array) -> Controller:
+    law = who.controller
+    return Controller.from_gain(law.plant, K, law.bounds, 1, terminal_set=False)
+
+
+def _filtered(law: Controller, who: Subject, outputs: Array, driven: Array) -> float:
+    plant, levels = law.plant, len(who.person.levels) + len(who.recorder)
+    none = NoiseDirections(np.zeros((*plant.C.shape, 0)), np.zeros((levels, 0)), 0)
+    prepared = prepare_filter(law, who.person, who.recorder, directions(law, 0), none)
+    return joint_likelihood(prepared, outputs, driven, np.zeros(plant.n)).value
+
+
+def main() -> None:
+    """Print a line for each person."""
+    parser = argparse.ArgumentParser(description="Scores at the truth, at a limit.")
+    parser.add_argument("--noise", choices=tuple(NOISES), default="sensory")
+    parser.add_argument("--vaf", type=float, default=70.0)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[3, 6])
+    parser.add_argument("--trials", type=int, default=30)
+    given = parser.parse_args()
+    for seed in given.seeds:
+        who = subject("seat", seed, given.noise, given.vaf, LIMITS["seat", given.vaf][1])
+        found, falls = differences(who, given.trials)
+        mean, error = found.mean(axis=0), found.std(axis=0, ddof=1) / np.sqrt(len(found))
+        print(
+            f"{seed}: {falls} of {given.trials} trials are falls; of the others the filter says "
+            f"{mean[0]:.2f} ± {error[0]:.2f} nats, particles {mean[1]:.2f} ± {error[1]:.2f}"
+        )
+
+
+if __name__ == "__main__":
+    main()
