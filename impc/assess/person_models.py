@@ -19,6 +19,7 @@ import numpy as np
 from impc.arrays import Array, Frozen, frozen
 from impc.assess import likely_people, person_profile
 from impc.assess.person_covariance import confusion, person_covariance
+from impc.assess.runaways import runaways
 from impc.assess.variance_accounted_for import whiteness
 from impc.checking import replace
 from impc.control.closed_loop import prepare_loop
@@ -112,6 +113,8 @@ class PersonReport(Frozen):
         Samples ahead.
     errors : Array
         Root-mean-square errors of predictions so far ahead (k, p), in the outputs' units.
+    runaways : int
+        In how many of sixty simulated trials like the recorded ones the person runs away.
     """
 
     models: tuple[PersonModel, ...]
@@ -123,6 +126,7 @@ class PersonReport(Frozen):
     whiteness: Array
     ahead: tuple[int, ...]
     errors: Array
+    runaways: int
 
     @property
     def fit(self) -> PersonFit | None:
@@ -171,7 +175,7 @@ def person_report(
         nothing = frozen(np.zeros((0, 2)))
         white = frozen([np.nan] * p)
         return PersonReport(
-            tuple(models), None, profiled, nothing, nothing, None, white, (), frozen([[]])
+            tuple(models), None, profiled, nothing, nothing, None, white, (), frozen([[]]), 0
         )
     if profiled:
         covariance = person_covariance(fit)
@@ -194,6 +198,7 @@ def person_report(
         frozen(_white(fit)),
         ahead,
         frozen(prediction_errors(fit, ahead)),
+        runaways(fit),
     )
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from impc.assess.intervals import entry_names
 from impc.assess.person_profile import FARTHEST
+from impc.assess.runaways import SIMULATED
 from impc.inverse.regulator_span import kept_to
 from impc.reporting.document import Block, Heading, Section, TextTable, table_of
 from impc.reporting.rendering import number
@@ -61,7 +62,7 @@ def person_sentences(result: FitResult) -> tuple[str, ...]:
             for item in told
         )
         lines.append(f"As one who {asked.name}: {each}, standard deviations of a sample (95 %).")
-    return (*lines, *_apart(result, report), *_left(result, report))
+    return (*lines, *_apart(result, report), *_left(result, report), *_falls(report))
 
 
 def preferred(report: PersonReport) -> bool:
@@ -133,6 +134,17 @@ def _left(result: FitResult, report: PersonReport) -> list[str]:
     ]
 
 
+def _falls(report: PersonReport) -> list[str]:
+    """Whether recordings like these are those of somebody who happened not to fall."""
+    if report.runaways == 0:
+        return []
+    return [
+        f"With this gain and this noise the person runs away in {report.runaways} of {SIMULATED} "
+        "simulated trials like these. Where none of the recorded ones did, or those that did were "
+        "left out, the noise was calmer than it is, and gain and levels are bent by that."
+    ]
+
+
 def person_section(result: FitResult, report: PersonReport) -> Section:
     """Section of the page."""
     blocks: list[Block] = [_models_table(report)]
@@ -181,6 +193,7 @@ def person_data(result: FitResult) -> dict[str, Any] | None:
         "whiteness": report.whiteness,
         "ahead": report.ahead,
         "errors_ahead": report.errors,
+        "runaways": {"count": report.runaways, "simulated": SIMULATED},
     }
 
 

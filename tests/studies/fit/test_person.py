@@ -92,6 +92,15 @@ def test_the_section_and_result_json_have_the_same_numbers() -> None:
     np.testing.assert_allclose(kept["K"], result.person.models[0].fit.K)  # type: ignore[union-attr]
 
 
+def test_the_page_warns_of_somebody_who_runs_away_now_and_then() -> None:
+    result = fitted()
+    assert result.person is not None
+    assert not any("runs away" in line for line in person_sentences(result))
+    other = replace(result, person=replace(result.person, runaways=7))
+    assert any("runs away in 7 of 60" in line for line in person_sentences(other))
+    assert person_data(other)["runaways"] == {"count": 7, "simulated": 60}  # type: ignore[index]
+
+
 def test_each_model_is_a_stage_and_intervals_follow_the_likelihood_where_asked() -> None:
     table = TABLE | {"observer": {"sensed": ["x", "v"], "profiles": True}}
     settings = fit_settings(table)
