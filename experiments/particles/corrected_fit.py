@@ -86,30 +86,6 @@ def with_particles(fit: PersonFit) -> PersonFit:
     ----------
     fit : PersonFit
         Of `fit_person`.
-
-    Examples
-    --------
-    >>> import control
-    >>> import numpy as np
-    >>> import impc
-    >>> from impc.control.noisy_person import simulate_person
-    >>> from experiments.particles.corrected_fit import with_particles
-    >>> system = control.ss(
-    ...     [[1, 0.1], [0, 0.9]], [[0, 0], [0.1, 0.1]], [[1, 0]], 0, 0.1,
-    ...     states=["x", "v"], inputs=["u", "push"],
-    ... )
-    >>> plant = impc.Plant(system, ["u"])
-    >>> bounds = impc.Bounds(plant, u_min=-1, u_max=1)
-    >>> law = impc.Controller(plant, impc.Weights(np.eye(2), 1), bounds, 3, terminal_set=False)
-    >>> person = impc.Observer(plant, ["x"], motor=0.5, sensory=0.05)
-    >>> push = np.repeat([1.0, -1.0, 0.0, 1.0, 0.0, -1.0, 1.0, -1.0], 25)
-    >>> y = simulate_person(law, person, push, recorder=0.01).outputs
-    >>> trial = impc.Recording(plant, y, push)
-    >>> found = impc.estimate(impc.Problem(plant, bounds, 3, [trial], terminal_set=False))
-    >>> likely = impc.fit_person(found, person)
-    >>> better = with_particles(likely)
-    >>> bool(np.all(np.abs(better.K - likely.K) < np.abs(likely.K)))
-    True
     """
     first, space = fit.prior, fit.space
     met = any(np.any(trial.status != Status.FREE) for trial in fit.told.trials)
