@@ -32,7 +32,7 @@ from impc.assess.likely_people import (
 )
 from impc.assess.person_covariance import TOLD, person_covariance
 from impc.assess.person_profile import fallen
-from impc.control.noisy_person import simulate_person
+from impc.assess.runaways import running_away
 from impc.errors import ImpcError
 from impc.inverse.likelihood_fit import fit_person
 from impc.inverse.methods import estimate
@@ -67,9 +67,9 @@ LIMITS = {
     ("seat", 70.0): (70.0, 9.0),
 }
 # Who on the seat is at a limit that is met in fewer samples, or more, is no subject, nor who falls
-# in any of so many trials that are not recorded: of people who fall now and then, those who did not
-# have had other noise than the model says.
-_SHARES, _UNSEEN = (0.12, 0.40), 60
+# in any trial that is not recorded, from this number on: of people who fall now and then, those who
+# did not have had other noise than the model says.
+_SHARES, _UNSEEN = (0.12, 0.40), 1000
 #: An angle that is a fall, rad.
 FALLEN = 1.0
 # An entry is told when half of its interval is below this share of it.
@@ -170,10 +170,8 @@ def score(
     clock.append(time.process_time())
     people = people_as_likely(likely)
     along, entries = _around_truth(people, robust, who)
-    directions, _ = _told(robust.directions, robust.deviations)
-    aims = directions @ true_unknowns(likely, who)[: likely.space.gain]
     clock.append(time.process_time())
-    fell = _fell(likely, directions, aims) if profiled else []
+    fell = _fell(likely, robust, who) if profiled else []
     clock.append(time.process_time())
     corrected = _corrected(likely, who, clock) if particles else None
     size = float(np.linalg.norm(truth @ least.T))
@@ -229,9 +227,8 @@ def _around_truth(
     people: list[LikelyPerson], robust: PersonCovariance, who: Subject
 ) -> tuple[list[tuple[float, float]], list[tuple[float, float]]]:
     """Intervals along told directions, and of entries of the gain, less the truth."""
-    fit, true = people[0].fit, np.array(who.controller.K).reshape(-1, 1)
-    directions, deviations = _told(robust.directions, robust.deviations)
-    aims = directions @ true_unknowns(fit, who)[: fit.space.gain]
+    true = np.array(who.controller.K).reshape(-1, 1)
+    directions, deviations, aims = _aims(people[0].fit, robust, who)
     along = (direction_intervals(people, directions) - aims[:, None]) / deviations[:, None]
     entries = (entry_intervals(people) - true) / np.abs(true)
     return along.tolist(), entries.tolist()
@@ -276,9 +273,16 @@ def _told(directions: Array, deviations: Array) -> tuple[Array, Array]:
     return directions[order], deviations[order]
 
 
-def _fell(likely: PersonFit, directions: Array, aims: Array) -> list[float]:
-    """What the likelihood falls by along each direction held at its aim, nats."""
+def _aims(fit: PersonFit, covariance: PersonCovariance, who: Subject) -> tuple[Array, Array, Array]:
+    """Determined directions, their deviations, and where the truth is along them."""
+    directions, deviations = _told(covariance.directions, covariance.deviations)
+    return directions, deviations, directions @ true_unknowns(fit, who)[: fit.space.gain]
+
+
+def _fell(likely: PersonFit, covariance: PersonCovariance, who: Subject) -> list[float]:
+    """What the likelihood falls by along each direction held at the truth, nats."""
     found, along = [], np.zeros(len(likely.theta))
+    directions, _, aims = _aims(likely, covariance, who)
     for direction, aim in zip(directions, aims, strict=True):
         along[: likely.space.gain] = direction
         found.append(fallen(likely, along, float(aim)))
@@ -304,12 +308,9 @@ def passed_over(who: Subject, trials: Recorded, seed: int, *, met: bool) -> str:
 
 def falls(who: Subject, seed: int) -> int:
     """In how many of sixty trials that nobody records a subject falls."""
-    found = 0
-    for trial in range(_UNSEEN):
-        push, drawn = who.pushes[trial % len(who.pushes)], [seed, 1000 + trial]
-        moved = simulate_person(who.controller, who.person, push, seed=drawn).outputs
-        found += bool(np.max(np.abs(moved)) > FALLEN)
-    return found
+    rest = np.zeros(who.controller.plant.n)
+    driven = [(np.asarray(push), rest) for push in who.pushes]
+    return running_away(who.controller, who.person, driven, FALLEN, seed, _UNSEEN)
 
 
 def _run(given: argparse.Namespace) -> None:
@@ -360,7 +361,7 @@ def _summed(scores: list[Score]) -> str:
     cells.append(_shares([[nats <= _LOWER for nats in one.fell] for one in scores if one.fell]))
     told = [[pair for pair in one.entries if pair[1] - pair[0] < 2 * _TOLD] for one in scores]
     cells.append(f"{_around(told)} ({sum(map(len, told))}), {_around([o.entries for o in scores])}")
-    cells.append(_shares([_inside(one) for one in scores]))
+    cells.append(_shares([_inside(one.levels, one.level_intervals) for one in scores]))
     times = np.median([one.seconds[:3] for one in scores], axis=0)
     cells.append(", ".join(f"{value:.1f}" for value in times))
     return "| " + " | ".join(cells) + " |"
@@ -370,8 +371,8 @@ def _summed_by_particles(scores: list[Score]) -> str:
     """The same of the fit that particles correct, as far as it has it."""
     corrected = [one.by_particles or {} for one in scores]
     levels = [
-        [low <= level <= high for level, (low, high) in zip(one.levels, two, strict=True)]
-        for one, two in zip(scores, (each["level_intervals"] for each in corrected), strict=True)
+        _inside(one.levels, other["level_intervals"])
+        for one, other in zip(scores, corrected, strict=True)
     ]
     return (
         f"  by particles ({sum(one['changed'] for one in corrected)} changed, "
@@ -392,9 +393,9 @@ def _means(pairs: list[list[tuple[float, float]]]) -> str:
     return f"{np.mean(errors):.2f} (rms {np.sqrt(np.mean(errors**2)):.2f})"
 
 
-def _inside(one: Score) -> list[bool]:
+def _inside(levels: list[float], intervals: list[tuple[float, float]]) -> list[bool]:
     """Which levels are inside their intervals."""
-    both = zip(one.levels, one.level_intervals, strict=True)
+    both = zip(levels, intervals, strict=True)
     return [low <= level <= high for level, (low, high) in both]
 
 

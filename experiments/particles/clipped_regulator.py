@@ -27,6 +27,8 @@ __all__ = ["ClippedRegulator", "clipped_regulator", "first_state"]
 
 # Eigenvalues of the noise below that, of the largest, are rounding.
 _ROUNDING = 1e-14
+# A wanted command whose deviation is below 1e-7 of the nearer bound is known.
+_KNOWN = 1e-14
 
 
 class ClippedRegulator(NamedTuple):
@@ -44,7 +46,9 @@ class ClippedRegulator(NamedTuple):
     low, high : float
         Bounds of the command, in its unit.
     unit : float
-        The nearer of them: a wanted command whose deviation is below 1e-7 of this is known.
+        The nearer of them.
+    known : float
+        A wanted command of a smaller variance is known: 1e-14 of the square of that.
     """
 
     F: Buffer
@@ -59,6 +63,7 @@ class ClippedRegulator(NamedTuple):
     low: float
     high: float
     unit: float
+    known: float
 
 
 def clipped_regulator(
@@ -91,7 +96,8 @@ def clipped_regulator(
     root = np.ascontiguousarray(vectors[:, kept] * np.sqrt(values[kept]))
     low, high = float(bounds.u_min[0]), float(bounds.u_max[0])
     parts = np.ascontiguousarray(joint.B[:, 0]), joint.E, joint.C, joint.Q, root, joint.R, joint.P0
-    return ClippedRegulator(joint.F, *parts, h, low, high, min(-low, high))
+    unit = min(-low, high)
+    return ClippedRegulator(joint.F, *parts, h, low, high, unit, _KNOWN * unit**2)
 
 
 def first_state(plant: Plant, regulator: ClippedRegulator, x0: Array) -> Array:

@@ -28,8 +28,6 @@ __all__ = ["particles"]
 
 # Particles are drawn anew when their effective share is below this.
 _SHARE = 0.5
-# A variance of this, of the square of the unit, stands for a wanted command that is known.
-_KNOWN = 1e-14
 
 
 @njit(cache=True, nogil=True)
@@ -59,7 +57,7 @@ def particles(
         (1 or samples, z, count), logarithms of weights for what is recorded until then, and wanted
         commands (1 or samples, count).
     """
-    F, B, E, C, _, _, _, _, h, low, high, unit = regulator
+    F, B, E, C, _, _, _, _, h, low, high, _, least_spread = regulator
     count, last = weights.shape[1], len(outputs) - 1
     np.random.seed(seed)
     pieces, offset = (-np.inf, low, high, np.inf), (low, 0.0, high)
@@ -76,7 +74,7 @@ def particles(
             break
         z += known.K[t] @ e
         g = h @ z
-        variance = max(known.spread[t], _KNOWN * unit**2)
+        variance = max(known.spread[t], least_spread)
         bend, pulled, level = _average(known.P[t + 1], ahead, t + 1)
         base = F @ (z - known.L[t][:, None] * g) + (E @ disturbance[t])[:, None]
         slope, steep = F @ known.L[t], np.zeros(3)
@@ -97,8 +95,7 @@ def particles(
             base, masses, tops = base[:, chosen], masses[:, chosen], tops[:, chosen]
             both, weight = both[chosen], np.zeros(count)
         g = _drawn(masses, both, tops, steep, pieces)
-        pushed = np.minimum(np.maximum(g, low), high)
-        z = base + slope[:, None] * g + B[:, None] * pushed
+        z = base + slope[:, None] * g + B[:, None] * np.clip(g, low, high)
         expected = _psi(bend, pulled, level, z)
         at = t % len(means)
         means[at], weights[at], commands[at] = z, weight - expected, g

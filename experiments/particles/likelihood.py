@@ -80,10 +80,8 @@ def particle_likelihood(
     seed : int
         Of all numbers drawn.
     """
-    known = gains(regulator, len(outputs))
+    known, room = gains(regulator, len(outputs)), _room(1, len(start), count)
     ahead = twist(regulator, outputs, disturbance, start, _ROUNDS)
-    size = len(start)
-    room = np.zeros((1, size, count)), np.zeros((1, count)), np.zeros((1, count))
     return float(particles(regulator, known, ahead, outputs, disturbance, start, seed, *room)[0])
 
 
@@ -106,10 +104,8 @@ def particle_paths(
     count, paths, seed : int
         How many particles and paths, and that of all numbers drawn.
     """
-    samples, size = len(outputs), len(start)
-    known = gains(regulator, samples)
+    known, room = gains(regulator, len(outputs)), _room(len(outputs), len(start), count)
     ahead = twist(regulator, outputs, disturbance, start, _ROUNDS)
-    room = np.zeros((samples, size, count)), np.zeros((samples, count)), np.zeros((samples, count))
     value, share = particles(regulator, known, ahead, outputs, disturbance, start, seed, *room)
     drawn = drawn_back(regulator, known, outputs, disturbance, *room, seed + 1, paths)
     return Paths(float(value), float(share), drawn)
@@ -178,6 +174,15 @@ def stein_fields(
     beyond = len(wanted) - inside
     found += [_field(wanted - met, slope, lag) + beyond * (lag == 0) for lag in _EXCESS_LAGS]
     return np.array(found).T
+
+
+def _room(samples: int, size: int, count: int) -> tuple[Array, Array, Array]:
+    """What is kept of particles: expected states, weights and wanted commands."""
+    return (
+        np.zeros((samples, size, count)),
+        np.zeros((samples, count)),
+        np.zeros((samples, count)),
+    )
 
 
 def _field(values: Array, slope: Array, lag: int) -> Array:

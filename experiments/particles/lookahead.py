@@ -95,7 +95,7 @@ def _expect(
     spreads: Buffer,
 ) -> None:
     """Write mean and covariance of each state before its output; `own` lines are written too."""
-    F, B, E, C, Q, _, R, P0, h, _, _, _ = regulator
+    F, B, E, C, Q, _, R, P0, h, _, _, _, _ = regulator
     z, P = start.copy(), P0.copy()
     for t in range(len(outputs)):
         means[t], spreads[t] = z, P
@@ -116,7 +116,7 @@ def _look_back(
     regulator: ClippedRegulator, outputs: Buffer, disturbance: Buffer, lines: Buffer, found: Twist
 ) -> None:
     """Write psi of each sample, from the last to the first."""
-    F, B, E, C, _, root, R, _, h, _, _, _ = regulator
+    F, B, E, C, _, root, R, _, h, _, _, _, _ = regulator
     rank = root.shape[1]
     seen = np.linalg.solve(R, C).T
     here = seen @ C

@@ -27,6 +27,7 @@ from impc.control.noisy_person import simulate_person
 if TYPE_CHECKING:
     from experiments.noisy_people import Subject
     from impc.arrays import Array
+    from impc.control.joint_likelihood import PreparedFilter
 
 __all__ = ["differences"]
 
@@ -43,23 +44,24 @@ def differences(who: Subject, trials: int) -> tuple[Array, int]:
     trials : int
     """
     plant, K = who.controller.plant, np.array(who.controller.K)
-    ends = [_law(who, K * (1 + side * _APART)) for side in (1, -1)]
+    true, *ends = (_law(who, K * factor) for factor in (1, 1 + _APART, 1 - _APART))
+    filters = [_filter(law, who) for law in ends]
+    rest = who.controller.bounds, who.person, who.recorder
+    regulators = [clipped_regulator(plant, np.array(law.K), *rest) for law in ends]
+    start = first_state(plant, regulators[0], np.zeros(plant.n))
 
     def one(number: int) -> list[float] | None:
         push = who.pushes[number % len(who.pushes)]
-        made = simulate_person(_law(who, K), who.person, push, recorder=who.recorder, seed=number)
+        made = simulate_person(true, who.person, push, recorder=who.recorder, seed=number)
         outputs = np.array(made.outputs)
         if np.max(np.abs(outputs)) > FALLEN:
             return None
-        driven = np.array(push, dtype=np.float64).reshape(len(push), -1)
-        values = []
-        for law in ends:
-            parts = np.array(law.K), law.bounds, who.person, who.recorder
-            own = clipped_regulator(plant, *parts)
-            start = first_state(plant, own, np.zeros(plant.n))
-            exact = particle_likelihood(own, outputs, driven, start, _PARTICLES, number)
-            values.append([_filtered(law, who, outputs, driven), exact])
-        return [up - down for up, down in zip(*values, strict=True)]
+        trial = outputs, np.array(push, dtype=np.float64).reshape(len(push), -1)
+        told = [joint_likelihood(each, *trial, np.zeros(plant.n)).value for each in filters]
+        exact = [
+            particle_likelihood(each, *trial, start, _PARTICLES, number) for each in regulators
+        ]
+        return [up - down for up, down in (told, exact)]
 
     with ThreadPoolExecutor(2) as pool:
         found = list(pool.map(one, range(trials)))
@@ -72,11 +74,10 @@ def _law(who: Subject, K: Array) -> Controller:
     return Controller.from_gain(law.plant, K, law.bounds, 1, terminal_set=False)
 
 
-def _filtered(law: Controller, who: Subject, outputs: Array, driven: Array) -> float:
+def _filter(law: Controller, who: Subject) -> PreparedFilter:
     plant, levels = law.plant, len(who.person.levels) + len(who.recorder)
     none = NoiseDirections(np.zeros((*plant.C.shape, 0)), np.zeros((levels, 0)), 0)
-    prepared = prepare_filter(law, who.person, who.recorder, directions(law, 0), none)
-    return joint_likelihood(prepared, outputs, driven, np.zeros(plant.n)).value
+    return prepare_filter(law, who.person, who.recorder, directions(law, 0), none)
 
 
 def main() -> None:

@@ -24,9 +24,8 @@ __all__ = ["Gains", "complete", "drawn_back", "gains", "pull"]
 
 # The gains are taken for stationary when no variance of a state changes by more, of itself.
 _STILL = 1e-12
-# A wanted command of a smaller variance is known, and one that is told is told to it, of the square
-# of the unit.
-_KNOWN, _TOLD = 1e-14, 1e-10
+# To such a variance a wanted command is told on the way back, of the square of the unit.
+_TOLD = 1e-10
 
 
 class Gains(NamedTuple):
@@ -62,7 +61,7 @@ def gains(regulator: ClippedRegulator, samples: int) -> Gains:
     samples : int
         How many there are.
     """
-    F, _, _, C, Q, _, R, P0, h, _, _, unit = regulator
+    F, _, _, C, Q, _, R, P0, h, _, _, _, known = regulator
     size, p = len(F), len(C)
     found = Gains(
         np.zeros((samples, size, size)),
@@ -88,7 +87,7 @@ def gains(regulator: ClippedRegulator, samples: int) -> Gains:
         P = P - found.K[t] @ CP
         wanted = P @ h
         variance = h @ wanted
-        if variance > _KNOWN * unit**2:
+        if variance > known:
             found.spread[t], found.L[t] = variance, wanted / variance
             P = P - np.outer(wanted, wanted) / variance
         P = F @ P @ F.T + Q
@@ -123,7 +122,7 @@ def complete(
         Written, for one sample or for all of them: what the filter misses of the outputs
         (1 or samples, p, paths) and of the wanted commands (1 or samples, paths).
     """
-    F, B, E, C, _, _, _, _, h, low, high, _ = regulator
+    F, B, E, C, _, _, _, _, h, low, high, _, _ = regulator
     samples, paths = len(outputs), wanted.shape[1]
     z, told = np.zeros((len(F), paths)), np.zeros(paths)
     z[:] = start[:, None]
@@ -141,7 +140,7 @@ def complete(
             told -= (math.log(2 * math.pi * known.spread[t]) + d**2 / known.spread[t]) / 2
             z += known.L[t][:, None] * d
         z = F @ z + (E @ disturbance[t])[:, None]
-        z += B[:, None] * np.minimum(np.maximum(wanted[t], low), high)
+        z += B[:, None] * np.clip(wanted[t], low, high)
     return told
 
 
@@ -163,7 +162,7 @@ def pull(
     missed, innovation : Buffer
         As `complete` wrote them for all samples, (samples, p, paths) and (samples, paths).
     """
-    F, B, _, C, _, _, _, _, h, low, high, _ = regulator
+    F, B, _, C, _, _, _, _, h, low, high, _, _ = regulator
     slope = np.zeros(wanted.shape)
     along = C.T @ (known.weight[-1] @ missed[-1])
     for t in range(len(wanted) - 1, -1, -1):
@@ -206,7 +205,7 @@ def drawn_back(
     paths : int
         How many are drawn.
     """
-    F, B, E, C, _, root, R, _, h, low, high, unit = regulator
+    F, B, E, C, _, root, R, _, h, low, high, unit, _ = regulator
     np.random.seed(seed)
     found = np.zeros((len(outputs) - 1, paths))
     seen = np.linalg.solve(R, C).T
@@ -219,7 +218,7 @@ def drawn_back(
         inner = np.eye(root.shape[1]) + root.T @ turned
         taken = np.linalg.solve(inner, np.ascontiguousarray(turned.T)).T
         L, a = L - turned @ taken.T, a - taken @ (root.T @ a)
-        pushed = B[:, None] * np.minimum(np.maximum(found[t], low), high)
+        pushed = B[:, None] * np.clip(found[t], low, high)
         a = back @ (a - L @ (pushed + (E @ disturbance[t])[:, None]))
         a += (seen @ outputs[t])[:, None] + h[:, None] * found[t] / (_TOLD * unit**2)
         L = back @ L @ F + here + np.outer(h, h) / (_TOLD * unit**2)

@@ -17,9 +17,14 @@ from impc.control.noisy_person import simulate_person
 from impc.inverse.problem import controller_for
 
 if TYPE_CHECKING:
-    from impc.inverse.likelihood_fit import PersonFit
+    from collections.abc import Sequence
 
-__all__ = ["SIMULATED", "runaways"]
+    from impc.arrays import Array
+    from impc.control.controller import Controller
+    from impc.inverse.likelihood_fit import PersonFit
+    from impc.model.observer import Observer
+
+__all__ = ["SIMULATED", "runaways", "running_away"]
 
 #: Trials that are simulated.
 SIMULATED = 60
@@ -47,12 +52,38 @@ def runaways(fit: PersonFit) -> int:
     trials = fit.problem.recordings
     law = controller_for(fit.problem, np.array(fit.K), np.array(fit.S))
     largest = np.max([np.max(np.abs(trial.outputs), axis=0) for trial in trials], axis=0)
+    # An output that never moved has no size to leave behind.
+    beyond = np.where(largest > 0, _FAR * largest, np.inf)
+    driven = [(np.array(trial.disturbance), np.array(trial.x0)) for trial in trials]
+    return running_away(law, fit.observer, driven, beyond, SIMULATED)
+
+
+def running_away(
+    law: Controller,
+    person: Observer,
+    trials: Sequence[tuple[Array, Array]],
+    beyond: Array | float,
+    seed: int,
+    first: int = 0,
+) -> int:
+    """In how many of sixty simulated trials an output goes beyond some size.
+
+    Parameters
+    ----------
+    law : Controller
+    person : Observer
+    trials : sequence of pairs of Array
+        Perturbation (samples, d) or (samples,) and first estimate (n,), one after the other.
+    beyond : Array or float
+        Of each output (p,) or of all, in their units.
+    seed, first : int
+        All numbers drawn in a trial follow from the seed and from the trial's own number; that of
+        the first one.
+    """
     found = 0
     for number in range(SIMULATED):
-        trial = trials[number % len(trials)]
-        made = simulate_person(
-            law, fit.observer, trial.disturbance, x0=trial.x0, seed=[SIMULATED, number]
-        )
-        far = np.abs(np.array(made.outputs)) > _FAR * largest
-        found += bool(np.any(far)) or made.reached < trial.samples
+        disturbance, x0 = trials[number % len(trials)]
+        drawn = [seed, first + number]
+        outputs = simulate_person(law, person, disturbance, x0=x0, seed=drawn).outputs
+        found += bool(np.any(np.abs(np.array(outputs)) > beyond))
     return found

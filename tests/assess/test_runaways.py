@@ -6,7 +6,8 @@ import control
 import numpy as np
 
 import impc
-from impc.assess.runaways import SIMULATED, runaways
+from impc.assess.runaways import SIMULATED, runaways, running_away
+from impc.checking import replace
 from impc.control.noisy_person import simulate_person
 from impc.inverse.likelihood_fit import PersonFit
 
@@ -51,6 +52,29 @@ def test_as_many_run_away_as_in_a_simulation_written_anew() -> None:
     share = np.mean(largest > far)
     assert 0.05 < share < 0.95
     assert abs(runaways(fit) / SIMULATED - share) < 4 * np.sqrt(share * (1 - share) / SIMULATED)
+
+
+def test_with_two_inputs_it_is_counted_as_well() -> None:
+    """Two copies of the plant side by side: a trial runs away where either does."""
+    system = control.ss(
+        POLE * np.eye(2), np.hstack([0.1 * np.eye(2), [[0.1], [0.1]]]), np.eye(2), 0, 0.1,
+        states=["x", "y"], inputs=["u", "v", "push"],
+    )  # fmt: skip
+    plant = impc.Plant(system, ["u", "v"])
+    bounds = impc.Bounds(plant, u_min=[-LIMIT, -LIMIT], u_max=[LIMIT, LIMIT])
+    law = impc.Controller.from_gain(plant, 1.6 * np.eye(2), bounds, 1, terminal_set=False)
+    person = impc.Observer(plant, motor=MOTOR)
+    driven = [(push(), np.zeros(2))]
+    both = running_away(law, person, driven, np.array([5.0, 5.0]), 0)
+    first = running_away(law, person, driven, np.array([5.0, np.inf]), 0)
+    second = running_away(law, person, driven, np.array([np.inf, 5.0]), 0)
+    assert 0 < max(first, second) < both <= first + second < 2 * SIMULATED
+
+
+def test_an_output_that_never_moved_is_never_left_behind() -> None:
+    fit = fitted(LIMIT)
+    still = impc.Recording(fit.problem.plant, np.zeros((SAMPLES, 1)), push())
+    assert runaways(replace(fit, problem=replace(fit.problem, recordings=(still,)))) == 0
 
 
 def test_where_no_bound_is_met_nobody_runs_away() -> None:
