@@ -1,4 +1,4 @@
-"""W2: simulation with exact Jacobian, against CasADi's own graph."""
+"""W2: simulation with exact Jacobian, against CasADi's own graph; its nonlinear body."""
 
 from __future__ import annotations
 
@@ -13,9 +13,14 @@ from experiments.benchmarks.timing import side_by_side
 from experiments.benchmarks.workloads import seat
 from impc.control.closed_loop import simulate, simulate_and_differentiate
 from impc.control.constraint_rows import directions
+from impc.control.controller import Controller
+from impc.model.plant import Plant
+from plants.seated_subject import seated_balance_for
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from experiments.benchmarks.workloads import Workload
 
 __all__ = ["simulation_rows"]
 
@@ -77,4 +82,23 @@ def simulation_rows(runs: int, _: Path) -> list[Row]:
             timings["qpoases"],
             None,
         ),
+        _body_row(work, runs),
     ]
+
+
+def _body_row(work: Workload, runs: int) -> Row:
+    """The same weights and torque, a person of the default size: equations beside matrices."""
+    system = seated_balance_for()
+    plant = Plant(system, ["command"], body=system.body)
+    laws = [
+        Controller(each, work.weights, work.controller.bounds, 20, terminal_set=False)
+        for each in (plant, plant.linear())
+    ]
+    along = [directions(law, 2 * plant.n, K=np.eye(plant.n, 2 * plant.n)[None]) for law in laws]
+    moved, linear = (
+        partial(simulate_and_differentiate, law, work.drives[0], each)
+        for law, each in zip(laws, along, strict=True)
+    )
+    timings = side_by_side({"body": moved, "linear": linear}, 4 * runs)
+    what = "a seat's nonlinear body, simulation + exact Jacobian in twenty directions"
+    return compare(what, "the linear plant", timings["body"], timings["linear"], None)

@@ -11,6 +11,7 @@ import numpy as np
 
 from impc.arrays import Array
 from impc.control.compiled_body import BodyTape, move_along, states_along
+from impc.control.native_body import address
 
 if TYPE_CHECKING:
     from impc.control.constraint_rows import Directions
@@ -20,16 +21,24 @@ if TYPE_CHECKING:
 __all__ = ["body_tape", "next_state", "pushes", "slopes_along"]
 
 
-def body_tape(body: Body | None, count: int) -> BodyTape:
-    """A body for the compiled loop along `count` directions, empty where there is none.
+def body_tape(body: Body | None, n: int, given: int, *, moving: bool) -> BodyTape:
+    """A body for the compiled loop, empty where there is none.
 
-    With slots of its own each time, because trials are simulated side by side.
+    With arrays of its own each time, because trials are simulated side by side.
+
+    Parameters
+    ----------
+    n, given : int
+        Numbers of states, and of states, inputs and disturbances.
+    moving : bool
+        Whether derivatives are wanted too.
     """
     if body is None:
-        return BodyTape(np.zeros((0, 4), dtype=np.int64), 0, np.zeros(0), np.zeros((0, count)))
-    values, first = np.zeros(body.slots), len(body.constants)
-    values[:first] = body.constants
-    return BodyTape(np.array(body.code), first, values, np.zeros((body.slots, count)))
+        return BodyTape(0, np.zeros(0), np.zeros(0), np.zeros(0), np.zeros((0, 0)))
+    found = np.zeros(n * (1 + given))
+    code = address(body, n, moving=moving)
+    constants = np.array(body.constants)
+    return BodyTape(code, constants, np.zeros(given), found, found[n:].reshape(n, given))
 
 
 def next_state(plant: Plant, x: Array, u: Array, d: Array) -> Array:
@@ -62,7 +71,9 @@ def pushes(along: Directions, x: Array, u: Array, d: Array) -> Array:
 
 def _ahead(body: Body, x: Array, u: Array, d: Array) -> Array:
     ahead = np.empty(x.shape)
-    states_along(body_tape(body, 0), np.array(x), np.array(u), np.array(d), ahead)
+    given = x.shape[1] + u.shape[1] + d.shape[1]
+    tape = body_tape(body, x.shape[1], given, moving=False)
+    states_along(tape, np.array(x), np.array(u), np.array(d), ahead)
     return ahead
 
 
@@ -83,10 +94,9 @@ def slopes_along(plant: Plant, x: Array, u: Array, d: Array) -> tuple[Array, Arr
     if plant.body is None:
         A, B, E = (np.broadcast_to(part, (steps, *part.shape)) for part in _matrices(plant))
         return A, B, E
-    count = n + m + plant.E.shape[1]
-    tape = body_tape(plant.body, count)
-    tape.slopes[tape.given : tape.given + count] = np.eye(count)
-    found = np.empty((steps, n, count))
+    given = n + m + plant.E.shape[1]
+    tape = body_tape(plant.body, n, given, moving=True)
+    found = np.empty((steps, n, given))
     move_along(tape, np.array(x), np.array(u), np.array(d), found)
     return found[..., :n], found[..., n : n + m], found[..., n + m :]
 

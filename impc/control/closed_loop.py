@@ -348,7 +348,7 @@ def run_loop(
     program = prepared.program
     loop = (
         *(prepared.matrices, prepared.matrix_directions, prepared.rows, prepared.row_directions),
-        body_tape(plant.body, p),
+        body_tape(plant.body, n, n + m + plant.E.shape[1], moving=p > 0),
         _pushes(prepared, given),
         *(np.array(given.disturbance), _divergence(plant, given), prepared.unit),
         workspace(prepared.rows, m, p),

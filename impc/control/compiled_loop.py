@@ -1,7 +1,7 @@
 """Compiled code: the closed loop over samples, with derivatives along any directions.
 
 The loop is that of `closed_loop`, which has its mathematics (docs/theory.md). Where the body that
-moves is not linear, its operations are run one after the other (`compiled_body`).
+moves is not linear, its machine code is called (`compiled_body`).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ __all__ = ["COMPILED_WITH", "run"]
 COMPILED_WITH = {
     "borrowed": "f9ef79e3bd6dacdb",
     "compiled_arrays": "f9299fe715d0d2a3",
-    "compiled_body": "7e4e5b9a21a8d467",
+    "compiled_body": "27264bd9a3e3de9a",
     "compiled_law": "fb4d0617cbd31619",
     "compiled_products": "50101205237e0db3",
 }
@@ -111,7 +111,7 @@ def run(
                 _hold(x, dx, t)
                 return weakly_active, row
             weakly_active += near
-        if len(body.code):
+        if body.address:
             move_body(body, x[t], u[t], disturbance[t], dx[t], du[t], x[t + 1], dx[t + 1])
             if len(pushes):
                 dx[t + 1] += pushes[t]

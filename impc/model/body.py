@@ -2,9 +2,9 @@
 
 A plant may offer its own equations beside the matrices by which its controller predicts them
 (docs/nonlinear.md, "A body that is not linear"). They come as a `casadi.Function` and are kept as
-the list of its scalar operations: arrays, which the compiled loop runs and differentiates sample by
-sample, without a compiler, and which can be compared, kept and sent. Parameters are among the
-constants of the list.
+the list of its scalar operations and of those of its derivatives: arrays, which can be compared,
+kept and sent, and which `native_body` makes machine code of. Parameters are among the constants of
+the list.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 __all__ = ["OPERATIONS", "Body", "read_body"]
 
-#: Names of the operations in CasADi, without ``OP_``; the compiled loop knows them by their places.
+#: Names of the operations in CasADi, without ``OP_``; a list of operations has their places.
 OPERATIONS = (
     *("OUTPUT", "MUL", "ADD", "SUB", "DIV", "NEG", "SQ", "TWICE", "SIN", "COS", "TAN", "SQRT"),
     *("INV", "EXP", "LOG", "POW", "CONSTPOW", "FABS", "SIGN", "TANH", "SINH", "COSH", "ASIN"),
@@ -35,27 +35,26 @@ OPERATIONS = (
 
 @dataclass(frozen=True)
 class Body(Value):
-    """The operations of one sample of a body.
+    """The operations of one sample of a body, and of its derivatives.
 
-    A value has a slot. The first slots hold the constants, those behind them the states, inputs
-    and disturbances, the rest what is computed.
+    A value has a slot. The first slots hold the constants, those behind them the g states, inputs
+    and disturbances that are given, the rest what is computed.
 
     Attributes
     ----------
     code : IntArray
-        (k, 4): operation, by its place in `OPERATIONS`; slot of the answer (of an OUTPUT, the
-        state that it is); slots of its two operands, of which one may not be used.
+        (k, 4): operation, by its place in `OPERATIONS`; slot of the answer; slots of its two
+        operands, of which one may not be used. The answer of an OUTPUT is a place among the n next
+        states and, behind them and row by row, their n x g derivatives by what is given. A
+        derivative that is zero wherever the body is has none.
     constants : Array
         (c,).
-    slots : int
-        How many there are.
     """
 
-    _rules: ClassVar[Mapping[str, Any]] = {"constants": "*", "slots": 1}
+    _rules: ClassVar[Mapping[str, Any]] = {"constants": "*"}
 
     code: IntArray
     constants: Array
-    slots: int
 
 
 def read_body(function: Any, order: Sequence[int], n: int) -> Body:
@@ -91,12 +90,19 @@ def read_body(function: Any, order: Sequence[int], n: int) -> Body:
     given = ca.SX.sym("given", n + len(order))
     inputs = ca.vertcat(*(given[n + list(order).index(k)] for k in range(len(order))))
     ahead = ca.densify(function.expand()(given[:n], inputs))
-    return _listed(ca.Function("body", [given], [ahead], {"cse": True}), n + len(order))
+    listed = []
+    for reverse in (0, 1):  # of the seat's 1511 operations the other way has 2331
+        slopes = ca.jacobian(ahead, given, {"helper_options": {"ad_weight": reverse}})
+        listed.append(ca.Function("body", [given], [ahead, slopes], {"cse": True}))
+    return _listed(min(listed, key=lambda each: each.n_instructions()))
 
 
-def _listed(function: Any, given: int) -> Body:
-    """The operations of a function of one vector, of SX expressions."""
+def _listed(function: Any) -> Body:
+    """The operations of a function of one vector, of SX expressions, and of its derivatives."""
     names = _names()
+    n, given = function.size_out(1)
+    at, by = (np.array(places) for places in function.sparsity_out(1).get_triplet())
+    places = (np.arange(n), n + at * given + by)
     code: list[tuple[int, int, int, int]] = []
     count = function.n_instructions()
     kinds = [function.instruction_id(k) for k in range(count)]
@@ -115,13 +121,13 @@ def _listed(function: Any, given: int) -> Body:
             read = [where[register] for register in function.instruction_input(k)]
             if name != "OUTPUT":
                 where[to[0]] = first + to[0]
-            slot = to[1] if name == "OUTPUT" else where[to[0]]
+            slot = places[to[0]][to[1]] if name == "OUTPUT" else where[to[0]]
             code.append((OPERATIONS.index(name), slot, read[0], read[-1]))
         else:
             raise PlantError("plant.body", f"has the operation {name}", "write it without")
     table = np.array(code, dtype=np.int64).reshape(-1, 4)
     table.flags.writeable = False
-    return Body(table, frozen(constants), first + function.sz_w())
+    return Body(table, frozen(constants))
 
 
 @functools.cache

@@ -1,0 +1,154 @@
+"""Machine code of a body: its list of operations, translated once for all samples.
+
+LLVM, which numba brings, makes it: a function of (constants, given, found) that reads and writes
+where they point to. The operations stand one behind the other without a branch, and none is taken
+together with another, so that every processor gives the same numbers. Parameters are among the
+constants, so that bodies which differ by them alone share their code.
+"""
+
+from __future__ import annotations
+
+import functools
+import threading
+from typing import TYPE_CHECKING, Any
+
+import llvmlite.binding as llvm
+import numpy as np
+from llvmlite import ir
+
+from impc.model.body import OPERATIONS
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from impc.model.body import Body
+
+__all__ = ["address"]
+
+_NUMBER, _PLACE = ir.DoubleType(), ir.IntType(64)
+_ZERO, _ONE, _MINUS = (_NUMBER(value) for value in (0.0, 1.0, -1.0))
+# Of the C library, by their names there.
+_CALLED = {
+    **{"SIN": "sin", "COS": "cos", "TAN": "tan", "SQRT": "sqrt", "EXP": "exp", "LOG": "log"},
+    **{"POW": "pow", "CONSTPOW": "pow", "FABS": "fabs", "TANH": "tanh", "SINH": "sinh"},
+    **{"COSH": "cosh", "ASIN": "asin", "ACOS": "acos", "ATAN": "atan", "ATAN2": "atan2"},
+    **{"FMIN": "fmin", "FMAX": "fmax", "HYPOT": "hypot", "LOG1P": "log1p", "EXPM1": "expm1"},
+}
+_OF_TWO = {"POW", "CONSTPOW", "ATAN2", "FMIN", "FMAX", "HYPOT"}
+# Of instructions, from a builder and two operands.
+_WRITTEN: dict[str, Callable[[Any, Any, Any], Any]] = {
+    "MUL": lambda to, a, b: to.fmul(a, b),
+    "ADD": lambda to, a, b: to.fadd(a, b),
+    "SUB": lambda to, a, b: to.fsub(a, b),
+    "DIV": lambda to, a, b: to.fdiv(a, b),
+    "NEG": lambda to, a, _: to.fneg(a),
+    "SQ": lambda to, a, _: to.fmul(a, a),
+    "TWICE": lambda to, a, _: to.fadd(a, a),
+    "INV": lambda to, a, _: to.fdiv(_ONE, a),
+    "ASSIGN": lambda _, a, __: a,
+    "SIGN": lambda to, a, _: to.select(
+        to.fcmp_ordered(">", a, _ZERO), _ONE, to.select(to.fcmp_ordered("<", a, _ZERO), _MINUS, a)
+    ),
+    "LT": lambda to, a, b: to.uitofp(to.fcmp_ordered("<", a, b), _NUMBER),
+    "LE": lambda to, a, b: to.uitofp(to.fcmp_ordered("<=", a, b), _NUMBER),
+    "EQ": lambda to, a, b: to.uitofp(to.fcmp_ordered("==", a, b), _NUMBER),
+    "NE": lambda to, a, b: to.uitofp(to.fcmp_unordered("!=", a, b), _NUMBER),
+    "NOT": lambda to, a, _: to.uitofp(to.fcmp_ordered("==", a, _ZERO), _NUMBER),
+    "AND": lambda to, a, b: to.uitofp(to.and_(_true(to, a), _true(to, b)), _NUMBER),
+    "OR": lambda to, a, b: to.uitofp(to.or_(_true(to, a), _true(to, b)), _NUMBER),
+    "IF_ELSE_ZERO": lambda to, a, b: to.select(_true(to, a), b, _ZERO),
+}
+_one_at_a_time = threading.Lock()
+
+
+def address(body: Body, states: int, *, moving: bool) -> int:
+    """Where the machine code of a body begins; it stays there as long as the process.
+
+    Parameters
+    ----------
+    states : int
+        Number n of states.
+    moving : bool
+        Whether derivatives are written too, behind the n next states.
+
+    Returns
+    -------
+    int
+        Of a C function without a value, of three pointers to numbers: the constants (c,), what is
+        given (g,) and what is found (n + n g,), where derivatives that are always zero are left as
+        they are.
+    """
+    with _one_at_a_time:
+        place, _ = _translated(body.code.tobytes(), len(body.constants), None if moving else states)
+    return place
+
+
+def _of_states(code: list[list[int]], states: int) -> list[list[int]]:
+    """The operations that the next states need."""
+    needed: set[int] = set()
+    kept = []
+    for line in code[::-1]:
+        operation, to, a, b = line
+        if OPERATIONS[operation] == "OUTPUT":
+            wanted = to < states
+        else:
+            wanted = to in needed
+            needed.discard(to)
+        if wanted:
+            needed |= {a, b}
+            kept.append(line)
+    return kept[::-1]
+
+
+@functools.cache
+def _translated(code: bytes, constants: int, states: int | None) -> tuple[int, Any]:
+    """The address of a function of `states` alone, if any, and what keeps it there."""
+    lines: list[list[int]] = np.frombuffer(code, dtype=np.int64).reshape(-1, 4).tolist()
+    if states is not None:
+        lines = _of_states(lines, states)
+    module = ir.Module()
+    pointer = _NUMBER.as_pointer()
+    kind = ir.FunctionType(ir.VoidType(), [pointer] * 3)
+    function = ir.Function(module, kind, "body")
+    builder = ir.IRBuilder(function.append_basic_block())
+    held, given, found = function.args
+    slots: dict[int, Any] = {}
+
+    def read(slot: int) -> Any:
+        if slot not in slots:  # what is computed is written before it is read
+            source, place = (held, slot) if slot < constants else (given, slot - constants)
+            slots[slot] = builder.load(builder.gep(source, [_PLACE(place)]))
+        return slots[slot]
+
+    for operation, to, a, b in lines:
+        name = OPERATIONS[operation]
+        if name == "OUTPUT":
+            builder.store(read(a), builder.gep(found, [_PLACE(to)]))
+        elif name in _WRITTEN:
+            slots[to] = _WRITTEN[name](builder, read(a), read(b))
+        else:
+            operands = [read(a), read(b)] if name in _OF_TWO else [read(a)]
+            slots[to] = builder.call(_library(module, _CALLED[name], len(operands)), operands)
+    builder.ret_void()
+    return _compiled(str(module))
+
+
+def _compiled(text: str) -> tuple[int, Any]:
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    parsed = llvm.parse_assembly(text)
+    machine = llvm.Target.from_default_triple().create_target_machine(opt=2, jit=True)
+    engine = llvm.create_mcjit_compiler(parsed, machine)
+    engine.finalize_object()
+    return int(engine.get_function_address("body")), engine
+
+
+def _library(module: Any, name: str, operands: int) -> Any:
+    """A function of the C library, declared once."""
+    if name in module.globals:
+        return module.globals[name]
+    return ir.Function(module, ir.FunctionType(_NUMBER, [_NUMBER] * operands), name)
+
+
+def _true(builder: Any, a: Any) -> Any:
+    return builder.fcmp_unordered("!=", a, _ZERO)
