@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.linalg
+import scipy.optimize
 
 from impc.arrays import Array, Frozen
 from impc.checking import checked
@@ -52,8 +53,8 @@ __all__ = [
 ]
 
 
-# Relative gap of the programs, and halvings that draw their points inside.
-_GAP, _HALVINGS = 1e-10, 36
+# Relative gap of the programs, and share of the way by which their points may be drawn too far.
+_GAP, _CLOSE = 1e-10, 1e-11
 
 
 @dataclass(frozen=True)
@@ -342,18 +343,23 @@ def _member(found: WeightsSet, y: Array) -> Array:
     n = found.fibre.plant.n
     centre = found.least.weights.block
     centre = centre * ((len(centre) - n) / np.trace(centre[n:, n:]))
-    # The condition number is quasiconvex along the segment.
-    inside, outside = 0.0, 2.0
-    for _ in range(_HALVINGS):
-        share = (inside + outside) / 2  # 1, the point itself, comes first
-        values = np.linalg.eigvalsh(centre + share * (X - centre))  # as `condition_number` sees it
-        if values[0] > 0 and values[-1] <= found.limit * values[0]:
-            inside = share
-        else:
-            outside = share
-        if inside == 1:
-            break
-    return np.asarray(centre + inside * (X - centre))
+
+    def at(share: float) -> Array:
+        return np.asarray(centre + share * (X - centre))
+
+    def room(share: float) -> float:
+        """What the limit leaves, as `condition_number` sees it: concave along the segment."""
+        values = np.linalg.eigvalsh(at(share))
+        return found.limit * float(values[0]) - float(values[-1])
+
+    if room(1.0) >= 0:
+        return at(1.0)
+    if room(0.0) <= 0:  # no other is a member
+        return at(0.0)
+    share, back = float(scipy.optimize.brentq(room, 0.0, 1.0, xtol=_CLOSE)), _CLOSE
+    while room(share) < 0:
+        share, back = max(0.0, share - back), 2 * back
+    return at(share)
 
 
 def _with_one_more(cones: list[Cone]) -> list[Cone]:

@@ -77,12 +77,15 @@ def move_body(
         ahead[i] = body.found[i]
         for c in range(p):
             dahead[i, c] = 0.0
-        for j in range(n):
+    # Row after row of what moves: a sum over them would wait, each time, for its last term.
+    for j in range(n):
+        for i in range(n):
             slope = body.slopes[i, j]
-            if slope != 0.0:  # that of a delay has one
+            if slope != 0.0:  # a delay has one in a row
                 for c in range(p):
                     dahead[i, c] += slope * dx[j, c]
-        for j in range(len(u)):
+    for j in range(len(u)):
+        for i in range(n):
             slope = body.slopes[i, n + j]
             for c in range(p):
                 dahead[i, c] += slope * du[j, c]

@@ -27,10 +27,11 @@ __all__ = ["address"]
 
 _NUMBER, _PLACE = ir.DoubleType(), ir.IntType(64)
 _ZERO, _ONE, _MINUS = (_NUMBER(value) for value in (0.0, 1.0, -1.0))
-# Of the C library, by their names there.
+# Of LLVM, which takes a sine and a cosine of one number together, and of the C library, by name.
 _CALLED = {
-    **{"SIN": "sin", "COS": "cos", "TAN": "tan", "SQRT": "sqrt", "EXP": "exp", "LOG": "log"},
-    **{"POW": "pow", "CONSTPOW": "pow", "FABS": "fabs", "TANH": "tanh", "SINH": "sinh"},
+    **{"SIN": "llvm.sin", "COS": "llvm.cos", "SQRT": "llvm.sqrt", "FABS": "llvm.fabs"},
+    **{"EXP": "exp", "LOG": "log", "POW": "pow", "CONSTPOW": "pow"},
+    **{"TAN": "tan", "TANH": "tanh", "SINH": "sinh"},
     **{"COSH": "cosh", "ASIN": "asin", "ACOS": "acos", "ATAN": "atan", "ATAN2": "atan2"},
     **{"FMIN": "fmin", "FMAX": "fmax", "HYPOT": "hypot", "LOG1P": "log1p", "EXPM1": "expm1"},
 }
@@ -144,7 +145,9 @@ def _compiled(text: str) -> tuple[int, Any]:
 
 
 def _library(module: Any, name: str, operands: int) -> Any:
-    """A function of the C library, declared once."""
+    """A function of LLVM or of the C library, declared once."""
+    if name.startswith("llvm."):
+        return module.declare_intrinsic(name, [_NUMBER])
     if name in module.globals:
         return module.globals[name]
     return ir.Function(module, ir.FunctionType(_NUMBER, [_NUMBER] * operands), name)
