@@ -17,12 +17,11 @@ import json
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from experiments.noisy_people import BODIES, NOISES, recorded, subject
-from experiments.particles.corrected_fit import with_particles
 from impc.assess.covariance import TWO_SIDED, gain_covariance
 from impc.assess.likely_people import (
     direction_intervals,
@@ -36,6 +35,7 @@ from impc.assess.runaways import running_away
 from impc.errors import ImpcError
 from impc.inverse.likelihood_fit import fit_person
 from impc.inverse.methods import estimate
+from impc.inverse.unbiased_fit import unbiased
 
 if TYPE_CHECKING:
     from experiments.noisy_people import Recorded, Subject
@@ -114,12 +114,9 @@ class Score:
         Motor, senses, recorder: true, and found.
     level_intervals : list of pairs
         Of everybody as likely, as printed.
-    by_particles : dict or None
-        Where asked for: of the fit that particles correct `converged`, `likely`, `expected`,
-        `along`, `entries`, `found` and `level_intervals` as here, and whether it has `changed`.
     seconds : list of float
-        Of processor time: least squares, likelihood, everybody as likely, what falls, particles,
-        everybody as likely by them.
+        Of processor time: least squares, likelihood, what is taken away without bias, everybody as
+        likely, what falls.
     """
 
     study: str
@@ -141,7 +138,6 @@ class Score:
     levels: list[float]
     found: list[float]
     level_intervals: list[tuple[float, float]]
-    by_particles: dict[str, Any] | None
     seconds: list[float]
 
 
@@ -152,12 +148,8 @@ def score(
     seed: int,
     *,
     profiled: bool = False,
-    particles: bool = False,
 ) -> Score:
-    """Both fits of a subject, what holds for everybody as likely and, asked for, what falls.
-
-    Asked for, the fit that particles correct is judged in the same way.
-    """
+    """Both fits of a subject, what holds for everybody as likely and, asked for, what falls."""
     truth = np.array(who.controller.K)
     clock = [time.process_time()]
     first = estimate(trials.problem)
@@ -165,6 +157,8 @@ def score(
     least = gain_covariance(first.problem, gain, metric, curvature=True)
     clock.append(time.process_time())
     likely = fit_person(first, blind(who))
+    clock.append(time.process_time())
+    likely = unbiased(likely)
     expected = person_covariance(likely, "expected")
     robust = person_covariance(likely)
     clock.append(time.process_time())
@@ -173,7 +167,6 @@ def score(
     clock.append(time.process_time())
     fell = _fell(likely, robust, who) if profiled else []
     clock.append(time.process_time())
-    corrected = _corrected(likely, who, clock) if particles else None
     size = float(np.linalg.norm(truth @ least.T))
     return Score(
         study,
@@ -199,28 +192,8 @@ def score(
         [*who.person.levels[who.person.levels > 0], *who.recorder],
         likely.levels.tolist(),
         level_intervals(people).tolist(),
-        corrected,
         np.diff(clock).tolist(),
     )
-
-
-def _corrected(likely: PersonFit, who: Subject, clock: list[float]) -> dict[str, Any]:
-    """What is said of the fit by particles, and the time after it and after its intervals."""
-    fit, truth = with_particles(likely), np.array(who.controller.K)
-    clock.append(time.process_time())
-    robust, people = person_covariance(fit), people_as_likely(fit)
-    along, entries = _around_truth(people, robust, who)
-    clock.append(time.process_time())
-    return {
-        "changed": fit is not likely,
-        "converged": fit.converged,
-        "likely": _steps(fit, robust, truth),
-        "expected": _steps(fit, person_covariance(fit, "expected"), truth),
-        "along": along,
-        "entries": entries,
-        "found": fit.levels.tolist(),
-        "level_intervals": level_intervals(people).tolist(),
-    }
 
 
 def _around_truth(
@@ -323,7 +296,7 @@ def _run(given: argparse.Namespace) -> None:
     kinds = list(itertools.product(given.noise, given.vaf, given.met))
     with path.open("a", encoding="utf-8") as file:
         for seed, (noise, share, met) in itertools.product(
-            range(given.first, given.subjects), kinds
+            range(given.first, given.first + given.subjects), kinds
         ):
             study = f"{given.body}, {noise}, VAF {share:g}, {'met' if met else 'none met'}"
             if (study, seed) in done:
@@ -334,8 +307,7 @@ def _run(given: argparse.Namespace) -> None:
                 reason = passed_over(who, trials, seed, met=met) if given.body == "seat" else ""
                 line = {"study": study, "seed": seed, "passed": reason}
                 if not reason:
-                    asked = {"profiled": given.profiles, "particles": given.particles}
-                    line = asdict(score(who, trials, study, seed, **asked))
+                    line = asdict(score(who, trials, study, seed, profiled=given.profiles))
             except ImpcError as error:  # counted: most are of the first fit, of a cart that ran off
                 line = {"study": study, "seed": seed, "reason": str(error)}
             file.write(json.dumps(line) + "\n")
@@ -362,35 +334,9 @@ def _summed(scores: list[Score]) -> str:
     told = [[pair for pair in one.entries if pair[1] - pair[0] < 2 * _TOLD] for one in scores]
     cells.append(f"{_around(told)} ({sum(map(len, told))}), {_around([o.entries for o in scores])}")
     cells.append(_shares([_inside(one.levels, one.level_intervals) for one in scores]))
-    times = np.median([one.seconds[:3] for one in scores], axis=0)
+    times = np.median([one.seconds[:4] for one in scores], axis=0)
     cells.append(", ".join(f"{value:.1f}" for value in times))
     return "| " + " | ".join(cells) + " |"
-
-
-def _summed_by_particles(scores: list[Score]) -> str:
-    """The same of the fit that particles correct, as far as it has it."""
-    corrected = [one.by_particles or {} for one in scores]
-    levels = [
-        _inside(one.levels, other["level_intervals"])
-        for one, other in zip(scores, corrected, strict=True)
-    ]
-    return (
-        f"  by particles ({sum(one['changed'] for one in corrected)} changed, "
-        f"{sum(one['converged'] for one in corrected)} settled): bias as expected "
-        f"{_means([one.expected for one in scores])} before, "
-        f"{_means([one['expected'] for one in corrected])} after; sandwich "
-        f"{_holds([one['likely'] for one in corrected])}, expected "
-        f"{_holds([one['expected'] for one in corrected])}, everybody as likely "
-        f"{_around([one['along'] for one in corrected])}, entries "
-        f"{_around([one['entries'] for one in corrected])}, levels {_shares(levels)}; "
-        f"{np.median([one.seconds[4] for one in scores]):.0f} s"
-    )
-
-
-def _means(pairs: list[list[tuple[float, float]]]) -> str:
-    """Mean and root mean square of errors in deviations, all directions together."""
-    errors = np.array([error / deviation for each in pairs for error, deviation in each])
-    return f"{np.mean(errors):.2f} (rms {np.sqrt(np.mean(errors**2)):.2f})"
 
 
 def _inside(levels: list[float], intervals: list[tuple[float, float]]) -> list[bool]:
@@ -455,8 +401,6 @@ def _sum(given: argparse.Namespace) -> None:
                 by_study.setdefault(found["study"], []).append(Score(**found))
     for scores in by_study.values():
         print(_summed(scores))
-        if corrected := [one for one in scores if one.by_particles]:
-            print(_summed_by_particles(corrected))
     for reason, count in passed.items():
         print(f"passed over: {reason}: {count}")
 
@@ -473,7 +417,6 @@ def main() -> None:
     run.add_argument("--first", type=int, default=0)
     run.add_argument("--subjects", type=int, default=200)
     run.add_argument("--profiles", action="store_true")
-    run.add_argument("--particles", action="store_true")
     run.add_argument("--out", required=True)
     run.set_defaults(run=_run)
     summed = which.add_parser("sum")

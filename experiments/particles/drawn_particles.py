@@ -1,7 +1,7 @@
 """Compiled code: the likelihood of a clipped regulator by particles that know what is to come.
 
 Each particle is a path of wanted commands g; given that and the outputs the state is normal, with a
-covariance that is the same for all (`wanted_paths`). With psi of `lookahead` and
+covariance that is the same for all (`gains`). With psi of `lookahead` and
 Psi_t(m) = E psi_t(z), z normal about m, a particle that expects the state m before output t
 
     is weighed by   p(y_t | m) E_g Psi_t+1(m+(g)) / Psi_t(m),
@@ -19,8 +19,8 @@ import math
 import numpy as np
 
 from experiments.particles.clipped_regulator import ClippedRegulator
+from experiments.particles.gains import Gains
 from experiments.particles.lookahead import Twist
-from experiments.particles.wanted_paths import Gains
 from impc.arrays import Buffer
 from impc.jit import njit
 
@@ -39,11 +39,9 @@ def particles(
     disturbance: Buffer,
     start: Buffer,
     seed: int,
-    means: Buffer,
-    weights: Buffer,
-    commands: Buffer,
-) -> tuple[float, float]:
-    """Log-likelihood, nats, and the least effective share of particles on the way.
+    count: int,
+) -> float:
+    """Log-likelihood, nats.
 
     Parameters
     ----------
@@ -52,20 +50,18 @@ def particles(
         (samples, p), (samples, d), and what is expected of the first state (z,).
     seed : int
         Of all numbers drawn.
-    means, weights, commands : Buffer
-        Written, for one sample or for all of them: the next state that each particle expects
-        (1 or samples, z, count), logarithms of weights for what is recorded until then, and wanted
-        commands (1 or samples, count).
+    count : int
+        How many particles.
     """
     F, B, E, C, _, _, _, _, h, low, high, _, least_spread = regulator
-    count, last = weights.shape[1], len(outputs) - 1
+    last = len(outputs) - 1
     np.random.seed(seed)
     pieces, offset = (-np.inf, low, high, np.inf), (low, 0.0, high)
     z = np.zeros((len(F), count))
     z[:] = start[:, None]
     bend, pulled, level = _average(known.P[0], ahead, 0)
     expected = _psi(bend, pulled, level, z)
-    weight, total, least = expected.copy(), 0.0, 1.0
+    weight, total = expected.copy(), 0.0
     masses, tops = np.zeros((3, count)), np.zeros((3, count))
     for t in range(last + 1):
         e = outputs[t][:, None] - C @ z
@@ -87,9 +83,7 @@ def particles(
             )  # fmt: skip
         both = _logarithm_of_sum(masses)
         weight += both
-        share = _effective(weight)
-        least = min(least, share)
-        if share < _SHARE:
+        if _effective(weight) < _SHARE:
             total += _logarithm_of_mean(weight)
             chosen = _systematic(weight)
             base, masses, tops = base[:, chosen], masses[:, chosen], tops[:, chosen]
@@ -97,9 +91,7 @@ def particles(
         g = _drawn(masses, both, tops, steep, pieces)
         z = base + slope[:, None] * g + B[:, None] * np.clip(g, low, high)
         expected = _psi(bend, pulled, level, z)
-        at = t % len(means)
-        means[at], weights[at], commands[at] = z, weight - expected, g
-    return total + _logarithm_of_mean(weight), least
+    return total + _logarithm_of_mean(weight)
 
 
 @njit(cache=True)

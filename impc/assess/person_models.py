@@ -30,6 +30,7 @@ from impc.errors import ImpcError
 from impc.inverse.likelihood_fit import PersonFit, fit_person
 from impc.inverse.problem import controller_for
 from impc.inverse.regulator_span import kept_to
+from impc.inverse.unbiased_fit import unbiased
 from impc.model.bounds import bound_rows
 
 if TYPE_CHECKING:
@@ -95,8 +96,14 @@ class PersonReport(Frozen):
     ----------
     models : tuple of PersonModel
         The first is the one that was asked for.
+    fit : PersonFit or None
+        That one, at a limit without the bias of its score (`unbiased`); None where it has no
+        likelihood.
+    moved : float
+        How far the gain is from the likeliest for that, along the direction where it is farthest,
+        in standard deviations.
     covariance : PersonCovariance or None
-        Of that, by the sandwich; None where it has no likelihood.
+        Of `fit`, by the sandwich; None where it has no likelihood.
     profiled : bool
         Whether intervals follow the likelihood.
     levels : Array
@@ -118,6 +125,8 @@ class PersonReport(Frozen):
     """
 
     models: tuple[PersonModel, ...]
+    fit: PersonFit | None
+    moved: float
     covariance: PersonCovariance | None
     profiled: bool
     levels: Array
@@ -127,11 +136,6 @@ class PersonReport(Frozen):
     ahead: tuple[int, ...]
     errors: Array
     runaways: int
-
-    @property
-    def fit(self) -> PersonFit | None:
-        """The one that was asked for."""
-        return self.models[0].fit
 
 
 def person_report(
@@ -156,7 +160,8 @@ def person_report(
         Whether intervals of the gain and of levels that are weakly told follow the likelihood:
         ten minutes and more on the seat.
     done : callable
-        Told the name of each model once it is fitted, and "intervals of the person".
+        Told the name of each model once it is fitted, "mean score of the person" and "intervals of
+        the person".
     remember : callable
         (name, problem, person, compute) -> the model, from memory when it is there.
     """
@@ -168,15 +173,13 @@ def person_report(
         fit_one = functools.partial(_model, name, first, person, budget)
         models.append(remember(name, posed, person, fit_one))
         done(name)
-    fit = models[0].fit
-    p = len(problem.plant.outputs)
-    if fit is None:
+    likeliest = models[0].fit
+    if likeliest is None:
+        done("mean score of the person")
         done("intervals of the person")
-        nothing = frozen(np.zeros((0, 2)))
-        white = frozen([np.nan] * p)
-        return PersonReport(
-            tuple(models), None, profiled, nothing, nothing, None, white, (), frozen([[]]), 0
-        )
+        return _nothing(tuple(models), len(problem.plant.outputs), profiled=profiled)
+    fit = unbiased(likeliest)
+    done("mean score of the person")
     if profiled:
         covariance = person_covariance(fit)
         levels = person_profile.level_intervals(fit, covariance)
@@ -190,6 +193,8 @@ def person_report(
     ahead = tuple(sorted({1 + round(time / problem.plant.dt) for time in _AHEAD}))
     return PersonReport(
         tuple(models),
+        fit,
+        _moved(likeliest, fit, covariance),
         covariance,
         profiled,
         levels,
@@ -200,6 +205,21 @@ def person_report(
         frozen(prediction_errors(fit, ahead)),
         runaways(fit),
     )
+
+
+def _nothing(models: tuple[PersonModel, ...], outputs: int, *, profiled: bool) -> PersonReport:
+    """What is said where the person that was asked for has no likelihood."""
+    none = frozen(np.zeros((0, 2)))
+    white = frozen([np.nan] * outputs)
+    return PersonReport(
+        models, None, 0.0, None, profiled, none, none, None, white, (), frozen([[]]), 0
+    )
+
+
+def _moved(likeliest: PersonFit, fit: PersonFit, covariance: PersonCovariance) -> float:
+    """Distance of two gains, in standard deviations of the direction in which it is largest."""
+    step = np.array(fit.theta - likeliest.theta)[: fit.space.gain]
+    return float(np.max(np.abs(covariance.directions @ step) / covariance.deviations, initial=0.0))
 
 
 def _model(name: str, first: Estimate, person: Observer, budget: int) -> PersonModel:

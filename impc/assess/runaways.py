@@ -15,6 +15,7 @@ import numpy as np
 from impc.control.closed_loop import Status
 from impc.control.noisy_person import simulate_person
 from impc.inverse.problem import controller_for
+from impc.inverse.simulated_score import left_behind
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -28,8 +29,6 @@ __all__ = ["SIMULATED", "runaways", "running_away"]
 
 #: Trials that are simulated.
 SIMULATED = 60
-# Times the largest recorded output: who falls from a seat at .16 rad is at 1.6 rad soon after.
-_FAR = 10.0
 
 
 def runaways(fit: PersonFit) -> int:
@@ -51,11 +50,8 @@ def runaways(fit: PersonFit) -> int:
         return 0
     trials = fit.problem.recordings
     law = controller_for(fit.problem, np.array(fit.K), np.array(fit.S))
-    largest = np.max([np.max(np.abs(trial.outputs), axis=0) for trial in trials], axis=0)
-    # An output that never moved has no size to leave behind.
-    beyond = np.where(largest > 0, _FAR * largest, np.inf)
     driven = [(np.array(trial.disturbance), np.array(trial.x0)) for trial in trials]
-    return running_away(law, fit.observer, driven, beyond, SIMULATED)
+    return running_away(law, fit.observer, driven, left_behind(trials), SIMULATED)
 
 
 def running_away(

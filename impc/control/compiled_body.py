@@ -32,12 +32,12 @@ class BodyTape(NamedTuple):
     constants : Buffer
         (c,).
     given : Buffer
-        Written at every sample: state, input and disturbance (n + m + d,).
+        Written at every sample: state, input and disturbance (g,).
     found : Buffer
-        Written by the code: the next state and behind it its slopes, (n + n (n + m + d),).
+        Written by the code: the next state and behind it its slopes (n + n*g,).
     slopes : Buffer
-        The same numbers as `found` has there: derivatives of the next state by what is given,
-        (n, n + m + d). Zero where the code does not write.
+        The same numbers as `found` has there: derivatives of the next state by what is given
+        (n, g). Zero where the code does not write.
     """
 
     address: int

@@ -27,7 +27,7 @@ __all__ = ["COMPILED_WITH", "run"]
 COMPILED_WITH = {
     "borrowed": "f9ef79e3bd6dacdb",
     "compiled_arrays": "f9299fe715d0d2a3",
-    "compiled_body": "913276749cfa9110",
+    "compiled_body": "009aae66ce7c6133",
     "compiled_law": "fb4d0617cbd31619",
     "compiled_products": "50101205237e0db3",
 }

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.inverse.person_prior import Place, Prior
 
-__all__ = ["learned_slope", "unseen_slope"]
+__all__ = ["jumps", "learned_slope", "unseen_slope"]
 
 # Step of the differences along a level, of its logarithm; square of one that teaches half.
 _DIFFERENCE, _DAMPING = 0.1, 0.1
@@ -45,7 +45,7 @@ def unseen_slope(prior: Prior, here: Place) -> Array:
     if prior.used:
         slope[prior.space.own :] = _lost(prior, here)
         if any(np.any(trial.status != Status.FREE) for trial in here.told.trials):
-            slope[: prior.space.gain] = _jumps(prior, here)
+            slope[: prior.space.gain] = jumps(prior, here)
     return slope
 
 
@@ -88,12 +88,17 @@ def _lost(prior: Prior, here: Place) -> Array:
     return slopes
 
 
-def _jumps(prior: Prior, here: Place) -> Array:
+def jumps(prior: Prior, here: Place) -> Array:
     """What jumps add up to along the coordinates of the gain (g,), initial states on their ridge.
 
     From one deviation below to one above along each direction that is told apart from the others:
     from a quarter to one and a half they say the same, and a longer step is less rough. Where there
     is no likelihood a step away the slope is taken for zero.
+
+    Parameters
+    ----------
+    prior : Prior
+    here : Place
     """
     own, gain = prior.space.own, prior.space.gain
     gradient, curvature = prior.parabola(here, np.zeros(len(here.theta)))

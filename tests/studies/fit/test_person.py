@@ -89,7 +89,8 @@ def test_the_section_and_result_json_have_the_same_numbers() -> None:
     assert kept["known"] is True
     assert kept["sensed"] == ["x", "v"]
     assert np.array(kept["errors_ahead"]).shape == (len(kept["ahead"]), 1)
-    np.testing.assert_allclose(kept["K"], result.person.models[0].fit.K)  # type: ignore[union-attr]
+    np.testing.assert_allclose(kept["K"], result.person.fit.K)  # type: ignore[union-attr]
+    assert kept["moved"] == result.person.moved
 
 
 def test_the_page_warns_of_somebody_who_runs_away_now_and_then() -> None:
@@ -112,7 +113,7 @@ def test_each_model_is_a_stage_and_intervals_follow_the_likelihood_where_asked()
     assert result.person is not None
     assert quick.person is not None
     assert len(heard) == stages(problem, settings)
-    assert len(heard) - stages(problem, without) == len(result.person.models) + 1
+    assert len(heard) - stages(problem, without) == len(result.person.models) + 2
     assert stages(problem, fit_settings(TABLE)) == len(heard)
     assert fit_observer(cart(), without, trials()) is None
     kept, rough = person_data(result), person_data(quick)

@@ -1,0 +1,144 @@
+"""What the score of a person is on average where that person is the truth: zero, were it exact.
+
+At a limit the filter takes a clipped command for a normal number, and later samples of a plan for
+what the estimate that is expected makes of them. Its likelihood is then nearly, and not wholly,
+that of the recordings, and its slope has a mean: half a deviation and more along some directions
+of a seat's gain. That mean is found by simulation, with the whole law and its bounds, of the score
+and of what jumps add to it (`unseen_slope`; docs/noisy-people.md, section "Without bias").
+"""
+
+from __future__ import annotations
+
+import copy
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from impc.arrays import Array
+from impc.checking import replace
+from impc.control.noisy_person import simulate_person
+from impc.errors import SolverError
+from impc.inverse.problem import controller_for
+from impc.inverse.unseen_slope import jumps
+
+if TYPE_CHECKING:
+    from impc.control.controller import Controller
+    from impc.inverse.person_coordinates import Person
+    from impc.inverse.person_prior import Prior
+    from impc.inverse.problem import Problem
+    from impc.model.recordings import Recording
+
+__all__ = ["SimulatedScore", "left_behind", "simulated_score"]
+
+# Times the largest recorded output: who falls from a seat at .16 rad is at 1.6 rad soon after.
+_FAR = 10.0
+# Jumps are asked of one set in so many: they scatter a third as much as scores, and take twice as
+# long.
+_JUMPS = 4
+# Trials that run away, one after the other, before there is none like the recorded ones.
+_AGAIN = 20
+
+
+class SimulatedScore(NamedTuple):
+    """The mean slope of sets of trials of one person, as many in each as were recorded.
+
+    Attributes
+    ----------
+    mean : Array
+        Along the unknowns (q,), nats.
+    spread : Array
+        Covariance of that mean, for the sets are drawn (q, q).
+    """
+
+    mean: Array
+    spread: Array
+
+
+def simulated_score(prior: Prior, theta: Array, seed: int, sets: int) -> SimulatedScore:
+    """The mean score at a point, with jumps along the gain, over trials that are simulated there.
+
+    Trials that run away are drawn anew, as those were that are recorded.
+
+    Parameters
+    ----------
+    prior : Prior
+        Of the search; its own slope is no part of the score.
+    theta : Array
+        The point (q,).
+    seed : int
+        Of all numbers drawn.
+    sets : int
+        How often all trials are simulated: five at least, so that the jumps of two are asked for.
+
+    Raises
+    ------
+    SolverError
+        When all trials run away.
+    ImpcError
+        When there is no likelihood of a simulated trial.
+    """
+    person = prior.space.unpack(theta)
+    law = controller_for(person.point.problem, person.point.K, person.point.S)
+    scores: list[Array] = []
+    jumped: list[Array] = []
+    for number in range(sets):
+        trials = _simulated(prior.space.space.problem, law, person, [seed, number])
+        other = _of(prior, trials)
+        told = other.space.told(theta)
+        scores.append(told.gradient)
+        if number % _JUMPS == 0:
+            jumped.append(np.zeros(len(theta)))
+            jumped[-1][: prior.space.gain] = jumps(other, other.placed(theta, told))
+    mean = np.mean(scores, axis=0) + np.mean(jumped, axis=0)
+    return SimulatedScore(mean, _spread(scores) + _spread(jumped))
+
+
+def _spread(found: list[Array]) -> Array:
+    """Covariance of the mean of what was drawn."""
+    return np.asarray(np.cov(np.array(found).T)) / len(found)
+
+
+def left_behind(trials: tuple[Recording, ...]) -> Array:
+    """The size of each output (p,) beyond which a trial has run away from all that was recorded.
+
+    Parameters
+    ----------
+    trials : tuple of Recording
+        Those that were recorded.
+    """
+    largest = np.max([np.max(np.abs(trial.outputs), axis=0) for trial in trials], axis=0)
+    # An output that never moved has no size to leave behind.
+    return np.where(largest > 0, _FAR * largest, np.inf)
+
+
+def _simulated(
+    recorded: Problem, law: Controller, person: Person, seed: list[int]
+) -> tuple[Recording, ...]:
+    """The recorded trials with other noise; each begins where the person's does."""
+    beyond, found = left_behind(recorded.recordings), []
+    for number, trial in enumerate(recorded.recordings):
+        first = np.array(person.point.problem.recordings[number].x0)
+        for again in range(_AGAIN):
+            made = simulate_person(
+                law,
+                person.observer,
+                np.array(trial.disturbance),
+                recorder=np.array(person.recorder),
+                x0=first,
+                seed=[*seed, number, again],
+            )
+            if not np.any(np.abs(made.outputs) > beyond):
+                break
+        else:
+            raise SolverError("person", "runs away in every simulated trial", "start elsewhere")
+        found.append(replace(trial, outputs=made.outputs))
+    return tuple(found)
+
+
+def _of(prior: Prior, trials: tuple[Recording, ...]) -> Prior:
+    """The same of other recordings."""
+    found = copy.copy(prior)
+    found.space = copy.copy(prior.space)
+    found.space.space = copy.copy(prior.space.space)
+    found.space.space.problem = replace(prior.space.space.problem, recordings=trials)
+    return found

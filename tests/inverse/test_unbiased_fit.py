@@ -1,0 +1,55 @@
+"""A fit from which the mean of the score is taken away, and the prior that does so."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from impc.arrays import Array
+from impc.inverse.likelihood_fit import PersonFit, fit_person
+from impc.inverse.methods import estimate
+from impc.inverse.simulated_score import simulated_score
+from impc.inverse.unbiased_fit import TiltedPrior, unbiased
+from tests.inverse.noisy_cart import person, problem
+from tests.support import extrapolated_slope
+
+
+@pytest.fixture(scope="module")
+def met() -> PersonFit:
+    return fit_person(estimate(problem(0.7)), person())
+
+
+def test_where_it_ends_the_score_is_what_it_is_on_average(met: PersonFit) -> None:
+    """Along the gain, with the slope of the prior; fresh draws, within a third of a deviation."""
+    found = unbiased(met)
+    theta, gain = np.array(found.theta), slice(0, met.space.gain)
+    score = found.told.gradient + met.prior.slopes(theta)[0] + np.array(found.unseen)
+    mean = simulated_score(met.prior, theta, 77, 60).mean
+    root = np.linalg.cholesky(found.told.information[gain, gain])
+    assert np.all(np.abs(np.linalg.solve(root, (score - mean)[gain])) < 0.5)
+    np.testing.assert_allclose(found.K, met.K, rtol=0.2)
+    np.testing.assert_array_equal(unbiased(met).theta, theta)
+
+
+def test_the_tilt_of_a_prior_has_the_slope_that_it_says(met: PersonFit) -> None:
+    theta, prior = np.array(met.theta), met.prior
+    rng = np.random.default_rng(1)
+    curvature = prior.parabola(prior.placed(theta, met.told), np.zeros(len(theta)))[1]
+    root = np.linalg.cholesky(curvature)
+    slope = root @ rng.standard_normal(len(theta))
+    tilted = TiltedPrior(prior, theta, slope, curvature)
+    np.testing.assert_allclose(tilted.slopes(theta)[0] - prior.slopes(theta)[0], slope, rtol=1e-8)
+    assert tilted.value(theta) == pytest.approx(prior.value(theta), rel=1e-12)
+    there = theta + np.linalg.solve(root.T, rng.standard_normal(len(theta)))
+    way = np.linalg.solve(root.T, rng.standard_normal(len(theta)))
+
+    def moved(t: float) -> Array:
+        return np.array([tilted.value(there + t * way) - prior.value(there + t * way)])
+
+    exact = (tilted.slopes(there)[0] - prior.slopes(there)[0]) @ way
+    assert exact == pytest.approx(extrapolated_slope(moved, 1e-3)[0], rel=1e-6)
+
+
+def test_where_no_bound_is_met_nothing_changes() -> None:
+    fit = fit_person(estimate(problem(50.0)), person())
+    assert unbiased(fit) is fit
