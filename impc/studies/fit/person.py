@@ -104,12 +104,13 @@ def _compared(report: PersonReport) -> str:
 
 def _moved(report: PersonReport) -> list[str]:
     """That the gain is not that of the largest likelihood."""
-    if report.moved == 0:
+    if report.fit is None or report.moved == 0:
         return []
+    settled = "" if report.fit.converged else " Where it ends the likelihood is rough."
     return [
         "At a limit the likelihood is nearly exact, not wholly: what its slope is on average for "
         "this person was found by simulation and taken away, which moved the gain by up to "
-        f"{report.moved:.1f} standard deviations."
+        f"{report.moved:.1f} standard deviations.{settled}"
     ]
 
 

@@ -102,6 +102,25 @@ def test_the_page_warns_of_somebody_who_runs_away_now_and_then() -> None:
     assert person_data(other)["runaways"] == {"count": 7, "simulated": 60}  # type: ignore[index]
 
 
+def test_the_page_says_how_far_the_gain_is_from_the_likeliest() -> None:
+    result = fitted()
+    report = result.person
+    assert report is not None
+    assert report.fit is not None
+    assert report.models[0].fit is not None
+    others = replace(report, moved=1.25, fit=replace(report.fit, converged=True))
+    still = replace(report, moved=0.0, fit=report.models[0].fit)
+    said, nothing = (
+        [line for line in person_sentences(replace(result, person=each)) if "simulation" in line]
+        for each in (others, still)
+    )
+    assert nothing == []
+    assert said[0].endswith("moved the gain by up to 1.2 standard deviations.")
+    # In this cart's trials the limit is met.
+    step = np.abs(np.array(report.fit.K) - np.array(report.models[0].fit.K))
+    assert (report.moved > 0) == bool(np.any(step > 0))
+
+
 def test_each_model_is_a_stage_and_intervals_follow_the_likelihood_where_asked() -> None:
     table = TABLE | {"observer": {"sensed": ["x", "v"], "profiles": True}}
     settings = fit_settings(table)
