@@ -384,7 +384,7 @@ def _sum(given: argparse.Namespace) -> None:
         "least squares: error %", "bias / deviation", "95 % holds %",
         "likelihood: error %", "bias / deviation", "95 % holds % (sandwich)", "(expected)",
         "(everybody as likely)", "(profile)", "entries told, all", "levels hold %",
-        "seconds: least squares, likelihood, everybody",
+        "seconds: least squares, likelihood, without bias, everybody as likely",
     )  # fmt: skip
     print("| " + " | ".join(heads) + " |")
     print("|" + "---|" * len(heads))

@@ -10,6 +10,8 @@ and of what jumps add to it (`unseen_slope`; docs/noisy-people.md, section "With
 from __future__ import annotations
 
 import copy
+import os
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -22,6 +24,8 @@ from impc.inverse.problem import controller_for
 from impc.inverse.unseen_slope import jumps
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from impc.control.controller import Controller
     from impc.inverse.person_coordinates import Person
     from impc.inverse.person_prior import Prior
@@ -79,21 +83,26 @@ def simulated_score(prior: Prior, theta: Array, seed: int, sets: int) -> Simulat
     """
     person = prior.space.unpack(theta)
     law = controller_for(person.point.problem, person.point.K, person.point.S)
-    scores: list[Array] = []
-    jumped: list[Array] = []
-    for number in range(sets):
+
+    def one(number: int) -> tuple[Array, Array | None]:
         trials = _simulated(prior.space.space.problem, law, person, [seed, number])
         other = _of(prior, trials)
         told = other.space.told(theta)
-        scores.append(told.gradient)
-        if number % _JUMPS == 0:
-            jumped.append(np.zeros(len(theta)))
-            jumped[-1][: prior.space.gain] = jumps(other, other.placed(theta, told))
+        if number % _JUMPS:
+            return told.gradient, None
+        jumped = np.zeros(len(theta))
+        jumped[: prior.space.gain] = jumps(other, other.placed(theta, told))
+        return told.gradient, jumped
+
+    # Compiled code lets other threads run.
+    with ThreadPoolExecutor(min(sets, os.cpu_count() or 1)) as pool:
+        scores, asked = zip(*pool.map(one, range(sets)), strict=True)
+    jumped = [each for each in asked if each is not None]
     mean = np.mean(scores, axis=0) + np.mean(jumped, axis=0)
     return SimulatedScore(mean, _spread(scores) + _spread(jumped))
 
 
-def _spread(found: list[Array]) -> Array:
+def _spread(found: Sequence[Array]) -> Array:
     """Covariance of the mean of what was drawn."""
     return np.asarray(np.cov(np.array(found).T)) / len(found)
 
