@@ -18,27 +18,14 @@ from impc.model.structure import Structure
 pytestmark = pytest.mark.long
 
 
-def scored(seed: int, limit: float, *, particles: bool = False) -> Score:
+def scored(seed: int, limit: float) -> Score:
     who = subject("cart", seed, "motor", 90.0, limit)
-    asked = {"profiled": seed == 0, "particles": particles}
-    return score(who, recorded(who, seed), "carts", seed, **asked)
-
-
-def test_what_particles_correct_is_judged_in_the_same_way() -> None:
-    found = scored(1, 0.7, particles=True)
-    own = found.by_particles
-    assert own is not None
-    assert own["changed"]
-    assert len(own["expected"]) == len(own["along"]) == len(found.along) == 2
-    assert len(own["entries"]) == 2
-    # A filter of a cart is all but exact: half a deviation is what paths are drawn to, and more.
-    for (one, _), (other, deviation) in zip(found.expected, own["expected"], strict=True):
-        assert one == pytest.approx(other, abs=deviation)
-    assert len(found.seconds) == 6
+    return score(who, recorded(who, seed), "carts", seed, profiled=seed == 0)
 
 
 def test_a_subject_is_scored_against_its_truth() -> None:
     found = scored(0, 0.7)
+    assert len(found.seconds) == 5
     assert 80 < found.vaf < 97
     assert found.converged
     assert found.above > 0
