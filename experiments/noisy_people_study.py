@@ -158,7 +158,7 @@ def score(
     clock.append(time.process_time())
     likely = fit_person(first, blind(who))
     clock.append(time.process_time())
-    likely = unbiased(likely)
+    likely = unbiased(likely).fit
     expected = person_covariance(likely, "expected")
     robust = person_covariance(likely)
     clock.append(time.process_time())

@@ -99,6 +99,8 @@ class PersonReport(Frozen):
     fit : PersonFit or None
         That one, at a limit without the bias of its score (`unbiased`); None where it has no
         likelihood.
+    biased : str
+        Why that bias was not taken away, or not wholly; empty where it was, or there is none.
     moved : float
         How far the gain is from the likeliest for that, along the direction where it is farthest,
         in standard deviations.
@@ -126,6 +128,7 @@ class PersonReport(Frozen):
 
     models: tuple[PersonModel, ...]
     fit: PersonFit | None
+    biased: str
     moved: float
     covariance: PersonCovariance | None
     profiled: bool
@@ -178,7 +181,7 @@ def person_report(
         done("mean score of the person")
         done("intervals of the person")
         return _nothing(tuple(models), len(problem.plant.outputs), profiled=profiled)
-    fit = unbiased(likeliest)
+    fit, biased = unbiased(likeliest)
     done("mean score of the person")
     if profiled:
         covariance = person_covariance(fit)
@@ -194,6 +197,7 @@ def person_report(
     return PersonReport(
         tuple(models),
         fit,
+        biased,
         _moved(likeliest, fit, covariance),
         covariance,
         profiled,
@@ -212,7 +216,7 @@ def _nothing(models: tuple[PersonModel, ...], outputs: int, *, profiled: bool) -
     none = frozen(np.zeros((0, 2)))
     white = frozen([np.nan] * outputs)
     return PersonReport(
-        models, None, 0.0, None, profiled, none, none, None, white, (), frozen([[]]), 0
+        models, None, "", 0.0, None, profiled, none, none, None, white, (), frozen([[]]), 0
     )
 
 

@@ -7,19 +7,21 @@ is beside the truth. With b(theta) its mean over recordings of the person at the
     score(theta) - b(theta)  +  slope of the prior  =  0,
 
 which has no bias whatever the filter leaves out: an estimating function whose mean is zero at the
-truth, as in indirect inference (Gourieroux, Monfort and Renault 1993). b changes little over a few
-deviations. So the search goes on from where it ended with
+truth, as in indirect inference (Gourieroux, Monfort and Renault 1993). It is solved by Newton's
+steps from the largest likelihood, with the curvature C there,
 
-    F(theta) - sum_i  b_i tanh(2^-1 (theta - theta_k)_i) 2,
+    theta  <-  theta_0 - C^-1 b(theta),
 
-i over coordinates in which the curvature of F is one, so that b is believed within two deviations
-of where it was found; it is found again where that ends, and so on. It is taken away along the gain
-alone: along levels that are weakly told it moved searches by powers of e.
+for b changes little over a few deviations. (A search for the largest of F - b'theta costs twice as
+much and stays where it is on a kink: between two jumps of the likelihood lies a maximum that a
+slope of half a nat for each deviation does not move.) The mean is taken away along the gain alone,
+levels and initial states follow on their ridge: along levels that are weakly told it moved them by
+powers of e.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -27,22 +29,20 @@ from impc.arrays import Array
 from impc.control.closed_loop import Status
 from impc.errors import ImpcError
 from impc.inverse.likelihood_fit import person_at
-from impc.inverse.likelihood_search import climb
 from impc.inverse.person_prior import Prior
 from impc.inverse.simulated_score import simulated_score
 from impc.inverse.unseen_slope import unseen_slope
 
 if TYPE_CHECKING:
     from impc.inverse.likelihood_fit import PersonFit
-    from impc.inverse.person_prior import Place
     from impc.inverse.simulated_score import SimulatedScore
 
-__all__ = ["TiltedPrior", "unbiased"]
+__all__ = ["TiltedPrior", "Unbiased", "unbiased"]
 
-# Means that are found, sets of trials for each, and likelihoods of each search after one. Those of
-# the second and later ones are averaged: 48 sets add a fiftieth to the variance of the gain.
-_ROUNDS, _SETS, _LIKELIHOODS = 3, 24, 40
-# Deviations within which a mean is as it was found.
+# Means that are found, one before each step, and sets of trials for each: 32 sets add a thirtieth
+# to the variance of the gain.
+_ROUNDS, _SETS = 2, 16
+# Deviations within which a mean is as it was found, and as far as it may move the gain.
 _NEAR = 2.0
 
 
@@ -77,11 +77,25 @@ class TiltedPrior(Prior):
         return gradient + self.unit.T @ (self.along / np.cosh(off / _NEAR) ** 2), bend
 
 
-def unbiased(fit: PersonFit) -> PersonFit:
-    """The person whose score is what it is on average, searched from a fit.
+class Unbiased(NamedTuple):
+    """A fit without the bias of its score.
 
-    Where no bound was met in the recordings, or the person who was found runs away in every trial,
-    that is the fit as it was.
+    Attributes
+    ----------
+    fit : PersonFit
+        The fit as it was where no bound was met, where it was made without a prior, or where there
+        is a reason.
+    reason : str
+        Why the mean of the score was not taken away, or not wholly; empty where it was, and where
+        no bound was met.
+    """
+
+    fit: PersonFit
+    reason: str
+
+
+def unbiased(fit: PersonFit) -> Unbiased:
+    """The person whose score is what it is on average, from the likeliest.
 
     Parameters
     ----------
@@ -91,31 +105,35 @@ def unbiased(fit: PersonFit) -> PersonFit:
     first = fit.prior
     met = any(np.any(trial.status != Status.FREE) for trial in fit.told.trials)
     if not (met and first.used):
-        return fit
-    unseen, means = np.array(fit.unseen), []
-    place, found, spent, settled = first.placed(np.array(fit.theta), fit.told), fit, 0, True
-    for seed in range(_ROUNDS):
-        try:
-            unseen = unseen_slope(first, place) if seed else unseen
+        return Unbiased(fit, "")
+    begin = first.placed(np.array(fit.theta), fit.told)
+    curvature = first.parabola(begin, np.array(fit.unseen))[1]
+    root = np.linalg.cholesky(curvature)
+    place, means, size = begin, [], 0.0
+    slope = np.zeros(len(begin.theta))
+    try:
+        for seed in range(_ROUNDS):
             mean = simulated_score(first, place.theta, seed, _SETS)
-        except ImpcError:
-            return found
-        means.append(_believed(first, place, unseen, mean))
-        slope = -np.mean(means[1:] or means, axis=0)
-        prior = TiltedPrior(first, place.theta, slope, first.parabola(place, unseen)[1])
-        begin = prior.placed(place.theta, place.told)
-        place, _, more, settled = climb(prior, begin, _LIKELIHOODS, unseen=unseen)
-        spent += more
-        found = person_at(prior, place, unseen, settled and fit.converged, fit.evaluations + spent)
-    return found
+            means.append(_believed(curvature, mean, first.space.gain))
+            slope = -np.mean(means, axis=0)
+            size = float(np.linalg.norm(np.linalg.solve(root, slope)))
+            slope *= min(1.0, _NEAR / size)
+            place = first.at(begin.theta + np.linalg.solve(curvature, slope))
+    except ImpcError as error:
+        return Unbiased(fit, str(error))
+    prior = TiltedPrior(first, place.theta, slope, curvature)
+    unseen = unseen_slope(first, place)
+    found = prior.placed(place.theta, place.told)
+    moved = person_at(prior, found, unseen, fit.converged, fit.evaluations + _ROUNDS)
+    far = f"it is worth {size:.1f} standard deviations, and {_NEAR:.0f} are taken away at most"
+    return Unbiased(moved, far if size > _NEAR else "")
 
 
-def _believed(prior: Prior, here: Place, unseen: Array, found: SimulatedScore) -> Array:
+def _believed(curvature: Array, found: SimulatedScore, gain: int) -> Array:
     """What is believed of a mean that is drawn (q,), nats; along the gain.
 
     C (C + M)^-1 of it, M its covariance and C the curvature: as of a number whose own size is C's.
     """
-    curvature = prior.parabola(here, unseen)[1]
     believed = curvature @ np.linalg.solve(curvature + found.spread, found.mean)
-    believed[prior.space.gain :] = 0.0
+    believed[gain:] = 0.0
     return np.asarray(believed)

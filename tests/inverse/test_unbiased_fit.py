@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from impc.arrays import Array
+from impc.errors import SolverError
+from impc.inverse import unbiased_fit
 from impc.inverse.likelihood_fit import PersonFit, fit_person
 from impc.inverse.methods import estimate
-from impc.inverse.simulated_score import simulated_score
+from impc.inverse.simulated_score import SimulatedScore, simulated_score
 from impc.inverse.unbiased_fit import TiltedPrior, unbiased
 from tests.inverse.noisy_cart import person, problem
 from tests.support import extrapolated_slope
@@ -21,14 +23,57 @@ def met() -> PersonFit:
 
 def test_where_it_ends_the_score_is_what_it_is_on_average(met: PersonFit) -> None:
     """Along the gain, with the slope of the prior; fresh draws, within a third of a deviation."""
-    found = unbiased(met)
+    found, reason = unbiased(met)
+    assert reason == ""
     theta, gain = np.array(found.theta), slice(0, met.space.gain)
     score = found.told.gradient + met.prior.slopes(theta)[0] + np.array(found.unseen)
     mean = simulated_score(met.prior, theta, 77, 60).mean
     root = np.linalg.cholesky(found.told.information[gain, gain])
     assert np.all(np.abs(np.linalg.solve(root, (score - mean)[gain])) < 0.5)
     np.testing.assert_allclose(found.K, met.K, rtol=0.2)
-    np.testing.assert_array_equal(unbiased(met).theta, theta)
+    np.testing.assert_array_equal(unbiased(met).fit.theta, theta)
+
+
+def test_the_tilted_likelihood_is_level_where_it_ends(met: PersonFit) -> None:
+    """What makes others as likely is measured from there; within a third of a deviation."""
+    found = unbiased(met).fit
+    here = found.prior.placed(np.array(found.theta), found.told)
+    slope, curvature = found.prior.parabola(here, np.array(found.unseen))
+    gain = slice(0, met.space.gain)
+    root = np.linalg.cholesky(curvature[gain, gain])
+    assert np.all(np.abs(np.linalg.solve(root, slope[gain])) < 1 / 3)
+    assert found.theta is not met.theta
+
+
+def test_a_mean_that_is_not_found_leaves_the_fit_and_says_why(
+    met: PersonFit, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def none(*_: object) -> SimulatedScore:
+        raise SolverError("person", "runs away in every simulated trial", "start elsewhere")
+
+    monkeypatch.setattr(unbiased_fit, "simulated_score", none)
+    found, reason = unbiased(met)
+    assert found is met
+    assert "runs away in every simulated trial" in reason
+
+
+def test_a_mean_that_is_too_large_is_taken_away_in_part_and_said(
+    met: PersonFit, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    theta, q = np.array(met.theta), len(met.theta)
+    curvature = met.prior.parabola(met.prior.placed(theta, met.told), np.array(met.unseen))[1]
+    root = np.linalg.cholesky(curvature)
+    way = np.zeros(q)
+    way[0] = 5.0 / np.linalg.norm(np.linalg.solve(root, np.eye(q)[0]))
+
+    def large(*_: object) -> SimulatedScore:
+        return SimulatedScore(way, np.zeros((q, q)))
+
+    monkeypatch.setattr(unbiased_fit, "simulated_score", large)
+    found, reason = unbiased(met)
+    assert "5.0 standard deviations" in reason
+    step = np.array(found.theta) - theta
+    assert np.linalg.norm(root.T @ step) == pytest.approx(2.0)
 
 
 def test_the_tilt_of_a_prior_has_the_slope_that_it_says(met: PersonFit) -> None:
@@ -52,4 +97,6 @@ def test_the_tilt_of_a_prior_has_the_slope_that_it_says(met: PersonFit) -> None:
 
 def test_where_no_bound_is_met_nothing_changes() -> None:
     fit = fit_person(estimate(problem(50.0)), person())
-    assert unbiased(fit) is fit
+    found, reason = unbiased(fit)
+    assert found is fit
+    assert reason == ""

@@ -103,14 +103,20 @@ def _compared(report: PersonReport) -> str:
 
 
 def _moved(report: PersonReport) -> list[str]:
-    """That the gain is not that of the largest likelihood."""
-    if report.fit is None or report.moved == 0:
+    """That the gain is not that of the largest likelihood, or should not be and is."""
+    nearly = "At a limit the likelihood is nearly exact, not wholly: what its slope is on average"
+    if report.fit is None or not (report.moved or report.biased):
         return []
-    settled = "" if report.fit.converged else " Where it ends the likelihood is rough."
+    if report.moved == 0:
+        return [
+            f"{nearly} for this person could not be found by simulation ({report.biased}). The "
+            "gain is the likeliest, and may be a standard deviation and more beside the truth."
+        ]
+    left = f" Not all of it: {report.biased}." if report.biased else ""
+    rough = "" if report.fit.converged else " The likelihood is rough where its search ended."
     return [
-        "At a limit the likelihood is nearly exact, not wholly: what its slope is on average for "
-        "this person was found by simulation and taken away, which moved the gain by up to "
-        f"{report.moved:.1f} standard deviations.{settled}"
+        f"{nearly} for this person was found by simulation and taken away, which moved the gain by "
+        f"up to {report.moved:.1f} standard deviations.{left}{rough}"
     ]
 
 
@@ -198,6 +204,7 @@ def person_data(result: FitResult) -> dict[str, Any] | None:
     return data | {
         "K": fit.K,
         "moved": report.moved,
+        "biased": report.biased,
         "profiled": report.profiled,
         "K_intervals": report.entries.reshape(*fit.K.shape, 2),
         "sensed": fit.observer.sensed,

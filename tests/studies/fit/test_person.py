@@ -91,6 +91,7 @@ def test_the_section_and_result_json_have_the_same_numbers() -> None:
     assert np.array(kept["errors_ahead"]).shape == (len(kept["ahead"]), 1)
     np.testing.assert_allclose(kept["K"], result.person.fit.K)  # type: ignore[union-attr]
     assert kept["moved"] == result.person.moved
+    assert kept["biased"] == result.person.biased
 
 
 def test_the_page_warns_of_somebody_who_runs_away_now_and_then() -> None:
@@ -108,14 +109,18 @@ def test_the_page_says_how_far_the_gain_is_from_the_likeliest() -> None:
     assert report is not None
     assert report.fit is not None
     assert report.models[0].fit is not None
-    others = replace(report, moved=1.25, fit=replace(report.fit, converged=True))
-    still = replace(report, moved=0.0, fit=report.models[0].fit)
-    said, nothing = (
+    others = replace(report, moved=1.25, biased="", fit=replace(report.fit, converged=True))
+    in_part = replace(others, biased="half is left")
+    still = replace(report, moved=0.0, biased="", fit=report.models[0].fit)
+    not_found = replace(still, biased="everybody runs away")
+    said, partly, nothing, sorry = (
         [line for line in person_sentences(replace(result, person=each)) if "simulation" in line]
-        for each in (others, still)
+        for each in (others, in_part, still, not_found)
     )
     assert nothing == []
     assert said[0].endswith("moved the gain by up to 1.2 standard deviations.")
+    assert partly[0].endswith("1.2 standard deviations. Not all of it: half is left.")
+    assert "could not be found by simulation (everybody runs away)" in sorry[0]
     # In this cart's trials the limit is met.
     step = np.abs(np.array(report.fit.K) - np.array(report.models[0].fit.K))
     assert (report.moved > 0) == bool(np.any(step > 0))
