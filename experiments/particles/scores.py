@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from experiments.noisy_people import NOISES, subject
-from experiments.noisy_people_study import FALLEN, LIMITS
+from experiments.noisy_people_score import FALLEN, LIMITS
 from experiments.particles.clipped_regulator import clipped_regulator, first_state
 from experiments.particles.likelihood import particle_likelihood
 from impc.control.constraint_rows import directions

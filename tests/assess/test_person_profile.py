@@ -9,7 +9,7 @@ import pytest
 import scipy.optimize
 
 from experiments.noisy_people import recorded, subject
-from experiments.noisy_people_study import blind
+from experiments.noisy_people_score import blind
 from impc.arrays import Array
 from impc.assess.person_covariance import person_covariance
 from impc.assess.person_profile import (

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from experiments.noisy_people import recorded, subject
-from experiments.noisy_people_study import blind, true_unknowns
+from experiments.noisy_people_score import blind, true_unknowns
 from impc.assess.person_covariance import person_covariance
 from impc.control.controller import Controller
 from impc.control.noisy_person import simulate_person

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from experiments.noisy_people import recorded, subject
-from experiments.noisy_people_study import Score, above_truth, blind, falls, passed_over, score
+from experiments.noisy_people_score import Score, above_truth, blind, falls, passed_over, score
 from impc.assess.likely_people import entry_intervals, people_as_likely
 from impc.assess.person_covariance import person_covariance
 from impc.assess.person_profile import profile

@@ -1,0 +1,265 @@
+"""A simulated subject of `noisy_people` scored: least squares beside maximum likelihood."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.assess.covariance import gain_covariance
+from impc.assess.likely_people import (
+    direction_intervals,
+    entry_intervals,
+    level_intervals,
+    people_as_likely,
+)
+from impc.assess.person_covariance import TOLD, person_covariance
+from impc.assess.person_profile import fallen
+from impc.assess.runaways import running_away
+from impc.inverse.likelihood_fit import fit_person
+from impc.inverse.methods import estimate
+from impc.inverse.unbiased_fit import unbiased
+
+if TYPE_CHECKING:
+    from experiments.noisy_people import Recorded, Subject
+    from impc.arrays import Array
+    from impc.assess.likely_people import LikelyPerson
+    from impc.assess.person_covariance import PersonCovariance
+    from impc.inverse.likelihood_fit import PersonFit
+    from impc.model.observer import Observer
+
+__all__ = [
+    "FALLEN",
+    "LIMITS",
+    "Score",
+    "above_truth",
+    "blind",
+    "falls",
+    "passed_over",
+    "score",
+    "true_unknowns",
+]
+
+#: A limit that is not met, and one that is, of each body at each VAF.
+LIMITS = {
+    ("cart", 90.0): (5.0, 0.7),
+    ("cart", 70.0): (5.0, 0.7),
+    ("seat", 90.0): (70.0, 6.0),
+    ("seat", 70.0): (70.0, 9.0),
+}
+# Who on the seat is at a limit that is met in fewer samples, or more, is no subject, nor who falls
+# in any trial that is not recorded, from this number on: of people who fall now and then, those who
+# did not have had other noise than the model says.
+_SHARES, _UNSEEN = (0.12, 0.40), 1000
+#: An angle that is a fall, rad.
+FALLEN = 1.0
+
+
+@dataclass(frozen=True)
+class Score:
+    """A subject.
+
+    Attributes
+    ----------
+    study : str
+        Body, noise, VAF and limit.
+    seed : int
+    saturated : float
+        Share of the samples at the limit.
+    vaf : float
+        Of the motion without noise, %.
+    above : float
+        What the search makes largest, at its end minus at the truth, nats.
+    converged : bool
+    evaluations : int
+    least_error, likely_error : float
+        Of the gain, as a share of it, in natural coordinates.
+    least, likely, expected : list of pairs
+        Error and deviation along each direction that the method tells, the best first: of least
+        squares, and of maximum likelihood by the sandwich and as expected.
+    along : list of pairs
+        Intervals along the directions of `likely` of everybody as likely, less the truth, in
+        deviations.
+    entries : list of pairs
+        The same of the entries of the gain, less the truth, as shares of the entry: as printed.
+    people : int
+        How many are as likely.
+    fell : list of float
+        Where asked for, by how many nats the likelihood falls with each of the directions of
+        `likely` held at the truth.
+    levels, found : list of float
+        Motor, senses, recorder: true, and found.
+    level_intervals : list of pairs
+        Of everybody as likely, as printed.
+    seconds : list of float
+        Of processor time: least squares, likelihood, what is taken away without bias, everybody as
+        likely, what falls.
+    """
+
+    study: str
+    seed: int
+    saturated: float
+    vaf: float
+    above: float
+    converged: bool
+    evaluations: int
+    least_error: float
+    likely_error: float
+    least: list[tuple[float, float]]
+    likely: list[tuple[float, float]]
+    expected: list[tuple[float, float]]
+    along: list[tuple[float, float]]
+    entries: list[tuple[float, float]]
+    people: int
+    fell: list[float]
+    levels: list[float]
+    found: list[float]
+    level_intervals: list[tuple[float, float]]
+    seconds: list[float]
+
+
+def score(
+    who: Subject,
+    trials: Recorded,
+    study: str,
+    seed: int,
+    *,
+    profiled: bool = False,
+) -> Score:
+    """Both fits of a subject, what holds for everybody as likely and, asked for, what falls."""
+    truth = np.array(who.controller.K)
+    clock = [time.process_time()]
+    first = estimate(trials.problem)
+    gain, metric = np.array(first.gain), np.array(first.metric)
+    least = gain_covariance(first.problem, gain, metric, curvature=True)
+    clock.append(time.process_time())
+    likely = fit_person(first, blind(who))
+    clock.append(time.process_time())
+    likely = unbiased(likely).fit
+    expected = person_covariance(likely, "expected")
+    robust = person_covariance(likely)
+    clock.append(time.process_time())
+    people = people_as_likely(likely)
+    along, entries = _around_truth(people, robust, who)
+    clock.append(time.process_time())
+    fell = _fell(likely, robust, who) if profiled else []
+    clock.append(time.process_time())
+    size = float(np.linalg.norm(truth @ least.T))
+    return Score(
+        study,
+        seed,
+        trials.saturated,
+        trials.vaf,
+        above_truth(likely, who),
+        likely.converged,
+        likely.evaluations,
+        float(np.linalg.norm((gain - truth) @ least.T)) / size,
+        float(np.linalg.norm((likely.K - truth) @ least.T)) / size,
+        _pairs(
+            least.directions,
+            least.deviations,
+            np.asarray(np.linalg.solve(least.G, (gain - truth) @ least.T)),
+        ),
+        _steps(likely, robust, truth),
+        _steps(likely, expected, truth),
+        along,
+        entries,
+        len(people),
+        fell,
+        [*who.person.levels[who.person.levels > 0], *who.recorder],
+        likely.levels.tolist(),
+        level_intervals(people).tolist(),
+        np.diff(clock).tolist(),
+    )
+
+
+def _around_truth(
+    people: list[LikelyPerson], robust: PersonCovariance, who: Subject
+) -> tuple[list[tuple[float, float]], list[tuple[float, float]]]:
+    """Intervals along told directions, and of entries of the gain, less the truth."""
+    true = np.array(who.controller.K).reshape(-1, 1)
+    directions, deviations, aims = _aims(people[0].fit, robust, who)
+    along = (direction_intervals(people, directions) - aims[:, None]) / deviations[:, None]
+    entries = (entry_intervals(people) - true) / np.abs(true)
+    return along.tolist(), entries.tolist()
+
+
+def blind(who: Subject) -> Observer:
+    """Levels to start from that know nothing of the subject but which there are."""
+    return who.person.with_levels(np.where(who.person.levels > 0, 0.1, 0.0))
+
+
+def above_truth(likely: PersonFit, who: Subject) -> float:
+    """What the search makes largest, at the fit minus at the subject as simulated, nats."""
+    return likely.value - likely.prior.at(true_unknowns(likely, who)).value
+
+
+def true_unknowns(likely: PersonFit, who: Subject) -> Array:
+    """The subject as simulated, in the coordinates of the fit (q,)."""
+    space = likely.space
+    own, theta = space.space, np.array(space.start)
+    truth = own.natural(np.array(who.controller.K))
+    theta[: space.gain] = np.tensordot(own.natural(own.gains.gains), truth, 2)
+    starts = np.array([trial.x0 for trial in own.problem.recordings])
+    theta[space.shared : space.after] = np.ravel(-np.linalg.solve(own.start_unit, starts.T).T)
+    levels = np.concatenate([who.person.levels, who.recorder])
+    theta[space.own :] = np.log(levels[space.moving])
+    return theta
+
+
+def _steps(
+    likely: PersonFit, covariance: PersonCovariance, truth: Array
+) -> list[tuple[float, float]]:
+    own, space = likely.space.space, likely.space
+    error = own.natural(np.array(likely.K) - truth)
+    along = np.tensordot(own.natural(own.gains.gains), error, 2)
+    return _pairs(covariance.directions, covariance.deviations, along[: space.gain])
+
+
+def _told(directions: Array, deviations: Array) -> tuple[Array, Array]:
+    """Determined directions and their deviations, the best told first."""
+    order = np.argsort(deviations, kind="stable")
+    order = order[deviations[order] < TOLD]
+    return directions[order], deviations[order]
+
+
+def _aims(fit: PersonFit, covariance: PersonCovariance, who: Subject) -> tuple[Array, Array, Array]:
+    """Determined directions, their deviations, and where the truth is along them."""
+    directions, deviations = _told(covariance.directions, covariance.deviations)
+    return directions, deviations, directions @ true_unknowns(fit, who)[: fit.space.gain]
+
+
+def _fell(likely: PersonFit, covariance: PersonCovariance, who: Subject) -> list[float]:
+    """What the likelihood falls by along each direction held at the truth, nats."""
+    found, along = [], np.zeros(len(likely.theta))
+    directions, _, aims = _aims(likely, covariance, who)
+    for direction, aim in zip(directions, aims, strict=True):
+        along[: likely.space.gain] = direction
+        found.append(fallen(likely, along, float(aim)))
+    return found
+
+
+def _pairs(directions: Array, deviations: Array, error: Array) -> list[tuple[float, float]]:
+    """Errors and deviations along determined directions, each turned to where it is largest."""
+    found = []
+    for direction, deviation in zip(*_told(directions, deviations), strict=True):
+        sign = np.sign(direction[np.argmax(np.abs(direction))])
+        found.append((float(sign * direction @ np.ravel(error)), float(deviation)))
+    return found
+
+
+def passed_over(who: Subject, trials: Recorded, seed: int, *, met: bool) -> str:
+    """Why somebody on the seat is no subject; empty for a subject."""
+    low, high = _SHARES
+    if trials.largest > FALLEN or (met and falls(who, seed)):
+        return "falls"
+    return "" if not met or low <= trials.saturated <= high else "not so often at the limit"
+
+
+def falls(who: Subject, seed: int) -> int:
+    """In how many of sixty trials that nobody records a subject falls."""
+    rest = np.zeros(who.controller.plant.n)
+    driven = [(np.asarray(push), rest) for push in who.pushes]
+    return running_away(who.controller, who.person, driven, FALLEN, seed, _UNSEEN)

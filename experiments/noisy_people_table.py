@@ -1,0 +1,141 @@
+"""Rows of the table of people who sense with noise, and all rows of a kind in one line."""
+
+from __future__ import annotations
+
+import itertools
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.assess.covariance import TWO_SIDED
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from experiments.noisy_people_score import Score
+
+__all__ = ["HEADS", "means", "pooled", "row"]
+
+#: Of the columns.
+HEADS = (
+    "people", "count", "at the limit %", "ended at the truth or above", "settled",
+    "least squares: error %", "bias / deviation", "95 % holds %",
+    "likelihood: error %", "bias / deviation", "95 % holds % (sandwich)", "(expected)",
+    "(everybody as likely)", "(profile)", "entries told, all", "levels hold %",
+    "seconds: least squares, likelihood, without bias, everybody as likely",
+)  # fmt: skip
+# Nats by which a likelihood falls at either end of an interval of 95 %.
+_LOWER = TWO_SIDED**2 / 2
+# An entry is told when half of its interval is below this share of it.
+_TOLD = 1.0
+# As far below the truth a search may end, nats.
+_ENDED = 0.5
+# Of a deviation: what a bias is to be below.
+_BIAS = 0.25
+
+Pairs = list[tuple[float, float]]
+
+
+def row(scores: list[Score]) -> list[str]:
+    """Cells of one study, by column.
+
+    Parameters
+    ----------
+    scores : list of Score
+        Of the same kind of people.
+    """
+    cells = [
+        scores[0].study,
+        str(len(scores)),
+        f"{100 * np.mean([one.saturated for one in scores]):.0f}",
+        f"{sum(one.above >= -_ENDED for one in scores)}",
+        f"{sum(one.converged for one in scores)}",
+    ]
+    for name in ("least", "likely"):
+        pairs = [getattr(one, name) for one in scores]
+        cells.append(f"{100 * np.median([getattr(one, f'{name}_error') for one in scores]):.1f}")
+        cells += [_bias(pairs), _share([_inside(each) for each in pairs])]
+    cells.append(_share([_inside(one.expected) for one in scores]))
+    cells.append(_share([_around(one.along) for one in scores]))
+    cells.append(_share([[nats <= _LOWER for nats in one.fell] for one in scores if one.fell]))
+    told = [[pair for pair in one.entries if pair[1] - pair[0] < 2 * _TOLD] for one in scores]
+    some = f"{_share([_around(each) for each in told])} ({sum(map(len, told))})"
+    cells.append(f"{some}, {_share([_around(one.entries) for one in scores])}")
+    cells.append(_share([_levels(one) for one in scores]))
+    times = np.median([one.seconds[:4] for one in scores], axis=0)
+    return [*cells, ", ".join(f"{value:.1f}" for value in times)]
+
+
+def means(pairs: Sequence[Pairs]) -> list[tuple[float, float]]:
+    """Mean error in deviations and its standard error, of each direction that most are told along.
+
+    Parameters
+    ----------
+    pairs : sequence of list of pairs
+        Error and deviation along the directions that each subject is told along, the best first.
+    """
+    found = []
+    for each in itertools.zip_longest(*pairs):
+        ratios = np.array([pair[0] / pair[1] for pair in each if pair is not None])
+        if len(ratios) > len(pairs) / 2:
+            spread = np.std(ratios, ddof=1) if len(ratios) > 1 else np.nan
+            found.append((float(np.mean(ratios)), float(spread / np.sqrt(len(ratios)))))
+    return found
+
+
+def pooled(studies: Sequence[list[Score]]) -> str:
+    """What holds of all people of several kinds, in one line.
+
+    Parameters
+    ----------
+    studies : sequence of list of Score
+        Those of one kind each.
+    """
+    scores = list(itertools.chain(*studies))
+    biases = [each for one in studies for each in means([score.likely for score in one])]
+    small = sum(abs(mean) < _BIAS for mean, _ in biases)
+    farthest = max((abs(mean) / error for mean, error in biases if error > 0), default=0.0)
+    counts = (
+        f"directions {_count([_around(one.along) for one in scores])}",
+        f"entries {_count([_around(one.entries) for one in scores])}",
+        f"levels {_count([_levels(one) for one in scores])}",
+        f"directions by the sandwich {_count([_inside(one.likely) for one in scores])}",
+        f"settled {sum(one.converged for one in scores)}",
+        f"mean errors below {_BIAS} {small} of {len(biases)}",
+        f"the farthest {farthest:.1f} of its standard errors from none",
+    )
+    return f"{len(scores)} people: " + ", ".join(counts)
+
+
+def _bias(pairs: Sequence[Pairs]) -> str:
+    return ", ".join(f"{mean:.2f} ± {error:.2f}" for mean, error in means(pairs)) or "-"
+
+
+def _levels(score: Score) -> list[bool]:
+    """Which levels are inside their intervals."""
+    both = zip(score.levels, score.level_intervals, strict=True)
+    return [low <= level <= high for level, (low, high) in both]
+
+
+def _inside(pairs: Pairs) -> list[bool]:
+    return [abs(error) <= TWO_SIDED * deviation for error, deviation in pairs]
+
+
+def _around(intervals: Pairs) -> list[bool]:
+    return [low <= 0 <= high for low, high in intervals]
+
+
+def _count(holds: list[list[bool]]) -> str:
+    inside, all_ = sum(map(sum, holds)), sum(map(len, holds))
+    return f"{inside} of {all_} ({100 * inside / max(all_, 1):.1f} %)"
+
+
+def _share(holds: list[list[bool]]) -> str:
+    """Share of all, %, with its standard error, subjects being independent; - of none."""
+    if not holds:
+        return "-"
+    counts = np.array([[sum(each), len(each)] for each in holds], dtype=np.float64)
+    share = counts[:, 0].sum() / max(counts[:, 1].sum(), 1)
+    left = counts[:, 0] - share * counts[:, 1]
+    error = np.sqrt(np.sum(left**2)) / max(counts[:, 1].sum(), 1)
+    return f"{100 * share:.0f} ± {100 * error:.0f}"
