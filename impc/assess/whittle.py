@@ -1,0 +1,232 @@
+"""Whittle's likelihood of the spectrum of residuals, in two models of noise, with its gradient.
+
+The models are those of `loop_noise`; with S the spectrum that a model says and P the periodograms,
+averaged over bins of c ordinates each,
+
+    misfit = sum c (log det S + tr(S^-1 P)),    d misfit = sum c tr((S^-1 - S^-1 P S^-1) dS).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy.signal
+
+from impc.arrays import Array
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from impc.model.plant import Plant
+
+__all__ = [
+    "ORDER",
+    "Spectrum",
+    "loop_shapes",
+    "loops",
+    "misfit",
+    "outputs",
+    "root_of",
+    "size",
+    "spectrum",
+]
+
+Complex = np.ndarray[tuple[int, ...], np.dtype[np.complex128]]
+
+#: Of the autoregression of each output.
+ORDER = 4
+# Frequencies are averaged over bins of this relative width; each bin holds one ordinate at least.
+_WIDTH, _INSIDE = 0.05, 4
+# Hann's window makes neighbours depend: as many independent ordinates as T / 1.94 (35 / 18).
+_HANN = 35 / 18
+# Of the mean level, and of its own size, for one input alone gives a spectrum of rank one: one
+# below it, as of rounding, is not looked into.
+_FLOOR, _OWN = 1e-3, 1e-9
+# Unknowns beyond these are at them: arguments of tanh of reflections and of the root (.995 at most,
+# a drift is not told from a trend), logarithms of the diagonal of V's factor, and of variances.
+_REFLECTION, _ROOT, _DIAGONAL, _VARIANCE = 5.0, 3.0, 10.0, (-25.0, 10.0)
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """Binned periodograms of outputs over their size.
+
+    Attributes
+    ----------
+    angles : Array
+        Middle of each bin (b,).
+    edges : Array
+        (b + 1,).
+    counts : Array
+        Independent ordinates in each (b,).
+    power : Array
+        (b, p, p), complex.
+    size : Array
+        Standard deviation of each output (p,), in its unit.
+    """
+
+    angles: Array
+    edges: Array
+    counts: Array
+    power: Complex
+    size: Array
+
+
+def spectrum(residuals: list[Array]) -> Spectrum | None:
+    """Of residuals (samples, p) of each trial; None of zeros, or of trials that are too short."""
+    shortest = min(map(len, residuals))
+    size = np.sqrt(
+        np.mean(np.concatenate([part - part.mean(axis=0) for part in residuals]) ** 2, axis=0)
+    )
+    if shortest < 64 or not np.all(size > 0) or not np.all(np.isfinite(size)):
+        return None
+    edges = [1.5]
+    while edges[-1] < shortest // 2 - 1:
+        edges.append(np.floor(max(edges[-1] + 1, edges[-1] * (1 + _WIDTH))) + 0.5)
+    angles = 2 * np.pi * np.array(edges) / shortest
+    angles[-1] = min(angles[-1], np.pi)
+    p, bins = len(size), len(angles) - 1
+    power, counts = np.zeros((bins, p, p), dtype=np.complex128), np.zeros(bins)
+    for part in residuals:
+        window = scipy.signal.windows.hann(len(part), sym=False)
+        seen = ((part - part.mean(axis=0)) / size) * (window / np.linalg.norm(window))[:, None]
+        found = np.fft.rfft(seen, axis=0)
+        place = np.digitize(2 * np.pi * np.arange(len(found)) / len(part), angles) - 1
+        inside = (place >= 0) & (place < bins)
+        np.add.at(power, place[inside], found[inside, :, None] * found[inside, None, :].conj())
+        np.add.at(counts, place[inside], 1.0)
+    centres = (angles[1:] + angles[:-1]) / 2
+    return Spectrum(centres, angles, counts / _HANN, power / counts[:, None, None], size)
+
+
+def loop_shapes(plant: Plant, gain: Array, found: Spectrum) -> Complex:
+    """G_j G_j* of each input, averaged over each bin, outputs over their size (b, m, p, p).
+
+    Parameters
+    ----------
+    plant : Plant
+    gain : Array
+        K (m, n), A - B K stable.
+    found : Spectrum
+    """
+    closed = plant.A - plant.B @ gain
+    shares = (np.arange(_INSIDE) + 0.5) / _INSIDE
+    angles = found.edges[:-1, None] + np.diff(found.edges)[:, None] * shares
+    z = np.exp(1j * angles)[..., None, None]
+    G = plant.C @ np.linalg.solve(z * np.eye(len(closed)) - closed, plant.B + 0j)
+    G = G / found.size[:, None]
+    return np.asarray(np.einsum("bkpj,bkqj->bjpq", G, G.conj()) / _INSIDE)
+
+
+def size(p: int) -> int:
+    """Numbers of S_0: reflections, a triangle, logarithms of white variances; p outputs."""
+    return ORDER * p + p * (p + 1) // 2 + p
+
+
+def outputs(theta: Array, found: Spectrum) -> tuple[Complex, Callable[[Complex], Array]]:
+    """S_0 (b, p, p), and what reads its gradient off.
+
+    Parameters
+    ----------
+    theta : Array
+        Reflection coefficients of each output before tanh, the Cholesky factor of V with logarithms
+        on its diagonal, logarithms of white variances (size(p),).
+    found : Spectrum
+    """
+    p = len(found.size)
+    H, slopes = _filters(theta[: ORDER * p].reshape(p, ORDER), found.angles)
+    factor, free = np.zeros((p, p)), np.ones((p, p))
+    factor[np.tril_indices(p)] = theta[ORDER * p : size(p) - p]
+    diagonal = np.diag(factor)
+    free[np.diag_indices(p)] = _clipped(diagonal, -_DIAGONAL, _DIAGONAL)[1]
+    factor[np.diag_indices(p)] = np.exp(_clipped(diagonal, -_DIAGONAL, _DIAGONAL)[0])
+    free[np.diag_indices(p)] *= np.diag(factor)
+    logs, moving = _clipped(theta[size(p) - p : size(p)], *_VARIANCE)
+    root, white = H[:, :, None] * factor, np.exp(logs)
+    S = root @ np.swapaxes(root.conj(), 1, 2) + np.diag(white)
+
+    def gradient(W: Complex) -> Array:
+        """Of sum tr(W dS): dS = dR R* + R dR*."""
+        back = 2 * np.swapaxes(root.conj(), 1, 2) @ W
+        own = np.einsum("bjk,kj->bk", back, factor)  # along H_k
+        reflections = np.einsum("bk,bkr->kr", own, slopes).real
+        triangle = np.einsum("bji,bi->ij", back, H).real * free
+        whites = np.einsum("bii->i", W).real * white * moving
+        return np.concatenate([np.ravel(reflections), triangle[np.tril_indices(p)], whites])
+
+    return S, gradient
+
+
+def _filters(theta: Array, angles: Array) -> tuple[Complex, Complex]:
+    """H (b, p) of each output, and its slopes along the arguments of its reflections (b, p, r).
+
+    With k a reflection and a the polynomial so far in z^-1, the next is (a, 0) + k (0, a reversed).
+    """
+    powers = np.exp(-1j * np.outer(angles, np.arange(ORDER + 1)))
+    arguments, free = _clipped(theta, -_REFLECTION, _REFLECTION)
+    reflections = np.tanh(arguments)
+    models = np.zeros((len(theta), 1 + ORDER, ORDER + 1))  # the polynomial, and its derivatives
+    models[:, 0, 0] = 1.0
+    for r in range(ORDER):
+        turned = np.zeros_like(models)
+        turned[..., : r + 2] = models[..., : r + 2][..., ::-1]
+        before = turned[:, 0].copy()
+        models = models + reflections[:, r, None, None] * turned
+        models[:, 1 + r] += before
+    found = np.einsum("bo,pko->bpk", powers, models)
+    H = 1 / found[..., 0]
+    return H, -(H**2)[..., None] * found[..., 1:] * (free * (1 - reflections**2))
+
+
+def loops(
+    theta: Array, shapes: Complex, found: Spectrum
+) -> tuple[Complex, Callable[[Complex], Array]]:
+    """G W G* (b, p, p), and what reads its gradient off.
+
+    Parameters
+    ----------
+    theta : Array
+        Logarithms of the variances at the inputs, and their root before tanh (m + 1,).
+    shapes : Array
+        Of `loop_shapes` (b, m, p, p), complex.
+    found : Spectrum
+    """
+    logs, moving = _clipped(theta[:-1], *_VARIANCE)
+    root, variances = root_of(theta), np.exp(logs)
+    free = _clipped(theta[-1], -_ROOT, _ROOT)[1]
+    apart = np.abs(1 - root * np.exp(-1j * found.angles)) ** 2
+    colour = (1 - root**2) / apart
+    # |1 - r e^-iw|^2 = 1 - 2 r cos w + r^2.
+    slope = -2 * root / apart - colour * (2 * root - 2 * np.cos(found.angles)) / apart
+    S = np.einsum("j,bjpq,b->bpq", variances, shapes, colour)
+
+    def gradient(W: Complex) -> Array:
+        each = np.einsum("bqp,bjpq->bj", W, shapes).real * variances
+        along = float(np.sum(each * slope[:, None])) * free * (1 - root**2)
+        return np.append(colour @ each * moving, along)
+
+    return np.asarray(S), gradient
+
+
+def root_of(theta: Array) -> float:
+    """Of the noise at the inputs, from the unknowns of `loops` or of both models."""
+    return float(np.tanh(np.clip(theta[-1], -_ROOT, _ROOT)))
+
+
+def misfit(S: Complex, found: Spectrum) -> tuple[float, Complex]:
+    """Minus Whittle's log-likelihood, twice, of S (b, p, p), and W: its slope is sum tr(W dS)."""
+    eye = np.eye(S.shape[1])
+    least = _FLOOR + _OWN * np.einsum("bii->b", S).real
+    inverse = np.linalg.inv(S + least[:, None, None] * eye)
+    told = inverse @ found.power
+    value = np.einsum("bii->b", told).real - np.linalg.slogdet(inverse)[1]
+    W = found.counts[:, None, None] * (inverse - told @ inverse)
+    own = _OWN * np.einsum("bii->b", W).real
+    return float(found.counts @ value), W + own[:, None, None] * eye
+
+
+def _clipped(value: Array, low: float, high: float) -> tuple[Array, Array]:
+    """A number inside its ends, and its slope."""
+    return np.clip(value, low, high), np.where((value > low) & (value < high), 1.0, 0.0)
