@@ -14,9 +14,10 @@ steps from the largest likelihood, with the curvature C there,
 
 for b changes little over a few deviations. (A search for the largest of F - b'theta costs twice as
 much and stays where it is on a kink: between two jumps of the likelihood lies a maximum that a
-slope of half a nat for each deviation does not move.) The mean is taken away along the gain alone,
-levels and initial states follow on their ridge: along levels that are weakly told it moved them by
-powers of e.
+slope of half a nat for each deviation does not move.) The mean is taken away along directions of the
+gain that are told, levels and initial states follow on their ridge: along levels that are weakly
+told it moved them by powers of e, and along directions of the gain that are not the likelihood is
+no parabola over a deviation.
 """
 
 from __future__ import annotations
@@ -44,6 +45,9 @@ __all__ = ["TiltedPrior", "Unbiased", "unbiased"]
 _ROUNDS, _SETS = 2, 16
 # Deviations within which a mean is as it was found, and as far as it may move the gain.
 _NEAR = 2.0
+# A direction of the gain whose deviation is larger, in natural coordinates, is not told: what
+# likelihoods say a deviation to either side of it is no slope.
+_TOLD = 0.25
 
 
 class TiltedPrior(Prior):
@@ -108,16 +112,16 @@ def unbiased(fit: PersonFit) -> Unbiased:
         return Unbiased(fit, "")
     begin = first.placed(np.array(fit.theta), fit.told)
     curvature = first.parabola(begin, np.array(fit.unseen))[1]
-    root = np.linalg.cholesky(curvature)
+    root, told = np.linalg.cholesky(curvature), _told(curvature, first.space.gain)
     place, means, size = begin, [], 0.0
     slope = np.zeros(len(begin.theta))
     try:
         for seed in range(_ROUNDS):
             mean = simulated_score(first, place.theta, seed, _SETS)
-            means.append(_believed(curvature, mean, first.space.gain))
-            slope = -np.mean(means, axis=0)
+            means.append(_believed(curvature, mean))
+            slope = told @ -np.mean(means, axis=0)
             size = float(np.linalg.norm(np.linalg.solve(root, slope)))
-            slope *= min(1.0, _NEAR / size)
+            slope *= _NEAR / max(size, _NEAR)
             place = first.at(begin.theta + np.linalg.solve(curvature, slope))
     except ImpcError as error:
         return Unbiased(fit, str(error))
@@ -129,11 +133,19 @@ def unbiased(fit: PersonFit) -> Unbiased:
     return Unbiased(moved, far if size > _NEAR else "")
 
 
-def _believed(curvature: Array, found: SimulatedScore, gain: int) -> Array:
-    """What is believed of a mean that is drawn (q,), nats; along the gain.
+def _believed(curvature: Array, found: SimulatedScore) -> Array:
+    """What is believed of a mean that is drawn (q,), nats.
 
     C (C + M)^-1 of it, M its covariance and C the curvature: as of a number whose own size is C's.
     """
-    believed = curvature @ np.linalg.solve(curvature + found.spread, found.mean)
-    believed[gain:] = 0.0
-    return np.asarray(believed)
+    return np.asarray(curvature @ np.linalg.solve(curvature + found.spread, found.mean))
+
+
+def _told(curvature: Array, gain: int) -> Array:
+    """The projection onto slopes along directions of the gain that are told (q, q)."""
+    covariance = np.linalg.inv(curvature)[:gain, :gain]
+    variances, directions = np.linalg.eigh(covariance)
+    kept = directions[:, variances < _TOLD**2]
+    projection = np.zeros_like(curvature)
+    projection[:gain, :gain] = kept @ kept.T
+    return projection

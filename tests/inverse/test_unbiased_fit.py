@@ -100,3 +100,21 @@ def test_where_no_bound_is_met_nothing_changes() -> None:
     found, reason = unbiased(fit)
     assert found is fit
     assert reason == ""
+
+
+def test_along_directions_that_are_not_told_nothing_moves(
+    met: PersonFit, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The limit of what is told is put between the two deviations of the gain."""
+    theta, gain = np.array(met.theta), met.space.gain
+    curvature = met.prior.parabola(met.prior.placed(theta, met.told), np.array(met.unseen))[1]
+    variances, directions = np.linalg.eigh(np.linalg.inv(curvature)[:gain, :gain])
+    assert gain == 2
+    monkeypatch.setattr(unbiased_fit, "_TOLD", float(np.prod(variances) ** 0.25))
+    step = (np.array(unbiased(met).fit.theta) - theta)[:gain]
+    assert abs(directions[:, 0] @ step) > 0.05 * np.sqrt(variances[0])
+    assert abs(directions[:, 1] @ step) < 1e-9
+    monkeypatch.setattr(unbiased_fit, "_TOLD", 1e-9)
+    found, reason = unbiased(met)
+    np.testing.assert_allclose(found.theta, theta, rtol=1e-12)
+    assert reason == ""
