@@ -14,10 +14,10 @@ steps from the largest likelihood, with the curvature C there,
 
 for b changes little over a few deviations. (A search for the largest of F - b'theta costs twice as
 much and stays where it is on a kink: between two jumps of the likelihood lies a maximum that a
-slope of half a nat for each deviation does not move.) The mean is taken away along directions of the
-gain that are told, levels and initial states follow on their ridge: along levels that are weakly
-told it moved them by powers of e, and along directions of the gain that are not the likelihood is
-no parabola over a deviation.
+slope of half a nat for each deviation does not move.) The mean is taken away along directions of
+the gain that are told, levels and initial states follow on their ridge: along levels that are
+weakly told it moved them by powers of e, and along directions of the gain that are not the
+likelihood is no parabola over a deviation.
 """
 
 from __future__ import annotations
