@@ -22,8 +22,9 @@ from tqdm import tqdm
 from impc.arrays import Array
 from impc.assess.covariance import gain_covariance
 from impc.assess.long_run_covariance import residual_noise, white_noise
-from impc.control.closed_loop import require_complete, scenario, simulate
+from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
+from impc.control.simulation import require_complete, scenario
 from impc.inverse.gain_search import fit_gain
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant

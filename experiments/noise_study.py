@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from impc.arrays import Array
-    from impc.control.closed_loop import Scenario
+    from impc.control.simulation import Scenario
     from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
 

@@ -17,9 +17,10 @@ import numpy as np
 import plants
 from experiments.benchmarks.workloads import seat
 from impc.assess.variance_accounted_for import vaf
-from impc.control.closed_loop import scenario, simulate
+from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
 from impc.control.noisy_person import simulate_person
+from impc.control.simulation import scenario
 from impc.inverse.problem import Problem
 from impc.model.bounds import Bounds
 from impc.model.observer import Observer

@@ -25,8 +25,9 @@ from impc.assess.covariance import gain_covariance
 from impc.assess.long_run_covariance import white_noise
 from impc.cli.seat import HORIZON, seat_controller, seat_weights
 from impc.control.casadi_controller import build_mpc, solve_mpc
-from impc.control.closed_loop import require_complete, scenario, simulate
+from impc.control.closed_loop import simulate
 from impc.control.nonlinear_controller import build_nonlinear_mpc, simulate_nonlinear
+from impc.control.simulation import require_complete, scenario
 from impc.inverse.methods import estimate
 from impc.inverse.noisy_fit import free_gain
 from impc.inverse.optimal_control_fit import fit_optimal_control
@@ -40,9 +41,9 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from impc.arrays import Array
-    from impc.control.closed_loop import Scenario, Simulation
     from impc.control.controller import Controller
     from impc.control.nonlinear_controller import NonlinearMpc
+    from impc.control.simulation import Scenario, Simulation
 
 __all__ = ["Amplitude", "Fitted", "compare_at", "first_torques", "fitted_person", "fitted_prices"]
 

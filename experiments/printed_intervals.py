@@ -26,8 +26,9 @@ from tqdm import tqdm
 
 from impc.assess.covariance import TWO_SIDED
 from impc.assess.printed_gain import gain_estimate
-from impc.control.closed_loop import require_complete, scenario, simulate
+from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
+from impc.control.simulation import require_complete, scenario
 from impc.inverse.noisy_fit import fit_controller
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant

@@ -15,16 +15,16 @@ if TYPE_CHECKING:
     from impc.assess.variance_accounted_for import vaf as vaf
     from impc.assess.variance_accounted_for import whiteness as whiteness
     from impc.control.casadi_controller import mpc_function as mpc_function
-    from impc.control.closed_loop import Scenario as Scenario
-    from impc.control.closed_loop import Simulation as Simulation
-    from impc.control.closed_loop import Status as Status
-    from impc.control.closed_loop import require_complete as require_complete
-    from impc.control.closed_loop import scenario as scenario
     from impc.control.closed_loop import simulate_and_differentiate as simulate_and_differentiate
     from impc.control.constraint_rows import directions as directions
     from impc.control.controller import Controller as Controller
     from impc.control.loop_function import closed_loop_function as closed_loop_function
     from impc.control.optimal_control import OptimalControlProblem as OptimalControlProblem
+    from impc.control.simulation import Scenario as Scenario
+    from impc.control.simulation import Simulation as Simulation
+    from impc.control.simulation import Status as Status
+    from impc.control.simulation import require_complete as require_complete
+    from impc.control.simulation import scenario as scenario
     from impc.control.terminal_set import TerminalSet as TerminalSet
     from impc.control.terminal_set import maximal_invariant_set as maximal_invariant_set
     from impc.errors import BoundsError as BoundsError
@@ -78,12 +78,12 @@ _NAMES = {
     "assess.identified_directions": "identifiability",
     "assess.variance_accounted_for": "vaf whiteness",
     "control.casadi_controller": "mpc_function",
-    "control.closed_loop": "Scenario Simulation Status require_complete scenario"
-    " simulate_and_differentiate",
+    "control.closed_loop": "simulate_and_differentiate",
     "control.constraint_rows": "directions",
     "control.controller": "Controller",
     "control.optimal_control": "OptimalControlProblem",
     "control.loop_function": "closed_loop_function",
+    "control.simulation": "Scenario Simulation Status require_complete scenario",
     "control.terminal_set": "TerminalSet maximal_invariant_set",
     "errors": "BoundsError DataError ImpcError InfeasibleError InputError OutputError PlantError"
     " SolverError WeightsError",

@@ -14,20 +14,12 @@ from decimal import Decimal
 
 import numpy as np
 
-from impc.control.closed_loop import (
-    PreparedLoop,
-    Scenario,
-    Simulation,
-    Status,
-    prepare_loop,
-    run_loop,
-    scenario,
-    simulate,
-)
+from impc.control.closed_loop import PreparedLoop, prepare_loop, run_loop, simulate
 from impc.control.compiled_dual import solve_dual
 from impc.control.constraint_rows import directions
 from impc.control.controller import Controller
 from impc.control.saturated import solve_saturated
+from impc.control.simulation import Scenario, Simulation, Status, scenario
 from impc.errors import SolverError
 from impc.model.bounds import Bounds, bound_rows
 from impc.model.weights import Weights

@@ -11,8 +11,9 @@ import scipy.optimize
 from hypothesis import settings
 from matplotlib.figure import Figure
 
-from impc.control.closed_loop import scenario, simulate
+from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
+from impc.control.simulation import scenario
 from impc.inverse.problem import Problem
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant

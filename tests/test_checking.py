@@ -14,8 +14,9 @@ import pytest
 
 from impc.arrays import Frozen, as_numbers
 from impc.checking import checked, replace
-from impc.control.closed_loop import scenario, simulate
+from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
+from impc.control.simulation import scenario
 from impc.errors import DataError, ImpcError, InputError
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant

@@ -12,10 +12,11 @@ import numpy as np
 
 from impc.assess.expected import expected_intervals
 from impc.checking import replace
-from impc.control.closed_loop import prepare_loop, scenario, simulate
+from impc.control.closed_loop import prepare_loop, simulate
 from impc.control.constraint_rows import directions
 from impc.control.controller import Controller
 from impc.control.saturated import solve_saturated
+from impc.control.simulation import scenario
 from impc.model.bounds import Bounds
 from tests.assess.test_expected import NOISE, PRICES, cart, cart_problem
 from tests.control.test_joint_likelihood import Someone, likelihood, recorded

@@ -16,7 +16,7 @@ from impc.assess import identified_directions as identifiability
 from impc.assess import variance_accounted_for as agreement
 from impc.checking import replace
 from impc.control import casadi_controller as mpc
-from impc.control import closed_loop, controller, terminal_set
+from impc.control import closed_loop, controller, simulation, terminal_set
 from impc.files import plant_sources as plant_source
 from impc.files import units
 from impc.inverse import cross_term, equivalent_weights, inverse_lqr
@@ -47,7 +47,7 @@ def values() -> dict[str, Any]:
     box = bounds.Bounds(two, u_min=-1, u_max=1)
     pair = weights.Weights(np.diag([2.0, 1.0]), np.diag([1.0, 3.0]))
     law = controller.Controller(two, pair, box, 4)
-    drive = closed_loop.scenario(two, [0.3, -0.2], disturbance=0.1 * np.sin(np.arange(30.0)))
+    drive = simulation.scenario(two, [0.3, -0.2], disturbance=0.1 * np.sin(np.arange(30.0)))
     run = closed_loop.simulate(law, drive)
     trial = recording.Recording(two, run.x, np.append(drive.disturbance, [[0.0]], axis=0))
     problem = inverse_problem.Problem(two, box, 4, (trial,))
@@ -220,13 +220,13 @@ def calls() -> list[Call]:
             },
         ),
         (
-            closed_loop.scenario,
+            simulation.scenario,
             {"plant": v["plant"], "x0": size, "steps": 30, "disturbance": np.zeros(30)},
         ),
-        (closed_loop.scenario, {"plant": v["plant"], "x0": size, "steps": 30}),
+        (simulation.scenario, {"plant": v["plant"], "x0": size, "steps": 30}),
         (closed_loop.simulate, {"controller": v["controller"], "given": v["scenario"]}),
         (
-            closed_loop.require_complete,
+            simulation.require_complete,
             {"controller": v["controller"], "simulation": v["simulation"]},
         ),
         (
@@ -298,7 +298,7 @@ def calls() -> list[Call]:
         (weights.Weights, {"Q": states, "R": states}),
         changed(trial),
         (recording.Label, {"subject": "a", "visit": "b", "condition": "c", "trial": "d"}),
-        (closed_loop.Scenario, {"x0": size, "disturbance": np.zeros((9, 1))}),
+        (simulation.Scenario, {"x0": size, "disturbance": np.zeros((9, 1))}),
         changed(v["controller"]),
         changed(v["problem"]),
     ]

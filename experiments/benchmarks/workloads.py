@@ -10,8 +10,9 @@ import numpy as np
 
 import plants
 from impc.checking import replace
-from impc.control.closed_loop import Scenario, require_complete, scenario, simulate
+from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
+from impc.control.simulation import Scenario, require_complete, scenario
 from impc.inverse.problem import Problem
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant

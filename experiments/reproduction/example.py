@@ -8,8 +8,9 @@ import numpy as np
 
 from experiments.reproduction.entry import Entry, Verdict, agrees, kind
 from impc.control.casadi_controller import build_mpc, simulate_mpc
-from impc.control.closed_loop import scenario, simulate
+from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
+from impc.control.simulation import scenario
 from impc.control.terminal_set import (
     invariance_violation,
     maximal_invariant_set,

@@ -12,7 +12,8 @@ import numpy as np
 
 from impc.arrays import Array, Frozen, frozen
 from impc.assess.variance_accounted_for import vaf
-from impc.control.closed_loop import Simulation, simulate
+from impc.control.closed_loop import simulate
+from impc.control.simulation import Simulation
 from impc.inverse.problem import scenarios
 
 if TYPE_CHECKING:

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.control.closed_loop import Status
 from impc.control.noisy_person import simulate_person
+from impc.control.simulation import Status
 from impc.inverse.problem import controller_for
 from impc.inverse.simulated_score import left_behind
 

@@ -13,7 +13,7 @@ from impc.checking import checked
 from impc.errors import InputError
 
 if TYPE_CHECKING:
-    from impc.control.closed_loop import Simulation
+    from impc.control.simulation import Simulation
     from impc.model.plant import Plant
     from impc.model.recordings import Recording
 

@@ -20,18 +20,18 @@ import scipy.linalg
 from impc.arrays import Array, BoolArray, finite_array
 from impc.checking import checked
 from impc.control.body_steps import next_state
-from impc.control.closed_loop import Simulation, Status
 from impc.control.constraint_rows import build_rows
 from impc.control.controller import Controller
 from impc.control.infeasibility import excluded_row
 from impc.control.named_solver import plugin, silent
+from impc.control.simulation import Simulation, Status
 from impc.errors import InputError
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-    from impc.control.closed_loop import Scenario
     from impc.control.constraint_rows import Rows
+    from impc.control.simulation import Scenario
 
 __all__ = [
     "SOLVERS",

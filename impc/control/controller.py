@@ -18,8 +18,9 @@ import numpy as np
 
 from impc.arrays import Array, finite_array, frozen, symmetric_matrix
 from impc.checking import Value, checked, replace
-from impc.control.closed_loop import Status, scenario, simulate
+from impc.control.closed_loop import simulate
 from impc.control.named_solver import COMPILED, require_solver
+from impc.control.simulation import Status, scenario
 from impc.control.terminal_set import maximal_invariant_set
 from impc.errors import InputError
 from impc.model.riccati import is_stable, solve_lqr
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike
 
-    from impc.control.closed_loop import Simulation
+    from impc.control.simulation import Simulation
     from impc.control.terminal_set import TerminalSet
     from impc.model.bounds import Bounds
     from impc.model.plant import Plant

@@ -27,13 +27,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.arrays import Array, Frozen, frozen
-from impc.control.closed_loop import Status, prepare_loop
+from impc.control.closed_loop import prepare_loop
 from impc.control.compiled_clip import Clip
 from impc.control.compiled_filter import Steady, run_filter
 from impc.control.compiled_room import filter_room
 from impc.control.compiled_sample import FilterResult
 from impc.control.constraint_rows import RowDirections, Rows
 from impc.control.joint_loop import PlantMoves, joint_directions, joint_loop
+from impc.control.simulation import Status
 from impc.errors import SolverError
 from impc.model.bounds import bound_rows
 from impc.model.kalman import filter_changes, stationary_filter

@@ -29,9 +29,10 @@ from impc.arrays import Array, frozen
 from impc.checking import checked
 from impc.control.body_steps import slopes_along
 from impc.control.casadi_callback import Linear, Matrix, Signature, differentiable
-from impc.control.closed_loop import Scenario, prepare_loop, run_loop, scenario
+from impc.control.closed_loop import prepare_loop, run_loop
 from impc.control.constraint_rows import directions
 from impc.control.controller import Controller
+from impc.control.simulation import Scenario, scenario
 from impc.errors import ImpcError, InputError
 from impc.model.riccati import regulator_changes, solve_lqr
 from impc.model.weights import Weights
@@ -39,7 +40,7 @@ from impc.model.weights import Weights
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-    from impc.control.closed_loop import Simulation
+    from impc.control.simulation import Simulation
     from impc.control.terminal_set import TerminalSet
     from impc.model.riccati import LqrSolution
 

@@ -13,10 +13,11 @@ import numpy as np
 
 from impc.arrays import Array, Frozen, finite_array, frozen
 from impc.checking import checked
-from impc.control.closed_loop import Status, prepare_loop, scenario
+from impc.control.closed_loop import prepare_loop
 from impc.control.compiled_person import run_person
 from impc.control.constraint_rows import directions
 from impc.control.joint_loop import joint_loop
+from impc.control.simulation import Status, scenario
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike

@@ -17,11 +17,11 @@ import casadi as ca
 import numpy as np
 
 from impc.arrays import Array
-from impc.control.closed_loop import Simulation, Status
+from impc.control.simulation import Simulation, Status
 from impc.model.riccati import solve_lqr
 
 if TYPE_CHECKING:
-    from impc.control.closed_loop import Scenario
+    from impc.control.simulation import Scenario
     from impc.model.bounds import Bounds
     from impc.model.plant import Plant
     from impc.model.weights import Weights

@@ -34,7 +34,7 @@ from impc.model.weights import Weights
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from impc.control.closed_loop import Simulation
+    from impc.control.simulation import Simulation
     from impc.control.terminal_set import TerminalSet
     from impc.inverse.equivalent_weights import EquivalentWeights
     from impc.inverse.explaining_weights import WeightsBehind

@@ -17,9 +17,9 @@ import numpy as np
 
 from impc.arrays import Array, finite_array, frozen
 from impc.checking import Value, checked, replace
-from impc.control.closed_loop import Scenario
 from impc.control.controller import LONGEST_HORIZON, Controller
 from impc.control.named_solver import COMPILED, require_solver
+from impc.control.simulation import Scenario
 from impc.errors import DataError, InputError
 from impc.model.bounds import Bounds
 from impc.model.plant_family import plant_at
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike
 
-    from impc.control.closed_loop import Simulation
+    from impc.control.simulation import Simulation
     from impc.control.terminal_set import TerminalSet
     from impc.model.plant import Plant
     from impc.model.plant_family import PlantFamily

@@ -14,8 +14,9 @@ import numpy as np
 
 from impc.arrays import Array, frozen
 from impc.checking import replace
-from impc.control.closed_loop import Scenario, Status, prepare_loop, run_loop, simulate
+from impc.control.closed_loop import prepare_loop, run_loop, simulate
 from impc.control.constraint_rows import Directions, directions
+from impc.control.simulation import Scenario, Status
 from impc.errors import ImpcError
 from impc.inverse.problem import controller_for, scenarios
 from impc.model.bounds import bound_rows
@@ -25,8 +26,8 @@ from impc.model.riccati import is_stable
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from impc.control.closed_loop import Simulation
     from impc.control.controller import Controller
+    from impc.control.simulation import Simulation
     from impc.control.terminal_set import TerminalSet
     from impc.inverse.problem import Problem
     from impc.model.plant_family import PlantDifferential

@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from impc.arrays import Array
-from impc.control.closed_loop import Status
+from impc.control.simulation import Status
 from impc.errors import ImpcError
 from impc.inverse.likelihood_fit import person_at
 from impc.inverse.person_prior import Prior

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.control.closed_loop import Status
+from impc.control.simulation import Status
 from impc.errors import ImpcError
 
 if TYPE_CHECKING:

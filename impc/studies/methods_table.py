@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from impc.assess.judged import MethodFit
-    from impc.control.closed_loop import Simulation
+    from impc.control.simulation import Simulation
     from impc.model.plant import Plant
     from impc.model.weights import Weights
 

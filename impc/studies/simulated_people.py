@@ -17,8 +17,9 @@ import numpy as np
 
 from impc.arrays import Array, Frozen, finite_array, frozen
 from impc.assess.variance_accounted_for import saturated_share
-from impc.control.closed_loop import Scenario, Status, prepare_loop, run_loop
+from impc.control.closed_loop import prepare_loop, run_loop
 from impc.control.constraint_rows import directions
+from impc.control.simulation import Scenario, Status
 from impc.errors import InputError
 from impc.model.observer import Observer, believed_filter, believed_matrices
 

@@ -10,8 +10,9 @@ from experiments.printed_intervals import carts
 from impc.arrays import Array
 from impc.assess.expected import Expectation, expected_intervals
 from impc.checking import replace
-from impc.control.closed_loop import scenario, simulate
+from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
+from impc.control.simulation import scenario
 from impc.errors import InputError
 from impc.inverse.problem import Problem
 from impc.model.bounds import Bounds

@@ -9,7 +9,8 @@ from experiments.benchmarks.workloads import seat
 from experiments.coverage import cart, noisy_trial, true_controller
 from experiments.simulated_subjects import noisy_recordings
 from impc.assess.input_limits import LimitEstimate, input_limit, with_limit
-from impc.control.closed_loop import scenario, simulate
+from impc.control.closed_loop import simulate
+from impc.control.simulation import scenario
 from impc.errors import InputError
 from impc.inverse.estimates import Estimate
 from impc.inverse.noisy_fit import fit_controller

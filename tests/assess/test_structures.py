@@ -17,8 +17,9 @@ from impc.assess.price_profiles import PriceProfiles
 from impc.assess.structure_test import structure_test
 from impc.assess.structured_weights import Tangent, price_covariance, tangent
 from impc.checking import replace
-from impc.control.closed_loop import scenario, simulate
+from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
+from impc.control.simulation import scenario
 from impc.inverse.problem import Problem
 from impc.inverse.residuals import residual_only
 from impc.inverse.structured_search import search_from

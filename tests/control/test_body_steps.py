@@ -13,16 +13,11 @@ from impc.checking import replace
 from impc.cli.seat import seat_controller
 from impc.control.body_steps import next_state, slopes_along
 from impc.control.casadi_controller import build_mpc, simulate_mpc
-from impc.control.closed_loop import (
-    Scenario,
-    Status,
-    scenario,
-    simulate,
-    simulate_and_differentiate,
-)
+from impc.control.closed_loop import simulate, simulate_and_differentiate
 from impc.control.constraint_rows import directions
 from impc.control.controller import Controller
 from impc.control.loop_function import closed_loop_function
+from impc.control.simulation import Scenario, Status, scenario
 from impc.inverse.methods import estimate
 from impc.inverse.problem import Problem
 from impc.inverse.residuals import evaluate, residual_only

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from impc.control.casadi_controller import SOLVERS, build_mpc, simulate_mpc, solve_mpc
-from impc.control.closed_loop import Status, require_complete, scenario, simulate
+from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
+from impc.control.simulation import Status, require_complete, scenario
 from impc.errors import (
     BoundsError,
     DataError,

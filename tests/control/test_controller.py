@@ -6,8 +6,8 @@ import control
 import numpy as np
 import pytest
 
-from impc.control.closed_loop import Status
 from impc.control.controller import Controller
+from impc.control.simulation import Status
 from impc.errors import DataError
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from impc.checking import replace
-from impc.control.closed_loop import Status, simulate
+from impc.control.closed_loop import simulate
+from impc.control.simulation import Status
 from tests import independent_mpc
 from tests.exact_mpc import ROUNDED, ExactProgram, exact
 from tests.exact_search import first_input

@@ -10,18 +10,11 @@ import numpy as np
 import pytest
 
 from impc.checking import replace
-from impc.control.closed_loop import (
-    Scenario,
-    Status,
-    prepare_loop,
-    require_complete,
-    run_loop,
-    scenario,
-    simulate,
-)
+from impc.control.closed_loop import prepare_loop, run_loop, simulate
 from impc.control.constraint_rows import build_rows, directions
 from impc.control.controller import Controller
 from impc.control.infeasibility import proves_infeasible
+from impc.control.simulation import Scenario, Status, require_complete, scenario
 from impc.errors import SolverError
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant

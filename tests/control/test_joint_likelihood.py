@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from statsmodels.tsa.statespace.kalman_filter import KalmanFilter
 
-from impc.control.closed_loop import scenario, simulate
+from impc.control.closed_loop import simulate
 from impc.control.constraint_rows import directions
 from impc.control.controller import Controller
 from impc.control.joint_likelihood import (
@@ -24,6 +24,7 @@ from impc.control.joint_likelihood import (
 )
 from impc.control.joint_loop import joint_loop
 from impc.control.noisy_person import PersonTrial, simulate_person
+from impc.control.simulation import scenario
 from impc.errors import SolverError
 from impc.model.bounds import Bounds
 from impc.model.observer import Observer, believed_filter

@@ -12,10 +12,11 @@ import pytest
 
 from impc.checking import replace
 from impc.control.casadi_controller import mpc_function
-from impc.control.closed_loop import Scenario, simulate, simulate_and_differentiate
+from impc.control.closed_loop import simulate, simulate_and_differentiate
 from impc.control.constraint_rows import directions
 from impc.control.controller import Controller
 from impc.control.loop_function import closed_loop_function
+from impc.control.simulation import Scenario
 from impc.errors import DataError, InputError
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from impc.checking import replace
-from impc.control.closed_loop import Status, scenario, simulate, simulate_and_differentiate
+from impc.control.closed_loop import simulate, simulate_and_differentiate
 from impc.control.constraint_rows import build_rows
 from impc.control.controller import Controller
 from impc.control.named_solver import (
@@ -23,6 +23,7 @@ from impc.control.named_solver import (
     described,
     require_solver,
 )
+from impc.control.simulation import Status, scenario
 from impc.errors import InputError
 from impc.inverse.direct_and_reduced import inverse_mpc_reduced
 from impc.inverse.problem import Problem

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from experiments.peer_systems import SYSTEMS, PeerSystem
-from impc.control.closed_loop import Status, scenario, simulate
+from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
 from impc.control.nlp_solvers import SOLVERS
 from impc.control.optimal_control import OptimalControlProblem
@@ -18,6 +18,7 @@ from impc.control.plan_derivatives import (
     differentiate_plan,
     weakly_active_rows,
 )
+from impc.control.simulation import Status, scenario
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.weights import Weights

@@ -7,9 +7,10 @@ import pytest
 
 from experiments.benchmarks.workloads import Workload, seat
 from impc.assess.identified_directions import identifiability
-from impc.control.closed_loop import Status, simulate, simulate_and_differentiate
+from impc.control.closed_loop import simulate, simulate_and_differentiate
 from impc.control.constraint_rows import directions
 from impc.control.controller import Controller
+from impc.control.simulation import Status
 from impc.inverse.direct_and_reduced import inverse_mpc_reduced, start_gains, starting_point
 
 

@@ -15,8 +15,9 @@ import pytest
 
 from experiments.benchmarks.workloads import seat
 from impc.control.casadi_controller import build_mpc, simulate_mpc
-from impc.control.closed_loop import Scenario, Simulation, Status, scenario, simulate
+from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
+from impc.control.simulation import Scenario, Simulation, Status, scenario
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.weights import Weights

@@ -27,11 +27,12 @@ from click.testing import CliRunner
 from impc.cli.consent import require_consent
 from impc.cli.main import main
 from impc.cli.plant import find_plant
-from impc.control.closed_loop import require_complete, scenario, simulate
+from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
 from impc.control.named_solver import require_solver
 from impc.control.nlp_solvers import require_solver as require_nlp_solver
 from impc.control.optimal_control import OptimalControlProblem
+from impc.control.simulation import require_complete, scenario
 from impc.errors import ImpcError
 from impc.files import apart
 from impc.files.alignment import misaligned

@@ -6,8 +6,9 @@ import control
 import numpy as np
 import pytest
 
-from impc.control.closed_loop import scenario, simulate
+from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
+from impc.control.simulation import scenario
 from impc.inverse.direct_and_reduced import infer_weights, inverse_mpc_reduced
 from impc.inverse.gain_search import fit_gain
 from impc.inverse.noisy_fit import fit_controller

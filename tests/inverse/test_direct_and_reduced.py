@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from impc.assess.identified_directions import identifiability
-from impc.control.closed_loop import Status, require_complete, scenario, simulate
+from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
+from impc.control.simulation import Status, require_complete, scenario
 from impc.errors import SolverError
 from impc.inverse.direct_and_reduced import (
     CONDITION_WEIGHT,

@@ -15,8 +15,9 @@ from experiments.coverage import cart
 from impc.assess.covariance import gain_covariance
 from impc.assess.residual_structure import residual_structure
 from impc.checking import replace
-from impc.control.closed_loop import scenario, simulate
+from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
+from impc.control.simulation import scenario
 from impc.inverse.gain_search import refine_gain
 from impc.inverse.problem import Problem
 from impc.inverse.residuals import evaluate

@@ -12,7 +12,8 @@ from impc.assess.covariance import gain_covariance
 from impc.assess.judged import judge
 from impc.assess.printed_gain import gain_estimate
 from impc.checking import replace
-from impc.control.closed_loop import scenario, simulate
+from impc.control.closed_loop import simulate
+from impc.control.simulation import scenario
 from impc.inverse.coordinates import Coordinates
 from impc.inverse.diagonal_start import diagonal_weights
 from impc.inverse.estimates import Estimate

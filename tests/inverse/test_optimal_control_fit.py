@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from experiments.peer_systems import SYSTEMS
-from impc.control.closed_loop import Status, scenario, simulate
+from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
 from impc.control.optimal_control import OptimalControlProblem
+from impc.control.simulation import Status, scenario
 from impc.errors import DataError, InfeasibleError, InputError
 from impc.inverse.methods import estimate
 from impc.inverse.optimal_control_fit import fit_optimal_control

@@ -12,8 +12,9 @@ from experiments.printed_intervals import carts, fit, noisy_recording, random_re
 from impc.assess.printed_gain import gain_estimate
 from impc.assess.weights_ranges import summarise_weights
 from impc.checking import replace
-from impc.control.closed_loop import scenario, simulate
+from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
+from impc.control.simulation import scenario
 from impc.errors import ImpcError
 from impc.inverse.coordinates import Coordinates
 from impc.inverse.diagonal_start import diagonal_weights

@@ -13,8 +13,9 @@ from experiments.coverage import cart, noisy_trial
 from impc.assess.assessments import ASSESSMENTS, Assessment
 from impc.assess.judged import MethodFit, judge
 from impc.checking import replace
-from impc.control.closed_loop import scenario, simulate
+from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
+from impc.control.simulation import scenario
 from impc.inverse.methods import METHODS, estimate
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant

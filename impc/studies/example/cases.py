@@ -15,9 +15,10 @@ import numpy as np
 from impc.arrays import Array, Frozen, frozen
 from impc.assess.identified_directions import Identifiability, identifiability
 from impc.assess.judged import judge
-from impc.control.closed_loop import Simulation, require_complete, scenario, simulate
+from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
 from impc.control.named_solver import COMPILED
+from impc.control.simulation import Simulation, require_complete, scenario
 from impc.inverse.direct_and_reduced import CONDITION_WEIGHT
 from impc.inverse.groundwork import PlantUnits
 from impc.inverse.methods import METHODS

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from impc.control.closed_loop import Simulation
+    from impc.control.simulation import Simulation
     from impc.studies.example.cases import CaseResult
 
 __all__ = ["FIGURES", "example_figures"]

@@ -57,7 +57,7 @@ if TYPE_CHECKING:
     from impc.assess.resampling import Replicate
     from impc.assess.structures import StructureFit
     from impc.assess.variance_accounted_for import TrialAgreement
-    from impc.control.closed_loop import Simulation
+    from impc.control.simulation import Simulation
     from impc.model.bounds import Bounds
     from impc.model.plant import Plant
     from impc.model.plant_family import PlantFamily

@@ -18,7 +18,8 @@ import numpy as np
 from impc.arrays import Array, Frozen, frozen
 from impc.assess.expected import Expectation, expected_intervals
 from impc.assess.variance_accounted_for import saturated_share
-from impc.control.closed_loop import scenario, simulate
+from impc.control.closed_loop import simulate
+from impc.control.simulation import scenario
 from impc.errors import SolverError
 from impc.inverse.problem import Problem
 from impc.model.recordings import Recording

@@ -8,8 +8,9 @@ import control
 import numpy as np
 
 from experiments.coverage import cart
-from impc.control.closed_loop import require_complete, scenario, simulate
+from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
+from impc.control.simulation import require_complete, scenario
 from impc.model.bounds import Bounds
 from impc.model.recordings import Recording
 from impc.model.weights import Weights

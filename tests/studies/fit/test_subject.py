@@ -14,8 +14,9 @@ from experiments.simulated_subjects import noisy_recordings
 from impc.assess.intent_rules import dominant_sentence, intent
 from impc.assess.variance_accounted_for import vaf
 from impc.checking import replace
-from impc.control.closed_loop import scenario, simulate
+from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
+from impc.control.simulation import scenario
 from impc.errors import DataError, InputError, SolverError
 from impc.inverse.delayed_feedback import preliminary_gain
 from impc.inverse.estimates import Estimate

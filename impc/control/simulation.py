@@ -1,0 +1,261 @@
+"""What drives a simulation and what comes of it, sample by sample.
+
+A simulation never raises for what happens on the way: it has a `Status` for each sample, and
+`require_complete` turns a failure into an error that names bound and sample.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+
+from impc.arrays import Array, Frozen, as_numbers, finite_array, frozen
+from impc.checking import Value, checked
+from impc.control import compiled_arrays
+from impc.control.constraint_rows import build_rows
+from impc.errors import DataError, InfeasibleError, SolverError
+from impc.model.bounds import bound_rows
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import ArrayLike
+
+    from impc.control.controller import Controller
+    from impc.model.plant import Plant
+
+__all__ = ["Scenario", "Sensitivity", "Simulation", "Status", "require_complete", "scenario"]
+
+
+class Status(IntEnum):
+    """What happened at a sample.
+
+    FREE: the gain keeps every bound. ACTIVE: a bound is active. SOFTENED: a soft bound was
+    exceeded. INFEASIBLE: it is proved that no input sequence keeps the bounds. UNSOLVED: which
+    input is the answer, or whether there is one, could not be told in double precision. DIVERGED:
+    the state left every reasonable range. NOT_REACHED: the simulation ended before.
+
+    Examples
+    --------
+    >>> import impc
+    >>> impc.Status.ACTIVE.sentence
+    'a bound is active'
+    """
+
+    FREE = compiled_arrays.FREE
+    ACTIVE = compiled_arrays.ACTIVE
+    SOFTENED = compiled_arrays.SOFTENED
+    INFEASIBLE = compiled_arrays.INFEASIBLE
+    UNSOLVED = compiled_arrays.UNSOLVED
+    DIVERGED = compiled_arrays.DIVERGED
+    NOT_REACHED = 6
+
+    @property
+    def sentence(self) -> str:
+        """The status in words."""
+        return _SENTENCES[self]
+
+
+_SENTENCES = {
+    Status.FREE: "the gain keeps every bound",
+    Status.ACTIVE: "a bound is active",
+    Status.SOFTENED: "a soft bound was exceeded",
+    Status.INFEASIBLE: "no input sequence keeps the bounds",
+    Status.UNSOLVED: "the input could not be told in double precision",
+    Status.DIVERGED: "the state left every reasonable range",
+    Status.NOT_REACHED: "the simulation ended before this sample",
+}
+
+
+@dataclass(frozen=True)
+class Scenario(Value):
+    """What drives a simulation, in the units of the plant.
+
+    Attributes
+    ----------
+    x0 : Array
+        Initial state (n,).
+    disturbance : Array
+        One row for each sample (steps, d).
+
+    Examples
+    --------
+    >>> import impc
+    >>> from plants import yalmip_example
+    >>> drive = impc.scenario(impc.Plant(yalmip_example()), x0=[1, 3], steps=20)
+    >>> isinstance(drive, impc.Scenario), drive.steps, drive.disturbance.shape
+    (True, 20, (20, 0))
+    """
+
+    _rules: ClassVar[Mapping[str, Any]] = {
+        "x0": "n",
+        "disturbance": "* d",
+    }
+
+    x0: Array
+    disturbance: Array
+
+    @property
+    def steps(self) -> int:
+        """Number of samples at which an input is applied."""
+        return len(self.disturbance)
+
+
+@dataclass(frozen=True)
+class Simulation(Frozen):
+    """A closed loop from its first state to its last.
+
+    Attributes
+    ----------
+    x : Array
+        States (steps + 1, n). Samples that were not reached repeat the last state.
+    u : Array
+        Inputs (steps, m).
+    status : Array of Status
+        (steps,).
+    weakly_active : int
+        Number of samples at which the active set is about to change, to 1e-8 of the bound.
+    failed_row : int
+        Row of `Rows` that proved the last problem inconsistent, -1 when none did.
+
+    Examples
+    --------
+    >>> import impc
+    >>> from plants import yalmip_example
+    >>> plant = impc.Plant(yalmip_example())
+    >>> bounds = impc.Bounds(plant, u_min=-1, u_max=1)
+    >>> truth = impc.Controller(plant, impc.Weights([[1, 0], [0, 1]], 1), bounds, horizon=3)
+    >>> run = truth.simulate([1, 3], steps=20)
+    >>> run.x.shape, run.u.shape, run.complete
+    ((21, 2), (20, 1), True)
+    >>> float(abs(run.u).max().round(9))
+    1.0
+    """
+
+    x: Array
+    u: Array
+    status: np.ndarray[tuple[int], np.dtype[np.int8]]
+    weakly_active: int
+    failed_row: int
+
+    @property
+    def complete(self) -> bool:
+        """Whether every sample was reached."""
+        return bool(np.all(self.status <= Status.SOFTENED))
+
+    @property
+    def reached(self) -> int:
+        """Number of samples with an input."""
+        return int(np.count_nonzero(self.status <= Status.SOFTENED))
+
+
+@dataclass(frozen=True)
+class Sensitivity(Frozen):
+    """Derivatives of a `Simulation` along p directions.
+
+    Attributes
+    ----------
+    x : Array
+        Of the states (steps + 1, n, p).
+    u : Array
+        Of the inputs (steps, m, p).
+    """
+
+    x: Array
+    u: Array
+
+
+@checked(x0="n", steps=(1, 10_000_000))
+def scenario(
+    plant: Plant, x0: ArrayLike, steps: int | None = None, disturbance: ArrayLike | None = None
+) -> Scenario:
+    """Check and freeze an initial state with a number of steps or a disturbance.
+
+    Parameters
+    ----------
+    x0 : array_like
+        (n,).
+    steps : int, optional
+        Needed when there is no disturbance; otherwise its length is taken.
+    disturbance : array_like, optional
+        (steps, d), or (steps,) for a single disturbance.
+
+    Raises
+    ------
+    DataError
+        When something is not finite or of the wrong shape, or neither length is given.
+
+    Examples
+    --------
+    >>> import impc
+    >>> from plants import yalmip_example
+    >>> impc.scenario(impc.Plant(yalmip_example()), x0=[1, 3], steps=20).x0
+    array([1., 3.])
+    """
+    start = finite_array("x0", x0, (plant.n,))
+    count = plant.E.shape[1]
+    if disturbance is None:
+        if steps is None:
+            raise DataError("steps", "got None without a disturbance", "give at least 1")
+        return Scenario(frozen(start), frozen(np.zeros((steps, count))))
+    columns = as_numbers("disturbance", disturbance)
+    given = finite_array(
+        "disturbance", columns[:, None] if columns.ndim == 1 else columns, (steps, count)
+    )
+    return Scenario(frozen(start), frozen(given))
+
+
+@checked
+def require_complete(controller: Controller, simulation: Simulation) -> Simulation:
+    """Return the simulation when every sample was reached.
+
+    Raises
+    ------
+    InfeasibleError
+        When a sample has no input that keeps the bounds: names the bound and the sample.
+    SolverError
+        When the loop diverged or the active-set method found no answer.
+
+    Examples
+    --------
+    >>> import warnings
+    >>> import impc
+    >>> from plants import yalmip_example
+    >>> plant = impc.Plant(yalmip_example())
+    >>> bounds = impc.Bounds(plant, u_min=-1, u_max=1)
+    >>> law = impc.Controller(plant, impc.Weights([[1, 0], [0, 1]], 1), bounds, horizon=3)
+    >>> impc.require_complete(law, law.simulate([1, 3], steps=20)).reached
+    20
+    >>> with warnings.catch_warnings(action="ignore"):
+    ...     run = law.simulate([90, 3], steps=20)
+    >>> impc.require_complete(law, run)
+    Traceback (most recent call last):
+        ...
+    impc.errors.InfeasibleError: x0: no input sequence keeps the bound u <= 1 ...
+    """
+    if simulation.complete:
+        return simulation
+    sample = simulation.reached
+    status = Status(int(simulation.status[sample]))
+    if status is Status.INFEASIBLE:
+        rows = build_rows(controller)
+        name = bound_rows(controller.bounds, controller.plant).names[
+            rows.family[simulation.failed_row]
+        ]
+        stage = int(rows.stage[simulation.failed_row])
+        where = (
+            f"{stage} samples ahead"
+            if stage < controller.horizon
+            else f"in the terminal set, {stage} samples ahead"
+        )
+        raise InfeasibleError(
+            "x0" if sample == 0 else f"sample {sample}",
+            f"no input sequence keeps the bound {name} {where}",
+            "start nearer to the origin, lengthen the horizon, or soften the state bounds",
+        )
+    raise SolverError(
+        f"sample {sample}", status.sentence, "check the plant, the gain and the bounds"
+    )

@@ -1,0 +1,69 @@
+"""What drives a simulation, what comes of it, and what is said where it did not end."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from impc.control.closed_loop import simulate
+from impc.control.controller import Controller
+from impc.control.simulation import Simulation, Status, require_complete, scenario
+from impc.errors import DataError, InfeasibleError, SolverError
+from impc.model.bounds import Bounds
+from impc.model.plant import Plant
+from impc.model.weights import Weights
+
+
+def test_a_diverging_loop_is_named(example_plant: Plant) -> None:
+    bounds = Bounds(example_plant, u_min=-0.1, u_max=0.1)
+    controller = Controller(example_plant, Weights(np.eye(2), 1), bounds, 3, terminal_set=False)
+    run = simulate(controller, scenario(example_plant, [5, 5], 400))
+    assert not run.complete
+    assert np.all(np.isfinite(run.x))
+    with pytest.raises(SolverError, match="left every reasonable range"):
+        require_complete(controller, run)
+
+
+def ended(statuses: list[Status]) -> Simulation:
+    steps = len(statuses)
+    codes = np.array(statuses, dtype=np.int8)
+    return Simulation(np.zeros((steps + 1, 2)), np.zeros((steps, 1)), codes, 0, -1)
+
+
+def test_a_simulation_ends_at_the_first_sample_without_an_input() -> None:
+    whole = ended([Status.FREE, Status.ACTIVE, Status.SOFTENED])
+    assert whole.complete
+    assert whole.reached == 3
+    broken = ended([Status.FREE, Status.ACTIVE, Status.UNSOLVED, Status.NOT_REACHED])
+    assert not broken.complete
+    assert broken.reached == 2
+
+
+@pytest.mark.parametrize("status", list(Status))
+def test_every_status_is_said_in_words(status: Status, example_plant: Plant) -> None:
+    """The statuses with an input are no failure; a failure's words are in the error."""
+    assert len(status.sentence) > 10
+    controller = Controller(
+        example_plant, Weights(np.eye(2), 1), Bounds(example_plant, u_max=1, u_min=-1), 3
+    )
+    run = ended([Status.FREE, status])
+    if status <= Status.SOFTENED:
+        assert require_complete(controller, run) is run
+    elif status is not Status.INFEASIBLE:
+        with pytest.raises(SolverError, match=f"sample 1.*{status.sentence}"):
+            require_complete(controller, run)
+
+
+def test_a_first_state_from_which_no_plan_keeps_the_bound_is_named(example_plant: Plant) -> None:
+    bounds = Bounds(example_plant, u_min=-1, u_max=1)
+    controller = Controller(example_plant, Weights(np.eye(2), 1), bounds, 3)
+    with pytest.raises(InfeasibleError, match=r"x0: .* u\[0\] <= 1 in the terminal set, 3 samples"):
+        require_complete(controller, simulate(controller, scenario(example_plant, [90, 3], 5)))
+
+
+def test_a_scenario_says_what_is_missing(example_plant: Plant) -> None:
+    with pytest.raises(DataError, match="without a disturbance"):
+        scenario(example_plant, [1, 3])
+    with pytest.raises(DataError, match="x0"):
+        scenario(example_plant, [1, np.nan], 5)
+    assert scenario(example_plant, [1, 3], 5).disturbance.shape == (5, 0)
