@@ -1,7 +1,7 @@
 """Whittle's likelihood of the spectrum of residuals, in two models of noise, with its gradient.
 
-The models are those of `loop_noise`; with S the spectrum that a model says and P the periodograms,
-averaged over bins of c ordinates each,
+The models are those of `loop_noise` (docs/fitting.md); with S the spectrum that a model says and P
+the periodograms, averaged over bins of c ordinates each,
 
     misfit = sum c (log det S + tr(S^-1 P)),    d misfit = sum c tr((S^-1 - S^-1 P S^-1) dS).
 """
@@ -56,9 +56,9 @@ class Spectrum:
     Attributes
     ----------
     angles : Array
-        Middle of each bin (b,).
+        Middle of each bin (b,), rad a sample.
     edges : Array
-        (b + 1,).
+        Of the bins (b + 1,), rad a sample.
     counts : Array
         Independent ordinates in each (b,).
     power : Array
@@ -126,13 +126,13 @@ def size(p: int) -> int:
 
 
 def outputs(theta: Array, found: Spectrum) -> tuple[Complex, Callable[[Complex], Array]]:
-    """S_0 (b, p, p), and what reads its gradient off.
+    """S_0 (b, p, p), and what reads its gradient off W (b, p, p) as in the module's text.
 
     Parameters
     ----------
     theta : Array
         Reflection coefficients of each output before tanh, the Cholesky factor of V with logarithms
-        on its diagonal, logarithms of white variances (size(p),).
+        on its diagonal, logarithms of white variances (any,), `size` of them.
     found : Spectrum
     """
     p = len(found.size)
@@ -183,7 +183,7 @@ def _filters(theta: Array, angles: Array) -> tuple[Complex, Complex]:
 def loops(
     theta: Array, shapes: Complex, found: Spectrum
 ) -> tuple[Complex, Callable[[Complex], Array]]:
-    """G W G* (b, p, p), and what reads its gradient off.
+    """G W G* (b, p, p), and what reads its gradient off as for `outputs`.
 
     Parameters
     ----------
@@ -211,7 +211,7 @@ def loops(
 
 
 def root_of(theta: Array) -> float:
-    """Of the noise at the inputs, from the unknowns of `loops` or of both models."""
+    """Of the noise at the inputs, from the unknowns `theta` of `loops` or of both models (any,)."""
     return float(np.tanh(np.clip(theta[-1], -_ROOT, _ROOT)))
 
 

@@ -10,7 +10,6 @@ docs/nonlinear.md has the derivation and an example.
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
 from numbers import Real
 from typing import TYPE_CHECKING, Any
@@ -19,6 +18,15 @@ import casadi as ca
 import numpy as np
 
 from impc.arrays import Array, BoolArray, Frozen, finite_array
+from impc.control.expressions import (
+    function_of,
+    names_of,
+    require_influence,
+    scalar,
+    stacked,
+    symbols_of,
+    with_values,
+)
 from impc.control.optimal_recordings import optimal_recording
 from impc.control.system_equations import is_system, system_equations
 from impc.errors import InputError
@@ -150,26 +158,26 @@ class OptimalControlProblem(Frozen):
     ) -> None:
         _require_horizon(horizon)
         kinds = (states, inputs, [] if disturbances is None else disturbances)
-        x, u, d = (_symbols(name, given) for name, given in
+        x, u, d = (symbols_of(name, given) for name, given in
                    zip(("states", "inputs", "disturbances"), kinds, strict=True))  # fmt: skip
-        theta = [_scalar(name, symbol) for name, symbol in dict(parameters).items()]
+        theta = [scalar(name, symbol) for name, symbol in dict(parameters).items()]
         _require_some(states=x, inputs=u, parameters=theta)
         names = tuple(dict(parameters))
-        path, rows = _stacked(constraints or {})
-        last, terminal_rows = _stacked(terminal_constraints or {})
+        path, rows = stacked(constraints or {})
+        last, terminal_rows = stacked(terminal_constraints or {})
         symbols = (x, u, d, theta)
-        signals = [_names(item) for item in (x, u, d)]
+        signals = [names_of(item) for item in (x, u, d)]
         step, following = _sample_time(dt), next_state
         if is_system(next_state):
             following = system_equations(next_state, (x, u, d), signals, dict(parameters), step)
         functions = (
-            _function("next_state", following, symbols, (len(signals[0]),)),
-            _function("stage_cost", stage_cost, symbols, (1,)),
-            _function("terminal_cost", terminal_cost, symbols, (1,), alone=True),
-            _function("constraints", path, symbols, (len(rows),)),
-            _function("terminal_constraints", last, symbols, (len(terminal_rows),), alone=True),
+            function_of("next_state", following, symbols, (len(signals[0]),)),
+            function_of("stage_cost", stage_cost, symbols, (1,)),
+            function_of("terminal_cost", terminal_cost, symbols, (1,), alone=True),
+            function_of("constraints", path, symbols, (len(rows),)),
+            function_of("terminal_constraints", last, symbols, (len(terminal_rows),), alone=True),
         )
-        _require_influence(names, functions)
+        require_influence(names, functions)
         told, flat = dict(units or {}), [name for group in signals for name in group]
         _require_named((*signed, *(key for key in told if key not in flat)), names)
         moved = ca.DM(functions[3].jac_sparsity(0, 1), 1).full()
@@ -234,7 +242,7 @@ class OptimalControlProblem(Frozen):
             parameter_names=tuple(self.parameter_names[k] for k in free),
             positive=_fixed(self.positive[free]),
             units=tuple(self.units[k] for k in free),
-            functions=tuple(_with_values(item, free, values) for item in self.functions),
+            functions=tuple(with_values(item, free, values) for item in self.functions),
         )
 
     def _changed(self, **fields: Any) -> OptimalControlProblem:
@@ -391,111 +399,6 @@ def _sample_time(dt: Any) -> float | None:
     if isinstance(dt, bool) or not isinstance(dt, Real) or not 0 < float(dt) < np.inf:
         raise InputError("dt", f"got {dt!r:.40}", "give a sample time above 0, s")
     return float(dt)
-
-
-def _with_values(function: Any, free: list[int], values: Array) -> Any:
-    """A function of (x, u, d, theta) as one of the free entries of theta."""
-    given = [ca.MX.sym(letter, function.numel_in(k)) for k, letter in enumerate("xud")]
-    left = ca.MX.sym("p", len(free))
-    whole = ca.MX(ca.DM(values))
-    whole[free] = left
-    return _expanded(ca.Function(function.name(), [*given, left], [function(*given, whole)]))
-
-
-def _symbols(subject: str, given: Any) -> list[Any]:
-    """Symbols of SX or MX; SX are taken apart, so that each has its name."""
-    items = given if isinstance(given, list | tuple) else [given]
-    found: list[Any] = []
-    for item in items:
-        if not isinstance(item, ca.SX | ca.MX) or not item.is_valid_input():
-            raise InputError(
-                subject, f"got {type(item).__name__}, not symbols", "make them with casadi's sym"
-            )
-        found += ca.vertsplit(ca.vec(item)) if isinstance(item, ca.SX) else [ca.vec(item)]
-    return found
-
-
-def _scalar(name: str, symbol: Any) -> Any:
-    if len(found := _symbols(f"parameter {name}", symbol)) != 1 or found[0].numel() != 1:
-        raise InputError(f"parameter {name}", "is not a scalar symbol", "give one symbol a name")
-    return found[0]
-
-
-def _names(symbols: Iterable[Any]) -> tuple[str, ...]:
-    """Of scalars their own; of the entries of MX, the vector's with a number."""
-    return tuple(
-        name
-        for item in symbols
-        for name in (
-            [item.name()]
-            if item.numel() == 1
-            else [f"{item.name()}[{k}]" for k in range(item.numel())]
-        )
-    )
-
-
-def _stacked(given: Mapping[str, Any]) -> tuple[Any, tuple[str, ...]]:
-    """Expressions below each other, and a name for each row."""
-    parts: list[Any] = []
-    names: list[str] = []
-    for name, expression in given.items():
-        part = ca.vec(expression) if isinstance(expression, ca.SX | ca.MX) else ca.DM(expression)
-        parts.append(part)
-        size = part.numel()
-        names += [name] if size == 1 else [f"{name}[{row}]" for row in range(size)]
-    return (ca.vertcat(*parts) if parts else ca.DM.zeros(0, 1)), tuple(names)
-
-
-def _function(
-    name: str, expression: Any, symbols: Sequence[list[Any]], size: tuple[int], alone: bool = False
-) -> Any:
-    """A function of (x, u, d, theta) in SX where CasADi can; `alone`: of x and theta only."""
-    flat = [item for group in symbols for item in group]
-    kind: Any = ca.SX if isinstance(flat[0], ca.SX) else ca.MX
-    if any(not isinstance(item, kind) for item in flat):
-        raise InputError("symbols", "are of SX and of MX", "make all of them with one of the two")
-    try:
-        vector = ca.densify(kind(expression))
-        raw = ca.Function(name, flat, [vector], {"allow_free": True})
-    except (NotImplementedError, TypeError, RuntimeError):
-        raise InputError(
-            name, f"got {type(expression).__name__}", f"give an expression of {kind.__name__}"
-        ) from None
-    if vector.shape != (size[0], 1) and not (size[0] == 0 and vector.numel() == 0):
-        raise InputError(name, f"has shape {vector.shape}", f"give ({size[0]}, 1)")
-    if raw.has_free():
-        raise InputError(
-            name, f"has the symbol {', '.join(raw.get_free())}",
-            "which is neither a state, an input, a disturbance nor a parameter: give it a value",
-        )  # fmt: skip
-    outer = [ca.MX.sym(letter, sum(i.numel() for i in group))
-             for letter, group in zip("xudp", symbols, strict=True)]  # fmt: skip
-    parts: list[Any] = []
-    for whole, group in zip(outer, symbols, strict=True):
-        ends = np.cumsum([0, *(item.numel() for item in group)])
-        parts += [whole[int(a) : int(b)] for a, b in itertools.pairwise(ends)]
-    made = ca.Function(name, outer, [raw(*parts)])
-    if alone and any(made.jac_sparsity(0, index).nnz() for index in (1, 2)):
-        raise InputError(name, "depends on an input or a disturbance", "give it of the last state")
-    return _expanded(made)
-
-
-def _expanded(made: Any) -> Any:
-    try:
-        return made.expand()
-    except RuntimeError:  # it calls what has no scalar form, such as an integrator
-        return made
-
-
-def _require_influence(names: Sequence[str], functions: Sequence[Any]) -> None:
-    """Every parameter is in an expression."""
-    seen = np.zeros(len(names), dtype=bool)
-    for function in functions:
-        if function.numel_out(0):
-            seen |= np.array(ca.DM(function.jac_sparsity(0, 3), 1).full()).any(axis=0)
-    for name, there in zip(names, seen, strict=True):
-        if not there:
-            raise InputError(f"parameter {name}", "is in no expression", "take it out")
 
 
 def _require_some(**given: Sequence[Any]) -> None:

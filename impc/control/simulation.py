@@ -1,7 +1,8 @@
 """What drives a simulation and what comes of it, sample by sample.
 
 A simulation never raises for what happens on the way: it has a `Status` for each sample, and
-`require_complete` turns a failure into an error that names bound and sample.
+`require_complete` turns a failure into an error that names bound and sample. The loop itself is in
+docs/theory.md, section 4.
 """
 
 from __future__ import annotations

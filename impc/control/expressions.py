@@ -1,0 +1,204 @@
+"""Expressions and symbols of CasADi that a user gives, checked, and made functions.
+
+Every function is one of (x, u, d, theta), in SX where CasADi can: a scalar form is evaluated
+fastest (docs/nonlinear.md).
+"""
+
+from __future__ import annotations
+
+import itertools
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+
+from impc.errors import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+
+    from impc.arrays import Array
+
+__all__ = [
+    "function_of",
+    "names_of",
+    "require_influence",
+    "scalar",
+    "stacked",
+    "symbols_of",
+    "with_values",
+]
+
+
+def with_values(function: Any, free: list[int], values: Array) -> Any:
+    """A function of (x, u, d, theta) as one of the free entries of theta.
+
+    Parameters
+    ----------
+    function : casadi.Function
+        Of `function_of`.
+    free : list of int
+        Which entries of theta stay.
+    values : Array
+        All of theta (any,); those that are free count for nothing.
+    """
+    given = [ca.MX.sym(letter, function.numel_in(k)) for k, letter in enumerate("xud")]
+    left = ca.MX.sym("p", len(free))
+    whole = ca.MX(ca.DM(values))
+    whole[free] = left
+    return _expanded(ca.Function(function.name(), [*given, left], [function(*given, whole)]))
+
+
+def symbols_of(subject: str, given: Any) -> list[Any]:
+    """Symbols of SX or MX; SX are taken apart, so that each has its name.
+
+    Parameters
+    ----------
+    subject : str
+        What an error is about.
+    given : SX, MX or list of them
+        What should be symbols.
+
+    Raises
+    ------
+    InputError
+        When something is no symbol.
+    """
+    items = given if isinstance(given, list | tuple) else [given]
+    found: list[Any] = []
+    for item in items:
+        if not isinstance(item, ca.SX | ca.MX) or not item.is_valid_input():
+            raise InputError(
+                subject, f"got {type(item).__name__}, not symbols", "make them with casadi's sym"
+            )
+        found += ca.vertsplit(ca.vec(item)) if isinstance(item, ca.SX) else [ca.vec(item)]
+    return found
+
+
+def scalar(name: str, symbol: Any) -> Any:
+    """The symbol of a parameter.
+
+    Parameters
+    ----------
+    name : str
+        That of the parameter.
+    symbol : SX or MX
+        What should be one.
+
+    Raises
+    ------
+    InputError
+        When it is not one scalar symbol.
+    """
+    if len(found := symbols_of(f"parameter {name}", symbol)) != 1 or found[0].numel() != 1:
+        raise InputError(f"parameter {name}", "is not a scalar symbol", "give one symbol a name")
+    return found[0]
+
+
+def names_of(symbols: Iterable[Any]) -> tuple[str, ...]:
+    """Of scalar `symbols` their own; of the entries of MX, the vector's with a number."""
+    return tuple(
+        name
+        for item in symbols
+        for name in (
+            [item.name()]
+            if item.numel() == 1
+            else [f"{item.name()}[{k}]" for k in range(item.numel())]
+        )
+    )
+
+
+def stacked(given: Mapping[str, Any]) -> tuple[Any, tuple[str, ...]]:
+    """The expressions of `given` below each other, by name, and a name for each row."""
+    parts: list[Any] = []
+    names: list[str] = []
+    for name, expression in given.items():
+        part = ca.vec(expression) if isinstance(expression, ca.SX | ca.MX) else ca.DM(expression)
+        parts.append(part)
+        size = part.numel()
+        names += [name] if size == 1 else [f"{name}[{row}]" for row in range(size)]
+    return (ca.vertcat(*parts) if parts else ca.DM.zeros(0, 1)), tuple(names)
+
+
+def function_of(
+    name: str, expression: Any, symbols: Sequence[list[Any]], size: tuple[int], alone: bool = False
+) -> Any:
+    """A function of (x, u, d, theta) in SX where CasADi can.
+
+    Parameters
+    ----------
+    name : str
+        Of the function, and what an error is about.
+    expression : SX, MX or number
+        A column of that many rows.
+    symbols : sequence of list
+        Those of states, inputs, disturbances and parameters.
+    size : tuple of int
+        Rows that the expression has to have.
+    alone : bool
+        Whether it may be of x and theta only.
+
+    Raises
+    ------
+    InputError
+        When the expression is none, is of another size, or has other symbols.
+    """
+    flat = [item for group in symbols for item in group]
+    kind: Any = ca.SX if isinstance(flat[0], ca.SX) else ca.MX
+    if any(not isinstance(item, kind) for item in flat):
+        raise InputError("symbols", "are of SX and of MX", "make all of them with one of the two")
+    try:
+        vector = ca.densify(kind(expression))
+        raw = ca.Function(name, flat, [vector], {"allow_free": True})
+    except (NotImplementedError, TypeError, RuntimeError):
+        raise InputError(
+            name, f"got {type(expression).__name__}", f"give an expression of {kind.__name__}"
+        ) from None
+    if vector.shape != (size[0], 1) and not (size[0] == 0 and vector.numel() == 0):
+        raise InputError(name, f"has shape {vector.shape}", f"give ({size[0]}, 1)")
+    if raw.has_free():
+        raise InputError(
+            name, f"has the symbol {', '.join(raw.get_free())}",
+            "which is neither a state, an input, a disturbance nor a parameter: give it a value",
+        )  # fmt: skip
+    outer = [ca.MX.sym(letter, sum(i.numel() for i in group))
+             for letter, group in zip("xudp", symbols, strict=True)]  # fmt: skip
+    parts: list[Any] = []
+    for whole, group in zip(outer, symbols, strict=True):
+        ends = np.cumsum([0, *(item.numel() for item in group)])
+        parts += [whole[int(a) : int(b)] for a, b in itertools.pairwise(ends)]
+    made = ca.Function(name, outer, [raw(*parts)])
+    if alone and any(made.jac_sparsity(0, index).nnz() for index in (1, 2)):
+        raise InputError(name, "depends on an input or a disturbance", "give it of the last state")
+    return _expanded(made)
+
+
+def _expanded(made: Any) -> Any:
+    try:
+        return made.expand()
+    except RuntimeError:  # it calls what has no scalar form, such as an integrator
+        return made
+
+
+def require_influence(names: Sequence[str], functions: Sequence[Any]) -> None:
+    """Every parameter is in an expression.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Of the parameters.
+    functions : sequence of casadi.Function
+        Of `function_of`.
+
+    Raises
+    ------
+    InputError
+        When one is in none.
+    """
+    seen = np.zeros(len(names), dtype=bool)
+    for function in functions:
+        if function.numel_out(0):
+            seen |= np.array(ca.DM(function.jac_sparsity(0, 3), 1).full()).any(axis=0)
+    for name, there in zip(names, seen, strict=True):
+        if not there:
+            raise InputError(f"parameter {name}", "is in no expression", "take it out")
