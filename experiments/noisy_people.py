@@ -1,9 +1,10 @@
-"""People of the study of noise, who sense positions and velocities: on a cart, and on the seat.
+"""People of the study of noise, who sense positions and velocities: carts, and the seat.
 
-A cart of two states under a push of three levels, or the linear seated subject under the ternary
-torque. Noise is in the motor, in the senses, or in both, of a size that leaves the motion without
-noise a VAF of 90 or 70 %; the limit of the command is far away, or met at a tenth of the samples
-and more. Prices are log-uniform within a factor of two. At the limit some on the seat fall.
+A cart of two states under a push of three levels, two such carts with a spring between them and an
+input each, or the linear seated subject under the ternary torque. Noise is in the motor, in the
+senses, or in both, of a size that leaves the motion without noise a VAF of 90 or 70 %; the limit of
+the command is far away, or met at a tenth of the samples and more (of two carts: at 3 to 13 %).
+Prices are log-uniform within a factor of two. At the limit some on the seat fall.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ __all__ = ["BODIES", "NOISES", "Recorded", "Subject", "recorded", "subject"]
 #: Noise of each kind before it is scaled, as shares of the sizes that a body has: motor, senses.
 NOISES = {"motor": (1.0, 0.1), "sensory": (0.05, 1.0), "both": (1.0, 1.0)}
 #: Who moves what.
-BODIES = ("cart", "seat")
+BODIES = ("cart", "seat", "pair")
 _TRIALS, _FACTOR = 3, 2.0
 # Of the standard deviation of the recorded motion.
 _RECORDER = 0.02
@@ -58,7 +59,7 @@ class Subject:
     recorder : Array
         Standard deviations of the recorder's noise (p,).
     pushes : sequence of Array
-        Of each trial (samples,).
+        Of each trial (samples,), of two carts (samples, 2).
     """
 
     controller: Controller
@@ -93,7 +94,7 @@ def subject(body: str, seed: int, noise: str, share: float, limit: float) -> Sub
     """A subject whose motion without noise has a VAF of about `share` %."""
     kind = [BODIES.index(body), list(NOISES).index(noise)]
     rng = np.random.default_rng([seed, round(share), *kind, round(100 * limit)])
-    law, pushes = (_on_cart if body == "cart" else _on_seat)(rng, limit)
+    law, pushes = {"cart": _on_cart, "seat": _on_seat, "pair": _on_pair}[body](rng, limit)
     low, high = _SIZES
     for _ in range(_HALVINGS):
         middle = (low + high) / 2
@@ -142,6 +143,26 @@ def _on_cart(rng: np.random.Generator, limit: float) -> tuple[Controller, list[A
     return law, [np.repeat(rng.choice([-0.7, 0.0, 0.7], 60), 10) for _ in range(_TRIALS)]
 
 
+def _on_pair(rng: np.random.Generator, limit: float) -> tuple[Controller, list[Array]]:
+    """Two such masses with a spring of 2 N/m between them, each pushed and each with an input."""
+    A = np.array(np.kron(np.eye(2), [[1, 0.05], [0, 0.98]]), dtype=np.float64)
+    A[1::2, ::2] += 0.05 * 2.0 * np.array([[-1, 1], [1, -1]])
+    B = np.zeros((4, 4))
+    B[1::2, :2] = B[1::2, 2:] = 0.05 * np.eye(2)
+    system = control.ss(
+        A, B, np.eye(4)[::2], 0, 0.05, states=["x1", "v1", "x2", "v2"],
+        inputs=["u1", "u2", "push1", "push2"], outputs=["x1", "x2"],
+    )  # fmt: skip
+    plant = Plant(system, ["u1", "u2"])
+    prices = np.array([8.0, 1.0, 8.0, 1.0]) * _factors(rng, 4)
+    weights = Weights(np.diag(prices), np.diag([1.0, float(_factors(rng, 1)[0])]))
+    law = Controller(
+        plant, weights, Bounds(plant, u_min=-limit, u_max=limit), 5, terminal_set=False
+    )
+    levels = [-0.7, 0.0, 0.7]
+    return law, [np.repeat(rng.choice(levels, (60, 2)), 10, axis=0) for _ in range(_TRIALS)]
+
+
 def _on_seat(rng: np.random.Generator, limit: float) -> tuple[Controller, list[Array]]:
     """The seated subject of the benchmarks, 100 samples a second, 30 s a trial."""
     work = seat(1, 2.0)
@@ -163,6 +184,8 @@ def _person(body: str, plant: Plant, noise: str, size: float) -> Observer:
     motor, look = np.array(NOISES[noise]) * size
     if body == "cart":  # 1 N, 5 cm, 10 cm/s
         return Observer(plant, ["x", "v"], motor=motor, sensory=[0.05 * look, 0.1 * look])
+    if body == "pair":
+        return Observer(plant, plant.states, motor=motor, sensory=[0.05 * look, 0.1 * look] * 2)
     angle = np.radians(look)  # 3 Nm, 1 deg, 10 deg/s
     sensed = ["theta1", "theta2", "theta1_rate", "theta2_rate"]
     return Observer(plant, sensed, motor=3 * motor, sensory=[angle, angle, 10 * angle, 10 * angle])

@@ -134,8 +134,14 @@ def person_covariance(fit: PersonFit, kind: str = "sandwich") -> PersonCovarianc
         raise InputError("kind", f"got {kind!r}", f"give one of {', '.join(KINDS)}")
     information = _observed(fit) if kind == "observed" else np.array(fit.told.information)
     values, vectors = np.linalg.eigh(information)
-    bread = (vectors / np.maximum(values, _FARTHEST**-2)) @ vectors.T
-    return _described(fit, kind, bread @ _meat(fit) @ bread if kind == "sandwich" else bread)
+    kept = np.maximum(values, _FARTHEST**-2)
+    unit = vectors / np.sqrt(kept)
+    if kind != "sandwich":
+        return _described(fit, kind, unit @ unit.T)
+    # As seen where the information is one, and with as much of the prior as it needs for that: of a
+    # direction that is not told scores are rounding, and the bread is the square of 1e6.
+    middle = _meat(fit, unit) + np.diag(1 - np.minimum(values, kept) / kept)
+    return _described(fit, kind, unit @ middle @ unit.T)
 
 
 def _described(fit: PersonFit, kind: str, covariance: Array) -> PersonCovariance:
@@ -183,11 +189,14 @@ def _observed(fit: PersonFit) -> Array:
     return np.asarray((found + found.T) / 2)
 
 
-def _meat(fit: PersonFit) -> Array:
-    """Covariance of the sum of all scores (Newey and West 1987, up to the root of the length)."""
+def _meat(fit: PersonFit, unit: Array) -> Array:
+    """Covariance of the sum of all scores along the columns of `unit` (q, q).
+
+    By Newey and West (1987), up to the root of the length.
+    """
     total = np.zeros((len(fit.theta),) * 2)
-    for scores in fit.told.scores:
-        lags = int(np.sqrt(len(scores)))
+    for own in fit.told.scores:
+        scores, lags = own @ unit, int(np.sqrt(len(own)))
         total += scores.T @ scores
         for lag in range(1, lags + 1):
             both = scores[lag:].T @ scores[:-lag] * (1 - lag / (lags + 1))

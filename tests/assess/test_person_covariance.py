@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from experiments.noisy_people import recorded, subject
+from experiments.noisy_people_score import blind
 from impc.assess.person_covariance import confusion, person_covariance
 from impc.errors import InputError
 from impc.inverse.likelihood_fit import PersonFit, fit_person
@@ -56,3 +58,20 @@ def test_the_step_that_is_least_told_apart(fitted: PersonFit) -> None:
 def test_an_unknown_kind_is_refused(fitted: PersonFit) -> None:
     with pytest.raises(InputError, match="expected, observed, sandwich"):
         person_covariance(fitted, "robust")
+
+
+def test_a_direction_that_nothing_tells_leaves_the_others_as_they_are() -> None:
+    """Two inputs and no limit: the metric of the inputs moves no command, nor any likelihood.
+
+    Deviations by the sandwich had been none along four directions of seven.
+    """
+    who = subject("pair", 0, "motor", 90.0, 5.0)
+    found = fit_person(estimate(recorded(who, 0).problem), blind(who))
+    assert np.linalg.eigvalsh(found.told.information)[0] < 1e-8
+    robust, expected = person_covariance(found), person_covariance(found, "expected")
+    assert np.linalg.eigvalsh(robust.covariance)[0] > 0
+    np.testing.assert_allclose(robust.deviations, expected.deviations, rtol=0.3)
+    np.testing.assert_allclose(robust.entries, expected.entries, rtol=0.3)
+    assert robust.deviations[-1] > 100
+    off = (np.array(found.K) - np.array(who.controller.K)) / robust.entries
+    assert np.all(np.abs(off) < 3)
