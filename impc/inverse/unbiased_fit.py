@@ -7,17 +7,19 @@ is beside the truth. With b(theta) its mean over recordings of the person at the
     score(theta) - b(theta)  +  slope of the prior  =  0,
 
 which has no bias whatever the filter leaves out: an estimating function whose mean is zero at the
-truth, as in indirect inference (Gourieroux, Monfort and Renault 1993). It is solved by Newton's
-steps from the largest likelihood, with the curvature C there,
+truth, as in indirect inference (Gourieroux, Monfort and Renault 1993). It is solved by one step of
+Newton's from the largest likelihood, with mean and curvature C there,
 
-    theta  <-  theta_0 - C^-1 b(theta),
+    theta  =  theta_0 - C^-1 b(theta_0),
 
-for b changes little over a few deviations. (A search for the largest of F - b'theta costs twice as
-much and stays where it is on a kink: between two jumps of the likelihood lies a maximum that a
-slope of half a nat for each deviation does not move.) The mean is taken away along directions of
-the gain that are told, levels and initial states follow on their ridge: along levels that are
-weakly told it moved them by powers of e, and along directions of the gain that are not the
-likelihood is no parabola over a deviation.
+for b changes little over a few deviations. (Once more from where that ends is no better: there the
+likelihood of the recordings is not at its best, and scores scatter by more. A search for the
+largest of F - b'theta stays where it is on a kink: between two jumps of the likelihood lies a
+maximum that a slope of half a nat for each deviation does not move.) The mean is taken away along
+directions of the gain that are told, levels and initial states follow on their ridge: along levels
+that are weakly told it moved them by powers of e, and along directions of the gain that are not the
+likelihood is no parabola over a deviation. Where it is none along the step either, as with two
+inputs in one of three people, the step is shortened.
 """
 
 from __future__ import annotations
@@ -40,11 +42,13 @@ if TYPE_CHECKING:
 
 __all__ = ["TiltedPrior", "Unbiased", "unbiased"]
 
-# Means that are found, one before each step, and sets of trials for each: 32 sets add a thirtieth
-# to the variance of the gain.
-_ROUNDS, _SETS = 2, 16
-# Deviations within which a mean is as it was found, and as far as it may move the gain.
+# Sets of trials for the mean: they add a thirtieth to the variance of the gain.
+_SETS = 32
+# Deviations within which a mean is as it was found.
 _NEAR = 2.0
+# Shares of the step that are tried, until the likelihood of the recordings falls by what the
+# parabola says and not by so much more, nats: it is rough by half a nat.
+_SHARES, _APART = (1.0, 0.5, 0.25, 0.125), 1.0
 # A direction of the gain whose deviation is larger, in natural coordinates, is not told: what
 # likelihoods say a deviation to either side of it is no slope.
 _TOLD = 0.25
@@ -112,25 +116,27 @@ def unbiased(fit: PersonFit) -> Unbiased:
         return Unbiased(fit, "")
     begin = first.placed(np.array(fit.theta), fit.told)
     curvature = first.parabola(begin, np.array(fit.unseen))[1]
-    root, told = np.linalg.cholesky(curvature), _told(curvature, first.space.gain)
-    place, means, size = begin, [], 0.0
-    slope = np.zeros(len(begin.theta))
     try:
-        for seed in range(_ROUNDS):
-            mean = simulated_score(first, place.theta, seed, _SETS)
-            means.append(_believed(curvature, mean))
-            slope = told @ -np.mean(means, axis=0)
-            size = float(np.linalg.norm(np.linalg.solve(root, slope)))
-            slope *= _NEAR / max(size, _NEAR)
-            place = first.at(begin.theta + np.linalg.solve(curvature, slope))
+        mean = _believed(curvature, simulated_score(first, begin.theta, 0, _SETS))
     except ImpcError as error:
         return Unbiased(fit, str(error))
-    prior = TiltedPrior(first, place.theta, slope, curvature)
+    slope = -_told(curvature, first.space.gain) @ mean
+    step = np.linalg.solve(curvature, slope)
+    size = float(np.sqrt(slope @ step))
+    worth = f"it is worth {size:.1f} standard deviations"
+    for share in _SHARES:
+        place = first.tried(begin.theta + share * step)
+        lost = np.inf if place is None else begin.value - place.value
+        if place is not None and lost < (share * size) ** 2 / 2 + _APART:
+            break
+    else:
+        return Unbiased(fit, f"{worth}, and the likelihood is no parabola")
+    prior = TiltedPrior(first, place.theta, share * slope, curvature)
     unseen = unseen_slope(first, place)
     found = prior.placed(place.theta, place.told)
-    moved = person_at(prior, found, unseen, fit.converged, fit.evaluations + _ROUNDS)
-    far = f"it is worth {size:.1f} standard deviations, and {_NEAR:.0f} are taken away at most"
-    return Unbiased(moved, far if size > _NEAR else "")
+    moved = person_at(prior, found, unseen, fit.converged, fit.evaluations + 1)
+    part = f"{worth}, and the likelihood a parabola over {share * size:.1f} of them alone"
+    return Unbiased(moved, part if share < 1 else "")
 
 
 def _believed(curvature: Array, found: SimulatedScore) -> Array:

@@ -57,23 +57,36 @@ def test_a_mean_that_is_not_found_leaves_the_fit_and_says_why(
     assert "runs away in every simulated trial" in reason
 
 
-def test_a_mean_that_is_too_large_is_taken_away_in_part_and_said(
-    met: PersonFit, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("deviations", [1.5, 12.0, 400.0])
+def test_no_farther_than_the_likelihood_is_a_parabola(
+    met: PersonFit, monkeypatch: pytest.MonkeyPatch, deviations: float
 ) -> None:
     theta, q = np.array(met.theta), len(met.theta)
-    curvature = met.prior.parabola(met.prior.placed(theta, met.told), np.array(met.unseen))[1]
+    begin = met.prior.placed(theta, met.told)
+    curvature = met.prior.parabola(begin, np.array(met.unseen))[1]
     root = np.linalg.cholesky(curvature)
-    way = np.zeros(q)
-    way[0] = 5.0 / np.linalg.norm(np.linalg.solve(root, np.eye(q)[0]))
+    unit = np.eye(q)[0]
+    mean = deviations / np.linalg.norm(np.linalg.solve(root, unit)) * unit
 
     def large(*_: object) -> SimulatedScore:
-        return SimulatedScore(way, np.zeros((q, q)))
+        return SimulatedScore(mean, np.zeros((q, q)))
 
     monkeypatch.setattr(unbiased_fit, "simulated_score", large)
     found, reason = unbiased(met)
-    assert "5.0 standard deviations" in reason
-    step = np.array(found.theta) - theta
-    assert np.linalg.norm(root.T @ step) == pytest.approx(2.0)
+    moved = float(np.linalg.norm(root.T @ (np.array(found.theta) - theta)))
+    if deviations == 1.5:
+        assert reason == ""
+        assert moved == pytest.approx(1.5)
+    elif deviations == 12.0:
+        assert reason.startswith("it is worth 12.0 standard deviations, and")
+        assert moved in [pytest.approx(share * 12.0) for share in (0.5, 0.25, 0.125)]
+        there = met.prior.at(np.array(found.theta))
+        assert begin.value - there.value < moved**2 / 2 + 1
+        further = met.prior.tried(theta + 2 * (np.array(found.theta) - theta))
+        assert further is None or begin.value - further.value > (2 * moved) ** 2 / 2 + 1
+    else:
+        assert found is met
+        assert reason.endswith("the likelihood is no parabola")
 
 
 def test_the_tilt_of_a_prior_has_the_slope_that_it_says(met: PersonFit) -> None:
@@ -95,13 +108,6 @@ def test_the_tilt_of_a_prior_has_the_slope_that_it_says(met: PersonFit) -> None:
     assert exact == pytest.approx(extrapolated_slope(moved, 1e-3)[0], rel=1e-6)
 
 
-def test_where_no_bound_is_met_nothing_changes() -> None:
-    fit = fit_person(estimate(problem(50.0)), person())
-    found, reason = unbiased(fit)
-    assert found is fit
-    assert reason == ""
-
-
 def test_along_directions_that_are_not_told_nothing_moves(
     met: PersonFit, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -117,4 +123,11 @@ def test_along_directions_that_are_not_told_nothing_moves(
     monkeypatch.setattr(unbiased_fit, "_TOLD", 1e-9)
     found, reason = unbiased(met)
     np.testing.assert_allclose(found.theta, theta, rtol=1e-12)
+    assert reason == ""
+
+
+def test_where_no_bound_is_met_nothing_changes() -> None:
+    fit = fit_person(estimate(problem(50.0)), person())
+    found, reason = unbiased(fit)
+    assert found is fit
     assert reason == ""
