@@ -109,8 +109,8 @@ def _moved(report: PersonReport) -> list[str]:
         return []
     if report.moved == 0:
         return [
-            f"{nearly} for this person could not be found by simulation ({report.biased}). The "
-            "gain is the likeliest, and may be a standard deviation and more beside the truth."
+            f"{nearly} for this person could not be taken away by simulation ({report.biased}). "
+            "The gain is the likeliest, and may be a standard deviation and more beside the truth."
         ]
     left = f" Not all of it: {report.biased}." if report.biased else ""
     rough = "" if report.fit.converged else " The likelihood is rough where its search ended."

@@ -120,7 +120,7 @@ def test_the_page_says_how_far_the_gain_is_from_the_likeliest() -> None:
     assert nothing == []
     assert said[0].endswith("moved the gain by up to 1.2 standard deviations.")
     assert partly[0].endswith("1.2 standard deviations. Not all of it: half is left.")
-    assert "could not be found by simulation (everybody runs away)" in sorry[0]
+    assert "could not be taken away by simulation (everybody runs away)" in sorry[0]
     # In this cart's trials the limit is met.
     step = np.abs(np.array(report.fit.K) - np.array(report.models[0].fit.K))
     assert (report.moved > 0) == bool(np.any(step > 0))
