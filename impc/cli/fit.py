@@ -83,7 +83,7 @@ def _print(result: FitResult) -> None:
     """The table of methods and the intent, as the page has them."""
     from impc.assess.intent_rules import dominant_sentence  # noqa: PLC0415
     from impc.studies.fit.person import person_sentences  # noqa: PLC0415
-    from impc.studies.fit.structures import structure_sentences  # noqa: PLC0415
+    from impc.studies.fit.structure_words import structure_sentences  # noqa: PLC0415
     from impc.studies.fit.verdict import verdict  # noqa: PLC0415
     from impc.studies.methods_table import methods_table  # noqa: PLC0415
 

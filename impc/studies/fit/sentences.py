@@ -10,7 +10,7 @@ from impc.assess.covariance import DETERMINED, TOLD
 from impc.assess.intent_rules import dominant_sentence
 from impc.studies.fit.person import person_sentences
 from impc.studies.fit.result import trial_name
-from impc.studies.fit.structures import structure_sentences
+from impc.studies.fit.structure_words import structure_sentences
 
 if TYPE_CHECKING:
     from impc.files.plant_sources import PlantSource

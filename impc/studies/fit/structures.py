@@ -1,4 +1,4 @@
-"""What a fit says of structures of the weights: sentences, tables, a picture, numbers."""
+"""What a fit says of structures of the weights: tables, a picture, numbers (docs/structures.md)."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from impc.assess.covariance import TWO_SIDED
 from impc.assess.long_run_covariance import residual_noise
 from impc.assess.other_models import residuals_of
 from impc.assess.structured_weights import TOLD_FACTOR
@@ -15,38 +14,25 @@ from impc.assess.structures import criterion_of
 from impc.reporting.document import Block, Details, Heading, Picture, Section, TextTable, table_of
 from impc.reporting.rendering import number
 from impc.reporting.style import BLUE, INK, VERMILLION, new_figure
+from impc.studies.fit.structure_words import ends, factor_of, probability
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from impc.arrays import Array
     from impc.assess.price_profiles import PriceInterval
-    from impc.assess.structures import Ratio, StructureFit
+    from impc.assess.structures import StructureFit
     from impc.studies.fit.result import FitResult
 
 __all__ = [
     "price_figure",
     "structure_data",
     "structure_section",
-    "structure_sentences",
 ]
 
-# A test that refuses a departure less often than this has not looked.
-_BLIND = 0.1
 _WIDTH = 4.2  # inches, so that its words can be read on a phone
 # Parts of a combination below this are not named.
 _NAMED = 0.15
-# docs/structures.md, What was measured.
-_AT_ZERO = (
-    "Where the best price is zero, intervals of 95 % held the truth of simulated seats in 78 to "
-    "96 %: take those of all prices for somewhat wider."
-)
-# The test holds its level where noise is in the recorder and the plant is the body.
-_OF_THE_MODEL = (
-    "The recordings also show an error of the body's model or of the controller's, whatever the "
-    "weights: that alone makes the test refuse a structure, so that the refusal may not be the "
-    "structure's fault."
-)
 _PICTURE = Picture(
     "structured-weights",
     "Prices of the features with their intervals, one row each, on a logarithmic axis",
@@ -54,26 +40,6 @@ _PICTURE = Picture(
     "for the colour of the residuals. An arrow: no lower end, the price may be zero.",
     narrow=True,
 )
-
-
-def structure_sentences(result: FitResult) -> tuple[str, ...]:
-    """What may be said within the first structure; nothing where none was asked for."""
-    if not result.structures:
-        return ()
-    found = result.structures[0]
-    lines = [_verdict(found)]
-    if found.estimate is None:
-        return tuple(lines)
-    other = result.diagnostics.structure
-    if found.refused and other is not None and other.found:
-        lines.append(_OF_THE_MODEL)
-    lines.append(_explains(result, found))
-    if not found.refused:
-        lines += [*_prices(found), _told(found)]
-        prices = found.estimate.prices
-        lines += [_AT_ZERO] if prices is not None and np.any(np.isneginf(prices)) else []
-    power = _power(found)
-    return (*lines, *([power] if power else []))
 
 
 def structure_section(result: FitResult) -> Section:
@@ -126,160 +92,6 @@ def price_figure(result: FitResult) -> Figure:
     return figure
 
 
-def _verdict(found: StructureFit) -> str:
-    name, test = found.structure.name, found.test
-    if test is None:
-        return f"Nothing can be said within the structure “{name}”: {found.reason}."
-    if test.refused:
-        return (
-            f"The recordings refuse the structure “{name}”: other gains explain what its weights "
-            f"leave ({_probability(test.probability)}, {test.freedom} directions of the gain). "
-            "What it says of prices is not the subject's."
-        )
-    if test.freedom == 0:
-        return (
-            f"Within the structure “{name}” statements on prices need no convention. Whether it "
-            "holds was not tested: the recordings tell nothing of the gain beyond it."
-        )
-    return (
-        f"Within the structure “{name}”, which the recordings do not refuse "
-        f"({_probability(test.probability)}, {test.freedom} directions of the gain), statements on "
-        "prices need no convention."
-    )
-
-
-def _explains(result: FitResult, found: StructureFit) -> str:
-    outputs = result.fitted.problem.plant.outputs
-    own = ", ".join(
-        f"{value:.2f} % of {name}" for value, name in zip(found.vaf, outputs, strict=True)
-    )
-    text = f"Its {found.structure.count} unknowns account for {own} (VAF)"
-    if not np.any(np.isnan(found.held_out)):
-        held = [f"{value:.2f} %" for value in found.held_out]
-        text += f", in trials left out for {' and '.join(held)}"
-    free = " and ".join(f"{value:.2f} %" for value in result.inverse_mpc.vaf)
-    return f"{text}; weights of any kind for {free}."
-
-
-def _prices(found: StructureFit) -> list[str]:
-    lines = []
-    for ratio in _tree(found.ratios):
-        lines.append(
-            f"Within it {ratio.first} costs {number(float(np.exp(ratio.interval.value)), 2)} times "
-            f"as much as {ratio.second}, at the size that they have in the recordings "
-            f"(95 %: {_ends(ratio.interval)})."
-        )
-    if found.ratios and not lines:
-        lines.append(
-            f"No ratio of two of its prices is told to a factor of {TOLD_FACTOR:g} at 95 %."
-        )
-    for index, label in enumerate(found.structure.labels):
-        item = found.intervals[index]
-        if item.low == -np.inf and np.isfinite(item.high) and found.ratios:
-            at_size = item.high + 2 * np.log(found.sizes[index]) - np.log(found.effort)
-            lines.append(
-                f"{label} may cost nothing: at most {number(float(np.exp(at_size)), 2)} times as "
-                f"much as {found.structure.input_labels[0]}, at the size that they have (95 %)."
-            )
-    return lines
-
-
-def _tree(ratios: tuple[Ratio, ...]) -> list[Ratio]:
-    """The best told ratios that do not follow from one another."""
-    group: dict[str, str] = {}
-
-    def root(label: str) -> str:
-        while label in group:
-            label = group[label]
-        return label
-
-    kept = []
-    for ratio in sorted(ratios, key=lambda item: item.interval.high - item.interval.low):
-        reach = max(
-            ratio.interval.high - ratio.interval.value, ratio.interval.value - ratio.interval.low
-        )
-        one, other = root(ratio.first), root(ratio.second)
-        if one != other and reach < np.log(TOLD_FACTOR):
-            group[one] = other
-            kept.append(ratio)
-    return kept
-
-
-def _told(found: StructureFit) -> str:
-    """Told and untold combinations, with their percentages."""
-    covariance = found.covariance
-    assert covariance is not None
-    structure = found.structure
-    text = (
-        f"Of its {structure.count} unknowns the recordings tell {found.told} combinations to a "
-        f"factor of {TOLD_FACTOR:g} or better"
-    )
-    pair = _best_pair(found)
-    text += f": {pair}." if pair else "."
-    blind = [
-        label
-        for label, own in zip(structure.unknowns, covariance.each, strict=True)
-        if TWO_SIDED * own >= np.log(TOLD_FACTOR)
-    ]
-    if blind:
-        text += f" By themselves they do not tell {', '.join(blind)}."
-    return text
-
-
-def _best_pair(found: StructureFit) -> str:
-    """The pair of prices whose ratio and common size are told most unequally, in words."""
-    covariance, structure = found.covariance, found.structure
-    assert covariance is not None
-    best, text = 0.0, ""
-    moving = np.flatnonzero(np.isfinite(covariance.values) & structure.is_price)
-    for place, i in enumerate(moving):
-        for j in moving[place + 1 :]:
-            row = np.zeros(structure.count)
-            row[i], row[j] = 1.0, -1.0
-            ratio, size = covariance.spread(row)[0], covariance.spread(np.abs(row) / 2)[0]
-            if not (np.isfinite(ratio) or np.isfinite(size)):
-                continue
-            unequal = abs(np.log(max(ratio, 1e-12) / max(size, 1e-12)))
-            if unequal > best:
-                one, other = structure.unknowns[i], structure.unknowns[j]
-                best = unequal
-                text = (
-                    f"the ratio of the price of {one} to that of {other} {_to(ratio)}, their "
-                    f"common size {_to(size)}"
-                )
-    return text
-
-
-def _to(deviation: float) -> str:
-    """How far a logarithm is told, at 95 %."""
-    reach = TWO_SIDED * deviation
-    if not reach < np.log(TOLD_FACTOR):
-        return "not at all"
-    factor = float(np.exp(reach))
-    return f"to {number(100 * (factor - 1), 2)} %" if factor < 2 else f"to a factor of {factor:.2g}"
-
-
-def _power(found: StructureFit) -> str:
-    """What the test would have seen."""
-    if found.test is None or found.test.refused or not found.test.powers:
-        return ""
-    powers = sorted(found.test.powers, key=lambda item: -item.power)
-    if powers[0].power < _BLIND:
-        return (
-            "The test is blind to cross terms here: prices of its features one by one make nearly "
-            "every gain that prices of their products would make, so it cannot be said whether "
-            "there are any."
-        )
-    most, least = powers[0], powers[-1]
-    text = (
-        f"A cross term of {most.first} and {most.second}, as large as half the geometric mean of "
-        f"their prices, would have been refused with a probability of {100 * most.power:.0f} %"
-    )
-    if len(powers) == 1:
-        return f"{text}."
-    return f"{text}, one of {least.first} and {least.second} with {100 * least.power:.0f} %."
-
-
 def _price_table(found: StructureFit) -> TextTable:
     structure = found.structure
     rows = []
@@ -289,7 +101,7 @@ def _price_table(found: StructureFit) -> TextTable:
         cost = "-"
         if price and index < len(structure.labels):
             cost = number(float(shown * found.sizes[index] ** 2 / found.effort), 3)
-        told = _ends(item) if price else _plain_ends(item)
+        told = ends(item) if price else _plain_ends(item)
         rows.append(
             (label, "price" if price else "correlation", number(float(shown), 4), told, cost)
         )
@@ -310,7 +122,7 @@ def _ratio_table(found: StructureFit) -> TextTable:
             "feature": lambda item: item.first,
             "over": lambda item: item.second,
             "ratio": lambda item: number(float(np.exp(item.interval.value)), 3),
-            "95 %": lambda item: _ends(item.interval),
+            "95 %": lambda item: ends(item.interval),
         },
     )
 
@@ -330,7 +142,7 @@ def _combination_table(found: StructureFit) -> TextTable:
                 covariance.directions[k], found.structure.unknowns
             ),
             "singular value / largest": lambda k: f"{values[k] / values[0]:.1e}",
-            "told": lambda k: _to(float(covariance.deviations[k])),
+            "told": lambda k: factor_of(float(covariance.deviations[k])),
         },
     )
 
@@ -390,7 +202,7 @@ def _comparison(result: FitResult) -> TextTable:
                 *(number(float(value), 5) for value in item.vaf),
                 *(number(float(value), 5) for value in item.held_out),
                 number(item.aic - least, 3),
-                "-" if test is None or not test.freedom else _probability(test.probability)[4:],
+                "-" if test is None or not test.freedom else probability(test.probability)[4:],
                 _outcome(item),
             )
         )
@@ -469,19 +281,6 @@ def _data(found: StructureFit) -> dict[str, Any]:
         "held_out_vaf": found.held_out,
         "aic": found.aic,
     }
-
-
-def _probability(value: float) -> str:
-    return "p < 0.001" if value < 1e-3 else f"p = {value:.2g}"
-
-
-def _ends(item: PriceInterval) -> str:
-    low, high = np.exp(item.low), np.exp(item.high)
-    if item.low == -np.inf:
-        return "not told" if item.high == np.inf else f"at most {number(float(high), 3)}"
-    if item.high == np.inf:
-        return f"at least {number(float(low), 3)}"
-    return f"{number(float(low), 3)} to {number(float(high), 3)}"
 
 
 def _plain_ends(item: PriceInterval) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 from impc.reporting.rendering import number
 from impc.studies.fit.person import preferred
 from impc.studies.fit.sentences import limited
-from impc.studies.fit.structures import structure_sentences
+from impc.studies.fit.structure_words import structure_sentences
 
 if TYPE_CHECKING:
     from impc.model.plant import Plant

@@ -18,7 +18,8 @@ from impc.model.bounds import Bounds
 from impc.model.weights import Weights
 from impc.studies.fit.result import FitResult
 from impc.studies.fit.settings import FitSettings, fit_settings, fit_structures
-from impc.studies.fit.structures import structure_data, structure_section, structure_sentences
+from impc.studies.fit.structure_words import structure_sentences
+from impc.studies.fit.structures import structure_data, structure_section
 from impc.studies.fit.subject import fit_problem, fit_recordings, stages
 from impc.studies.fit.verdict import verdict
 
