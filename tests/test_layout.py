@@ -101,8 +101,8 @@ ELSEWHERE = {
     "studies/plan/test_study.py": """
         studies/plan/designs.py studies/plan/settings.py studies/plan/simulated_fits.py""",
     "studies/cohort/test_store.py": """
-        studies/cohort/engine.py studies/cohort/report.py studies/cohort/tables.py
-        studies/cohort/unit_task.py""",
+        studies/cohort/engine.py studies/cohort/report.py studies/cohort/subject_page.py
+        studies/cohort/tables.py studies/cohort/unit_task.py""",
     "studies/cohort/test_study.py": """
         studies/cohort/figures.py studies/cohort/finding.py studies/cohort/names.py
         studies/cohort/sheet.py studies/cohort/tasks.py""",

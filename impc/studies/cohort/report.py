@@ -1,8 +1,8 @@
-"""Tables, pages and figures of a cohort, made from its folder."""
+"""Tables, page and figures of a cohort, made from its folder."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -23,8 +23,9 @@ from impc.reporting.rendering import number
 from impc.reporting.style import drawn, journal_style
 from impc.reporting.writer import write_files
 from impc.studies.cohort.comparison import compare_cohort, measures_of
-from impc.studies.cohort.figures import group_figure, subject_figure
+from impc.studies.cohort.figures import group_figure
 from impc.studies.cohort.study import safe_name
+from impc.studies.cohort.subject_page import missing, signal_words, subject_files
 from impc.studies.cohort.tables import cohort_tables, table_bytes
 from impc.studies.cohort.told import not_told, not_told_sentences, only_told
 from impc.studies.cohort.words import measure_words
@@ -89,7 +90,7 @@ def write_report(study: Study, store: Store, failures: Failures, command: str) -
         subjects.setdefault(unit.subject, []).append(unit)
     for subject, own in subjects.items():
         # One after the other: the figures of a thousand subjects would fill the memory.
-        write_files(store.folder, _subject_files(subject, own, store, failures))
+        write_files(store.folder, subject_files(subject, own, store, failures))
     figures = _figures(only_told(units), compared, _measure_units(study.units, store))
     left_out = {name: n for name, n in not_told(units).items() if name in measures_of(units)}
     said = [
@@ -114,7 +115,7 @@ def write_report(study: Study, store: Store, failures: Failures, command: str) -
         ],
         figures=figures,
         provenance=Provenance(command=command),
-        words=_words(study.units, store),
+        words=signal_words(study.units, store),
         data={
             "units": len(study.units),
             "fitted": len(units),
@@ -332,125 +333,10 @@ def _unit_table(units: pd.DataFrame) -> TextTable | None:
         (
             str(row["unit"]),
             str(row["group"]),
-            *(number(_nan(row[name]), 4) for name in shown),
+            *(number(missing(row[name]), 4) for name in shown),
             f"{100 * row['saturated']:.1f}",
         )
         for _, row in units.iterrows()
     )
     heads = ("unit", "group", *(f"{measure_words(name)} %" for name in shown), "at the bound %")
     return TextTable("Every unit. units.csv has all numbers.", heads, rows)
-
-
-def _subject_files(
-    subject: str, units: list[Unit], store: Store, failures: Failures
-) -> dict[str, bytes]:
-    """The page of a subject and the figures on it."""
-    sections: list[Section] = []
-    figures: dict[str, bytes] = {}
-    for unit in units:
-        fit = store.fit(unit.name)
-        if fit is None:
-            reason = failures.units.get(unit.name, "not fitted yet")
-            sections.append(Section(unit.name, (f"Not fitted: {reason}",)))
-            continue
-        with journal_style():
-            figures |= drawn({unit.name: subject_figure(fit)})
-        sections.append(Section(unit.name, _unit_blocks(unit, fit, failures)))
-    group = f", group {units[0].group}" if units[0].group else ""
-    report = Report(
-        f"impc cohort: {subject}",
-        f"Subject {subject}{group}",
-        (*_subject_verdict(units, store), Markup('<a href="../report.html">The cohort</a>')),
-        sections,
-        figures=figures,
-        words=_words(units, store),
-    )
-    files = {f"sub-{safe_name(subject)}.html": report.page().encode(), **figures}
-    return {f"subjects/{name}": content for name, content in files.items()}
-
-
-def _subject_verdict(units: list[Unit], store: Store) -> tuple[Verdict, ...]:
-    """What the fits of a subject explain, in one sentence."""
-    fits = [fit for unit in units if (fit := store.fit(unit.name)) is not None]
-    shares = [_nan(value) for fit in fits for value in fit["vaf"].values()]
-    if not fits or np.isnan(shares).any():
-        return (Verdict("Not every recording of this subject could be explained to its end."),)
-    at_bound = 100 * float(np.mean([fit["saturated"] for fit in fits]))
-    return (
-        Verdict(
-            f"Inverse MPC accounts for {min(shares):.2f} to {max(shares):.2f} % of the outputs; "
-            f"the command stands at its bound for {at_bound:.1f} % of the time."
-        ),
-    )
-
-
-def _words(units: Sequence[Unit], store: Store) -> list[tuple[str, str]]:
-    """What the signals are, as the first unit that was fitted tells."""
-    fits = (store.fit(unit.name) for unit in units)
-    first = next((fit for fit in fits if fit is not None), {})
-    return [(name, meaning) for name, meaning in first.get("words", ())]
-
-
-def _unit_blocks(unit: Unit, fit: dict[str, Any], failures: Failures) -> list[Block]:
-    blocks: list[Block] = [
-        Picture(
-            unit.name,
-            "Recorded and simulated outputs of the first trial",
-            "First trial. Grey: recorded. Dashed: simulated from the disturbance alone.",
-        )
-    ]
-    failed = len(failures.replicates.get(unit.name, {}))
-    if failed:
-        blocks.append(
-            f"{failed} bootstrap replicates could not be fitted; the reasons are in "
-            "failed_replicates of result.json."
-        )
-    return [
-        *blocks,
-        _fit_table(fit),
-        _gain_table(fit),
-        *(line for trial in fit["findings"] for line in trial),
-    ]
-
-
-def _fit_table(fit: dict[str, Any]) -> TextTable:
-    rows = tuple(
-        (name, number(_nan(fit["vaf"][name]), 5), number(_nan(fit["held_out_vaf"][name]), 5))
-        for name in fit["outputs"]
-    )
-    return TextTable(
-        f"Variance accounted for, {fit['trials']} trials; the command stands at its bound for "
-        f"{100 * fit['saturated']:.1f} % of the time.",
-        ("output", "VAF %", "left out %"),
-        rows,
-    )
-
-
-def _gain_table(fit: dict[str, Any]) -> TextTable:
-    reported = next(iter(fit["readings"].values()))
-    rows = []
-    for i, control in enumerate(fit["controls"]):
-        for j, state in enumerate(fit["states"]):
-            rows.append(
-                (
-                    f"{control} from {state}",
-                    number(fit["K"][i][j], 4),
-                    number(_nan(fit["K_deviation"][i][j]), 2)
-                    if fit["K_told"][i][j]
-                    else "not told",
-                    number(fit["K_of_weights"][i][j], 4),
-                    number(reported["Q"][j][j]) if i == 0 else "",
-                )
-            )
-    caption = (
-        "Gain with standard deviations (not told: the recordings tell this entry only together "
-        "with others), beside the gain of the reported weights; and prices of the weights of least "
-        "condition number: a choice among all weights with the latter gain."
-    )
-    heads = ("entry", "gain", "deviation", "gain of the weights", "price of the state")
-    return TextTable(caption, heads, rows)
-
-
-def _nan(value: float | None) -> float:
-    """A missing number, as JSON and pandas have it."""
-    return float("nan") if value is None else float(value)
