@@ -3,7 +3,7 @@
 A cart of two states under a push of three levels, two such carts with a spring between them and an
 input each, or the linear seated subject under the ternary torque. Noise is in the motor, in the
 senses, or in both, of a size that leaves the motion without noise a VAF of 90 or 70 %; the limit of
-the command is far away, or met at a tenth of the samples and more (of two carts: at 3 to 13 %).
+the command is far away, or met at a tenth of the samples and more (by two carts, less often).
 Prices are log-uniform within a factor of two. At the limit some on the seat fall.
 """
 

@@ -15,11 +15,12 @@ from impc.assess.likely_people import (
     level_intervals,
     people_as_likely,
 )
-from impc.assess.person_covariance import TOLD, person_covariance
+from impc.assess.person_covariance import person_covariance
 from impc.assess.person_profile import fallen
 from impc.assess.runaways import running_away
 from impc.inverse.likelihood_fit import fit_person
 from impc.inverse.methods import estimate
+from impc.inverse.person_prior import TOLD
 from impc.inverse.unbiased_fit import unbiased
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ from experiments.noisy_people_score import LIMITS, Score, passed_over, score
 from experiments.noisy_people_table import HEADS, pooled, row
 from impc.errors import ImpcError
 
-# Digits of a number that is kept: rows of the seat are in the repository.
+# Digits of a number that is kept.
 _DIGITS = 4
 
 

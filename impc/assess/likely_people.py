@@ -22,10 +22,11 @@ import numpy as np
 from impc.arrays import Array, frozen
 from impc.assess.covariance import TWO_SIDED
 from impc.assess.held_person import held_person
-from impc.assess.person_covariance import TOLD, person_covariance
+from impc.assess.person_covariance import person_covariance
 from impc.checking import replace
 from impc.inverse.likelihood_fit import person_at
 from impc.inverse.likelihood_search import climb
+from impc.inverse.person_prior import TOLD
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

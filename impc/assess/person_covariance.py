@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "KINDS",
-    "TOLD",
     "Confusion",
     "PersonCovariance",
     "confusion",
@@ -36,8 +35,6 @@ __all__ = [
 
 #: Ways to a covariance.
 KINDS = ("expected", "observed", "sandwich")
-#: A number of the gain is told by itself when its deviation is below this, of a coordinate.
-TOLD = 0.25
 # Of a coordinate, which none leaves by much more than one: the prior that is left.
 _FARTHEST = 1e3
 # Step of the differences, of a coordinate: their error is the square of it, and rounding over it.
@@ -140,7 +137,7 @@ def person_covariance(fit: PersonFit, kind: str = "sandwich") -> PersonCovarianc
         return _described(fit, kind, unit @ unit.T)
     # As seen where the information is one, and with as much of the prior as it needs for that: of a
     # direction that is not told scores are rounding, and the bread is the square of 1e6.
-    middle = _meat(fit, unit) + np.diag(1 - np.minimum(values, kept) / kept)
+    middle = _meat(fit, unit) + np.diag(1 - values / kept)
     return _described(fit, kind, unit @ middle @ unit.T)
 
 

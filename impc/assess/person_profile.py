@@ -19,7 +19,7 @@ import numpy as np
 
 from impc.arrays import Array, frozen
 from impc.assess.held_person import held_person
-from impc.assess.person_covariance import TOLD
+from impc.inverse.person_prior import TOLD
 
 if TYPE_CHECKING:
     from impc.assess.person_covariance import PersonCovariance

@@ -77,28 +77,29 @@ class Spectrum:
 def spectrum(residuals: list[Array]) -> Spectrum | None:
     """Of residuals (samples, p) of each trial; None of zeros, or of trials that are too short."""
     shortest = min(map(len, residuals))
-    size = np.sqrt(
+    deviations = np.sqrt(
         np.mean(np.concatenate([part - part.mean(axis=0) for part in residuals]) ** 2, axis=0)
     )
-    if shortest < 64 or not np.all(size > 0) or not np.all(np.isfinite(size)):
+    if shortest < 64 or not np.all(deviations > 0) or not np.all(np.isfinite(deviations)):
         return None
     edges = [1.5]
     while edges[-1] < shortest // 2 - 1:
         edges.append(np.floor(max(edges[-1] + 1, edges[-1] * (1 + _WIDTH))) + 0.5)
     angles = 2 * np.pi * np.array(edges) / shortest
     angles[-1] = min(angles[-1], np.pi)
-    p, bins = len(size), len(angles) - 1
+    p, bins = len(deviations), len(angles) - 1
     power, counts = np.zeros((bins, p, p), dtype=np.complex128), np.zeros(bins)
     for part in residuals:
         window = scipy.signal.windows.hann(len(part), sym=False)
-        seen = ((part - part.mean(axis=0)) / size) * (window / np.linalg.norm(window))[:, None]
+        scaled = (part - part.mean(axis=0)) / deviations
+        seen = scaled * (window / np.linalg.norm(window))[:, None]
         found = np.fft.rfft(seen, axis=0)
         place = np.digitize(2 * np.pi * np.arange(len(found)) / len(part), angles) - 1
         inside = (place >= 0) & (place < bins)
         np.add.at(power, place[inside], found[inside, :, None] * found[inside, None, :].conj())
         np.add.at(counts, place[inside], 1.0)
     centres = (angles[1:] + angles[:-1]) / 2
-    return Spectrum(centres, angles, counts / _HANN, power / counts[:, None, None], size)
+    return Spectrum(centres, angles, counts / _HANN, power / counts[:, None, None], deviations)
 
 
 def loop_shapes(plant: Plant, gain: Array, found: Spectrum) -> Complex:
@@ -139,10 +140,9 @@ def outputs(theta: Array, found: Spectrum) -> tuple[Complex, Callable[[Complex],
     H, slopes = _filters(theta[: ORDER * p].reshape(p, ORDER), found.angles)
     factor, free = np.zeros((p, p)), np.ones((p, p))
     factor[np.tril_indices(p)] = theta[ORDER * p : size(p) - p]
-    diagonal = np.diag(factor)
-    free[np.diag_indices(p)] = _clipped(diagonal, -_DIAGONAL, _DIAGONAL)[1]
-    factor[np.diag_indices(p)] = np.exp(_clipped(diagonal, -_DIAGONAL, _DIAGONAL)[0])
-    free[np.diag_indices(p)] *= np.diag(factor)
+    diagonal, inside = _clipped(np.diag(factor), -_DIAGONAL, _DIAGONAL)
+    factor[np.diag_indices(p)] = np.exp(diagonal)
+    free[np.diag_indices(p)] = inside * np.exp(diagonal)
     logs, moving = _clipped(theta[size(p) - p : size(p)], *_VARIANCE)
     root, white = H[:, :, None] * factor, np.exp(logs)
     S = root @ np.swapaxes(root.conj(), 1, 2) + np.diag(white)
@@ -216,7 +216,7 @@ def root_of(theta: Array) -> float:
 
 
 def misfit(S: Complex, found: Spectrum) -> tuple[float, Complex]:
-    """Minus Whittle's log-likelihood, twice, of S (b, p, p), and W: its slope is sum tr(W dS)."""
+    """Minus Whittle's log-likelihood of S (b, p, p), and W (b, p, p): its slope is sum tr(W dS)."""
     eye = np.eye(S.shape[1])
     least = _FLOOR + _OWN * np.einsum("bii->b", S).real
     inverse = np.linalg.inv(S + least[:, None, None] * eye)

@@ -21,7 +21,10 @@ if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.inverse.person_coordinates import PersonCoordinates, Told
 
-__all__ = ["Place", "Prior"]
+__all__ = ["TOLD", "Place", "Prior"]
+
+#: A number of the gain is told by itself when its deviation is below this, of a coordinate.
+TOLD = 0.25
 
 # Without a prior a level that slides to zero, or a sense to one that is not used, has no end: along
 # what is so flat a step of ten is as far as a promise is believed.

@@ -32,7 +32,7 @@ from impc.arrays import Array
 from impc.control.simulation import Status
 from impc.errors import ImpcError
 from impc.inverse.likelihood_fit import person_at
-from impc.inverse.person_prior import Prior
+from impc.inverse.person_prior import TOLD, Prior
 from impc.inverse.simulated_score import simulated_score
 from impc.inverse.unseen_slope import unseen_slope
 
@@ -49,9 +49,6 @@ _NEAR = 2.0
 # Shares of the step that are tried, until the likelihood of the recordings falls by what the
 # parabola says and not by so much more, nats: it is rough by half a nat.
 _SHARES, _APART = (1.0, 0.5, 0.25, 0.125), 1.0
-# A direction of the gain whose deviation is larger, in natural coordinates, is not told: what
-# likelihoods say a deviation to either side of it is no slope.
-_TOLD = 0.25
 
 
 class TiltedPrior(Prior):
@@ -148,10 +145,13 @@ def _believed(curvature: Array, found: SimulatedScore) -> Array:
 
 
 def _told(curvature: Array, gain: int) -> Array:
-    """The projection onto slopes along directions of the gain that are told (q, q)."""
+    """The projection onto slopes along directions of the gain that are told (q, q).
+
+    What likelihoods say a deviation to either side along another is no slope.
+    """
     covariance = np.linalg.inv(curvature)[:gain, :gain]
     variances, directions = np.linalg.eigh(covariance)
-    kept = directions[:, variances < _TOLD**2]
+    kept = directions[:, variances < TOLD**2]
     projection = np.zeros_like(curvature)
     projection[:gain, :gain] = kept @ kept.T
     return projection

@@ -116,11 +116,11 @@ def test_along_directions_that_are_not_told_nothing_moves(
     curvature = met.prior.parabola(met.prior.placed(theta, met.told), np.array(met.unseen))[1]
     variances, directions = np.linalg.eigh(np.linalg.inv(curvature)[:gain, :gain])
     assert gain == 2
-    monkeypatch.setattr(unbiased_fit, "_TOLD", float(np.prod(variances) ** 0.25))
+    monkeypatch.setattr(unbiased_fit, "TOLD", float(np.prod(variances) ** 0.25))
     step = (np.array(unbiased(met).fit.theta) - theta)[:gain]
     assert abs(directions[:, 0] @ step) > 0.05 * np.sqrt(variances[0])
     assert abs(directions[:, 1] @ step) < 1e-9
-    monkeypatch.setattr(unbiased_fit, "_TOLD", 1e-9)
+    monkeypatch.setattr(unbiased_fit, "TOLD", 1e-9)
     found, reason = unbiased(met)
     np.testing.assert_allclose(found.theta, theta, rtol=1e-12)
     assert reason == ""

@@ -25,7 +25,7 @@ from impc.reporting.writer import write_files
 from impc.studies.cohort.comparison import compare_cohort, measures_of
 from impc.studies.cohort.figures import group_figure
 from impc.studies.cohort.study import safe_name
-from impc.studies.cohort.subject_page import missing, signal_words, subject_files
+from impc.studies.cohort.subject_page import kept_words, or_nan, subject_files
 from impc.studies.cohort.tables import cohort_tables, table_bytes
 from impc.studies.cohort.told import not_told, not_told_sentences, only_told
 from impc.studies.cohort.words import measure_words
@@ -115,7 +115,7 @@ def write_report(study: Study, store: Store, failures: Failures, command: str) -
         ],
         figures=figures,
         provenance=Provenance(command=command),
-        words=signal_words(study.units, store),
+        words=kept_words(study.units, store),
         data={
             "units": len(study.units),
             "fitted": len(units),
@@ -333,7 +333,7 @@ def _unit_table(units: pd.DataFrame) -> TextTable | None:
         (
             str(row["unit"]),
             str(row["group"]),
-            *(number(missing(row[name]), 4) for name in shown),
+            *(number(or_nan(row[name]), 4) for name in shown),
             f"{100 * row['saturated']:.1f}",
         )
         for _, row in units.iterrows()

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from impc.studies.cohort.store import Store
     from impc.studies.cohort.study import Unit
 
-__all__ = ["missing", "signal_words", "subject_files"]
+__all__ = ["kept_words", "or_nan", "subject_files"]
 
 
 def subject_files(
@@ -55,7 +55,7 @@ def subject_files(
         (*_subject_verdict(units, store), Markup('<a href="../report.html">The cohort</a>')),
         sections,
         figures=figures,
-        words=signal_words(units, store),
+        words=kept_words(units, store),
     )
     files = {f"sub-{safe_name(subject)}.html": report.page().encode(), **figures}
     return {f"subjects/{name}": content for name, content in files.items()}
@@ -64,7 +64,7 @@ def subject_files(
 def _subject_verdict(units: list[Unit], store: Store) -> tuple[Verdict, ...]:
     """What the fits of a subject explain, in one sentence."""
     fits = [fit for unit in units if (fit := store.fit(unit.name)) is not None]
-    shares = [missing(value) for fit in fits for value in fit["vaf"].values()]
+    shares = [or_nan(value) for fit in fits for value in fit["vaf"].values()]
     if not fits or np.isnan(shares).any():
         return (Verdict("Not every recording of this subject could be explained to its end."),)
     at_bound = 100 * float(np.mean([fit["saturated"] for fit in fits]))
@@ -76,7 +76,7 @@ def _subject_verdict(units: list[Unit], store: Store) -> tuple[Verdict, ...]:
     )
 
 
-def signal_words(units: Sequence[Unit], store: Store) -> list[tuple[str, str]]:
+def kept_words(units: Sequence[Unit], store: Store) -> list[tuple[str, str]]:
     """What the signals are, as the first unit that was fitted tells.
 
     Parameters
@@ -113,7 +113,7 @@ def _unit_blocks(unit: Unit, fit: dict[str, Any], failures: Failures) -> list[Bl
 
 def _fit_table(fit: dict[str, Any]) -> TextTable:
     rows = tuple(
-        (name, number(missing(fit["vaf"][name]), 5), number(missing(fit["held_out_vaf"][name]), 5))
+        (name, number(or_nan(fit["vaf"][name]), 5), number(or_nan(fit["held_out_vaf"][name]), 5))
         for name in fit["outputs"]
     )
     return TextTable(
@@ -133,7 +133,7 @@ def _gain_table(fit: dict[str, Any]) -> TextTable:
                 (
                     f"{control} from {state}",
                     number(fit["K"][i][j], 4),
-                    number(missing(fit["K_deviation"][i][j]), 2)
+                    number(or_nan(fit["K_deviation"][i][j]), 2)
                     if fit["K_told"][i][j]
                     else "not told",
                     number(fit["K_of_weights"][i][j], 4),
@@ -149,6 +149,6 @@ def _gain_table(fit: dict[str, Any]) -> TextTable:
     return TextTable(caption, heads, rows)
 
 
-def missing(value: float | None) -> float:
+def or_nan(value: float | None) -> float:
     """A `value` that may be missing, as JSON and pandas have it."""
     return float("nan") if value is None else float(value)
