@@ -112,11 +112,12 @@ def _moved(report: PersonReport) -> list[str]:
             f"{nearly} for this person could not be taken away by simulation ({report.biased}). "
             "The gain is the likeliest, and may be a standard deviation and more beside the truth."
         ]
+    far = f"up to {report.moved:.1f}" if report.moved >= 0.05 else "less than 0.1"
     left = f" Not all of it: {report.biased}." if report.biased else ""
     rough = "" if report.fit.converged else " The likelihood is rough where its search ended."
     return [
         f"{nearly} for this person was found by simulation and taken away, which moved the gain by "
-        f"up to {report.moved:.1f} standard deviations.{left}{rough}"
+        f"{far} standard deviations.{left}{rough}"
     ]
 
 

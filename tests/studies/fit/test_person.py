@@ -111,14 +111,16 @@ def test_the_page_says_how_far_the_gain_is_from_the_likeliest() -> None:
     assert report.models[0].fit is not None
     others = replace(report, moved=1.25, biased="", fit=replace(report.fit, converged=True))
     in_part = replace(others, biased="half is left")
+    hardly = replace(others, moved=0.03)
     still = replace(report, moved=0.0, biased="", fit=report.models[0].fit)
     not_found = replace(still, biased="everybody runs away")
-    said, partly, nothing, sorry = (
+    said, partly, little, nothing, sorry = (
         [line for line in person_sentences(replace(result, person=each)) if "simulation" in line]
-        for each in (others, in_part, still, not_found)
+        for each in (others, in_part, hardly, still, not_found)
     )
     assert nothing == []
     assert said[0].endswith("moved the gain by up to 1.2 standard deviations.")
+    assert little[0].endswith("moved the gain by less than 0.1 standard deviations.")
     assert partly[0].endswith("1.2 standard deviations. Not all of it: half is left.")
     assert "could not be taken away by simulation (everybody runs away)" in sorry[0]
     # In this cart's trials the limit is met.
