@@ -29,7 +29,7 @@ from experiments.cursor_ceiling import fit_step_response, follow
 from experiments.cursor_data import RATE, Condition, data_file, read_conditions
 from experiments.cursor_figure import cursor_figure
 from impc.arrays import Array, frozen
-from impc.assess.bounded_weights import linear_range, weights_set
+from impc.assess.bounded_weights import linear_ranges, weights_set
 from impc.assess.covariance import gain_covariance
 from impc.assess.input_limits import with_limit
 from impc.assess.variance_accounted_for import centred_vaf
@@ -186,9 +186,9 @@ def fit_condition(
     covariance = gain_covariance(fitted.problem, np.array(fitted.gain), np.array(fitted.metric))
     plant = fitted.problem.plant
     found = weights_set(gain_fibre(plant, fitted.gain), _RATIO)
-    of_error = np.zeros((plant.n + 1, plant.n + 1))
-    of_error[0, 0] = 1.0
-    price = linear_range(found, of_error)
+    of_error = np.zeros((1, plant.n + 1, plant.n + 1))
+    of_error[0, 0, 0] = 1.0
+    (price,) = linear_ranges(found, of_error)
     delay, lag = _parameters(fitted)
     told = np.array(covariance.parameters) < _TOLD
     prices, gains = resampled(condition, resamples, seed)

@@ -17,6 +17,7 @@ farther: what the programs then returned was 1.4e-3 from the optimum and called 
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -29,13 +30,20 @@ from impc.arrays import Array, Frozen
 from impc.checking import checked
 from impc.errors import InputError, SolverError, WeightsError
 from impc.inverse.equivalent_weights import analytic_centre, inverse_factor, least_condition_weights
-from impc.inverse.semidefinite import Cone, matrix_inequality, norm_bound, solve_semidefinite
+from impc.inverse.semidefinite import (
+    Cone,
+    matrix_inequality,
+    norm_bound,
+    solve_each,
+    solve_semidefinite,
+)
 from impc.inverse.solution_set import pair_blocks, split_blocks
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from impc.inverse.equivalent_weights import EquivalentWeights
+    from impc.inverse.semidefinite import SemidefiniteSolution
     from impc.inverse.solution_set import GainFibre
     from impc.model.weights import Weights
 
@@ -45,8 +53,8 @@ __all__ = [
     "WeightsSet",
     "entry_ranges",
     "extreme_eigenvalue",
-    "linear_maximum",
-    "linear_range",
+    "linear_maxima",
+    "linear_ranges",
     "nearest_diagonal",
     "trace_range",
     "weights_set",
@@ -152,10 +160,10 @@ class Range:
 
 
 @checked
-def weights_set(fibre: GainFibre, ratio: float = 10.0, *, scaled: bool = False) -> WeightsSet:
+def weights_set(fibre: GainFibre, ratio: float = 10.0, *, rough: bool = False) -> WeightsSet:
     """Prepare the set of weights with condition number up to `ratio` times the least.
 
-    `scaled` as in `least_condition_weights`.
+    `rough` as in `least_condition_weights`.
 
     Raises
     ------
@@ -166,7 +174,7 @@ def weights_set(fibre: GainFibre, ratio: float = 10.0, *, scaled: bool = False) 
     """
     if not 1 < ratio < np.inf:
         raise InputError("ratio", f"got {ratio}", "give a number above 1")
-    least = least_condition_weights(fibre, scaled=scaled)
+    least = least_condition_weights(fibre, rough=rough)
     n, m = fibre.plant.n, fibre.plant.m
     try:
         centre = analytic_centre(fibre).weights
@@ -207,29 +215,44 @@ def _largest_trace(fibre: GainFibre, inverse: Array, raw: Array) -> float:
     return alpha * m * float(np.linalg.norm(fibre.G, 2)) ** 2 / (1 - error)
 
 
-@checked(direction="n+m n+m")
-def linear_range(found: WeightsSet, direction: Array) -> Range:
-    """Range of trace(direction blkdiag(Q, R)) over the set, direction symmetric (n + m, n + m).
+@checked(directions="* n+m n+m")
+def linear_ranges(
+    found: WeightsSet, directions: Array, *, tolerance: float = _GAP
+) -> tuple[Range, ...]:
+    """Range over the set of each trace(direction blkdiag(Q, R)).
+
+    Parameters
+    ----------
+    found : WeightsSet
+    directions : Array
+        Symmetric (k, n + m, n + m).
+    tolerance : float
+        Clarabel's, of the gap to what no member goes beyond, for a function of size one.
 
     Raises
     ------
     SolverError
         When a program returns no finite point.
     """
-    return Range(_minimum(found, direction), linear_maximum(found, direction))
+    least = _minima(found, directions, tolerance)
+    most = linear_maxima(found, directions, tolerance=tolerance)
+    return tuple(Range(*ends) for ends in zip(least, most, strict=True))
 
 
-@checked(direction="n+m n+m")
-def linear_maximum(found: WeightsSet, direction: Array) -> End:
-    """Largest trace(direction blkdiag(Q, R)) over the set, direction symmetric (n + m, n + m).
+@checked(directions="* n+m n+m")
+def linear_maxima(
+    found: WeightsSet, directions: Array, *, tolerance: float = _GAP
+) -> tuple[End, ...]:
+    """Largest value over the set of each trace(direction blkdiag(Q, R)).
+
+    `directions` (k, n + m, n + m) and `tolerance` as in `linear_ranges`.
 
     Raises
     ------
     SolverError
-        When the program returns no finite point.
+        When a program returns no finite point.
     """
-    end = _minimum(found, -direction)
-    return End(-end.value, end.weights, lambda: -end.bound)
+    return tuple(_negative(end) for end in _minima(found, -directions, tolerance))
 
 
 @checked
@@ -239,13 +262,11 @@ def entry_ranges(
     """Range of every entry Q_ij, i >= j, of the given states (indices), of all by default."""
     size = len(found.first)
     chosen = sorted(range(found.fibre.plant.n) if states is None else states)
-    ranges = {}
-    for position, i in enumerate(chosen):
-        for j in chosen[: position + 1]:
-            direction = np.zeros((size, size))
-            direction[i, j] = direction[j, i] = 1.0 if i == j else 0.5
-            ranges[i, j] = linear_range(found, direction)
-    return ranges
+    pairs = [(i, j) for position, i in enumerate(chosen) for j in chosen[: position + 1]]
+    directions = np.zeros((len(pairs), size, size))
+    for direction, (i, j) in zip(directions, pairs, strict=True):
+        direction[i, j] = direction[j, i] = 1.0 if i == j else 0.5
+    return dict(zip(pairs, linear_ranges(found, directions), strict=True))
 
 
 @checked(scaling="n")
@@ -253,7 +274,7 @@ def trace_range(found: WeightsSet, scaling: Array) -> Range:
     """Range of trace(D Q D), D = diag(scaling) (n,): the low end is the member of least trace."""
     size = np.zeros(len(found.first))
     size[: len(scaling)] = np.asarray(scaling) ** 2
-    return linear_range(found, np.diag(size))
+    return linear_ranges(found, np.diag(size)[None])[0]
 
 
 @checked(scaling="n")
@@ -320,17 +341,37 @@ def extreme_eigenvalue(found: WeightsSet, *, largest: bool) -> End:
     return End(value, split_blocks(X, n), lambda: sign * unit * solved.bound)
 
 
-def _minimum(found: WeightsSet, direction: Array) -> End:
+def _minima(found: WeightsSet, directions: Array, tolerance: float) -> list[End]:
+    """Ends of least trace(direction X), of directions (k, n + m, n + m)."""
+    ends = [_same_for_all(found, direction) for direction in directions]
+    slopes = np.tensordot(directions, found.level, ([1, 2], [1, 2]))
+    scales = np.linalg.norm(slopes, axis=1)
+    told = np.flatnonzero(scales)
+    if len(told) == 0:  # or there is but one member
+        return ends
+    objectives = np.pad(slopes[told] / scales[told, None], ((0, 0), (0, 1)))
+    each = solve_each(objectives, found.cones, reach=_reach(found), tolerance=tolerance)
+    for index, solved in zip(told, each, strict=True):
+        X = _member(found, solved.y)
+        ends[index] = End(
+            float(np.sum(directions[index] * X)),
+            split_blocks(X, found.fibre.plant.n),
+            functools.partial(_bound, ends[index].value, float(scales[index]), solved),
+        )
+    return ends
+
+
+def _negative(end: End) -> End:
+    return End(-end.value, end.weights, lambda: -end.bound)
+
+
+def _same_for_all(found: WeightsSet, direction: Array) -> End:
     constant = float(np.sum(direction * found.first))
-    slopes = np.tensordot(found.level, direction, 2)
-    scale = float(np.linalg.norm(slopes))
-    if scale == 0:  # the same for every member, or there is but one
-        return End(constant, found.least.weights, lambda: constant)
-    objective = np.append(slopes / scale, 0.0)
-    solved = solve_semidefinite(objective, found.cones, reach=_reach(found), tolerance=_GAP)
-    X = _member(found, solved.y)
-    member = split_blocks(X, found.fibre.plant.n)
-    return End(float(np.sum(direction * X)), member, lambda: constant + scale * solved.bound)
+    return End(constant, found.least.weights, lambda: constant)
+
+
+def _bound(constant: float, scale: float, solved: SemidefiniteSolution) -> float:
+    return constant + scale * solved.bound
 
 
 def _member(found: WeightsSet, y: Array) -> Array:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.assess.bounded_weights import extreme_eigenvalue, linear_maximum, linear_range
+from impc.assess.bounded_weights import extreme_eigenvalue, linear_maxima, linear_ranges
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -77,8 +77,8 @@ def eigenvalue_ranges(
     most_bottom = extreme_eigenvalue(found, largest=False)
     known += [least_top.weights.block, most_bottom.weights.block]
     if not members:
-        for vector in np.linalg.eigh(centre[:n, :n])[1].T:
-            ends = linear_range(found, _on_states(found, vector))
+        vectors = np.linalg.eigh(centre[:n, :n])[1].T
+        for ends in linear_ranges(found, np.array([_on_states(found, one) for one in vectors])):
             known += [ends.least.weights.block, ends.most.weights.block]
     values = np.array([np.linalg.eigvalsh(X[:n, :n]) for X in known])
     ranges = []
@@ -102,7 +102,7 @@ def _search(found: WeightsSet, start: Array, index: int, sign: float) -> float:
     for _ in range(_STEPS):
         _, vectors = np.linalg.eigh(X[:n, :n])
         direction = sign * _on_states(found, vectors[:, index])
-        end = linear_maximum(found, direction).weights.block
+        end = linear_maxima(found, direction[None])[0].weights.block
         along = np.linalg.eigvalsh(X[:n, :n] + _SHARES[:, None, None] * (end - X)[:n, :n])[:, index]
         best = int(np.argmax(sign * along))
         if sign * (along[best] - along[0]) <= 1e-6 * abs(along[0]):

@@ -23,7 +23,7 @@ import numpy as np
 import scipy.linalg
 
 from impc.arrays import Array
-from impc.assess.bounded_weights import linear_maximum, linear_range, weights_set
+from impc.assess.bounded_weights import linear_maxima, linear_ranges, weights_set
 from impc.assess.compiled_regulator import doubled_gain
 from impc.checking import replace
 from impc.errors import SolverError, WeightsError
@@ -32,9 +32,8 @@ from impc.model.riccati import gain_gradients, solve_lqr
 from impc.model.weights import Weights
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
-    from impc.assess.bounded_weights import WeightsSet
     from impc.assess.covariance import GainCovariance
     from impc.assess.intent_statements import Statement
     from impc.model.plant import Plant
@@ -42,6 +41,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "DRAWS",
+    "DrawnSet",
     "PriceRange",
     "drawn_gains",
     "prices_over_gains",
@@ -57,6 +57,9 @@ _DECADE = np.log(10.0)
 _STEPS = 6
 # Share of P that the last doubling may add: the next would add its square.
 _ENOUGH = 1e-9
+# Of a drawn gain's programs: the range of 39 draws is itself a rough one, and a program takes four
+# fifths of the time of those for the fitted gain.
+_ROUGH = 1e-6
 # Natural units of the gain: an exact recording is no sharper than rounding and search leave it.
 _SHARPEST = 1e-6
 
@@ -80,6 +83,26 @@ class PriceRange:
     high: float
     low_drawn: float
     high_drawn: float
+
+
+@dataclass(frozen=True)
+class DrawnSet:
+    """The weights of a drawn gain, and what holds for all of them.
+
+    Attributes
+    ----------
+    least : Weights or None
+        Those of least condition number; None where the programs fail: nothing is known of this
+        gain's weights.
+    prices : tuple of (float, float)
+        Least and largest price of a typical excursion of each state that was asked for.
+    agrees : tuple of bool
+        Whether each statement that was asked for says the same here.
+    """
+
+    least: Weights | None
+    prices: tuple[tuple[float, float], ...]
+    agrees: tuple[bool, ...]
 
 
 def drawn_gains(
@@ -161,7 +184,7 @@ def _directions(
 
 
 def with_confidence(
-    statements: tuple[Statement, ...], sets: tuple[WeightsSet | None, ...], sizes: Array
+    statements: tuple[Statement, ...], sets: tuple[DrawnSet, ...]
 ) -> tuple[Statement, ...]:
     """Statements with the share of the drawn gains for which they hold as well.
 
@@ -169,52 +192,46 @@ def with_confidence(
     ----------
     statements : tuple of Statement
         Over the weights with the fitted gain; those that do not hold there are left as they are.
-    sets : tuple of WeightsSet or None
-        Of the drawn gains; None where there is none, which counts as a case where nothing holds.
-    sizes : Array
-        Typical excursions of the states (n,), in their units.
+    sets : tuple of DrawnSet
+        Of the drawn gains, asked for these statements.
     """
+    shares = np.mean([one.agrees for one in sets], axis=0)
     return tuple(
-        item
-        if item.holds is None
-        else replace(item, confidence=float(np.mean([_holds(item, one, sizes) for one in sets])))
-        for item in statements
+        item if item.holds is None else replace(item, confidence=float(share))
+        for item, share in zip(statements, shares, strict=True)
     )
 
 
 def prices_over_gains(
-    found: WeightsSet, sets: tuple[WeightsSet | None, ...], sizes: Array, states: tuple[str, ...]
+    own: Mapping[str, tuple[float, float]], sets: tuple[DrawnSet, ...]
 ) -> tuple[PriceRange, ...]:
     """Prices of some states, over the weights of the fitted gain and of those drawn.
 
     Parameters
     ----------
-    found : WeightsSet
-        Of the fitted gain.
-    sets : tuple of WeightsSet or None
-        Of the drawn gains.
-    sizes : Array
-        Typical excursions of the states (n,), in their units.
-    states : tuple of str
-        Which.
+    own : mapping of str to (float, float)
+        Least and largest price of each state over the weights of the fitted gain.
+    sets : tuple of DrawnSet
+        Of the drawn gains, asked for these states.
     """
     result = []
-    for name in states:
-        index = found.fibre.plant.states.index(name)
-        direction = np.zeros_like(found.first)
-        direction[index, index] = sizes[index] ** 2
-        own = linear_range(found, direction)
-        drawn = [_range(one, direction) for one in sets]
-        low = min([own.low, *(ends[0] for ends in drawn)])
-        high = max([own.high, *(ends[1] for ends in drawn)])
-        result.append(PriceRange(name, own.low, own.high, low, high))
+    for position, (name, (low, high)) in enumerate(own.items()):
+        ends = [one.prices[position] for one in sets]
+        widest = min([low, *(end[0] for end in ends)]), max([high, *(end[1] for end in ends)])
+        result.append(PriceRange(name, low, high, *widest))
     return tuple(result)
 
 
 def set_of_gain(
-    plant: Plant, solution: LqrSolution, metrics: Array, ratio: float
-) -> WeightsSet | None:
-    """The weights of a drawn gain; None where the programs fail.
+    plant: Plant,
+    solution: LqrSolution,
+    metrics: Array,
+    ratio: float,
+    sizes: Array,
+    states: tuple[str, ...],
+    statements: tuple[Statement, ...],
+) -> DrawnSet:
+    """What holds for all weights of a drawn gain.
 
     Parameters
     ----------
@@ -226,41 +243,46 @@ def set_of_gain(
         the drawn metric takes its place.
     ratio : float
         As in `weights_set`.
+    sizes : Array
+        Typical excursions of the states (n,), in their units.
+    states : tuple of str
+        Whose prices are asked for.
+    statements : tuple of Statement
+        Those that are tried, over the weights with the fitted gain; nothing is asked of one that
+        does not hold there.
     """
+    tried = [item for item in statements if item.holds is not None]
     try:
         own = np.concatenate([np.array(solution.S)[None], metrics[1:]])
         # Nothing is searched from these: only how far they reach is asked for.
-        return weights_set(gain_fibre(plant, solution.K, own), ratio, scaled=True)
+        found = weights_set(gain_fibre(plant, solution.K, own), ratio, rough=True)
+        priced = np.array([_price(plant, sizes, name) for name in states])
+        ranges = linear_ranges(found, priced, tolerance=_ROUGH)
+        against = np.array([_against(item, plant, sizes) for item in tried])
+        most = linear_maxima(found, against, tolerance=_ROUGH) if tried else ()
     except (WeightsError, SolverError):
-        return None
+        return DrawnSet(None, ((0.0, np.inf),) * len(states), (False,) * len(statements))
+    holding = iter([end.value < 0 for end in most])
+    agrees = tuple(item.holds is not None and next(holding) for item in statements)
+    return DrawnSet(found.least.weights, tuple((one.low, one.high) for one in ranges), agrees)
 
 
-def _range(found: WeightsSet | None, direction: Array) -> tuple[float, float]:
-    if found is None:  # nothing is known of this gain's weights: no end
-        return 0.0, np.inf
-    try:
-        ends = linear_range(found, direction)
-    except SolverError:
-        return 0.0, np.inf
-    return ends.low, ends.high
+def _price(plant: Plant, sizes: Array, state: str) -> Array:
+    index = plant.states.index(state)
+    direction = np.zeros((plant.n + plant.m, plant.n + plant.m))
+    direction[index, index] = sizes[index] ** 2
+    return direction
 
 
-def _holds(item: Statement, found: WeightsSet | None, sizes: Array) -> bool:
-    """Whether every member of another set says the same."""
-    if found is None:
-        return False
-    names = found.fibre.plant.states
-    i, j = names.index(item.first), names.index(item.second)
-    direction = np.zeros_like(found.first)
+def _against(item: Statement, plant: Plant, sizes: Array) -> Array:
+    """The linear function that is below zero for every member of a set where a statement holds."""
+    i, j = plant.states.index(item.first), plant.states.index(item.second)
+    direction = np.zeros((plant.n + plant.m, plant.n + plant.m))
     if item.kind == "order":
         direction[i, i], direction[j, j] = sizes[i] ** 2, -(sizes[j] ** 2)
     else:
         direction[i, j] = direction[j, i] = sizes[i] * sizes[j] / 2
-    sign = -1.0 if item.holds else 1.0
-    try:
-        return linear_maximum(found, sign * direction).value < 0
-    except SolverError:
-        return False
+    return -direction if item.holds else direction
 
 
 def _gain(plant: Plant, Q: Array, R: Array) -> Array | None:

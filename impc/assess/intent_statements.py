@@ -14,13 +14,14 @@ docs/equivalent-weights.md, section 5, and docs/what-may-be-concluded.md.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from impc.arrays import Array
-from impc.assess.bounded_weights import linear_maximum, linear_range
+from impc.assess.bounded_weights import linear_maxima, linear_ranges
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -87,17 +88,19 @@ def order_statements(
         The states to compare; those of the plant's own that a reader can name.
     """
     names = found.fibre.plant.states
-    total = len(found.first)
+    pairs = list(itertools.combinations(states, 2))
+    if not pairs:
+        return ()
+    directions = np.zeros((len(pairs), *found.first.shape))
+    for direction, pair in zip(directions, pairs, strict=True):
+        i, j = (names.index(name) for name in pair)
+        direction[i, i], direction[j, j] = sizes[i] ** 2, -(sizes[j] ** 2)
     statements = []
-    for position, one in enumerate(states):
-        for other in states[position + 1 :]:
-            i, j = names.index(one), names.index(other)
-            direction = np.zeros((total, total))
-            direction[i, i], direction[j, j] = sizes[i] ** 2, -(sizes[j] ** 2)
-            says = f"a typical {one} costs more than a typical {other}"
-            ends = linear_range(found, direction)
-            span = (ends.least.bound, ends.most.bound)  # no member goes beyond
-            statements.append(_statement(found, span, one, other, says, sizes[i], "order"))
+    for (one, other), ends in zip(pairs, linear_ranges(found, directions), strict=True):
+        says = f"a typical {one} costs more than a typical {other}"
+        span = (ends.least.bound, ends.most.bound)  # no member goes beyond
+        size = sizes[names.index(one)]
+        statements.append(_statement(found, span, one, other, says, size, "order"))
     return tuple(statements)
 
 
@@ -120,13 +123,12 @@ def sense_statements(
     """
     names = found.fibre.plant.states
     statements = []
-    for position, one in enumerate(states):
-        for other in states[position + 1 :]:
-            i, j = names.index(one), names.index(other)
-            ends, scale = ranges[max(i, j), min(i, j)], sizes[i] * sizes[j]
-            says = f"{one} and {other} of the same sign cost more than of opposite signs"
-            span = (scale * ends.least.bound, scale * ends.most.bound)
-            statements.append(_statement(found, span, one, other, says, sizes[i], "sense"))
+    for one, other in itertools.combinations(states, 2):
+        i, j = names.index(one), names.index(other)
+        ends, scale = ranges[max(i, j), min(i, j)], sizes[i] * sizes[j]
+        says = f"{one} and {other} of the same sign cost more than of opposite signs"
+        span = (scale * ends.least.bound, scale * ends.most.bound)
+        statements.append(_statement(found, span, one, other, says, sizes[i], "sense"))
     return tuple(statements)
 
 
@@ -146,10 +148,9 @@ def widest_dominant_angle(found: WeightsSet, sizes: Array) -> tuple[float, Weigh
     centre = _dominant(D @ found.least.weights.Q @ D)
     largest = np.argsort(-np.diag(D @ found.least.weights.Q @ D))[:2]
     starts = [found.least.weights.block]
-    for index in largest:
-        direction = np.zeros_like(found.first)
-        direction[index, index] = 1.0
-        ends = linear_range(found, direction)
+    directions = np.zeros((len(largest), *found.first.shape))
+    directions[np.arange(len(largest)), largest, largest] = 1.0
+    for ends in linear_ranges(found, directions):
         starts += [ends.least.weights.block, ends.most.weights.block]
     best_angle, best = 0.0, found.least.weights.block
     for start in starts:
@@ -166,7 +167,7 @@ def _frank_wolfe(found: WeightsSet, D: Array, centre: Array, start: Array) -> Ar
     for _ in range(_FRANK_WOLFE):
         gradient = np.zeros_like(X)
         gradient[:n, :n] = D @ _turning(D @ X[:n, :n] @ D, centre) @ D
-        end = linear_maximum(found, gradient).weights.block
+        end = linear_maxima(found, gradient[None])[0].weights.block
         shares = np.linspace(0.0, 1.0, 21)
         angles = [_angle(centre, _dominant(D @ (X + s * (end - X))[:n, :n] @ D)) for s in shares]
         step = shares[int(np.argmax(angles))]

@@ -22,7 +22,7 @@ from impc.inverse.solution_set import gain_fibre
 if TYPE_CHECKING:
     from impc.assess.bounded_weights import WeightsSet
     from impc.assess.eigenvalue_ranges import EigenvalueRange
-    from impc.assess.intent_draws import PriceRange
+    from impc.assess.intent_draws import DrawnSet, PriceRange
     from impc.assess.intent_statements import Statement
     from impc.model.plant import Plant
     from impc.model.riccati import LqrSolution
@@ -137,7 +137,14 @@ def summarise_weights(
     statements = order_statements(found, sizes, names) + sense_statements(
         found, sizes, names, ranges
     )
-    sets = tuple(set_of_gain(plant, item, metrics, ratio) for item in draws)
+    sets = tuple(
+        set_of_gain(plant, item, metrics, ratio, sizes, names, statements) for item in draws
+    )
+    own = [(sizes[index] ** 2, ranges[index, index]) for index in named]
+    prices = {
+        name: (unit * ends.low, unit * ends.high)
+        for name, (unit, ends) in zip(names, own, strict=True)
+    }
     return WeightsSummary(
         found.fibre.dimension - 1,
         found.least.condition,
@@ -147,10 +154,10 @@ def summarise_weights(
             for (i, j), item in ranges.items()
         ),
         eigenvalue_ranges(found, [*members, _at_trace(widest, plant.m)]),
-        with_confidence(statements, sets, sizes) if sets else statements,
+        with_confidence(statements, sets) if sets else statements,
         angle,
         len(sets),
-        prices_over_gains(found, sets, sizes, names) if sets else (),
+        prices_over_gains(prices, sets) if sets else (),
         _angle_of_gain(found, sets, sizes),
     )
 
@@ -181,20 +188,20 @@ def weights_summary_or_reason(
         return None, str(error)
 
 
-def _angle_of_gain(found: WeightsSet, sets: tuple[WeightsSet | None, ...], sizes: Array) -> float:
+def _angle_of_gain(found: WeightsSet, sets: tuple[DrawnSet, ...], sizes: Array) -> float:
     if not sets:
         return float("nan")
-    own, widest = _dominant(found, sizes), 0.0
+    own, widest = _dominant(found.least.weights, sizes), 0.0
     for one in sets:
         # Without a least conditioned member the direction is anywhere.
-        cosine = 0.0 if one is None else abs(float(own @ _dominant(one, sizes)))
+        cosine = 0.0 if one.least is None else abs(float(own @ _dominant(one.least, sizes)))
         widest = max(widest, float(np.degrees(np.arccos(min(1.0, cosine)))))
     return widest
 
 
-def _dominant(found: WeightsSet, sizes: Array) -> Array:
+def _dominant(weights: Weights, sizes: Array) -> Array:
     D = np.diag(np.asarray(sizes))
-    return np.asarray(np.linalg.eigh(D @ found.least.weights.Q @ D)[1][:, -1])
+    return np.asarray(np.linalg.eigh(D @ weights.Q @ D)[1][:, -1])
 
 
 def _shown(plant: Plant, weights: Weights, sizes: Array) -> list[int]:

@@ -121,12 +121,16 @@ def diagonal_weights(problem: Problem, *, max_evaluations: int = 15) -> Weights:
 
 
 def _ranked(problem: Problem) -> list[tuple[Weights, LqrSolution]]:
-    """Those of `bryson_weights` that can be simulated, least misfit first."""
-    candidates, reason = [], ""
+    """Those of `bryson_weights` that can be simulated, least misfit first.
+
+    The others stand by what was seen until they were farther off than the best so far.
+    """
+    candidates, reason, best = [], "", np.inf
     for weights, solution in bryson_regulators(problem):
-        size, why = misfit_or_reason(problem, solution.K, solution.S)
+        size, why = misfit_or_reason(problem, solution.K, solution.S, best)
         reason = reason or why
         if not why:
+            best = min(best, size)
             candidates.append((size, weights, solution))
     if not candidates:
         raise SolverError(

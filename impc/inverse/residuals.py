@@ -164,20 +164,29 @@ def start_residual(problem: Problem, gain: Array, metric: Array) -> StartResidua
     return at
 
 
-def misfit_or_reason(problem: Problem, gain: Array, metric: Array) -> tuple[float, str]:
+def misfit_or_reason(
+    problem: Problem, gain: Array, metric: Array, most: float = np.inf
+) -> tuple[float, str]:
     """2-norm of the residual and an empty string, or infinity and why there is none.
 
     At a `gain` (m, n) and a `metric` (m, m). A fifth of the time of `evaluate`, which also
     differentiates.
+
+    Parameters
+    ----------
+    most : float
+        Once the trials so far have more, the rest are not looked at, and theirs is not in it.
     """
-    residual, reason = residual_or_reason(problem, gain, metric)
+    residual, reason = residual_or_reason(problem, gain, metric, most)
     return np.inf if reason else float(np.linalg.norm(residual)), reason
 
 
-def residual_or_reason(problem: Problem, gain: Array, metric: Array) -> tuple[Array, str]:
+def residual_or_reason(
+    problem: Problem, gain: Array, metric: Array, most: float = np.inf
+) -> tuple[Array, str]:
     """`residual_only` (r,) and an empty string, or nothing (0,) and why there is none.
 
-    At a `gain` (m, n) and a `metric` (m, m).
+    At a `gain` (m, n) and a `metric` (m, m); `most` as in `misfit_or_reason`.
     """
     if not is_stable(problem.plant.A - problem.plant.B @ gain, discrete=True):
         return np.zeros(0), "the gain does not stabilise the plant"
@@ -185,12 +194,17 @@ def residual_or_reason(problem: Problem, gain: Array, metric: Array) -> tuple[Ar
         controller = controller_for(problem, gain, metric)
     except ImpcError as error:
         return np.zeros(0), str(error)
-    runs = [simulate(controller, drive) for drive in scenarios(problem)]
-    for run in runs:
+    parts, square = [], 0.0
+    for trial, drive in zip(problem.recordings, scenarios(problem), strict=True):
+        run = simulate(controller, drive)
         if not run.complete:
             reason = f"sample {run.reached}: {Status(int(run.status[run.reached])).sentence}"
             return np.zeros(0), reason
-    return _residual(problem, runs), ""
+        parts.append(_off(problem, trial, run).ravel())
+        square += float(parts[-1] @ parts[-1])
+        if square > most**2:
+            break
+    return np.concatenate(parts), ""
 
 
 def residual_only(problem: Problem, gain: Array, metric: Array) -> Array:
@@ -212,14 +226,10 @@ def residual_only(problem: Problem, gain: Array, metric: Array) -> Array:
         As `controller_for`.
     """
     controller = controller_for(problem, gain, metric)
-    return _residual(problem, [simulate(controller, drive) for drive in scenarios(problem)])
-
-
-def _residual(problem: Problem, runs: list[Simulation]) -> Array:
     return np.concatenate(
         [
-            ((run.x @ problem.plant.C.T - trial.outputs) / problem.output_scale).ravel()
-            for run, trial in zip(runs, problem.recordings, strict=True)
+            _off(problem, trial, simulate(controller, drive)).ravel()
+            for trial, drive in zip(problem.recordings, scenarios(problem), strict=True)
         ]
     )
 
@@ -296,10 +306,15 @@ def _symmetric(columns: Array, m: int) -> Array:
 
 def _difference(problem: Problem, trial: Recording, run: Simulation) -> Array:
     """Simulated minus recorded outputs over their scales (samples, p), large where not reached."""
-    difference = (run.x @ problem.plant.C.T - trial.outputs) / problem.output_scale
+    difference = _off(problem, trial, run)
     if not run.complete:
         difference[run.reached + 1 :] = _NOT_REACHED * _scale(problem, trial)
-    return np.asarray(difference)
+    return difference
+
+
+def _off(problem: Problem, trial: Recording, run: Simulation) -> Array:
+    """Simulated minus recorded outputs over their scales (samples, p)."""
+    return np.asarray((run.x @ problem.plant.C.T - trial.outputs) / problem.output_scale)
 
 
 def _scale(problem: Problem, trial: Recording) -> float:

@@ -10,7 +10,7 @@ from impc.arrays import Array
 from impc.assess.bounded_weights import (
     WeightsSet,
     entry_ranges,
-    linear_range,
+    linear_ranges,
     trace_range,
     weights_set,
 )
@@ -92,11 +92,12 @@ def test_ranges_of_several_inputs_are_never_passed() -> None:
     work = chain_of_masses(6, 100)
     found = set_of(work)
     sampled = np.array(random_members(found, 100))
-    for i, j in ((0, 0), (2, 1), (5, 5)):
-        direction = np.zeros_like(found.first)
+    pairs = ((0, 0), (2, 1), (5, 5))
+    directions = np.zeros((len(pairs), *found.first.shape))
+    for direction, (i, j) in zip(directions, pairs, strict=True):
         direction[i, j] += 0.5
         direction[j, i] += 0.5
-        ends = linear_range(found, direction)
+    for (i, j), ends in zip(pairs, linear_ranges(found, directions), strict=True):
         width = ends.high - ends.low
         assert np.min(sampled[:, i, j]) >= ends.low - 1e-7 * width
         assert np.max(sampled[:, i, j]) <= ends.high + 1e-7 * width

@@ -8,7 +8,12 @@ import numpy as np
 import pytest
 
 from impc.errors import SolverError
-from impc.inverse.semidefinite import matrix_inequality, norm_bound, solve_semidefinite
+from impc.inverse.semidefinite import (
+    matrix_inequality,
+    norm_bound,
+    solve_each,
+    solve_semidefinite,
+)
 from tests.support import random_weights
 
 if TYPE_CHECKING:
@@ -43,6 +48,19 @@ def test_a_bound_with_a_norm_is_never_above_the_distance() -> None:
         )
         assert found.bound <= truth * (1 + 1e-14)
         assert found.bound >= truth - 100 * tolerance
+
+
+def test_each_objective_over_the_same_cone_has_its_own_end() -> None:
+    """min c'y over the disc |y| <= 1 as a matrix inequality: -|c|, whatever came before."""
+    rng = np.random.default_rng(6)
+    basis = np.array([[[1.0, 0.0], [0.0, -1.0]], [[0.0, 1.0], [1.0, 0.0]]])
+    cone = matrix_inequality(np.eye(2), basis)
+    objectives = rng.normal(size=(20, 2)) * 10 ** rng.uniform(-3, 1, size=(20, 1))
+    sizes = np.linalg.norm(objectives, axis=1)
+    found = solve_each(objectives, [cone], reach=np.full(2, 2.0))
+    for objective, size, one in zip(objectives, sizes, found, strict=True):
+        np.testing.assert_allclose(one.y, -objective / size, atol=2e-5)
+        assert -size * (1 + 1e-8) <= one.bound <= -size * (1 - 1e-14)
 
 
 def test_a_solver_that_breaks_off_is_an_error_of_ours(monkeypatch: pytest.MonkeyPatch) -> None:
