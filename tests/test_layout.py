@@ -21,7 +21,7 @@ ELSEWHERE = {
         reporting/writer.py studies/example/figures.py reporting/document.py files/columns.py
         reporting/glossary.py studies/example/report.py studies/example/result.py""",
     "assess/test_all_intervals.py": "assess/judged.py assess/other_models.py",
-    "assess/test_bounded_weights.py": "assess/intent_statements.py",
+    "assess/test_bounded_weights.py": "assess/extreme_weights.py assess/intent_statements.py",
     "assess/test_covariance.py": "assess/printed_gain.py",
     "assess/test_diagnostics.py": "assess/loop_noise.py assess/residual_structure.py",
     "assess/test_intent_draws.py": "assess/weights_ranges.py studies/fit/tables.py",

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import scipy.sparse
 
-from impc.assess import bounded_weights as weights_set
+from impc.assess import bounded_weights, extreme_weights
 from impc.assess import identified_directions as identifiability
 from impc.assess import variance_accounted_for as agreement
 from impc.checking import replace
@@ -65,7 +65,7 @@ def values() -> dict[str, Any]:
         "problem": problem,
         "solution": solution,
         "fibre": fibre,
-        "set": weights_set.weights_set(fibre),
+        "set": bounded_weights.weights_set(fibre),
         "mpc": mpc.build_mpc(law),
         "terminal": law.terminal,
         "family": plant_family.PlantFamily(lambda _: two, ["mass"], [1.0]),
@@ -251,13 +251,13 @@ def calls() -> list[Call]:
             equivalent_weights.other_weights,
             {"fibre": v["fibre"], "count": 2, "condition_ratio": 10.0},
         ),
-        (weights_set.weights_set, {"fibre": v["fibre"], "ratio": 10.0}),
-        (weights_set.linear_ranges, {"found": v["set"], "directions": np.eye(4)[None]}),
-        (weights_set.linear_maxima, {"found": v["set"], "directions": np.eye(4)[None]}),
-        (weights_set.entry_ranges, {"found": v["set"], "states": [0]}),
-        (weights_set.trace_range, {"found": v["set"], "scaling": size}),
-        (weights_set.nearest_diagonal, {"found": v["set"], "scaling": size}),
-        (weights_set.extreme_eigenvalue, {"found": v["set"], "largest": True}),
+        (bounded_weights.weights_set, {"fibre": v["fibre"], "ratio": 10.0}),
+        (extreme_weights.linear_ranges, {"found": v["set"], "directions": np.eye(4)[None]}),
+        (extreme_weights.linear_maxima, {"found": v["set"], "directions": np.eye(4)[None]}),
+        (extreme_weights.entry_ranges, {"found": v["set"], "states": [0]}),
+        (extreme_weights.trace_range, {"found": v["set"], "scaling": size}),
+        (extreme_weights.nearest_diagonal, {"found": v["set"], "scaling": size}),
+        (extreme_weights.extreme_eigenvalue, {"found": v["set"], "largest": True}),
         (inverse_lqr.inverse_lqr_lmi, about),
         (
             inverse_lqr.inverse_lqr_gradient,

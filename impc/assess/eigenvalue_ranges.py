@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.assess.bounded_weights import extreme_eigenvalue, linear_maxima, linear_ranges
+from impc.assess.extreme_weights import extreme_eigenvalue, linear_maxima, linear_ranges
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -23,8 +23,9 @@ import numpy as np
 import scipy.linalg
 
 from impc.arrays import Array
-from impc.assess.bounded_weights import linear_maxima, linear_ranges, weights_set
+from impc.assess.bounded_weights import weights_set
 from impc.assess.compiled_regulator import doubled_gain
+from impc.assess.extreme_weights import linear_maxima, linear_ranges
 from impc.checking import replace
 from impc.errors import SolverError, WeightsError
 from impc.inverse.solution_set import gain_fibre

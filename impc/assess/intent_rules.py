@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.arrays import Array, Frozen, frozen
-from impc.assess.bounded_weights import nearest_diagonal, trace_range, weights_set
+from impc.assess.bounded_weights import weights_set
+from impc.assess.extreme_weights import nearest_diagonal, trace_range
 from impc.errors import SolverError, WeightsError
 from impc.inverse.equivalent_weights import analytic_centre, least_condition_weights
 from impc.inverse.solution_set import gain_fibre

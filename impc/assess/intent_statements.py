@@ -21,12 +21,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.arrays import Array
-from impc.assess.bounded_weights import linear_maxima, linear_ranges
+from impc.assess.extreme_weights import linear_maxima, linear_ranges
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from impc.assess.bounded_weights import Range, WeightsSet
+    from impc.assess.bounded_weights import WeightsSet
+    from impc.assess.extreme_weights import Range
     from impc.model.weights import Weights
 
 __all__ = ["Statement", "order_statements", "sense_statements", "widest_dominant_angle"]

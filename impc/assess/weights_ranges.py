@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.arrays import Array
-from impc.assess.bounded_weights import entry_ranges, weights_set
+from impc.assess.bounded_weights import weights_set
 from impc.assess.eigenvalue_ranges import eigenvalue_ranges
+from impc.assess.extreme_weights import entry_ranges
 from impc.assess.intent_draws import prices_over_gains, set_of_gain, with_confidence
 from impc.assess.intent_statements import order_statements, sense_statements, widest_dominant_angle
 from impc.errors import SolverError, WeightsError

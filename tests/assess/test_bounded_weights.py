@@ -7,13 +7,8 @@ import pytest
 
 from experiments.benchmarks.workloads import Workload, chain_of_masses, example, seat
 from impc.arrays import Array
-from impc.assess.bounded_weights import (
-    WeightsSet,
-    entry_ranges,
-    linear_ranges,
-    trace_range,
-    weights_set,
-)
+from impc.assess.bounded_weights import WeightsSet, weights_set
+from impc.assess.extreme_weights import entry_ranges, linear_ranges, trace_range
 from impc.assess.intent_statements import order_statements, sense_statements, widest_dominant_angle
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
