@@ -98,6 +98,7 @@ ELSEWHERE = {
         inverse/told_combinations.py""",
     "inverse/test_stationarity.py": "inverse/smoothing.py",
     "model/test_riccati.py": "model/bounds.py model/plant.py model/weights.py",
+    "model/test_structure.py": "model/combinations.py",
     "studies/plan/test_study.py": """
         studies/plan/designs.py studies/plan/settings.py studies/plan/simulated_fits.py""",
     "studies/cohort/test_store.py": """
@@ -109,6 +110,7 @@ ELSEWHERE = {
     "studies/compare/test_subject.py": """
         cli/compare.py inverse/estimates.py inverse/methods.py studies/compare/csv_tables.py
         studies/compare/report.py""",
+    "studies/fit/test_settings.py": "studies/fit/asked.py",
     "studies/fit/test_verdict.py": """
         studies/charts.py studies/fit/interval_figures.py studies/signal_words.py""",
     "studies/fit/test_subject.py": """

@@ -82,7 +82,7 @@ def _person(
     from impc.control.controller import Controller  # noqa: PLC0415
     from impc.errors import InputError  # noqa: PLC0415
     from impc.files.plant_sources import make_plant, plant_family_of  # noqa: PLC0415
-    from impc.studies.fit.settings import fit_bounds, moving_body  # noqa: PLC0415
+    from impc.studies.fit.asked import fit_bounds, moving_body  # noqa: PLC0415
     from impc.studies.plan.designs import Person  # noqa: PLC0415
     from impc.studies.plan.settings import (  # noqa: PLC0415
         mechanical_stops,

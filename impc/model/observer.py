@@ -25,8 +25,8 @@ import scipy.linalg
 from impc.arrays import Array, as_numbers, finite_array, frozen
 from impc.checking import Value, checked, replace
 from impc.errors import InputError
+from impc.model.combinations import linear_combination
 from impc.model.kalman import stationary_filter
-from impc.model.structure import linear_combination
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -63,7 +63,8 @@ from impc.studies.cohort.sheet import Sheet, column_values, read_sheet
 from impc.studies.cohort.store import Store, open_store
 from impc.studies.cohort.study import read_study
 from impc.studies.effort import Effort
-from impc.studies.fit.settings import FitSettings, fit_settings, fit_structures, require_used
+from impc.studies.fit.asked import fit_structures
+from impc.studies.fit.settings import FitSettings, fit_settings, require_used
 from impc.studies.fit.subject import fit_problem
 from impc.studies.optimal_fit.settings import optimal_fit_settings, posed, recorded
 from impc.studies.selection.subsets import largest_subsets

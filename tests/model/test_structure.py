@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from impc.errors import ImpcError, InputError, WeightsError
+from impc.model.combinations import linear_combination
 from impc.model.plant import Plant
-from impc.model.structure import Structure, linear_combination
+from impc.model.structure import Structure
 from tests.support import extrapolated_slope
 
 NAMES = ("a", "a_rate", "b", "x[0]", "1st")

@@ -13,7 +13,7 @@ import numpy as np
 from impc.assess.structures import assess_structure
 from impc.errors import SolverError, WeightsError
 from impc.inverse.structured_fit import fit_structured
-from impc.studies.fit.settings import fit_structures
+from impc.studies.fit.asked import fit_structures
 
 if TYPE_CHECKING:
     from impc.inverse.estimates import Estimate

@@ -7,41 +7,26 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import msgspec
 import numpy as np
-import scipy.signal
 
 from impc.control.named_solver import COMPILED, require_solver
 from impc.errors import InputError, brief
 from impc.files.configuration import FILL_IN
 from impc.inverse.methods import method_named
-from impc.model.bounds import Bounds
-from impc.model.observer import Observer
-from impc.model.structure import Structure
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping, Sequence
+    from collections.abc import Collection, Mapping
 
-    from impc.arrays import Array
-    from impc.model.plant import Plant
-    from impc.model.plant_family import PlantFamily
-    from impc.model.recordings import Recording
 
 __all__ = [
     "BESIDE",
     "FitSettings",
     "ObserverSettings",
     "StructureSettings",
-    "fit_bounds",
-    "fit_observer",
     "fit_settings",
-    "fit_structures",
-    "moving_body",
     "read_settings",
     "require_used",
 ]
 
-# A recorded angle is differentiated over this time, by a parabola: noise of 1 % of the largest
-# angle at 100 Hz then gives a rate of a few per cent of the largest.
-_RATE_WINDOW = 0.15
 # Percentiles of 95 % lie between replicates only from 20 on.
 _FEWEST = 20
 # Least and most of each number. The most is far beyond any use: it keeps sizes and seconds numbers.
@@ -70,9 +55,6 @@ _PAGES = {"fit": "docs/fitting.md", "plan": "docs/planning.md", "select": "docs/
 
 #: Methods that a fit shows beside inverse MPC, which comes last (docs/fitting.md).
 BESIDE = ("feedback_gain", "inverse_lqr", "inverse_lqr_output", "clipped_lqr")
-
-# Of the command that is noise, where the search begins: what isometric force has, and less.
-_SHARE = 0.1
 
 T = TypeVar("T")
 
@@ -327,112 +309,3 @@ def _require_structures(table: Mapping[str, Any]) -> None:
                 raise InputError(
                     f"[fit.{name}] {key}", "is not a setting", f"known: {', '.join(known)}"
                 )
-
-
-def fit_observer(
-    plant: Plant, settings: FitSettings, recordings: Sequence[Recording]
-) -> tuple[Observer, Array] | None:
-    """The person of [fit.observer], and where steps of an unknown perturbation begin (d,).
-
-    Levels stand at places to begin from; the search finds others by the residuals.
-
-    Raises
-    ------
-    InputError, PlantError
-        When a sensed signal is not known, or an unknown perturbation has nobody to estimate it.
-    """
-    asked = settings.observer
-    if asked is None:
-        return None
-    steps = np.concatenate([np.diff(trial.disturbance, axis=0) for trial in recordings])
-    size = np.sqrt(np.mean(steps**2, axis=0))
-    walk = np.where(size > 0, size, 1.0)
-    person = Observer(
-        plant,
-        asked.sensed,
-        motor=float(asked.motor),
-        share=_SHARE * asked.share,
-        process=float(asked.process),
-        sensory=1.0,
-        walk=None if asked.known else walk,
-    )
-    return person, walk
-
-
-def fit_structures(plant: Plant, settings: FitSettings) -> tuple[Structure, ...]:
-    """Structures of the weights that the settings name, that of [fit.structure] first.
-
-    Raises
-    ------
-    InputError, WeightsError
-        When a feature cannot be read, nothing prices a mode that does not decay, or two structures
-        have one name.
-    """
-    first = [] if settings.structure is None else [settings.structure]
-    found: list[Structure] = []
-    for item in (*first, *settings.structures):
-        one = Structure(plant, item.Q, item.R, over=item.over, name=item.name)
-        if one.name in [other.name for other in found]:
-            raise InputError("[fit] structures", f"has {one.name!r} twice", "name each by itself")
-        found.append(one)
-    return tuple(found)
-
-
-def moving_body(
-    plant: Plant, family: PlantFamily | None, settings: FitSettings
-) -> tuple[Plant, PlantFamily | None]:
-    """The plant and its family with the body that the settings ask for."""
-    if settings.body != "linear":
-        return plant, family
-    return plant.linear(), None if family is None else family.linear()
-
-
-def fit_bounds(plant: Plant, settings: FitSettings, recordings: Sequence[Recording]) -> Bounds:
-    """Bounds of the controller: inputs as set, states as set or from the data (3.22).
-
-    Raises
-    ------
-    InputError, BoundsError
-        When a state is unknown or its bound cannot be taken from the data.
-    """
-    x_max = np.full(plant.n, np.inf)
-    for name, value in settings.bounded_states.items():
-        if name not in plant.states:
-            raise InputError(
-                f"[fit] bounded_states {name}", "is not a state", f"known: {list(plant.states)}"
-            )
-        limit = value
-        if isinstance(value, str):
-            limit = settings.margin * _recorded_maximum(plant, name, value, recordings)
-        x_max[plant.states.index(name)] = limit
-    u_max = None if settings.u_max is None else np.asarray(settings.u_max, dtype=np.float64)
-    if u_max is not None and u_max.shape not in ((), (plant.m,)):
-        raise InputError(
-            "[fit] u_max", f"has {len(u_max)} numbers", f"give one, or {plant.m}, one an input"
-        )
-    u_min = None if u_max is None else -u_max
-    return Bounds(plant, x_min=-x_max, x_max=x_max, u_min=u_min, u_max=u_max)
-
-
-def _recorded_maximum(plant: Plant, name: str, word: str, recordings: Sequence[Recording]) -> float:
-    if word != "data":
-        raise InputError(f"[fit] bounded_states {name}", f"got {word!r}", 'give a number or "data"')
-    if name in plant.outputs:
-        column = plant.outputs.index(name)
-        return max(float(np.max(np.abs(trial.outputs[:, column]))) for trial in recordings)
-    base = name.removesuffix("_rate")
-    if base != name and base in plant.outputs:
-        column = plant.outputs.index(base)
-        return max(_largest_rate(trial.outputs[:, column], plant.dt) for trial in recordings)
-    raise InputError(
-        f"[fit] bounded_states {name}", "is neither an output nor the rate of one", "give a number"
-    )
-
-
-def _largest_rate(values: Array, dt: float) -> float:
-    window = max(5, 2 * round(_RATE_WINDOW / dt / 2) + 1)
-    if len(values) < window:
-        raise InputError("recording", f"has {len(values)} samples", f"give at least {window}")
-    rate = scipy.signal.savgol_filter(values, window, 2, deriv=1, delta=dt)
-    half = window // 2  # at the ends the parabola is one-sided
-    return float(np.max(np.abs(rate[half:-half])))

@@ -39,14 +39,9 @@ from impc.inverse.methods import estimate_all
 from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.problem import Problem, controller_for, scenarios
 from impc.inverse.structured_fit import fit_structured
+from impc.studies.fit.asked import fit_bounds, fit_observer, fit_structures, moving_body
 from impc.studies.fit.result import FitResult, FittedParameter
-from impc.studies.fit.settings import (
-    FitSettings,
-    fit_bounds,
-    fit_observer,
-    fit_structures,
-    moving_body,
-)
+from impc.studies.fit.settings import FitSettings
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence

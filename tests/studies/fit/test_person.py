@@ -23,9 +23,10 @@ from impc.model.recordings import Recording
 from impc.model.weights import Weights
 from impc.reporting.document import TextTable
 from impc.reporting.rendering import plain
+from impc.studies.fit.asked import fit_observer
 from impc.studies.fit.person import person_data, person_section, person_sentences, preferred
 from impc.studies.fit.result import FitResult
-from impc.studies.fit.settings import FitSettings, fit_observer, fit_settings
+from impc.studies.fit.settings import FitSettings, fit_settings
 from impc.studies.fit.subject import fit_problem, fit_recordings, stages
 from impc.studies.fit.verdict import verdict
 from tests.inverse.test_likelihood_fit import cart

@@ -11,7 +11,8 @@ import plants
 from impc.errors import ImpcError, InputError
 from impc.model.plant import Plant
 from impc.model.recordings import Recording
-from impc.studies.fit.settings import FitSettings, fit_bounds, fit_settings, require_used
+from impc.studies.fit.asked import fit_bounds
+from impc.studies.fit.settings import FitSettings, fit_settings, require_used
 
 
 @pytest.fixture(scope="module")

@@ -16,8 +16,9 @@ from impc.errors import InputError
 from impc.inverse.noisy_fit import fit_controller
 from impc.model.bounds import Bounds
 from impc.model.weights import Weights
+from impc.studies.fit.asked import fit_structures
 from impc.studies.fit.result import FitResult
-from impc.studies.fit.settings import FitSettings, fit_settings, fit_structures
+from impc.studies.fit.settings import FitSettings, fit_settings
 from impc.studies.fit.structure_words import structure_sentences
 from impc.studies.fit.structures import structure_data, structure_section
 from impc.studies.fit.subject import fit_problem, fit_recordings, stages
