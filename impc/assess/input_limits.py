@@ -246,7 +246,7 @@ def _typical_peak(fitted: Estimate, control: int) -> float:
     K, S = np.array(fitted.gain), np.array(fitted.metric)
     controller = controller_for(fitted.problem, K, S)
     runs = [simulate(controller, drive) for drive in scenarios(fitted.problem)]
-    command = np.concatenate([np.abs(run.u[:, control]) for run in runs])
+    command = np.concatenate([np.abs(run.applied[:, control]) for run in runs])
     return float(np.quantile(command, 0.995))
 
 

@@ -31,7 +31,9 @@ class MethodFit(Frozen):
     Attributes
     ----------
     estimate : Estimate
-        What it found.
+        What it found; its problem has the bounds that the method knows.
+    bounds : Bounds
+        Those of the subject.
     runs : tuple of Simulation
         One a trial; empty without a gain.
     vaf : Array
@@ -44,12 +46,14 @@ class MethodFit(Frozen):
     largest_input : Array
         Largest magnitude of each input (m,).
     exceeded : float
-        Share of the samples at which an input bound is exceeded, by more than 1e-6 of it.
+        Share of the samples that were reached at which an input bound is exceeded, by more than
+        1e-6 of it.
     fell : tuple of float or None
         For each trial the time in s at which the loop left every reasonable range.
     """
 
     estimate: Estimate
+    bounds: Bounds
     runs: tuple[Simulation, ...]
     vaf: Array
     trial_vaf: Array
@@ -68,6 +72,12 @@ class MethodFit(Frozen):
         """Whether there is a gain and it never exceeds an input bound."""
         return self.estimate.K is not None and self.exceeded == 0
 
+    @property
+    def commands(self) -> Array:
+        """Those of all samples that were reached (samples, m), in the units of the inputs."""
+        none = np.empty((0, self.estimate.problem.plant.m))
+        return np.concatenate([none, *(run.applied for run in self.runs)])
+
 
 def judge(estimate: Estimate, bounds: Bounds) -> MethodFit:
     """Simulate all recordings with what a method found.
@@ -75,7 +85,7 @@ def judge(estimate: Estimate, bounds: Bounds) -> MethodFit:
     Parameters
     ----------
     estimate : Estimate
-        Its problem has the bounds that its controller knows.
+        What is judged.
     bounds : Bounds
         Those of the subject, which it may exceed.
 
@@ -86,30 +96,32 @@ def judge(estimate: Estimate, bounds: Bounds) -> MethodFit:
     """
     problem = estimate.problem
     if estimate.K is None:
-        return _without_gain(estimate)
+        return _without_gain(estimate, bounds)
     controller = estimate.controller()
     runs = tuple(simulate(controller, drive) for drive in scenarios(problem))
-    commands = np.concatenate([run.u for run in runs])
+    commands = np.concatenate([run.applied for run in runs])
     beyond = (commands > bounds.u_max + 1e-6 * np.abs(bounds.u_max)) | (
         commands < bounds.u_min - 1e-6 * np.abs(bounds.u_min)
     )
     return MethodFit(
         estimate,
+        bounds,
         runs,
         frozen(_pooled_vaf(problem, runs)),
         frozen([_trial_vaf(problem, index, run) for index, run in enumerate(runs)]),
         frozen(np.empty((0, len(problem.plant.outputs)))),
-        frozen(np.max(np.abs(commands), axis=0)),
-        float(np.mean(np.any(beyond, axis=1))),
+        frozen(np.max(np.abs(commands), axis=0, initial=0.0)),
+        float(np.count_nonzero(np.any(beyond, axis=1)) / max(len(commands), 1)),
         tuple(None if run.complete else run.reached * problem.plant.dt for run in runs),
     )
 
 
-def _without_gain(estimate: Estimate) -> MethodFit:
+def _without_gain(estimate: Estimate, bounds: Bounds) -> MethodFit:
     plant, count = estimate.problem.plant, len(estimate.problem.recordings)
     p = len(plant.outputs)
     return MethodFit(
         estimate,
+        bounds,
         (),
         frozen(np.full(p, np.nan)),
         frozen(np.full((count, p), np.nan)),

@@ -171,7 +171,7 @@ def agreement(
         frozen(centred_vaf(trial.outputs, simulated)),
         frozen(whiteness(residual, max(lags, 1))),
         frozen(np.sqrt(np.mean(residual**2, axis=0))),
-        saturated_share(run.u, u_min, u_max),
+        saturated_share(run.applied, u_min, u_max),
     )
 
 
@@ -187,4 +187,4 @@ def saturated_share(u: Array, u_min: Array, u_max: Array) -> float:
         Their bounds (m,); infinite where there is none.
     """
     near = (u >= u_max * (1 - 1e-6)) | (u <= u_min * (1 - 1e-6))  # the origin is strictly inside
-    return float(np.mean(np.any(near, axis=1)))
+    return float(np.count_nonzero(np.any(near, axis=1)) / max(len(u), 1))

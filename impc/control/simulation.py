@@ -114,7 +114,7 @@ class Simulation(Frozen):
     x : Array
         States (steps + 1, n). Samples that were not reached repeat the last state.
     u : Array
-        Inputs (steps, m).
+        Inputs (steps, m); zero at samples that were not reached.
     status : Array of Status
         (steps,).
     weakly_active : int
@@ -151,6 +151,11 @@ class Simulation(Frozen):
     def reached(self) -> int:
         """Number of samples with an input."""
         return int(np.count_nonzero(self.status <= Status.SOFTENED))
+
+    @property
+    def applied(self) -> Array:
+        """The inputs of the samples that were reached (reached, m), in their units."""
+        return self.u[: self.reached]
 
 
 @dataclass(frozen=True)

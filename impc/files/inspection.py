@@ -125,7 +125,7 @@ def _plant_lines(wanted: Wanted) -> list[str]:
     for name, value in wanted.arguments.items():
         if isinstance(value, bool | int | float | str):
             text = json.dumps(value, ensure_ascii=False)
-            own = f"of the subject; without this line it is {text}, of a typical one"
+            own = f"the subject's own; without this line it is {text}, the plant's"
             if name in OWN and value != FILL_IN:
                 lines.append(_line(f'{name} = "{FILL_IN}"', own))
             else:

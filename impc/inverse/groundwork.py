@@ -51,6 +51,9 @@ if TYPE_CHECKING:
 
 __all__ = ["Found", "Groundwork", "NaturalUnits", "PlantUnits", "Remember", "afresh", "regulator"]
 
+# Share by which weights may miss the recordings by more than the gain that they were found for.
+_AS_GOOD = 1e-3
+
 #: (name, compute) -> the estimate: from memory, or computed now.
 Remember = Callable[[str, Callable[[], Estimate]], Estimate]
 
@@ -266,7 +269,10 @@ class NaturalUnits:
         behind = weights_behind(free_gain(self.known, self.fitted.stage_weights))
         weights = None if behind.equivalent is None else behind.equivalent.weights
         gain = behind.gain
-        return Found(np.array(gain.K), weights, gain.evaluations, np.array(gain.S), behind.reason)
+        # What the gain leaves too is noise, and no fault of the weights.
+        missed = weights is None or behind.misfit > (1 + _AS_GOOD) * gain.misfit
+        reason = behind.reason if missed else ""
+        return Found(np.array(gain.K), weights, gain.evaluations, np.array(gain.S), reason)
 
 
 #: What methods on the same recordings share, each part made when it is first asked for.

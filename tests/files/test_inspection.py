@@ -130,7 +130,7 @@ def test_settings_that_only_the_user_knows_are_asked_for(trial: Path, tmp_path: 
     with pytest.raises(InputError, match=r"\[plant\] mass: is still '\?'; fill it in"):
         make_plant(find_plant("seated-balance", read_configuration(out).plant), ())
     text = out.read_text()
-    assert 'mass = "?"                # of the subject; without this line it is 79.7' in text
+    assert 'mass = "?"                # the subject\'s own; without this line it is 79.7' in text
     assert 'height = "?"' in text
     assert '# sex = "male"' in text
     assert "command in N m" in text

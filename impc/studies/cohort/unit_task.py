@@ -145,7 +145,7 @@ def _described(problem: Problem, fitted: Estimate, settings: FitSettings) -> dic
     family = estimate.problem.family
     names = () if family is None else family.names
     limit = np.minimum(np.abs(problem.bounds.u_max), np.abs(problem.bounds.u_min))
-    commands = np.concatenate([np.abs(run.u) for run in fit.runs])
+    commands = np.abs(fit.commands)
     return {
         "states": plant.states,
         "controls": plant.controls,

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import control
 import numpy as np
 
+from impc.assess.assessments import ASSESSMENTS
 from impc.files.configuration import Configuration, RecordingTable
+from impc.model.plant import Plant
 from impc.studies.cohort.finding import KEYS
 from impc.studies.cohort.study import Study, Unit
 from impc.studies.cohort.unit_task import FitTask
@@ -14,6 +17,8 @@ from impc.studies.cohort.workers import Done
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Hashable, Iterator
+
+    from impc.assess.assessments import Assessment
 
 __all__ = ["Here", "fit_of", "made_up_study", "replicate_of", "tasks_of"]
 
@@ -36,6 +41,24 @@ def tasks_of(study: Study) -> dict[str, FitTask]:
     }
 
 
+def made_up(item: Assessment, rng: np.random.Generator) -> dict[str, float] | float:
+    """An assessment of the hand of `fit_of`, about 98."""
+    plant = Plant(
+        control.ss(
+            [[1, 0.1], [0, 1]],
+            [[0], [0.1]],
+            [[1, 0]],
+            0,
+            0.1,
+            inputs=["force"],
+            outputs=["position"],
+        )
+    )
+    names = item.signals(plant)
+    values = [98.0 + rng.random() for _ in names]
+    return values[0] if names == ("",) else dict(zip(names, values, strict=True))
+
+
 def fit_of(seed: int) -> dict[str, Any]:
     """What `impc.studies.cohort.unit_task.fit_unit` returns."""
     rng = np.random.default_rng(seed)
@@ -48,9 +71,7 @@ def fit_of(seed: int) -> dict[str, Any]:
         "trials": 2, "samples": 100, "K": gain, "K_deviation": [[0.1, None]],
         "K_told": [[True, False]], "K_of_weights": gain, "S": [[1.0]],
         "Q": weights["Q"], "R": [[1.0]], "misfit": 0.1, "exact": True, "converged": True,
-        "vaf": {"position": 98.0 + rng.random()}, "held_out_vaf": {"position": None},
-        "largest_input": {"force": 1.0}, "beyond_bound": 0.0, "first_fall": None,
-        "condition_number": 10.0,
+        **{item.name: made_up(item, rng) for item in ASSESSMENTS.values()},
         "saturated": 0.1, "state_sizes": [1.0, 1.0],
         "readings": {"least condition": weights, "analytic centre (no units)": weights},
         "parameters": {"mass": 2.0 + rng.random()}, "starts": [[0.0, 0.0]], "logarithms": [0.0],

@@ -7,6 +7,7 @@ import json
 import re
 from pathlib import Path
 
+import control
 import numpy as np
 import pandas as pd
 import pytest
@@ -14,15 +15,17 @@ from click.testing import CliRunner
 
 from experiments.coverage import cart, noisy_trial, true_controller
 from impc.arrays import Array
-from impc.assess.judged import MethodFit
+from impc.assess.judged import MethodFit, judge
 from impc.checking import replace
 from impc.cli.main import main
+from impc.control.controller import Controller
 from impc.inverse import methods
 from impc.inverse.estimates import Estimate, Status, decode_estimate, encode_estimate
 from impc.inverse.problem import Problem
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.recordings import Recording
+from impc.model.weights import Weights
 from impc.studies.compare.subject import (
     compare_recordings,
     compared_methods,
@@ -84,6 +87,32 @@ def test_exceeding_is_counted_sample_by_sample(compared: dict[str, MethodFit]) -
     u: Array = np.concatenate([run.u for run in fit.runs])
     assert fit.exceeded == pytest.approx(float(np.mean(np.abs(u) > 1 + 1e-6)))
     assert fit.largest_input[0] == pytest.approx(float(np.max(np.abs(u))))
+
+
+def test_only_samples_that_were_reached_count() -> None:
+    """x+ = 1.5 x + u with |u| <= 0.1 falls from 1: every command until then is at the limit."""
+    plant = Plant(control.ss([[1.5]], [[1]], [[1]], 0, 1))
+    wide = Bounds(plant, u_min=-5, u_max=5)
+    run = Controller(plant, Weights(1, 1), wide, 3, terminal_set=False).simulate([1.0], steps=400)
+    problem = Problem(plant, wide, 3, [Recording(plant, run.x)], terminal_set=False)
+    found = methods.estimate(problem)
+    tight = Bounds(plant, u_min=-0.1, u_max=0.1)
+    fit = judge(replace(found, problem=replace(found.problem, bounds=tight)), wide)
+    assert fit.fell[0] is not None
+    assert 5 < len(fit.commands) < 200
+    np.testing.assert_allclose(fit.commands, -0.1)
+    small = Bounds(plant, u_min=-0.05, u_max=0.05)
+    assert judge(fit.estimate, small).exceeded == 1.0
+
+
+def test_what_the_gain_leaves_too_is_no_fault_of_the_weights(
+    compared: dict[str, MethodFit],
+) -> None:
+    """Of recordings with noise: weights with exactly the gain miss as much as it does."""
+    found = compared["inverse_mpc_reduced"].estimate
+    assert found.weights is not None
+    assert found.misfit > 0.1
+    assert found.reason == ""
 
 
 def test_estimates_go_through_json(compared: dict[str, MethodFit]) -> None:
