@@ -6,6 +6,9 @@ turn, so that a run can be ended at any time, be gone on with, and be summed up:
     python -m experiments.noisy_people_study run --subjects 200 --out a.jsonl
     python -m experiments.noisy_people_study run --body seat --vaf 90 --subjects 20 --out b.jsonl
     python -m experiments.noisy_people_study sum a.jsonl b.jsonl
+
+Those of docs/noisy-people.md that were made by the code as it is are in noisy_people_rows.jsonl
+beside this file; a run with that as `--out` goes on from there.
 """
 
 from __future__ import annotations
@@ -18,7 +21,7 @@ from pathlib import Path
 
 from experiments.noisy_people import BODIES, NOISES, recorded, subject
 from experiments.noisy_people_score import LIMITS, Score, passed_over, score
-from experiments.noisy_people_table import HEADS, pooled, row
+from experiments.noisy_people_table import pooled, table
 from impc.errors import ImpcError
 
 # Digits of a number that is kept.
@@ -73,14 +76,18 @@ def _sum(given: argparse.Namespace) -> None:
                 others[f"{found['study']}: {why}"] = others.get(f"{found['study']}: {why}", 0) + 1
             else:
                 scores.setdefault(found["study"], []).append(Score(**found))
-    print("| " + " | ".join(HEADS) + " |")
-    print("|" + "---|" * len(HEADS))
-    for each in scores.values():
-        print("| " + " | ".join(row(each)) + " |")
+    for line in table(list(scores.values())):
+        print(line)
     print()
-    for met in ("none met", "met"):
-        if people := [each for name, each in scores.items() if name.endswith(f", {met}")]:
-            print(f"{met}: {pooled(people)}")
+    for body, met in itertools.product(BODIES, ("none met", "met")):
+        ends = f"{body}, ", f", {met}"
+        people = [
+            each
+            for name, each in scores.items()
+            if name.startswith(ends[0]) and name.endswith(ends[1])
+        ]
+        if people:
+            print(f"{body}, {met}: {pooled(people)}")
     for reason, count in others.items():
         print(f"not scored: {reason}: {count}")
 

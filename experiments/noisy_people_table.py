@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from experiments.noisy_people_score import Score
 
-__all__ = ["HEADS", "means", "pooled", "row"]
+__all__ = ["HEADS", "means", "pooled", "row", "table"]
 
 #: Of the columns.
 HEADS = (
@@ -34,6 +34,21 @@ _ENDED = 0.5
 _BIAS = 0.25
 
 Pairs = list[tuple[float, float]]
+
+
+def table(studies: Sequence[list[Score]]) -> list[str]:
+    """Lines in Markdown, without columns in which no study has anything.
+
+    Parameters
+    ----------
+    studies : sequence of list of Score
+        Those of one kind each.
+    """
+    rows = [row(each) for each in studies]
+    filled = [k for k in range(len(HEADS)) if any(cells[k] != "-" for cells in rows)]
+    lines = [[cells[k] for k in filled] for cells in (HEADS, *rows)]
+    texts = ["| " + " | ".join(cells) + " |" for cells in lines]
+    return [texts[0], "|" + "---|" * len(filled), *texts[1:]]
 
 
 def row(scores: list[Score]) -> list[str]:

@@ -86,6 +86,7 @@ def test_files_of_several_runs_are_summed_up(
     main()
     out = capsys.readouterr().out
     assert "| seat, both, VAF 70, met | 2 | 25 |" in out
-    assert "met: 2 people: directions 2 of 4" in out
+    assert "seat, met: 2 people: directions 2 of 4" in out
+    assert "(profile)" not in out, "nobody was asked"
     assert "not scored: seat, both, VAF 70, met: falls: 1" in out
     assert "not scored: seat, both, VAF 70, met: no regulator: 1" in out
