@@ -108,6 +108,8 @@ def pooled(studies: Sequence[list[Score]]) -> str:
     """
     scores = list(itertools.chain(*studies))
     biases = [each for one in studies for each in means([score.likely for score in one])]
+    far = [one for one in scores if one.likely_error > 1]
+    settled = [one for one in far if one.converged]
     small = sum(abs(mean) < _BIAS for mean, _ in biases)
     farthest = max((abs(mean) / error for mean, error in biases if error > 0), default=0.0)
     counts = (
@@ -116,6 +118,7 @@ def pooled(studies: Sequence[list[Score]]) -> str:
         f"levels {_count([_levels(one) for one in scores])}",
         f"directions by the sandwich {_count([_inside(one.likely) for one in scores])}",
         f"settled {sum(one.converged for one in scores)}",
+        f"gains off by more than themselves {len(far)}, of which {len(settled)} settled",
         f"mean errors below {_BIAS} {small} of {len(biases)}",
         f"the farthest {farthest:.1f} of its standard errors from none",
     )

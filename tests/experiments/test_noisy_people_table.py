@@ -57,7 +57,9 @@ def test_all_rows_of_a_kind_in_one_line() -> None:
     line = pooled([[ONE, other], [ONE]])
     assert line.startswith("3 people: directions 3 of 6 (50.0 %), entries 6 of 9 (66.7 %)")
     assert "directions by the sandwich 3 of 6" in line
-    assert "settled 2" in line
+    assert "settled 2, gains off by more than themselves 0, of which 0 settled" in line
+    lost = replace(ONE, likely_error=2.0)
+    assert "themselves 2, of which 1 settled" in pooled([[lost, replace(lost, converged=False)]])
     # Means of the first kind are none; of the second one and two deviations.
     assert "mean errors below 0.25 2 of 4" in line
 

@@ -64,6 +64,7 @@ def person_sentences(result: FitResult) -> tuple[str, ...]:
         lines.append(f"As one who {asked.name}: {each}, standard deviations of a sample (95 %).")
     return (
         *lines,
+        *_gain_told(report),
         *_moved(report),
         *_apart(result, report),
         *_left(result, report),
@@ -102,6 +103,25 @@ def _compared(report: PersonReport) -> str:
     )
 
 
+def _gain_told(report: PersonReport) -> list[str]:
+    """How much of the gain may be read as a number, and whether its search settled."""
+    fit, entries = report.fit, np.array(report.entries)
+    if fit is None or not len(entries):
+        return []
+    told = int(np.count_nonzero((entries[:, 0] > 0) | (entries[:, 1] < 0)))
+    said = (
+        f"{told} of the {len(entries)} entries of this person's gain are told from zero: their "
+        "intervals (95 %) leave it out."
+    )
+    if told == 0:
+        said = (
+            f"None of the {len(entries)} entries of this person's gain is told from zero (95 %): "
+            "the values stand for gains that are several times as large or as small."
+        )
+    loose = "" if fit.converged else " The search did not settle: another may end beside it."
+    return [f"{said}{loose}"]
+
+
 def _moved(report: PersonReport) -> list[str]:
     """That the gain is not that of the largest likelihood, or should not be and is."""
     nearly = "At a limit the likelihood is nearly exact, not wholly: what its slope is on average"
@@ -114,10 +134,9 @@ def _moved(report: PersonReport) -> list[str]:
         ]
     far = f"up to {report.moved:.1f}" if report.moved >= 0.05 else "less than 0.1"
     left = f" Not all of it: {report.biased}." if report.biased else ""
-    rough = "" if report.fit.converged else " The likelihood is rough where its search ended."
     return [
         f"{nearly} for this person was found by simulation and taken away, which moved the gain by "
-        f"{far} standard deviations.{left}{rough}"
+        f"{far} standard deviations.{left}"
     ]
 
 

@@ -77,6 +77,33 @@ def test_who_senses_with_noise_is_preferred_to_who_sees_all() -> None:
     assert any("sensory" in line and "of a sample (95 %)" in line for line in lines[1:])
 
 
+def test_it_is_said_how_much_of_the_gain_is_told() -> None:
+    result = fitted()
+    report = result.person
+    assert report is not None
+    assert report.fit is not None
+    settled = replace(report, fit=replace(report.fit, converged=True))
+
+    def said(intervals: list[list[float]], *, loose: bool = False) -> str:
+        fit = replace(report.fit, converged=not loose)
+        other = replace(settled, entries=np.array(intervals), fit=fit)
+        (line,) = [
+            line
+            for line in person_sentences(replace(result, person=other))
+            if "told from zero" in line
+        ]
+        return line
+
+    both, one = [[1.0, 2.0], [-2.0, -1.0]], [[1.0, 2.0], [-1.0, 3.0]]
+    assert said(both).startswith("2 of the 2 entries of this person's gain are told from zero")
+    assert said(one).startswith("1 of the 2 entries")
+    # By profile an entry that is not told by itself has no interval.
+    nothing = said([[np.nan, np.nan], [-1.0, np.inf]])
+    assert nothing.startswith("None of the 2 entries")
+    assert nothing.endswith("several times as large or as small.")
+    assert said(both, loose=True).endswith("The search did not settle: another may end beside it.")
+
+
 def test_the_section_and_result_json_have_the_same_numbers() -> None:
     result = fitted()
     assert result.person is not None
