@@ -56,7 +56,7 @@ def read_truth(recordings: Iterable[Path], plant: Plant) -> Array | None:
 def truth_sentence(result: FitResult, truth: Array) -> str:
     """How many entries of a `truth` (m, n) lie inside their intervals, and which is farthest off.
 
-    Of the gain of a `result`.
+    Of the gain of a `result`, and of that of its person who senses with noise.
     """
     pairs = _pairs(result, truth)
     level = pairs[0][0].level
@@ -65,13 +65,27 @@ def truth_sentence(result: FitResult, truth: Array) -> str:
         f"The recordings are simulated: {len(pairs) - len(off)} of the {len(pairs)} entries of "
         f"their true gain lie inside their {100 * level:.0f} % intervals"
     )
+    person = _of_person(result, truth)
     if not off:
-        return f"{text}."
+        return f"{text}.{person}"
     item, value = max(off, key=lambda pair: _distance(*pair))
     name = number_name(result.given.plant, item.name)
     return (
         f"{text}; farthest off is the {name}, {number(item.low, 4)} to {number(item.high, 4)} "
-        f"where the truth is {number(value, 4)}."
+        f"where the truth is {number(value, 4)}.{person}"
+    )
+
+
+def _of_person(result: FitResult, truth: Array) -> str:
+    """The same of the person who senses with noise, where one was found."""
+    if result.person is None or result.person.fit is None:
+        return ""
+    ends = np.array(result.person.entries)  # NaN of what is not told by itself
+    told = ~np.isnan(ends[:, 0])
+    inside = np.count_nonzero((ends[:, 0] <= truth.ravel()) & (truth.ravel() <= ends[:, 1]))
+    return (
+        f" Of the gain of the person who senses with noise {inside} of {np.count_nonzero(told)} "
+        "lie inside theirs."
     )
 
 

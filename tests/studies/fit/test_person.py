@@ -28,6 +28,7 @@ from impc.studies.fit.person import person_data, person_section, person_sentence
 from impc.studies.fit.result import FitResult
 from impc.studies.fit.settings import FitSettings, fit_settings
 from impc.studies.fit.subject import fit_problem, fit_recordings, stages
+from impc.studies.fit.truth import truth_sentence
 from impc.studies.fit.verdict import verdict
 from tests.inverse.test_likelihood_fit import cart
 
@@ -102,6 +103,23 @@ def test_it_is_said_how_much_of_the_gain_is_told() -> None:
     assert nothing.startswith("None of the 2 entries")
     assert nothing.endswith("several times as large or as small.")
     assert said(both, loose=True).endswith("The search did not settle: another may end beside it.")
+
+
+def test_the_truth_stands_beside_the_gain_of_the_person() -> None:
+    result = fitted()
+    report = result.person
+    assert report is not None
+    ends = np.array(report.entries)
+    inside = np.mean(ends, axis=1)[None]
+    ours = "Of the gain of the person who senses with noise"
+    assert truth_sentence(result, inside).endswith(f"{ours} 2 of 2 lie inside theirs.")
+    beside = np.add(inside, [[0.0, 2 * np.ptp(ends[1])]])
+    assert truth_sentence(result, beside).endswith(f"{ours} 1 of 2 lie inside theirs.")
+    one = replace(report, entries=np.array([[np.nan, np.nan], ends[1]]))
+    said = truth_sentence(replace(result, person=one), inside)
+    assert said.endswith(f"{ours} 1 of 1 lie inside theirs.")
+    nobody = truth_sentence(replace(result, person=None), inside)
+    assert "senses with noise" not in nobody
 
 
 def test_the_section_and_result_json_have_the_same_numbers() -> None:
