@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from dataclasses import asdict
 from pathlib import Path
@@ -15,6 +16,7 @@ from experiments.noisy_people_study import main
 from experiments.noisy_people_table import HEADS, means, pooled, row
 from impc.checking import replace
 
+ROOT = Path(__file__).parents[2]
 ONE = Score(
     study="seat, both, VAF 70, met",
     seed=1,
@@ -92,3 +94,23 @@ def test_files_of_several_runs_are_summed_up(
     assert "(profile)" not in out, "nobody was asked"
     assert "not scored: seat, both, VAF 70, met: falls: 1" in out
     assert "not scored: seat, both, VAF 70, met: no regulator: 1" in out
+
+
+def test_the_page_has_what_the_kept_rows_say(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = ROOT / "experiments" / "noisy_people_rows.jsonl"
+    monkeypatch.setattr(sys, "argv", ["study", "sum", str(rows)])
+    main()
+    said = capsys.readouterr().out.splitlines()
+    page = (ROOT / "docs" / "noisy-people.md").read_text(encoding="utf-8")
+    table = [line for line in said if line.startswith(("| cart", "| seat"))]
+    assert len(table) == 12
+    assert [line for line in table if line not in page] == []
+    for body in ("cart", "seat"):
+        (whole,) = [line for line in said if line.startswith(f"{body}, met: ")]
+        counted = re.findall(r"(?:directions|levels) \d+ of \d+", whole)[:2]
+        assert len(counted) == 2
+        for each in counted:
+            inside, name = re.search(r"\d+ of \d+", each)[0], each.split()[0]  # type: ignore[index]
+            assert f"{inside} {name}" in page
