@@ -21,26 +21,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.linalg
-import scipy.optimize
 
 from impc.arrays import Array, Frozen
 from impc.checking import checked
 from impc.errors import InputError, SolverError, WeightsError
 from impc.inverse.equivalent_weights import analytic_centre, inverse_factor, least_condition_weights
-from impc.inverse.semidefinite import (
-    Cone,
-    matrix_inequality,
-)
+from impc.inverse.semidefinite import Cone, matrix_inequality
 from impc.inverse.solution_set import pair_blocks
 
 if TYPE_CHECKING:
     from impc.inverse.equivalent_weights import EquivalentWeights
     from impc.inverse.solution_set import GainFibre
 
-__all__ = [
-    "WeightsSet",
-    "weights_set",
-]
+__all__ = ["WeightsSet", "weights_set"]
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,6 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.linalg
 import scipy.optimize
 
 from impc.arrays import Array
@@ -116,9 +115,11 @@ def linear_ranges(
     SolverError
         When a program returns no finite point.
     """
-    least = _minima(found, directions, tolerance)
-    most = linear_maxima(found, directions, tolerance=tolerance)
-    return tuple(Range(*ends) for ends in zip(least, most, strict=True))
+    ends = _minima(found, np.concatenate([directions, -directions]), tolerance)
+    half = len(directions)
+    return tuple(
+        Range(low, _negative(high)) for low, high in zip(ends[:half], ends[half:], strict=True)
+    )
 
 
 @checked(directions="* n+m n+m")

@@ -26,6 +26,7 @@ from impc.arrays import Array
 from impc.assess.bounded_weights import weights_set
 from impc.assess.compiled_regulator import doubled_gain
 from impc.assess.extreme_weights import linear_maxima, linear_ranges
+from impc.assess.intent_statements import price_direction
 from impc.checking import replace
 from impc.errors import SolverError, WeightsError
 from impc.inverse.solution_set import gain_fibre
@@ -257,7 +258,7 @@ def set_of_gain(
         own = np.concatenate([np.array(solution.S)[None], metrics[1:]])
         # Nothing is searched from these: only how far they reach is asked for.
         found = weights_set(gain_fibre(plant, solution.K, own), ratio, rough=True)
-        priced = np.array([_price(plant, sizes, name) for name in states])
+        priced = np.array([price_direction(plant, sizes, name) for name in states])
         ranges = linear_ranges(found, priced, tolerance=_ROUGH)
         against = np.array([_against(item, plant, sizes) for item in tried])
         most = linear_maxima(found, against, tolerance=_ROUGH) if tried else ()
@@ -268,20 +269,14 @@ def set_of_gain(
     return DrawnSet(found.least.weights, tuple((one.low, one.high) for one in ranges), agrees)
 
 
-def _price(plant: Plant, sizes: Array, state: str) -> Array:
-    index = plant.states.index(state)
-    direction = np.zeros((plant.n + plant.m, plant.n + plant.m))
-    direction[index, index] = sizes[index] ** 2
-    return direction
-
-
 def _against(item: Statement, plant: Plant, sizes: Array) -> Array:
     """The linear function that is below zero for every member of a set where a statement holds."""
-    i, j = plant.states.index(item.first), plant.states.index(item.second)
-    direction = np.zeros((plant.n + plant.m, plant.n + plant.m))
     if item.kind == "order":
-        direction[i, i], direction[j, j] = sizes[i] ** 2, -(sizes[j] ** 2)
+        direction = price_direction(plant, sizes, item.first)
+        direction -= price_direction(plant, sizes, item.second)
     else:
+        i, j = plant.states.index(item.first), plant.states.index(item.second)
+        direction = np.zeros((plant.n + plant.m, plant.n + plant.m))
         direction[i, j] = direction[j, i] = sizes[i] * sizes[j] / 2
     return -direction if item.holds else direction
 

@@ -28,9 +28,16 @@ if TYPE_CHECKING:
 
     from impc.assess.bounded_weights import WeightsSet
     from impc.assess.extreme_weights import Range
+    from impc.model.plant import Plant
     from impc.model.weights import Weights
 
-__all__ = ["Statement", "order_statements", "sense_statements", "widest_dominant_angle"]
+__all__ = [
+    "Statement",
+    "order_statements",
+    "price_direction",
+    "sense_statements",
+    "widest_dominant_angle",
+]
 
 _FRANK_WOLFE = 12
 # A range that ends this near to zero, of its width, does not tell the sign.
@@ -76,6 +83,23 @@ class Statement:
         return self.confidence is not None and self.confidence >= _AGREE
 
 
+def price_direction(plant: Plant, sizes: Array, state: str) -> Array:
+    """The linear function trace(. blkdiag(Q, R)) that is the price of a state (n + m, n + m).
+
+    Parameters
+    ----------
+    plant : Plant
+    sizes : Array
+        Typical excursion of every state (n,), in its unit.
+    state : str
+        Its name.
+    """
+    index = plant.states.index(state)
+    direction = np.zeros((plant.n + plant.m, plant.n + plant.m))
+    direction[index, index] = sizes[index] ** 2
+    return direction
+
+
 def order_statements(
     found: WeightsSet, sizes: Array, states: tuple[str, ...]
 ) -> tuple[Statement, ...]:
@@ -92,10 +116,8 @@ def order_statements(
     pairs = list(itertools.combinations(states, 2))
     if not pairs:
         return ()
-    directions = np.zeros((len(pairs), *found.first.shape))
-    for direction, pair in zip(directions, pairs, strict=True):
-        i, j = (names.index(name) for name in pair)
-        direction[i, i], direction[j, j] = sizes[i] ** 2, -(sizes[j] ** 2)
+    prices = {name: price_direction(found.fibre.plant, sizes, name) for name in states}
+    directions = np.array([prices[one] - prices[other] for one, other in pairs])
     statements = []
     for (one, other), ends in zip(pairs, linear_ranges(found, directions), strict=True):
         says = f"a typical {one} costs more than a typical {other}"

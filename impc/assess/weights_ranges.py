@@ -141,10 +141,9 @@ def summarise_weights(
     sets = tuple(
         set_of_gain(plant, item, metrics, ratio, sizes, names, statements) for item in draws
     )
-    own = [(sizes[index] ** 2, ranges[index, index]) for index in named]
     prices = {
-        name: (unit * ends.low, unit * ends.high)
-        for name, (unit, ends) in zip(names, own, strict=True)
+        plant.states[k]: (sizes[k] ** 2 * ranges[k, k].low, sizes[k] ** 2 * ranges[k, k].high)
+        for k in named
     }
     return WeightsSummary(
         found.fibre.dimension - 1,

@@ -24,6 +24,7 @@ from impc.assess.intent_rules import intent
 from impc.assess.judged import judge
 from impc.assess.printed_gain import gain_estimate
 from impc.assess.resampling import DRAWS, bootstrap_model, replicate
+from impc.assess.variance_accounted_for import saturated_share
 from impc.checking import replace
 from impc.errors import ImpcError
 from impc.files.plant_sources import make_plant, plant_family_of, plant_source
@@ -144,8 +145,7 @@ def _described(problem: Problem, fitted: Estimate, settings: FitSettings) -> dic
     readings = intent(plant, K, np.array(fitted.metrics), sizes, weights)
     family = estimate.problem.family
     names = () if family is None else family.names
-    limit = np.minimum(np.abs(problem.bounds.u_max), np.abs(problem.bounds.u_min))
-    commands = np.abs(fit.commands)
+    limits = np.array(problem.bounds.u_min), np.array(problem.bounds.u_max)
     return {
         "states": plant.states,
         "controls": plant.controls,
@@ -166,7 +166,7 @@ def _described(problem: Problem, fitted: Estimate, settings: FitSettings) -> dic
         "exact": fitted.explained,
         "converged": fitted.converged,
         **assessed(fit),
-        "saturated": float(np.mean(np.any(commands >= limit * (1 - 1e-6), axis=1))),
+        "saturated": saturated_share(fit.commands, *limits),
         "state_sizes": sizes,
         "readings": {
             item.rule: {"Q": item.weights.Q, "dominant": item.dominant, "angle": item.angle}

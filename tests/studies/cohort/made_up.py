@@ -72,6 +72,8 @@ def fit_of(seed: int) -> dict[str, Any]:
         "K_told": [[True, False]], "K_of_weights": gain, "S": [[1.0]],
         "Q": weights["Q"], "R": [[1.0]], "misfit": 0.1, "exact": True, "converged": True,
         **{item.name: made_up(item, rng) for item in ASSESSMENTS.values()},
+        "held_out_vaf": {"position": None}, "largest_input": {"force": 1.0}, "beyond_bound": 0.0,
+        "first_fall": None, "condition_number": 10.0,
         "saturated": 0.1, "state_sizes": [1.0, 1.0],
         "readings": {"least condition": weights, "analytic centre (no units)": weights},
         "parameters": {"mass": 2.0 + rng.random()}, "starts": [[0.0, 0.0]], "logarithms": [0.0],
