@@ -21,8 +21,9 @@ from experiments.particles.clipped_regulator import clipped_regulator, first_sta
 from experiments.particles.likelihood import particle_likelihood
 from impc.control.constraint_rows import directions
 from impc.control.controller import Controller
-from impc.control.joint_likelihood import NoiseDirections, joint_likelihood, prepare_filter
+from impc.control.joint_likelihood import NoiseDirections, joint_likelihoods, prepare_filter
 from impc.control.noisy_person import simulate_person
+from impc.model.recordings import Recording
 
 if TYPE_CHECKING:
     from experiments.noisy_people import Subject
@@ -57,7 +58,8 @@ def differences(who: Subject, trials: int) -> tuple[Array, int]:
         if np.max(np.abs(outputs)) > FALLEN:
             return None
         trial = outputs, np.array(push, dtype=np.float64).reshape(len(push), -1)
-        told = [joint_likelihood(each, *trial, np.zeros(plant.n)).value for each in filters]
+        recording = Recording(plant, *trial, np.zeros(plant.n))
+        told = [joint_likelihoods(each, [recording])[0].value for each in filters]
         exact = [
             particle_likelihood(each, *trial, start, _PARTICLES, number) for each in regulators
         ]

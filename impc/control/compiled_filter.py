@@ -1,8 +1,10 @@
-"""Compiled code: the filter of plant and estimate together, with its exact derivatives.
+"""Compiled code: the filter of plant and estimate, of many trials at once, with its derivatives.
 
 The filter is that of `joint_likelihood` (docs/noisy-people.md), a sample of it that of
-`compiled_sample`. numba's cache looks at this file only: a change of another one whose functions
-are called must change `COMPILED_WITH` below, which tests/control/test_joint_likelihood.py asks for.
+`compiled_sample`. While no bound is near, what is recorded changes no covariance, so that trials
+share one: it is most of what a filter costs. numba's cache looks at this file only: a change of
+another one whose functions are called must change `COMPILED_WITH` below, which
+tests/control/test_joint_likelihood.py asks for.
 """
 
 from __future__ import annotations
@@ -18,23 +20,30 @@ from impc.control.compiled_clip import Clip
 from impc.control.compiled_covariance import advance, weigh
 from impc.control.compiled_law import law
 from impc.control.compiled_room import Covariance, Room
-from impc.control.compiled_sample import FilterResult, ahead, clip_command, share_noise, update
+from impc.control.compiled_sample import (
+    FilterResult,
+    ahead,
+    clip_command,
+    expected_command,
+    share_noise,
+    update,
+)
 from impc.control.compiled_slope import slope_of_law
 from impc.control.constraint_rows import RowDirections, Rows
 from impc.control.joint_loop import JointLoop
 from impc.jit import njit
 
-__all__ = ["COMPILED_WITH", "Steady", "run_filter"]
+__all__ = ["COMPILED_WITH", "Course", "FilterParts", "Steady", "run_filter"]
 
 #: First digits of the SHA-256 of each file whose functions are called.
 COMPILED_WITH = {
     "borrowed": "f9ef79e3bd6dacdb",
     "compiled_arrays": "f9299fe715d0d2a3",
     "compiled_clip": "4b317b8d6c67db13",
-    "compiled_covariance": "7d75cf433740ec3c",
+    "compiled_covariance": "baae8087983d530c",
     "compiled_law": "fb4d0617cbd31619",
-    "compiled_room": "45595e764d61fc2a",
-    "compiled_sample": "8872ef9655abd297",
+    "compiled_room": "fa7fc135ea27d9fb",
+    "compiled_sample": "cd74742718710aa3",
     "compiled_slope": "1be8607182549482",
 }
 
@@ -59,30 +68,42 @@ class Steady(NamedTuple):
     known: bool
 
 
-@njit(cache=True, nogil=True)
-def run_filter(
-    loop: LoopMatrices,
-    dloop: LoopMatrices,
-    rows: Rows,
-    drows: RowDirections,
-    unit: Buffer,
-    clip: Clip,
-    joint: JointLoop,
-    djoint: JointLoop,
-    steady: Steady,
-    at: int,
-    shared: int,
-    outputs: Buffer,
-    disturbance: Buffer,
-    z: Buffer,
-    dz: Buffer,
-    room: Room,
-    result: FilterResult,
-    first: int,
-) -> int:
-    """Filter one recording; directions that move covariances stand first among all q.
+class Course(NamedTuple):
+    """Trials that are filtered together, and where each leaves.
 
-    Parameters
+    Attributes
+    ----------
+    begin : Buffer
+        The row at which each trial begins, and the one after the last (trials + 1,).
+    first : int
+        The sample at which all are.
+    corrected : bool
+        Whether z knows the outputs of that sample.
+    shared : bool
+        Whether trials share a covariance, and leave where a bound is near; one alone need not.
+    reached : Buffer
+        Written: the sample at which each leaves, or how many it has (trials,).
+    known : Buffer
+        Written: whether its z knows the outputs of that sample (trials,).
+    P, dP : Buffer
+        Written, of each that leaves before its end: the covariance before that sample
+        (trials, z, z), and its derivatives (trials, z, z, k).
+    """
+
+    begin: Buffer
+    first: int
+    corrected: bool
+    shared: bool
+    reached: Buffer
+    known: Buffer
+    P: Buffer
+    dP: Buffer
+
+
+class FilterParts(NamedTuple):
+    """What is filtered with, along q directions of which the first k move covariances.
+
+    Attributes
     ----------
     loop, dloop, rows, drows, unit
         Of the controller's law, as in `compiled_loop.run`, along all q directions; unit (m,).
@@ -94,62 +115,144 @@ def run_filter(
         The stationary filter.
     at : int
         Where the estimate stands in z.
-    shared : int
+    lasting : int
         How many directions, the first ones, move more than the first state.
+    """
+
+    loop: LoopMatrices
+    dloop: LoopMatrices
+    rows: Rows
+    drows: RowDirections
+    unit: Buffer
+    clip: Clip
+    joint: JointLoop
+    djoint: JointLoop
+    steady: Steady
+    at: int
+    lasting: int
+
+
+@njit(cache=True, nogil=True)
+def run_filter(
+    parts: FilterParts,
+    outputs: Buffer,
+    disturbance: Buffer,
+    z: Buffer,
+    dz: Buffer,
+    room: Room,
+    result: FilterResult,
+    course: Course,
+) -> None:
+    """Filter trials from the sample at which all are.
+
+    A trial leaves at its end; at a sample whose status has been written, at which the law has no
+    answer or the state leaves every range; at the first one at which a bound is near, where
+    covariances are shared; and where they are not, at the first one that remembers nothing of the
+    first state, from where `lasting` directions are enough.
+
+    Parameters
+    ----------
+    parts : FilterParts
     outputs, disturbance : Buffer
-        (samples, p) and (samples, d).
+        Of all trials, one after the other, (rows, p) and (rows, d).
     z, dz : Buffer
-        Expected state at the first sample (z,) and its derivatives (z, q); overwritten.
+        Expected states at the sample where all are (trials, z), and their derivatives
+        (trials, z, q); overwritten.
     room : Room
-        Overwritten.
+        With the covariance there; overwritten.
     result : FilterResult
         Written.
-    first : int
-        The first sample.
-
-    Returns
-    -------
-    int
-        The sample at which it ended: all when it came to the end; one whose status has been
-        written, at which the law has no answer or the state leaves every range; or the first one
-        that remembers nothing of the first state, from where `shared` directions are enough.
+    course : Course
+        Which trials, and from where on; completed.
     """
     # The caller keeps all of these while this runs.
-    loop, dloop, rows, drows, unit = borrowed((loop, dloop, rows, drows, unit))
-    joint, djoint, steady, room, result = borrowed((joint, djoint, steady, room, result))
+    parts, room, result, course = borrowed((parts, room, result, course))
     outputs, disturbance, z, dz = borrowed((outputs, disturbance, z, dz))
-    work, lam, du, here = room.work, room.lam, room.du, room.here
-    n, k = loop.K.shape[1], here.dP.shape[2]
-    settled, quiet = False, 0
+    u, here, joint, djoint, lasting = room.u, room.here, parts.joint, parts.djoint, parts.lasting
+    begin, reached, first, at = course.begin, course.reached, course.first, parts.at
+    n = parts.loop.K.shape[1]
+    settled, quiet, left, t = False, 0, len(reached), first
+    reached[:] = begin[1:] - begin[:-1]
+    course.known[:] = False
     weigh(joint, djoint, room)
-    for t in range(first, len(outputs)):
-        if quiet > 2 * len(z) and dz.shape[1] > shared:
-            return t
-        forgotten = update(joint, djoint, room, outputs[t], z, dz, result, t, shared)
-        quiet = quiet + 1 if forgotten else 0
-        u, x, dx = result.u[t], z[at : at + n], dz[at : at + n]
-        status, _, _ = law(loop, dloop, rows, drows, unit, work, x, dx, lam, False, u, du)
-        if status > SOFTENED:
-            result.status[t] = status
-            return t
-        slope_of_law(loop, dloop, rows, drows, work, room.slope, room.dslope)
-        met = status > 0
-        if clip.used:
-            beyond, near = clip_command(clip, joint, djoint, room, at, u)
-            status, met = max(status, beyond), met or near
-        result.status[t] = status
-        if not settled or met:
-            share_noise(joint.share, djoint.share, u, du, room.noise[1], room.dnoise[1])
-            advance(joint, djoint, room, at)
-            settled = steady.known and not met and _near(here, steady)
-            if settled:
-                here.P[:], here.dP[:] = steady.P, steady.dP[:, :, :k]
-            weigh(joint, djoint, room)
-        ahead(joint, djoint, room, u, disturbance[t], z, dz)
-        if not np.max(np.abs(z)) < LARGEST:
-            result.status[t] = DIVERGED
-            return t
-    return len(outputs)
+    while left > 0:
+        met, left = False, 0
+        for i in range(len(reached)):
+            row = begin[i] + t
+            if t >= reached[i]:
+                continue
+            if not (t == first and course.corrected):
+                if quiet > 2 * z.shape[1] and dz.shape[2] > lasting:
+                    _leave(course, here, i, t, False)
+                    continue
+                forgotten = update(
+                    joint, djoint, room, outputs[row], z[i], dz[i], result, i, row, t, lasting
+                )
+                quiet = quiet + 1 if forgotten and not course.shared else 0
+            x, dx = z[i, at : at + n], dz[i, at : at + n]
+            status, near = _command(parts, room, course.shared, x, dx)
+            result.u[row], result.status[row] = u, status
+            if status > SOFTENED:
+                reached[i] = t
+                continue
+            if course.shared and near:
+                _leave(course, here, i, t, True)
+                continue
+            met = met or near
+            ahead(joint, djoint, room, u, disturbance[row], z[i], dz[i])
+            if not np.max(np.abs(z[i])) < LARGEST:
+                result.status[row], reached[i] = DIVERGED, t
+                continue
+            left += 1
+        if left > 0 and (not settled or met):
+            settled = _advanced(parts, room, met)
+        t += 1
+
+
+@njit(cache=True, inline="always")
+def _command(
+    parts: FilterParts, room: Room, shared: bool, x: Buffer, dx: Buffer
+) -> tuple[int, bool]:
+    """The room has what is expected of a command, but of one near a bound if that is to be shared.
+
+    The estimate x (n,) and its derivatives (n, q) are those that are expected. Returns the status,
+    and whether a bound is near.
+    """
+    loop, dloop, rows, drows, unit = parts.loop, parts.dloop, parts.rows, parts.drows, parts.unit
+    work, lam, u, du = room.work, room.lam, room.u, room.du
+    status, _, _ = law(loop, dloop, rows, drows, unit, work, x, dx, lam, False, u, du)
+    near = status > 0
+    if status > SOFTENED or (shared and near):
+        return status, near
+    slope_of_law(loop, dloop, rows, drows, work, room.slope, room.dslope)
+    if parts.clip.used:
+        found, s = expected_command(parts.clip, room, parts.at, u)
+        near = near or found.near
+        if not (shared and near):
+            clip_command(found, s, parts.joint, parts.djoint, room, parts.at, u)
+            status = max(status, found.beyond)
+    return status, near
+
+
+@njit(cache=True, inline="always")
+def _advanced(parts: FilterParts, room: Room, met: bool) -> bool:
+    """The covariance becomes that of the next sample; whether it is the stationary one."""
+    here, noise, dnoise = room.here, room.noise[1], room.dnoise[1]
+    joint, djoint, steady = parts.joint, parts.djoint, parts.steady
+    share_noise(joint.share, djoint.share, room.u, room.du, noise, dnoise)
+    advance(joint, djoint, room, parts.at)
+    settled = steady.known and not met and _near(here, steady)
+    if settled:
+        here.P[:], here.dP[:] = steady.P, steady.dP[:, :, : here.dP.shape[2]]
+    weigh(joint, djoint, room)
+    return settled
+
+
+@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+def _leave(course: Course, here: Covariance, i: int, t: int, known: bool) -> None:
+    """One trial leaves at a sample, with the covariance before it."""
+    course.reached[i], course.known[i] = t, known
+    course.P[i], course.dP[i] = here.P, here.dP
 
 
 @njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)

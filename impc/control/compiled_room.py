@@ -131,8 +131,8 @@ class Room(NamedTuple):
     ----------
     work : Workspace
         Of the law.
-    lam, du : Buffer
-        Multipliers (r,), and derivatives of the commands (m, q).
+    lam, u, du : Buffer
+        Multipliers (r,), and the commands (m,) with their derivatives (m, q).
     slope, dslope : Buffer
         Of the commands with the estimate (m, n), and its derivatives (m, n, k).
     noise, dnoise : Buffer
@@ -158,6 +158,7 @@ class Room(NamedTuple):
 
     work: Workspace
     lam: Buffer
+    u: Buffer
     du: Buffer
     slope: Buffer
     dslope: Buffer
@@ -198,6 +199,7 @@ def filter_room(
     return Room(
         workspace(rows, m, q),
         np.zeros(len(rows.b)),
+        np.empty(m),
         np.empty((m, q)),
         np.empty((m, n)),
         np.empty((m, n, k)),

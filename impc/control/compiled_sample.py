@@ -1,9 +1,9 @@
 """Compiled code: what one sample does in the filter of plant and estimate.
 
-`update` takes the recorded outputs in, `clip_command` and `share_noise` say what is expected of the
-command that follows and what noise comes with it, and `ahead` goes on to the next sample
-(`joint_likelihood`, docs/noisy-people.md). numba's cache looks at this file only: a change of
-another one whose functions are called must change `COMPILED_WITH` below, which
+`update` takes the recorded outputs in, `expected_command`, `clip_command` and `share_noise` say
+what is expected of the command that follows and what noise comes with it, and `ahead` goes on to
+the next sample (`joint_likelihood`, docs/noisy-people.md). numba's cache looks at this file only:
+a change of another one whose functions are called must change `COMPILED_WITH` below, which
 tests/control/test_joint_likelihood.py asks for.
 """
 
@@ -14,21 +14,29 @@ from typing import NamedTuple
 import numpy as np
 
 from impc.arrays import Buffer
-from impc.control.compiled_clip import Clip, clipped
+from impc.control.compiled_clip import Clip, Clipped, clipped
 from impc.control.compiled_covariance import variance_changes
 from impc.control.compiled_products import combine
 from impc.control.compiled_room import Room
 from impc.control.joint_loop import JointLoop
 from impc.jit import njit
 
-__all__ = ["COMPILED_WITH", "FilterResult", "ahead", "clip_command", "share_noise", "update"]
+__all__ = [
+    "COMPILED_WITH",
+    "FilterResult",
+    "ahead",
+    "clip_command",
+    "expected_command",
+    "share_noise",
+    "update",
+]
 
 #: First digits of the SHA-256 of each file whose functions are called.
 COMPILED_WITH = {
     "compiled_clip": "4b317b8d6c67db13",
-    "compiled_covariance": "7d75cf433740ec3c",
+    "compiled_covariance": "baae8087983d530c",
     "compiled_products": "50101205237e0db3",
-    "compiled_room": "45595e764d61fc2a",
+    "compiled_room": "fa7fc135ea27d9fb",
 }
 
 # A first state is forgotten when none of its directions moves an innovation by more than this, of
@@ -37,27 +45,27 @@ _FORGOTTEN = 1e-9
 
 
 class FilterResult(NamedTuple):
-    """What the filter writes, sample by sample.
+    """What the filter writes, sample by sample, the trials one after the other.
 
     Attributes
     ----------
     told : Buffer
-        Log-likelihood of each sample given the earlier ones (samples,).
+        Log-likelihood of each sample given the earlier ones of its trial (rows,).
     score : Buffer
-        Its derivatives along the q directions (samples, q).
+        Its derivatives along the q directions (rows, q).
     information : Buffer
-        Sum of their expected products (q, q), the lower half.
+        Of each trial, the sum of their expected products (trials, q, q), the lower half.
     innovation, spread : Buffer
-        Recorded outputs minus what is expected (samples, p), and their covariance (samples, p, p).
+        Recorded outputs minus what is expected (rows, p), and their covariance (rows, p, p).
     filtered : Buffer
-        Expected z given all outputs so far (samples, z).
+        Expected z given all outputs so far (rows, z).
     u : Buffer
-        Command expected there (samples, m).
+        Command expected there (rows, m).
     status : Buffer
-        Of each sample: the value of `closed_loop.Status` (samples,).
+        Of each sample: the value of `closed_loop.Status` (rows,).
     counted : int
-        The first sample that is told: those before it tell nothing, and are what the others are
-        told given.
+        The first sample of a trial that is told: those before it tell nothing, and are what the
+        others are told given.
     """
 
     told: Buffer
@@ -80,14 +88,16 @@ def update(
     z: Buffer,
     dz: Buffer,
     result: FilterResult,
+    i: int,
+    row: int,
     t: int,
-    shared: int,
+    lasting: int,
 ) -> bool:
     """Likelihood and score of one sample; z and dz become those given the sample.
 
     Parameters
     ----------
-    joint, djoint, result, shared
+    joint, djoint, result, lasting
         As in `run_filter`.
     room : Room
         With what follows from the covariance of z before the sample.
@@ -95,19 +105,20 @@ def update(
         What is recorded (p,).
     z, dz : Buffer
         The state that is expected (z,) and its derivatives (z, q); overwritten.
-    t : int
-        The sample.
+    i, row, t : int
+        The trial, and the sample among all rows and in the trial.
 
     Returns
     -------
     bool
-        Whether directions from `shared` on move the innovation and its covariance by nothing.
+        Whether directions from `lasting` on move the innovation and its covariance by nothing.
     """
     _innovate(joint, djoint, room, output, z, dz)
-    _tell(room, result, t)
+    result.innovation[row], result.spread[row] = room.e, room.here.S
+    _tell(room, result, i, row, t)
     _correct(room, z, dz)
-    result.filtered[t] = z
-    return _forgotten(room, shared)
+    result.filtered[row] = z
+    return _forgotten(room, lasting)
 
 
 @njit(cache=True, inline="always")
@@ -135,11 +146,10 @@ def _innovate(
 
 
 @njit(cache=True, inline="always")
-def _tell(room: Room, result: FilterResult, t: int) -> None:
+def _tell(room: Room, result: FilterResult, i: int, row: int, t: int) -> None:
     """Write likelihood and score, and add the information."""
     here, e, we, de, moved = room.here, room.e, room.we, room.de, room.moved
     inverse, dS, (p, q), k = here.inverse, here.dS, de.shape, moved.shape[1]
-    result.innovation[t], result.spread[t] = e, here.S
     moved[:] = 0.0
     for a in range(p):
         for b in range(p):
@@ -147,8 +157,8 @@ def _tell(room: Room, result: FilterResult, t: int) -> None:
                 moved[a, c] += dS[a, b, c] * we[b]
     if t < result.counted:
         return
-    result.told[t] = -(np.dot(e, we) + here.volume[0] + p * np.log(2 * np.pi)) / 2
-    score = result.score[t, :q]
+    result.told[row] = -(np.dot(e, we) + here.volume[0] + p * np.log(2 * np.pi)) / 2
+    score = result.score[row, :q]
     for a in range(p):
         for c in range(q):
             score[c] -= we[a] * de[a, c]
@@ -157,7 +167,7 @@ def _tell(room: Room, result: FilterResult, t: int) -> None:
         for b in range(p):
             for c in range(k):
                 score[c] -= inverse[a, b] * dS[a, b, c] / 2
-    _inform(result.information, de, room.wde, here.half)
+    _inform(result.information[i], de, room.wde, here.half)
 
 
 @njit(cache=True, inline="always")
@@ -180,14 +190,14 @@ def _correct(room: Room, z: Buffer, dz: Buffer) -> None:
 
 
 @njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
-def _forgotten(room: Room, shared: int) -> bool:
-    """Whether directions from `shared` on move neither the innovation nor its covariance."""
+def _forgotten(room: Room, lasting: int) -> bool:
+    """Whether directions from `lasting` on move neither the innovation nor its covariance."""
     S, dS, de = room.here.S, room.here.dS, room.de
     for a in range(len(S)):
-        for c in range(shared, de.shape[1]):
+        for c in range(lasting, de.shape[1]):
             if not abs(de[a, c]) <= _FORGOTTEN * np.sqrt(S[a, a]):
                 return False
-        for c in range(shared, dS.shape[2]):
+        for c in range(lasting, dS.shape[2]):
             if not abs(dS[a, a, c]) <= _FORGOTTEN * S[a, a]:
                 return False
     return True
@@ -206,32 +216,20 @@ def _inform(information: Buffer, de: Buffer, wde: Buffer, half: Buffer) -> None:
 
 
 @njit(cache=True, inline="always")
-def clip_command(
-    clip: Clip, joint: JointLoop, djoint: JointLoop, room: Room, at: int, u: Buffer
-) -> tuple[int, bool]:
-    """Command and slope become those that are expected of a clipped command; see `Clip`.
-
-    The variance that no slope explains goes to the first row of the room's noise.
+def expected_command(clip: Clip, room: Room, at: int, u: Buffer) -> tuple[Clipped, float]:
+    """What is expected of a command, and the deviation of what the person would do without bounds.
 
     Parameters
     ----------
-    clip, joint, djoint, at
+    clip, at
         As in `run_filter`.
     room : Room
-        With the command's slope and derivatives, which are overwritten.
+        With the command's slope; what is seen of z, and its covariance with z, are written.
     u : Buffer
-        The command (1,); overwritten.
-
-    Returns
-    -------
-    tuple of int and bool
-        1 where the command itself is beyond a bound, else 0, and whether one is anywhere near.
+        The command (1,).
     """
-    slope, dslope, du, here = room.slope, room.dslope, room.du, room.here
-    noise, dnoise, seen, weighed, ds = (
-        room.noise[0], room.dnoise[0], room.seen, room.weighed, room.ds
-    )  # fmt: skip
-    n, k = slope.shape[1], dslope.shape[2]
+    slope, here, seen, weighed = room.slope, room.here, room.seen, room.weighed
+    n = slope.shape[1]
     seen[:], weighed[:], variance = 0.0, 0.0, 0.0
     seen[at : at + n] = slope[0]
     for i in range(len(seen)):
@@ -239,10 +237,36 @@ def clip_command(
             weighed[i] += here.left[i, j] * seen[j]
         variance += seen[i] * weighed[i]
     s = np.sqrt(max(variance, 0.0))
-    found = clipped(clip, u[0], s)
+    return clipped(clip, u[0], s), s
+
+
+@njit(cache=True, inline="always")
+def clip_command(
+    found: Clipped, s: float, joint: JointLoop, djoint: JointLoop, room: Room, at: int, u: Buffer
+) -> None:
+    """Command and slope become those that are expected of a clipped command; see `Clip`.
+
+    The variance that no slope explains goes to the first row of the room's noise.
+
+    Parameters
+    ----------
+    found : Clipped
+        From `expected_command`.
+    s : float
+        Likewise.
+    joint, djoint, at
+        As in `run_filter`.
+    room : Room
+        With the command's slope and derivatives, which are overwritten.
+    u : Buffer
+        The command (1,); overwritten.
+    """
+    slope, dslope, du = room.slope, room.dslope, room.du
+    noise, dnoise, weighed, ds = room.noise[0], room.dnoise[0], room.weighed, room.ds
+    n, k = slope.shape[1], dslope.shape[2]
     noise[0], dnoise[0] = found.variance, 0.0
     if not found.near:
-        return 0, False
+        return
     ds[:] = 0.0
     if found.inside_g != 0.0 or found.inside_s != 0.0:
         changes = variance_changes(joint, djoint, room)
@@ -262,7 +286,6 @@ def clip_command(
         du[0, c] += found.value_s * ds[c]
     u[0] = found.value
     slope *= found.inside
-    return found.beyond, True
 
 
 @njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)

@@ -1,4 +1,4 @@
-"""The likelihood of a recording of a person who senses with noise, and its exact derivatives.
+"""The likelihood of recordings of a person who senses with noise, and its exact derivatives.
 
 With z of `joint_loop` (plant and estimate) and the innovation e_t = y_t - C z_t of a Kalman filter,
 
@@ -13,14 +13,16 @@ command that is only expected, u_t, D_t and some variance beside follow from the
 that command (`Clip`); for several inputs it is the extended filter. Derivatives follow the active
 sets, as those of a simulation do, and hold wherever none is about to change.
 
-P_t does not depend on what is recorded while D_t stays. Once it has come as near to its stationary
-value as rounding lets a derivative see it is taken for that value, until a bound is met
-(docs/noisy-people.md).
+P_t does not depend on what is recorded while D_t stays: until a bound is near all recordings have
+the same, which no first state moves. Once it has come as near to its stationary value as rounding
+lets a derivative see it is taken for that value, until a bound is met (docs/noisy-people.md).
 """
 
 from __future__ import annotations
 
 import dataclasses
+import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -29,7 +31,7 @@ import numpy as np
 from impc.arrays import Array, Frozen, frozen
 from impc.control.closed_loop import prepare_loop
 from impc.control.compiled_clip import Clip
-from impc.control.compiled_filter import Steady, run_filter
+from impc.control.compiled_filter import Course, FilterParts, Steady, run_filter
 from impc.control.compiled_room import filter_room
 from impc.control.compiled_sample import FilterResult
 from impc.control.constraint_rows import RowDirections, Rows
@@ -40,13 +42,20 @@ from impc.model.bounds import bound_rows
 from impc.model.kalman import filter_changes, stationary_filter
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from impc.arrays import Buffer
     from impc.control.closed_loop import PreparedLoop
     from impc.control.constraint_rows import Directions
     from impc.control.controller import Controller
     from impc.control.joint_loop import JointLoop
     from impc.model.observer import Observer
+    from impc.model.recordings import Recording
 
-__all__ = ["Likelihood", "NoiseDirections", "PreparedFilter", "joint_likelihood", "prepare_filter"]
+__all__ = ["Likelihood", "NoiseDirections", "PreparedFilter", "joint_likelihoods", "prepare_filter"]
+
+# How a sample ends at which there is no likelihood.
+_FAILED = (Status.INFEASIBLE, Status.UNSOLVED, Status.DIVERGED)
 
 
 @dataclass(frozen=True)
@@ -76,23 +85,12 @@ class PreparedFilter:
     ----------
     law : PreparedLoop
         Of one input without its bounds at the present sample, see `Clip`.
-    clip : Clip
-    joint, moves : JointLoop
-        The system, and its derivatives along the first directions.
-    steady : Steady
-    at : int
-        Where the estimate stands in z.
-    shared : int
-        How many of the directions, the first ones, move more than the first state.
+    parts : FilterParts
+        With it, and with the system.
     """
 
     law: PreparedLoop
-    clip: Clip
-    joint: JointLoop
-    moves: JointLoop
-    steady: Steady
-    at: int
-    shared: int
+    parts: FilterParts
 
 
 @dataclass(frozen=True)
@@ -168,21 +166,32 @@ def prepare_filter(
     moves = joint_directions(plant, person, recorder, PlantMoves(*first[:4]), first[4])
     at = plant.n if person.estimates else 0
     steady = _steady(controller, joint, moves, along.K[..., :count], at)
-    return PreparedFilter(law, clip, joint, moves, steady, at, noise.covariances)
+    parts = FilterParts(
+        law.matrices,
+        law.matrix_directions,
+        law.rows,
+        law.row_directions,
+        law.unit,
+        clip,
+        joint,
+        moves,
+        steady,
+        at,
+        noise.covariances,
+    )
+    return PreparedFilter(law, parts)
 
 
-def joint_likelihood(
-    prepared: PreparedFilter, outputs: Array, disturbance: Array, x0: Array, counted: int = 0
-) -> Likelihood:
-    """Likelihood of one recording.
+def joint_likelihoods(
+    prepared: PreparedFilter, recordings: Sequence[Recording], counted: int = 0
+) -> list[Likelihood]:
+    """Likelihood of each recording.
 
     Parameters
     ----------
     prepared : PreparedFilter
-    outputs, disturbance : Array
-        (samples, p) and (samples, d).
-    x0 : Array
-        What the person takes for the state at the first sample (n,).
+    recordings : sequence of Recording
+        Each begins where the person takes the state for its `x0`.
     counted : int
         The first sample that is told: the likelihood is that of it and the later ones given those
         before it.
@@ -192,83 +201,111 @@ def joint_likelihood(
     SolverError
         When the command of a sample could not be told, or the expectation diverges.
     """
-    law, n = prepared.law, prepared.law.controller.plant.n
-    samples, p, q = len(outputs), outputs.shape[1], law.along.count
-    size, m = len(prepared.joint.F), law.controller.plant.m
-    z, dz = np.zeros(size), np.zeros((size, q))
-    z[prepared.at : prepared.at + n] = x0
-    dz[prepared.at : prepared.at + n] = law.along.x0
+    law, at, size = prepared.law, prepared.parts.at, len(prepared.parts.joint.F)
+    plant, q = law.controller.plant, law.along.count
+    begin = np.concatenate([[0], np.cumsum([each.samples for each in recordings])])
+    count, trials, p = int(begin[-1]), len(recordings), len(plant.C)
+    z, dz = np.zeros((trials, size)), np.zeros((trials, size, q))
+    z[:, at : at + plant.n] = [each.x0 for each in recordings]
+    dz[:, at : at + plant.n] = law.along.x0
     result = FilterResult(
-        np.zeros(samples),
-        np.zeros((samples, q)),
-        np.zeros((q, q)),
-        np.zeros((samples, p)),
-        np.zeros((samples, p, p)),
-        np.zeros((samples, size)),
-        np.zeros((samples, m)),
-        np.full(samples, Status.NOT_REACHED, dtype=np.int8),
+        np.zeros(count),
+        np.zeros((count, q)),
+        np.zeros((trials, q, q)),
+        np.zeros((count, p)),
+        np.zeros((count, p, p)),
+        np.zeros((count, size)),
+        np.zeros((count, plant.m)),
+        np.full(count, Status.NOT_REACHED, dtype=np.int8),
         counted,
     )
-    given = np.array(outputs, order="C"), np.array(disturbance, order="C")
-    reached = _filter(prepared, *given, z, dz, result)
-    if reached < samples:
-        status = Status(int(result.status[reached]))
+    outputs = np.concatenate([each.outputs for each in recordings])
+    disturbance = np.concatenate([each.disturbance for each in recordings])
+    _filter(prepared.parts, begin, outputs, disturbance, z, dz, result)
+    return [_of_trial(result, i, slice(*begin[i : i + 2])) for i in range(trials)]
+
+
+def _of_trial(result: FilterResult, i: int, rows: slice) -> Likelihood:
+    """What the filter has written of one trial; an error where it ended early."""
+    failed = np.flatnonzero(np.isin(result.status[rows], _FAILED))
+    if len(failed):
+        status = Status(int(result.status[rows][failed[0]]))
         raise SolverError(
-            f"sample {reached}", f"{status.sentence}, as the filter expects it", "start elsewhere"
+            f"sample {failed[0]}", f"{status.sentence}, as the filter expects it", "start elsewhere"
         )
+    information = result.information[i]
     return Likelihood(
-        frozen(result.told),
-        frozen(result.score),
-        frozen(np.tril(result.information) + np.tril(result.information, -1).T),
-        frozen(result.innovation),
-        frozen(result.spread),
-        frozen(result.filtered),
-        frozen(result.u),
-        result.status,
+        frozen(result.told[rows]),
+        frozen(result.score[rows]),
+        frozen(np.tril(information) + np.tril(information, -1).T),
+        frozen(result.innovation[rows]),
+        frozen(result.spread[rows]),
+        frozen(result.filtered[rows]),
+        frozen(result.u[rows]),
+        result.status[rows],
     )
 
 
 def _filter(
-    prepared: PreparedFilter,
+    parts: FilterParts,
+    begin: np.ndarray[tuple[int], np.dtype[np.int64]],
     outputs: Array,
     disturbance: Array,
     z: Array,
     dz: Array,
     result: FilterResult,
-) -> int:
-    """Write the result from the expected first state (z,) and its derivatives (z, q).
+) -> None:
+    """Write the result from the expected first states (trials, z) and their derivatives.
 
-    Once the first state is forgotten, all is followed along the directions that are left. Returns
-    the sample at which the filter ended, or how many there are.
+    All trials go together until a bound is near, and then each by itself; once its first state is
+    forgotten, along the directions that are left.
     """
-    law, joint, moves, shared = prepared.law, prepared.joint, prepared.moves, prepared.shared
-    n = law.controller.plant.n
-    P, dP, first = joint.P0, moves.P0, 0
-    while True:
-        room = filter_room(law.rows, joint, moves, P, dP, n, dz.shape[1])
-        first = run_filter(
-            law.matrices,
-            law.matrix_directions,
-            law.rows,
-            law.row_directions,
-            law.unit,
-            prepared.clip,
-            joint,
-            moves,
-            prepared.steady,
-            prepared.at,
-            shared,
-            outputs,
-            disturbance,
-            z,
-            dz,
-            room,
-            result,
-            first,
-        )
-        if first == len(outputs) or result.status[first] != Status.NOT_REACHED:
-            return int(first)
-        dz, P, dP = dz[:, :shared].copy(), room.here.P, room.here.dP[:, :, :shared].copy()
+    joint, moves, lasting = parts.joint, parts.djoint, parts.lasting
+    count = moves.P0.shape[2]
+
+    def run(some: slice, course: Course, dz: Array, P: Buffer, dP: Buffer) -> None:
+        room = filter_room(parts.rows, joint, moves, P, dP, parts.loop.K.shape[1], dz.shape[2])
+        mine = result._replace(information=result.information[some])
+        run_filter(parts, outputs, disturbance, z[some], dz, room, mine, course)
+
+    def alone(i: int) -> None:
+        here, some = together, slice(i, i + 1)
+        mine, P, first, known = dz[some], here.P[i], int(here.reached[i]), bool(here.known[i])
+        dP = np.concatenate([here.dP[i], np.zeros((*P.shape, count - here.dP.shape[3]))], axis=2)
+        while first < begin[i + 1] - begin[i] and result.status[begin[i] + first] not in _FAILED:
+            course = _course(begin[i : i + 2], first, known, False, dP)
+            run(some, course, mine, P, dP)
+            first, known = int(course.reached[0]), False
+            mine = np.ascontiguousarray(mine[:, :, :lasting])
+            P, dP = course.P[0], np.ascontiguousarray(course.dP[0, :, :, :lasting])
+
+    # Noise that is a share of the command differs from trial to trial from the first sample on.
+    sharing = not np.any(joint.share)
+    dP0 = np.ascontiguousarray(moves.P0[:, :, : lasting if sharing else count])
+    together = _course(begin, 0, False, True, dP0)
+    if sharing:
+        run(slice(None), together, dz, joint.P0, dP0)
+    else:
+        together.P[:], together.dP[:] = joint.P0, dP0
+    left = np.flatnonzero(together.reached < np.diff(begin))
+    if len(left):
+        # The compiled filter lets other threads run.
+        with ThreadPoolExecutor(min(len(left), os.cpu_count() or 1)) as pool:
+            list(pool.map(alone, left))
+
+
+def _course(
+    begin: np.ndarray[tuple[int], np.dtype[np.int64]],
+    first: int,
+    corrected: bool,
+    shared: bool,
+    dP: Buffer,
+) -> Course:
+    """Trials at one sample, with derivatives of their covariance along as many directions as dP."""
+    trials, (size, _, k) = len(begin) - 1, dP.shape
+    reached, known = np.zeros(trials, dtype=np.int64), np.zeros(trials, dtype=np.bool_)
+    P, dP = np.zeros((trials, size, size)), np.zeros((trials, size, size, k))
+    return Course(begin, first, corrected, shared, reached, known, P, dP)
 
 
 def _unclipped(law: PreparedLoop) -> tuple[PreparedLoop, Clip]:

@@ -8,8 +8,6 @@ person's noise, and of the recorder's (docs/noisy-people.md).
 
 from __future__ import annotations
 
-import os
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -17,7 +15,7 @@ import numpy as np
 
 from impc.arrays import Array, frozen
 from impc.control.constraint_rows import directions
-from impc.control.joint_likelihood import NoiseDirections, joint_likelihood, prepare_filter
+from impc.control.joint_likelihood import NoiseDirections, joint_likelihoods, prepare_filter
 from impc.errors import SolverError
 from impc.inverse.coordinates import PARAMETER_UNIT
 from impc.inverse.problem import controller_for
@@ -35,7 +33,6 @@ if TYPE_CHECKING:
     from impc.control.joint_likelihood import Likelihood
     from impc.inverse.coordinates import Coordinates, Point
     from impc.model.observer import Observer
-    from impc.model.recordings import Recording
 
 __all__ = ["Person", "PersonCoordinates", "Told"]
 
@@ -263,15 +260,7 @@ class PersonCoordinates:
         # The initial states of all trials have the same unit, so one law serves them all.
         along, noise = self._directions(theta, controller, person, columns[0])
         prepared = prepare_filter(controller, person.observer, person.recorder, along, noise)
-
-        def one(trial: Recording) -> Likelihood:
-            return joint_likelihood(
-                prepared, trial.outputs, trial.disturbance, trial.x0, self.counted
-            )
-
-        # The compiled filter lets other threads run.
-        with ThreadPoolExecutor(min(len(problem.recordings), os.cpu_count() or 1)) as pool:
-            return list(pool.map(one, problem.recordings))
+        return joint_likelihoods(prepared, problem.recordings, self.counted)
 
     def _directions(
         self, theta: Array, controller: Controller, person: Person, moved: _Moved

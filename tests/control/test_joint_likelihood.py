@@ -19,7 +19,8 @@ from impc.control.controller import Controller
 from impc.control.joint_likelihood import (
     Likelihood,
     NoiseDirections,
-    joint_likelihood,
+    PreparedFilter,
+    joint_likelihoods,
     prepare_filter,
 )
 from impc.control.joint_loop import joint_loop
@@ -29,6 +30,7 @@ from impc.errors import SolverError
 from impc.model.bounds import Bounds
 from impc.model.observer import Observer, believed_filter
 from impc.model.plant import Plant
+from impc.model.recordings import Recording
 from tests.documents.blocks import ROOT
 from tests.support import extrapolated_slope
 
@@ -119,6 +121,15 @@ def recorded(who: Someone, samples: int, seed: int = 1) -> PersonTrial:
 def likelihood(
     who: Someone, outputs: Array, *, slopes: bool = False, steady: bool = True, counted: int = 0
 ) -> Likelihood:
+    prepared = filter_of(who, slopes=slopes, steady=steady)
+    return joint_likelihoods(prepared, [trial_of(who, outputs)], counted)[0]
+
+
+def trial_of(who: Someone, outputs: Array) -> Recording:
+    return Recording(who.plant(), outputs, push(len(outputs)), who.start)
+
+
+def filter_of(who: Someone, *, slopes: bool = False, steady: bool = True) -> PreparedFilter:
     """Along gain (2), levels in their order, the recorder's, and the first state: `moved`."""
     person, q = who.observer(), 11 if slopes else 0
     levels = np.concatenate([person.levels, [who.recorder]])
@@ -141,9 +152,9 @@ def likelihood(
         NoiseDirections(np.zeros((1, 2, q)), along, min(q, 9)),
     )
     if not steady:
-        prepared = replaced(prepared, steady=prepared.steady._replace(known=False))
-    trial = outputs, push(len(outputs)), np.array(who.start)
-    return joint_likelihood(prepared, *trial, counted)
+        parts = prepared.parts
+        return replaced(prepared, parts=parts._replace(steady=parts.steady._replace(known=False)))
+    return prepared
 
 
 SENSES = [
@@ -181,6 +192,8 @@ def test_without_bounds_it_is_that_of_statsmodels(who: Someone) -> None:
 
 
 SATURATING = Someone(limit=0.6)
+#: Knows so well where the cart is that no bound is near until one is met, after 95 samples.
+QUIET = Someone(limit=0.8, motor=0.01, process=0.001, sensory=(0.001, 0.002), recorder=0.001)
 PEOPLE = [
     Someone(),
     Someone(walk=0.2),
@@ -190,6 +203,7 @@ PEOPLE = [
     SATURATING._replace(walk=0.2),
     SATURATING._replace(share=0.3),
     SATURATING._replace(horizon=1),
+    QUIET,
 ]
 
 
@@ -207,6 +221,33 @@ def test_derivatives_equal_differences(who: Someone) -> None:
         exact = found.score.sum(axis=0) @ step
         # Differences of a sum of size 300 carry 1e-9 of rounding at these steps.
         assert exact == pytest.approx(slope[0], rel=1e-6, abs=1e-6)
+
+
+@pytest.mark.parametrize("who", [QUIET, QUIET._replace(share=0.3), SATURATING, Someone()])
+def test_recordings_together_tell_what_each_tells(who: Someone) -> None:
+    """Of other lengths and noise, met by bounds at other samples, or by none."""
+    lengths = {1: 120, 2: 30, 3: 80, 4: 120}
+    trials = [
+        trial_of(who, recorded(who, length, seed).outputs) for seed, length in lengths.items()
+    ]
+    prepared = filter_of(who, slopes=True)
+    for found, trial in zip(joint_likelihoods(prepared, trials), trials, strict=True):
+        alone = joint_likelihoods(prepared, [trial])[0]
+        np.testing.assert_array_equal(found.status, alone.status)
+        for name in ("told", "score", "information", "innovations", "spreads", "filtered", "u"):
+            np.testing.assert_allclose(getattr(found, name), getattr(alone, name), 1e-12, 1e-12)
+
+
+def test_a_covariance_that_was_shared_until_a_bound_is_near_is_each_trials_own() -> None:
+    """With noise that is a share of the command, however small, so it is from the first sample."""
+    outputs = recorded(QUIET, 130).outputs
+    own = likelihood(QUIET._replace(share=1e-12), outputs, slopes=True)
+    found = likelihood(QUIET, outputs, slopes=True)
+    assert 60 < np.flatnonzero(found.status)[0] < 120
+    np.testing.assert_allclose(found.told, own.told, rtol=1e-10, atol=1e-10)
+    kept = [0, 1, 2, 4, 5, 6, 8, 9, 10]  # all but the share, and the walk that is none
+    scale = np.sqrt(np.sum(own.score[:, kept] ** 2, axis=0))
+    np.testing.assert_allclose(found.score[:, kept] / scale, own.score[:, kept] / scale, atol=1e-9)
 
 
 def test_a_perturbation_that_does_not_persist_is_noise_to_the_person() -> None:
@@ -287,7 +328,7 @@ def test_an_expectation_without_a_command_is_an_error() -> None:
     nothing = NoiseDirections(np.zeros((1, 1, 0)), np.zeros((4, 0)), 0)
     prepared = prepare_filter(law, Observer(plant), np.array([1.0]), directions(law, 0), nothing)
     with pytest.raises(SolverError, match="as the filter expects it"):
-        joint_likelihood(prepared, np.zeros((60, 1)), np.zeros((60, 0)), np.array([3.0]))
+        joint_likelihoods(prepared, [Recording(plant, np.zeros((60, 1)), x0=[3.0])])
 
 
 def particles(who: Someone, outputs: Array, count: int, seed: int) -> float:

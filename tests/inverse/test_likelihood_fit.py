@@ -12,10 +12,10 @@ from numpy.testing import assert_array_equal
 
 from impc.arrays import Array
 from impc.assess.person_covariance import person_covariance
+from impc.control import joint_likelihood
 from impc.control.controller import Controller
 from impc.control.noisy_person import simulate_person
 from impc.errors import ImpcError, InputError, SolverError
-from impc.inverse import person_coordinates
 from impc.inverse.estimates import Estimate
 from impc.inverse.gain_search import fit_gain
 from impc.inverse.likelihood_fit import PersonFit, fit_person
@@ -85,7 +85,7 @@ def test_trials_side_by_side_say_what_they_say_one_after_the_other(
     found = replaced(noisy[1], problem=problem)
     space = fit_person(found, noisy[0], max_evaluations=1).space
     beside = [space.told(space.start) for _ in range(5)]
-    monkeypatch.setattr(person_coordinates, "ThreadPoolExecutor", lambda _: ThreadPoolExecutor(1))
+    monkeypatch.setattr(joint_likelihood, "ThreadPoolExecutor", lambda _: ThreadPoolExecutor(1))
     alone = space.told(space.start)
     for told in beside:
         assert told.value == alone.value
