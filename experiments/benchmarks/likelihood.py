@@ -27,6 +27,8 @@ from impc.inverse.residuals import evaluate
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from experiments.noisy_people import Subject
+
 __all__ = ["likelihood_rows"]
 
 
@@ -38,7 +40,11 @@ def likelihood_rows(runs: int, _: Path) -> list[Row]:
     kept = PersonCoordinates(Coordinates(*given, kept_to(problem)), who.person, who.recorder)
     free = PersonCoordinates(Coordinates(*given), who.person, who.recorder)
     known = np.array(work.controller.K), np.array(work.controller.S)
+    far = subject("seat", 0, "both", 90.0, 70.0)
+    apart = [_of_trials(far, trials) for trials in (slice(3), *(slice(i, i + 1) for i in range(3)))]
     cases: dict[str, Callable[[], object]] = {
+        "together": partial(apart[0].told, apart[0].start),
+        "each": lambda: [each.told(each.start) for each in apart[1:]],
         "kept": partial(kept.told, kept.start),
         "free": partial(free.told, free.start),
         "value": partial(kept.value, kept.start),
@@ -56,8 +62,20 @@ def likelihood_rows(runs: int, _: Path) -> list[Row]:
                 timings["kept"], timings["person"], None),
         compare("the same with any gain, ten numbers in the place of five", met,
                 timings["free"], timings["W2"], None),
+        compare("three trials of a person without a limit", "each trial by itself",
+                timings["together"], timings["each"], None),
+        compare("three trials of a person without a limit", met,
+                timings["together"], timings["W2"], None),
         compare("the likelihood alone", met, timings["value"], timings["W2"], None),
     ]  # fmt: skip
+
+
+def _of_trials(who: Subject, some: slice) -> PersonCoordinates:
+    """Where some of the trials of a person are told, at the truth."""
+    problem = recorded(who, 0).problem
+    problem = replace(problem, recordings=problem.recordings[some])
+    given = problem, np.array(who.controller.K), np.array(who.controller.S)
+    return PersonCoordinates(Coordinates(*given, kept_to(problem)), who.person, who.recorder)
 
 
 if __name__ == "__main__":
