@@ -121,6 +121,7 @@ def pooled(studies: Sequence[list[Score]]) -> str:
         f"gains off by more than themselves {len(far)}, of which {len(settled)} settled",
         f"mean errors below {_BIAS} {small} of {len(biases)}",
         f"the farthest {farthest:.1f} of its standard errors from none",
+        f"mean errors of all {_bias([one.likely for one in scores])}",
     )
     return f"{len(scores)} people: " + ", ".join(counts)
 
