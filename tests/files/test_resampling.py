@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import scipy.signal
 
+from impc.assess.variance_accounted_for import whiteness
 from impc.files.resampling import held_means, instants, resampled_samples, same_rate
 
 DT = 0.01
@@ -116,3 +117,12 @@ def test_number_of_samples(samples: int, rate: float, expected: int) -> None:
 
 def test_a_recording_shorter_than_the_filter() -> None:
     np.testing.assert_allclose(instants(np.full(30, 2.5), 1e-3, DT), 2.5, rtol=1e-12)
+
+
+def test_white_noise_of_a_faster_recorder_is_not_white_at_the_slower_rate() -> None:
+    """What the page of a person says of residuals that are not white (docs/noisy-people.md)."""
+    noise = np.random.default_rng(0).standard_normal(90_000)
+    slower = instants(noise, 0.001, 0.01)
+    assert slower[1:] @ slower[:-1] / (slower @ slower) == pytest.approx(0.15, abs=0.03)
+    assert whiteness(slower[:, None], 100)[0] < 1e-6
+    assert whiteness(instants(noise[:9000], 0.01, 0.01)[:, None], 100)[0] > 1e-3
