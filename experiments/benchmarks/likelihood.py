@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from experiments.noisy_people import Subject
+    from impc.inverse.problem import Problem
 
 __all__ = ["likelihood_rows"]
 
@@ -37,14 +38,16 @@ def likelihood_rows(runs: int, _: Path) -> list[Row]:
     who, work = subject("seat", 0, "both", 90.0, 6.0), seat(3)
     law, problem = who.controller, recorded(who, 0).problem
     given = problem, np.array(law.K), np.array(law.S)
-    kept = PersonCoordinates(Coordinates(*given, kept_to(problem)), who.person, who.recorder)
+    kept = _at_the_truth(who, problem)
     free = PersonCoordinates(Coordinates(*given), who.person, who.recorder)
     known = np.array(work.controller.K), np.array(work.controller.S)
     far = subject("seat", 0, "both", 90.0, 70.0)
-    apart = [_of_trials(far, trials) for trials in (slice(3), *(slice(i, i + 1) for i in range(3)))]
+    all_trials = recorded(far, 0).problem
+    each = [replace(all_trials, recordings=(trial,)) for trial in all_trials.recordings]
+    together, *apart = (_at_the_truth(far, some) for some in (all_trials, *each))
     cases: dict[str, Callable[[], object]] = {
-        "together": partial(apart[0].told, apart[0].start),
-        "each": lambda: [each.told(each.start) for each in apart[1:]],
+        "together": partial(together.told, together.start),
+        "each": lambda: [one.told(one.start) for one in apart],
         "kept": partial(kept.told, kept.start),
         "free": partial(free.told, free.start),
         "value": partial(kept.value, kept.start),
@@ -70,10 +73,8 @@ def likelihood_rows(runs: int, _: Path) -> list[Row]:
     ]  # fmt: skip
 
 
-def _of_trials(who: Subject, some: slice) -> PersonCoordinates:
-    """Where some of the trials of a person are told, at the truth."""
-    problem = recorded(who, 0).problem
-    problem = replace(problem, recordings=problem.recordings[some])
+def _at_the_truth(who: Subject, problem: Problem) -> PersonCoordinates:
+    """Gains that prices can have, from the person's own."""
     given = problem, np.array(who.controller.K), np.array(who.controller.S)
     return PersonCoordinates(Coordinates(*given, kept_to(problem)), who.person, who.recorder)
 

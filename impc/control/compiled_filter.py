@@ -86,8 +86,8 @@ class Course(NamedTuple):
     known : Buffer
         Written: whether its z knows the outputs of that sample (trials,).
     P, dP : Buffer
-        Written, of each that leaves before its end: the covariance before that sample
-        (trials, z, z), and its derivatives (trials, z, z, k).
+        Covariance before the first sample (trials, z, z), and its derivatives (trials, z, z, k);
+        written, of each that leaves before its end: those before the sample at which it does.
     """
 
     begin: Buffer

@@ -263,18 +263,19 @@ def _filter(
     joint, moves, lasting = parts.joint, parts.djoint, parts.lasting
     count = moves.P0.shape[2]
 
-    def run(some: slice, course: Course, dz: Array, P: Buffer, dP: Buffer) -> None:
-        room = filter_room(parts.rows, joint, moves, P, dP, parts.loop.K.shape[1], dz.shape[2])
-        mine = result._replace(information=result.information[some])
-        run_filter(parts, outputs, disturbance, z[some], dz, room, mine, course)
+    def run(some: slice, course: Course, dz: Array) -> None:
+        P, dP, n = course.P[0], course.dP[0], parts.loop.K.shape[1]
+        room = filter_room(parts.rows, joint, moves, P, dP, n, dz.shape[2])
+        own = result._replace(information=result.information[some])
+        run_filter(parts, outputs, disturbance, z[some], dz, room, own, course)
 
     def alone(i: int) -> None:
         here, some = together, slice(i, i + 1)
         mine, P, first, known = dz[some], here.P[i], int(here.reached[i]), bool(here.known[i])
         dP = np.concatenate([here.dP[i], np.zeros((*P.shape, count - here.dP.shape[3]))], axis=2)
         while first < begin[i + 1] - begin[i] and result.status[begin[i] + first] not in _FAILED:
-            course = _course(begin[i : i + 2], first, known, False, dP)
-            run(some, course, mine, P, dP)
+            course = _course(begin[i : i + 2], first, known, False, P, dP)
+            run(some, course, mine)
             first, known = int(course.reached[0]), False
             mine = np.ascontiguousarray(mine[:, :, :lasting])
             P, dP = course.P[0], np.ascontiguousarray(course.dP[0, :, :, :lasting])
@@ -282,11 +283,9 @@ def _filter(
     # Noise that is a share of the command differs from trial to trial from the first sample on.
     sharing = not np.any(joint.share)
     dP0 = np.ascontiguousarray(moves.P0[:, :, : lasting if sharing else count])
-    together = _course(begin, 0, False, True, dP0)
+    together = _course(begin, 0, False, True, joint.P0, dP0)
     if sharing:
-        run(slice(None), together, dz, joint.P0, dP0)
-    else:
-        together.P[:], together.dP[:] = joint.P0, dP0
+        run(slice(None), together, dz)
     left = np.flatnonzero(together.reached < np.diff(begin))
     if len(left):
         # The compiled filter lets other threads run.
@@ -299,13 +298,14 @@ def _course(
     first: int,
     corrected: bool,
     shared: bool,
+    P: Buffer,
     dP: Buffer,
 ) -> Course:
-    """Trials at one sample, with derivatives of their covariance along as many directions as dP."""
-    trials, (size, _, k) = len(begin) - 1, dP.shape
+    """Trials at one sample, where all have the covariance P and its derivatives dP."""
+    trials = len(begin) - 1
     reached, known = np.zeros(trials, dtype=np.int64), np.zeros(trials, dtype=np.bool_)
-    P, dP = np.zeros((trials, size, size)), np.zeros((trials, size, size, k))
-    return Course(begin, first, corrected, shared, reached, known, P, dP)
+    each = (np.repeat(part[None], trials, axis=0) for part in (P, dP))
+    return Course(begin, first, corrected, shared, reached, known, *each)
 
 
 def _unclipped(law: PreparedLoop) -> tuple[PreparedLoop, Clip]:
