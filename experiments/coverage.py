@@ -72,7 +72,7 @@ def noisy_trial(seed: int, root: float) -> Recording:
 def covered(seed: int, root: float) -> Array:
     """Error over standard deviation, (2, n): Cramér-Rao, then sandwich."""
     problem = fit_problem(cart(), [noisy_trial(seed, root)], _SETTINGS)
-    fit = fit_gain(problem, attempts=1, spread=3.0)
+    fit = fit_gain(problem)
     error = fit.K - true_controller().K
     rows = [
         np.ravel(error / gain_covariance(fit.problem, fit.K, fit.S, colour).entries)

@@ -204,7 +204,7 @@ def true_unknowns(likely: PersonFit, who: Subject) -> Array:
     space = likely.space
     own, theta = space.space, np.array(space.start)
     truth = own.natural(np.array(who.controller.K))
-    theta[: space.gain] = np.tensordot(own.natural(own.gains.gains), truth, 2)
+    theta[: space.gain] = np.tensordot(own.natural(own.gains), truth, 2)
     starts = np.array([trial.x0 for trial in own.problem.recordings])
     theta[space.shared : space.after] = np.ravel(-np.linalg.solve(own.start_unit, starts.T).T)
     levels = np.concatenate([who.person.levels, who.recorder])
@@ -217,7 +217,7 @@ def _steps(
 ) -> list[tuple[float, float]]:
     own, space = likely.space.space, likely.space
     error = own.natural(np.array(likely.K) - truth)
-    along = np.tensordot(own.natural(own.gains.gains), error, 2)
+    along = np.tensordot(own.natural(own.gains), error, 2)
     return _pairs(covariance.directions, covariance.deviations, along[: space.gain])
 
 

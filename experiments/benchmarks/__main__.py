@@ -17,7 +17,6 @@ from experiments.benchmarks.growth import growth_rows
 from experiments.benchmarks.layers import layer_rows
 from experiments.benchmarks.likelihood import likelihood_rows
 from experiments.benchmarks.routes import route_rows
-from experiments.benchmarks.search import search_rows
 from experiments.benchmarks.simulation import simulation_rows
 from experiments.benchmarks.solvers import solver_rows
 from experiments.benchmarks.table import write_tables
@@ -27,7 +26,6 @@ _PARTS = {
     "solvers": solver_rows,
     "fits": fit_rows,
     "growth": growth_rows,
-    "search": search_rows,
     "routes": route_rows,
     "layers": layer_rows,
     "likelihood": likelihood_rows,

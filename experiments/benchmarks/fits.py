@@ -15,7 +15,6 @@ from impc.inverse.direct_and_reduced import (
     CONDITION_WEIGHT,
     inverse_mpc,
     inverse_mpc_reduced,
-    start_gains,
     starting_point,
 )
 from impc.model.weights import weight_error
@@ -38,18 +37,16 @@ def fit_rows(runs: int, _: Path) -> list[Row]:
 
 def _seat(runs: int) -> list[Row]:
     one, three, long = seat(), seat(trials=3), seat(seconds=300.0)
-    start = starting_point(one.problem)
-    gains = start_gains(start, one.problem.plant)
     loop = casadi_loop(one, "qpoases")
     for work in (one, three, long):
-        _check(inverse_mpc_reduced(work.problem, *gains), work.controller.K)
+        _check(inverse_mpc_reduced(work.problem), work.controller.K)
     timings = side_by_side(
         {
             "qpoases": lambda: loop(one.controller.K),
             "start": lambda: starting_point(one.problem),
-            "one": lambda: inverse_mpc_reduced(one.problem, *gains),
-            "three": lambda: inverse_mpc_reduced(three.problem, *gains),
-            "long": lambda: inverse_mpc_reduced(long.problem, *gains),
+            "one": lambda: inverse_mpc_reduced(one.problem),
+            "three": lambda: inverse_mpc_reduced(three.problem),
+            "long": lambda: inverse_mpc_reduced(long.problem),
         },
         runs,
     )

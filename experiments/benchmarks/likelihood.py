@@ -19,9 +19,9 @@ from experiments.benchmarks.timing import side_by_side
 from experiments.benchmarks.workloads import seat
 from experiments.noisy_people import recorded, subject
 from impc.checking import replace
-from impc.inverse.coordinates import Coordinates
+from impc.inverse.coordinates import Coordinates, Point
+from impc.inverse.likelihood_start import gain_space
 from impc.inverse.person_coordinates import PersonCoordinates
-from impc.inverse.regulator_span import kept_to
 from impc.inverse.residuals import evaluate
 
 if TYPE_CHECKING:
@@ -75,8 +75,8 @@ def likelihood_rows(runs: int, _: Path) -> list[Row]:
 
 def _at_the_truth(who: Subject, problem: Problem) -> PersonCoordinates:
     """Gains that prices can have, from the person's own."""
-    given = problem, np.array(who.controller.K), np.array(who.controller.S)
-    return PersonCoordinates(Coordinates(*given, kept_to(problem)), who.person, who.recorder)
+    point = Point(np.array(who.controller.K), np.array(who.controller.S), problem)
+    return PersonCoordinates(gain_space(point, None), who.person, who.recorder)
 
 
 if __name__ == "__main__":

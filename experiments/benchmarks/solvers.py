@@ -16,7 +16,7 @@ from impc.control.closed_loop import simulate_and_differentiate
 from impc.control.constraint_rows import directions
 from impc.control.loop_function import closed_loop_function
 from impc.control.named_solver import COMPILED, SOLVERS
-from impc.inverse.direct_and_reduced import inverse_mpc_reduced, start_gains, starting_point
+from impc.inverse.direct_and_reduced import inverse_mpc_reduced
 from impc.model.weights import weight_error
 
 if TYPE_CHECKING:
@@ -100,9 +100,8 @@ def _example_fits(runs: int) -> list[Row]:
 
 def _seat_fits(runs: int) -> list[Row]:
     work = seat()
-    gains = start_gains(starting_point(work.problem), work.problem.plant)
     fits: dict[str, Callable[[], ReducedFit]] = {
-        name: partial(inverse_mpc_reduced, replace(work.problem, solver=name), *gains)
+        name: partial(inverse_mpc_reduced, replace(work.problem, solver=name))
         for name in (COMPILED, *_FITS)
     }
     found = {name: np.array(fit().gain.K) for name, fit in fits.items()}

@@ -8,15 +8,16 @@ an unknown, other horizons (docs/fitting.md, docs/what-may-be-concluded.md).
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from impc.assess.input_limits import input_limit
 from impc.assess.intervals import LEVEL, Interval, covariance_intervals
 from impc.assess.other_models import fit_alternatives
-from impc.assess.profiles import profile_likelihood
+from impc.assess.profiles import profile_likelihood, require_numbers
 from impc.assess.resampling import (
     DRAWS,
     bootstrap_intervals,
@@ -25,7 +26,7 @@ from impc.assess.resampling import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
 
     from impc.assess.input_limits import LimitEstimate
     from impc.assess.other_models import Alternative
@@ -35,7 +36,10 @@ if TYPE_CHECKING:
     from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
 
-__all__ = ["Asked", "Certainty", "assess", "count_stages"]
+#: (stage, compute, default) -> what it finds, or the default where it fails.
+Attempt = Callable[[str, Callable[[], Any], Any], Any]
+
+__all__ = ["Asked", "Attempt", "Certainty", "assess", "count_stages"]
 
 
 class Asked(Protocol):
@@ -116,6 +120,7 @@ def assess(
     settings: Asked,
     done: Callable[[str], None],
     remember: Callable[[str, Callable[[], Replicate]], Replicate],
+    attempt: Attempt,
 ) -> Certainty:
     """Run what the settings ask for.
 
@@ -134,30 +139,39 @@ def assess(
         Told each stage.
     remember : callable
         (name, compute) -> a replicate, from memory or computed now.
+    attempt : callable
+        (stage, compute, default) -> what the stage finds, or the default where it fails.
 
     Raises
     ------
     InputError
         When a profile names no number of this fit.
-    WeightsError, SolverError
-        When a replicate or the limit cannot be fitted.
     """
     intervals = [
         *covariance_intervals(estimate, estimate.covariance, "sandwich"),
         *covariance_intervals(estimate, estimate.white, "cramer-rao"),
     ]
+    require_numbers(estimate, settings.profiles)
     for name in settings.profiles:
-        intervals.append(profile_likelihood(estimate, name).interval)
-        done(f"profile of {name}")
+        stage = f"profile of {name}"
+        profile = attempt(stage, functools.partial(profile_likelihood, estimate, name), None)
+        intervals += [] if profile is None else [profile.interval]
+        done(stage)
     limits = []
     for control in range(problem.plant.m if settings.unknown_limit else 0):
-        limits.append(input_limit(fitted, control))
-        intervals.append(_limit_interval(limits[-1], problem.plant.controls[control]))
-        done(f"limit of {problem.plant.controls[control]}")
+        name = problem.plant.controls[control]
+        limit = attempt(f"limit of {name}", functools.partial(input_limit, fitted, control), None)
+        if limit is not None:
+            limits.append(limit)
+            intervals.append(_limit_interval(limit, name))
+        done(f"limit of {name}")
     alternatives: tuple[Alternative, ...] = ()
     if settings.horizons:
-        alternatives = fit_alternatives(problem, fitted, settings.horizons, settings.settle, done)
-    intervals += _bootstrap(estimate, settings, done, remember)
+        given = problem, fitted, settings.horizons, settings.settle, done
+        others = functools.partial(fit_alternatives, *given)
+        alternatives = attempt("other horizons", others, ())
+    replicates = functools.partial(_bootstrap, estimate, settings, done, remember)
+    intervals += attempt("bootstrap", replicates, ())
     return Certainty(tuple(intervals), *weights, tuple(limits), alternatives)
 
 

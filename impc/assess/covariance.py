@@ -10,10 +10,9 @@ the middle as `residual_noise` estimates it from the residuals. With white noise
 Cramér-Rao bound.
 
 Beside the gain everything else that was fitted is unknown: initial states, physical parameters
-and, for several inputs, the metric S. Gain and metric move within the pairs that weights have
-(`consistent_pairs`): a step of the gain, or of a parameter, takes the metric along, and what is
-left for the metric alone is m - 1 numbers. The prior of a search (`fit_gain`) is left out: the
-result says what the recordings determine, and in a direction that they hardly do it is wide.
+and, for several inputs, the metric S, which is independent of the gain. The prior of a search
+(`fit_gain`) is left out: the result says what the recordings determine, and in a direction that
+they hardly do it is wide.
 
 To first order a direction that is not told has no part in those that are; to second order it has,
 and it may be wrong by as much as a gain can be. `curvature` adds that (docs/fitting.md).
@@ -29,11 +28,11 @@ import numpy as np
 
 from impc.arrays import Array, BoolArray, Frozen, frozen
 from impc.assess.long_run_covariance import ResidualNoise, residual_noise, spread_of_sum
-from impc.inverse.consistent_pairs import gain_changes, metric_changes, scaled_changes
+from impc.inverse.coordinates import metric_directions, scaled_changes
+from impc.inverse.problem import recorded_size
 from impc.inverse.residuals import evaluate, residual_only, residual_or_reason
 from impc.inverse.solution_set import natural_coordinates
 from impc.inverse.trial_span import trial_span
-from impc.model.plant_family import plant_differential
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -45,6 +44,7 @@ if TYPE_CHECKING:
 __all__ = [
     "DETERMINED",
     "FOREIGN",
+    "ROUNDING",
     "TOLD",
     "TWO_SIDED",
     "GainCovariance",
@@ -54,6 +54,8 @@ __all__ = [
 
 #: A direction whose singular value is below this, of the largest, is not determined at all.
 DETERMINED = 1e-6
+#: So is one along which a natural step changes the outputs by less than this share of them.
+ROUNDING = 1e-10
 #: A direction with a larger deviation, of the natural size of a gain, is not told: there the prior
 #: of a search and the curvature of the problem count beside the recordings.
 TOLD = 0.2
@@ -65,7 +67,7 @@ FOREIGN = 0.2
 TWO_SIDED = 1.959964
 # Of an entry's natural size: a smaller share in a direction is rounding's.
 _SHARE = 1e-6
-_ROUNDING = 1e-10
+_SEEN = 1e-10
 _STEPS = (1.0, 0.5, 0.25, 0.125)
 
 
@@ -157,30 +159,26 @@ def gain_covariance(
     found = evaluation or evaluate(problem, gain, metric)
     in_units = np.kron(G, np.linalg.inv(T).T)
     on_gain = found.dK.reshape(-1, m * n) @ in_units
-    with_gain, alone = metric_changes(problem.plant, gain, metric, T, G)
-    on_metric = found.dS.reshape(len(on_gain), -1)
-    on_gain = on_gain + _seen(on_metric, metric, with_gain)
-    metric_columns = _told_metric(_seen(on_metric, metric, alone))
+    along = scaled_changes(metric, metric_directions(metric)).reshape(-1, m * m)
+    metric_columns = _told_metric(found.dS.reshape(len(on_gain), -1) @ along.T)
     # What the rest can explain is taken out of the gain's columns; the gain's
     # block of the inverse of H is that of what is left.
-    on_parameters = _on_parameters(problem, found, (gain, metric, T, G), with_gain)
-    rest = _span(problem, found, metric_columns, on_parameters)
+    rest = _span(problem, found, metric_columns, found.dparameters)
     others = _span(problem, found, on_gain, metric_columns)
     seen = rest.without(on_gain)
     _, values, directions = np.linalg.svd(seen, full_matrices=False)
-    usable = values > DETERMINED * values[0]
+    usable = values > max(DETERMINED * values[0], ROUNDING * recorded_size(problem))
     unit = seen @ directions[usable].T / values[usable]
     colour = noise(by_trial(problem, found.residual), rest.plus(unit))
-    along = unit / values[usable]
-    spread = spread_of_sum(colour, by_trial(problem, along))
+    spread = spread_of_sum(colour, by_trial(problem, unit / values[usable]))
     deviations = np.full(m * n, np.inf)
     deviations[usable] = np.sqrt(np.maximum(np.diag(spread), 0.0))
     if curvature:
         told = np.flatnonzero(deviations < TOLD)
         reach = np.minimum(deviations, 1.0)[:, None] * directions
         untold = reach[deviations >= TOLD]
-        steps = (untold @ in_units.T).reshape(-1, m, n), np.tensordot(untold, with_gain, 1)
-        shifts = _shifts(problem, gain, metric, *steps) @ along[:, told]
+        shifts = _shifts(problem, gain, metric, (untold @ in_units.T).reshape(-1, m, n))
+        shifts = shifts @ unit[:, told] / values[told]
         spread[np.ix_(told, told)] += shifts.T @ shifts / 2
         deviations[usable] = np.sqrt(np.maximum(np.diag(spread), 0.0))
     entries, foreign = _entries(in_units @ directions.T, deviations, spread)
@@ -192,21 +190,13 @@ def gain_covariance(
         frozen(deviations),
         frozen(entries.reshape(m, n)),
         frozen(foreign.reshape(m, n)),
-        frozen(_parameter_deviations(problem, on_parameters, others, colour)),
+        frozen(_parameter_deviations(problem, found.dparameters, others, colour)),
         colour,
     )
 
 
-def _seen(on_metric: Array, metric: Array, changes: Array) -> Array:
-    """Derivative (r, k) of the residual along changes (k, m, m) of a metric (m, m)."""
-    scaled = scaled_changes(metric, changes)
-    return np.asarray(on_metric @ scaled.reshape(len(scaled), metric.size).T)
-
-
-def _shifts(problem: Problem, gain: Array, metric: Array, steps: Array, metrics: Array) -> Array:
-    """What steps of gain (k, m, n) and metric (k, m, m), forth and back, do to the residual.
-
-    (2 k, r), one row a step and sign.
+def _shifts(problem: Problem, gain: Array, metric: Array, steps: Array) -> Array:
+    """What steps of the gain (k, m, n), forth and back, do to the residual (2 k, r).
 
     A step that cannot be simulated is halved, and what it does scaled by the square: the first
     order of a step that is not told has no part in those that are.
@@ -214,8 +204,7 @@ def _shifts(problem: Problem, gain: Array, metric: Array, steps: Array, metrics:
     here, shifts = residual_only(problem, gain, metric), []
     for index, sign in itertools.product(range(len(steps)), (1.0, -1.0)):
         for share in _STEPS:
-            there = gain + sign * share * steps[index], metric + sign * share * metrics[index]
-            moved, reason = residual_or_reason(problem, *there)
+            moved, reason = residual_or_reason(problem, gain + sign * share * steps[index], metric)
             if not reason:
                 shifts.append((moved - here) / share**2)
                 break
@@ -253,28 +242,14 @@ def by_trial(problem: Problem, rows: Array) -> list[Array]:
 def _told_metric(alone: Array) -> Array:
     """Columns of what is told of S `alone` (r, k)."""
     metric, sizes, _ = np.linalg.svd(alone, full_matrices=False)
-    # Rounding leaves 1e-15 where S is not told: its scale, and inputs that are never at a bound.
-    return np.asarray(metric[:, sizes > _ROUNDING * np.max(sizes)])
+    # Rounding leaves 1e-15 where S is not identified: inputs that are never at a bound.
+    return np.asarray(metric[:, sizes > _SEEN * np.max(sizes, initial=0.0)])
 
 
 def _span(problem: Problem, found: Evaluation, *shared: Array) -> TrialSpan:
     """What initial states and the columns `shared` can explain."""
     sizes = [trial.outputs.size for trial in problem.recordings]
     return trial_span(found.dx0, sizes, np.hstack(shared))
-
-
-def _on_parameters(
-    problem: Problem, found: Evaluation, at: tuple[Array, Array, Array, Array], with_gain: Array
-) -> Array:
-    """Derivative (r, k) along the parameters: the gain stands, its metric stays that of weights."""
-    if problem.family is None or problem.plant.m == 1:
-        return found.dparameters
-    _, metric, T, G = at
-    change = plant_differential(problem.family, problem.logarithms)
-    steps = gain_changes(problem.plant, *at, change)
-    back = np.linalg.solve(G, steps @ T).reshape(len(steps), -1)
-    on_metric = found.dS.reshape(len(found.residual), -1)
-    return found.dparameters - _seen(on_metric, metric, np.tensordot(back, with_gain, 1))
 
 
 def _parameter_deviations(

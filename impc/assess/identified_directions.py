@@ -17,9 +17,9 @@ from impc.arrays import Array, Frozen, frozen
 from impc.checking import checked
 from impc.control.closed_loop import simulate
 from impc.errors import SolverError, WeightsError
-from impc.inverse.arrow import triangular_rows
 from impc.inverse.equivalent_weights import other_weights
-from impc.inverse.problem import controller_for, misfit, scenarios
+from impc.inverse.least_squares import triangular_rows
+from impc.inverse.problem import controller_for, misfit, recorded_size, scenarios
 from impc.inverse.proximal_search import Residual, weight_jacobian
 from impc.inverse.proximal_step import block_basis
 from impc.inverse.residuals import evaluate
@@ -38,6 +38,8 @@ __all__ = ["Identifiability", "OtherWeights", "identifiability"]
 
 # Exact derivatives leave singular values of 1e-13 where nothing is determined.
 _DETERMINED = 1e-8
+# Of the recorded outputs: what rounding leaves of their derivative where no weights have an effect.
+_ROUNDING = 1e-10
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,8 @@ class Identifiability(Frozen):
     free : int
         Directions of (Q, R), scale not counted.
     rank : int
-        How many of them the recordings determine: singular values above 1e-8 of the largest.
+        How many of them the recordings determine: singular values above 1e-8 of the largest, and
+        above 1e-10 of the recorded outputs.
     chosen : int
         How many the condition number chose: free - rank.
     tolerance : float
@@ -133,7 +136,8 @@ def identifiability(problem: Problem, weights: Weights) -> Identifiability:
     factor = np.linalg.cholesky(weights.block)
     basis = factor @ block_basis(plant.n, plant.m) @ factor.T
     values = _singular_values(solution, found, basis)
-    rank = int(np.count_nonzero(values > _DETERMINED * values[0]))
+    least = max(_DETERMINED * values[0], _ROUNDING * recorded_size(problem))
+    rank = int(np.count_nonzero(values > least))
     free = len(basis) - 1
     metric = solution.S if plant.m > 1 else None
     fibre = gain_fibre(plant, solution.K, metric)

@@ -40,11 +40,19 @@ if TYPE_CHECKING:
     from impc.inverse.gain_search import GainFit
     from impc.inverse.problem import Problem
 
-__all__ = ["LimitEstimate", "input_limit", "on_limit", "with_limit"]
+__all__ = [
+    "LimitEstimate",
+    "OtherLimit",
+    "at_another_limit",
+    "input_limit",
+    "on_limit",
+    "with_limit",
+]
 
-_SPREAD = 1.0
 # The limit is searched to this share of itself.
 _RESOLUTION = 1e-4
+# Growth of the steps towards an end of the interval, and how exact the end is, of the last step.
+_GROWTH, _NEARLY = 2.0, 0.02
 _GRID, _NEAR = np.geomspace(0.3, 1.05, 10), np.array([0.8, 0.9, 1.0, 1.1, 1.25])
 _ROUNDS = 5
 
@@ -80,6 +88,54 @@ class LimitEstimate(Frozen):
     reason: str
     limits: Array
     distances: Array
+
+
+@dataclass(frozen=True)
+class OtherLimit:
+    """A fit whose limit of the command was searched too.
+
+    Attributes
+    ----------
+    given : float
+        The limit as it was given, in the input's unit.
+    limit : LimitEstimate
+    fitted : Estimate
+        Inverse MPC at that limit.
+    """
+
+    given: float
+    limit: LimitEstimate
+    fitted: Estimate
+
+    @property
+    def contradicted(self) -> bool:
+        """Whether the interval of the limit excludes the given one."""
+        return not self.limit.low <= self.given <= self.limit.high
+
+
+def at_another_limit(fitted: Estimate, known: LimitEstimate | None = None) -> OtherLimit | None:
+    """The fit with the limit of its one input free; None without one, or where none is determined.
+
+    Parameters
+    ----------
+    fitted : Estimate
+        At the limit that was given.
+    known : LimitEstimate, optional
+        Of `input_limit`, where it has been estimated already.
+
+    Raises
+    ------
+    SolverError, WeightsError
+        As `input_limit` and `fit_controller`.
+    """
+    given = float(fitted.problem.bounds.u_max[0])
+    if fitted.problem.plant.m > 1 or not np.isfinite(given):
+        return None
+    limit = known or input_limit(fitted)
+    if limit.value is None:
+        return None
+    posed = with_limit(fitted.problem, limit.value)
+    return OtherLimit(given, limit, fit_controller(posed, fitted.weights))
 
 
 def with_limit(problem: Problem, limit: float, control: int = 0) -> Problem:
@@ -131,13 +187,16 @@ def input_limit(fitted: Estimate, control: int = 0, *, level: float = 0.95) -> L
     unit = noise * factor
 
     def distance(limit: float) -> float:
-        return (search.misfit(limit) ** 2 - best.misfit**2) / unit
+        return (search.misfit(limit) ** 2 - search.least()[1].misfit ** 2) / unit
 
-    value = search.limit_of(best)
-    none = (free.misfit**2 - best.misfit**2) / unit
-    low = _crossing(distance, value, 0.3 * value, quantile)
-    determined = none > quantile
-    high = _crossing(distance, value, 1.5 * top, quantile) if determined else np.inf
+    for _ in range(_ROUNDS):  # on its way the profile may pass a better limit
+        value, best = search.least()
+        none = (free.misfit**2 - best.misfit**2) / unit
+        determined = none > quantile
+        low = _crossing(distance, value, 0.3 * value, quantile)
+        high = _crossing(distance, value, 1.5 * top, quantile) if determined else np.inf
+        if search.least()[0] == value:
+            break
     limits = np.array(sorted(key for key in search.tried if np.isfinite(key)))
     distances = np.array([distance(limit) for limit in limits])
     if determined:
@@ -212,6 +271,14 @@ class _Search:
             raise SolverError("limit", "no gain holds with any limit tried", "check the plant")
         return min(finite, key=lambda fit: fit.misfit)
 
+    def least(self) -> tuple[float, GainFit]:
+        """The best of all finite limits that were tried."""
+        fits = [fit for fit in self.tried.values() if fit is not None]
+        best = min(
+            (fit for fit in fits if np.isfinite(self.limit_of(fit))), key=lambda fit: fit.misfit
+        )
+        return self.limit_of(best), best
+
     def limit_of(self, fit: GainFit) -> float:
         return float(fit.problem.bounds.u_max[self.control])
 
@@ -234,7 +301,7 @@ class _Search:
                     K,
                     metric,
                     max_evaluations=30,
-                    spread=_SPREAD,
+                    prior=1.0,
                 )
             except (SolverError, WeightsError):  # it falls with that limit; the next may not
                 continue
@@ -293,10 +360,21 @@ def on_limit(problem: Problem, gain: Array, metric: Array, limit: float, control
 def _crossing(
     distance: Callable[[float], float], inside: float, outside: float, quantile: float
 ) -> float:
-    """Limit between two at which D passes the quantile; the outer one when it does not."""
+    """Limit between two at which D passes the quantile; the outer one when it does not.
+
+    Steps from inside grow until D is beyond: an interval may be a thousandth of the limit.
+    """
+    step = _RESOLUTION * inside
+    while step < abs(outside - inside):
+        there = inside + np.sign(outside - inside) * step
+        if distance(there) > quantile:
+            outside = there
+            break
+        inside, step = there, _GROWTH * step
     if distance(outside) <= quantile:
         return outside
+    width = abs(outside - inside)
     found = scipy.optimize.brentq(
-        lambda limit: distance(limit) - quantile, inside, outside, xtol=1e-3 * inside
+        lambda limit: distance(limit) - quantile, inside, outside, xtol=_NEARLY * width
     )
     return float(found)

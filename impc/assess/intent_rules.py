@@ -114,7 +114,11 @@ def intent(plant: Plant, gain: Array, metrics: Array, sizes: Array, fallback: We
     """
     readings: list[Reading] = []
     missing: list[str] = []
-    for rule, choose in _rules(plant, gain, metrics, sizes):
+    try:
+        rules = _rules(plant, gain, metrics, sizes)
+    except (WeightsError, SolverError) as error:
+        rules, missing = [], [f"{_PLANT_UNITS}: {error}"]
+    for rule, choose in rules:
         try:
             found = choose()
         except (WeightsError, SolverError) as error:

@@ -23,10 +23,12 @@ if TYPE_CHECKING:
     from impc.assess.printed_gain import GainEstimate
     from impc.model.plant import Plant
 
-__all__ = ["LEVEL", "Interval", "covariance_intervals", "entry_names"]
+__all__ = ["LEVEL", "PARAMETER", "Interval", "covariance_intervals", "entry_names"]
 
 #: Of an interval, where none is asked for.
 LEVEL = 0.95
+#: Standard error of the logarithm of a parameter from which on it is not identified.
+PARAMETER = 0.5
 
 
 @dataclass(frozen=True)
@@ -46,9 +48,11 @@ class Interval:
     low, high : float
         Infinite where the recordings set no end.
     told : bool
-        Whether the recordings tell this number by itself. Where they do not, a covariance's
-        interval is that of a plain least-squares estimate, while the value is kept near where the
-        search began: it holds the truth more often than its level. A bootstrap's has no ends.
+        Whether this number is individually identified: an entry of the gain by `GainCovariance`, a
+        parameter when the standard error of its logarithm is below 0.5. Where it is not, a
+        covariance's interval is that of a plain least-squares estimate, while the value is kept
+        near where the search began: it covers the truth more often than its level. A bootstrap's
+        has no ends.
     """
 
     name: str
@@ -58,6 +62,11 @@ class Interval:
     low: float
     high: float
     told: bool = True
+
+    @property
+    def excludes_zero(self) -> bool:
+        """Whether both ends are on one side of zero."""
+        return self.low > 0 or self.high < 0
 
 
 def entry_names(plant: Plant) -> tuple[str, ...]:
@@ -98,7 +107,7 @@ def covariance_intervals(
             family.names, estimate.parameters, covariance.parameters, strict=True
         ):
             low, high = _around(value, z * float(deviation))
-            told = bool(np.isfinite(deviation))
+            told = bool(deviation < PARAMETER)
             found.append(Interval(name, method, level, float(value), low, high, told))
     return tuple(found)
 

@@ -21,17 +21,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.linalg
-import scipy.optimize
 
 from impc.arrays import Array, frozen
 from impc.assess.covariance import GainCovariance, gain_covariance
 from impc.assess.long_run_covariance import white_noise
-from impc.inverse.arrow import Tolerances
-from impc.inverse.coordinates import Coordinates
+from impc.inverse.coordinates import Coordinates, descend
 from impc.inverse.gain_search import EXPLAINED
-from impc.inverse.many_trials import has_many_trials, search_many
+from impc.inverse.least_squares import Stop
 from impc.inverse.problem import recorded_size
 from impc.inverse.residuals import evaluate
+from impc.model.riccati import is_stable
 
 if TYPE_CHECKING:
     from impc.inverse.estimates import Estimate
@@ -44,12 +43,8 @@ __all__ = ["GainEstimate", "ToldGain", "gain_estimate", "told_gain"]
 _ROUNDS = 4
 _SETTLED = 1e-4
 _EVALUATIONS = 40
-# Of the misfit's square. Where the limit of an input is met the sensitivities have kinks, about
-# which a search goes to and fro: eight replicates on the seat took half the evaluations of 1e-8 and
-# ended within .06 of a deviation of its gain (1e-5: .04, but 4 of chi-square short in one).
-_TOLERANCE = 1e-6
-# Steps that move the gain by less than this along what is not told leave it there.
-_SAME = 1e-10
+# Nats at which a search ends.
+_TOLERANCE = 0.01
 
 
 @dataclass(frozen=True)
@@ -157,7 +152,10 @@ def _search(problem: Problem, gain: Array, metric: Array) -> _Here:
     here = _described(problem, gain, metric, evaluate(problem, gain, metric))
     explained = here.misfit <= EXPLAINED * recorded_size(problem)
     for _ in range(0 if explained else _ROUNDS):
-        before, here = here, _round(here)
+        there = _round(here)
+        if there is None:  # it leaves what can be described: the last gain stands
+            break
+        before, here = here, there
         same = np.count_nonzero(here.linear.told) == np.count_nonzero(before.linear.told)
         if same and here.misfit > (1 - _SETTLED) * before.misfit:
             break
@@ -170,50 +168,22 @@ def _described(problem: Problem, gain: Array, metric: Array, evaluation: Evaluat
     return _Here(problem, gain, metric, misfit, evaluation, linear)
 
 
-def _round(here: _Here) -> _Here:
-    """Least squares over the told directions and everything beside the gain.
+def _round(here: _Here) -> _Here | None:
+    """Least squares over the identified directions and everything beside the gain.
 
     What is beside the gain has the normal prior of any search (`fit_gain`): it is not printed with
     an interval, and some of it nothing determines.
     """
     space = Coordinates(here.problem, here.K, here.S)
     space.evaluated(space.start, here.evaluation)
-    samples = sum(trial.outputs.size for trial in here.problem.recordings)
-    z = _least_squares(space, here.linear, here.misfit / np.sqrt(samples))
+    identified = here.linear.directions[here.linear.told]
+    beside = int(space.ends[1] - space.ends[0] + space.ends[3] - space.ends[2])
+    along = scipy.linalg.block_diag(identified.T, np.eye(beside))
+    shared = np.concatenate([np.zeros(len(identified)), np.ones(beside)])
+    stop = Stop(_TOLERANCE, 0.0, _EVALUATIONS)
+    z, _, _ = descend(space, space.start, stop, shared=shared, own=1.0, along=along)
     there = space.unpack(z)
+    plant = there.problem.plant
+    if not is_stable(plant.A - plant.B @ there.K, discrete=True):
+        return None
     return _described(there.problem, there.K, there.S, space.evaluated(z)[0])
-
-
-def _least_squares(space: Coordinates, linear: GainCovariance, noise: float) -> Array:
-    """Where the search ends that moves the gain along the told directions only.
-
-    The search has the same natural coordinates as the directions: both are those of this gain.
-    """
-    if has_many_trials(space) and space.m == 1:  # one input: no other coordinate moves the gain
-        told = linear.directions[linear.told]
-        beside = int(space.ends[1] - space.ends[0] + space.ends[3] - space.ends[2])
-        shared = scipy.linalg.block_diag(told.T, np.eye(beside))
-        weights = np.concatenate([np.zeros(len(told)), np.full(beside, noise)]), noise
-        ends = Tolerances(_TOLERANCE, 1e-12, 1e-15, _EVALUATIONS)
-        return search_many(space, space.start, shared, weights, ends)[0]
-    changes, _ = space.changes(space.unpack(space.start), space.start)
-    moves = space.natural(changes).reshape(len(changes), -1).T
-    along = scipy.linalg.null_space(linear.directions[~linear.told] @ moves, _SAME)
-    prior = noise * along[space.ends[0] :]
-
-    def residual(step: Array) -> Array:
-        return np.concatenate([space.at(space.start + along @ step).residual, prior @ step])
-
-    def derivative(step: Array) -> Array:
-        return np.vstack([space.at(space.start + along @ step).jacobian @ along, prior])
-
-    found = scipy.optimize.least_squares(
-        residual,
-        np.zeros(along.shape[1]),
-        jac=derivative,
-        ftol=_TOLERANCE,
-        xtol=1e-12,
-        gtol=1e-15,
-        max_nfev=_EVALUATIONS,
-    )
-    return np.asarray(space.start + along @ found.x)

@@ -33,7 +33,7 @@ from impc.errors import InputError
 from impc.inverse.coordinates import PARAMETER_UNIT, Coordinates
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from impc.assess.printed_gain import GainEstimate
 
@@ -82,6 +82,7 @@ def profile_likelihood(estimate: GainEstimate, name: str, level: float = LEVEL) 
     InputError
         When there is no such entry or parameter.
     """
+    require_numbers(estimate, [name])
     search = _Search(estimate, name)
     quantile = float(scipy.special.chdtri(1, 1 - level))
     ends = search.ends(quantile)
@@ -93,6 +94,22 @@ def profile_likelihood(estimate: GainEstimate, name: str, level: float = LEVEL) 
         frozen([search.number(offset) for offset in tried]),
         frozen([search.distance(offset) for offset in tried]),
     )
+
+
+def require_numbers(estimate: GainEstimate, names: Sequence[str]) -> None:
+    """Require that every name is of an entry of K or a parameter that was fitted.
+
+    Raises
+    ------
+    InputError
+        When one is not.
+    """
+    family = estimate.problem.family
+    known = [*entry_names(estimate.problem.plant), *(() if family is None else family.names)]
+    for name in names:
+        if name not in known:
+            said = f"known: {', '.join(known)}"
+            raise InputError(f"profile of {name}", "there is no such number", said)
 
 
 class _Search:
@@ -113,7 +130,7 @@ class _Search:
         self.samples = sum(trial.outputs.size for trial in problem.recordings)
         misfit = float(np.linalg.norm(self.space.at(self.space.start).residual))
         self.noise = max(misfit, 1e-12) / np.sqrt(self.samples)
-        self.target = self.space.with_prior(self.noise / _WIDTH)
+        self.pull = self.noise / _WIDTH
         self.tried: dict[float, tuple[float, Array]] = {}
         self.squared(0.0)
         self.deviation, self.factor = _spread(estimate, name)
@@ -128,11 +145,13 @@ class _Search:
                 start = np.zeros(self.null.shape[1])
 
             def residual(w: Array) -> Array:
-                return self.target.residual(self._at(offset, w)[0])
+                z, _ = self._at(offset, w)
+                away = self.pull * (z - self.space.start)
+                return np.concatenate([self.space.at(z).residual, away])
 
             def derivative(w: Array) -> Array:
                 z, along = self._at(offset, w)
-                return np.asarray(self.target.derivative(z) @ along)
+                return np.vstack([self.space.at(z).jacobian @ along, self.pull * along])
 
             found = scipy.optimize.least_squares(
                 residual, start, jac=derivative, ftol=1e-8, max_nfev=40
@@ -217,18 +236,16 @@ def _functional(
 
         return entry, lambda offset: value + offset
     family = estimate.problem.family
-    if family is not None and name in family.names:
-        index = family.names.index(name)
-        row = np.zeros(int(space.ends[-1]))
-        row[int(space.ends[2]) + index] = PARAMETER_UNIT
-        value = float(estimate.parameters[index])
+    assert family is not None  # see `require_numbers`
+    index = family.names.index(name)
+    row = np.zeros(int(space.ends[-1]))
+    row[int(space.ends[2]) + index] = PARAMETER_UNIT
+    value = float(estimate.parameters[index])
 
-        def parameter(z: Array) -> tuple[float, Array]:
-            return float(row @ (z - space.start)), row
+    def parameter(z: Array) -> tuple[float, Array]:
+        return float(row @ (z - space.start)), row
 
-        return parameter, lambda offset: float(value * np.exp(offset)) if offset < 700 else np.inf
-    known = [*entries, *(family.names if family is not None else ())]
-    raise InputError(f"profile of {name}", "there is no such number", f"known: {', '.join(known)}")
+    return parameter, lambda offset: float(value * np.exp(offset)) if offset < 700 else np.inf
 
 
 def _spread(estimate: GainEstimate, name: str) -> tuple[float, float]:

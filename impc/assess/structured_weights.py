@@ -26,7 +26,7 @@ from impc.assess.long_run_covariance import (
     spread_of_sum,
     white_noise,
 )
-from impc.inverse.consistent_pairs import metric_changes, scaled_changes
+from impc.inverse.coordinates import metric_directions, scaled_changes
 from impc.inverse.residuals import evaluate
 from impc.inverse.solution_set import natural_coordinates
 from impc.inverse.structured_search import regulator_slopes
@@ -119,20 +119,16 @@ class Tangent(Frozen):
         Returns
         -------
         Array
-            Along G^-1 K T, the metric moving with it, (r, mn).
+            Along G^-1 K T (r, mn).
         Array
-            Along what is left for the metric alone (r, b).
+            Along the metric (r, b).
         """
         gain, metric = np.array(self.solution.K), np.array(self.solution.S)
         T, G = natural_coordinates(self.problem.plant, gain)
         on_gain = self.found.dK.reshape(len(self.residual), -1) @ np.kron(G, np.linalg.inv(T).T)
-        with_gain, alone = metric_changes(self.problem.plant, gain, metric, T, G)
+        along = scaled_changes(metric, metric_directions(metric))
         on_metric = self.found.dS.reshape(len(self.residual), -1)
-        tied, own = (
-            on_metric @ scaled_changes(metric, part).reshape(len(part), -1).T
-            for part in (with_gain, alone)
-        )
-        return np.asarray(on_gain + tied), np.asarray(own)
+        return np.asarray(on_gain), np.asarray(on_metric @ along.reshape(len(along), -1).T)
 
 
 def tangent(structure: Structure, problem: Problem, prices: Array) -> Tangent:

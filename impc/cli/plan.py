@@ -101,7 +101,7 @@ def _person(
     structure, prices = presumed_prices(plant, settings, fit)
     bounds = fit_bounds(plant, fit, ())
     controller = Controller(
-        plant, structure.weights(prices), bounds, fit.horizon, terminal_set=fit.terminal_set
+        plant, structure.weights(prices), bounds, fit.horizon, terminal_set=fit.terminal_set is True
     )
     tau = settings.correlation
     return Person(

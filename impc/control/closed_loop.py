@@ -42,7 +42,6 @@ if TYPE_CHECKING:
     from impc.control.controller import Controller
     from impc.control.saturated import Plan
     from impc.control.simulation import Scenario
-    from impc.model.plant import Plant
 
 __all__ = [
     "PreparedLoop",
@@ -122,9 +121,15 @@ def simulate_and_differentiate(
     return run_loop(prepare_loop(controller, along), given)
 
 
-def prepare_loop(controller: Controller, along: Directions) -> PreparedLoop:
-    """Build all that does not depend on the recording, so that several trials share it."""
+def prepare_loop(
+    controller: Controller, along: Directions, moves: tuple[Array, Array, Array] | None = None
+) -> PreparedLoop:
+    """Build all that does not depend on the recording, so that several trials share it.
+
+    `moves` are A, B and E of what moves in place of the plant; the controller predicts by its own.
+    """
     plant = controller.plant
+    A, B, E = (plant.A, plant.B, plant.E) if moves is None else moves
     rows = build_rows(controller)
     moved = differentiate_rows(controller, along) if along.count else _no_directions(rows)
     inverse = np.asarray(np.linalg.inv(controller.S), dtype=np.float64)
@@ -133,7 +138,7 @@ def prepare_loop(controller: Controller, along: Directions) -> PreparedLoop:
         along,
         rows,
         moved,
-        _writable(plant.A, plant.B, plant.E, controller.K, inverse),
+        _writable(A, B, E, controller.K, inverse),
         _writable(along.A, along.B, along.E, along.K, along.S),
         np.minimum(-controller.bounds.u_min, controller.bounds.u_max),
         None if controller.solver == COMPILED else build_program(controller.solver, rows),
@@ -141,13 +146,15 @@ def prepare_loop(controller: Controller, along: Directions) -> PreparedLoop:
 
 
 def run_loop(
-    prepared: PreparedLoop, given: Scenario, *, local: bool = False
+    prepared: PreparedLoop, given: Scenario, *, local: bool = False, proved: bool = True
 ) -> tuple[Simulation, Sensitivity]:
     """Simulate one recording of a prepared loop, with its derivatives.
 
     Samples that were not reached repeat the last state, so that a search can go on with them. Where
     `local`, the state at every sample moves along the directions of the first, whatever the others
-    did: `Sensitivity.u` then has the derivatives of the controller at each sample by itself.
+    did: `Sensitivity.u` then has the derivatives of the controller at each sample by itself. With
+    `proved` false the first sample that the rows do not solve ends the simulation: a search then
+    steps back.
     """
     plant, along = prepared.controller.plant, prepared.along
     steps, n, m, p = given.steps, plant.n, plant.m, along.count
@@ -159,9 +166,9 @@ def run_loop(
     program = prepared.program
     loop = (
         *(prepared.matrices, prepared.matrix_directions, prepared.rows, prepared.row_directions),
-        body_tape(plant.body, n, n + m + plant.E.shape[1], moving=p > 0),
+        body_tape(plant.body, n, n + m + given.disturbance.shape[1], moving=p > 0),
         _pushes(prepared, given),
-        *(np.array(given.disturbance), _divergence(plant, given), prepared.unit),
+        *(np.array(given.disturbance), _divergence(prepared.matrices.E, given), prepared.unit),
         workspace(prepared.rows, m, p),
     )
     written = (x, u, dx, du, status, multipliers)
@@ -181,6 +188,8 @@ def run_loop(
             if status[t] > Status.SOFTENED:
                 break
             continue
+        if not proved:
+            break
         asked = plan is None  # the rows, which did not tell
         if asked and status[t] == Status.INFEASIBLE:
             if proves_infeasible(prepared.controller, prepared.rows, multipliers, x[t]):
@@ -281,7 +290,7 @@ def _no_directions(rows: Rows) -> RowDirections:
     )
 
 
-def _divergence(plant: Plant, given: Scenario) -> float:
+def _divergence(E: Array, given: Scenario) -> float:
     """State norm that ends a simulation: a million times what drives it, and at least that."""
-    pushes = plant.E @ given.disturbance.T
+    pushes = E @ given.disturbance.T
     return 1e6 * max(1.0, float(np.max(np.abs(given.x0))), float(np.max(np.abs(pushes), initial=0)))

@@ -20,7 +20,7 @@ from impc.arrays import Array, finite_array, frozen, symmetric_matrix
 from impc.checking import Value, checked, replace
 from impc.control.closed_loop import simulate
 from impc.control.named_solver import COMPILED, require_solver
-from impc.control.simulation import Status, scenario
+from impc.control.simulation import Status, excluded_bound, scenario
 from impc.control.terminal_set import maximal_invariant_set
 from impc.errors import InputError
 from impc.model.riccati import is_stable, solve_lqr
@@ -58,7 +58,8 @@ class Controller(Value):
     horizon : int
         N >= 1, in samples.
     terminal_set : bool
-        Whether x_N must lie in the maximal invariant set of the regulator under the bounds.
+        Whether x_N must lie in the maximal invariant set of the regulator under the bounds, as in
+        the dissertation.
     softening, solver : optional
         See the attributes.
 
@@ -244,10 +245,12 @@ class Controller(Value):
         if run.complete:
             return run
         end = run.reached
-        warnings.warn(
-            f"sample {end}: {Status(int(run.status[end])).sentence}; what follows is NaN",
-            stacklevel=3,
-        )
+        status = Status(int(run.status[end]))
+        said = status.sentence
+        if status is Status.INFEASIBLE:
+            bound, remedy = excluded_bound(self, run)
+            said = f"no input sequence keeps {bound} ({remedy})"
+        warnings.warn(f"sample {end}: {said}; what follows is NaN", stacklevel=3)
         x, u = np.array(run.x), np.array(run.u)
         x[end + 1 :], u[end:] = np.nan, np.nan
         return replace(run, x=x, u=u)

@@ -356,12 +356,12 @@ class OptimalControlProblem(Frozen):
         *,
         d: Any = None,
         x0: Any = None,
-        unknown_start: bool = False,
+        unknown_start: bool | None = None,
     ) -> OptimalRecording:
         """A recording that is one plan: `impc.control.optimal_recordings.optimal_recording`.
 
         x (N + 1, n), u (N, m), d (N, d), x0 (n,); NaN is not measured. With
-        `unknown_start` x0 is searched from what is given.
+        `unknown_start` x0 is searched from what is given: by default where it is the first of x.
         """
         return optimal_recording(
             self, x, u, closed_loop=False, d=d, x0=x0, unknown_start=unknown_start
@@ -374,12 +374,12 @@ class OptimalControlProblem(Frozen):
         *,
         d: Any = None,
         x0: Any = None,
-        unknown_start: bool = False,
+        unknown_start: bool | None = None,
     ) -> OptimalRecording:
         """A recording of the closed loop: `impc.control.optimal_recordings.optimal_recording`.
 
         x (steps + 1, n), u (steps, m), d (steps, d), x0 (n,); NaN is not measured. With
-        `unknown_start` x0 is searched from what is given.
+        `unknown_start` x0 is searched from what is given: by default where it is the first of x.
         """
         return optimal_recording(
             self, x, u, closed_loop=True, d=d, x0=x0, unknown_start=unknown_start

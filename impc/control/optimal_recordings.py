@@ -58,7 +58,7 @@ def optimal_recording(
     closed_loop: bool,
     d: Any = None,
     x0: Any = None,
-    unknown_start: bool = False,
+    unknown_start: bool | None = None,
 ) -> OptimalRecording:
     """A recording, checked.
 
@@ -75,8 +75,8 @@ def optimal_recording(
         Disturbances (steps, d); none by default.
     x0 : array_like, optional
         (n,); the first of x by default.
-    unknown_start : bool
-        Whether x0 is only a guess.
+    unknown_start : bool, optional
+        Whether x0 is only a guess, and searched; by default where it is the first of x.
 
     Raises
     ------
@@ -104,7 +104,7 @@ def optimal_recording(
         raise DataError("recording", "has nothing that was measured", "give states or inputs")
     return OptimalRecording(
         problem, frozen(states), frozen(inputs), frozen(known), frozen(start), closed_loop,
-        unknown_start,
+        x0 is None if unknown_start is None else unknown_start,
     )  # fmt: skip
 
 

@@ -28,7 +28,15 @@ if TYPE_CHECKING:
     from impc.control.controller import Controller
     from impc.model.plant import Plant
 
-__all__ = ["Scenario", "Sensitivity", "Simulation", "Status", "require_complete", "scenario"]
+__all__ = [
+    "Scenario",
+    "Sensitivity",
+    "Simulation",
+    "Status",
+    "excluded_bound",
+    "require_complete",
+    "scenario",
+]
 
 
 class Status(IntEnum):
@@ -214,6 +222,23 @@ def scenario(
     return Scenario(frozen(start), frozen(given))
 
 
+def excluded_bound(controller: Controller, simulation: Simulation) -> tuple[str, str]:
+    """The bound that an infeasible simulation could not keep, and what to do, in words."""
+    remedy = "start nearer to the origin, lengthen the horizon, or soften the state bounds"
+    row = simulation.failed_row
+    if row < 0:
+        return "the bounds", remedy
+    rows = build_rows(controller)
+    name = bound_rows(controller.bounds, controller.plant).names[rows.family[row]]
+    stage = int(rows.stage[row])
+    if stage < controller.horizon:
+        return f"the bound {name} {stage} samples ahead", remedy
+    return (
+        f"the bound {name} in the terminal set, {stage} samples ahead",
+        f"{remedy}, or leave the set out: terminal_set=False",
+    )
+
+
 @checked
 def require_complete(controller: Controller, simulation: Simulation) -> Simulation:
     """Return the simulation when every sample was reached.
@@ -247,21 +272,9 @@ def require_complete(controller: Controller, simulation: Simulation) -> Simulati
     sample = simulation.reached
     status = Status(int(simulation.status[sample]))
     if status is Status.INFEASIBLE:
-        rows = build_rows(controller)
-        name = bound_rows(controller.bounds, controller.plant).names[
-            rows.family[simulation.failed_row]
-        ]
-        stage = int(rows.stage[simulation.failed_row])
-        where = (
-            f"{stage} samples ahead"
-            if stage < controller.horizon
-            else f"in the terminal set, {stage} samples ahead"
-        )
-        raise InfeasibleError(
-            "x0" if sample == 0 else f"sample {sample}",
-            f"no input sequence keeps the bound {name} {where}",
-            "start nearer to the origin, lengthen the horizon, or soften the state bounds",
-        )
+        bound, remedy = excluded_bound(controller, simulation)
+        where = "x0" if sample == 0 else f"sample {sample}"
+        raise InfeasibleError(where, f"no input sequence keeps {bound}", remedy)
     raise SolverError(
         f"sample {sample}", status.sentence, "check the plant, the gain and the bounds"
     )

@@ -13,23 +13,26 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.optimize
 
 from impc.arrays import Array, BoolArray, Frozen, frozen
 from impc.errors import InputError, SolverError
-from impc.inverse.coordinates import start_unit
-from impc.inverse.diagonal_start import bryson_regulators
-from impc.inverse.residuals import evaluate, misfit_or_reason
+from impc.inverse.coordinates import Coordinates, descend
+from impc.inverse.least_squares import Stop
+from impc.inverse.residuals import misfit_or_reason
+from impc.inverse.solution_set import natural_coordinates
+from impc.inverse.starting_regulators import regulators
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from impc.inverse.problem import Problem
+    from impc.model.plant import Plant
 
 __all__ = ["PreliminaryGain", "preliminary_gain"]
 
 _SCALES = np.geomspace(1.0, 1e-3, 25)
-_PARAMETER_UNIT = 1 / 3
+# Nats and evaluations at which the search ends.
+_FINE, _EVALUATIONS = 0.01, 60
 
 
 @dataclass(frozen=True)
@@ -54,7 +57,7 @@ class PreliminaryGain(Frozen):
 def preliminary_gain(problem: Problem, states: Sequence[str]) -> PreliminaryGain:
     """Fit gains on some states, with initial states and physical parameters, without bounds.
 
-    From the gains of Bryson's regulators on those states, at the scale at which they fit best.
+    From the gains of balanced regulators on those states, at the scale at which they fit best.
 
     Raises
     ------
@@ -71,21 +74,29 @@ def preliminary_gain(problem: Problem, states: Sequence[str]) -> PreliminaryGain
             "[fit] feedback_states", f"{unknown or 'is empty'}", f"known: {list(names)}"
         )
     kept: BoolArray = np.isin(names, states)
-    search = _Search(loose, kept, _start(loose, kept))
-    found = scipy.optimize.least_squares(
-        search.residual, search.start, jac=search.derivative, x_scale="jac", ftol=1e-8, max_nfev=60
-    )
-    K, here = search.unpack(found.x)
-    misfit = float(np.linalg.norm(evaluate(here, K, np.eye(problem.plant.m)).residual))
-    return PreliminaryGain(frozen(K), here, misfit)
+    gain, metric = _start(loose, kept), np.eye(problem.plant.m)
+    space = Coordinates(loose, gain, metric, _basis(loose.plant, gain, kept))
+    stop = Stop(_FINE, 0.0, _EVALUATIONS)
+    z, _, _ = descend(space, space.start, stop)
+    found = space.unpack(z)
+    misfit = float(np.linalg.norm(space.at(z).residual))
+    return PreliminaryGain(frozen(found.K), found.problem, misfit)
+
+
+def _basis(plant: Plant, gain: Array, kept: BoolArray) -> Array:
+    """Gains on the kept states (k, m, n), orthonormal in natural coordinates of a gain (m, n)."""
+    T, G = natural_coordinates(plant, gain)
+    entries = np.eye(gain.size).reshape(-1, *gain.shape)[np.tile(kept, plant.m)]
+    natural, _ = np.linalg.qr(np.linalg.solve(G, entries @ T).reshape(len(entries), -1).T)
+    return np.asarray(G @ natural.T.reshape(entries.shape) @ np.linalg.inv(T))
 
 
 def _start(problem: Problem, kept: BoolArray) -> Array:
-    """The best stabilising multiple of a Bryson regulator's gains on the kept states."""
+    """The best stabilising multiple of a balanced regulator's gains on the kept states."""
     metric = np.eye(problem.plant.m)
     best: Array | None = None
     least = np.inf
-    for _, solution in bryson_regulators(problem):
+    for solution in regulators(problem):
         gain: Array = np.asarray(solution.K * kept, dtype=np.float64)
         for scale in _SCALES:
             misfit, reason = misfit_or_reason(problem, scale * gain, metric)
@@ -98,48 +109,3 @@ def _start(problem: Problem, kept: BoolArray) -> Array:
             "choose others in [fit] feedback_states",
         )
     return best
-
-
-class _Search:
-    """Unknowns: kept entries of K over their start, initial states, logarithms of parameters."""
-
-    def __init__(self, problem: Problem, kept: BoolArray, start: Array) -> None:
-        self.problem, self.gain = problem, start
-        self.at_entry = np.flatnonzero(np.tile(kept, problem.plant.m))
-        self.unit = start_unit(problem, start)
-        self.trials = len(problem.recordings) if problem.unknown_start else 0
-        self.n = problem.plant.n
-        sizes = (len(self.at_entry), self.trials * self.n, len(problem.logarithms))
-        self.ends = np.cumsum(sizes)
-        self.start = np.zeros(int(self.ends[-1]))
-        size = np.abs(np.ravel(start)[self.at_entry])
-        self.scale = np.maximum(size, 1e-3 * np.max(size))
-
-    def unpack(self, z: Array) -> tuple[Array, Problem]:
-        entries, starts, logarithms = np.split(z, self.ends[:-1])
-        gain = self.gain.copy()
-        gain.ravel()[self.at_entry] += entries * self.scale
-        x0 = np.array([trial.x0 for trial in self.problem.recordings])
-        if self.trials:
-            x0 = x0 + starts.reshape(self.trials, self.n) @ self.unit.T
-        here = self.problem.logarithms + _PARAMETER_UNIT * logarithms
-        return gain, self.problem.at(x0, here)
-
-    def residual(self, z: Array) -> Array:
-        gain, problem = self.unpack(z)
-        return evaluate(problem, gain, np.eye(problem.plant.m)).residual
-
-    def derivative(self, z: Array) -> Array:
-        gain, problem = self.unpack(z)
-        found = evaluate(problem, gain, np.eye(problem.plant.m))
-        rows = len(found.residual)
-        columns = [found.dK.reshape(rows, -1)[:, self.at_entry] * self.scale]
-        first = 0
-        for trial in problem.recordings[: self.trials]:
-            mine = slice(first, first + trial.outputs.size)
-            first = mine.stop
-            block = np.zeros((rows, self.n))
-            block[mine] = found.dx0[mine] @ self.unit
-            columns.append(block)
-        columns.append(found.dparameters * _PARAMETER_UNIT)
-        return np.hstack(columns)

@@ -8,7 +8,7 @@ weights of least condition number among all those with that gain are one semidef
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -16,9 +16,9 @@ from impc.arrays import Array
 from impc.checking import checked, replace
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
-from impc.inverse.diagonal_start import bryson_regulators
+from impc.errors import InputError, SolverError, WeightsError
 from impc.inverse.explaining_weights import weights_behind
-from impc.inverse.gain_search import EXPLAINED, GainFit, fit_gain
+from impc.inverse.gain_search import EXPLAINED, GainFit, fit_gain, refine_gain
 from impc.inverse.inverse_lqr import inverse_lqr_gradient, inverse_lqr_lmi
 from impc.inverse.nearest_regulator import (
     AUXILIARY_CONDITION_WEIGHT,
@@ -28,6 +28,7 @@ from impc.inverse.nearest_regulator import (
 from impc.inverse.problem import recorded_size, scenarios, typical_output
 from impc.inverse.proximal_search import ConditionedFit, Objective, Residual, conditioned_fit
 from impc.inverse.residuals import evaluate
+from impc.inverse.starting_regulators import regulators
 from impc.model.riccati import solve_lqr
 from impc.model.weights import Weights
 
@@ -40,7 +41,6 @@ if TYPE_CHECKING:
     from impc.inverse.explaining_weights import WeightsBehind
     from impc.inverse.inverse_lqr import InverseLqr
     from impc.inverse.problem import Problem
-    from impc.model.plant import Plant
     from impc.model.riccati import LqrSolution
 
 __all__ = [
@@ -53,7 +53,6 @@ __all__ = [
     "inverse_mpc",
     "inverse_mpc_reduced",
     "output_penalty_weights",
-    "start_gains",
     "starting_point",
     "verify_hard",
 ]
@@ -88,6 +87,8 @@ class ReducedFit:
     ----------
     gain : GainFit
         What the recordings determine.
+    metrics : Array
+        The metric, then directions along which they do not identify it (k, m, m).
     equivalent : EquivalentWeights or None
         Weights of least condition number with exactly that gain; None when there are none.
     direct : DirectFit or None
@@ -103,11 +104,17 @@ class ReducedFit:
     """
 
     gain: GainFit
+    metrics: Array
     equivalent: EquivalentWeights | None
     direct: DirectFit | None
     explained: bool
     reason: str
     kept_hard: bool
+
+    @property
+    def misfit(self) -> float:
+        """2-norm of the residual of the direct form, or of the gain."""
+        return self.gain.misfit if self.direct is None else self.direct.misfit
 
     @property
     def weights(self) -> Weights:
@@ -189,14 +196,21 @@ def infer_weights(problem: Problem, *, condition_weight: float | None = None) ->
     return Inference(start, inverse_mpc(problem, start.weights, condition_weight=condition_weight))
 
 
-def start_gains(start: Start, plant: Plant) -> list[tuple[Array, Array]]:
-    """The gains (m, n) that Table 3.1 passed, with metrics (m, m), as starts for `fit_gain`."""
-    passed = [start.weights]
-    if start.gradient is not None and start.gradient.weights is not None:
-        passed.append(start.gradient.weights)
-    solutions = [solve_lqr(plant, weights) for weights in passed]
-    pairs = [(np.array(item.K), np.array(item.S)) for item in solutions]
-    return [(np.array(start.gain.K), np.array(start.gain.S)), *pairs]
+T = TypeVar("T", "DirectFit", "ReducedFit")
+
+
+def _either(problem: Problem, fit: Callable[[Problem], T]) -> T:
+    """A fit without the terminal set, and where that does not explain one with it: the better."""
+    if problem.terminal_set is not None:
+        return fit(problem)
+    without = fit(replace(problem, terminal_set=False))
+    if without.explained:
+        return without
+    try:
+        within = fit(replace(problem, terminal_set=True))
+    except (InputError, SolverError, WeightsError):  # no controller with the set comes near
+        return without
+    return within if within.misfit < without.misfit else without
 
 
 @checked
@@ -209,7 +223,7 @@ def starting_point(problem: Problem) -> Start:
         As `infer_weights`.
     """
     plant = problem.plant
-    gain = fit_gain(problem.without_bounds(), attempts=1)
+    gain = fit_gain(problem.without_bounds())
     lmi = inverse_lqr_lmi(plant, gain.K)
     if lmi.weights is not None:
         return Start(gain, lmi, None, None, lmi.weights)
@@ -270,10 +284,26 @@ def inverse_mpc(
     weight = condition_weight
     if weight is None:
         weight = CONDITION_WEIGHT * typical_output(problem)
+    settings = squared, max_iterations, explain and not squared and condition_weight is None
+
+    def fit(problem: Problem) -> DirectFit:
+        return _conditioned(problem, start, weight, *settings)
+
+    return _either(problem, fit)
+
+
+def _conditioned(
+    problem: Problem,
+    start: Weights,
+    weight: float,
+    squared: bool,
+    max_iterations: int,
+    explain: bool,
+) -> DirectFit:
     objective = Objective(_closed_loop_residual(problem), 1.0, weight, squared)
     fit = conditioned_fit(problem.plant, objective, definite(start), max_iterations=max_iterations)
     found = _direct(problem, fit)
-    if found.explained or not explain or squared or condition_weight is not None:
+    if found.explained or not explain:
         return found
     return _explaining(problem, found, weight)
 
@@ -286,8 +316,8 @@ def _direct(problem: Problem, fit: ConditionedFit) -> DirectFit:
 
 def _explaining(problem: Problem, found: DirectFit, weight: float) -> DirectFit:
     """Weights of least condition number that explain the recordings, if any; else those given."""
-    start = np.array(found.solution.K), np.array(found.solution.S)
-    behind = weights_behind(fit_gain(problem, start, attempts=1, regulators=False))
+    K, S = np.array(found.solution.K), np.array(found.solution.S)
+    behind = weights_behind(refine_gain(problem, K, S))
     if not behind.explained or behind.equivalent is None:
         return found
     weights, condition = behind.equivalent.weights, behind.equivalent.condition
@@ -305,28 +335,22 @@ def _explaining(problem: Problem, found: DirectFit, weight: float) -> DirectFit:
 
 
 @checked(condition_weight=0)
-def inverse_mpc_reduced(
-    problem: Problem,
-    *starts: tuple[Array, Array],
-    condition_weight: float | None = None,
-) -> ReducedFit:
+def inverse_mpc_reduced(problem: Problem, *, condition_weight: float | None = None) -> ReducedFit:
     """Reduced inverse MPC: fit the gain through the constrained controller, then one program.
 
-    Three searches at most: two for a gain, and when neither explains the recordings, or no weights
-    have the gain found, one that stays among weights (the direct form) and goes on as a search for
-    a gain from where that ends. It passes local minima at gains that no weights have.
+    When the gain does not explain the recordings, or no weights have it, a search that stays among
+    weights (the direct form) follows, and goes on as a search for a gain from where that ends.
 
     Parameters
     ----------
-    starts : pairs of Array
-        Gains (m, n) and metrics (m, m) from which the search may start, see `fit_gain`.
+    problem : Problem
     condition_weight : float, optional
         Of the direct form, see `inverse_mpc`.
 
     Raises
     ------
     SolverError
-        When the recordings cannot be simulated from any start.
+        When the recordings cannot be simulated from where any search begins.
 
     Examples
     --------
@@ -340,7 +364,15 @@ def inverse_mpc_reduced(
     >>> found.explained, bool(abs(found.gain.K - truth.K).max() < 1e-6)
     (True, True)
     """
-    first = weights_behind(fit_gain(problem, *starts, attempts=2))
+
+    def fit(problem: Problem) -> ReducedFit:
+        return _reduced(problem, condition_weight)
+
+    return _either(problem, fit)
+
+
+def _reduced(problem: Problem, condition_weight: float | None) -> ReducedFit:
+    first = weights_behind(fit_gain(problem))
     if first.explained:
         return _with_gain(problem, first)
     direct = inverse_mpc(
@@ -350,28 +382,30 @@ def inverse_mpc_reduced(
         max_iterations=_DETOUR,
         explain=False,
     )
-    end = np.array(direct.solution.K), np.array(direct.solution.S)
-    second = weights_behind(fit_gain(problem, end, attempts=1))
+    K, S = np.array(direct.solution.K), np.array(direct.solution.S)
+    second = weights_behind(refine_gain(problem, K, S))
     best = min(first, second, key=lambda item: item.misfit)
     if best.misfit <= direct.misfit:
         return _with_gain(problem, best)
     kept = all(run.complete for run in verify_hard(problem, direct.weights))
-    return ReducedFit(first.gain, None, direct, False, first.reason, kept)
+    return ReducedFit(first.gain, first.metrics, None, direct, False, first.reason, kept)
 
 
 def _with_gain(problem: Problem, found: WeightsBehind) -> ReducedFit:
     assert found.equivalent is not None  # its misfit is finite
     kept = all(run.complete for run in verify_hard(problem, found.equivalent.weights))
-    return ReducedFit(found.gain, found.equivalent, None, found.explained, found.reason, kept)
+    return ReducedFit(
+        found.gain, found.metrics, found.equivalent, None, found.explained, found.reason, kept
+    )
 
 
 def _most_promising(problem: Problem) -> Weights:
-    """Of `bryson_weights` those with the least misfit, whether or not every sample is reached."""
+    """Of balanced regulators that of least misfit, whether or not every sample is reached."""
 
     def distance(solution: LqrSolution) -> float:
         return float(np.linalg.norm(evaluate(problem, solution.K, solution.S).residual))
 
-    return min(bryson_regulators(problem), key=lambda item: distance(item[1]))[0]
+    return min(regulators(problem), key=distance).weights
 
 
 @checked(condition_weight=0)
@@ -412,7 +446,7 @@ def verify_hard(problem: Problem, weights: Weights) -> list[Simulation]:
         weights,
         problem.bounds,
         problem.horizon,
-        terminal_set=problem.terminal_set,
+        terminal_set=bool(problem.terminal_set),
         solver=problem.solver,
     )
     return [simulate(controller, drive) for drive in scenarios(problem)]

@@ -17,12 +17,18 @@ import scipy.linalg
 from impc.arrays import Array, Frozen
 from impc.checking import checked
 from impc.errors import SolverError, WeightsError
-from impc.inverse.semidefinite import matrix_inequality, solve_semidefinite
+from impc.inverse.semidefinite import (
+    Cone,
+    matrix_inequality,
+    norm_bound,
+    solve_semidefinite,
+)
 from impc.inverse.solution_set import GainFibre, pair_blocks, split_blocks
 from impc.model.riccati import solve_lqr
 from impc.model.weights import Weights, condition_number, normalised
 
 __all__ = [
+    "SLACK",
     "EquivalentWeights",
     "WeightsMargin",
     "analytic_centre",
@@ -34,6 +40,9 @@ __all__ = [
 
 # Least eigenvalue, of a mean of 1, from which weights are said to exist: Clarabel errs by 1e-10.
 _MARGIN = 1e-9
+#: By how much, relatively, the condition number of a convention may exceed the least: with less
+#: the members differ by less than the programs can tell.
+SLACK = 1e-5
 # Relative distance to the dual bound at which a program is not solved again, and counts as failed.
 _GAP, _LARGEST_GAP = 1e-9, 1e-4
 
@@ -126,6 +135,10 @@ def least_condition_weights(
 
     minimise alpha subject to I <= X <= alpha I, X = blkdiag(Q, R) in the fibre.
 
+    Many weights may have the least condition number. By convention the answer is, of those whose
+    condition number is at most 1e-5 larger, that of least Frobenius norm in natural coordinates
+    (`gain_fibre`) when their least eigenvalue is 1: it is unique, and the same on every processor.
+
     A member X0 = LL' of least eigenvalue 1 and largest a sets the scale: the first inequality is
     written for L^-1 X L^-T, the second divided by a, so that all entries are of order one. One
     such program reaches 2e-4 on the seat plant (a condition number of 2e7); from its own answer
@@ -177,6 +190,10 @@ def least_condition_weights(
             f"Clarabel: {status}, condition {least:.6g}, proven only to {gap:.2g}",
             "use `analytic_centre`, or scale the states",
         )
+    if not rough:
+        chosen = _least_norm(fibre, best, (1 + SLACK) * least)
+        if condition_number(chosen) <= (1 + 2 * SLACK) * least:
+            best = chosen
     return _member(fibre, best, f"least condition number, Clarabel: {status}", gap)
 
 
@@ -281,32 +298,78 @@ def _interior(fibre: GainFibre, member: Weights | None = None) -> Weights:
     return found.weights
 
 
+@dataclass(frozen=True)
+class _Centred:
+    """A fibre as seen from a member, whose least eigenvalue is 1 and whose largest is `largest`.
+
+    Members are sum_i y_i raw_i; the inequalities on them, block by block, are of size one.
+    """
+
+    raw: Array
+    seen: Array  # L^-1 raw L^-T, orthonormal: the programs' variables are well scaled
+    lower: Array  # L^-1 L^-T
+    largest: float
+    natural: Array  # raw in the fibre's own basis, orthonormal in natural coordinates
+    blocks: tuple[slice, slice]
+
+    @classmethod
+    def about(cls, fibre: GainFibre, centre: Weights) -> _Centred:
+        n, eigenvalues = fibre.plant.n, np.linalg.eigvalsh(centre.block)
+        if eigenvalues[0] <= 0:
+            raise SolverError(
+                "least condition number",
+                "the weights are singular to working precision in the units of the plant",
+                "scale the states",
+            )
+        inverse = inverse_factor(fibre, centre) * np.sqrt(eigenvalues[0])
+        lower = inverse @ inverse.T
+        raw = pair_blocks(fibre.Q, fibre.R)
+        seen, triangle = np.linalg.qr((inverse @ raw @ inverse.T).reshape(len(raw), -1).T)
+        back = np.linalg.inv(triangle).T
+        return cls(
+            np.tensordot(back, raw, 1),
+            seen.T.reshape(-1, *lower.shape),
+            lower,
+            float(eigenvalues[-1] / eigenvalues[0]),
+            back,
+            (slice(0, n), slice(n, len(lower))),
+        )
+
+    def cones(self, limit: float | None) -> list[Cone]:
+        """I <= X <= limit I; without a limit X <= s largest I, s one variable more."""
+        size, cones = len(self.lower), []
+        more = np.zeros((1, size, size)), np.eye(size)[None] * (limit is None)
+        seen = np.concatenate([self.seen, more[0]])
+        upper = np.concatenate([-self.raw / self.largest, more[1]])
+        most = np.zeros((size, size)) if limit is None else limit / self.largest * np.eye(size)
+        for part in self.blocks:
+            cones.append(matrix_inequality(-self.lower[part, part], seen[:, part, part]))
+            cones.append(matrix_inequality(most[part, part], upper[:, part, part]))
+        return cones
+
+    def member(self, y: Array) -> Weights:
+        return split_blocks(np.tensordot(y, self.raw, 1), self.blocks[0].stop)
+
+
 def _centred_program(fibre: GainFibre, centre: Weights, scaled: bool) -> tuple[Weights, float, str]:
     """One program of `least_condition_weights`, scaled by a member: (found, bound, status)."""
-    n, eigenvalues = fibre.plant.n, np.linalg.eigvalsh(centre.block)
-    if eigenvalues[0] <= 0:
-        raise SolverError(
-            "least condition number",
-            "the weights are singular to working precision in the units of the plant",
-            "scale the states",
-        )
-    largest = float(eigenvalues[-1] / eigenvalues[0])
-    inverse = inverse_factor(fibre, centre) * np.sqrt(eigenvalues[0])
-    lower = inverse @ inverse.T
-    raw = pair_blocks(fibre.Q, fibre.R)
-    # Orthonormal as seen from the centre: the program's own variables are well scaled too.
-    seen, triangle = np.linalg.qr((inverse @ raw @ inverse.T).reshape(len(raw), -1).T)
-    seen = np.append(seen.T, np.zeros((1, raw[0].size)), axis=0).reshape(-1, *lower.shape)
-    raw = np.tensordot(np.linalg.inv(triangle).T, raw, 1)
-    upper = np.append(-raw / largest, np.eye(len(lower))[None], axis=0)
-    cones = []
-    for block in (slice(0, n), slice(n, len(lower))):
-        cones.append(matrix_inequality(-lower[block, block], seen[:, block, block]))
-        part = upper[:, block, block]
-        cones.append(matrix_inequality(np.zeros(part.shape[1:]), part))
-    found = solve_semidefinite(np.eye(len(upper))[-1], cones, scaled=scaled)
-    member = split_blocks(np.tensordot(found.y[:-1], raw, 1), n)
-    return member, largest * found.bound, found.status
+    at = _Centred.about(fibre, centre)
+    last = np.eye(len(at.raw) + 1)[-1]
+    found = solve_semidefinite(last, at.cones(None), scaled=scaled)
+    return at.member(found.y[:-1]), at.largest * found.bound, found.status
+
+
+def _least_norm(fibre: GainFibre, centre: Weights, limit: float) -> Weights:
+    """Of the members with I <= X <= limit I that of least Frobenius norm in natural coordinates.
+
+    The least condition number has many members; this one is unique, and as exact as the program.
+    """
+    at = _Centred.about(fibre, centre)
+    last = np.eye(len(at.raw) + 1)[-1]
+    size = np.linalg.norm(fibre.to_natural(centre)) / np.linalg.eigvalsh(centre.block)[0]
+    vectors = np.concatenate([at.natural, np.zeros((1, at.natural.shape[1]))]) / size
+    found = solve_semidefinite(last, [norm_bound(vectors, last), *at.cones(limit)])
+    return at.member(found.y[:-1])
 
 
 def _ends(fibre: GainFibre, centre: Weights, limit: float) -> tuple[list[Array], Array]:

@@ -6,22 +6,38 @@ The unknowns are those of docs/theory.md, section 6; what one more function says
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from enum import Enum
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from impc.arrays import Array, Frozen, frozen
+from impc.checking import replace
+from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
+from impc.control.simulation import Status as SampleStatus
 from impc.errors import SolverError, WeightsError
-from impc.inverse.problem import controller_for, recorded_size
+from impc.inverse.problem import controller_for, misfit, recorded_size, scenarios
+from impc.inverse.residuals import evaluate
+from impc.inverse.solution_set import natural_coordinates
+from impc.inverse.trial_span import trial_span
+from impc.model.riccati import is_stable
 from impc.model.weights import Weights
 
 if TYPE_CHECKING:
+    from impc.control.simulation import Simulation
     from impc.inverse.problem import Problem
 
-__all__ = ["Estimate", "Status", "decode_estimate", "encode_estimate"]
+__all__ = [
+    "Estimate",
+    "Goodness",
+    "Status",
+    "decode_estimate",
+    "encode_estimate",
+    "gain_rank",
+    "goodness",
+]
 
 
 class Status(Enum):
@@ -48,6 +64,11 @@ class Status(Enum):
 # What is left is much when half of the recordings' 2-norm is (a VAF of 75 %). Of the noisy carts of
 # the tests inverse MPC ends within 0.3 % of the best gain's misfit, inverse LQR 170 % above it.
 _MUCH, _MORE = 0.5, 1.05
+# Standard deviations of the first autocorrelation of white noise beyond which a residual is not
+# white, and its least size: that of noise after a filter on the way to a lower rate is 0.15.
+_WHITE, _LEAST = 3.0, 0.3
+# Of the largest singular value, and of the recorded outputs: less is not identified.
+_DETERMINED, _ROUNDING = 1e-6, 1e-10
 
 _SENTENCES = {
     Status.EXPLAINED: "The weights reproduce the recordings to 1e-9 of them.",
@@ -56,6 +77,33 @@ _SENTENCES = {
     Status.GAIN_ONLY: "A gain was found, and no weights that have it.",
     Status.NONE: "The method ended without a gain.",
 }
+
+
+@dataclass(frozen=True)
+class Goodness:
+    """What the simulation of the recordings says of an answer.
+
+    Attributes
+    ----------
+    white : bool
+        Whether what is left of no output is autocorrelated from one sample to the next; of an exact
+        answer it is rounding.
+    softened, samples : int
+        How many samples exceed a soft bound or the terminal set, and of how many.
+    rank : int
+        Directions of the gain that the recordings identify.
+    lone : bool
+        Whether the best of several searches was alone: the others ended at more.
+    beaten : str
+        Method whose answer leaves less in the model of this one; empty where there is none.
+    """
+
+    white: bool
+    softened: int
+    samples: int
+    rank: int
+    lone: bool = False
+    beaten: str = ""
 
 
 @dataclass(frozen=True)
@@ -86,6 +134,8 @@ class Estimate(Frozen):
         Simulations with derivatives.
     seconds : float
         Time of the method, given what it starts from, s.
+    fit : Goodness
+        What its simulation of the recordings says against it.
     prices : Array or None
         Unknowns of the problem's structure (count,), for the method that searches them; minus
         infinity is a price of zero.
@@ -117,23 +167,52 @@ class Estimate(Frozen):
     reason: str
     evaluations: int
     seconds: float
+    fit: Goodness
     prices: Array | None = None
 
     def __str__(self) -> str:
-        ended = f" {self.reason}." if self.reason else ""
-        gain = "" if self.K is None else f" K = {np.array2string(self.K, precision=4)}"
-        told = f"{self.status.sentence}{ended}{self._doubts()}"
-        return f"{self.method}: {told} Misfit {self.misfit:.3g}.{gain}"
+        ended = f"{self.reason}." if self.reason else ""
+        gain = "" if self.K is None else f"K = {np.array2string(self.K, precision=4)}"
+        misfit = f"Misfit {self.misfit:.3g}."
+        said = (self.status.sentence, ended, *self.doubts, misfit, gain)
+        return f"{self.method}: {' '.join(part for part in said if part)}"
 
-    def _doubts(self) -> str:
-        """What speaks against it: that it leaves much, or more than the noise."""
-        if self.K is None or self.explained:
-            return ""
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """Sentences that say why the answer may be wrong, or is not all of the answer."""
+        if self.K is None:
+            return ()
+        found, doubts = self.fit, []
+        if self.problem.terminal_set:
+            doubts.append("The controller ends in its terminal set.")
+        if found.softened:
+            doubts.append(
+                f"{found.softened} of {found.samples} samples of its simulation exceed a state "
+                "bound or the terminal set, which the search had softened."
+            )
+        if found.rank < self.K.size:
+            doubts.append(
+                f"The recordings identify {found.rank} of the {self.K.size} directions of the gain."
+            )
+        if self.explained:
+            return tuple(doubts)
         share = self.misfit / recorded_size(self.problem)
-        little = f" It leaves {100 * share:.0f} % of the recordings." if share > _MUCH else ""
-        more = self.misfit > _MORE * self.noise
-        noisy = f" But another gain leaves less, {self.noise:.3g}: not all of it is noise."
-        return little + (noisy if more else "")
+        if share > _MUCH:
+            doubts.append(f"It leaves {100 * share:.0f} % of the recordings.")
+        if self.misfit > _MORE * self.noise:
+            doubts.append(
+                f"But another gain leaves less, {self.noise:.3g}: not all of it is noise."
+            )
+        if found.beaten:
+            doubts.append(f"The answer of {found.beaten} leaves less here: the search failed.")
+        if found.lone:
+            doubts.append("Of several searches one ended here: a better answer may exist.")
+        if not found.white:
+            doubts.append(
+                "What it leaves is no white noise: noise in the loop, another model, or a better "
+                "answer that was not found."
+            )
+        return tuple(doubts)
 
     @property
     def gain(self) -> Array:
@@ -196,6 +275,52 @@ class Estimate(Frozen):
         return matrix
 
 
+def goodness(problem: Problem, gain: Array, metric: Array) -> tuple[float, Goodness]:
+    """Misfit of a gain (m, n) with a metric (m, m), and what else its simulation says.
+
+    Raises
+    ------
+    InputError, SolverError
+        As `controller_for`.
+    """
+    controller = controller_for(problem, gain, metric)
+    runs = [simulate(controller, drive) for drive in scenarios(problem)]
+    status = np.concatenate([run.status for run in runs])
+    softened = int(np.count_nonzero(status == SampleStatus.SOFTENED))
+    rank = gain_rank(problem, gain, metric)
+    left = misfit(problem, runs)
+    return left, Goodness(_is_white(problem, runs), softened, len(status), rank)
+
+
+def gain_rank(problem: Problem, gain: Array, metric: Array) -> int:
+    """How many directions of the gain the recordings identify to first order."""
+    found = evaluate(problem, gain, metric)
+    if found.reason:
+        return 0
+    plant, count = problem.plant, len(found.residual)
+    stable = is_stable(plant.A - plant.B @ gain, discrete=True)
+    T, G = natural_coordinates(plant, gain) if stable else (np.eye(plant.n), np.eye(plant.m))
+    on_gain = found.dK.reshape(count, -1) @ np.kron(G, np.linalg.inv(T).T)
+    beside = np.hstack([found.dS.reshape(count, -1), found.dparameters])
+    sizes = [trial.outputs.size for trial in problem.recordings]
+    left = trial_span(found.dx0, sizes, beside).without(on_gain)
+    values = np.linalg.svd(left, compute_uv=False)
+    least = max(_DETERMINED * values[0], _ROUNDING * recorded_size(problem))
+    return int(np.count_nonzero(values > least))
+
+
+def _is_white(problem: Problem, runs: list[Simulation]) -> bool:
+    before, after = [], []
+    for run, trial in zip(runs, problem.recordings, strict=True):
+        left = (run.x @ problem.plant.C.T - trial.outputs) / problem.output_scale
+        before.append(left[:-1])
+        after.append(left[1:])
+    first, second = np.concatenate(before), np.concatenate(after)
+    squares = np.maximum(np.sum(first**2, axis=0), 1e-300)
+    correlation = np.sum(first * second, axis=0) / squares
+    return bool(np.all(np.abs(correlation) <= max(_WHITE / np.sqrt(len(first)), _LEAST)))
+
+
 def encode_estimate(estimate: Estimate) -> dict[str, Any]:
     """Values that JSON keeps to the last digit; the problem itself is not among them."""
     given = estimate.weights
@@ -214,6 +339,8 @@ def encode_estimate(estimate: Estimate) -> dict[str, Any]:
         "reason": estimate.reason,
         "evaluations": estimate.evaluations,
         "seconds": estimate.seconds,
+        "fit": asdict(estimate.fit),
+        "terminal_set": bool(estimate.problem.terminal_set),
         "prices": None if estimate.prices is None else encode_prices(estimate.prices),
     }
 
@@ -229,9 +356,10 @@ def decode_estimate(seen: Problem, kept: dict[str, Any]) -> Estimate:
         Of `encode_estimate`.
     """
     m = seen.plant.m
+    posed = replace(seen, terminal_set=kept["terminal_set"])
     return Estimate(
         kept["method"],
-        seen.at(np.array(kept["starts"]), np.array(kept["logarithms"], dtype=np.float64)),
+        posed.at(np.array(kept["starts"]), np.array(kept["logarithms"], dtype=np.float64)),
         None if kept["K"] is None else frozen(kept["K"]),
         None if kept["S"] is None else frozen(kept["S"]),
         None if kept["Q"] is None else Weights(kept["Q"], kept["R"]),
@@ -242,6 +370,7 @@ def decode_estimate(seen: Problem, kept: dict[str, Any]) -> Estimate:
         kept["reason"],
         kept["evaluations"],
         kept["seconds"],
+        Goodness(**kept["fit"]),
         None if kept["prices"] is None else decode_prices(kept["prices"]),
     )
 

@@ -1,12 +1,10 @@
 """Weights behind a fitted gain, judged by what they do: the second half of the reduced form.
 
-See docs/theory.md, section 6, and docs/fitting.md for several inputs.
+    all weights with the gain and, along what is identified of it, the metric
+        ->  least condition number  ->  simulated and compared
 
-    all weights with the gain and, along what is told of it, the metric  ->  least condition number
-                                                                         ->  simulated and compared
-
-The fitted pair (K, S) is consistent (`consistent_pairs`), so that it has weights to the last digit
-wherever positive definite ones exist.
+With several inputs the metric is the one of those that weights can have with the gain that fits
+best (`consistent_metrics`). See docs/theory.md, section 6, and docs/fitting.md for several inputs.
 """
 
 from __future__ import annotations
@@ -17,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.errors import SolverError, WeightsError
+from impc.inverse.consistent_metrics import fitted_metric, metric_family, unidentified_metrics
 from impc.inverse.equivalent_weights import least_condition_weights
 from impc.inverse.gain_search import EXPLAINED
 from impc.inverse.problem import recorded_size
@@ -25,16 +24,13 @@ from impc.inverse.solution_set import gain_fibre
 from impc.model.riccati import solve_lqr
 
 if TYPE_CHECKING:
+    from impc.arrays import Array
     from impc.inverse.equivalent_weights import EquivalentWeights
     from impc.inverse.gain_search import GainFit
     from impc.inverse.problem import Problem
     from impc.model.weights import Weights
 
 __all__ = ["WeightsBehind", "weights_behind", "weights_misfit"]
-
-# Shares of the largest singular value below which a condition on the weights counts as kept: exact,
-# and what fits of weakly told metrics leave (1e-9 to 1e-6 in random problems with three inputs).
-_RANKS = (1e-10, 1e-7, 1e-4)
 
 
 @dataclass(frozen=True)
@@ -44,7 +40,9 @@ class WeightsBehind:
     Attributes
     ----------
     gain : GainFit
-        The gain that the weights have: the given one, or the one next to it that has weights.
+        The gain that the weights have.
+    metrics : Array
+        The metric, then directions along which nothing identifies it (k, m, m).
     equivalent : EquivalentWeights or None
         None when there are none.
     misfit : float
@@ -56,6 +54,7 @@ class WeightsBehind:
     """
 
     gain: GainFit
+    metrics: Array
     equivalent: EquivalentWeights | None
     misfit: float
     explained: bool
@@ -71,14 +70,28 @@ def weights_behind(fit: GainFit) -> WeightsBehind:
         When the plant under the fitted gain cannot be simulated.
     """
     problem = fit.problem
+    metrics = np.array(fit.S)[None]
     try:
-        equivalent = least_condition_weights(gain_fibre(problem.plant, fit.K, fit.metrics))
+        metrics = _metrics(fit)
+        equivalent = least_condition_weights(gain_fibre(problem.plant, fit.K, metrics))
     except (WeightsError, SolverError) as error:
-        return WeightsBehind(fit, None, np.inf, explained=False, reason=str(error))
+        return WeightsBehind(fit, metrics, None, np.inf, explained=False, reason=str(error))
     misfit, size = weights_misfit(problem, equivalent.weights), recorded_size(problem)
     explained = misfit <= EXPLAINED * size
     reason = "" if explained else f"the weights miss the recordings by {misfit / size:.2g} of them"
-    return WeightsBehind(fit, equivalent, misfit, explained, reason)
+    return WeightsBehind(fit, metrics, equivalent, misfit, explained, reason)
+
+
+def _metrics(fit: GainFit) -> Array:
+    """The metric that fits best with the gain, then directions that nothing identifies."""
+    plant, K = fit.problem.plant, np.array(fit.K)
+    if plant.m == 1:
+        return np.array(fit.S)[None]
+    family = metric_family(plant, K)
+    if family is None:
+        raise WeightsError("gain", "no metric makes K A^-1 B symmetric", "no weights have it")
+    z = fitted_metric(fit.problem, K, family, np.array(fit.S))
+    return unidentified_metrics(fit.problem, K, family, z)
 
 
 def weights_misfit(problem: Problem, weights: Weights) -> float:

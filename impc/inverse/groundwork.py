@@ -171,6 +171,8 @@ class NaturalUnits:
         (name, compute) -> the estimate: from memory, or computed now.
     feedback_states : sequence of str
         Those that the preliminary gains (3.20) are on.
+    fitted : Estimate, optional
+        Inverse MPC, where it is known.
     """
 
     def __init__(
@@ -178,9 +180,12 @@ class NaturalUnits:
         problem: Problem,
         remember: Remember = afresh,
         feedback_states: Sequence[str] = (),
+        fitted: Estimate | None = None,
     ) -> None:
         self.problem, self.remember = problem, remember
         self.feedback_states = feedback_states
+        if fitted is not None:
+            self.fitted = fitted
 
     @cached_property
     def fitted(self) -> Estimate:
@@ -214,7 +219,7 @@ class NaturalUnits:
     @cached_property
     def feedback(self) -> GainFit:
         """The best gain without bounds (3.12)."""
-        return free_gain(self.known.without_bounds(), self.fitted.stage_weights)
+        return free_gain(self.fitted.problem.without_bounds(), self.fitted.stage_weights)
 
     @property
     def starting_gain(self) -> Array:
@@ -254,10 +259,10 @@ class NaturalUnits:
         natural, target, centre, T, G = self._coordinates
         return in_plant_units(auxiliary_weights(natural, target, centre).weights, T, G)
 
-    def output(self) -> Found:
-        """(3.16)."""
-        noise = noise_of(self.feedback)
-        found = inverse_mpc_natural(self.known.without_bounds(), self.fitted.stage_weights, noise)
+    def output(self, start: Weights | None = None) -> Found:
+        """(3.16), from some weights, or those of inverse MPC."""
+        noise, begin = noise_of(self.feedback), start or self.fitted.stage_weights
+        found = inverse_mpc_natural(self.known.without_bounds(), begin, noise)
         return regulator(self, found.weights, found.evaluations)
 
     def inverse_mpc(self) -> Estimate:

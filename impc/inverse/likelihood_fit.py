@@ -18,7 +18,6 @@ from impc.arrays import Array, Frozen, frozen
 from impc.checking import checked
 from impc.errors import ImpcError, InputError
 from impc.inverse.coordinates import Point
-from impc.inverse.gain_search import bryson_starts
 from impc.inverse.likelihood_search import climb
 from impc.inverse.likelihood_start import (
     Asked,
@@ -29,6 +28,7 @@ from impc.inverse.likelihood_start import (
 )
 from impc.inverse.person_coordinates import PersonCoordinates
 from impc.inverse.person_prior import Place, Prior
+from impc.inverse.starting_regulators import regulators
 from impc.model.observer import LEVELS
 
 if TYPE_CHECKING:
@@ -206,7 +206,12 @@ def fit_person(
     first = [Point(np.array(found.gain), np.array(found.metric), problem)]
     starts: list[tuple[list[Point], Array | None]] = [(first, found.prices)]
     if found.prices is None:
-        starts.append(([Point(K, S, problem) for K, S in bryson_starts(problem)], None))
+        starts.append(
+            (
+                [Point(np.array(one.K), np.array(one.S), problem) for one in regulators(problem)],
+                None,
+            )
+        )
     elif observer.estimates:
         starts.append((first, np.array(found.prices) + _FAR))
     begun, reasons = [], []

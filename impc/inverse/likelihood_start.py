@@ -16,8 +16,9 @@ from impc.errors import ImpcError, SolverError
 from impc.inverse.coordinates import Coordinates
 from impc.inverse.person_coordinates import PersonCoordinates
 from impc.inverse.person_prior import Prior
-from impc.inverse.regulator_span import kept_to
+from impc.inverse.regulator_span import kept_to, regulators_alone
 from impc.inverse.residuals import residual_only
+from impc.inverse.solution_set import natural_coordinates
 from impc.inverse.structured_search import PriceCoordinates
 from impc.model.observer import LEVELS
 from impc.model.riccati import lyapunov_series
@@ -68,7 +69,11 @@ def gain_space(point: Point, prices: Array | None) -> Coordinates:
     structure = point.problem.structure
     if prices is not None and structure is not None:
         return PriceCoordinates(point.problem, structure, np.array(prices))
-    return Coordinates(point.problem, point.K, point.S, kept_to(point.problem))
+    kept, gains = kept_to(point.problem), None
+    if kept is not None:
+        T, _ = natural_coordinates(point.problem.plant, point.K)
+        gains = regulators_alone(point.problem.plant, kept, T)
+    return Coordinates(point.problem, point.K, point.S, gains)
 
 
 def prices_at(space: PersonCoordinates, theta: Array) -> Array | None:

@@ -19,11 +19,10 @@ from impc.arrays import frozen
 from impc.checking import checked, replace
 from impc.errors import ImpcError, InputError
 from impc.inverse.delayed_feedback import preliminary_gain
-from impc.inverse.estimates import Estimate, Status
-from impc.inverse.gain_search import EXPLAINED
+from impc.inverse.estimates import Estimate, Goodness, Status, goodness
+from impc.inverse.gain_search import EXPLAINED, GainFit
 from impc.inverse.groundwork import Found, Groundwork, NaturalUnits, PlantUnits, regulator
 from impc.inverse.problem import recorded_size
-from impc.inverse.residuals import residual_only
 from impc.inverse.stationarity import inverse_kkt
 from impc.inverse.structured_fit import fit_structured
 from impc.model.bounds import Bounds
@@ -34,7 +33,7 @@ if TYPE_CHECKING:
 
     from impc.inverse.problem import Problem
 
-__all__ = ["METHODS", "Method", "estimate", "estimate_all", "method_named"]
+__all__ = ["METHODS", "Method", "estimate", "estimate_all", "estimate_of", "method_named"]
 
 
 @dataclass(frozen=True)
@@ -59,7 +58,7 @@ class Method:
     label: str
     sentence: str
     sees: Callable[[Problem], Problem]
-    find: Callable[[Groundwork], Found | Estimate]
+    find: Callable[[Groundwork], Found | GainFit | Estimate]
 
     def estimate(self, ground: Groundwork) -> Estimate:
         """Run the method; one that ends without a gain says why in its estimate.
@@ -69,32 +68,53 @@ class Method:
         ground : Groundwork
             What it starts from; its making is not in the method's time.
         """
-        seen = self.sees(ground.known)
         started = time.perf_counter()
         try:
             found = self.find(ground)
         except ImpcError as error:
+            seen = self.sees(ground.known)
             return _nothing(self.name, seen, str(error), time.perf_counter() - started)
         if isinstance(found, Estimate):
             return found
-        S = ground.metric if found.S is None else found.S
-        settled = ground.settle(found.problem or seen, found.K, S)
-        seconds = time.perf_counter() - started
-        misfit = float(np.linalg.norm(residual_only(settled, found.K, S)))
-        return Estimate(
-            self.name,
-            settled,
-            frozen(found.K),
-            frozen(S),
-            None if found.weights is None else normalised(found.weights),
-            frozen(S[None]),
-            misfit,
-            ground.noise,
-            _status(found, settled, misfit),
-            found.reason,
-            found.evaluations,
-            seconds,
-        )
+        return estimate_of(ground, self.name, found, started)
+
+
+def estimate_of(
+    ground: Groundwork, name: str, found: Found | GainFit, started: float | None = None
+) -> Estimate:
+    """What a method found, simulated: its estimate.
+
+    Parameters
+    ----------
+    ground : Groundwork
+        What the method started from.
+    name : str
+        Of the method.
+    found : Found or GainFit
+    started : float, optional
+        Of `time.perf_counter`.
+    """
+    if isinstance(found, GainFit):
+        found = Found(np.array(found.K), None, found.evaluations, problem=found.problem.known())
+    S = ground.metric if found.S is None else found.S
+    settled = ground.settle(found.problem or METHODS[name].sees(ground.known), found.K, S)
+    seconds = 0.0 if started is None else time.perf_counter() - started
+    misfit, fit = goodness(settled, found.K, S)
+    return Estimate(
+        name,
+        settled,
+        frozen(found.K),
+        frozen(S),
+        None if found.weights is None else normalised(found.weights),
+        frozen(S[None]),
+        misfit,
+        ground.noise,
+        _status(found, settled, misfit),
+        found.reason,
+        found.evaluations,
+        seconds,
+        fit,
+    )
 
 
 def _status(found: Found, settled: Problem, misfit: float) -> Status:
@@ -108,8 +128,9 @@ def _status(found: Found, settled: Problem, misfit: float) -> Status:
 def _nothing(name: str, seen: Problem, reason: str, seconds: float) -> Estimate:
     m, none = seen.plant.m, float("nan")
     metrics = frozen(np.zeros((0, m, m)))
+    nothing = Goodness(white=True, softened=0, samples=0, rank=0)
     return Estimate(
-        name, seen, None, None, None, metrics, none, none, Status.NONE, reason, 0, seconds
+        name, seen, None, None, None, metrics, none, none, Status.NONE, reason, 0, seconds, nothing
     )
 
 
@@ -162,7 +183,7 @@ _TABLE = (
         "The fixed gain K of u = -Kx whose loop fits the outputs best (3.12). It knows no bounds "
         "and has no weights.",
         _without_bounds,
-        lambda ground: Found(np.array(ground.feedback.K), None, ground.feedback.evaluations),
+        lambda ground: ground.feedback,
     ),
     Method(
         "inverse_lqr_lmi",

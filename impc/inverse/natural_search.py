@@ -7,10 +7,11 @@ seat (radians beside the states of a delay) all weights near the answer have con
 the same weights have condition numbers of 10 to 100. There it is a mild regulariser, which is what
 (3.6) wants of it, and half a dozen prox-linear steps reach the answer.
 
-    minimise  ||r||^2 / ||r_free||^2 + kappa(blkdiag(T'QT, G'RG)) / kappa_start / samples
+    minimise  ||r||^2 / ||r_free||^2 + kappa(blkdiag(T'QT, G'RG)) / kappa_reference / samples
 
 r_free is the residual of the gain without weights (`fit_gain`), which says how much is noise; T and
-G are the natural coordinates of the start and stay.
+G are the natural coordinates of the start and stay. The reference is the condition number of the
+start, then that of the answer while it is larger: the penalty costs one sample's noise there.
 """
 
 from __future__ import annotations
@@ -22,8 +23,8 @@ import numpy as np
 from impc.arrays import Array, frozen
 from impc.checking import replace
 from impc.errors import SolverError, WeightsError
-from impc.inverse.arrow import triangular_rows
 from impc.inverse.equivalent_weights import least_condition_weights
+from impc.inverse.least_squares import triangular_rows
 from impc.inverse.proximal_search import Objective, Residual, conditioned_fit
 from impc.inverse.residuals import evaluate
 from impc.inverse.solution_set import gain_fibre, natural_coordinates, pair_blocks, split_blocks
@@ -40,13 +41,22 @@ if TYPE_CHECKING:
     from impc.inverse.solution_set import GainFibre
     from impc.model.riccati import LqrSolution
 
-__all__ = ["CONDITION_SHARE", "WORST_START", "in_plant_units", "inverse_mpc_natural"]
+__all__ = [
+    "CONDITION_SHARE",
+    "WORST_START",
+    "best_conditioned",
+    "in_natural_units",
+    "in_plant_units",
+    "inverse_mpc_natural",
+]
 
 #: What the condition number of the start counts, in squared standard deviations of one sample's
 #: noise. It decides along directions that noise leaves open, and moves no other by as much as its
 #: own deviation; counted against all samples together (1e-3 of the squared misfit) it moved the
 #: gains of long, weakly excited recordings by several, and again at every restart.
 CONDITION_SHARE = 1.0
+# Rounds with another reference, and by how much the condition number has to grow for one more.
+_ROUNDS, _WORSE = 3, 1.05
 # A step that promises less than this, of the objective, is below what the noise decides.
 _TOLERANCE = 1e-5
 #: Condition number, in natural coordinates, of the weights that a search begins with. Prices of a
@@ -102,25 +112,29 @@ def inverse_mpc_natural(
     T, G = natural_coordinates(plant, solution.K)
     natural = change_coordinates(plant, T, G)
     fibre = gain_fibre(natural, np.linalg.solve(G, solution.K @ T), G.T @ solution.S @ G)
-    member = split_blocks(
-        pair_blocks((T.T @ start.Q @ T)[None], (G.T @ start.R @ G)[None])[0], plant.n
-    )
-    best = _best_conditioned(fibre, member)
+    best = best_conditioned(fibre, in_natural_units(start, T, G))
     residual = _residual(problem, T, G, noise)
     fits = np.linalg.norm(residual(solve_lqr(natural, best)).values) <= _FITS
     begin = best if fits else _away_from_the_edge(best, worst_start)
     samples = sum(trial.outputs.size for trial in problem.recordings)
-    share = condition_share / samples / condition_number(best)
-    objective = Objective(residual, 1.0, share, squared=True)
-    found = conditioned_fit(
-        natural, objective, begin, max_iterations=max_iterations, tolerance=_TOLERANCE
-    )
+    reference, evaluations, found = condition_number(best), 0, None
+    for _ in range(_ROUNDS):
+        objective = Objective(residual, 1.0, condition_share / samples / reference, squared=True)
+        found = conditioned_fit(
+            natural, objective, begin, max_iterations=max_iterations, tolerance=_TOLERANCE
+        )
+        evaluations += found.evaluations
+        if found.condition <= _WORSE * reference:
+            break
+        begin, reference = found.weights, found.condition
+    assert found is not None  # there are rounds
     weights = in_plant_units(found.weights, T, G)
     return replace(
         found,
         weights=weights,
         solution=solve_lqr(plant, weights),
         misfit=found.misfit * noise,
+        evaluations=evaluations,
         converged=found.iterations < max_iterations,
     )
 
@@ -138,7 +152,13 @@ def in_plant_units(weights: Weights, T: Array, G: Array) -> Weights:
     return normalised(split_blocks(block, len(T)))
 
 
-def _best_conditioned(fibre: GainFibre, member: Weights) -> Weights:
+def in_natural_units(weights: Weights, T: Array, G: Array) -> Weights:
+    """Weights of x = T z and u = G v as weights of z and v; T (n, n), G (m, m)."""
+    block = pair_blocks((T.T @ weights.Q @ T)[None], (G.T @ weights.R @ G)[None])[0]
+    return split_blocks(block, len(T))
+
+
+def best_conditioned(fibre: GainFibre, member: Weights) -> Weights:
     """The member of least condition number, or the known one where no program tells it."""
     try:
         return least_condition_weights(fibre, member).weights

@@ -1,4 +1,4 @@
-"""The auxiliary problem (3.7): well-conditioned weights whose regulator is near a given gain."""
+"""Well-conditioned weights whose regulator is near a gain: (3.7), and as recordings see it."""
 
 from __future__ import annotations
 
@@ -15,13 +15,15 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
     from impc.model.riccati import LqrSolution
 
-__all__ = ["AUXILIARY_CONDITION_WEIGHT", "auxiliary_weights", "definite"]
+__all__ = ["AUXILIARY_CONDITION_WEIGHT", "auxiliary_weights", "definite", "weights_near"]
 
 #: Weight of the condition number in (3.7), against 1 for a distance as large as the gain in
 #: `infer_weights`.
 AUXILIARY_CONDITION_WEIGHT = 1e-3
 # Starting weights are kept this definite: the search takes the Cholesky factor of them.
 _LARGEST_START_CONDITION = 1e6
+# Steps of a search for weights near a gain, and the decrease of the objective that is worth one.
+_STEPS, _NEAR = 60, 1e-4
 
 
 @checked(gain="m n", condition_weight=0)
@@ -71,6 +73,39 @@ def auxiliary_weights(
     return conditioned_fit(
         plant, Objective(distance, 1.0, condition_weight, squared=False), definite(begin)
     )
+
+
+def weights_near(
+    plant: Plant, form: Array, gain: Array, start: Weights, condition_share: float
+) -> ConditionedFit:
+    """Weights whose gain is nearest in a quadratic form, such as that of recordings about a fit.
+
+    minimise  1 + |form vec(K(Q, R) - gain)|^2 + condition_share kappa(blkdiag(Q, R))
+
+    Parameters
+    ----------
+    form : Array
+        (r, m n).
+    gain : Array
+        (m, n).
+    start : Weights
+        Positive definite: where the search begins.
+    condition_share : float
+
+    Raises
+    ------
+    WeightsError
+        When the start has no stabilising Riccati solution.
+    """
+    dK = np.concatenate([form, np.zeros((1, gain.size))]).reshape(-1, *gain.shape)
+    dS = np.zeros((len(dK), plant.m, plant.m))
+
+    def distance(solution: LqrSolution) -> Residual:
+        beyond = np.append(form @ (solution.K - gain).ravel(), 1.0)
+        return Residual(beyond, dK, dS, usable=True)
+
+    objective = Objective(distance, 1.0, condition_share, squared=True)
+    return conditioned_fit(plant, objective, start, max_iterations=_STEPS, tolerance=_NEAR)
 
 
 def definite(weights: Weights) -> Weights:

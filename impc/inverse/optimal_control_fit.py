@@ -38,6 +38,9 @@ __all__ = ["MU_STEPS", "OptimalControlEstimate", "fit_optimal_control"]
 MU_STEPS = (1e-1, 1e-2, 1e-4, 1e-10)
 _MOST_STARTS = 1000
 _SPREAD = 0.3  # of further starts, in a logarithm
+# A scaling holds while it moves all trajectories by less than this share of them, or of the noise
+# of one number.
+_UNMOVED, _LITTLE = 1e-5, 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -298,7 +301,19 @@ def _estimate(
 ) -> OptimalControlEstimate:
     problem, signals = given.problem, given.signals()
     loss = float(np.sum((found.residual * given.scales[signals]) ** 2))
-    told = combinations(problem, found.theta, found.jacobian, found.residual, signals)
+
+    def holds(theta: Array) -> bool:
+        unknowns = found.unknowns.copy()
+        unknowns[: len(theta)] = np.where(problem.positive, np.log(np.abs(theta)), theta)
+        try:
+            there = begin(given, unknowns, found.mu)
+        except (InputError, InfeasibleError, SolverError):
+            return False
+        moved = float(np.linalg.norm(there.residual - found.residual))
+        noise = float(np.sqrt(np.mean(found.residual**2)))
+        return bool(moved <= max(_UNMOVED * np.sqrt(given.size), _LITTLE * noise))
+
+    told = combinations(problem, found.theta, found.jacobian, found.residual, signals, holds)
     begun, named = (
         dict(zip(problem.parameter_names, map(float, values), strict=True))
         for values in (start, found.theta)

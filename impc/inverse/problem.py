@@ -39,12 +39,16 @@ if TYPE_CHECKING:
 __all__ = [
     "Problem",
     "controller_for",
+    "follows_plant",
     "misfit",
     "recorded_size",
     "recorded_states",
     "scenarios",
     "typical_output",
 ]
+
+# Of the states: noise that a laboratory would call none is above, rounding in files is below.
+_EXACT = 1e-9
 
 
 @dataclass(frozen=True, init=False)
@@ -72,15 +76,19 @@ class Problem(Value):
     horizon : int
         N, in samples.
     recordings : tuple of Recording
-    terminal_set : bool
-        Whether the controller ends in its maximal invariant set.
+    terminal_set : bool or None
+        Whether the controller ends in its maximal invariant set. None, the default: `estimate` and
+        `impc fit` decide by which explains the recordings better, and the problem of their answer
+        says which; everything else takes None for False.
     softening : float
         Price of exceeding a state bound or the terminal set during the search, see `Controller`.
-        The rows are verified hard at the end.
+        An answer says how many of its samples do.
     output_scale : Array
         What each output is divided by in the residual (p,), in its unit.
     unknown_start : bool
-        Whether the initial states are searched too, from the `x0` of the recordings.
+        Whether the initial states are searched too, from the `x0` of the recordings. By default
+        they are, unless the recordings are exact: all states, and the plant follows them to
+        rounding.
     family : PlantFamily or None
         Plants among which the search goes on; None when the plant is known.
     logarithms : Array
@@ -120,7 +128,7 @@ class Problem(Value):
     bounds: Bounds
     horizon: int
     recordings: tuple[Recording, ...]
-    terminal_set: bool
+    terminal_set: bool | None
     softening: float
     output_scale: Array
     unknown_start: bool
@@ -137,10 +145,10 @@ class Problem(Value):
         horizon: int,
         recordings: Sequence[Recording],
         *,
-        terminal_set: bool = True,
+        terminal_set: bool | None = None,
         softening: float = 1e6,
         output_scale: ArrayLike | None = None,
-        unknown_start: bool = False,
+        unknown_start: bool | None = None,
         family: PlantFamily | None = None,
         structure: Structure | None = None,
         solver: str = COMPILED,
@@ -160,7 +168,9 @@ class Problem(Value):
             terminal_set=terminal_set,
             softening=softening,
             output_scale=frozen(scale),
-            unknown_start=unknown_start,
+            unknown_start=(
+                not follows_plant(plant, recordings) if unknown_start is None else unknown_start
+            ),
             family=family,
             logarithms=frozen(np.zeros(0 if family is None else len(family.names))),
             structure=structure,
@@ -229,7 +239,7 @@ def controller_for(
         problem.bounds,
         problem.horizon,
         metric=metric,
-        terminal_set=problem.terminal_set,
+        terminal_set=bool(problem.terminal_set),
         softening=problem.softening,
         near=near,
         solver=problem.solver,
@@ -256,6 +266,23 @@ def recorded_states(problem: Problem) -> list[Array] | None:
         np.asarray(np.linalg.solve(C, trial.outputs.T).T, dtype=np.float64)
         for trial in problem.recordings
     ]
+
+
+def follows_plant(plant: Plant, recordings: Sequence[Recording]) -> bool:
+    """Whether recordings of all states are exact: what inputs cannot do is rounding.
+
+    Where there are as many inputs as states they could do anything, and nothing says so.
+    """
+    C, rank = plant.C, int(np.linalg.matrix_rank(plant.B))
+    if C.shape[0] != C.shape[1] or np.linalg.matrix_rank(C) < len(C) or rank == plant.n:
+        return False
+    left = np.linalg.svd(plant.B)[0][:, rank:]
+    missed, size = 0.0, 0.0
+    for trial in recordings:
+        x = np.linalg.solve(C, trial.outputs.T).T
+        rest = x[1:] - x[:-1] @ plant.A.T - trial.disturbance[:-1] @ plant.E.T
+        missed, size = missed + float(np.sum((rest @ left) ** 2)), size + float(np.sum(x**2))
+    return missed <= _EXACT**2 * size
 
 
 def typical_output(problem: Problem) -> float:

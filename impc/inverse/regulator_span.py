@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.inverse.consistent_pairs import ConsistentGains
 from impc.inverse.solution_set import RANK
 from impc.model.riccati import regulator_changes, solve_lqr
 from impc.model.weights import Weights
@@ -49,16 +48,15 @@ def kept_to(problem: Problem) -> Structure | None:
     return structure if np.linalg.matrix_rank(structure.features) < problem.plant.n else None
 
 
-def regulators_alone(
-    gains: ConsistentGains, plant: Plant, structure: Structure, T: Array
-) -> ConsistentGains:
-    """Of all gains those in the span of what weights over a structure's features have.
+def regulators_alone(plant: Plant, structure: Structure, T: Array) -> Array:
+    """Basis (k, 1, n) of the gains that weights over a structure's features have.
+
+    Orthonormal in natural coordinates.
 
     Parameters
     ----------
-    gains : ConsistentGains
-        All gains of the one input.
     plant : Plant
+        Of one input.
     structure : Structure
         All products of its features are taken to have prices.
     T : Array
@@ -71,7 +69,7 @@ def regulators_alone(
     """
     _, values, rows = np.linalg.svd(_regulators(plant, structure, T), full_matrices=False)
     kept = rows[values > _BESIDE * values[0]]
-    return ConsistentGains(gains.metric, np.tensordot(kept, gains.gains, 1), None)
+    return np.asarray((kept @ np.linalg.inv(T))[:, None, :])
 
 
 def _regulators(plant: Plant, structure: Structure, T: Array) -> Array:

@@ -1,7 +1,8 @@
 """The residual of an inverse problem at a gain and a metric, with its exact derivatives.
 
 One pass over each recording gives both (docs/theory.md, section 4). The columns follow what the
-problem does not know: gain, metric for several inputs, initial states, physical parameters.
+problem does not know: gain, metric for several inputs, initial states, physical parameters. A
+`Correction` makes it the residual of a prediction, at which searches begin.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from impc.control.controller import Controller
     from impc.control.simulation import Simulation
     from impc.control.terminal_set import TerminalSet
+    from impc.inverse.prediction import Correction
     from impc.inverse.problem import Problem
     from impc.model.plant_family import PlantDifferential
     from impc.model.recordings import Recording
@@ -68,6 +70,8 @@ class Evaluation:
         (r, k), with respect to the logarithms of the parameters of the family; k may be 0.
     reason : str
         Why some samples were not reached; empty when all were.
+    active : int
+        Samples with an active bound.
     weakly_active : int
         Samples at which the derivative is one-sided.
     terminal : TerminalSet or None
@@ -80,44 +84,53 @@ class Evaluation:
     dx0: Array
     dparameters: Array
     reason: str
+    active: int
     weakly_active: int
     terminal: TerminalSet | None
 
 
 def evaluate(
-    problem: Problem, gain: Array, metric: Array, near: TerminalSet | None = None
+    problem: Problem,
+    gain: Array,
+    metric: Array,
+    near: TerminalSet | None = None,
+    correction: Correction | None = None,
 ) -> Evaluation:
     """Residual and exact derivatives at a `gain` (m, n) and a `metric` (m, m).
 
     `near` as in `controller_for`. A gain that does not stabilise the plant, or a loop that
-    diverges, gives a large finite residual and its reason, so that a search can step back.
+    diverges, gives a large finite residual and its reason, so that a search can step back. With a
+    `correction` every gain can be evaluated, and no parameters may be searched.
     """
     plant = problem.plant
     m, n = plant.m, plant.n
-    # Past the edge of stability lie local minima that a bounded input and a recording that ends
-    # hide; no weights have such a gain. A plain gain is left free: it goes there and comes back.
-    bounded = problem.terminal_set or len(bound_rows(problem.bounds, plant).b) > 0
-    if bounded and not is_stable(plant.A - plant.B @ gain, discrete=True):
-        return unusable(problem, "the gain does not stabilise the plant")
+    refused = _refused(problem, gain, correction)
+    if refused:
+        return unusable(problem, refused)
     try:
         controller = controller_for(problem, gain, metric, near)
     except ImpcError as error:
         return unusable(problem, str(error))
     layout = _layout(problem)
     differential = _plant_differential(problem)
-    prepared = prepare_loop(controller, _all_directions(controller, layout, differential))
-    weighting = plant.C / problem.output_scale[:, None]
-    residuals, derivatives, reason, weakly_active = [], [], "", 0
-    for trial, drive in zip(problem.recordings, scenarios(problem), strict=True):
-        run, sensitivity = run_loop(prepared, drive)
+    along = _all_directions(controller, layout, differential)
+    seen = _Seen.of(problem, correction)
+    if correction is not None and seen.moves is not None:
+        E = np.zeros((n, seen.moves[2].shape[1], layout.count))
+        along = replace(along, x0=correction.kept(problem) @ along.x0, E=E)
+    prepared = prepare_loop(controller, along, seen.moves)
+    residuals, derivatives, reason, active, weakly_active = [], [], "", 0, 0
+    for trial, drive in zip(problem.recordings, seen.drives, strict=True):
+        run, sensitivity = run_loop(prepared, drive, proved=False)
         weakly_active += run.weakly_active
+        active += int(np.count_nonzero(run.status != Status.FREE))
         if not run.complete:
             reason = f"sample {run.reached}: {Status(int(run.status[run.reached])).sentence}"
-        residuals.append(_difference(problem, trial, run).ravel())
-        derivative = weighting @ sensitivity.x
+        residuals.append(_difference(problem, seen, trial, run).ravel())
+        derivative = (seen.weighting @ plant.C) @ sensitivity.x
         if differential is not None:
-            seen = np.tensordot(run.x, differential.C, ((1,), (1,)))  # dC x: (samples, p, k)
-            derivative[..., layout.parameters] += seen / problem.output_scale[:, None]
+            on_outputs = np.tensordot(run.x, differential.C, ((1,), (1,)))  # (samples, p, k)
+            derivative[..., layout.parameters] += on_outputs / problem.output_scale[:, None]
         derivatives.append(derivative.reshape(-1, layout.count))
     jacobian = np.concatenate(derivatives)
     return Evaluation(
@@ -127,6 +140,7 @@ def evaluate(
         jacobian[:, layout.start],
         jacobian[:, layout.parameters],
         reason,
+        active,
         weakly_active,
         controller.terminal,
     )
@@ -154,56 +168,49 @@ def start_residual(problem: Problem, gain: Array, metric: Array) -> StartResidua
     n = problem.plant.n
     prepared = prepare_loop(controller, directions(controller, n, x0=np.eye(n)))
     (trial,) = problem.recordings
-    weighting = problem.plant.C / problem.output_scale[:, None]
+    seen = _Seen.of(problem, None)
+    weighting = seen.weighting @ problem.plant.C
 
     def at(x0: Array) -> tuple[Array, Array]:
         run, sensitivity = run_loop(prepared, Scenario(frozen(x0), trial.disturbance[:-1]))
-        difference = _difference(problem, trial, run)
+        difference = _difference(problem, seen, trial, run)
         return difference.ravel(), (weighting @ sensitivity.x).reshape(-1, n)
 
     return at
 
 
-def misfit_or_reason(
-    problem: Problem, gain: Array, metric: Array, most: float = np.inf
-) -> tuple[float, str]:
+def misfit_or_reason(problem: Problem, gain: Array, metric: Array) -> tuple[float, str]:
     """2-norm of the residual and an empty string, or infinity and why there is none.
 
     At a `gain` (m, n) and a `metric` (m, m). A fifth of the time of `evaluate`, which also
     differentiates.
-
-    Parameters
-    ----------
-    most : float
-        Once the trials so far have more, the rest are not looked at, and theirs is not in it.
     """
-    residual, reason = residual_or_reason(problem, gain, metric, most)
+    residual, reason = residual_or_reason(problem, gain, metric)
     return np.inf if reason else float(np.linalg.norm(residual)), reason
 
 
 def residual_or_reason(
-    problem: Problem, gain: Array, metric: Array, most: float = np.inf
+    problem: Problem, gain: Array, metric: Array, correction: Correction | None = None
 ) -> tuple[Array, str]:
     """`residual_only` (r,) and an empty string, or nothing (0,) and why there is none.
 
-    At a `gain` (m, n) and a `metric` (m, m); `most` as in `misfit_or_reason`.
+    At a `gain` (m, n) and a `metric` (m, m); `correction` as in `evaluate`.
     """
-    if not is_stable(problem.plant.A - problem.plant.B @ gain, discrete=True):
-        return np.zeros(0), "the gain does not stabilise the plant"
+    refused = _refused(problem, gain, correction)
+    if refused:
+        return np.zeros(0), refused
     try:
         controller = controller_for(problem, gain, metric)
     except ImpcError as error:
         return np.zeros(0), str(error)
-    parts, square = [], 0.0
-    for trial, drive in zip(problem.recordings, scenarios(problem), strict=True):
-        run = simulate(controller, drive)
+    seen, parts = _Seen.of(problem, correction), []
+    prepared = prepare_loop(controller, directions(controller, 0), seen.moves)
+    for trial, drive in zip(problem.recordings, seen.drives, strict=True):
+        run, _ = run_loop(prepared, drive, proved=False)
         if not run.complete:
             reason = f"sample {run.reached}: {Status(int(run.status[run.reached])).sentence}"
             return np.zeros(0), reason
-        parts.append(_off(problem, trial, run).ravel())
-        square += float(parts[-1] @ parts[-1])
-        if square > most**2:
-            break
+        parts.append(seen.off(problem, trial, run).ravel())
     return np.concatenate(parts), ""
 
 
@@ -225,13 +232,47 @@ def residual_only(problem: Problem, gain: Array, metric: Array) -> Array:
     InputError, SolverError
         As `controller_for`.
     """
-    controller = controller_for(problem, gain, metric)
+    controller, seen = controller_for(problem, gain, metric), _Seen.of(problem, None)
     return np.concatenate(
         [
-            _off(problem, trial, simulate(controller, drive)).ravel()
-            for trial, drive in zip(problem.recordings, scenarios(problem), strict=True)
+            seen.off(problem, trial, simulate(controller, drive)).ravel()
+            for trial, drive in zip(problem.recordings, seen.drives, strict=True)
         ]
     )
+
+
+def _refused(problem: Problem, gain: Array, correction: Correction | None) -> str:
+    """Why a gain is not simulated, or nothing.
+
+    Past the edge of stability lie local minima that a bounded input and a recording that ends hide;
+    no weights have such a gain. A plain gain is left free: it goes there and comes back.
+    """
+    plant = problem.plant
+    bounded = problem.terminal_set or len(bound_rows(problem.bounds, plant).b) > 0
+    if correction is not None or not bounded or is_stable(plant.A - plant.B @ gain, discrete=True):
+        return ""
+    return "the gain does not stabilise the plant"
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """How the recordings of a problem are simulated, and compared with a simulation."""
+
+    moves: tuple[Array, Array, Array] | None
+    drives: list[Scenario]
+    weighting: Array
+
+    @classmethod
+    def of(cls, problem: Problem, correction: Correction | None) -> _Seen:
+        if correction is None:
+            return cls(None, scenarios(problem), np.diag(1 / problem.output_scale))
+        return cls(
+            correction.moves(problem), correction.drives(problem), correction.weighting(problem)
+        )
+
+    def off(self, problem: Problem, trial: Recording, run: Simulation) -> Array:
+        """Simulated minus recorded outputs over their scales (samples, p)."""
+        return np.asarray((run.x @ problem.plant.C.T - trial.outputs) @ self.weighting.T)
 
 
 @dataclass(frozen=True)
@@ -304,17 +345,12 @@ def _symmetric(columns: Array, m: int) -> Array:
     return dS
 
 
-def _difference(problem: Problem, trial: Recording, run: Simulation) -> Array:
+def _difference(problem: Problem, seen: _Seen, trial: Recording, run: Simulation) -> Array:
     """Simulated minus recorded outputs over their scales (samples, p), large where not reached."""
-    difference = _off(problem, trial, run)
+    difference = seen.off(problem, trial, run)
     if not run.complete:
         difference[run.reached + 1 :] = _NOT_REACHED * _scale(problem, trial)
     return difference
-
-
-def _off(problem: Problem, trial: Recording, run: Simulation) -> Array:
-    """Simulated minus recorded outputs over their scales (samples, p)."""
-    return np.asarray((run.x @ problem.plant.C.T - trial.outputs) / problem.output_scale)
 
 
 def _scale(problem: Problem, trial: Recording) -> float:
@@ -338,6 +374,7 @@ def unusable(problem: Problem, reason: str) -> Evaluation:
         np.zeros((size, starts)),
         np.zeros((size, len(problem.logarithms))),
         reason,
+        0,
         0,
         None,
     )

@@ -25,7 +25,7 @@ from impc.checking import replace
 from impc.control.closed_loop import simulate
 from impc.errors import SolverError, WeightsError
 from impc.inverse.coordinates import Coordinates
-from impc.inverse.estimates import Estimate, Status
+from impc.inverse.estimates import Estimate, Status, goodness
 from impc.inverse.gain_search import EXPLAINED
 from impc.inverse.problem import controller_for, recorded_size, scenarios
 from impc.inverse.residuals import misfit_or_reason
@@ -174,7 +174,7 @@ class _Target:
         samples = sum(trial.outputs.size for trial in problem.recordings)
         self.noise = float(np.linalg.norm(self.space.at(start).residual)) / np.sqrt(samples)
         # Of the gain alone: the metric shows only where commands stand at their limits.
-        count = len(self.space.gains.gains)
+        count = len(self.space.gains)
         here = self.space.natural(self.space.changes(self.space.unpack(start), start)[0][:count])
         self.form = np.linalg.qr(seen[:, :count], mode="r") @ here.reshape(count, -1)
         self.gain = self.space.natural(gain)
@@ -252,6 +252,7 @@ def structured_estimate(
     seconds : float
         Time that it took, s.
     """
+    _, fit = goodness(end.problem, np.array(end.K), np.array(end.S))
     explained = end.misfit <= EXPLAINED * recorded_size(problem)
     settled = Status.SETTLED if end.settled else Status.STOPPED
     return Estimate(
@@ -267,5 +268,6 @@ def structured_estimate(
         reason="",
         evaluations=end.evaluations,
         seconds=seconds,
+        fit=fit,
         prices=end.prices,
     )

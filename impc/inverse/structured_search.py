@@ -19,15 +19,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.linalg
-import scipy.optimize
 
 from impc.arrays import Array, frozen
 from impc.checking import replace
 from impc.errors import WeightsError
-from impc.inverse.arrow import Tolerances
-from impc.inverse.consistent_pairs import scaled_changes
-from impc.inverse.coordinates import PARAMETER_UNIT, Coordinates, Point
-from impc.inverse.many_trials import has_many_trials, search_many
+from impc.inverse.coordinates import PARAMETER_UNIT, Coordinates, Point, descend, scaled_changes
+from impc.inverse.least_squares import Stop
 from impc.inverse.problem import recorded_size
 from impc.inverse.residuals import evaluate, unusable
 from impc.model.plant_family import plant_differential
@@ -47,16 +44,15 @@ _SPREAD = 5.0
 # A combination with a larger deviation keeps that prior to the end.
 _FREE = 3.0
 _ROUNDS = 8
-# As in `gain_search`: a noisy search ends when the misfit falls by less than 1e-6 of itself, the
-# rounds when one lowers it by less than 1e-3.
-_NOISY_TOLERANCE, _SETTLED = 1e-6, 1e-3
+# Misfits that differ by less, of themselves, are the same.
+_NOISY_TOLERANCE = 1e-6
 # Least share of the misfit of exact recordings, up to which they are explained (`gain_search`).
 _EXACT = 1e-9
 # A price whose logarithm has a deviation beyond this is tried at zero.
 _NEARLY_ZERO = 2.0
 _EVALUATIONS = 60
-# Of the last search, in misfit: 2e-4 of chi-squared on 18000 samples.
-_FINE = 1e-8
+# Nats at which a search ends, and of rounding, of the recorded outputs.
+_FINE, _ROUNDING = 1e-3, 1e-13
 _ENDLESS = 1e6
 # Of chi-squared's units: a misfit that falls by less when the prior is begun anew was not held.
 _PULL = 0.1
@@ -155,6 +151,14 @@ class PriceCoordinates(Coordinates):
             self.last = z.tobytes(), found, self._compress(found, *nothing)
             return self.last[1:]
 
+    def residual(self, z: Array) -> Array | None:
+        """Residual (r,) at z (q,); None where there is none, nor a regulator."""
+        try:
+            return super().residual(z)
+        except WeightsError as error:
+            self.refused.append(str(error))
+            return None
+
     def changes(self, here: Point, z: Array) -> tuple[Array, Array]:
         """Change of K (q, m, n), and of S scaled to trace m (q, m, m), with each of z (q,)."""
         slopes = regulator_slopes(here.problem, self.structure, self.unknowns(z), self.solved[1])
@@ -218,7 +222,7 @@ class StructuredEnd:
 def search_from(
     problem: Problem, structure: Structure, prices: Array, *, max_evaluations: int = 120
 ) -> StructuredEnd:
-    """One search from given unknowns, in rounds, each with the noise that the last one left.
+    """One search from given unknowns.
 
     Parameters
     ----------
@@ -235,7 +239,10 @@ def search_from(
         When the start has no regulator.
     """
     space = PriceCoordinates(problem, structure, prices)
-    z, spent, settled = _rounds(space, max_evaluations)
+    beside = len(problem.logarithms)
+    shared = np.concatenate([np.full(int(space.ends[0]), 1 / _SPREAD), np.ones(beside)])
+    stop = _stop(space, max_evaluations)
+    z, spent, settled = descend(space, space.start, stop, shared=shared, own=1.0)
     here = _Place(problem, structure, space.unknowns(z), space.unpack(z).problem)
     end = _with_zeros(_polished(here, spent, settled), here, max_evaluations)
     if end.misfit <= _EXACT * recorded_size(problem):
@@ -258,33 +265,15 @@ class _Place:
         return space, space.placed(self.there)
 
 
-def _rounds(space: PriceCoordinates, budget: int) -> tuple[Array, int, bool]:
-    z, spent, misfit = space.start, 0, _misfit(space, space.start)
-    for _ in range(_ROUNDS):
-        noise = misfit / np.sqrt(_samples(space.problem))
-        weights = np.full(len(z), noise)
-        weights[: space.ends[0]] /= _SPREAD
-        z, more = _descend(space, z, np.eye(len(z)), weights, _NOISY_TOLERANCE, budget - spent)
-        spent += more
-        before, misfit = misfit, _misfit(space, z)
-        exact = misfit <= _EXACT * recorded_size(space.problem)
-        if exact or misfit > (1 - _SETTLED) * before:
-            return z, spent, True
-        if spent >= budget:
-            break
-    return z, spent, False
-
-
 def _polished(place: _Place, spent: int, settled: bool) -> StructuredEnd:
     """Without the prior along what the recordings tell of the prices, with one about here."""
     space, z = place.space()
     noise = _misfit(space, z) / np.sqrt(_samples(space.problem))
     rows, deviations = space.deviations(z, noise)
-    count = int(space.ends[0])
-    along = scipy.linalg.block_diag(rows.T, np.eye(len(z) - count))
-    weights = np.full(len(z), noise)
-    weights[:count] *= (deviations >= _FREE) / _SPREAD
-    z, more = _descend(space, z, along, weights, _FINE, _EVALUATIONS)
+    beside = len(space.problem.logarithms)
+    along = scipy.linalg.block_diag(rows.T, np.eye(beside))
+    shared = np.concatenate([(deviations >= _FREE) / _SPREAD, np.ones(beside)])
+    z, more, _ = descend(space, z, _stop(space, _EVALUATIONS), shared=shared, own=1.0, along=along)
     here = space.unpack(z)
     return StructuredEnd(
         frozen(space.unknowns(z)),
@@ -297,37 +286,8 @@ def _polished(place: _Place, spent: int, settled: bool) -> StructuredEnd:
     )
 
 
-def _descend(
-    space: PriceCoordinates,
-    z: Array,
-    along: Array,
-    weights: Array,
-    tolerance: float,
-    budget: int,
-) -> tuple[Array, int]:
-    """Least squares from z along given columns, with a prior about the space's start."""
-    if has_many_trials(space):
-        first, last = int(space.ends[1]), int(space.ends[2])
-        rows = np.delete(np.arange(len(z)), slice(first, last))
-        told = along.shape[1] - (len(z) - first)
-        columns = np.delete(np.arange(along.shape[1]), slice(told, told + last - first))
-        shared = weights[columns], float(weights[told])
-        ends = Tolerances(tolerance, 1e-12, 1e-15, max(budget, 1))
-        return search_many(space, z, along[np.ix_(rows, columns)], shared, ends)
-    prior = weights[:, None] * along.T
-
-    def residual(step: Array) -> Array:
-        there = z + along @ step
-        return np.concatenate([space.at(there).residual, prior @ (there - space.start)])
-
-    def derivative(step: Array) -> Array:
-        return np.vstack([space.at(z + along @ step).jacobian @ along, np.diag(weights)])
-
-    found = scipy.optimize.least_squares(
-        residual, np.zeros(along.shape[1]), jac=derivative, ftol=tolerance, xtol=1e-12,
-        gtol=1e-15, max_nfev=max(budget, 1),
-    )  # fmt: skip
-    return np.asarray(z + along @ found.x), int(found.nfev)
+def _stop(space: PriceCoordinates, budget: int) -> Stop:
+    return Stop(_FINE, (_ROUNDING * recorded_size(space.problem)) ** 2, max(budget, 1))
 
 
 def _with_zeros(end: StructuredEnd, place: _Place, budget: int) -> StructuredEnd:

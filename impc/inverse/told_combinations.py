@@ -1,9 +1,11 @@
 """Which combinations of the parameters the recordings tell: singular values, with names.
 
 To first order the residual moves by J dphi, phi the logarithms of the positive parameters and the
-signed ones themselves. Directions of J with a singular value of nothing are combinations that may
-take any value; written with as few parameters as there are, their exponents are those of a scaling
-(l by a, m by a^-2). The told ones are the products that no such scaling changes. docs/nonlinear.md.
+signed ones themselves. Directions of J with a singular value of nothing are combinations that the
+recordings do not identify; written with as few parameters as there are, their exponents may be
+those of a scaling (l by a, m by a^-2): one that holds at factors of 1.2 and 2 when it is simulated.
+Any other is the tangent of a curve, and is said to hold near these values only. The identified ones
+are the products that no scaling changes. docs/nonlinear.md.
 """
 
 from __future__ import annotations
@@ -16,6 +18,8 @@ import numpy as np
 from impc.arrays import Array, BoolArray, Frozen, IntArray
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from impc.control.optimal_control import OptimalControlProblem
 
 __all__ = ["Combination", "Combinations", "combinations"]
@@ -25,6 +29,9 @@ __all__ = ["Combination", "Combinations", "combinations"]
 _NOTHING = 1e-8
 _ROUGH = 0.5  # of a logarithm: twice that is a factor of e
 _ROUND = 1e-3  # of an exponent: nearer to nothing, or to a multiple of a sixth, it is that
+_LARGEST = 4.0  # exponent of a scaling: larger ones are of tangents
+#: Factors at which a scaling has to hold.
+FACTORS = (1.2, 2.0)
 
 
 @dataclass(frozen=True)
@@ -41,17 +48,26 @@ class Combination:
         Standard deviation of its logarithm; infinite for an untold one.
     difference : bool
         Whether it is a signed parameter by itself, and deviation that of its value.
+    scaling : bool
+        Of an unidentified one: whether any factor is possible, as simulated; else it holds near
+        these values.
     """
 
     exponents: dict[str, float]
     value: float
     deviation: float
     difference: bool = False
+    scaling: bool = True
 
     @property
     def rough(self) -> bool:
         """Whether it is told to a factor of more than e only, at 95 %."""
         return self.deviation > _ROUGH and not self.difference
+
+    @property
+    def printable(self) -> bool:
+        """Whether its exponents are those of a product that somebody could mean."""
+        return all(abs(item) <= _LARGEST for item in self.exponents.values())
 
     @property
     def name(self) -> str:
@@ -85,10 +101,17 @@ class Combinations(Frozen):
     def sentences(self) -> tuple[str, ...]:
         """One for each untold combination, one for those told, and one for those told roughly."""
         found = [_untold_sentence(one) for one in self.untold]
-        for rough, words in ((False, "Told"), (True, "Told roughly, as the intervals say")):
-            values = [f"{one.name} = {one.value:.6g}" for one in self.told if one.rough is rough]
+        for rough, words in (
+            (False, "Identified"),
+            (True, "Identified roughly (see the intervals)"),
+        ):
+            values = [
+                f"{one.name} = {one.value:.6g}"
+                for one in self.told
+                if one.rough is rough and one.printable
+            ]
             found += [f"{words}: {', '.join(values)}."] if values else []
-        return (*found, *(() if self.told else ("Nothing is told.",)))
+        return (*found, *(() if self.told else ("Nothing is identified.",)))
 
 
 def combinations(
@@ -97,6 +120,7 @@ def combinations(
     jacobian: Array,
     residual: Array,
     signals: IntArray,
+    holds: Callable[[Array], bool] = lambda _: True,
 ) -> Combinations:
     """Split the parameters.
 
@@ -111,6 +135,8 @@ def combinations(
         (r,).
     signals : IntArray
         Which signal each residual is of (r,); each has its own noise.
+    holds : callable
+        Parameters (p,) -> whether the recordings are as well explained there.
     """
     p = len(theta)
     own, rest = jacobian[:, :p], jacobian[:, p:]
@@ -125,9 +151,15 @@ def combinations(
     basis = _sparse(right[~told])
     pivots = [int(np.flatnonzero(np.isclose(row, 1.0))[0]) for row in basis]
     names = problem.parameter_names
+    rows = [row / np.min(np.abs(row[row != 0])) for row in basis]
     untold = tuple(
-        Combination(_named(row / np.min(np.abs(row[row != 0])), names), 1.0, np.inf)
-        for row in basis
+        Combination(
+            _named(row, names),
+            1.0,
+            np.inf,
+            scaling=_is_scaling(row, theta, problem.positive, holds),
+        )
+        for row in rows
     )
     kept = []
     for index in range(p):
@@ -143,6 +175,16 @@ def combinations(
     involved = np.any(basis != 0, axis=0) if len(basis) else np.zeros(p, dtype=bool)
     deviations = np.where(involved, np.inf, np.sqrt(np.maximum(np.diag(covariance), 0.0)))
     return Combinations(tuple(kept), untold, values, deviations)
+
+
+def _is_scaling(
+    row: Array, theta: Array, positive: BoolArray, holds: Callable[[Array], bool]
+) -> bool:
+    if np.count_nonzero(row) == 1:
+        return True
+    if np.max(np.abs(row)) > _LARGEST or np.any(row[~positive]):
+        return False
+    return all(holds(theta * factor**row) for factor in FACTORS)
 
 
 def _covariance(jacobian: Array, residual: Array, signals: IntArray, told: BoolArray) -> Array:
@@ -195,7 +237,10 @@ def _power(name: str, exponent: float) -> str:
 def _untold_sentence(one: Combination) -> str:
     if len(one.exponents) == 1:
         name = next(iter(one.exponents))
-        return f"{name} is not told: near its value nothing that was measured depends on it."
+        return f"{name} is not identified: near its value nothing that was measured depends on it."
+    if not one.scaling:
+        named = ", ".join(one.exponents)
+        return f"Near these values the recordings cannot distinguish {named}."
     parts = ", ".join(
         f"{name} by a" if item == 1 else f"{name} by a^{item:.3g}"
         for name, item in one.exponents.items()

@@ -20,8 +20,6 @@ from impc.assess.covariance import gain_covariance
 from impc.assess.long_run_covariance import ResidualNoise
 from impc.assess.printed_gain import gain_estimate
 from impc.checking import replace
-from impc.inverse.diagonal_start import diagonal_weights
-from impc.inverse.noisy_fit import free_gain
 from impc.inverse.problem import Problem
 from impc.inverse.proximal_step import block_basis
 from impc.inverse.residuals import residual_only
@@ -121,12 +119,7 @@ def test_a_direction_that_is_told_is_told_where_others_are_not(seed: int) -> Non
     """A random plant on which the free gain wanders off, and takes its told directions along."""
     controller, trial = random_recording(seed, 1, 90.0)
     fitted = fit(controller, trial)
-    settings = FitSettings(horizon=controller.horizon, u_max=list(controller.bounds.u_max))
-    problem = fit_problem(controller.plant, [trial], settings)
-    free, truth = free_gain(problem, diagonal_weights(problem)), controller.K
-    wandered = gain_covariance(free.problem, np.array(free.K), np.array(free.S))
-    off = np.abs(wandered.along(free.K - truth) / wandered.deviations)
-    assert np.max(off[wandered.told]) > 4
+    truth = controller.K
     estimate = gain_estimate(fitted)
     found = estimate.covariance
     off = np.abs(found.along(estimate.K - truth) / found.deviations)

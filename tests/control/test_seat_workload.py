@@ -11,7 +11,7 @@ from impc.control.closed_loop import simulate, simulate_and_differentiate
 from impc.control.constraint_rows import directions
 from impc.control.controller import Controller
 from impc.control.simulation import Status
-from impc.inverse.direct_and_reduced import inverse_mpc_reduced, start_gains, starting_point
+from impc.inverse.direct_and_reduced import inverse_mpc_reduced
 
 
 @pytest.fixture(scope="module")
@@ -58,8 +58,7 @@ def _with_gain_entry(work: Workload, index: int, change: float) -> np.ndarray:
 @pytest.mark.parametrize("limit", [70.0, 6.0, pytest.param(4.5, marks=pytest.mark.full)])
 def test_the_whole_fit_reaches_the_true_gain(limit: float) -> None:
     work = seat(limit=limit)
-    gains = start_gains(starting_point(work.problem), work.problem.plant)
-    found = inverse_mpc_reduced(work.problem, *gains)
+    found = inverse_mpc_reduced(work.problem)
     assert found.equivalent is not None
     error = np.linalg.norm(found.gain.K - work.controller.K) / np.linalg.norm(work.controller.K)
     assert error < 1e-8

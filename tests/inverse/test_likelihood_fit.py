@@ -12,12 +12,13 @@ from numpy.testing import assert_array_equal
 
 from impc.arrays import Array
 from impc.assess.person_covariance import person_covariance
+from impc.checking import replace
 from impc.control import joint_likelihood
 from impc.control.controller import Controller
 from impc.control.noisy_person import simulate_person
 from impc.errors import ImpcError, InputError, SolverError
 from impc.inverse.estimates import Estimate
-from impc.inverse.gain_search import fit_gain
+from impc.inverse.gain_search import refine_gain
 from impc.inverse.likelihood_fit import PersonFit, fit_person
 from impc.inverse.methods import estimate
 from impc.inverse.problem import Problem
@@ -170,14 +171,15 @@ def test_a_level_that_cannot_be_squared_has_no_likelihood(
 def test_without_noise_in_the_loop_it_is_the_fit_of_least_squares() -> None:
     """W, V -> 0: the same gain to 1e-6, where neither has a prior."""
     problem = posed(Observer(cart()), 0.01, 0.9)
-    start = estimate(problem)
-    least = fit_gain(start.problem, (np.array(start.gain), np.array(start.metric)),
-                     attempts=1, regulators=False)  # fmt: skip
+    found = estimate(problem)
+    least = refine_gain(found.problem, np.array(found.gain), np.array(found.metric))
+    start = replace(found, K=least.K, problem=least.problem)
     tiny = Observer(cart(), ["x", "v"], motor=1e-9, sensory=1e-9)
     for person in (Observer(cart()), tiny):
-        found = fit_person(start, person, recorder=np.array([0.01]), spread=np.inf)
-        np.testing.assert_allclose(found.K, least.K, rtol=1e-6)
-        np.testing.assert_allclose(found.problem.starts, least.problem.starts, atol=1e-6)
+        likely = fit_person(start, person, recorder=np.array([0.01]), spread=np.inf)
+        assert likely.converged
+        np.testing.assert_allclose(likely.K, least.K, rtol=1e-6)
+        np.testing.assert_allclose(likely.problem.starts, least.problem.starts, atol=1e-6)
 
 
 @pytest.mark.parametrize(("along", "units"), [(0, 3.0), (1, 3.0), (1, 5.0)])
@@ -185,7 +187,7 @@ def test_a_gain_that_cannot_be_the_persons_is_left_behind(
     noisy: tuple[Observer, Estimate], fitted: PersonFit, along: int, units: float
 ) -> None:
     """From three natural units away a search had ended at ten times the gain, from five in none."""
-    far = np.array(noisy[1].gain) + units * fitted.space.space.gains.gains[along]
+    far = np.array(noisy[1].gain) + units * fitted.space.space.gains[along]
     found = fit_person(replaced(noisy[1], K=far), noisy[0])
     assert found.converged
     deviations = np.array(person_covariance(fitted, "expected").entries)

@@ -56,7 +56,7 @@ def test_levels_that_slide_do_not_hold_back_the_rest(sliding: PersonFit) -> None
     assert spent < 40
     truth = Controller(cart(), Weights(np.diag([8.0, 1.0]), 1), sliding.problem.bounds, 5).K
     own = space.space
-    along = np.tensordot(own.natural(own.gains.gains), own.natural(np.array(truth)), 2)
+    along = np.tensordot(own.natural(own.gains), own.natural(np.array(truth)), 2)
     theta[: space.gain] = along
     starts = np.array([trial.x0 for trial in own.problem.recordings])
     theta[space.shared : space.after] = -np.linalg.solve(own.start_unit, starts.T).T.ravel()

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 import impc.assess.residual_structure
-import impc.inverse.many_trials
 from experiments.coverage import cart
 from impc.assess.covariance import gain_covariance
 from impc.assess.residual_structure import residual_structure
@@ -72,7 +71,7 @@ def peak_of(work: Callable[[], object]) -> int:
 
 
 WORK: dict[str, Callable[[Problem], object]] = {
-    "search": lambda problem: refine_gain(problem, GAIN, np.eye(1), max_evaluations=3, spread=0.5),
+    "search": lambda problem: refine_gain(problem, GAIN, np.eye(1), max_evaluations=3, prior=2.0),
     "covariance": lambda problem: gain_covariance(problem, GAIN, np.eye(1)),
     "structure": lambda problem: residual_structure(
         problem, GAIN, evaluate(problem, GAIN, np.eye(1))
@@ -85,22 +84,9 @@ def test_memory_grows_as_the_trials_do(name: str, monkeypatch: pytest.MonkeyPatc
     """Thrice the trials: 3 times the memory; nine times when each had columns beside all others."""
     monkeypatch.setattr(impc.assess.residual_structure, "_LAGS", 2)
     monkeypatch.setattr(impc.assess.residual_structure, "_SHIFTS", 3)
-    monkeypatch.setattr(impc.inverse.many_trials, "_MANY", 0)
     few, many = (starts_unknown(count) for count in (60, 180))
     WORK[name](few)  # what is compiled and kept once does not count
     assert peak_of(lambda: WORK[name](many)) < 4.5 * peak_of(lambda: WORK[name](few))
-
-
-def test_many_trials_are_fitted_as_few_are(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Eliminated trial by trial, and with all columns side by side: the same gain and starts."""
-    problem = starts_unknown(12)
-    beside = refine_gain(problem, GAIN, np.eye(1), spread=0.5)
-    monkeypatch.setattr(impc.inverse.many_trials, "_MANY", 0)
-    found = refine_gain(problem, GAIN, np.eye(1), spread=0.5)
-    # Both searches end where the misfit falls by less than 1e-8 of it.
-    assert found.misfit == pytest.approx(beside.misfit, rel=1e-7)
-    np.testing.assert_allclose(found.K, beside.K, rtol=1e-3)
-    np.testing.assert_allclose(found.singular_values, beside.singular_values, rtol=1e-3)
 
 
 def test_of_very_many_samples_some_trials_are_tested(monkeypatch: pytest.MonkeyPatch) -> None:

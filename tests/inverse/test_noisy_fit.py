@@ -15,7 +15,6 @@ from impc.checking import replace
 from impc.control.closed_loop import simulate
 from impc.control.simulation import scenario
 from impc.inverse.coordinates import Coordinates
-from impc.inverse.diagonal_start import diagonal_weights
 from impc.inverse.estimates import Estimate
 from impc.inverse.groundwork import NaturalUnits
 from impc.inverse.initial_states import with_fitted_starts
@@ -26,7 +25,6 @@ from impc.inverse.residuals import evaluate
 from impc.model.plant import Plant
 from impc.model.plant_family import PlantFamily, plant_at, plant_differential
 from impc.model.recordings import Recording
-from impc.model.riccati import solve_lqr
 from impc.studies.fit.settings import FitSettings
 from impc.studies.fit.subject import fit_problem
 
@@ -202,15 +200,6 @@ def test_moved_changes_starts_and_plant() -> None:
     there = problem.at(starts, np.array([0.1, 0.0]))
     assert [trial.x0.tolist() for trial in there.recordings] == starts.tolist()
     assert not np.array_equal(there.plant.A, problem.plant.A)
-
-
-def test_diagonal_weights_come_near() -> None:
-    """Nearer than the best of Bryson's rule, from which they start."""
-    _, problem = clean_problem(6.0, 1)
-    solution = solve_lqr(problem.plant, diagonal_weights(problem))
-    found = evaluate(problem, solution.K, solution.S)
-    samples = problem.recordings[0].outputs.size
-    assert np.linalg.norm(found.residual) ** 2 / samples < 0.1
 
 
 def test_standard_deviations_of_a_linear_model_are_those_of_theory() -> None:

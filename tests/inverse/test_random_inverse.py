@@ -31,9 +31,9 @@ def solved(seed: int) -> bool:
     found = inverse_mpc_reduced(problem)
     misfit = found.gain.misfit if found.direct is None else found.direct.misfit
     true = solve_lqr(problem.plant, weights)
-    span = found.gain.metrics.reshape(len(found.gain.metrics), -1).T
+    span = found.metrics.reshape(len(found.metrics), -1).T
     beyond = true.S.ravel() - span @ np.linalg.lstsq(span, true.S.ravel())[0]
-    best = least_condition_weights(gain_fibre(problem.plant, true.K, found.gain.metrics)).condition
+    best = least_condition_weights(gain_fibre(problem.plant, true.K, found.metrics)).condition
     return bool(
         misfit < 1e-8 * np.linalg.norm(problem.recordings[0].outputs / problem.output_scale)
         and np.linalg.norm(beyond) < 1e-6 * np.linalg.norm(true.S)

@@ -14,6 +14,7 @@ from impc.assess.held_out import left_out_vaf
 from impc.assess.judged import judge
 from impc.checking import replace
 from impc.errors import SolverError, WeightsError
+from impc.inverse.cross_check import cross_checked
 from impc.inverse.groundwork import NaturalUnits, afresh
 from impc.inverse.methods import METHODS, estimate_all
 
@@ -62,7 +63,8 @@ def compare_recordings(
         When no regulator can be simulated on all trials.
     """
     count, names = len(problem.recordings), compared_methods()
-    whole = estimate_all(NaturalUnits(problem, _within("all", remember)), names)
+    ground = NaturalUnits(problem, _within("all", remember))
+    _, whole = cross_checked(ground, estimate_all(ground, names))
     parts = []
     for index in range(count if held_out and count > 1 else 0):
         ground = NaturalUnits(problem.leaving_out(index), _within(f"without {index + 1}", remember))

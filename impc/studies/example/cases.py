@@ -201,7 +201,9 @@ def run_case(
         bounds,
         HORIZON,
         (Recording(plant, truth.x),),
+        terminal_set=True,
         output_scale=np.ones(plant.n),
+        unknown_start=False,
         solver=solver,
     )
     ground = PlantUnits(problem)

@@ -47,10 +47,21 @@ def _gain(result: FitResult) -> TextTable:
             float(item.high),
             item.level,
             "yes" if item.told else "no",
+            "yes" if item.excludes_zero else "no",
         )
         for item in result.certainty.intervals
     ]
-    heads = ("number", "unit", "method", "value", "low", "high", "level", "told")
+    heads = (
+        "number",
+        "unit",
+        "method",
+        "value",
+        "low",
+        "high",
+        "level",
+        "identified",
+        "excludes zero",
+    )
     return TextTable("", heads, rows)
 
 

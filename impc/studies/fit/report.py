@@ -46,7 +46,7 @@ from impc.studies.fit.tables import (
     statements_table,
 )
 from impc.studies.fit.truth import truth_sentence, truth_table
-from impc.studies.fit.verdict import abstract, verdict
+from impc.studies.fit.verdict import abstract, other_limit_sentence, verdict
 from impc.studies.methods_table import column_terms, methods_table
 from impc.studies.signal_words import body_sentence, signal_words
 
@@ -119,6 +119,7 @@ def fit_report(
     """
     told = () if truth is None else (Note("Truth.", truth_sentence(result, truth)),)
     subject = str(result.given.recordings[0].label.subject) or "a subject"
+    gain: list[Block] = _gain(result, truth) if result.usable else [verdict(result)]
     return Report(
         f"impc fit: {subject}",
         f"The controller behind the recordings of {subject}",
@@ -131,7 +132,7 @@ def fit_report(
             Details("What stands behind these sentences", (Lines(remarks(result)),)),
         ),
         [
-            Section("1. The gain, and how sure it is", _gain(result, truth), "Gain", together=True),
+            Section("1. The gain, and how sure it is", gain, "Gain", together=True),
             *([structure_section(result)] if result.structures else []),
             *([] if result.person is None else [person_section(result, result.person)]),
             Section("2. What may be said of the weights", _statements(result), "Weights"),
@@ -166,6 +167,8 @@ def _gain(result: FitResult, truth: Array | None) -> list[Block]:
     blocks += [] if truth is None else [Details("The true gain", (truth_table(result, truth),))]
     blocks += [] if parameters is None else [parameters]
     blocks += [Details("Combinations of entries: directions of the gain", (_directions(result),))]
+    if result.other_limit is not None:
+        limits = (*limits, other_limit_sentence(result))
     if limits or others is not None:
         blocks += [Heading("Limit and horizon"), *limits, *(() if others is None else (others,))]
     return blocks
@@ -337,7 +340,7 @@ def _directions(result: FitResult) -> TextTable:
     return table_of(
         "Directions of the gain, best determined first, as commands at typical states; the "
         "deviation is relative to the natural size of a gain, so that 1 means all but unknown; "
-        f"above {TOLD:g} the recordings do not tell, and the estimate stays near the weights'.",
+        f"above {TOLD:g} it is not identified, and the estimate stays near the weights'.",
         range(len(values)),
         {
             "": lambda k: str(k + 1),
@@ -351,7 +354,7 @@ def _directions(result: FitResult) -> TextTable:
 def _deviation(value: float) -> str:
     if np.isinf(value):
         return "not determined"
-    return number(value, 2) if value < TOLD else f"not told ({number(value, 2)})"
+    return number(value, 2) if value < TOLD else f"not identified ({number(value, 2)})"
 
 
 def _parameters(result: FitResult) -> TextTable | None:
@@ -380,9 +383,11 @@ def _matrix(caption: str, values: Array, names: tuple[str, ...]) -> TextTable:
 
 def _terminal_set(result: FitResult) -> str:
     changed = result.terminal_set_difference
-    present = "without" if result.settings.terminal_set else "with"
+    within = bool(result.fitted.problem.terminal_set)
+    present = "without" if within else "with"
     if np.isnan(changed):
-        return f"The loop {present} the terminal set does not reach the end of every trial."
-    return (
-        f"The loop {present} the terminal set differs by {changed:.2g} of an output's size at most."
-    )
+        effect = "does not reach the end of every trial"
+    else:
+        effect = f"differs by {changed:.2g} of an output's size at most"
+    ends = "ends in its terminal set" if within else "has no terminal set"
+    return f"The fitted controller {ends}. The loop {present} it {effect}."

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from impc.assess.diagnostics import residual_warnings
+from impc.assess.intervals import PARAMETER, entry_names
+from impc.control.simulation import Status
 from impc.model.riccati import solve_lqr
 
 if TYPE_CHECKING:
@@ -16,23 +19,26 @@ if TYPE_CHECKING:
     from impc.assess.diagnostics import ResidualDiagnostics
     from impc.assess.held_out import HeldOut
     from impc.assess.identified_directions import Identifiability
+    from impc.assess.input_limits import OtherLimit
     from impc.assess.intent_rules import Intent
+    from impc.assess.intervals import Interval
     from impc.assess.judged import MethodFit
     from impc.assess.person_models import PersonReport
     from impc.assess.printed_gain import GainEstimate
     from impc.assess.structures import StructureFit
     from impc.assess.variance_accounted_for import TrialAgreement
+    from impc.assess.weights_test import WeightsTest
     from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
     from impc.studies.fit.settings import FitSettings
 
-__all__ = ["MOST_TRIALS", "FitResult", "FittedParameter", "shown_trials", "trial_name"]
+__all__ = ["LITTLE", "MOST_TRIALS", "FitResult", "FittedParameter", "shown_trials", "trial_name"]
 
 #: Trials that are drawn one by one: 500 made a page of 51 MB and took 6.3 GB.
 MOST_TRIALS = 24
 
-# Standard deviation of the logarithm of a parameter that the recordings tell.
-_TOLD = 0.5
+#: % of an output below which a fit explains less than it leaves.
+LITTLE = 50.0
 
 
 @dataclass(frozen=True)
@@ -56,11 +62,11 @@ class FittedParameter:
 
     @property
     def determined(self) -> bool:
-        """Whether the recordings tell it: to a factor of e at 95 %, its logarithm to 0.5.
+        """Whether it is identified: to a factor of e at 95 %, its logarithm to 0.5.
 
-        What they do not tell stays near its nominal value, where the search began.
+        What is not stays near its nominal value, where the search began.
         """
-        return self.deviation < _TOLD * self.value
+        return self.deviation < PARAMETER * self.value
 
 
 @dataclass(frozen=True)
@@ -95,6 +101,12 @@ class FitResult:
         the loop with it does not reach the end.
     seconds : float
         Time of the whole fit, s.
+    weights_test : WeightsTest
+        Whether any weights explain the gain.
+    other_limit : OtherLimit or None
+        The fit with the limit of the command free, where the recordings contradict the given one.
+    failures : dict of str to str
+        Stages that failed, and why; what they would have found is missing.
     structures : tuple of StructureFit
         Those that were asked for, that of [fit.structure] first.
     person : PersonReport or None
@@ -115,8 +127,31 @@ class FitResult:
     diagnostics: ResidualDiagnostics
     terminal_set_difference: float
     seconds: float
+    weights_test: WeightsTest
+    other_limit: OtherLimit | None = None
+    failures: Mapping[str, str] = field(default_factory=dict)
     structures: tuple[StructureFit, ...] = ()
     person: PersonReport | None = None
+
+    @property
+    def usable(self) -> bool:
+        """Whether half of every recorded signal is explained: else nothing may be said."""
+        return bool(np.all(self.inverse_mpc.vaf >= LITTLE))
+
+    @property
+    def met(self) -> bool:
+        """Whether a bound of an input or a state is active at any sample."""
+        return any(np.any(run.status != Status.FREE) for run in self.inverse_mpc.runs)
+
+    @property
+    def gain_intervals(self) -> tuple[Interval, ...]:
+        """The intervals of the gain's entries, by the sandwich."""
+        names = entry_names(self.given.plant)
+        return tuple(
+            item
+            for item in self.certainty.intervals
+            if item.method == "sandwich" and item.name in names
+        )
 
     @property
     def reported_P(self) -> Array:  # noqa: N802

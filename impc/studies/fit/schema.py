@@ -6,12 +6,19 @@
     body                                     "nonlinear" where the plant's own equations moved, or
                                              "linear"
     solver                                   what solved the quadratic programs
-    K, S, Q, R, P, horizon, bounds           the controller of the weights, at R[0][0] = 1
-    weights_rule                             which of all weights with this gain Q and R are; those
-                                             of methods.inverse_mpc are where the search ended
-    estimate                                 the gain that the recordings tell, without weights: K,
-                                             deviations, directions, and which of them are told
-    intervals.<number>                       of that gain and of the parameters
+    usable                                   whether half of every recorded signal is explained
+    K                                        the gain that the recordings identify; its intervals
+                                             are in intervals
+    Q, R, P, S, weights_gain                 the weights whose gain comes nearest, at R[0][0] = 1
+    weights_rule                             which of all weights with that gain Q and R are
+    weights_test                             whether any weights explain K: statistic, freedom,
+                                             p_value, rejected, return_difference
+    terminal_set, doubts                     of the fitted controller; sentences
+    horizon, bounds, other_limit             as given; the fit with the limit free, or null
+    failures.<stage>                         why the stage has no result
+    estimate                                 standard errors of K and of its directions, and which
+                                             of them are identified
+    intervals.<number>                       of the gain and of the parameters
     warnings, residuals                      sentences; the tests behind them
     intent                                   eigenvalues (ascending), dominant, sentence, readings
     structures                               of each that was named: prices and ratios with
@@ -58,7 +65,7 @@ def _controller(result: FitResult) -> dict[str, Any]:
     plant, fitted = result.fitted.problem.plant, result.fitted
     weights = result.intent.reported.weights
     scale = weights.R[0, 0] / fitted.stage_weights.R[0, 0]
-    bounds = result.given.bounds
+    bounds, other = result.given.bounds, result.other_limit
     held = np.array([item.vaf for item in result.held_out])
     return {
         "vaf": dict(zip(plant.outputs, result.inverse_mpc.vaf, strict=True)),
@@ -71,12 +78,27 @@ def _controller(result: FitResult) -> dict[str, Any]:
         "outputs": plant.outputs,
         "disturbances": plant.disturbances,
         "units": dict(plant.units),
-        "K": fitted.gain,
+        "usable": result.usable,
+        "K": result.estimate.K,
         "S": fitted.metric * scale,
         "Q": weights.Q,
         "R": weights.R,
+        "weights_gain": fitted.gain,
         "weights_rule": result.intent.reported.rule,
         "P": result.reported_P,
+        "weights_test": {**asdict(result.weights_test), "rejected": result.weights_test.rejected},
+        "terminal_set": bool(fitted.problem.terminal_set),
+        "doubts": fitted.doubts,
+        "failures": dict(result.failures),
+        "other_limit": None
+        if other is None
+        else {
+            "given": other.given,
+            "limit": asdict(other.limit),
+            "K": other.fitted.gain,
+            "misfit": other.fitted.misfit,
+            "contradicted": other.contradicted,
+        },
         "horizon": result.fitted.problem.horizon,
         "body": plant.moves,
         "solver": result.fitted.problem.solver,
@@ -135,15 +157,14 @@ def _found(result: FitResult) -> dict[str, Any]:
 def _estimate(estimate: GainEstimate) -> dict[str, Any]:
     covariance = estimate.covariance
     return {
-        "K": estimate.K,
         "S": estimate.S,
         "misfit": estimate.misfit,
-        "deviations": covariance.entries,
-        "told": covariance.told_entries,
+        "standard_errors": covariance.entries,
+        "identified": covariance.told_entries,
         "singular_values": covariance.singular_values,
         "directions": covariance.directions,
-        "direction_deviations": covariance.deviations,
-        "told_directions": covariance.told,
+        "direction_standard_errors": covariance.deviations,
+        "identified_directions": covariance.told,
         "natural_coordinates": covariance.T,
         "natural_inputs": covariance.G,
     }

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.assess.covariance import DETERMINED, TOLD
+from impc.assess.covariance import TOLD
 from impc.assess.intent_rules import dominant_sentence
 from impc.studies.fit.person import person_sentences
 from impc.studies.fit.result import trial_name
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from impc.studies.fit.result import FitResult
     from impc.studies.fit.settings import FitSettings
 
-__all__ = ["direction_name", "limited", "missing", "remarks"]
+__all__ = ["bounded", "direction_name", "limited", "missing", "remarks"]
 
 # Parts of a direction below this are not named.
 _NAMED = 0.15
@@ -28,11 +28,10 @@ def remarks(result: FitResult) -> tuple[str, ...]:
     return (
         *structure_sentences(result)[1:],
         *_clipped(result),
-        dominant_sentence(
-            result.intent.reported, result.fitted.problem.plant, np.array(result.intent.sizes)
-        ),
-        _how_sure(result),
+        *(_of_weights(result) if result.usable and not result.weights_test.rejected else ()),
         _determined(result),
+        *result.fitted.doubts,
+        *_failed(result),
         *person_sentences(result),
     )
 
@@ -53,6 +52,13 @@ def missing(settings: FitSettings, source: PlantSource) -> str:
 def limited(result: FitResult) -> bool:
     """Whether the settings give a limit on any input."""
     return bool(np.any(np.isfinite(result.given.bounds.u_max)))
+
+
+def bounded(result: FitResult) -> bool:
+    """Whether there is a limit on any input or state."""
+    bounds = result.given.bounds
+    sides = np.concatenate([bounds.u_min, bounds.u_max, bounds.x_min, bounds.x_max])
+    return bool(np.any(np.isfinite(sides)))
 
 
 def direction_name(
@@ -80,7 +86,19 @@ def _clipped(result: FitResult) -> list[str]:
     )
     if not falls:
         return []
-    return [f"The same gain merely clipped at the bound falls: {falls}; inverse MPC stands."]
+    own = [time for time in methods["inverse_mpc"].fell if time is not None]
+    stands = "" if own else "; inverse MPC does not"
+    return [f"The same gain merely clipped at the bound falls: {falls}{stands}."]
+
+
+def _of_weights(result: FitResult) -> tuple[str, str]:
+    reading, plant = result.intent.reported, result.fitted.problem.plant
+    return dominant_sentence(reading, plant, np.array(result.intent.sizes)), _how_sure(result)
+
+
+def _failed(result: FitResult) -> tuple[str, ...]:
+    """The stages that failed, and why."""
+    return tuple(f"Not available, {stage}: {reason}." for stage, reason in result.failures.items())
 
 
 def _how_sure(result: FitResult) -> str:
@@ -101,12 +119,13 @@ def _how_sure(result: FitResult) -> str:
 def _determined(result: FitResult) -> str:
     found, covariance = result.identifiability, result.estimate.covariance
     values = covariance.singular_values
-    count = int(np.count_nonzero(values > DETERMINED * values[0]))
+    count = int(np.count_nonzero(np.isfinite(covariance.deviations)))
     told = int(np.count_nonzero(covariance.told))
     entries = int(np.count_nonzero(covariance.told_entries))
     return (
         f"Of the {len(values)} directions of the gain the recordings determine {count} above "
-        f"rounding and {told} to better than {TOLD:g} of their natural size; {entries} of its "
-        f"entries they tell by themselves. Of the {found.free} directions "
-        f"of the weights {found.rank}, the other {found.chosen} are a choice."
+        f"rounding and identify {told}: their standard error is below {TOLD:g} of a natural gain. "
+        f"{entries} of its entries are individually identified. Of the {found.free} directions of "
+        f"the weights the recordings determine {found.rank}; the other {found.chosen} are a "
+        "convention."
     )

@@ -122,8 +122,9 @@ class FitSettings:
         At 1 the bound lies on the recorded maximum, and a controller that never met a bound would
         meet one there: on the simulated seat a margin of 1 changes the angles by one to two
         hundredths of a radian, 1.05 by nothing.
-    terminal_set : bool
-        Whether the controller ends in its maximal invariant set.
+    terminal_set : bool or "auto"
+        Whether the controller ends in its maximal invariant set. "auto" takes what explains the
+        recordings better: without it, unless that leaves more than white noise.
     free : list of str
         Physical parameters of the plant that are fitted with the gain (3.19).
     feedback_states : list of str
@@ -177,7 +178,7 @@ class FitSettings:
     u_max: float | list[float] | None = None
     bounded_states: dict[str, float | str] = field(default_factory=dict)
     margin: float = 1.2
-    terminal_set: bool = False
+    terminal_set: bool | Literal["auto"] = "auto"
     free: list[str] = field(default_factory=list)
     feedback_states: list[str] = field(default_factory=list)
     settle: float = 1.0

@@ -12,16 +12,21 @@ import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from tqdm.auto import tqdm
 
 from impc.arrays import Array, frozen
 from impc.assess.all_intervals import assess, count_stages
-from impc.assess.diagnostics import residual_diagnostics
+from impc.assess.diagnostics import (
+    ResidualDiagnostics,
+    residual_diagnostics,
+    residual_warnings,
+)
 from impc.assess.held_out import predict
 from impc.assess.identified_directions import identifiability
+from impc.assess.input_limits import at_another_limit
 from impc.assess.intent_draws import drawn_gains
 from impc.assess.intent_rules import intent
 from impc.assess.judged import judge
@@ -30,9 +35,11 @@ from impc.assess.printed_gain import gain_estimate
 from impc.assess.structures import assess_structure, no_structure
 from impc.assess.variance_accounted_for import agreement
 from impc.assess.weights_ranges import weights_summary_or_reason
+from impc.assess.weights_test import weights_test
 from impc.checking import checked, replace
 from impc.control.closed_loop import simulate
-from impc.errors import DataError, SolverError, WeightsError
+from impc.errors import DataError, ImpcError, SolverError, WeightsError
+from impc.inverse.cross_check import cross_checked
 from impc.inverse.estimates import Estimate
 from impc.inverse.groundwork import NaturalUnits, Remember, afresh
 from impc.inverse.methods import estimate_all
@@ -40,18 +47,20 @@ from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.problem import Problem, controller_for, scenarios
 from impc.inverse.structured_fit import fit_structured
 from impc.studies.fit.asked import fit_bounds, fit_observer, fit_structures, moving_body
-from impc.studies.fit.result import FitResult, FittedParameter
+from impc.studies.fit.result import LITTLE, FitResult, FittedParameter
 from impc.studies.fit.settings import FitSettings
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
+    from impc.assess.held_out import HeldOut
     from impc.assess.judged import MethodFit
     from impc.assess.person_models import PersonReport, RememberPerson
     from impc.assess.printed_gain import GainEstimate
     from impc.assess.resampling import Replicate
     from impc.assess.structures import StructureFit
     from impc.assess.variance_accounted_for import TrialAgreement
+    from impc.assess.weights_ranges import WeightsSummary
     from impc.control.simulation import Simulation
     from impc.model.bounds import Bounds
     from impc.model.plant import Plant
@@ -62,6 +71,7 @@ if TYPE_CHECKING:
 __all__ = ["FitProgress", "fit_problem", "fit_recordings", "stages", "state_sizes"]
 
 _THREADS = 2
+_UNUSABLE = "the controller explains less than half of a recorded signal."
 
 
 @dataclass(frozen=True)
@@ -151,7 +161,7 @@ def fit_problem(
         fit_bounds(plant, settings, recordings),
         settings.horizon,
         tuple(_first_guess(plant, trial) for trial in recordings),
-        terminal_set=settings.terminal_set,
+        terminal_set=None if settings.terminal_set == "auto" else settings.terminal_set,
         output_scale=scale,
         unknown_start=True,
         family=family,
@@ -211,29 +221,55 @@ def fit_recordings(
     return _fitted(problem, settings, progress)
 
 
+def _attempt(failures: dict[str, str], stage: str, compute: Callable[[], Any], default: Any) -> Any:
+    """What a stage finds; where it fails the default, and why among the failures."""
+    try:
+        return compute()
+    except (ImpcError, np.linalg.LinAlgError) as error:
+        failures[stage] = str(error)
+        return default
+
+
 def _fitted(problem: Problem, settings: FitSettings, progress: FitProgress) -> FitResult:
     started = time.perf_counter()
+    failures: dict[str, str] = {}
+    attempt = functools.partial(_attempt, failures)
     ground = NaturalUnits(problem, progress.estimate, settings.feedback_states)
-    fitted = ground.fitted
+    _ = ground.fitted
     progress.done("inverse MPC")
+    names = _beside(settings)
+    ground, found = cross_checked(ground, estimate_all(ground, [*names, "inverse_mpc"]))
+    fitted = found["inverse_mpc"]
     estimate = gain_estimate(fitted)
     known, weights = ground.known, fitted.stage_weights
     plant, K, metrics = known.plant, np.array(fitted.gain), np.array(fitted.metrics)
     methods = [judge(fitted, problem.bounds)]
     sizes = state_sizes(methods[0].runs)
+    usable = bool(np.all(methods[0].vaf >= LITTLE))
+    test = weights_test(fitted, estimate)
+    barred = "" if usable else _UNUSABLE
+    barred = barred or test.sentence
     with _threads() as pool:
         others = _left_out(pool, ground, settings)
         draws: tuple[LqrSolution, ...] = ()
-        if settings.intent_draws:
-            draws = drawn_gains(plant, weights, estimate.K, estimate.covariance)
-        whole_set = pool.submit(weights_summary_or_reason, plant, K, metrics, sizes, draws)
-        for name in _beside(settings)[::-1]:
-            methods.insert(0, judge(estimate_all(ground, [name])[name], problem.bounds))
+        if settings.intent_draws and not barred:
+            drawn = functools.partial(drawn_gains, plant, weights, estimate.K, estimate.covariance)
+            draws = attempt("drawn gains", drawn, ())
+        whole_set = pool.submit(_weights_set, barred, plant, K, metrics, sizes, draws)
+        for name in names[::-1]:
+            methods.insert(0, judge(found[name], problem.bounds))
             progress.done(name)
         held_out = []
         for index, other in enumerate(others):
-            held_out.append(predict(problem, other.result(), fitted, index, settings.settle))
+            predicted = attempt(
+                _without(index),
+                functools.partial(_predicted, problem, other, fitted, index, settings.settle),
+                None,
+            )
+            held_out += [] if predicted is None else [predicted]
             progress.done(_without(index))
+        if len(held_out) < len(others):
+            held_out = []  # the table has a row for each trial, or none
         if held_out:
             shares = frozen([item.vaf for item in held_out])
             methods[-1] = replace(methods[-1], held_out=shares)
@@ -241,8 +277,26 @@ def _fitted(problem: Problem, settings: FitSettings, progress: FitProgress) -> F
         progress.done("set of weights")
     structures = _structures(problem, settings, fitted, progress)
     certainty = assess(
-        problem, fitted, estimate, weights_found, settings, progress.done, progress.replicate
+        problem,
+        fitted,
+        estimate,
+        weights_found,
+        settings,
+        progress.done,
+        progress.replicate,
+        attempt,
     )
+    diagnostics = attempt(
+        "tests of the residuals",
+        lambda: residual_diagnostics(fitted.problem, K, np.array(fitted.metric)),
+        ResidualDiagnostics(None, None),
+    )
+    trials = _agreements(known, methods[-1].runs, problem.bounds)
+    doubtful = residual_warnings(diagnostics, plant.outputs, 1.0) or not usable
+    limits, free = certainty.limits, None
+    if any(item.saturated for item in trials) and (doubtful or limits):
+        first = limits[0] if limits else None
+        free = attempt("free limit", functools.partial(at_another_limit, fitted, first), None)
     return FitResult(
         settings,
         problem,
@@ -251,16 +305,43 @@ def _fitted(problem: Problem, settings: FitSettings, progress: FitProgress) -> F
         _parameters(estimate),
         intent(plant, K, metrics, sizes, weights),
         identifiability(known, weights),
-        certainty,
-        _agreements(known, methods[-1].runs, problem.bounds),
+        certainty if usable else replace(certainty, intervals=()),
+        trials,
         tuple(held_out),
         tuple(methods),
-        residual_diagnostics(fitted.problem, K, np.array(fitted.metric)),
+        diagnostics,
         _terminal_set_difference(methods[-1]),
         time.perf_counter() - started,
+        test,
+        free,
+        failures,
         structures,
-        _person(problem, settings, fitted, progress),
+        attempt(
+            "subject with sensory noise",
+            lambda: _person(problem, settings, fitted, progress),
+            None,
+        ),
     )
+
+
+def _predicted(
+    problem: Problem, other: Future[Estimate], fitted: Estimate, index: int, settle: float
+) -> HeldOut:
+    return predict(problem, other.result(), fitted, index, settle)
+
+
+def _weights_set(
+    barred: str,
+    plant: Plant,
+    K: Array,
+    metrics: Array,
+    sizes: Array,
+    draws: tuple[LqrSolution, ...],
+) -> tuple[WeightsSummary | None, str]:
+    """The set of weights with a gain (m, n), or why nothing may be said of it."""
+    if barred:
+        return None, barred
+    return weights_summary_or_reason(plant, K, metrics, sizes, draws)
 
 
 def _person(

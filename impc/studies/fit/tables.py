@@ -232,7 +232,7 @@ def _verdict(item: Statement) -> str:
 
 def _told(item: Interval) -> str:
     ends = _range(item.low, item.high)
-    return ends if item.told or ends == _NO_ENDS else f"not told ({ends})"
+    return ends if item.told or ends == _NO_ENDS else f"not identified ({ends})"
 
 
 def _over_gains(item: Statement) -> str:

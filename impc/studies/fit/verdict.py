@@ -8,37 +8,41 @@ import numpy as np
 
 from impc.reporting.rendering import number
 from impc.studies.fit.person import preferred
-from impc.studies.fit.sentences import limited
+from impc.studies.fit.result import LITTLE
+from impc.studies.fit.sentences import bounded, limited
 from impc.studies.fit.structure_words import structure_sentences
 
 if TYPE_CHECKING:
     from impc.model.plant import Plant
     from impc.studies.fit.result import FitResult
 
-__all__ = ["abstract", "verdict"]
-
-# % of an output below which a fit explains less than it leaves.
-_LITTLE = 50.0
+__all__ = ["abstract", "other_limit_sentence", "verdict"]
 
 
 def verdict(result: FitResult) -> str:
     """The one sentence that says what may be made of the fit; what forbids most comes first."""
     found, within = result.diagnostics, structure_sentences(result)
     saturated = any(item.saturated for item in result.trials)
+    other = result.other_limit
     cases = (
         (bool(within) and result.structures[0].refused, next(iter(within), "")),
+        (not result.usable, _little(result)),
         (
             not result.fitted.converged,
             "The search ended before it converged: a longer or less noisy recording is needed.",
         ),
+        (other is not None and other.contradicted, other_limit_sentence(result)),
         (
-            bool(np.any(result.inverse_mpc.vaf < _LITTLE)),
-            "The controller explains less than half of a recorded signal: it is another's.",
+            result.person is not None and preferred(result.person),
+            "A subject with noise inside the loop explains the recordings better than noise in "
+            "the recorder: go by the gain of that subject, in its section.",
         ),
+        (result.weights_test.rejected, result.weights_test.sentence),
         (
             saturated and found.loop is not None and found.loop.found,
             "The controller agrees with the recordings, but what it leaves looks like noise inside "
-            f"the loop: do not rely on its gain or its weights{_instead(result)}.",
+            "the loop: do not rely on its gain or its weights. [fit.observer] asks for a subject "
+            "who senses with noise.",
         ),
         (
             found.structure is not None and found.structure.found,
@@ -46,14 +50,14 @@ def verdict(result: FitResult) -> str:
             "is not that of the model: its intervals do not hold that error.",
         ),
         (
-            not limited(result),
-            "No limit of the command was given: this is inverse LQR, and says nothing of how the "
-            "subject uses what strength there is.",
+            not bounded(result),
+            "No limit of the command or of a state was given: this is inverse LQR, and says "
+            "nothing of how the subject uses what strength there is.",
         ),
         (
-            not saturated,
-            "The command never reaches its bound: these recordings cannot tell inverse MPC from "
-            "inverse LQR.",
+            not result.met,
+            "No bound is ever active: these recordings cannot distinguish inverse MPC from inverse "
+            "LQR.",
         ),
         (bool(within), next(iter(within), "")),
         (
@@ -66,12 +70,37 @@ def verdict(result: FitResult) -> str:
     return next(sentence for holds, sentence in cases if holds)
 
 
-def _instead(result: FitResult) -> str:
-    """Where a gain is that such noise does not bend."""
-    report = result.person
-    if report is None:
-        return ". [fit.observer] asks for a person who senses with noise"
-    return ". Go by the gain of the person who senses with noise" if preferred(report) else ""
+def _little(result: FitResult) -> str:
+    """Which signals are explained by less than half."""
+    plant = result.given.plant
+    least = [
+        f"{name} (VAF {value:.0f} %)" if np.isfinite(value) else f"{name} (no simulation ends)"
+        for name, value in zip(plant.outputs, result.inverse_mpc.vaf, strict=True)
+        if not value >= LITTLE
+    ]
+    return (
+        f"The fitted controller explains less than half of {' and '.join(least)}: do not interpret "
+        "it. Check the units, the plant and the limit of the command."
+    )
+
+
+def other_limit_sentence(result: FitResult) -> str:
+    """What the recordings say of the limit of the command, where it was set free."""
+    other, plant = result.other_limit, result.given.plant
+    if other is None or other.limit.value is None:
+        return ""
+    unit = plant.unit(plant.controls[0])
+    found, value = other.limit, other.limit.value
+    interval = f"95 %: {number(found.low, 4)} to {number(found.high, 4)}"
+    gain = np.array2string(np.array(other.fitted.gain), precision=4)
+    said = (
+        f"With the limit of the command free the recordings give {number(value, 4)} {unit} "
+        f"({interval}) for the given {number(other.given, 4)} {unit}; at that limit the misfit is "
+        f"{number(other.fitted.misfit, 3)} for {number(result.fitted.misfit, 3)}, the gain {gain}."
+    )
+    if not other.contradicted:
+        return said
+    return f"{said} The recordings contradict the given limit: fit again with u_max at that value."
 
 
 def abstract(result: FitResult) -> tuple[str, ...]:
@@ -80,8 +109,7 @@ def abstract(result: FitResult) -> tuple[str, ...]:
         _what_was_done(result),
         _agreement(result),
         *_at_the_bound(result),
-        _gain(result),
-        _weights(result),
+        *((_gain(result), _weights(result)) if result.usable else ()),
     )
 
 
@@ -144,13 +172,15 @@ def _at_the_bound(result: FitResult) -> list[str]:
 
 
 def _gain(result: FitResult) -> str:
-    told = result.estimate.covariance.told_entries
-    count, total = int(np.count_nonzero(told)), int(np.size(told))
+    identified = result.estimate.covariance.told_entries
+    count, total = int(np.count_nonzero(identified)), int(np.size(identified))
+    zero = sum(item.excludes_zero for item in result.gain_intervals)
+    apart = f"the 95 % intervals of {zero} exclude zero"
     if count == total:
-        return f"The recordings tell each of the {total} entries of the gain by itself."
+        return f"All {total} entries of the gain are individually identified; {apart}."
     return (
-        f"Of the {total} entries of the gain the recordings tell {count} by themselves; of the "
-        "others only combinations."
+        f"Of the {total} entries of the gain {count} are individually identified, of the others "
+        f"only combinations; {apart}."
     )
 
 
@@ -160,6 +190,8 @@ def _weights(result: FitResult) -> str:
         f"{result.widest_angle:.0f} degrees"
     )
     summary = result.certainty.weights
+    if result.weights_test.rejected:
+        return "No cost weights explain this gain: nothing may be said of the subject's intent."
     if summary is None or not summary.drawn:
         return f"{text}: which weights are reported is a convention."
     made = sum(item.made for item in summary.statements)

@@ -166,14 +166,16 @@ def _ends(one: Combination) -> tuple[float, float]:
 def _combinations(fit: OptimalFit) -> TextTable:
     found = fit.estimate.combinations
     rows = []
-    for one in found.told:
+    for one in filter(lambda one: one.printable, found.told):
         low, high = _ends(one)
         rows.append((one.name, number(one.value, 5), f"{number(low, 4)} to {number(high, 4)}"))
     for one in found.untold:
-        moved = ", ".join(
+        powers = [
             name if item == 1 else f"{name}^{item:.3g}" for name, item in one.exponents.items()
-        )
-        rows.append((moved, "not told", "any factor a of these together"))
+        ]
+        moved = ", ".join(powers if one.scaling else one.exponents)
+        said = "any factor a of these together" if one.scaling else "near these values"
+        rows.append((moved, "not identified", said))
     return TextTable(
         "Products of parameters with their 95 % intervals, in the problem's units.",
         ("product", "value", "interval"),

@@ -1,0 +1,112 @@
+"""Correction of a simulated state by the recorded outputs: from simulation to prediction error.
+
+    e   = y - C x                innovation, the residual
+    x_f = x + M e                corrected state
+    u   = controller(x_f)
+    x+  = A x_f + B u + E d
+
+M = 0 is the simulation; with the gain M of a steady Kalman filter e is a one-step prediction error.
+Then the effect of a wrong gain on x dies within the memory of the filter, so that the loop does
+not diverge and the sum of squares is that of many short pieces: it has few local minima in K where
+that of a simulation has many (experiments/search_study.py has the rates). What moves is linear in
+(x_f, u, d, y):
+
+    x_f+ = (I - MC)(A x_f + B u + E d) + M y+,        e = (I - CM)^-1 (y - C x_f)
+
+so the same loop simulates it, with other matrices and y as a further disturbance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy.linalg
+
+from impc.arrays import Array
+from impc.control.simulation import Scenario
+from impc.inverse.problem import scenarios
+
+if TYPE_CHECKING:
+    from impc.inverse.problem import Problem
+
+__all__ = ["Correction", "command_sizes", "correction"]
+
+# Noise that reaches every mode, of that of the commands: for modes that B misses. The larger ones
+# are for plants whose Riccati equation is beyond double precision with less.
+_EVERYWHERE = (1e-9, 1e-6, 1e-3)
+
+
+@dataclass(frozen=True)
+class Correction:
+    """The correction of one problem.
+
+    Attributes
+    ----------
+    M : Array
+        Gain of the correction (n, p).
+    """
+
+    M: Array
+
+    def moves(self, problem: Problem) -> tuple[Array, Array, Array]:
+        """A, B and (E, M) that move the corrected state."""
+        plant, kept = problem.plant, self.kept(problem)
+        return kept @ plant.A, kept @ plant.B, np.hstack([kept @ plant.E, self.M])
+
+    def kept(self, problem: Problem) -> Array:
+        """I - MC (n, n), which takes the simulated to the corrected state."""
+        return np.asarray(np.eye(problem.plant.n) - self.M @ problem.plant.C)
+
+    def weighting(self, problem: Problem) -> Array:
+        """What turns C x_f - y into a residual (p, p): its inverse, and the outputs' scales."""
+        C = problem.plant.C
+        return np.asarray(
+            np.linalg.inv(np.eye(len(C)) - C @ self.M) / problem.output_scale[:, None]
+        )
+
+    def drives(self, problem: Problem) -> list[Scenario]:
+        """What drives each recording: its disturbance and its outputs, one sample later."""
+        kept = self.kept(problem)
+        return [
+            Scenario(
+                kept @ trial.x0 + self.M @ trial.outputs[0],
+                np.hstack([drive.disturbance, trial.outputs[1:]]),
+            )
+            for trial, drive in zip(problem.recordings, scenarios(problem), strict=True)
+        ]
+
+
+def correction(problem: Problem, ratio: float) -> Correction:
+    """The correction by a steady filter.
+
+    For outputs of which all could be noise, and commands that could be wrong by `ratio` times
+    their size: a slow filter, which remembers long, at small ratios. None where no filter is
+    stable: a mode that no output sees does not decay.
+    """
+    plant, scale = problem.plant, np.asarray(problem.output_scale)
+    C, outputs = plant.C / scale[:, None], np.eye(len(scale))
+    commands = plant.B * (ratio * command_sizes(problem))
+    driving = commands @ commands.T
+    for share in _EVERYWHERE:
+        floor = share * np.trace(driving) * np.eye(plant.n)
+        try:
+            P = scipy.linalg.solve_discrete_are(plant.A.T, C.T, driving + floor, outputs)
+        except (np.linalg.LinAlgError, ValueError):
+            continue
+        return Correction(P @ C.T @ np.linalg.inv(C @ P @ C.T + outputs) / scale)
+    return Correction(np.zeros((plant.n, len(scale))))
+
+
+def command_sizes(problem: Problem) -> Array:
+    """Size of each input (m,): its bound, or what moves the outputs by their size in n samples."""
+    plant, scale = problem.plant, np.asarray(problem.output_scale)
+    bounds = np.maximum(-problem.bounds.u_min, problem.bounds.u_max)
+    if np.all(np.isfinite(bounds)):
+        return np.asarray(bounds)
+    moved, reach = plant.B, np.zeros(plant.m)
+    for _ in range(plant.n + 1):
+        reach += np.linalg.norm((plant.C @ moved) / scale[:, None], axis=0)
+        moved = plant.A @ moved
+    return np.where(np.isfinite(bounds), bounds, 1 / np.where(reach > 0, reach, 1.0))
