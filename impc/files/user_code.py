@@ -58,7 +58,8 @@ def consented_name(
     if not name:
         raise InputError(where, "is missing", f'write {option} = "module:function"')
     module = name.partition(":")[0]
-    if name in known or Path(name).suffix in _DATA or module == "plants" or ":" not in name:
+    data = option == "plant" and Path(name).suffix in _DATA  # a model is never a file
+    if name in known or data or module == "plants" or ":" not in name:
         return name  # the last: no name of code at all, and told so by who looks for it
     if given is None and not allowed:
         raise InputError(
