@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.files.table import Table
 
-__all__ = ["encode_delimited", "is_number", "read_delimited"]
+__all__ = ["encode_delimited", "is_number", "read_delimited", "text_cell"]
 
 _DELIMITERS = {".csv": ",;\t", ".tsv": "\t", ".txt": "\t;, "}
 _NAMES = {",": "commas", ";": "semicolons", "\t": "tabs", " ": "blanks", "|": "bars", ":": "colons"}
@@ -38,6 +38,9 @@ _NUMBER = re.compile(
     r"[+-]?(\d++[.,]?\d*+|[.,]\d++)(e[+-]?\d++)?|[+-]?inf(inity)?|nan", re.IGNORECASE
 )
 _LONGEST = 50_000  # characters of a line: 2000 columns of 24
+# Where a spreadsheet would begin a formula: at the start, or behind what it may take for the end of
+# a cell. A list separator is a semicolon in half of Europe, whether the text is quoted or not.
+_FORMULA = re.compile(r"(^|[;\t\r\n])(?=\s*[=+@\-])")
 _HEAD = 100  # lines in which the first row of numbers must stand
 
 
@@ -90,10 +93,16 @@ def encode_delimited(table: Table, suffix: str) -> bytes:
     delimiter = "," if suffix == ".csv" else "\t"
     text = io.StringIO()
     writer = csv.writer(text, delimiter=delimiter, lineterminator="\n")
-    writer.writerow(written_heading(name, table.units.get(name)) for name in table.columns)
+    heads = [written_heading(name, table.units.get(name)) for name in table.columns]
+    writer.writerow([text_cell(head) for head in heads])
     columns = [values.tolist() for values in table.columns.values()]
     writer.writerows([repr(value) for value in row] for row in zip(*columns, strict=True))
     return text.getvalue().encode()
+
+
+def text_cell(text: str) -> str:
+    """A text of which no spreadsheet makes a formula: an apostrophe stands before its sign."""
+    return _FORMULA.sub(r"\1'", text)
 
 
 def _lines(source: str, content: bytes) -> list[tuple[int, str]]:
