@@ -16,6 +16,7 @@ from impc.files.alignment import misaligned
 from impc.files.apart import match_apart
 from impc.files.clock import column_of, on_even_instants, read_clock
 from impc.files.configuration import FILL_IN
+from impc.files.digests import content_digest
 from impc.files.formats import read_table
 from impc.files.resampling import held_means, instants, resampled_samples, same_rate
 from impc.files.units import si_unit
@@ -252,19 +253,31 @@ def require_kind(name: str, written: str, expected: str) -> None:
 
 
 def require_distinct(paths: Sequence[Path]) -> None:
-    """None of the `paths` is given twice, by whatever name.
+    """None of the `paths` is given twice, by whatever name, nor a copy of another to the byte.
 
     Raises
     ------
     InputError
         When one is.
     """
-    seen: set[str] = set()
+    places: dict[str, Path] = {}
+    sizes: dict[int, list[Path]] = {}
     for path in paths:
         place = os.path.realpath(path)  # Path.resolve raises on a circle of links
-        if place in seen:
-            raise InputError(str(path), "is given twice", "name each trial once")
-        seen.add(place)
+        if place in places:
+            same = "" if str(places[place]) == str(path) else f", as {places[place]} too"
+            raise InputError(str(path), f"is given twice{same}", "name each trial once")
+        places[place] = Path(path)
+        if os.path.isfile(place):
+            sizes.setdefault(os.path.getsize(place), []).append(Path(path))
+    for alike in sizes.values():
+        contents: dict[str, Path] = {}
+        for path in alike if len(alike) > 1 else ():
+            other = contents.setdefault(content_digest(path), path)
+            if other is not path:
+                raise InputError(
+                    str(path), f"is a copy of {other}, byte for byte", "name each trial once"
+                )
 
 
 def label_of(source: str, entry: RecordingTable) -> Label:

@@ -168,6 +168,12 @@ def test_trials_of_unequal_length_in_the_order_given(tmp_path: Path, seat: Plant
     assert "2500 samples where the longest has 3000" in trials[1].findings[0]
     with pytest.raises(InputError, match="is given twice"):
         read_recordings([paths[0], tmp_path / "." / "b.csv"], configured(tmp_path), seat)
+    (tmp_path / "link.csv").symlink_to(paths[0])
+    with pytest.raises(InputError, match=r"link.csv: is given twice, as .*b.csv too"):
+        read_recordings([paths[0], tmp_path / "link.csv"], configured(tmp_path), seat)
+    (tmp_path / "copy.csv").write_bytes(paths[0].read_bytes())
+    with pytest.raises(InputError, match=r"copy.csv: is a copy of .*b.csv, byte for byte"):
+        read_recordings([paths[0], tmp_path / "copy.csv"], configured(tmp_path), seat)
     with pytest.raises(InputError, match="no file is given"):
         read_recordings([], configured(tmp_path), seat)
 
