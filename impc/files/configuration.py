@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import msgspec
 
+from impc.checking import checked
 from impc.errors import InputError, brief
 from impc.files.names import require_ordinary
 from impc.files.units import si_unit
@@ -143,6 +144,7 @@ class Configuration(msgspec.Struct, frozen=True):
     report: ReportTable = ReportTable()
 
 
+@checked
 def read_configuration(path: Path | str, *more: str) -> Configuration:
     r"""Read the configuration at `path`; `more` names tables that it may have besides.
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from impc.checking import checked
 from impc.errors import DataError, ImpcError, InputError, OutputError
 from impc.files.apart import read_apart
 from impc.files.c3d_analog import encode_c3d
@@ -70,6 +71,7 @@ _SIGNATURES = {
 }
 
 
+@checked
 def read_table(path: Path | str, largest: int = LARGEST) -> Table:
     r"""Read the columns of a recording.
 
@@ -114,6 +116,7 @@ def read_table(path: Path | str, largest: int = LARGEST) -> Table:
         raise damaged(source, error) from None
 
 
+@checked
 def write_table(path: Path | str, table: Table) -> None:
     """Write a table in the format of the `path`, whole or not at all; .mat is written as v5.
 

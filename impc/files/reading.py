@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.checking import replace
+from impc.checking import checked, replace
 from impc.errors import DataError, InputError
 from impc.files import checks, measurable
 from impc.files.alignment import misaligned
@@ -49,6 +49,7 @@ __all__ = [
 _SAMPLES_A_STATE = 5
 
 
+@checked
 def read_recordings(
     paths: Sequence[Path], configuration: Configuration, plant: Plant
 ) -> tuple[Recording, ...]:

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
-
-import numpy as np
+from typing import TYPE_CHECKING, Any
 
 from impc.arrays import Frozen, frozen
+from impc.checking import checked
 from impc.errors import DataError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+
+    from numpy.typing import ArrayLike
 
     from impc.arrays import Array
 
@@ -51,9 +52,10 @@ class Table(Frozen):
         return len(next(iter(self.columns.values())))
 
 
+@checked
 def make_table(
     source: str,
-    columns: Mapping[str, Array],
+    columns: Mapping[str, ArrayLike],
     units: Mapping[str, str] | None = None,
     rate: float | None = None,
     skipped: Mapping[str, str] | None = None,
@@ -64,8 +66,8 @@ def make_table(
     ----------
     source : str
         File, for messages.
-    columns : mapping of str to Array
-        (samples,) each, by name.
+    columns : mapping of str to array_like
+        (samples,) each, by name. What a masked array masks is missing: NaN.
     units : mapping of str to str, optional
         As the file writes them, of the columns that have one.
     rate : float, optional
@@ -85,14 +87,14 @@ def make_table(
     >>> table.samples, dict(table.units)
     (2, {'tilt': 'deg'})
     """
-    given, columns = columns, {_line(name): value for name, value in columns.items()}
-    if len(columns) < len(given):
+    vectors: dict[str, Any] = {_line(name): value for name, value in columns.items()}
+    if len(vectors) < len(columns):
         raise DataError(source, "has two columns of one name", "give each its own")
     units = {_line(name): _line(unit) for name, unit in (units or {}).items()}
     left_out = {_line(name): _line(reason) for name, reason in (skipped or {}).items()}
-    lengths = Counter(len(values) for values in columns.values() if len(values) > 1)
+    lengths = Counter(len(values) for values in vectors.values() if len(values) > 1)
     if not lengths:
-        left_out |= {name: f"has {len(values)} values" for name, values in columns.items()}
+        left_out |= {name: f"has {len(values)} values" for name, values in vectors.items()}
         found = next((f"{name} {reason}" for name, reason in left_out.items()), "nothing in it")
         raise DataError(
             source, f"holds no column of numbers ({found})", "save each signal as a column"
@@ -100,9 +102,9 @@ def make_table(
     # The longer one where two are equally frequent.
     usual = max(lengths, key=lambda length: (lengths[length], length))
     kept = {}
-    for name, values in columns.items():
+    for name, values in vectors.items():
         if len(values) == usual:
-            kept[name] = frozen(np.asarray(values, dtype=np.float64))
+            kept[name] = frozen(values)
         else:
             left_out[name] = f"has {len(values)} values where most columns have {usual}"
     told = {name: unit for name, unit in units.items() if name in kept and unit}

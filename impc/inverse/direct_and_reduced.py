@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.arrays import Array
+from impc.arrays import Array, finite_array, symmetric_matrix
 from impc.checking import checked, replace
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
@@ -340,7 +340,9 @@ def inverse_mpc_reduced(
     >>> found.explained, bool(abs(found.gain.K - truth.K).max() < 1e-6)
     (True, True)
     """
-    first = weights_behind(fit_gain(problem, *starts, attempts=2))
+    m, n = problem.plant.m, problem.plant.n
+    given = [(finite_array("K", K, (m, n)), symmetric_matrix("S", S, m)) for K, S in starts]
+    first = weights_behind(fit_gain(problem, *given, attempts=2))
     if first.explained:
         return _with_gain(problem, first)
     direct = inverse_mpc(
