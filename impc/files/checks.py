@@ -71,8 +71,10 @@ class Channel:
         return f"sample {index + 1} ({self.time[index]:.6g} s)"
 
 
-def unit_of_the_file(channel: Channel, told: Unit | None) -> str:
-    """The unit that the file tells must be the one that the configuration gives.
+def unit_of_the_file(channel: Channel, told: Unit | None, overruled: bool) -> str:
+    """The unit that the file gives must be that of the configuration, unless it is overruled.
+
+    A file that says "1" gives none.
 
     Raises
     ------
@@ -83,10 +85,16 @@ def unit_of_the_file(channel: Channel, told: Unit | None) -> str:
         told.base == channel.unit.base and np.isclose(told.factor, channel.unit.factor)
     ):
         return ""
+    key = f"signals.{channel.signal}"
+    if overruled or (told.base == "dimensionless" and told.factor == 1):
+        return (
+            f"{channel.name}: taken in {channel.unit.written!r} by {key}, where the file says "
+            f"{told.written!r}"
+        )
     raise DataError(
         channel.name,
         f"is in {channel.unit.written!r} by the configuration and in {told.written!r} by the file",
-        f"correct signals.{channel.signal}.unit, or the column's unit in the file",
+        f"correct {key}.unit, or write {key}.overrule_unit = true if the file is wrong",
     )
 
 

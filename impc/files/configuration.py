@@ -93,6 +93,8 @@ class SignalTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         In this unit.
     sign : int
         1 or -1.
+    overrule_unit : bool
+        Whether `unit` counts where the file gives another one.
     """
 
     column: str
@@ -100,6 +102,7 @@ class SignalTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     limit: float | None = None
     offset: float = 0.0
     sign: Literal[1, -1] = 1
+    overrule_unit: bool = False
 
 
 class ReportTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -15,7 +15,7 @@ from impc.errors import InputError
 from impc.files.columns import in_columns
 from impc.files.configuration import FILL_IN
 from impc.files.plant_sources import OWN
-from impc.files.units import si_unit
+from impc.files.units import guessed_unit, si_unit
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -158,10 +158,23 @@ def _span(table: Table, column: str) -> str:
 def _fits(table: Table, column: str, signal: str, wanted: Wanted) -> bool:
     """Whether the unit that the file tells of a column may be one of the signal."""
     try:
-        told, needed = si_unit(table.units[column]), si_unit(wanted.units[signal])
+        unit, _ = _read_unit(table.units[column])
+        told, needed = si_unit(unit), si_unit(wanted.units[signal])
     except (KeyError, InputError):  # one of the two says nothing that is known
         return True
     return told.base in (needed.base, "dimensionless")
+
+
+def _read_unit(told: str) -> tuple[str, str]:
+    """The unit that a file's own word for it stands for, and how sure that is."""
+    try:
+        si_unit(told)
+    except InputError:
+        guess = guessed_unit(told)
+        if guess:
+            return guess, f"a guess: the file says {told!r}"
+        return FILL_IN, f"the file says {told!r}, which is not known"
+    return told, "as the file says"
 
 
 def _row(table: Table, name: str) -> tuple[str, ...]:
@@ -234,11 +247,9 @@ def _clock_lines(table: Table) -> list[str]:
 
 
 def _time_unit(told: str | None, step: float) -> tuple[str, str]:
-    try:
-        if told and si_unit(told).base == "second":
-            return told, "as the file says"
-    except InputError:
-        pass
+    written, how = _read_unit(told) if told else (FILL_IN, "")
+    if written != FILL_IN and si_unit(written).base == "second":
+        return written, how
     unit, second = next(pair for pair in _GUESSES if step < pair[1] * _SLOWEST or pair[1] == 1e9)
     return unit, f"a guess: {second / step:.4g} samples per second; a counter needs rate"
 
@@ -271,10 +282,7 @@ def _guessed(
 
 def _signal_lines(table: Table, signal: str, column: str, kind: str, why: str) -> list[str]:
     told = table.units.get(column)
-    try:
-        unit, how = (told, "as the file says") if told and si_unit(told) else (FILL_IN, "")
-    except InputError:
-        unit, how = FILL_IN, f"the file says {told!r}, which is not known"
+    unit, how = _read_unit(told) if told else (FILL_IN, "")
     key = signal if signal.isidentifier() and signal.isascii() else _quoted(signal)
     return [
         _line(f"[signals.{key}]", kind),

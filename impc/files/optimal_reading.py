@@ -152,7 +152,7 @@ def _series(
     entry = configuration.signals[name]
     channel = channel_of(table, clock, name, entry)
     found = [
-        checks.unit_of_the_file(channel, told_unit(table, channel.column)),
+        checks.unit_of_the_file(channel, told_unit(table, channel.column), entry.overrule_unit),
         measurable.size(channel),
         "" if entry.limit is None else checks.beyond_the_stop(channel, entry.limit),
     ]

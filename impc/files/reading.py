@@ -346,7 +346,7 @@ def _checked(
 ) -> list[str]:
     """Every check of one channel, those first whose fault would explain the others."""
     found = [
-        checks.unit_of_the_file(channel, told_unit(table, channel.column)),
+        checks.unit_of_the_file(channel, told_unit(table, channel.column), entry.overrule_unit),
         measurable.size(channel),
         checks.missing(channel, recorded.fill_gaps),
         checks.constant(channel),

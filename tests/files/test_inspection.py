@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -42,6 +43,16 @@ def trial(tmp_path: Path) -> Path:
     path = tmp_path / "trial.csv"
     path.write_text("\n".join([header + ",side", *(row + ",left" for row in rows)]) + "\n")
     return path
+
+
+def test_units_of_other_languages_are_guesses(tmp_path: Path) -> None:
+    path = tmp_path / "t.csv"
+    path.write_text("Zeit (Sek);theta1 (Grad);theta2 (degrés);push (Ellen)\n0;1;1;2\n0,1;2;3;4\n")
+    text = inspect(path).stdout
+    for unit, word in (("deg", "Grad"), ("deg", "degrés")):
+        assert re.search(rf'unit = "{unit}" +# a guess: the file says {word!r}', text)
+    assert re.search(r"time_unit = \"s\" +# a guess: the file says 'Sek'", text)
+    assert '[signals."push (Ellen)"]' in text  # no unit that is known
 
 
 def test_the_table_of_columns(trial: Path) -> None:
