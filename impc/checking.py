@@ -381,9 +381,6 @@ def _path(name: str, value: Any) -> Any:
         raise InputError(name, f"got {brief(ascii(value))}", "give a name that is text") from None
     if b"\0" in text:
         raise InputError(name, f"has a zero byte: {brief(ascii(value))}", "give a path without")
-    if max(len(text) / 4095, *(len(part) / 255 for part in text.split(b"/"))) > 1:
-        problem = f"has {len(text)} bytes, more than a file system takes"
-        raise InputError(f"{name} {brief(os.fsdecode(text))}", problem, "give a shorter path")
     return value
 
 

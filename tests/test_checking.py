@@ -201,7 +201,7 @@ WRONG_CALLS: dict[str, tuple[Callable[[], object], str]] = {
     "too many": (lambda: Weights([[1]], 1, 1), "too many positional arguments"),  # type: ignore[call-arg]
     "unknown": (lambda: Weights([[1]], R=1, S=1), "unexpected keyword argument 'S'"),  # type: ignore[call-arg]
     "NUL": (lambda: read_result("a\0b"), "path: has a zero byte"),
-    "long": (lambda: read_result("x" * 5000), "more than a file system takes"),
+    "long": (lambda: read_result("x" * 5000), "File name too long"),
     "no text": (lambda: read_table("\ud800.csv"), "give a name that is text"),
     "no path": (lambda: read_table(None), "path: got None; give a path"),  # type: ignore[arg-type]
     "no settings": (lambda: read_recordings([], None, PLANT), "configuration: expected a Conf"),  # type: ignore[arg-type]

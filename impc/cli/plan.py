@@ -126,7 +126,12 @@ def _perturbation(
     from impc.files.reading import disturbances_of  # noqa: PLC0415
 
     if files:
-        found = [disturbances_of(read_table(path), configuration, plant) for path in files]
+        found = [
+            disturbances_of(
+                read_table(path, sheet=configuration.recording.sheet), configuration, plant
+            )
+            for path in files
+        ]
         return lambda amplitude, _dwell, number: amplitude * found[number % len(found)]
     torque: Any = import_function(TORQUE)
 

@@ -61,7 +61,7 @@ _ENVIRONMENT = {
 }
 
 
-def read_apart(kind: str, path: Path, largest: int) -> Table:
+def read_apart(kind: str, path: Path, largest: int, sheet: str = "") -> Table:
     """Read a file in a process of its own.
 
     Parameters
@@ -72,6 +72,8 @@ def read_apart(kind: str, path: Path, largest: int) -> Table:
         Of the file.
     largest : int
         The most bytes that its arrays may take.
+    sheet : str
+        Of a workbook, where one is asked for.
 
     Raises
     ------
@@ -80,7 +82,8 @@ def read_apart(kind: str, path: Path, largest: int) -> Table:
         too long, or ended the process.
     """
     source = str(path)
-    reply, columns = _asked(_request(kind, path, largest))
+    named = {"sheet": sheet} if sheet else {}
+    reply, columns = _asked(_request(kind, path, largest) | {"more": named})
     if "refused" in reply:
         raise DataError(*reply["refused"])
     told = reply["table"]
@@ -90,6 +93,7 @@ def read_apart(kind: str, path: Path, largest: int) -> Table:
         told["units"],
         told["rate"],
         told["skipped"],
+        tuple(told["notes"]),
     )
 
 

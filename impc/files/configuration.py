@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import os
 import re
 import tomllib
 import warnings
@@ -63,6 +64,8 @@ class RecordingTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         Seconds; the longest gap that may be filled by interpolation. 0 fills none.
     start, stop : float or None
         Seconds on the file's clock, which begins at 0 where there is only a rate.
+    sheet : str
+        Of a workbook; empty for the first one with rows of numbers.
     """
 
     time: str | None = None
@@ -76,6 +79,7 @@ class RecordingTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     fill_gaps: float = 0.0
     start: float | None = None
     stop: float | None = None
+    sheet: str = ""
 
 
 class SignalTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -202,7 +206,7 @@ _Struct = TypeVar("_Struct", bound=msgspec.Struct)
 
 
 def _parsed(source: str, path: Path) -> dict[str, Any]:
-    if not path.exists() and not path.is_symlink():
+    if not os.path.lexists(path):
         raise InputError(source, "does not exist", "`impc inspect FILE --out` writes one")
     require_ordinary(path, _LARGEST, InputError)
     try:

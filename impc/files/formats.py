@@ -43,7 +43,8 @@ class Format:
     Attributes
     ----------
     read : callable
-        (path, most bytes that its arrays may take) -> table. Whatever it raises becomes one line.
+        (path, most bytes that its arrays may take) -> table; of a workbook also the name of a
+        sheet, where one is asked for. Whatever it raises becomes one line.
     encode : callable
         Table -> the bytes of a file.
     begins : callable
@@ -51,11 +52,12 @@ class Format:
         what does not begin as something else.
     """
 
-    read: Callable[[Path, int], Table]
+    read: Callable[..., Table]
     encode: Callable[[Table], bytes]
     begins: Callable[[bytes], bool] = lambda head: not _what_it_is(head)
 
 
+_WORKBOOKS = (".xlsx", ".ods")
 # First bytes of what else may carry one of the endings, and what it is.
 _SIGNATURES = {
     b"PK\x03\x04": "a zip archive or an Excel workbook",
@@ -72,7 +74,7 @@ _SIGNATURES = {
 
 
 @checked
-def read_table(path: Path | str, largest: int = LARGEST) -> Table:
+def read_table(path: Path | str, largest: int = LARGEST, sheet: str = "") -> Table:
     r"""Read the columns of a recording.
 
     Parameters
@@ -81,6 +83,8 @@ def read_table(path: Path | str, largest: int = LARGEST) -> Table:
         With one of the endings in `FORMATS`.
     largest : int
         Bytes above which a file is refused before it is read.
+    sheet : str
+        Of a workbook; by default the first one with rows of numbers.
 
     Raises
     ------
@@ -104,8 +108,10 @@ def read_table(path: Path | str, largest: int = LARGEST) -> Table:
     suffix = _suffix(path, DataError)
     head, form = _head(path, largest), FORMATS[suffix]
     _require(source, form.begins(head), suffix, head)
+    if sheet and suffix not in _WORKBOOKS:
+        raise DataError(source, "has no sheets", "leave recording.sheet out")
     try:
-        return form.read(path, largest)
+        return form.read(path, largest, sheet) if sheet else form.read(path, largest)
     except ImpcError:
         raise
     except MemoryError:
@@ -213,9 +219,7 @@ def _read_matlab(path: Path, largest: int) -> Table:
 
 
 def _delimited(ending: str) -> Format:
-    return Format(
-        lambda path, _: read_delimited(path), lambda table: encode_delimited(table, ending)
-    )
+    return Format(read_delimited, lambda table: encode_delimited(table, ending))
 
 
 def _spreadsheet(encode: Callable[[Table], bytes]) -> Format:
@@ -247,6 +251,10 @@ FORMATS: dict[str, Format] = {
     ".csv": _delimited(".csv"),
     ".tsv": _delimited(".tsv"),
     ".txt": _delimited(".txt"),
+    ".lvm": _delimited(".lvm"),
+    ".sto": _delimited(".sto"),
+    ".mot": _delimited(".mot"),
+    ".trc": _delimited(".trc"),
     ".xlsx": _spreadsheet(encode_workbook),
     ".ods": _spreadsheet(_no_ods),
     ".mat": Format(_read_matlab, encode_matlab, lambda _: True),

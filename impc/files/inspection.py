@@ -42,6 +42,7 @@ def summary(table: Table) -> str:
     if table.rate is not None:
         lines.append(f"The file says {table.rate:g} samples per second.")
     lines += [f"Not read: {name} {reason}" for name, reason in table.skipped.items()]
+    lines += [f"Note: {note}" for note in table.notes]
     return "\n".join(lines)
 
 
@@ -227,6 +228,7 @@ _OPTIONS = (
     _line("# fill_gaps = 0.0", "s, the longest gap that may be filled by interpolation"),
     _line("# start = 0.0", "s, cut on the file's clock"),
     "# stop = 30.0",
+    _line('# sheet = "Data"', "of a workbook; by default the first with rows of numbers"),
 )
 
 

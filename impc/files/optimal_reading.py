@@ -93,7 +93,8 @@ def read_optimal_trials(
     """
     _require_names(configuration, problem)
     require_distinct(paths)
-    return tuple(_trial(read_table(Path(path)), configuration, problem) for path in paths)
+    sheet = configuration.recording.sheet
+    return tuple(_trial(read_table(path, sheet=sheet), configuration, problem) for path in paths)
 
 
 def _require_names(configuration: Configuration, problem: OptimalControlProblem) -> None:

@@ -172,7 +172,7 @@ def _beside_the_recordings() -> Iterator[None]:
 
 
 @checked
-def make_plant(source: PlantSource, recorded: Sequence[str], **changed: float) -> Plant:
+def make_plant(source: PlantSource, recorded: Sequence[str], **changed: Any) -> Plant:
     """Make the plant; inputs that are recorded are disturbances, the others are controls.
 
     Parameters

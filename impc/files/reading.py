@@ -99,7 +99,9 @@ def read_recordings(
     require_distinct(paths)
     if not paths:
         raise InputError("recordings", "no file is given", "name at least one")
-    trials = [recording_of(read_table(Path(path)), configuration, plant) for path in paths]
+    sheet = configuration.recording.sheet
+    tables = (read_table(path, sheet=sheet) for path in paths)
+    trials = [recording_of(table, configuration, plant) for table in tables]
     longest = max(trial.samples for trial in trials)
     return tuple(
         trial
@@ -126,7 +128,7 @@ def recording_of(table: Table, configuration: Configuration, plant: Plant) -> Re
     measurable.comparable_rates(table.source, clock.period, plant.dt)
     samples = resampled_samples(int(clock.steps[-1]) + 1, clock.period, plant.dt)
     checks.too_few(table.source, samples, _SAMPLES_A_STATE * plant.n)
-    findings = list(clock.findings)
+    findings = [*(f"{table.source}: {note}" for note in table.notes), *clock.findings]
     acting = [name for name in plant.disturbances if name in configuration.signals]
     series: dict[str, Array] = {}
     for name in (*plant.outputs, *acting):

@@ -38,6 +38,9 @@ class Table(Frozen):
         Samples per second, where the file tells it itself (TDMS, C3D).
     skipped : mapping of str to str
         What else the file holds, and why it is no column.
+    notes : tuple of str
+        What a user of the columns has to know of the file: names that were changed, rows that
+        were not read.
     """
 
     source: str
@@ -45,6 +48,7 @@ class Table(Frozen):
     units: Mapping[str, str]
     rate: float | None
     skipped: Mapping[str, str] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
     @property
     def samples(self) -> int:
@@ -59,6 +63,7 @@ def make_table(
     units: Mapping[str, str] | None = None,
     rate: float | None = None,
     skipped: Mapping[str, str] | None = None,
+    notes: tuple[str, ...] = (),
 ) -> Table:
     """Keep the columns of the length that most have; the others are named among the skipped.
 
@@ -74,6 +79,8 @@ def make_table(
         Samples per second, where the file tells it.
     skipped : mapping of str to str, optional
         What was not read, and why.
+    notes : tuple of str, optional
+        What a user of the columns has to know.
 
     Raises
     ------
@@ -104,11 +111,11 @@ def make_table(
     kept = {}
     for name, values in vectors.items():
         if len(values) == usual:
-            kept[name] = frozen(values)
+            kept[name] = values if not values.flags.writeable else frozen(values)
         else:
             left_out[name] = f"has {len(values)} values where most columns have {usual}"
     told = {name: unit for name, unit in units.items() if name in kept and unit}
-    return Table(source, kept, told, rate, left_out)
+    return Table(source, kept, told, rate, left_out, tuple(map(_line, notes)))
 
 
 def _line(text: str) -> str:
