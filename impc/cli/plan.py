@@ -90,7 +90,7 @@ def _person(
         presumed_prices,
     )
 
-    recorded = tuple(settings.perturbed or configuration.signals)
+    recorded = tuple(settings.perturbed or configuration.recorded)
     family = plant_family_of(source, recorded, fit.free)
     plant, family = moving_body(make_plant(source, recorded), family, fit)
     if not plant.disturbances:

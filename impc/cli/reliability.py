@@ -73,7 +73,7 @@ def _trials(units: Sequence[Unit], configuration: Configuration, source: PlantSo
     from impc.studies.reliability.analysis import Trials  # noqa: PLC0415
 
     cells = {}
-    recorded = tuple(configuration.signals)
+    recorded = configuration.recorded
     plant = make_plant(source, recorded)
     for unit in tqdm(units, unit="visit", file=sys.stderr, disable=None, leave=False):
         found = read_recordings(unit.files, configuration, plant)

@@ -99,6 +99,10 @@ class SignalTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         1 or -1.
     overrule_unit : bool
         Whether `unit` counts where the file gives another one.
+    shift : int or float
+        By how much the signal is moved later: a whole number of samples, or seconds with a point.
+    command : bool
+        Whether it is a command of the subject that was recorded, and not a disturbance.
     """
 
     column: str
@@ -107,6 +111,8 @@ class SignalTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     offset: float = 0.0
     sign: Literal[1, -1] = 1
     overrule_unit: bool = False
+    shift: int | float = 0
+    command: bool = False
 
 
 class ReportTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -149,6 +155,11 @@ class Configuration(msgspec.Struct, frozen=True):
     model: dict[str, Any] = {}
     select: dict[str, Any] = {}
     report: ReportTable = ReportTable()
+
+    @property
+    def recorded(self) -> tuple[str, ...]:
+        """The signals that are no commands: what is recorded of the plant."""
+        return tuple(name for name, entry in self.signals.items() if not entry.command)
 
 
 @checked
@@ -297,6 +308,8 @@ def _check_signal(source: str, place: str, table: SignalTable) -> None:
         _unit(source, f"{place}.unit", table.unit)
     if not math.isfinite(table.offset):
         raise InputError(f"{source}: {place}.offset", f"is {table.offset}", "give a number")
+    if not math.isfinite(table.shift):
+        raise InputError(f"{source}: {place}.shift", f"is {table.shift}", "give samples or seconds")
     if table.limit is not None and not (math.isfinite(table.limit) and table.limit > 0):
         raise InputError(
             f"{source}: {place}.limit", f"is {table.limit:g}", "give a magnitude above 0"

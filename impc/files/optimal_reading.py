@@ -105,6 +105,9 @@ def _require_names(configuration: Configuration, problem: OptimalControlProblem)
             remedy = f"did you mean {near[0]}?" if near else f"it has {', '.join(known)}"
             raise InputError(f"signals.{name}", "is no signal of the problem", remedy)
         require_filled_in(name, entry)
+        if entry.shift:
+            unused = "is not used by an optimal control problem"
+            raise InputError(f"signals.{name}.shift", unused, "shift the column in the file")
         require_kind(name, entry.unit, problem.signal_units.get(name, UNKNOWN))
     for name in problem.disturbance_names:
         if name not in configuration.signals:

@@ -193,7 +193,8 @@ def make_plant(source: PlantSource, recorded: Sequence[str], **changed: Any) -> 
     inputs = tuple(getattr(system, "input_labels", ()))
     controls = [item for item in inputs if item not in recorded]
     if inputs and not controls:
-        raise PlantError(name, "all its inputs are recorded", "one must be the command")
+        remedy = "write command = true in [signals.NAME] of the command"
+        raise PlantError(name, "all its inputs are recorded", remedy)
     with _refused_arguments(name), users_code(name, *_REFUSED):
         return Plant(system, controls or None)
 

@@ -13,15 +13,18 @@ the first and behind the last sample x is continued by its point reflection 2 x_
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.signal
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from impc.arrays import Array
 
-__all__ = ["held_means", "instants", "resampled_samples", "same_rate"]
+__all__ = ["held_means", "instants", "resampled_samples", "same_rate", "shifted"]
 
 # Attenuation in dB of what would alias, and the largest ripple below: 10^(-70/20) = 3e-4.
 _ATTENUATION = 70.0
@@ -42,6 +45,23 @@ def same_rate(samples: int, period: float, dt: float) -> bool:
         Of the two clocks, s.
     """
     return samples * abs(period - dt) <= _SAME * dt
+
+
+def shifted(series: Mapping[str, Array], samples: Mapping[str, float]) -> dict[str, Array]:
+    """The `series`, each moved later by so many samples, where all of them have values.
+
+    A part of a sample is interpolated linearly.
+    """
+    first = max(0, *map(math.ceil, samples.values()))
+    size = min(map(len, series.values()))
+    last = size - 1 + min(0, *map(math.floor, samples.values()))
+    places = np.arange(first, last + 1)
+    return {
+        name: values[first : last + 1]
+        if samples[name] == 0
+        else np.interp(places - samples[name], np.arange(len(values)), values)
+        for name, values in series.items()
+    }
 
 
 def resampled_samples(samples: int, period: float, dt: float) -> int:
