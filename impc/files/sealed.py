@@ -14,12 +14,11 @@ import hashlib
 import json
 import os
 import re
-import shutil
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from impc.errors import InputError, OutputError
-from impc.files.writing import require_ordinary, write_whole
+from impc.files.writing import remove_empty, require_ordinary, write_whole
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -78,16 +77,15 @@ class Kept:
     def recall_all(self, digest: str) -> dict[str, Any]:
         """All that runs with that `digest` kept, name -> content, oldest first."""
         found = {}
-        files = [
-            path
-            for path in self.folder.rglob("*.json")
-            if path.is_file() and os.access(path, os.R_OK)
-        ]
-        for path in sorted(files, key=lambda path: (path.stat().st_mtime_ns, path.name)):
+        for path in sorted(self._files(), key=lambda path: (path.stat().st_mtime_ns, path.name)):
             one = _unsealed(path.read_bytes())
             if one is not None and one["digest"] == digest and self.path(one["name"]) == path:
                 found[one["name"]] = one["content"]
         return found
+
+    def _files(self) -> list[Path]:
+        files = self.folder.rglob("*.json")
+        return [path for path in files if path.is_file() and os.access(path, os.R_OK)]
 
     def keep(self, name: str, digest: str, content: Any) -> None:
         """Write a result down.
@@ -126,7 +124,7 @@ class Kept:
             ) from None
 
     def forget(self) -> None:
-        """Remove the folder: the final results have been written.
+        """Remove what was kept: the final results have been written. Files of others stay.
 
         Raises
         ------
@@ -134,9 +132,11 @@ class Kept:
             When that cannot be done.
         """
         try:
-            shutil.rmtree(self.folder)
-        except FileNotFoundError:
-            return
+            for path in self._files():
+                found = _unsealed(path.read_bytes())
+                if found is not None and self.path(found["name"]) == path:
+                    path.unlink()
+            remove_empty(self.folder)
         except OSError as error:
             raise OutputError(
                 f"folder {self.folder}", f"cannot be removed ({error.strerror})", "remove it"

@@ -15,6 +15,7 @@ __all__ = [
     "IN_ITS_PLACE",
     "NO_ROOM",
     "flush_folder",
+    "remove_empty",
     "require_ordinary",
     "unwritable",
     "write_whole",
@@ -83,6 +84,13 @@ def write_whole(path: Path, content: bytes) -> None:
         flush_folder(path.parent)
     except (OSError, ValueError) as error:
         raise unwritable(f"file {path}", error, IN_ITS_PLACE) from None
+
+
+def remove_empty(folder: Path) -> None:
+    """Remove a `folder` and those in it, as far as there are no files in them."""
+    for path in (*sorted(folder.rglob("*"), reverse=True), folder):
+        if path.is_dir() and not path.is_symlink() and not os.listdir(path):
+            path.rmdir()
 
 
 def flush_folder(folder: Path) -> None:
