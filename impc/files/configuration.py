@@ -39,6 +39,8 @@ __all__ = [
 FILL_IN = "?"
 
 _LARGEST = 1_000_000
+_DEEPEST = 16  # tables within tables
+_DOTTED = re.compile(rf"""(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){{{_DEEPEST}}}""")
 _LABELS = ("subject", "visit", "condition", "trial")
 _TABLES = ("recording", "signals", "plant", "fit", "plan", "report")
 _STUDY = ("study", "model", "select")
@@ -221,7 +223,12 @@ def _parsed(source: str, path: Path) -> dict[str, Any]:
         raise InputError(source, "does not exist", "`impc inspect FILE --out` writes one")
     require_ordinary(path, _LARGEST, InputError)
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        text = path.read_text(encoding="utf-8-sig")
+        # tomllib keeps every prefix of a dotted key: one of 32 kB takes 1 GB.
+        content = {} if (dotted := _DOTTED.search(text)) else tomllib.loads(text)
+        if dotted or _deeper(content, _DEEPEST):
+            raise RecursionError
+        return content
     except OSError as error:
         reason = error.strerror or type(error).__name__
         raise InputError(source, f"cannot be opened ({reason})", "check the path") from None
@@ -233,6 +240,12 @@ def _parsed(source: str, path: Path) -> dict[str, Any]:
         ) from None
     except RecursionError:
         raise InputError(source, "is nested too deep", "give a plain TOML file") from None
+
+
+def _deeper(value: Any, levels: int) -> bool:
+    """Whether tables and lists are nested more than so many `levels` deep."""
+    items = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+    return levels < 0 or any(_deeper(item, levels - 1) for item in items)
 
 
 def _require_known(source: str, place: str, table: Mapping[str, Any], known: Iterable[str]) -> None:
