@@ -133,6 +133,11 @@ def directions(controller: Controller, count: int, **given: Array) -> Directions
     **given : Array
         Fields of `Directions` by name, in any layout that reshapes to theirs: K to (m, n, p).
 
+    Raises
+    ------
+    InputError, DataError
+        When a part is of another name or size.
+
     Examples
     --------
     >>> import impc

@@ -112,7 +112,13 @@ def names_of(symbols: Iterable[Any]) -> tuple[str, ...]:
 
 
 def stacked(given: Mapping[str, Any]) -> tuple[Any, tuple[str, ...]]:
-    """The expressions of `given` below each other, by name, and a name for each row."""
+    """The expressions of `given` below each other, by name, and a name for each row.
+
+    Raises
+    ------
+    InputError
+        When one is a comparison.
+    """
     parts: list[Any] = []
     names: list[str] = []
     for name, expression in given.items():

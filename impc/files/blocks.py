@@ -24,16 +24,14 @@ _SEVERAL = 3
 
 @dataclass
 class Block:
-    """Rows of one shape.
+    """Rows of one shape: the index of the first, kinds of each place of all, and counts.
 
     Attributes
     ----------
-    first : int
-        Index of the first row.
+    first, rows, numbers, words : int
+        Index of the first row, and how many rows, numbers and words it has.
     kinds : list of int
         Of each place, of all rows together.
-    rows, numbers, words : int
-        How many rows, numbers and words it has.
     """
 
     first: int
@@ -62,7 +60,7 @@ class Block:
     def fits(self, row: Sequence[int], after_blank: bool = False) -> bool:
         """Whether a row has the same shape: as many places, or fewer or more without numbers.
 
-        One behind an empty row must have the first number of the rows above: the clock, as a rule.
+        One `after_blank`, an empty row, must have the first number of the rows above: the clock.
         """
         if after_blank and row[self.kinds.index(NUMBER) :][:1] != [NUMBER]:
             return False
@@ -83,8 +81,8 @@ class Block:
     def ends_at(self, row: Sequence[int], following: Sequence[int], after_blank: bool) -> bool:
         """Whether a row that does not fit is where the block ends, and not a row that is damaged.
 
-        It is behind an empty line, or as a head of words, or as a word before statistics, which no
-        row of the block follows.
+        It is `after_blank`, behind an empty row; or a head of words; or it begins with a word, as
+        statistics do, and the `following` row does not fit either.
         """
         words = NUMBER not in row
         if after_blank or (words and row.count(WORD) > 1):
@@ -94,17 +92,11 @@ class Block:
 
 
 def first_block(rows: Sequence[Sequence[int]], alone: bool) -> Block | None:
-    """The first block of several rows that are mostly numbers, else that with most numbers.
+    """The first block of several `rows` that are mostly numbers, else that with most numbers.
 
-    Rows as long as its own right above it that begin with a number too belong to it: they have a
-    word in the place of a number.
-
-    Parameters
-    ----------
-    rows : sequence of sequence of int
-        Kinds of the rows at the top of a file.
-    alone : bool
-        Whether a row may be one number alone.
+    The rows are kinds, from the top of a file; `alone` says whether one may be a number alone. Rows
+    as long as its own right above it that begin with a number too belong to it: they have a word in
+    the place of a number.
     """
     blocks: list[Block] = []
     for index, row in enumerate(rows):

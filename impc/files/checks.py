@@ -110,13 +110,7 @@ def unit_of_the_file(channel: Channel, told: Unit | None, overruled: bool) -> st
 
 
 def missing(channel: Channel, fill_gaps: float) -> str:
-    """Samples that are missing or not finite; short runs may be filled.
-
-    Parameters
-    ----------
-    channel : Channel
-    fill_gaps : float
-        s; the longest time between two finite samples that may be bridged.
+    """Samples of a `channel` that are missing or not finite; `fill_gaps`, in s, may be bridged.
 
     Raises
     ------

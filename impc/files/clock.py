@@ -98,32 +98,18 @@ def read_clock(table: Table, recording: RecordingTable) -> Clock:
 
 
 def counts_days(values: Array) -> bool:
-    """Whether a clock without a unit has the day numbers of Excel or MATLAB.
+    """Whether a clock without a unit, `values` (samples,), has day numbers of Excel or MATLAB.
 
-    They are days since 1900 or the year 0, and a recording is a small part of one: as seconds it
-    would last less than a tenth of one.
+    Days since 1900 or the year 0; as seconds the recording would last less than a tenth of one.
     """
     first, last = float(values[0]), float(values[-1])
     return (2e4 < first < 1e5 or 6e5 < first < 9e5) and 0 < last - first < 0.1
 
 
 def column_of(table: Table, name: str, place: str) -> tuple[str, Array]:
-    """A column by its name, with or without the unit that stands behind it in the heading.
+    """A column by its `name`, with or without the unit behind it: its name in the file, its values.
 
-    Parameters
-    ----------
-    table : Table
-    name : str
-        Of the column.
-    place : str
-        Key of the configuration that gives it, for the message.
-
-    Returns
-    -------
-    name : str
-        As the file has it.
-    values : Array
-        (samples,).
+    The values are (samples,); `place` is the key of the configuration that gives the name.
 
     Raises
     ------
@@ -152,19 +138,10 @@ def column_of(table: Table, name: str, place: str) -> tuple[str, Array]:
 
 
 def on_even_instants(clock: Clock, values: Array) -> Array:
-    """Values at start + k period; Akima's interpolation where samples are missing or late.
+    """The `values` (samples,) at start + k period (instants,), of which there are steps[-1] + 1.
 
-    Parameters
-    ----------
-    clock : Clock
-    values : Array
-        (samples,), NaN where a sample is to be filled; the first and the last are finite.
-
-    Returns
-    -------
-    Array
-        (instants,), of which there are steps[-1] + 1. The values themselves where the clock is
-        even and all are finite.
+    Akima's interpolation where samples are missing, NaN, or late; the values themselves where the
+    clock is even and all are finite. The first and the last are.
     """
     finite = np.isfinite(values)
     if clock.even and finite.all():

@@ -56,17 +56,7 @@ _PIECE = 100_000  # rows that are parsed at once
 
 @dataclass(frozen=True)
 class _Text:
-    """The content of a file, and how its rows are divided: by which sign, with which decimal sign.
-
-    Attributes
-    ----------
-    source : str
-        Name of the file.
-    content : bytes
-        With a newline at the end of each line, in `encoding`.
-    encoding, delimiter, decimal : str
-        Of the text.
-    """
+    """The content of a file, lines ended by newlines, and the signs that divide its rows."""
 
     source: str
     content: bytes
@@ -106,17 +96,7 @@ class _Text:
 
 @dataclass(frozen=True)
 class _Body:
-    """The rows of numbers.
-
-    Attributes
-    ----------
-    start : int
-        Number of lines that are not empty before the first row.
-    rows, width : int
-        How many rows, and fields of the longest.
-    rest : str
-        What stands below them, for a note; empty for nothing.
-    """
+    """The rows of numbers: how many lines are above, rows, places of the longest, what is below."""
 
     start: int
     rows: int
@@ -139,12 +119,7 @@ class _Column:
 def read_delimited(path: Path, largest: int = LARGEST) -> Table:
     """Read the text file at `path`, whose ending says which delimiters it may have.
 
-    Parameters
-    ----------
-    path : Path
-        Of the file.
-    largest : int
-        The most bytes that its numbers may take.
+    Its numbers may take `largest` bytes.
 
     Raises
     ------

@@ -64,18 +64,10 @@ class Headings:
 def find_headings(
     source: str, above: Sequence[Sequence[str]], empty: Sequence[bool], named_rows: bool
 ) -> Headings:
-    """Names and units from the rows above the numbers, the last of which are the header.
+    """Names and units from the rows `above` the numbers, the last of which are the header.
 
-    Parameters
-    ----------
-    source : str
-        File, for the message.
-    above : sequence of sequence of str
-        Fields of the rows above.
-    empty : sequence of bool
-        Which of the columns below have no value.
-    named_rows : bool
-        Whether the first column may be names of rows, above which nothing stands.
+    `empty` says which columns below have no value, `named_rows` whether the first may be names of
+    rows, above which nothing stands; `source` is the file.
 
     Raises
     ------
@@ -107,16 +99,10 @@ def find_headings(
 
 
 def named_columns(heads: Sequence[str], units: Sequence[str], level: Sequence[str]) -> Headings:
-    """Names of all columns, those that come again made distinct, and units of those that have one.
+    """Names from the `heads` of all columns, made distinct, and units of those that have one.
 
-    Parameters
-    ----------
-    heads : sequence of str
-        As they stand above the columns.
-    units : sequence of str
-        From a row of their own; empty where there is none.
-    level : sequence of str
-        From the row above the heads: it names what has none, and tells apart what has the same.
+    `units` is a row of their own, empty where there is none; `level` the row above the heads, which
+    names what has no name, and tells apart what has the same.
     """
     split = [split_heading(item) for item in heads]
     names = [name or above for (name, _), above in zip(split, level, strict=True)]

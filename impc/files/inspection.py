@@ -88,11 +88,7 @@ class Wanted:
 def draft_configuration(table: Table, wanted: Wanted | None = None) -> str:
     """A commented TOML file that `read_configuration` reads (docs/recordings.md).
 
-    Parameters
-    ----------
-    table : Table
-    wanted : Wanted, optional
-        Of the plant; without it every column becomes a signal by its own name.
+    Without the plant, what is `wanted`, every column becomes a signal by its own name.
     """
     lines = [
         f"# What the columns of {Path(table.source).name!r} mean. Check every line; what neither",

@@ -32,7 +32,10 @@ _SHARE = 0.04  # of the variance of the residual, which one lag saves compared w
 
 
 def departures(response: Array, disturbances: Sequence[Array]) -> tuple[float, float]:
-    """Offset and drift over the trial, in the unit of the `response`; 0 where none is certain."""
+    """Offset and drift over the trial of a `response` (samples,), in its unit; 0 if not certain.
+
+    The `disturbances` are (samples,) each.
+    """
     count = len(response)
     now = np.arange(_LAGS, count)
     size = float(np.std(response))
@@ -55,16 +58,9 @@ def departures(response: Array, disturbances: Sequence[Array]) -> tuple[float, f
 
 
 def rows_later(outputs: Array, disturbance: Array, effects: Array) -> int:
-    """By how many rows a disturbance acts later than recorded; 0 where no other lag is better.
+    """By how many rows a `disturbance` (samples,) acts later than recorded; 0 where none is better.
 
-    Parameters
-    ----------
-    outputs : Array
-        (samples, p).
-    disturbance : Array
-        (samples,).
-    effects : Array
-        Of one unit of it on the outputs one, two and three samples later (3, p).
+    `outputs` is (samples, p); `effects` (3, p) those of one unit of it one to three samples later.
     """
     lags = range(-_REACH, _REACH + 1)
     now = np.arange(_ROW_LAGS + _REACH, len(outputs) - _REACH)

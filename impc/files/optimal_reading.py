@@ -73,16 +73,10 @@ class OptimalTrial(Frozen):
 def read_optimal_trials(
     paths: Sequence[Path], configuration: Configuration, problem: OptimalControlProblem
 ) -> tuple[OptimalTrial, ...]:
-    """Read one recording from each file.
+    """Read one recording from each of the `paths`.
 
-    Parameters
-    ----------
-    paths : sequence of Path
-        One file a recording.
-    configuration : Configuration
-        Names a column for each disturbance, and for the states and inputs that were measured.
-    problem : OptimalControlProblem
-        Gives the names, the units and the sample time; without one that of each file is taken.
+    The `configuration` names a column for each disturbance of the `problem`, and for the states and
+    inputs that were measured. Without a sample time of the problem that of each file is taken.
 
     Raises
     ------

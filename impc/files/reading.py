@@ -196,13 +196,6 @@ def recording_of(table: Table, configuration: Configuration, plant: Plant) -> Re
 def disturbances_of(table: Table, configuration: Configuration, plant: Plant) -> Array:
     """Perturbations of one table on the plant's clock (samples, d), in SI base units.
 
-    Parameters
-    ----------
-    table : Table
-    configuration : Configuration
-        Names a column for each disturbance.
-    plant : Plant
-
     Raises
     ------
     InputError
@@ -304,13 +297,7 @@ def _require_names(configuration: Configuration, plant: Plant) -> None:
 
 
 def require_filled_in(name: str, entry: SignalTable) -> None:
-    """Column and unit of the signal `name` are said.
-
-    Parameters
-    ----------
-    name : str
-        Of the signal.
-    entry : SignalTable
+    """Require that column and unit of the signal `name` are no longer `FILL_IN`.
 
     Raises
     ------
@@ -323,16 +310,9 @@ def require_filled_in(name: str, entry: SignalTable) -> None:
 
 
 def require_kind(name: str, written: str, expected: str) -> None:
-    """A force cannot stand for an angle; what has no unit may stand for anything.
+    """Require that a `written` unit may stand for the `expected` one of the signal `name`.
 
-    Parameters
-    ----------
-    name : str
-        Of the signal.
-    written : str
-        Unit of its column.
-    expected : str
-        Unit of the plant's.
+    What has no unit may stand for anything.
 
     Raises
     ------
@@ -385,13 +365,7 @@ def require_distinct(paths: Sequence[Path]) -> None:
 
 
 def label_of(source: str, entry: RecordingTable) -> Label:
-    """Whose trial a file is, by its name and the [recording] table.
-
-    Parameters
-    ----------
-    source : str
-        The file.
-    entry : RecordingTable
+    """Whose trial the file `source` is, by its name and the [recording] table.
 
     Raises
     ------
@@ -418,15 +392,7 @@ def label_of(source: str, entry: RecordingTable) -> Label:
 
 
 def channel_of(table: Table, clock: Clock, name: str, entry: SignalTable) -> checks.Channel:
-    """The column of a signal, in its own unit, after offset and sign.
-
-    Parameters
-    ----------
-    table : Table
-    clock : Clock
-    name : str
-        Of the signal.
-    entry : SignalTable
+    """The column of the signal `name`, in its own unit, after offset and sign.
 
     Raises
     ------

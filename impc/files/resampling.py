@@ -37,18 +37,12 @@ _CHUNK = 2_000_000  # numbers in memory at a time: 16 MB
 
 
 def same_rate(samples: int, period: float, dt: float) -> bool:
-    """Whether two clocks stay together over a recording of so many `samples`.
-
-    Parameters
-    ----------
-    period, dt : float
-        Of the two clocks, s.
-    """
+    """Whether clocks of `period` and `dt`, in s, stay together over so many `samples`."""
     return samples * abs(period - dt) <= _SAME * dt
 
 
 def shifted(series: Mapping[str, Array], samples: Mapping[str, float]) -> dict[str, Array]:
-    """The `series`, each moved later by so many samples, where all of them have values.
+    """The `series` (samples,), each moved later by so many `samples`, where all have values (any,).
 
     A part of a sample is interpolated linearly.
     """
@@ -70,19 +64,9 @@ def resampled_samples(samples: int, period: float, dt: float) -> int:
 
 
 def instants(values: Array, period: float, dt: float) -> Array:
-    """Values at the instants k dt, without what the lower of the two rates cannot show.
+    """The `values` (samples,), every `period` s, at the instants k dt (resampled,).
 
-    Parameters
-    ----------
-    values : Array
-        (samples,), recorded every `period` seconds.
-    period, dt : float
-        s.
-
-    Returns
-    -------
-    Array
-        (resampled,). The values themselves when the rates are the same.
+    Without what the lower of the two rates cannot show; themselves when `dt`, in s, is the period.
     """
     if same_rate(len(values), period, dt):
         return values
@@ -106,21 +90,10 @@ def instants(values: Array, period: float, dt: float) -> Array:
 
 
 def held_means(values: Array, period: float, dt: float) -> Array:
-    """Means over [k dt, (k + 1) dt) of a signal that is linear between its samples.
+    """Means of the `values` (samples,), every `period` s, over [k dt, (k + 1) dt) (resampled,).
 
-    The last interval reaches beyond the recording; there the last value is held.
-
-    Parameters
-    ----------
-    values : Array
-        (samples,), recorded every `period` seconds.
-    period, dt : float
-        s.
-
-    Returns
-    -------
-    Array
-        (resampled,). The values themselves when the rates are the same.
+    The signal is linear between its samples. The last interval reaches beyond the recording; there
+    the last value is held. The values themselves when `dt`, in s, is the period.
     """
     if same_rate(len(values), period, dt):
         return values

@@ -88,16 +88,7 @@ class Kept:
         return [path for path in files if path.is_file() and os.access(path, os.R_OK)]
 
     def keep(self, name: str, digest: str, content: Any) -> None:
-        """Write a result down.
-
-        Parameters
-        ----------
-        name : str
-            What it is.
-        digest : str
-            Of all that it was made of.
-        content : JSON
-            Dictionaries with text as keys, lists, text, numbers, None.
+        """Write the result `name` down: `content`, as JSON has it, and the `digest` of its origin.
 
         Raises
         ------

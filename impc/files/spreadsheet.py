@@ -36,19 +36,10 @@ _TIMES = (datetime.datetime, datetime.date, datetime.time, datetime.timedelta)
 
 
 def read_spreadsheet(path: Path, largest: int, sheet: str = "") -> Table:
-    """Read the columns of the first sheet that has a block of rows of numbers.
+    """Read the columns of the first sheet that has a block of rows of numbers, or of `sheet`.
 
     Dates and times become seconds after the first. Numbers that were saved as text, with decimal
-    commas too, are numbers.
-
-    Parameters
-    ----------
-    path : Path
-        Of the file.
-    largest : int
-        The most bytes that it may unpack to, and its arrays take.
-    sheet : str
-        Name of the sheet to be read instead.
+    commas too, are numbers. The file at `path` may unpack to `largest` bytes.
 
     Raises
     ------
@@ -93,14 +84,7 @@ def _kind_of(cell: Any) -> int:
 
 
 def read_cells(path: Path, largest: int) -> dict[str, Any]:
-    """The cells of the first sheet as texts, a row in each list.
-
-    Parameters
-    ----------
-    path : Path
-        Of the file.
-    largest : int
-        The most bytes that it may unpack to.
+    """The cells of the first sheet at `path` as texts, a row in each list; `largest` as above.
 
     Raises
     ------

@@ -32,17 +32,11 @@ _BETWEEN = 0.1  # of a sample, by which two channels may be apart
 
 
 def read_tdms(path: Path, largest: int) -> Table:
-    """Read the channels of all groups; `group/channel` where two groups name one alike.
+    """Read the channels of all groups at `path`; `group/channel` where two groups name one alike.
 
     Time stamps become seconds after the first. The rate is 1 / wf_increment, where it is given.
-    Channels that begin at different times are cut to the time that they have in common.
-
-    Parameters
-    ----------
-    path : Path
-        Of the file.
-    largest : int
-        The most bytes that its arrays may take.
+    Channels that begin at different times are cut to the time that they have in common. Arrays take
+    `largest` bytes at most.
 
     Raises
     ------

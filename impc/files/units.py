@@ -137,7 +137,7 @@ def is_unit(text: str) -> bool:
 
 
 def guessed_unit(written: str) -> str:
-    """The unit that a word of another language probably means: Grad/s -> deg/s; else empty."""
+    """The unit that a `written` word of another language means: Grad/s -> deg/s; else empty."""
     parts = unicodedata.normalize("NFKD", written.strip().translate(_DEGREES)).casefold()
     plain = "".join(mark for mark in parts if not unicodedata.combining(mark)).rstrip(".")
     joined = re.sub(r"\bnewtons?[ ·*._-]+(met)", r"newton\1", plain)

@@ -28,16 +28,9 @@ NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 def unwritable(subject: str, error: OSError | ValueError, remedy: str) -> OutputError:
-    """What to say of something that cannot be written: `remedy`, or to make room if there is none.
+    """What to say of the `error` of a `subject` that cannot be written.
 
-    Parameters
-    ----------
-    subject : str
-        The file or folder.
-    error : OSError or ValueError
-        Of the attempt.
-    remedy : str
-        What to do about it otherwise.
+    The `remedy`, or to make room if there is none.
     """
     number = getattr(error, "errno", None)
     reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
