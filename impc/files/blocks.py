@@ -18,8 +18,8 @@ __all__ = ["EMPTY", "HEAD", "NUMBER", "WORD", "Block", "first_block"]
 EMPTY, NUMBER, WORD = 0, 1, 2
 #: Rows among which the first row of numbers must be.
 HEAD = 100
-# Rows of one shape that are a recording; settings above it (X0, Delta_X) come in fewer.
-_SEVERAL = 3
+# Rows of one shape that are a recording, and where they begin with a word, as settings do.
+_SEVERAL, _NAMED = 3, 20
 
 
 @dataclass
@@ -55,7 +55,7 @@ class Block:
     @property
     def several(self) -> bool:
         """Whether it has several rows, which are mostly numbers."""
-        return self.share > 0.5 and self.rows >= _SEVERAL
+        return self.share > 0.5 and self.rows >= (_NAMED if self.kinds[0] == WORD else _SEVERAL)
 
     def fits(self, row: Sequence[int], after_blank: bool = False) -> bool:
         """Whether a row has the same shape: as many places, or fewer or more without numbers.

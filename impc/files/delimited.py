@@ -77,7 +77,8 @@ class _Text:
         if self.delimiter == "\n":
             return [line.strip()]
         if self.delimiter == " ":
-            return line.split()
+            blanks = csv.reader([line.replace("\t", " ")], delimiter=" ", skipinitialspace=True)
+            return [item for item in next(blanks) if item] if '"' in line else line.split()
         return [item.strip() for item in next(csv.reader([line], delimiter=self.delimiter))]
 
     def width(self, line: str) -> int:
