@@ -19,6 +19,7 @@ __all__ = [
     "Buffer",
     "Frozen",
     "IntArray",
+    "System",
     "as_numbers",
     "finite_array",
     "frozen",
@@ -34,6 +35,8 @@ Array = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
 IntArray = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
 #: An array of truth values.
 BoolArray = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
+#: A control.StateSpace, or what has its attributes.
+System = Any
 #: An array as compiled code takes it, of any element type.
 Buffer = np.ndarray[Any, np.dtype[Any]]
 
@@ -197,10 +200,15 @@ def with_shape(name: str, array: Array, shape: tuple[int | None, ...]) -> Array:
         When it has another.
     """
     wanted = "(" + ", ".join("any" if size is None else str(size) for size in shape) + ")"
-    if array.ndim != len(shape) or any(
-        size is not None and size != given for size, given in zip(shape, array.shape, strict=True)
-    ):
-        raise DataError(name, f"expected shape {wanted}, got {array.shape}", "reshape it")
+
+    def fits(given: tuple[int, ...]) -> bool:
+        pairs = zip(shape, given, strict=False)
+        return len(given) == len(shape) and all(size in (None, found) for size, found in pairs)
+
+    if not fits(array.shape):
+        turned = array.ndim > 1 and fits(array.shape[::-1])
+        remedy = f"transpose it: {name}.T" if turned else "reshape it"
+        raise DataError(name, f"expected shape {wanted}, got {array.shape}", remedy)
     return array
 
 
@@ -255,6 +263,10 @@ def symmetric_matrix(name: str, values: ArrayLike, size: int | None = None) -> A
         When the matrix is not symmetric.
     """
     given = as_numbers(name, values)
+    if given.ndim != 0 and (given.ndim != 2 or given.size == 0):
+        diagonal = f"np.diag({given.tolist()})" if given.size < 6 else "np.diag(...)"
+        remedy = f"for a diagonal {name} pass {diagonal}" if given.ndim == 1 else "give (n, n)"
+        raise DataError(name, f"expected a square matrix, got shape {given.shape}", remedy)
     # R of a single input is usually written as a number.
     matrix = finite_array(name, given.reshape(1, 1) if given.ndim == 0 else given, (size, size))
     if matrix.shape[0] != matrix.shape[1]:

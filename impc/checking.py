@@ -22,6 +22,7 @@ import functools
 import inspect
 import math
 import numbers
+import os
 import re
 import sys
 from collections.abc import Mapping
@@ -30,7 +31,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, ParamSpec, TypeVar, cast, overl
 import numpy as np
 
 from impc.arrays import Frozen, as_numbers, require_finite, with_shape
-from impc.errors import DataError, InputError, brief
+from impc.errors import DataError, InputError, PlantError, brief
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Container, Hashable
@@ -81,30 +82,66 @@ def checked(function: Any = None, /, **rules: Rule) -> Any:
 def _checked(function: Callable[P, R], rules: dict[str, Rule]) -> Callable[P, R]:
     kinds: dict[str, Kind] = {}
     names: list[str] = []  # of those that can be given by position
-    for name, parameter in inspect.signature(function).parameters.items():
-        bound = name in ("self", "cls")
-        if not bound and parameter.kind not in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
+    rest: dict[Any, tuple[str, Kind]] = {}  # of *args and **kwargs
+    signature = inspect.signature(function)
+    for name, parameter in signature.parameters.items():
+        if parameter.kind in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
+            rest[parameter.kind] = name, _kind(str(parameter.annotation))
+        elif name not in ("self", "cls"):
             kinds[name] = _kind(str(parameter.annotation))
         if parameter.kind is parameter.POSITIONAL_OR_KEYWORD:
             names.append(name)
+    needed = {
+        name
+        for name, parameter in signature.parameters.items()
+        if parameter.default is parameter.empty and (name in kinds or name in names)
+    }
+    more = rest.get(inspect.Parameter.VAR_POSITIONAL)
+    others = rest.get(inspect.Parameter.VAR_KEYWORD)
 
     @functools.wraps(function)
     def at_the_door(*args: P.args, **kwargs: P.kwargs) -> R:
         sizes: dict[str, int] = {}
         named = dict(zip(names, args, strict=False)) | kwargs
+        extra: Any = args[len(names) :]
+        if not needed <= named.keys() or (extra and more is None):
+            raise _wrong_call(function, signature, args, kwargs)
         for name, value in named.items():
             if name in kinds:
                 found = kinds[name](name, value)
                 _require_sizes(name, found, sizes)
                 named[name] = found
+            elif name not in names and others is None:
+                raise _wrong_call(function, signature, args, kwargs)
+            elif name not in names and others is not None:
+                named[name] = others[1](name, value)
+        if more is not None:
+            extra = (more[1](f"{more[0]}[{k}]", value) for k, value in enumerate(extra))
         for name, rule in rules.items():
             if named.get(name) is not None:
                 named[name] = _ruled(name, named[name], rule, sizes)
         given = [named.pop(name) for name in names[: len(args)]]
-        # What is left of args is for *args, or one too many: Python says so.
-        return function(*given, *args[len(names) :], **named)  # type: ignore[arg-type]
+        return function(*given, *extra, **named)  # type: ignore[arg-type]
 
     return at_the_door
+
+
+def _wrong_call(
+    function: Callable[..., Any], signature: inspect.Signature, args: Any, kwargs: Any
+) -> InputError:
+    """What Python would say of arguments that are missing or too many, and how to call it."""
+    name = function.__qualname__.removesuffix(".__init__")
+    try:
+        signature.bind(*args, **kwargs)
+        said = "has wrong arguments"
+    except TypeError as error:
+        said = str(error)
+    known = [
+        f"*{item.name}" if item.kind is item.VAR_POSITIONAL else item.name
+        for item in signature.parameters.values()
+        if item.name not in ("self", "cls") and item.kind is not item.VAR_KEYWORD
+    ]
+    return InputError(name, said, f"its arguments are {', '.join(known)}")
 
 
 class Value(Frozen):
@@ -334,6 +371,50 @@ def _either(module: str, kind: str, other: Kind) -> Kind:
     return check
 
 
+def _path(name: str, value: Any) -> Any:
+    """What may be the name of a file; whether there is one is for who opens it."""
+    if not isinstance(value, (str, os.PathLike)):
+        raise InputError(name, f"got {_described(value)}", "give a path, as text or a Path")
+    try:
+        text = os.fsencode(value)
+    except UnicodeEncodeError:
+        raise InputError(name, f"got {brief(ascii(value))}", "give a name that is text") from None
+    if b"\0" in text:
+        raise InputError(name, f"has a zero byte: {brief(ascii(value))}", "give a path without")
+    return value
+
+
+def _vectors(name: str, value: Any) -> Any:
+    """A dictionary of columns, each of numbers along one axis; of a frame its columns."""
+    columns = value if hasattr(value, "dtypes") else _mapping(name, value)
+    return {
+        _text(f"{name}: the name of a column", key): with_shape(
+            f"{name}[{key!r}]", as_numbers(f"{name}[{key!r}]", column), (None,)
+        )
+        for key, column in columns.items()
+    }
+
+
+def _system(name: str, value: Any) -> Any:
+    if not all(hasattr(value, part) for part in ("A", "B", "C", "dt")):
+        problem = f"expected a control.StateSpace, got {_described(value)}"
+        raise PlantError(name, problem, "pass control.ss(A, B, C, D, dt)")
+    return value
+
+
+def _pair(name: str, value: Any) -> Any:
+    if not isinstance(value, (tuple, list)) or len(value) != 2:
+        raise InputError(name, f"got {_described(value)}", "give a pair (K, S) of arrays")
+    return tuple(as_numbers(f"{name}[{index}]", part) for index, part in enumerate(value))
+
+
+def _texts(name: str, value: Any) -> Any:
+    given = _mapping(name, value)
+    return {
+        _text(f"{name}: a key", key): _text(f"{name}[{key!r}]", item) for key, item in given.items()
+    }
+
+
 def _several(kind: Kind, what: str) -> Kind:
     """A tuple of the items of any sequence but a text, an array or a frame of several columns."""
 
@@ -382,6 +463,8 @@ _VALUES = {
     "Structure": ("impc.model.structure", "make it with Structure(plant, ...)"),
     "Problem": ("impc.inverse.problem", "make it with Problem(plant, ...)"),
     "PlantFamily": ("impc.model.plant_family", "make it with plant_family"),
+    "Table": ("impc.files.table", "make it with read_table or make_table"),
+    "Configuration": ("impc.files.configuration", "make it with read_configuration"),
     "PlantSource": ("impc.files.plant_sources", "make it with plant_source"),
     "LqrSolution": ("impc.model.riccati", "make it with solve_lqr"),
     "GainFibre": ("impc.inverse.solution_set", "make it with gain_fibre"),
@@ -393,6 +476,14 @@ _VALUES = {
     "MpcSolver": ("impc.control.casadi_controller", "make it with build_mpc"),
     "FitSettings": ("impc.studies.fit.settings", "make it with FitSettings"),
     "FitProgress": ("impc.studies.fit.subject", "make it with FitProgress, or leave it out"),
+    "OptimalControlProblem": (
+        "impc.control.optimal_control",
+        "make it with OptimalControlProblem(states, inputs, ...)",
+    ),
+    "OptimalRecording": (
+        "impc.control.optimal_recordings",
+        "make it with problem.recorded_plan or recorded_loop",
+    ),
     "Estimate": ("impc.inverse.estimates", "make it with estimate(problem)"),
     "Rows": ("impc.control.constraint_rows", "make it with build_rows"),
 }
@@ -413,7 +504,9 @@ _KINDS: dict[str, Kind] = {
     "int": _whole,
     "bool": _truth,
     "str": _text,
-    "str | Path": _as_it_is,
+    "str | Path": _path,
+    "Path | str": _path,
+    "Sequence[Path]": _several(_path, "paths"),
     "Any": _as_it_is,
     "Sequence[str]": _several(_text, "names"),
     "tuple[str, ...]": _several(_text, "names"),
@@ -425,6 +518,14 @@ _KINDS: dict[str, Kind] = {
     ),
     "Sequence[Recording]": _several(_instance("impc.model.recordings", "Recording"), "recordings"),
     "Mapping[str, Any]": _mapping,
+    "Mapping[str, ArrayLike]": _vectors,
+    "Mapping[str, str]": _texts,
+    "Mapping[str, float]": _mapping,
+    "System": _system,
+    "tuple[Array, Array]": _pair,
+    "Sequence[OptimalRecording]": _several(
+        _instance("impc.control.optimal_recordings", "OptimalRecording"), "recordings"
+    ),
     "Mapping[int, IntArray]": _mapping,
 }
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 __all__ = [
     "BoundsError",
     "DataError",
+    "FallError",
     "ImpcError",
     "InfeasibleError",
     "InputError",
@@ -125,6 +126,17 @@ class DataError(InputError):
     Traceback (most recent call last):
         ...
     impc.errors.DataError: outputs: has 1 samples; give at least 2
+    """
+
+
+class FallError(DataError):
+    """A recording in which the subject fell: other recordings of the subject may be used.
+
+    Examples
+    --------
+    >>> from impc.errors import FallError
+    >>> print(FallError("run-2.csv", "the subject fell at 5.14 s", "leave the trial out"))
+    run-2.csv: the subject fell at 5.14 s; leave the trial out
     """
 
 

@@ -1,9 +1,10 @@
 """numba's `njit`, wherever the package is installed.
 
-numba keeps compiled code beside the module or in the user's cache folder, and refuses to compile at
-all where neither can be written. There it is kept in a folder of the user's own among the temporary
-files, or compiled anew in every process. Compiled code is run as it is read: a folder that another
-user could have made or may write to is never used (docs/speed.md).
+numba keeps compiled code in the folder of NUMBA_CACHE_DIR, else beside the module or in the user's
+cache folder, and refuses to compile at all where none can be written. There it is kept in a folder
+of the user's own among the temporary files, or compiled anew in every process. Compiled code is run
+as it is read: a folder that another user could have made or may write to is never used, nor one
+that a file of the working folder names (docs/speed.md).
 """
 
 from __future__ import annotations
@@ -13,6 +14,8 @@ import os
 import stat
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
+
+from impc.settings_files import ignore_settings_files
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -24,14 +27,21 @@ F = TypeVar("F", bound="Callable[..., Any]")
 
 def njit(**options: Any) -> Callable[[F], F]:
     """numba's decorator of the same name and `options`; without a cache where none can be kept."""
+    ignore_settings_files("numba")
     import numba  # noqa: PLC0415  # a quarter of a second, and `keep_caches` needs none
 
     def decorate(function: F) -> F:
         make: Any = numba.njit
+        config: Any = numba.core.config
+        # Of the environment only: where numba was imported before impc, a file of the working
+        # folder may name another folder, from which numba would unpickle.
+        before, config.CACHE_DIR = config.CACHE_DIR, os.environ.get("NUMBA_CACHE_DIR", "")
         try:
             found: F = make(**options)(function)
         except RuntimeError:  # "no locator available for file ..."
             found = make(**{**options, "cache": False})(function)
+        finally:
+            config.CACHE_DIR = before
         return found
 
     return decorate

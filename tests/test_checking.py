@@ -18,9 +18,14 @@ from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
 from impc.control.simulation import scenario
 from impc.errors import DataError, ImpcError, InputError
+from impc.files.formats import read_table
+from impc.files.reading import read_recordings
+from impc.files.results import read_result
+from impc.files.table import make_table
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.recordings import Recording
+from impc.model.structure import Structure
 from impc.model.weights import Weights
 from tests.wrong_arguments import calls, values, wrong_values
 
@@ -28,7 +33,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 # Calls of more than half a second: numbers that mean something are left out.
-SLOW = ("infer_weights", "inverse_mpc_reduced", "starting_point", "fit_gain", "fit_controller")
+SLOW = (
+    *("infer_weights", "inverse_mpc_reduced", "starting_point", "fit_gain", "fit_controller"),
+    "fit_optimal_control",
+)
 PLANT = Plant(control.ss([[2, -1], [1, 0.2]], [[1], [0]], np.eye(2), 0, True))
 
 
@@ -164,6 +172,49 @@ def test_arrays_stay_read_only_in_copies_and_pickles(name: str) -> None:
             if name != "simulation":
                 assert not array.flags.writeable
     assert arrays_of(value)
+
+
+def test_columns_of_a_table_are_numbers_and_what_is_masked_is_missing() -> None:
+    given = np.ma.masked_array([0.1, 0.2, -999.0, 0.4], mask=[False, False, True, False])
+    found = make_table(
+        "lab", {"angle": given, "none": np.ma.masked_array(np.ones(4), mask=True)}
+    ).columns
+    np.testing.assert_array_equal(found["angle"], [0.1, 0.2, np.nan, 0.4])
+    assert np.isnan(found["none"]).all()
+    frame: Any = pd.DataFrame({"a": [1, 2]})
+    assert make_table("lab", frame).columns["a"].tolist() == [1.0, 2.0]
+    for wrong in ({"a": "xy"}, [1, 2], {"a": [[1.0]]}, {1: [1.0]}, {"a": [1j, 2]}):
+        with pytest.raises(ImpcError):
+            make_table("lab", wrong)  # type: ignore[arg-type]
+
+
+MATRIX: Any = [[1.0]]
+WRONG_CALLS: dict[str, tuple[Callable[[], object], str]] = {
+    "no square": (lambda: Weights([5, 2], 0.1), r"Q: expected a square .* np.diag\(\[5.0, 2.0\]\)"),
+    "empty": (
+        lambda: Weights(np.zeros((0, 0)), 1),
+        r"Q: expected a square matrix, got shape \(0, 0\)",
+    ),
+    "matrices": (lambda: Plant([[1]], MATRIX), r"system: .* pass control.ss\(A, B, C, D, dt\)"),
+    "turned": (lambda: Recording(PLANT, np.ones((2, 9))), r"transpose it: outputs.T"),
+    "too few": (lambda: Weights([[1]]), "Weights: missing a required argument: 'R'"),  # type: ignore[call-arg]
+    "too many": (lambda: Weights([[1]], 1, 1), "too many positional arguments"),  # type: ignore[call-arg]
+    "unknown": (lambda: Weights([[1]], R=1, S=1), "unexpected keyword argument 'S'"),  # type: ignore[call-arg]
+    "NUL": (lambda: read_result("a\0b"), "path: has a zero byte"),
+    "long": (lambda: read_result("x" * 5000), "File name too long"),
+    "no text": (lambda: read_table("\ud800.csv"), "give a name that is text"),
+    "no path": (lambda: read_table(None), "path: got None; give a path"),  # type: ignore[arg-type]
+    "no settings": (lambda: read_recordings([], None, PLANT), "configuration: expected a Conf"),  # type: ignore[arg-type]
+    "on one side": (lambda: Bounds(PLANT, u_min=0, u_max=1), "leave u.* no room on one side of 0"),
+    "tiny": (lambda: Structure(PLANT, ["1e-320 x[0]"]), "has a factor of .*scale it to about 1"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG_CALLS)
+def test_a_wrong_call_says_what_to_do(name: str) -> None:
+    call, said = WRONG_CALLS[name]
+    with pytest.raises(ImpcError, match=said):
+        call()
 
 
 def test_a_value_made_by_hand_is_checked_and_not_the_callers() -> None:

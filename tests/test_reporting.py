@@ -159,10 +159,12 @@ def test_the_same_case_gives_the_same_bytes(case_a: CaseResult, figures: dict[st
 
 
 def test_the_style_ends_with_its_block() -> None:
-    before = dict(mpl.rcParams)
-    with journal_style():
-        assert dict(mpl.rcParams) != before
-    assert dict(mpl.rcParams) == before
+    with mpl.rc_context({"text.usetex": True, "lines.linewidth": 0}):
+        before = dict(mpl.rcParams)
+        with journal_style():
+            assert dict(mpl.rcParams) != before
+            assert mpl.rcParams["text.usetex"] is False  # matplotlib's own settings, not the user's
+        assert dict(mpl.rcParams) == before
 
 
 # The page

@@ -2,30 +2,41 @@
 
 from __future__ import annotations
 
+import atexit
 import dataclasses
+import tempfile
 from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import casadi as ca
 import control
 import numpy as np
 import pandas as pd
 import scipy.sparse
 
-from impc.assess import bounded_weights, extreme_weights
+from impc.assess import bounded_weights, expected, extreme_weights
 from impc.assess import identified_directions as identifiability
 from impc.assess import variance_accounted_for as agreement
 from impc.checking import replace
 from impc.control import casadi_controller as mpc
-from impc.control import closed_loop, controller, simulation, terminal_set
+from impc.control import (
+    closed_loop,
+    constraint_rows,
+    controller,
+    optimal_control,
+    simulation,
+    terminal_set,
+)
+from impc.files import configuration, formats, reading, table, units
 from impc.files import plant_sources as plant_source
-from impc.files import units
-from impc.inverse import cross_term, equivalent_weights, inverse_lqr
+from impc.inverse import cross_term, equivalent_weights, inverse_lqr, optimal_control_fit
 from impc.inverse import direct_and_reduced as inverse_mpc
 from impc.inverse import gain_search as gain
 from impc.inverse import noisy_fit as fitted_controller
 from impc.inverse import problem as inverse_problem
 from impc.inverse import solution_set as gain_fibre
-from impc.model import bounds, observer, plant, plant_family, weights
+from impc.model import bounds, observer, plant, plant_family, structure, weights
 from impc.model import recordings as recording
 from impc.model import riccati as lqr
 
@@ -33,6 +44,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 __all__ = ["calls", "wrong_values"]
+
+_FOLDER = tempfile.TemporaryDirectory()
+atexit.register(_FOLDER.cleanup)
 
 Call = tuple["Callable[..., Any]", dict[str, Any]]
 
@@ -44,6 +58,7 @@ def values() -> dict[str, Any]:
         [[1.1, 0.4], [0.0, 0.8]], [[0.2, 0.1, 0.3], [1, 0.5, 0]], np.eye(2), 0, True
     )
     two = plant.Plant(system, ["u[0]", "u[1]"])
+    x, u, w = (ca.SX.sym(name) for name in "xuw")
     box = bounds.Bounds(two, u_min=-1, u_max=1)
     pair = weights.Weights(np.diag([2.0, 1.0]), np.diag([1.0, 3.0]))
     law = controller.Controller(two, pair, box, 4)
@@ -67,6 +82,10 @@ def values() -> dict[str, Any]:
         "fibre": fibre,
         "set": bounded_weights.weights_set(fibre),
         "mpc": mpc.build_mpc(law),
+        "structured": replace(problem, structure=structure.Structure(two, "diagonal")),
+        "point": optimal_control.OptimalControlProblem(
+            x, u, {"price": w}, x + u, w * x**2 + u**2, 2
+        ),
         "terminal": law.terminal,
         "family": plant_family.PlantFamily(lambda _: two, ["mass"], [1.0]),
         "source": plant_source.plant_source("plants:yalmip_example", {}),
@@ -137,6 +156,31 @@ def changed(value: Any) -> Call:
         return replace(value, **fields)
 
     return change, {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+
+
+def _of_files() -> list[Call]:
+    """Files that are there, in a folder that stays until Python ends."""
+    folder = Path(_FOLDER.name)
+    columns = {"t": np.arange(30.0), "y": np.sin(np.arange(30.0))}
+    made = table.make_table("simulated", columns)
+    formats.write_table(folder / "trial.csv", made)
+    one = plant.Plant(control.ss([[0.9]], [[1]], [[1]], 0, 1, outputs=["y"]))
+    text = '[recording]\ntime = "t"\n[signals.y]\ncolumn = "y"\nunit = "1"\n'
+    (folder / "lab.toml").write_text(text)
+    settings = configuration.read_configuration(folder / "lab.toml")
+    return [
+        (
+            table.make_table,
+            {"source": "s", "columns": columns, "units": {"y": "m"}, "skipped": {"z": "is text"}},
+        ),
+        (formats.read_table, {"path": folder / "trial.csv", "largest": 10**6}),
+        (formats.write_table, {"path": folder / "again.csv", "table": made}),
+        (configuration.read_configuration, {"path": folder / "lab.toml"}),
+        (
+            reading.read_recordings,
+            {"paths": [folder / "trial.csv"], "configuration": settings, "plant": one},
+        ),
+    ]
 
 
 def calls() -> list[Call]:
@@ -293,6 +337,24 @@ def calls() -> list[Call]:
         (plant_family.PlantFamily, {"make": len, "names": ["mass"], "nominal": [1.0]}),
         (plant_family.plant_at, {"family": v["family"], "logarithms": np.zeros(1)}),
         (units.si_unit, {"written": "deg"}),
+        *_of_files(),
+        (structure.Structure, {"plant": v["plant"], "Q": "diagonal", "R": "full", "name": "one"}),
+        (constraint_rows.directions, {"controller": v["controller"], "count": 1, "K": K}),
+        (
+            expected.expected_intervals,
+            {"problem": v["structured"], "prices": np.zeros(3), "deviation": 0.01, "root": 0.0},
+        ),
+        (v["point"].plan, {"theta": {"price": 1.0}, "x0": [1.0], "solver": "ipopt", "mu": 1e-9}),
+        (
+            optimal_control_fit.fit_optimal_control,
+            {
+                "problem": v["point"],
+                "recordings": [v["point"].recorded_plan(np.ones((3, 1)), np.ones((2, 1)))],
+                "start": {"price": 1.0},
+                "evaluations": 3,
+                "starts": 1,
+            },
+        ),
         changed(v["plant"]),
         changed(v["bounds"]),
         (weights.Weights, {"Q": states, "R": states}),

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy.special
 
-from impc.arrays import Array, Frozen, finite_array, frozen
+from impc.arrays import Array, Frozen, finite_array, frozen, with_shape
 from impc.assess.covariance import GainCovariance, by_trial, gain_covariance
 from impc.assess.input_limits import on_limit
 from impc.assess.intervals import LEVEL
@@ -146,8 +146,9 @@ def expected_intervals(
     structure, p = problem.structure, len(problem.plant.outputs)
     if structure is None:
         raise InputError("structure", "the problem has none", "give Problem(..., structure=...)")
-    size = np.broadcast_to(np.asarray(deviation, dtype=np.float64), p)
-    if not np.all(np.isfinite(size) & (size > 0)):
+    given = np.asarray(deviation, dtype=np.float64)
+    size = np.full(p, given) if given.ndim == 0 else with_shape("deviation", given, (p,))
+    if not np.all((size > 1e-50) & (size < 1e50)):
         raise InputError("deviation", f"got {size}", "give a positive noise for each output")
     if not 0 <= root <= _LARGEST_ROOT:
         raise InputError("root", f"got {root:g}", f"give 0 or more, at most {_LARGEST_ROOT}")

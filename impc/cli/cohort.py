@@ -50,6 +50,7 @@ def command(
     at any time: what is done is kept, and the same command goes on from there.
     """
     # Imported here: the libraries take seconds to load, and --help needs none.
+    from impc.files.reading import require_distinct  # noqa: PLC0415
     from impc.studies.cohort.report import write_report  # noqa: PLC0415
     from impc.studies.cohort.store import Store  # noqa: PLC0415
     from impc.studies.cohort.study import read_study  # noqa: PLC0415
@@ -57,6 +58,7 @@ def command(
     from impc.studies.fit.settings import fit_settings, require_used  # noqa: PLC0415
 
     study = read_study(study_file)
+    require_distinct([file for unit in study.units for file in unit.files])
     require_used(fit_settings(study.configuration.fit), _USED, "cohort")
     source = named_plant(study_file, study, plant_name, allowed)
     study = replace(study, plant=source.name)

@@ -85,7 +85,7 @@ def _check(file: Path, config: Path, plant_name: str | None) -> None:
     if plant_name is None:
         raise InputError("--config", "is given without --plant", "name the plant")
     configuration = read_configuration(config)
-    plant = make_plant(find_plant(plant_name, configuration.plant), tuple(configuration.signals))
+    plant = make_plant(find_plant(plant_name, configuration.plant), configuration.recorded)
     (trial,) = read_recordings([file], configuration, plant)
     click.echo(f"{trial.label}: {trial.samples} samples at {1 / plant.dt:g} per second")
     for finding in trial.findings or ("Nothing was found.",):

@@ -13,6 +13,7 @@ import click
 from impc.cli.ending import ended, interruptions, own_process
 from impc.cli.exit_status import ExitStatus
 from impc.jit import keep_caches
+from impc.settings_files import ignore_settings_files
 
 __all__ = ["main"]
 
@@ -62,6 +63,7 @@ class _Program(click.Group):
         # took a fifth of the drawing, and a twentieth of `impc fit`.
         gc.set_threshold(50_000)
         with own_process():
+            ignore_settings_files("matplotlib", "numba")
             note = keep_caches()
             status = ended(work)
             if note and status == ExitStatus.DONE and "numba" in sys.modules:

@@ -90,7 +90,7 @@ def _person(
         presumed_prices,
     )
 
-    recorded = tuple(settings.perturbed or configuration.signals)
+    recorded = tuple(settings.perturbed or configuration.recorded)
     family = plant_family_of(source, recorded, fit.free)
     plant, family = moving_body(make_plant(source, recorded), family, fit)
     if not plant.disturbances:
@@ -126,7 +126,12 @@ def _perturbation(
     from impc.files.reading import disturbances_of  # noqa: PLC0415
 
     if files:
-        found = [disturbances_of(read_table(path), configuration, plant) for path in files]
+        found = [
+            disturbances_of(
+                read_table(path, sheet=configuration.recording.sheet), configuration, plant
+            )
+            for path in files
+        ]
         return lambda amplitude, _dwell, number: amplitude * found[number % len(found)]
     torque: Any = import_function(TORQUE)
 

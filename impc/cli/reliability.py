@@ -41,6 +41,7 @@ def command(study_file: Path, plant_name: str | None, allowed: bool, out: Path, 
     The study file is that of `impc cohort`.
     """
     from impc.files.inputs import study_inputs  # noqa: PLC0415
+    from impc.files.reading import require_distinct  # noqa: PLC0415
     from impc.reporting.shown_units import angles_in  # noqa: PLC0415
     from impc.reporting.writer import write_files  # noqa: PLC0415
     from impc.studies.cohort.study import read_study  # noqa: PLC0415
@@ -49,6 +50,7 @@ def command(study_file: Path, plant_name: str | None, allowed: bool, out: Path, 
     from impc.studies.reliability.report import reliability_report  # noqa: PLC0415
 
     study = read_study(study_file)
+    require_distinct([file for unit in study.units for file in unit.files])
     source = named_plant(study_file, study, plant_name, allowed)
     units = [replace(unit, files=unit.files[-last:]) for unit in study.units]
     trials = _trials(units, study.configuration, source)
@@ -71,7 +73,7 @@ def _trials(units: Sequence[Unit], configuration: Configuration, source: PlantSo
     from impc.studies.reliability.analysis import Trials  # noqa: PLC0415
 
     cells = {}
-    recorded = tuple(configuration.signals)
+    recorded = configuration.recorded
     plant = make_plant(source, recorded)
     for unit in tqdm(units, unit="visit", file=sys.stderr, disable=None, leave=False):
         found = read_recordings(unit.files, configuration, plant)

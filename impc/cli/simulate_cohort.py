@@ -32,7 +32,8 @@ _RATE = 100.0
 _WITHIN = 10
 # Of the angles, degrees: what a recorder of 0.1 degrees at 1000 samples a second leaves at 100.
 _NOISE = 0.03
-_STOP = "limit = 12.0\n"
+_STOP = 12.0  # deg
+_LIMIT = f"limit = {_STOP}\n"
 # Spread of the prices between subjects, and of one subject between visits: of their logarithm.
 _BETWEEN, _AGAIN = 0.2, 0.05
 
@@ -76,7 +77,9 @@ def cohort(out: Path, **given: Any) -> None:
     import numpy as np  # noqa: PLC0415
 
     from impc.reporting.writer import require_writable, write_files  # noqa: PLC0415
+    from impc.studies.fit.settings import fit_settings  # noqa: PLC0415
 
+    fit_settings({"replicates": given["replicates"]})  # what `impc cohort` would refuse
     require_writable(out)
     rng = np.random.default_rng(given["seed"])
     rows = ["participant_id\tgroup\tmass\theight\tsex"]
@@ -91,8 +94,11 @@ def cohort(out: Path, **given: Any) -> None:
         truth[name] = {"group": group, "gain": {}}
         for visit in range(1, given["visits"] + 1):
             price = factor * float(np.exp(_AGAIN * rng.standard_normal()))
-            files, gain = _visit(name, visit, person, price, given, rng)
+            files, gain, falls = _visit(name, visit, person, price, given, rng)
             truth[name]["gain"][str(visit)] = gain
+            truth[name].setdefault("fell", {}).update(falls)
+            for file, when in falls.items():
+                click.echo(f"{file}: the subject fell at {when:.2f} s")
             write_files(out / f"sub-{name}" / f"ses-{visit}", files)
     texts = {
         "participants.tsv": "\n".join(rows) + "\n",
@@ -111,8 +117,8 @@ def _visit(
     price: float,
     given: dict[str, Any],
     rng: np.random.Generator,
-) -> tuple[dict[str, bytes], list[list[float]]]:
-    """All trials of a visit as files, and the gain behind them."""
+) -> tuple[dict[str, bytes], list[list[float]], dict[str, float]]:
+    """All trials of a visit as files, the gain behind them, and when the subject fell in which."""
     import numpy as np  # noqa: PLC0415
 
     from impc.files.formats import encode_table  # noqa: PLC0415
@@ -122,7 +128,7 @@ def _visit(
     controller = seat_controller(person, given["torque_limit"], price)
     step = plant_source(STEP, person | {"sample_time": 1 / (_WITHIN * _RATE)})
     make, torque = step.make(**step.arguments), import_function(TORQUE)
-    files = {}
+    files, falls = {}, {}
     for run in range(1, given["trials"] + 1):
         pushed = torque(duration=given["duration"], rate=_RATE, seed=int(rng.integers(2**31)))
         # Held: a recording on the controller's own clock is read as it stands.
@@ -138,7 +144,10 @@ def _visit(
         file = f"sub-{name}_ses-{visit}_task-seat_run-{run}_motion"
         table = seat_table(file, np.degrees(trial.outputs[::_WITHIN]), pushed, _RATE)
         files[f"{file}.csv"] = encode_table(".csv", table)
-    return files, np.array(controller.K).tolist()
+        beyond = np.abs(trial.outputs[:, 0]) > np.radians(_STOP)
+        if beyond.any():  # the stop that study.toml names: the seat is on the floor
+            falls[file] = float(trial.time[np.argmax(beyond)])
+    return files, np.array(controller.K).tolist(), falls
 
 
 def _study(given: dict[str, Any]) -> str:
@@ -152,7 +161,7 @@ participants = "participants.tsv"
 [recording]
 time = "time"
 
-{SIGNALS.replace("LIMIT", _STOP)}
+{SIGNALS.replace("LIMIT", _LIMIT)}
 [fit]
 horizon = {HORIZON}                     # samples of 0.01 s
 u_max = {given["torque_limit"]}                      # N m

@@ -96,7 +96,7 @@ def read_subject(
     if solver is not None:
         settings = replace(settings, solver=require_solver(solver))
     source = find_plant(plant_name, configuration.plant)
-    recorded = tuple(configuration.signals)
+    recorded = configuration.recorded
     plant = make_plant(source, recorded)
     family = plant_family_of(source, recorded, settings.free)
     recordings = read_recordings(files, configuration, plant)

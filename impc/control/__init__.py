@@ -1,1 +1,9 @@
 """The constrained controller: its rows, its closed loop and the derivatives of both."""
+
+from __future__ import annotations
+
+from impc.settings_files import ignore_settings_files
+
+# Before a module of this package imports numba: by a settings file it would take compiled code from
+# the working folder.
+ignore_settings_files("numba")

@@ -18,6 +18,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from impc.arrays import Array, IntArray
+from impc.checking import checked
+from impc.errors import DataError, InputError
 from impc.model.bounds import bound_rows
 
 if TYPE_CHECKING:
@@ -120,6 +122,7 @@ class Directions:
         return self.x0.shape[1]
 
 
+@checked(count=(0, 1_000_000))
 def directions(controller: Controller, count: int, **given: Array) -> Directions:
     """Return `count` directions with the given parts; those not given are zero.
 
@@ -129,6 +132,11 @@ def directions(controller: Controller, count: int, **given: Array) -> Directions
         Number of directions p.
     **given : Array
         Fields of `Directions` by name, in any layout that reshapes to theirs: K to (m, n, p).
+
+    Raises
+    ------
+    InputError, DataError
+        When a part is of another name or size.
 
     Examples
     --------
@@ -154,6 +162,11 @@ def directions(controller: Controller, count: int, **given: Array) -> Directions
     }
     parts = {name: np.zeros((*shape, count)) for name, shape in shapes.items()}
     for name, values in given.items():
+        if name not in shapes:
+            raise InputError(name, "is no part of a direction", f"give some of {', '.join(shapes)}")
+        if values.size != parts[name].size:
+            problem = f"expected {parts[name].shape}, got {values.shape}"
+            raise DataError(name, problem, "give a part for each direction")
         parts[name] = np.ascontiguousarray(values).reshape(*shapes[name], count)
     return Directions(**parts, bodies=())
 

@@ -30,6 +30,9 @@ __all__ = [
 ]
 
 
+_COMPARISONS = (ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE, ca.OP_NOT, ca.OP_AND, ca.OP_OR)
+
+
 def with_values(function: Any, free: list[int], values: Array) -> Any:
     """A function of (x, u, d, theta) as one of the free entries of theta.
 
@@ -109,15 +112,29 @@ def names_of(symbols: Iterable[Any]) -> tuple[str, ...]:
 
 
 def stacked(given: Mapping[str, Any]) -> tuple[Any, tuple[str, ...]]:
-    """The expressions of `given` below each other, by name, and a name for each row."""
+    """The expressions of `given` below each other, by name, and a name for each row.
+
+    Raises
+    ------
+    InputError
+        When one is a comparison.
+    """
     parts: list[Any] = []
     names: list[str] = []
     for name, expression in given.items():
+        items = expression.elements() if isinstance(expression, ca.SX) else [expression]
+        if any(isinstance(item, ca.SX | ca.MX) and _compares(item) for item in items):
+            remedy = "write what must not exceed 0: u - 1 for u <= 1"
+            raise InputError(f"constraint {name}", "is a comparison", remedy)
         part = ca.vec(expression) if isinstance(expression, ca.SX | ca.MX) else ca.DM(expression)
         parts.append(part)
         size = part.numel()
         names += [name] if size == 1 else [f"{name}[{row}]" for row in range(size)]
     return (ca.vertcat(*parts) if parts else ca.DM.zeros(0, 1)), tuple(names)
+
+
+def _compares(item: Any) -> bool:
+    return any(item.is_op(kind) for kind in _COMPARISONS)
 
 
 def function_of(

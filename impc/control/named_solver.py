@@ -28,6 +28,7 @@ import scipy.optimize
 from impc.arrays import Array, BoolArray, IntArray
 from impc.control.compiled_dual import DEPENDENT
 from impc.errors import InputError
+from impc.settings_files import IPOPT_ALONE
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -53,8 +54,7 @@ _IPOPT: dict[str, Any] = {
     "print_time": False,
     "error_on_fail": False,
     "ipopt": {
-        "print_level": 0,
-        "sb": "yes",
+        **IPOPT_ALONE,
         "tol": 1e-12,
         "compl_inf_tol": 1e-12,
         "constr_viol_tol": 1e-12,

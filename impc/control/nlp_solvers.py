@@ -17,6 +17,7 @@ import numpy as np
 from impc.arrays import Array, BoolArray
 from impc.control.relaxed_conditions import Point, wanted_rows
 from impc.errors import InputError
+from impc.settings_files import IPOPT_ALONE
 
 if TYPE_CHECKING:
     from impc.control.optimal_control import OptimalControlProblem
@@ -47,7 +48,7 @@ def require_solver(name: str) -> str:
 def _options(name: str, problem: OptimalControlProblem, mu: float) -> dict[str, Any]:
     if name == "ipopt":
         return _SILENT | {"ipopt": {
-            "print_level": 0, "sb": "yes", "max_iter": 300, "tol": 1e-8, "mu_target": mu,
+            **IPOPT_ALONE, "max_iter": 300, "tol": 1e-8, "mu_target": mu,
             # mu means the same as in the conditions only if IPOPT scales and relaxes nothing.
             "nlp_scaling_method": "none", "bound_relax_factor": 0.0,
         }}  # fmt: skip
@@ -182,8 +183,8 @@ def worst_row(
         "x": ca.vertcat(program["x"], excess), "p": program["p"], "f": ca.sum1(excess),
         "g": program["g"] - ca.mtimes(ca.DM(placed), excess),
     }  # fmt: skip
-    silent = {"print_level": 0, "sb": "yes", "max_iter": 500}
-    solver = ca.nlpsol("worst", "ipopt", soft, _SILENT | {"ipopt": silent})
+    ipopt = IPOPT_ALONE | {"max_iter": 500}
+    solver = ca.nlpsol("worst", "ipopt", soft, _SILENT | {"ipopt": ipopt})
     guess = np.r_[np.hstack([x[:-1], u]).ravel(), x[-1]]
     answer = solver(
         x0=np.r_[guess, np.ones(excess.numel())], p=np.r_[x[0], d.ravel(), theta],

@@ -19,6 +19,7 @@ import numpy as np
 from impc.arrays import Array
 from impc.control.simulation import Simulation, Status
 from impc.model.riccati import solve_lqr
+from impc.settings_files import IPOPT_ALONE
 
 if TYPE_CHECKING:
     from impc.control.simulation import Scenario
@@ -33,8 +34,7 @@ _OPTIONS: dict[str, Any] = {
     "print_time": False,
     "error_on_fail": False,
     "ipopt": {
-        "print_level": 0,
-        "sb": "yes",
+        **IPOPT_ALONE,
         "tol": 1e-9,
         "bound_relax_factor": 0.0,
         "warm_start_init_point": "yes",

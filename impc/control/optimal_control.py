@@ -18,6 +18,7 @@ import casadi as ca
 import numpy as np
 
 from impc.arrays import Array, BoolArray, Frozen, finite_array
+from impc.checking import checked
 from impc.control.expressions import (
     function_of,
     names_of,
@@ -139,6 +140,7 @@ class OptimalControlProblem(Frozen):
     dt: float | None
     functions: tuple[Any, ...]
 
+    @checked
     def __init__(
         self,
         states: Any,
@@ -225,6 +227,7 @@ class OptimalControlProblem(Frozen):
         _require_horizon(horizon)
         return self._changed(horizon=int(horizon))
 
+    @checked
     def with_known(self, known: Mapping[str, float]) -> OptimalControlProblem:
         """The same problem with the values of some parameters `known` by name: the others are left.
 
@@ -251,6 +254,7 @@ class OptimalControlProblem(Frozen):
             object.__setattr__(made, name, value)
         return made
 
+    @checked
     def values(self, theta: Mapping[str, float]) -> Array:
         """Values of the parameters (p,) in their order, from `theta`, values by name.
 
@@ -286,6 +290,7 @@ class OptimalControlProblem(Frozen):
         """
         return finite_array("x0", x0, (self.n,))
 
+    @checked
     def plan(
         self, theta: Mapping[str, float], x0: Any, *, solver: str = "ipopt", mu: float = 1e-10
     ) -> Plan:
@@ -311,6 +316,7 @@ class OptimalControlProblem(Frozen):
 
         return solve_plan(self, self.values(theta), self.start(x0), solver=solver, mu=mu)
 
+    @checked
     def closed_loop(
         self,
         theta: Mapping[str, float],

@@ -36,12 +36,7 @@ _SHORTEST = 400  # samples below which a missing connection says nothing
 def misaligned(disturbance: Array, response: Array, dt: float) -> str:
     """What is wrong with the order of cause and effect, as the end of a sentence; or nothing.
 
-    Parameters
-    ----------
-    disturbance, response : Array
-        (samples,), on the plant's clock.
-    dt : float
-        s.
+    The `disturbance` (samples,) and the `response` (samples,) are on the plant's clock of `dt` s.
     """
     width = max(1, round(1 / (_RATE * dt)))
     step = width * dt

@@ -61,17 +61,10 @@ _ENVIRONMENT = {
 }
 
 
-def read_apart(kind: str, path: Path, largest: int) -> Table:
-    """Read a file in a process of its own.
+def read_apart(kind: str, path: Path, largest: int, sheet: str = "") -> Table:
+    """Read the file at `path` in a process of its own: `kind` is a key of `READERS`.
 
-    Parameters
-    ----------
-    kind : str
-        A key of `impc.files.reader_process.READERS`.
-    path : Path
-        Of the file.
-    largest : int
-        The most bytes that its arrays may take.
+    Its arrays take `largest` bytes at most; `sheet` is that of a workbook, where one is asked for.
 
     Raises
     ------
@@ -80,7 +73,8 @@ def read_apart(kind: str, path: Path, largest: int) -> Table:
         too long, or ended the process.
     """
     source = str(path)
-    reply, columns = _asked(_request(kind, path, largest))
+    named = {"sheet": sheet} if sheet else {}
+    reply, columns = _asked(_request(kind, path, largest) | {"more": named})
     if "refused" in reply:
         raise DataError(*reply["refused"])
     told = reply["table"]
@@ -90,23 +84,14 @@ def read_apart(kind: str, path: Path, largest: int) -> Table:
         told["units"],
         told["rate"],
         told["skipped"],
+        tuple(told["notes"]),
     )
 
 
 def matrices_apart(path: Path, largest: int) -> dict[str, Any]:
-    """What a .mat file of version 5 to 7 holds of a saved plant, by name.
+    """What a .mat file of version 5 to 7 at `path` holds of a saved plant, by name.
 
-    Parameters
-    ----------
-    path : Path
-        Of the file.
-    largest : int
-        The most bytes that its arrays may take.
-
-    Returns
-    -------
-    dict of str to object
-        Arrays of real numbers, (rows, columns) or more, and lists of text.
+    Real arrays, (rows, columns) or more, of `largest` bytes at most, and lists of text.
 
     Raises
     ------
@@ -125,14 +110,9 @@ def matrices_apart(path: Path, largest: int) -> dict[str, Any]:
 
 
 def cells_apart(path: Path, largest: int) -> list[list[str]]:
-    """The rows of the first sheet of a workbook, cells as texts.
+    """The rows of the first sheet of the workbook at `path`, cells as texts.
 
-    Parameters
-    ----------
-    path : Path
-        Of the file, .xlsx or .ods.
-    largest : int
-        The most bytes that it may unpack to.
+    It may unpack to `largest` bytes.
 
     Raises
     ------
@@ -147,16 +127,10 @@ def cells_apart(path: Path, largest: int) -> list[list[str]]:
 
 
 def match_apart(subject: str, pattern: str, text: str) -> dict[str, str | None] | None:
-    """The named groups of a regular expression that matches a whole text; None when it does not.
+    """The named groups of a `pattern` that matches a whole `text`; None when it does not.
 
-    Parameters
-    ----------
-    subject : str
-        Whose pattern it is, for the message.
-    pattern : str
-        Of a user: some, such as ``(a+)+x``, take longer than anybody lives.
-    text : str
-        To be matched.
+    Some patterns of users, such as ``(a+)+x``, take longer than anybody lives; `subject` is for the
+    message.
 
     Raises
     ------

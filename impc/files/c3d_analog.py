@@ -23,14 +23,9 @@ __all__ = ["encode_c3d", "read_c3d"]
 
 
 def read_c3d(path: Path, largest: int) -> Table:
-    """Read the analog channels of a file, with their units and rate.
+    """Read the analog channels of the file at `path`, with their units and rate.
 
-    Parameters
-    ----------
-    path : Path
-        Of the file.
-    largest : int
-        The most bytes that its arrays may take.
+    Its arrays take `largest` bytes at most.
 
     Raises
     ------

@@ -7,33 +7,44 @@ column, how many samples, and where the first is.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.errors import DataError
+from impc.errors import DataError, FallError
 
 if TYPE_CHECKING:
     from impc.arrays import Array, BoolArray
     from impc.files.units import Unit
 
 __all__ = [
+    "FELL",
     "Channel",
     "beyond_the_stop",
     "clipped",
     "constant",
     "degrees_for_radians",
     "missing",
+    "stretches",
     "too_few",
     "unit_of_the_file",
 ]
 
+#: How the message of a fall begins.
+FELL = "the subject fell"
 # Share of samples that rest on an extreme value: above the first a finding, above the second no
 # use. A sinusoid in coarse steps rests on its extremes too, but at most 2.4 times as long as on the
 # next step (square roots of 2 and 4 steps); so three times is asked for.
 _CLIPPED, _TOO_CLIPPED = 0.01, 0.05
 _NEXT = 3.0
+# A response stands still where it keeps a value so many times longer than anywhere else, for so
+# many samples at least, and in so many places at most.
+_LONGER, _STILL, _EPISODES = 4, 10, 20
+# A jump is so many times the usual step, and is no accident when it leads to one value so often.
+_JUMP, _AGAIN = 6, 3
+_BALANCED = 0.05  # share of a trial before a fall
 # Largest deviations of an angle, rad: more than half a turn is no posture; 0.2 deg is the size of
 # 11.5 deg that were recorded in rad and called deg.
 _TURN, _WIDE, _TINY = np.pi, 1.0, np.deg2rad(0.2)
@@ -71,8 +82,10 @@ class Channel:
         return f"sample {index + 1} ({self.time[index]:.6g} s)"
 
 
-def unit_of_the_file(channel: Channel, told: Unit | None) -> str:
-    """The unit that the file tells must be the one that the configuration gives.
+def unit_of_the_file(channel: Channel, told: Unit | None, overruled: bool) -> str:
+    """The unit that the file gives must be that of the configuration, unless it is overruled.
+
+    A file that says "1" gives none.
 
     Raises
     ------
@@ -83,21 +96,21 @@ def unit_of_the_file(channel: Channel, told: Unit | None) -> str:
         told.base == channel.unit.base and np.isclose(told.factor, channel.unit.factor)
     ):
         return ""
+    key = f"signals.{channel.signal}"
+    if overruled or (told.base == "dimensionless" and told.factor == 1):
+        return (
+            f"{channel.name}: taken in {channel.unit.written!r} by {key}, where the file says "
+            f"{told.written!r}"
+        )
     raise DataError(
         channel.name,
         f"is in {channel.unit.written!r} by the configuration and in {told.written!r} by the file",
-        f"correct signals.{channel.signal}.unit, or the column's unit in the file",
+        f"correct {key}.unit, or write {key}.overrule_unit = true if the file is wrong",
     )
 
 
 def missing(channel: Channel, fill_gaps: float) -> str:
-    """Samples that are missing or not finite; short runs may be filled.
-
-    Parameters
-    ----------
-    channel : Channel
-    fill_gaps : float
-        s; the longest time between two finite samples that may be bridged.
+    """Samples of a `channel` that are missing or not finite; `fill_gaps`, in s, may be bridged.
 
     Raises
     ------
@@ -169,9 +182,44 @@ def clipped(channel: Channel) -> str:
             f"{len(resting)} samples, the first {channel.at(first)}"
         )
         if share > _TOO_CLIPPED:
-            raise DataError(channel.name, found, "record with a wider range")
+            raise _fault(channel, abs(extreme), found, "record with a wider range")
         return f"{channel.name} {found}"
     return ""
+
+
+def stretches(channel: Channel) -> str:
+    """A response that stands still within its range, or jumps to one value and back."""
+    values, finite = channel.values, np.isfinite(channel.values)
+    steps = np.abs(np.diff(values))
+    ends = np.flatnonzero(~(steps == 0)) + 1
+    starts, ends = np.append(0, ends), np.append(ends, len(values))
+    ends_of_range = (np.nanmin(values), np.nanmax(values))  # where it is clipped
+    extreme = np.isin(values[starts], ends_of_range)
+    lengths = np.where(extreme, 1, ends - starts)
+    sizes = np.sort(lengths)[::-1]
+    gaps = np.flatnonzero(sizes[:-1] >= _LONGER * sizes[1:])[:1]
+    if len(gaps) and gaps[0] < _EPISODES and sizes[gaps[0]] >= _STILL:
+        still = lengths >= sizes[gaps[0]]
+        first, often = int(starts[np.argmax(still)]), "time" if still.sum() == 1 else "times"
+        return (
+            f"{channel.name} stands still {still.sum()} {often}, {lengths[still].sum()} samples "
+            f"in all, the first at {values[first]:.6g} {channel.unit.written} from "
+            f"{channel.at(first)}: did the sensor fail? cut it with recording.start and stop"
+        )
+    moves = steps[np.isfinite(steps) & (steps > 0)]
+    inside = (starts > 0) & (ends < len(values)) & finite[starts]
+    into, out = steps[starts[inside] - 1], steps[ends[inside] - 1]
+    jumps = np.minimum(into, out) > _JUMP * np.median(moves)
+    found, times = np.unique(values[starts[inside][jumps]], return_counts=True)
+    if len(found) == 0 or times.max() < _AGAIN:
+        return ""
+    value = found[np.argmax(times)]
+    lost = values == value
+    return (
+        f"{channel.name} jumps to {value:.6g} {channel.unit.written} and back {times.max()} times, "
+        f"in {lost.sum()} samples, the first {channel.at(int(np.argmax(lost)))}: samples that were "
+        "lost? leave them empty in the file, and allow recording.fill_gaps"
+    )
 
 
 def beyond_the_stop(channel: Channel, limit: float) -> str:
@@ -186,8 +234,9 @@ def beyond_the_stop(channel: Channel, limit: float) -> str:
     if not beyond.any():
         return ""
     largest = float(np.nanmax(np.abs(channel.values)))
-    raise DataError(
-        channel.name,
+    raise _fault(
+        channel,
+        limit,
         f"is beyond its stop of {limit:g} {channel.unit.written} in {beyond.sum()} of "
         f"{len(beyond)} samples, the first {channel.at(int(np.argmax(beyond)))}, "
         f"at most {largest:.4g}",
@@ -210,8 +259,9 @@ def degrees_for_radians(channel: Channel) -> str:
     written = channel.unit.written
     where = channel.at(int(np.nanargmax(np.abs(channel.values))))
     if span > _TURN:
-        raise DataError(
-            channel.name,
+        raise _fault(
+            channel,
+            _TURN / 2 / channel.unit.factor,
             f"spans {span / channel.unit.factor:.4g} {written}, more than half a turn, largest in "
             f"{where}",
             "the column is in smaller units: degrees taken for radians?",
@@ -228,6 +278,21 @@ def degrees_for_radians(channel: Channel) -> str:
             f"({np.rad2deg(span):.0f} degrees), largest in {where}: check its unit"
         )
     return ""
+
+
+def _fault(channel: Channel, beyond: float, problem: str, remedy: str) -> DataError:
+    """A fall, where the response goes `beyond` a value once and stays there; else the problem."""
+    size = np.abs(channel.values)
+    first = int(np.argmax(size >= beyond))
+    if first < _BALANCED * len(size) or np.any(size[first:] < beyond / 2):
+        return DataError(channel.name, problem, remedy)
+    usual = min(beyond / 2, 2 * float(np.nanquantile(size[:first], 0.9)))
+    when = float(channel.time[np.flatnonzero(~(size[:first] > usual))[-1]])
+    return FallError(
+        channel.name,
+        f"{FELL} at {when:.4g} s",
+        f"leave the trial out, or cut it with recording.stop = {math.floor(10 * when) / 10:g}",
+    )
 
 
 def too_few(source: str, samples: int, needed: int) -> str:

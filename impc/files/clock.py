@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy.interpolate
 
-from impc.errors import DataError
+from impc.checking import replace
+from impc.errors import DataError, InputError
 from impc.files import measurable
 from impc.files.units import si_unit
 
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     from impc.files.configuration import RecordingTable
     from impc.files.table import Table
 
-__all__ = ["Clock", "column_of", "on_even_instants", "read_clock"]
+__all__ = ["Clock", "column_of", "counts_days", "on_even_instants", "read_clock"]
 
 # An interval this many periods long has lost a sample.
 _GAP = 1.5
@@ -43,6 +44,8 @@ class Clock:
         s; the even instants are start + k period.
     findings : tuple of str
         Gaps and jitter that were let pass.
+    note : str
+        How its numbers were read, where nothing says it; empty otherwise.
     """
 
     time: Array
@@ -51,6 +54,7 @@ class Clock:
     start: float
     period: float
     findings: tuple[str, ...] = ()
+    note: str = ""
 
     @property
     def even(self) -> bool:
@@ -76,33 +80,36 @@ def read_clock(table: Table, recording: RecordingTable) -> Clock:
         return Clock(time[rows], rows, steps, float(time[rows.start]), 1 / rate)
     name, values = column_of(table, recording.time, "recording.time")
     subject = f"{table.source}: clock {name!r}"
-    unit = si_unit(recording.time_unit or table.units.get(name) or "s")
+    days = not recording.time_unit and name not in table.units and counts_days(values)
+    told = recording.time_unit or table.units.get(name) or ("day" if days else "s")
+    try:
+        unit = si_unit(told)
+    except InputError as error:
+        remedy = 'write recording.time_unit = "s" or "ms"'
+        raise DataError(subject, f"is in {error.subject}, which {error.problem}", remedy) from None
     if unit.base != "second":
         raise DataError(subject, f"has the unit {unit.written!r}", 'write time_unit = "s" or "ms"')
     _require_rising(subject, values)
     time = values * unit.factor
     measurable.times_of_a_recording(subject, time)
     rows = _cut(table.source, time, recording)
-    return _measured(subject, time[rows], rows, recording.fill_gaps)
+    note = f"{subject}: read as day numbers of a spreadsheet" if days else ""
+    return replace(_measured(subject, time[rows], rows, recording.fill_gaps), note=note)
+
+
+def counts_days(values: Array) -> bool:
+    """Whether a clock without a unit, `values` (samples,), has day numbers of Excel or MATLAB.
+
+    Days since 1900 or the year 0; as seconds the recording would last less than a tenth of one.
+    """
+    first, last = float(values[0]), float(values[-1])
+    return (2e4 < first < 1e5 or 6e5 < first < 9e5) and 0 < last - first < 0.1
 
 
 def column_of(table: Table, name: str, place: str) -> tuple[str, Array]:
-    """A column by its name, with or without the unit that stands behind it in the heading.
+    """A column by its `name`, with or without the unit behind it: its name in the file, its values.
 
-    Parameters
-    ----------
-    table : Table
-    name : str
-        Of the column.
-    place : str
-        Key of the configuration that gives it, for the message.
-
-    Returns
-    -------
-    name : str
-        As the file has it.
-    values : Array
-        (samples,).
+    The values are (samples,); `place` is the key of the configuration that gives the name.
 
     Raises
     ------
@@ -131,19 +138,10 @@ def column_of(table: Table, name: str, place: str) -> tuple[str, Array]:
 
 
 def on_even_instants(clock: Clock, values: Array) -> Array:
-    """Values at start + k period; Akima's interpolation where samples are missing or late.
+    """The `values` (samples,) at start + k period (instants,), of which there are steps[-1] + 1.
 
-    Parameters
-    ----------
-    clock : Clock
-    values : Array
-        (samples,), NaN where a sample is to be filled; the first and the last are finite.
-
-    Returns
-    -------
-    Array
-        (instants,), of which there are steps[-1] + 1. The values themselves where the clock is
-        even and all are finite.
+    Akima's interpolation where samples are missing, NaN, or late; the values themselves where the
+    clock is even and all are finite. The first and the last are.
     """
     finite = np.isfinite(values)
     if clock.even and finite.all():

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import os
 import re
 import tomllib
 import warnings
@@ -17,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import msgspec
 
+from impc.checking import checked
 from impc.errors import InputError, brief
 from impc.files.names import require_ordinary
 from impc.files.units import si_unit
@@ -37,6 +39,8 @@ __all__ = [
 FILL_IN = "?"
 
 _LARGEST = 1_000_000
+_DEEPEST = 16  # tables within tables
+_DOTTED = re.compile(rf"""(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){{{_DEEPEST}}}""")
 _LABELS = ("subject", "visit", "condition", "trial")
 _TABLES = ("recording", "signals", "plant", "fit", "plan", "report")
 _STUDY = ("study", "model", "select")
@@ -62,6 +66,8 @@ class RecordingTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         Seconds; the longest gap that may be filled by interpolation. 0 fills none.
     start, stop : float or None
         Seconds on the file's clock, which begins at 0 where there is only a rate.
+    sheet : str
+        Of a workbook; empty for the first one with rows of numbers.
     """
 
     time: str | None = None
@@ -75,6 +81,7 @@ class RecordingTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     fill_gaps: float = 0.0
     start: float | None = None
     stop: float | None = None
+    sheet: str = ""
 
 
 class SignalTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -92,6 +99,12 @@ class SignalTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         In this unit.
     sign : int
         1 or -1.
+    overrule_unit : bool
+        Whether `unit` counts where the file gives another one.
+    shift : int or float
+        By how much the signal is moved later: a whole number of samples, or seconds with a point.
+    command : bool
+        Whether it is a command of the subject that was recorded, and not a disturbance.
     """
 
     column: str
@@ -99,6 +112,9 @@ class SignalTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     limit: float | None = None
     offset: float = 0.0
     sign: Literal[1, -1] = 1
+    overrule_unit: bool = False
+    shift: int | float = 0
+    command: bool = False
 
 
 class ReportTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -142,7 +158,13 @@ class Configuration(msgspec.Struct, frozen=True):
     select: dict[str, Any] = {}
     report: ReportTable = ReportTable()
 
+    @property
+    def recorded(self) -> tuple[str, ...]:
+        """The signals that are no commands: what is recorded of the plant."""
+        return tuple(name for name, entry in self.signals.items() if not entry.command)
 
+
+@checked
 def read_configuration(path: Path | str, *more: str) -> Configuration:
     r"""Read the configuration at `path`; `more` names tables that it may have besides.
 
@@ -197,11 +219,16 @@ _Struct = TypeVar("_Struct", bound=msgspec.Struct)
 
 
 def _parsed(source: str, path: Path) -> dict[str, Any]:
-    if not path.exists() and not path.is_symlink():
+    if not os.path.lexists(path):
         raise InputError(source, "does not exist", "`impc inspect FILE --out` writes one")
     require_ordinary(path, _LARGEST, InputError)
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        text = path.read_text(encoding="utf-8-sig")
+        # tomllib keeps every prefix of a dotted key: one of 32 kB takes 1 GB.
+        content = {} if (dotted := _DOTTED.search(text)) else tomllib.loads(text)
+        if dotted or _deeper(content, _DEEPEST):
+            raise RecursionError
+        return content
     except OSError as error:
         reason = error.strerror or type(error).__name__
         raise InputError(source, f"cannot be opened ({reason})", "check the path") from None
@@ -213,6 +240,12 @@ def _parsed(source: str, path: Path) -> dict[str, Any]:
         ) from None
     except RecursionError:
         raise InputError(source, "is nested too deep", "give a plain TOML file") from None
+
+
+def _deeper(value: Any, levels: int) -> bool:
+    """Whether tables and lists are nested more than so many `levels` deep."""
+    items = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+    return levels < 0 or any(_deeper(item, levels - 1) for item in items)
 
 
 def _require_known(source: str, place: str, table: Mapping[str, Any], known: Iterable[str]) -> None:
@@ -288,6 +321,8 @@ def _check_signal(source: str, place: str, table: SignalTable) -> None:
         _unit(source, f"{place}.unit", table.unit)
     if not math.isfinite(table.offset):
         raise InputError(f"{source}: {place}.offset", f"is {table.offset}", "give a number")
+    if not math.isfinite(table.shift):
+        raise InputError(f"{source}: {place}.shift", f"is {table.shift}", "give samples or seconds")
     if table.limit is not None and not (math.isfinite(table.limit) and table.limit > 0):
         raise InputError(
             f"{source}: {place}.limit", f"is {table.limit:g}", "give a magnitude above 0"

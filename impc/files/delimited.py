@@ -1,7 +1,8 @@
 """Delimited text: CSV with comma or semicolon, TSV, columns of blanks; decimal point or comma.
 
-What stands above the first row of numbers may be lines of another width (ignored), the header, and
-a row of units below it. A header may carry its unit: ``angle (deg)`` or ``angle [deg]``.
+Lines above the first row of numbers are titles and settings (ignored), the header, and a row of
+units below it. What stands below the last row of the block is named and not read. The numbers are
+parsed piece by piece: a file takes no more memory than its content and its numbers.
 """
 
 from __future__ import annotations
@@ -15,12 +16,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from impc.errors import DataError
-from impc.files.headings import are_units, named_columns, written_heading
+from impc.files.blocks import EMPTY, HEAD, NUMBER, WORD, Block, first_block
+from impc.files.headings import find_headings, written_heading
+from impc.files.names import LARGEST
 from impc.files.table import make_table
 from impc.files.thousands import require_no_thousands
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
     import pandas as pd
@@ -28,31 +31,96 @@ if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.files.table import Table
 
-__all__ = ["encode_delimited", "is_number", "read_delimited"]
+__all__ = ["encode_delimited", "is_number", "read_delimited", "text_cell"]
 
-_DELIMITERS = {".csv": ",;\t", ".tsv": "\t", ".txt": "\t;, "}
+_DELIMITERS = {".csv": ",;\t", ".lvm": "\t,;", ".txt": "\t;, "}
+_TABS = "\t", "\t "  # .tsv; files of OpenSim, which blanks may divide too
 _NAMES = {",": "commas", ";": "semicolons", "\t": "tabs", " ": "blanks", "|": "bars", ":": "colons"}
-_MISSING = ["", "NaN", "nan", "NAN", "NA", "N/A", "null"]
+# What stands for no number, errors of spreadsheets and of C among it.
+_MISSING = [
+    *("", "NaN", "nan", "NAN", "NA", "N/A", "n/a", "null", "-nan", "-nan(ind)", "nan(ind)"),
+    *("#N/A", "#NV", "#NA", "#DIV/0!", "#VALUE!", "#WERT!", "#NUM!", "#ZAHL!", "#REF!", "#BEZUG!"),
+    *("#NAME?", "#NULL!", "1.#QNAN", "-1.#IND"),
+]
 # Digits are taken once (++): a field of 50 000 of them and a letter is no matter of a minute.
 _NUMBER = re.compile(
     r"[+-]?(\d++[.,]?\d*+|[.,]\d++)(e[+-]?\d++)?|[+-]?inf(inity)?|nan", re.IGNORECASE
 )
 _LONGEST = 50_000  # characters of a line: 2000 columns of 24
-_HEAD = 100  # lines in which the first row of numbers must stand
+# Where a spreadsheet would begin a formula: at the start, or behind what it may take for the end of
+# a cell. A list separator is a semicolon in half of Europe, whether the text is quoted or not.
+_FORMULA = re.compile(r"(^|[;\t\r\n])(?=\s*[=+@\-])")
+_SAMPLE = 3 * HEAD  # lines by which the layout is known
+_PIECE = 100_000  # rows that are parsed at once
 
 
 @dataclass(frozen=True)
-class _Layout:
-    """How the text is laid out: its delimiter, decimal sign, width, and where its numbers begin."""
+class _Text:
+    """The content of a file, lines ended by newlines, and the signs that divide its rows."""
 
-    delimiter: str
-    decimal: str
+    source: str
+    content: bytes
+    encoding: str
+    delimiter: str = ""
+    decimal: str = ""
+
+    def lines(self) -> Iterator[tuple[int, str]]:
+        """The lines that are not empty, with their numbers in the file."""
+        blank = " " if self.delimiter == "\t" else " \t"
+        for number, line in enumerate(io.BytesIO(self.content), 1):
+            text = line.decode(self.encoding, "replace").rstrip("\n")
+            if text.strip(blank):
+                yield number, text
+
+    def fields(self, line: str) -> list[str]:
+        """The fields of a line."""
+        if self.delimiter == "\n":
+            return [line.strip()]
+        if self.delimiter == " ":
+            blanks = csv.reader([line.replace("\t", " ")], delimiter=" ", skipinitialspace=True)
+            return [item for item in next(blanks) if item] if '"' in line else line.split()
+        return [item.strip() for item in next(csv.reader([line], delimiter=self.delimiter))]
+
+    def width(self, line: str) -> int:
+        """Number of its fields."""
+        if '"' in line or self.delimiter == " ":
+            return len(self.fields(line))
+        return line.count(self.delimiter) + 1  # of "\n" none
+
+    def kinds(self, line: str) -> list[int]:
+        """What stands in each of its fields."""
+        return [
+            EMPTY if not item else NUMBER if is_number(item, self.decimal) else WORD
+            for item in self.fields(line)
+        ]
+
+
+@dataclass(frozen=True)
+class _Body:
+    """The rows of numbers: how many lines are above, rows, places of the longest, what is below."""
+
+    start: int
+    rows: int
     width: int
-    first: int
+    rest: str
 
 
-def read_delimited(path: Path) -> Table:
-    """Read the .csv, .tsv or .txt file at `path`.
+@dataclass
+class _Column:
+    """What is found in a column: its numbers, and how often a word, the first with its row."""
+
+    values: Array
+    signs: bool = False  # whether some of its numbers may have a decimal sign
+    words: int = 0
+    word: str = ""
+    row: int = 0
+    truths: bool = False
+
+
+def read_delimited(path: Path, largest: int = LARGEST) -> Table:
+    """Read the text file at `path`, whose ending says which delimiters it may have.
+
+    Its numbers may take `largest` bytes.
 
     Raises
     ------
@@ -61,28 +129,19 @@ def read_delimited(path: Path) -> Table:
         fewer values than the others, or when a column of numbers has text in it.
     """
     source = str(path)
-    lines = _lines(source, path.read_bytes())
-    layout = _layout(source, path.suffix.lower(), [text for _, text in lines[:_HEAD]])
-    body = lines[layout.first :]
-    _require_width(source, body, layout)
-    names, units = _headings(source, lines[: layout.first], layout)
-    frame = _frame(source, body, layout)
-    columns: dict[str, Array] = {}
-    skipped: dict[str, str] = {}
-    floats: dict[int, str] = {}
-    numbers = [number for number, _ in body]
-    for index, name in enumerate(names):
-        if not name and frame[index].isna().all():
-            continue  # the empty column behind a delimiter at the end of each line
-        values = _column(source, name, frame[index], numbers, layout.decimal)
-        if isinstance(values, str):
-            skipped[name] = values
-        else:
-            columns[name or f"column_{index + 1}"] = values
-            if frame[index].dtype.kind == "f":  # in a column of whole numbers no sign stands
-                floats[index] = name
-    _require_no_thousands(source, floats, body, layout)
-    return make_table(source, columns, units, None, skipped)
+    content, encoding = _decoded(source, path.read_bytes())
+    text, block = _divided(_Text(source, content, encoding), path.suffix.lower())
+    body = _body(text, block)
+    if 8 * body.rows * body.width > largest:
+        problem = f"has {body.rows} rows of {body.width} values, more than are read"
+        raise DataError(source, problem, "export only the signals that are needed")
+    columns = _columns(text, body)
+    end = _statistics(text, block, body, columns)
+    if end is not None:
+        body = end
+        columns = _columns(text, body)
+    above = [line for _, (_, line) in zip(range(block.first), text.lines(), strict=False)]
+    return _table(text, body, columns, above)
 
 
 def encode_delimited(table: Table, suffix: str) -> bytes:
@@ -90,83 +149,16 @@ def encode_delimited(table: Table, suffix: str) -> bytes:
     delimiter = "," if suffix == ".csv" else "\t"
     text = io.StringIO()
     writer = csv.writer(text, delimiter=delimiter, lineterminator="\n")
-    writer.writerow(written_heading(name, table.units.get(name)) for name in table.columns)
+    heads = [written_heading(name, table.units.get(name)) for name in table.columns]
+    writer.writerow([text_cell(head) for head in heads])
     columns = [values.tolist() for values in table.columns.values()]
     writer.writerows([repr(value) for value in row] for row in zip(*columns, strict=True))
     return text.getvalue().encode()
 
 
-def _lines(source: str, content: bytes) -> list[tuple[int, str]]:
-    """The lines that are not empty, with their numbers in the file."""
-    if content.startswith((b"\xff\xfe", b"\xfe\xff")):
-        text = content.decode("utf-16", errors="replace")
-    else:
-        try:
-            text = content.decode("utf-8-sig")
-        except UnicodeDecodeError:
-            text = content.decode("latin-1")
-    if "\0" in text:
-        line = text[: text.index("\0")].count("\n") + 1
-        raise DataError(
-            source, f"is not text (a zero byte in line {line})", "export it as CSV again"
-        )
-    split = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
-    lines = [(number, line) for number, line in enumerate(split, 1) if line.strip()]
-    if not lines:
-        raise DataError(source, "is empty", "export it again")
-    long = next(((number, len(line)) for number, line in lines if len(line) > _LONGEST), None)
-    if long is not None:
-        problem = f"line {long[0]} has {long[1]} characters, and {_LONGEST} is the most"
-        raise DataError(source, problem, "export it again, one sample a row")
-    return lines
-
-
-def _layout(source: str, suffix: str, head: Sequence[str]) -> _Layout:
-    """The delimiter and decimal sign with which most fields of the rows are numbers."""
-    best, most = None, 0.5
-    for delimiter in (*_DELIMITERS[suffix], "\n"):
-        for decimal in (".", ","):
-            share, layout = _share_of_numbers(head, delimiter, decimal)
-            if layout is not None and share > most:
-                best, most = layout, share
-    if best is not None:
-        return best
-    others = [mark for mark in _NAMES if mark not in _DELIMITERS[suffix]]
-    between = next((mark for mark in others if _share_of_numbers(head, mark, ".")[0] > 0.9), None)
-    expected = " or ".join(_NAMES[mark] for mark in _DELIMITERS[suffix])
-    if between is None:
-        problem = (
-            f"has no rows of numbers divided by {expected} in the first {len(head)} of its lines"
-        )
-    else:
-        problem = f"is divided by {_NAMES[between]}, and a {suffix} file is by {expected}"
-    raise DataError(source, problem, "export it again, one signal a column")
-
-
-def _share_of_numbers(
-    head: Sequence[str], delimiter: str, decimal: str
-) -> tuple[float, _Layout | None]:
-    """Share of numbers among the fields of the rows, of which the first has at least half."""
-    if decimal == delimiter:
-        return 0.0, None
-    rows = [_fields(line, delimiter) for line in head]
-    kinds = [[not item or is_number(item, decimal) for item in row] for row in rows]
-    alone = 1 if delimiter == "\n" else 2
-    for index, (row, numbers) in enumerate(zip(rows, kinds, strict=True)):
-        some = any(is_number(item, decimal) for item in row)
-        if some and len(row) >= alone and sum(numbers) >= len(row) / 2:
-            below = [kind for line in kinds[index:] for kind in line]
-            share = sum(below) / len(below)
-            return share, _Layout(delimiter, decimal, len(row), index)
-    return 0.0, None
-
-
-def _fields(line: str, delimiter: str) -> list[str]:
-    if delimiter == "\n":
-        return [line.strip()]
-    if delimiter == " ":
-        return line.split()
-    return [item.strip() for item in next(csv.reader([line], delimiter=delimiter))]
+def text_cell(text: str) -> str:
+    """A text of which no spreadsheet makes a formula: an apostrophe stands before its sign."""
+    return _FORMULA.sub(r"\1'", text)
 
 
 def is_number(text: str, decimal: str) -> bool:
@@ -175,107 +167,246 @@ def is_number(text: str, decimal: str) -> bool:
     return text in _MISSING[1:] or (_NUMBER.fullmatch(text) is not None and other not in text)
 
 
-def _require_width(source: str, body: Sequence[tuple[int, str]], layout: _Layout) -> None:
-    for position, (number, line) in enumerate(body):
-        width = len(_fields(line, layout.delimiter)) if '"' in line else _width(line, layout)
-        if width != layout.width:
-            last = position == len(body) - 1 and width < layout.width
-            raise DataError(
-                source,
-                f"line {number} has {width} values where the first row has {layout.width}"
-                + (": the file ends in the middle of a row" if last else ""),
-                "copy or export the file again",
-            )
-
-
-def _width(line: str, layout: _Layout) -> int:
-    if layout.delimiter == " ":
-        return len(line.split())
-    return line.count(layout.delimiter) + 1
-
-
-def _headings(
-    source: str, above: Sequence[tuple[int, str]], layout: _Layout
-) -> tuple[list[str], dict[str, str]]:
-    """Names and units from the lines above the numbers."""
-    rows = [_fields(line.strip().lstrip("#%").strip(), layout.delimiter) for _, line in above]
-    if not rows:
-        return [f"column_{index + 1}" for index in range(layout.width)], {}
-    row_of_units = [""] * layout.width
-    last = rows[-1]
-    if len(rows) > 1 and len(last) == len(rows[-2]) == layout.width and are_units(last):
-        row_of_units = last
-        last = rows[-2]
-    if len(last) != layout.width:
+def _decoded(source: str, content: bytes) -> tuple[bytes, str]:
+    """The content with plain newlines, and its encoding."""
+    if content.startswith((b"\xff\xfe", b"\xfe\xff")):
+        content = content.decode("utf-16", errors="replace").encode()
+    content = content.removeprefix(b"\xef\xbb\xbf")
+    if b"\r" in content:
+        content = content.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+    if b"\0" in content:
+        line = content[: content.index(b"\0")].count(b"\n") + 1
         raise DataError(
-            source,
-            f"line {above[-1][0]} names {len(last)} columns, and the rows below have "
-            f"{layout.width} values",
-            "export with a point as decimal sign, or with semicolons between columns",
+            source, f"is not text (a zero byte in line {line})", "export it as CSV again"
         )
-    return named_columns(source, last, row_of_units)
+    if not content.strip():
+        raise DataError(source, "is empty", "export it again")
+    long = re.search(rb"[^\n]{%d,}" % (_LONGEST + 1), content)
+    if long is not None:
+        line, size = content[: long.start()].count(b"\n") + 1, len(long[0])
+        problem = f"line {line} has {size} characters, and {_LONGEST} is the most"
+        raise DataError(source, problem, "export it again, one sample a row")
+    try:
+        content.decode()
+    except UnicodeDecodeError:
+        return content, "latin-1"
+    return content, "utf-8"
 
 
-def _frame(source: str, body: Sequence[tuple[int, str]], layout: _Layout) -> pd.DataFrame:
+def _divided(text: _Text, suffix: str) -> tuple[_Text, Block]:
+    """The text with the delimiter and decimal sign that make most numbers, and where they begin."""
+    allowed = _DELIMITERS.get(suffix, _TABS[suffix != ".tsv"])
+    best, most = None, 0.5
+    for delimiter in (*allowed, "\n"):
+        for decimal in (".", ","):
+            found = _Text(text.source, text.content, text.encoding, delimiter, decimal)
+            block, share = _block(found)
+            if block is not None and share > most:
+                best, most = (found, block), share
+    if best is not None:
+        return best
+    others = {mark: _Text(text.source, text.content, text.encoding, mark, ".") for mark in _NAMES}
+    between = next(
+        (mark for mark in _NAMES if mark not in allowed and _block(others[mark])[1] > 0.9), None
+    )
+    expected = " or ".join(_NAMES[mark] for mark in allowed)
+    if between is None:
+        problem = f"has no rows of numbers divided by {expected} in the first {HEAD} of its lines"
+    else:
+        problem = f"is divided by {_NAMES[between]}, and a {suffix} file is by {expected}"
+    raise DataError(text.source, problem, "export it again, one signal a column")
+
+
+def _block(text: _Text) -> tuple[Block | None, float]:
+    """The block of numbers, and their share in what is not empty from its first row on."""
+    if text.decimal == text.delimiter:
+        return None, 0.0
+    sample = zip(range(_SAMPLE), text.lines(), strict=False)
+    rows = [text.kinds(line) for _, (_, line) in sample]
+    block = first_block(rows, text.delimiter == "\n")
+    below = [kind for row in rows[block.first :] for kind in row if kind] if block else []
+    return block, below.count(NUMBER) / max(len(below), 1)
+
+
+def _body(text: _Text, block: Block) -> _Body:
+    """The rows from the first of the block to the last one that has as many fields.
+
+    Raises
+    ------
+    DataError
+        When a row between others, or the last one, has another number of fields.
+    """
+    width, rows, kept, before = len(block.kinds), 0, 0, 0
+    lines = text.lines()
+    for _ in range(block.first):
+        before, _line = next(lines)
+    for number, line in lines:
+        found, blank = text.width(line), number > before + 1
+        usual = found == len(block.kinds) and not blank
+        if not usual and not block.fits(text.kinds(line), blank):
+            _, following = next(lines, (0, ""))
+            ends = block.ends_at(text.kinds(line), text.kinds(following), blank)
+            cut = not following and found < block.width and not _is_word(line, text)
+            if cut or not ends:
+                raise DataError(
+                    text.source,
+                    f"line {number} has {found} values where the first row has {len(block.kinds)}"
+                    + (": the file ends in the middle of a row" if cut else ""),
+                    "copy or export the file again",
+                )
+            return _Body(block.first, kept, width, _rest(number, line))
+        rows, width = rows + 1, max(width, found)
+        if line.strip(f" {text.delimiter}"):
+            kept, before = rows, number  # rows of delimiters alone at the end are none
+    return _Body(block.first, kept, width, "")
+
+
+def _is_word(line: str, text: _Text) -> bool:
+    """Whether a line begins with a word, which no number that was cut does."""
+    return re.match(r"[^\W\d_]{3}", text.fields(line)[0]) is not None or text.content.endswith(
+        b"\n"
+    )
+
+
+def _rest(number: int, line: str) -> str:
+    return f"line {number} and those below are not read: they begin with {line.strip()[:40]!r}"
+
+
+def _statistics(text: _Text, block: Block, body: _Body, columns: Sequence[_Column]) -> _Body | None:
+    """The body without what stands below it in rows as long as its own; None where nothing does."""
+    mixed = [column.row for column in columns if column.words and np.isfinite(column.values).any()]
+    if not mixed:
+        return None
+    row = min(mixed)
+    lines = text.lines()
+    for _ in range(block.first + row - 1):
+        next(lines)
+    before = next(lines)[0] if block.first + row else 0
+    (number, line), (_, following) = next(lines), next(lines, (0, ""))
+    if row == 0 or not block.ends_at(text.kinds(line), text.kinds(following), number > before + 1):
+        return None
+    return _Body(body.start, row, body.width, _rest(number, line))
+
+
+def _columns(text: _Text, body: _Body) -> list[_Column]:
+    """The columns of the body, parsed piece by piece."""
     import pandas as pd  # noqa: PLC0415  # half a second, for who reads text only
 
-    text = "\n".join(line for _, line in body)
-    separator: Any = {"\n": "\x1f", " ": r"\s+"}.get(layout.delimiter, layout.delimiter)
+    found = [_Column(np.full(body.rows, np.nan)) for _ in range(body.width)]
+    separator: Any = {"\n": "\x1f", " ": r"\s+"}.get(text.delimiter, text.delimiter)
+    stream, left = io.BytesIO(text.content), body.start
+    blank = b" " if text.delimiter == "\t" else b" \t"
+    while left:
+        left -= bool(stream.readline().strip(blank + b"\n"))
     try:
-        return pd.read_csv(
-            io.StringIO(text),
+        pieces = pd.read_csv(
+            stream,
             sep=separator,
             header=None,
-            decimal=layout.decimal,
+            names=range(body.width),
+            index_col=False,
+            decimal=text.decimal,
             na_values=_MISSING,
             keep_default_na=False,
             skipinitialspace=True,
-            low_memory=False,
+            encoding=text.encoding,
+            encoding_errors="replace",
+            nrows=body.rows,
+            chunksize=_PIECE,
         )
+        with pieces:
+            start = 0
+            for piece in pieces:
+                for place, column in enumerate(found):
+                    _take(column, piece[place], start, text.decimal)
+                start += len(piece)
     except (ValueError, OverflowError) as error:
         reason = str(error).strip().splitlines()[0]
         problem = f"cannot be divided into columns ({reason})"
-        raise DataError(source, problem, "export it again") from None
+        raise DataError(text.source, problem, "export it again") from None
+    return found
 
 
-def _column(
-    source: str, name: str, values: pd.Series[Any], lines: Sequence[int], decimal: str
-) -> Array | str:
-    """The numbers of a column, or why it has none."""
-    import pandas as pd  # noqa: PLC0415
-
-    if pd.api.types.is_bool_dtype(values):
-        return "holds true and false"
-    numbers = pd.to_numeric(values, errors="coerce")
-    text = np.asarray(numbers.isna() & values.notna())
-    if decimal == "," and values.dtype.kind not in "fiu":
-        # Beside a word the rest is text to pandas: 2,5 is a number, and 1.000 is none.
-        text = np.array([not is_number(str(item).strip(), ",") for item in values])
-        text &= np.asarray(values.notna())
-    if not text.any():
-        return np.asarray(numbers, dtype=np.float64)
-    first = int(np.argmax(text))
-    written = str(values.iloc[first])[:20]
-    if numbers.notna().any() or not text.all():
-        raise DataError(
-            source,
-            f"column {name!r} has text in {int(text.sum())} of {len(values)} rows, the first "
-            f"{written!r} in line {lines[first]}",
-            "correct those rows or export the column as numbers, without thousands separators",
-        )
-    return f"is text, such as {written!r} in line {lines[first]}"
-
-
-def _require_no_thousands(
-    source: str, floats: dict[int, str], body: Sequence[tuple[int, str]], layout: _Layout
-) -> None:
-    """Look for thousands where some of the numbers that are not whole have no decimal sign."""
-    signs = sum(line.count(layout.decimal) for _, line in body)
-    if signs >= len(body) * len(floats):
+def _take(column: _Column, piece: pd.Series[Any], start: int, decimal: str) -> None:
+    """Take in the values of some rows, and count the words among them."""
+    values = column.values[start : start + len(piece)]
+    column.signs |= piece.dtype.kind not in "iu"
+    if piece.dtype.kind in "fiu":
+        values[:] = piece
         return
-    split = None if layout.delimiter == " " else layout.delimiter
-    rows = (
-        (number, _fields(line, layout.delimiter) if '"' in line else line.split(split))
-        for number, line in body
+    for place, item in enumerate(piece):
+        written = str(item).strip()
+        if isinstance(item, float) or item is None:  # missing, or a number of a piece with words
+            values[place] = item
+        elif is_number(written, decimal) and not isinstance(item, bool):
+            values[place] = float("nan" if written in _MISSING else written.replace(",", "."))
+        else:
+            if not column.words:
+                column.word, column.row = written[:20], start + place
+                column.truths = isinstance(item, bool)
+            column.words += 1
+
+
+def _table(text: _Text, body: _Body, columns: Sequence[_Column], above: Sequence[str]) -> Table:
+    empty = [not column.words and bool(np.isnan(column.values).all()) for column in columns]
+    quoted = any(line.lstrip().startswith('"') for line in _first(text, body))
+    rows = [text.fields(line.strip(" ").lstrip("#%").strip(" ")) for line in above]
+    heads = find_headings(text.source, rows, empty, named_rows=quoted or bool(columns[0].words))
+    kept: dict[str, Array] = {}
+    skipped: dict[str, str] = {}
+    floats: dict[int, str] = {}
+    for place, (name, column) in enumerate(zip(heads.names, columns, strict=True)):
+        known = name or f"column_{place + 1}"
+        if empty[place]:
+            skipped |= {name: "is empty"} if name else {}
+        elif column.words:
+            skipped[known] = _words(text, body, known, column)
+        else:
+            column.values.flags.writeable = False  # taken as they are
+            kept[known] = column.values
+            floats |= {place: name} if column.signs else {}
+    _require_no_thousands(text, body, floats)
+    notes = (*heads.notes, *([body.rest] if body.rest else []))
+    return make_table(text.source, kept, heads.units, None, skipped, notes)
+
+
+def _first(text: _Text, body: _Body) -> Iterator[str]:
+    """The first rows of the body."""
+    for index, (_, line) in zip(range(body.start + 3), text.lines(), strict=False):
+        if index >= body.start:
+            yield line
+
+
+def _words(text: _Text, body: _Body, name: str, column: _Column) -> str:
+    """Why a column with words is none of numbers.
+
+    Raises
+    ------
+    DataError
+        When it has numbers too.
+    """
+    row = body.start + column.row
+    line = next(number for index, (number, _) in enumerate(text.lines()) if index == row)
+    if column.truths:
+        return "holds true and false"
+    if np.isnan(column.values).all():
+        return f"is text, such as {column.word!r} in line {line}"
+    raise DataError(
+        text.source,
+        f"column {name!r} has text in {column.words} of {body.rows} rows, the first "
+        f"{column.word!r} in line {line}",
+        "correct those rows or export the column as numbers, without thousands separators",
     )
-    require_no_thousands(source, floats, rows, layout.decimal)
+
+
+def _require_no_thousands(text: _Text, body: _Body, floats: dict[int, str]) -> None:
+    """Look for thousands where some of the numbers that are not whole have no decimal sign."""
+    sign = text.decimal.encode()
+    if text.content.count(sign) >= body.rows * len(floats):
+        return
+    rows = (
+        (number, text.fields(line))
+        for index, (number, line) in enumerate(text.lines())
+        if body.start <= index < body.start + body.rows
+    )
+    require_no_thousands(text.source, floats, rows, text.decimal)

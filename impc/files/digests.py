@@ -43,13 +43,10 @@ _SOURCES: dict[ModuleType, str] = {}
 
 
 def digest(*parts: object) -> str:
-    """SHA-256 of values, hexadecimal: of their kinds, sizes and contents.
+    """SHA-256 of the `parts`, hexadecimal: of their kinds, sizes and contents.
 
-    Parameters
-    ----------
-    *parts : object
-        None, numbers, text, bytes, paths, dates, arrays of numbers, and mappings, sequences, sets,
-        dataclasses and msgspec structs of such.
+    None, numbers, text, bytes, paths, dates, arrays of numbers, and mappings, sequences, sets,
+    dataclasses and msgspec structs of such.
 
     Raises
     ------
@@ -144,14 +141,7 @@ def source_digest(name: str, arguments: Mapping[str, Any] | None = None) -> str:
 
     The code is the module that is named and all modules that it imports, as long as they are no
     part of Python, of this package or of what is installed: those are told by `versions`. The
-    module has to be imported already.
-
-    Parameters
-    ----------
-    name : str
-        File, or import path ``module:function``.
-    arguments : mapping, optional
-        Of its function. The content counts where one is the name of a file.
+    module has to be imported already. Of `arguments` that name a file its content counts.
 
     Raises
     ------

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from impc.checking import checked
 from impc.errors import DataError, ImpcError, InputError, OutputError
 from impc.files.apart import read_apart
 from impc.files.c3d_analog import encode_c3d
@@ -42,7 +43,8 @@ class Format:
     Attributes
     ----------
     read : callable
-        (path, most bytes that its arrays may take) -> table. Whatever it raises becomes one line.
+        (path, most bytes that its arrays may take) -> table; of a workbook also the name of a
+        sheet, where one is asked for. Whatever it raises becomes one line.
     encode : callable
         Table -> the bytes of a file.
     begins : callable
@@ -50,11 +52,12 @@ class Format:
         what does not begin as something else.
     """
 
-    read: Callable[[Path, int], Table]
+    read: Callable[..., Table]
     encode: Callable[[Table], bytes]
     begins: Callable[[bytes], bool] = lambda head: not _what_it_is(head)
 
 
+_WORKBOOKS = (".xlsx", ".ods")
 # First bytes of what else may carry one of the endings, and what it is.
 _SIGNATURES = {
     b"PK\x03\x04": "a zip archive or an Excel workbook",
@@ -70,7 +73,8 @@ _SIGNATURES = {
 }
 
 
-def read_table(path: Path | str, largest: int = LARGEST) -> Table:
+@checked
+def read_table(path: Path | str, largest: int = LARGEST, sheet: str = "") -> Table:
     r"""Read the columns of a recording.
 
     Parameters
@@ -79,6 +83,8 @@ def read_table(path: Path | str, largest: int = LARGEST) -> Table:
         With one of the endings in `FORMATS`.
     largest : int
         Bytes above which a file is refused before it is read.
+    sheet : str
+        Of a workbook; by default the first one with rows of numbers.
 
     Raises
     ------
@@ -102,8 +108,10 @@ def read_table(path: Path | str, largest: int = LARGEST) -> Table:
     suffix = _suffix(path, DataError)
     head, form = _head(path, largest), FORMATS[suffix]
     _require(source, form.begins(head), suffix, head)
+    if sheet and suffix not in _WORKBOOKS:
+        raise DataError(source, "has no sheets", "leave recording.sheet out")
     try:
-        return form.read(path, largest)
+        return form.read(path, largest, sheet) if sheet else form.read(path, largest)
     except ImpcError:
         raise
     except MemoryError:
@@ -114,6 +122,7 @@ def read_table(path: Path | str, largest: int = LARGEST) -> Table:
         raise damaged(source, error) from None
 
 
+@checked
 def write_table(path: Path | str, table: Table) -> None:
     """Write a table in the format of the `path`, whole or not at all; .mat is written as v5.
 
@@ -210,9 +219,7 @@ def _read_matlab(path: Path, largest: int) -> Table:
 
 
 def _delimited(ending: str) -> Format:
-    return Format(
-        lambda path, _: read_delimited(path), lambda table: encode_delimited(table, ending)
-    )
+    return Format(read_delimited, lambda table: encode_delimited(table, ending))
 
 
 def _spreadsheet(encode: Callable[[Table], bytes]) -> Format:
@@ -244,6 +251,10 @@ FORMATS: dict[str, Format] = {
     ".csv": _delimited(".csv"),
     ".tsv": _delimited(".tsv"),
     ".txt": _delimited(".txt"),
+    ".lvm": _delimited(".lvm"),
+    ".sto": _delimited(".sto"),
+    ".mot": _delimited(".mot"),
+    ".trc": _delimited(".trc"),
     ".xlsx": _spreadsheet(encode_workbook),
     ".ods": _spreadsheet(_no_ods),
     ".mat": Format(_read_matlab, encode_matlab, lambda _: True),

@@ -58,18 +58,9 @@ class Inputs:
 def gather_inputs(
     files: Sequence[Path], configuration: Path, name: str, arguments: Mapping[str, Any]
 ) -> Inputs:
-    """Digests of recordings, configuration and plant as they are now.
+    """Digests of the recordings `files`, of the `configuration` and of a plant as they are now.
 
-    Parameters
-    ----------
-    files : sequence of Path
-        The recordings.
-    configuration : Path
-        Its file.
-    name : str
-        Import path, imported already, or file of the plant.
-    arguments : mapping
-        Of the plant.
+    The plant is a file or an import path, the `name`, imported already, with its `arguments`.
 
     Raises
     ------
@@ -97,20 +88,9 @@ class Recorded(Protocol):
 def study_inputs(
     units: Sequence[Recorded], study: Path, kind: str, name: str, arguments: Mapping[str, Any]
 ) -> Inputs:
-    """Digests of the recordings of a study, of its file and of its plant or model as they are now.
+    """Digests of the recordings of `units`, of the `study` file and of its plant or model.
 
-    Parameters
-    ----------
-    units : sequence of Recorded
-        With the recordings that are used.
-    study : Path
-        The study file.
-    kind : str
-        "plant" or "model".
-    name : str
-        Import path, imported already, or file.
-    arguments : mapping
-        Of the plant or model.
+    `kind` is "plant" or "model"; `name` and `arguments` are as in `gather_inputs`.
 
     Raises
     ------

@@ -12,13 +12,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.errors import InputError
+from impc.files.clock import counts_days
 from impc.files.columns import in_columns
 from impc.files.configuration import FILL_IN
 from impc.files.plant_sources import OWN
-from impc.files.units import si_unit
+from impc.files.units import guessed_unit, si_unit
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
 
     from impc.arrays import Array
     from impc.files.table import Table
@@ -31,6 +32,11 @@ _CLOCKS = ("time", "t", "zeit", "temps", "tiempo", "timestamp", "clock", "second
 _GUESSES = (("s", 1.0), ("ms", 1e3), ("us", 1e6), ("ns", 1e9))
 _SLOWEST = 0.2
 _HORIZON = 20
+_INPUT = "an input: without this table, or with command = true, a command"
+# Units at the end of names, as in alpha_deg.
+_IN_NAMES = {
+    name: name for name in ("deg", "rad", "mm", "cm", "m", "N", "Nm", "V", "mV", "s", "ms")
+}
 _ALIKE = 0.6  # theta1 and theta_2 are, push and perturbation are not
 
 
@@ -42,6 +48,7 @@ def summary(table: Table) -> str:
     if table.rate is not None:
         lines.append(f"The file says {table.rate:g} samples per second.")
     lines += [f"Not read: {name} {reason}" for name, reason in table.skipped.items()]
+    lines += [f"Note: {note}" for note in table.notes]
     return "\n".join(lines)
 
 
@@ -81,11 +88,7 @@ class Wanted:
 def draft_configuration(table: Table, wanted: Wanted | None = None) -> str:
     """A commented TOML file that `read_configuration` reads (docs/recordings.md).
 
-    Parameters
-    ----------
-    table : Table
-    wanted : Wanted, optional
-        Of the plant; without it every column becomes a signal by its own name.
+    Without the plant, what is `wanted`, every column becomes a signal by its own name.
     """
     lines = [
         f"# What the columns of {Path(table.source).name!r} mean. Check every line; what neither",
@@ -106,11 +109,11 @@ def draft_configuration(table: Table, wanted: Wanted | None = None) -> str:
         lines += ["", "[plant]", "# arguments of the plant's function", ""]
         return "\n".join([*lines, "[fit]", "# settings of the fit"]) + "\n"
     signals = (*wanted.outputs, *wanted.disturbances)
-    chosen = _guessed(signals, rest, lambda signal, column: _fits(table, column, signal, wanted))
+    chosen = _guessed(table, signals, rest, wanted)
     for signal in signals:
         column, why = chosen.get(signal, (FILL_IN, "no column is left that fits: name it"))
         acts = signal in wanted.disturbances
-        kind = "a disturbance: may be left out where none acts" if acts else _span(table, column)
+        kind = _INPUT if acts else _span(table, column)
         lines += ["", *_signal_lines(table, signal, column, kind, why)]
     unused = [name for name in rest if name not in [column for column, _ in chosen.values()]]
     if unused:
@@ -145,8 +148,8 @@ def _fit_lines(wanted: Wanted) -> list[str]:
 
 
 def _told(table: Table, column: str) -> str:
-    unit = table.units.get(column)
-    return f"{_quoted(column)} ({unit})" if unit else _quoted(column)
+    about = ", ".join(filter(None, (table.units.get(column), _idle(table, column))))
+    return f"{_quoted(column)} ({about})" if about else _quoted(column)
 
 
 def _span(table: Table, column: str) -> str:
@@ -155,13 +158,36 @@ def _span(table: Table, column: str) -> str:
     return f"recorded from {values.min():.4g} to {values.max():.4g}" if len(values) else "missing"
 
 
-def _fits(table: Table, column: str, signal: str, wanted: Wanted) -> bool:
-    """Whether the unit that the file tells of a column may be one of the signal."""
+def _fits(table: Table, column: str, signal: str, wanted: Wanted) -> int:
+    """Whether the unit of a column may be one of the signal: 0 it may not, 2 it is of its kind."""
     try:
-        told, needed = si_unit(table.units[column]), si_unit(wanted.units[signal])
+        told = si_unit(_column_unit(table, column)[0])
+        needed = si_unit(wanted.units[signal])
     except (KeyError, InputError):  # one of the two says nothing that is known
-        return True
-    return told.base in (needed.base, "dimensionless")
+        return 1
+    return 2 if told.base == needed.base else int(told.base == "dimensionless")
+
+
+def _column_unit(table: Table, column: str) -> tuple[str, str]:
+    """The unit of a column and how it is known: by the file, or by the end of its name."""
+    if table.units.get(column):
+        return _read_unit(table.units[column])
+    last = re.split(r"[_ .]", column)[-1]
+    if last != column and last in _IN_NAMES:
+        return _IN_NAMES[last], "a guess: by its name"
+    return FILL_IN, ""
+
+
+def _read_unit(told: str) -> tuple[str, str]:
+    """The unit that a file's own word for it stands for, and how sure that is."""
+    try:
+        si_unit(told)
+    except InputError:
+        guess = guessed_unit(told)
+        if guess:
+            return guess, f"a guess: the file says {told!r}"
+        return FILL_IN, f"the file says {told!r}, which is not known"
+    return told, "as the file says"
 
 
 def _row(table: Table, name: str) -> tuple[str, ...]:
@@ -214,6 +240,7 @@ _OPTIONS = (
     _line("# fill_gaps = 0.0", "s, the longest gap that may be filled by interpolation"),
     _line("# start = 0.0", "s, cut on the file's clock"),
     "# stop = 30.0",
+    _line('# sheet = "Data"', "of a workbook; by default the first with rows of numbers"),
 )
 
 
@@ -228,30 +255,33 @@ def _clock_lines(table: Table) -> list[str]:
         ]
     values = table.columns[clock]
     step = float(np.median(np.diff(values)))
-    unit, why = _time_unit(table.units.get(clock), step)
+    unit, why = _time_unit(*_column_unit(table, clock), step)
+    if unit != "day" and counts_days(values) and not table.units.get(clock):
+        unit, why = "day", "a guess: day numbers of a spreadsheet"
     span = f"from {values[0]:.6g} to {values[-1]:.6g}, in steps of {step:.6g}"
     return [_line(f"time = {_quoted(clock)}", span), _line(f"time_unit = {_quoted(unit)}", why)]
 
 
-def _time_unit(told: str | None, step: float) -> tuple[str, str]:
-    try:
-        if told and si_unit(told).base == "second":
-            return told, "as the file says"
-    except InputError:
-        pass
+def _time_unit(written: str, how: str, step: float) -> tuple[str, str]:
+    if written != FILL_IN and si_unit(written).base == "second":
+        return written, how
     unit, second = next(pair for pair in _GUESSES if step < pair[1] * _SLOWEST or pair[1] == 1e9)
     return unit, f"a guess: {second / step:.4g} samples per second; a counter needs rate"
 
 
 def _guessed(
-    signals: Sequence[str], columns: Sequence[str], fits: Callable[[str, str], bool]
+    table: Table, signals: Sequence[str], columns: Sequence[str], wanted: Wanted
 ) -> dict[str, tuple[str, str]]:
-    """A column for each signal, and why: the most alike first, then by order; none that misfits."""
-    likeness = {
-        (signal, column): difflib.SequenceMatcher(None, signal.lower(), column.lower()).ratio()
+    """A column for each signal, and why: the most alike first, then by unit and order."""
+    fits = {
+        (signal, column): _fits(table, column, signal, wanted)
         for signal in signals
         for column in columns
-        if fits(signal, column)
+    }
+    likeness = {
+        (signal, column): difflib.SequenceMatcher(None, signal.lower(), column.lower()).ratio()
+        for (signal, column), fit in fits.items()
+        if fit
     }
     chosen: dict[str, tuple[str, str]] = {}
     free = list(columns)
@@ -262,19 +292,27 @@ def _guessed(
             chosen[signal] = column, "" if same else "a guess, by its name"
             free.remove(column)
     for signal in signals:
-        left = [column for column in free if (signal, column) in likeness]
+        left = [column for column in free if fits[signal, column] and not _idle(table, column)]
         if signal not in chosen and left:
-            chosen[signal] = left[0], "A GUESS, by its place: check it"
-            free.remove(left[0])
+            # Of those that fit equally well the first in the file.
+            best = max(left, key=lambda column: fits[signal, column])
+            how = "unit" if fits[signal, best] == 2 else "place"
+            chosen[signal] = best, f"A GUESS, by its {how}: check it"
+            free.remove(best)
     return chosen
 
 
+def _idle(table: Table, column: str) -> str:
+    """Why a column is hardly a signal; empty where it may be."""
+    values = table.columns[column]
+    values = values[np.isfinite(values)]
+    if len(values) == 0 or np.ptp(values) == 0:
+        return "constant"
+    return "" if _rate(values) is None else "a clock or counter"
+
+
 def _signal_lines(table: Table, signal: str, column: str, kind: str, why: str) -> list[str]:
-    told = table.units.get(column)
-    try:
-        unit, how = (told, "as the file says") if told and si_unit(told) else (FILL_IN, "")
-    except InputError:
-        unit, how = FILL_IN, f"the file says {told!r}, which is not known"
+    unit, how = _column_unit(table, column)
     key = signal if signal.isidentifier() and signal.isascii() else _quoted(signal)
     return [
         _line(f"[signals.{key}]", kind),

@@ -44,14 +44,7 @@ _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,62}")
 
 
 def read_matlab(path: Path, largest: int) -> Table:
-    """Read a .mat file of version 5 to 7.
-
-    Parameters
-    ----------
-    path : Path
-        Of the file.
-    largest : int
-        The most bytes that its arrays may take once they are unpacked.
+    """Read the .mat file of version 5 to 7 at `path`; unpacked it takes `largest` bytes at most.
 
     Raises
     ------
@@ -68,20 +61,10 @@ def read_matlab(path: Path, largest: int) -> Table:
 
 
 def read_matrices(path: Path, largest: int) -> dict[str, Array | list[str | None]]:
-    """Read the matrices and names of a saved plant from a .mat file of version 5 to 7.
+    """Read the matrices and names of a saved plant from the .mat file of version 5 to 7 at `path`.
 
-    Parameters
-    ----------
-    path : Path
-        Of the file.
-    largest : int
-        The most bytes that its arrays may take once they are unpacked, as float64.
-
-    Returns
-    -------
-    dict of str to Array or list
-        Real numbers in MATLAB's sizes, (rows, columns) or more; of a text its rows, of a cell array
-        its texts, None for what is no text.
+    Real numbers in MATLAB's sizes, (rows, columns) or more, of `largest` bytes at most; of a text
+    its rows, of a cell array its texts, None for what is no text.
 
     Raises
     ------
@@ -137,14 +120,9 @@ def encode_matlab(table: Table) -> bytes:
 
 
 def nested_columns(source: str, columns: Mapping[str, Array]) -> dict[str, Any]:
-    """Columns as MATLAB variables; `s.field` as the field of a struct.
+    """The `columns`, (samples,) each, as MATLAB variables; `s.field` as the field of a struct.
 
-    Parameters
-    ----------
-    source : str
-        File, for the message.
-    columns : mapping of str to Array
-        (samples,) each.
+    `source` is the file, for the message.
 
     Raises
     ------

@@ -46,14 +46,7 @@ class _Found:
 
 
 def read_matlab73(path: Path, largest: int) -> Table:
-    """Read a .mat file of version 7.3.
-
-    Parameters
-    ----------
-    path : Path
-        Of the file.
-    largest : int
-        The most bytes that its arrays may take once they are unpacked.
+    """Read the .mat file of version 7.3 at `path`; unpacked it takes `largest` bytes at most.
 
     Raises
     ------

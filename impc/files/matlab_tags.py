@@ -30,14 +30,9 @@ _NESTED = 100  # arrays within one another: scipy's reader calls itself for each
 
 
 def look_at_tags(path: Path, largest: int) -> None:
-    """Require types that exist, lengths that are there, and so many bytes unpacked at the most.
+    """Require types that exist, lengths that are there, and `largest` bytes unpacked at the most.
 
-    Parameters
-    ----------
-    path : Path
-        Of the file; its header is not looked at.
-    largest : int
-        The most bytes of its variables.
+    The header of the file at `path` is not looked at.
 
     Raises
     ------
@@ -80,15 +75,7 @@ def _unpacked(path: Path, packed: memoryview, order: str, most: int) -> memoryvi
 
 
 def too_large(path: Path, size: int) -> DataError:
-    """The reason to raise for a file whose variables take `size` bytes.
-
-    Parameters
-    ----------
-    path : Path
-        Of the file.
-    size : int
-        Bytes.
-    """
+    """The reason to raise for the file at `path`, whose variables take `size` bytes."""
     return DataError(
         str(path),
         f"would take {size / 1e9:.1f} GB once it is unpacked",

@@ -55,14 +55,9 @@ def size(channel: Channel) -> str:
 
 
 def times_of_a_recording(subject: str, time: Array) -> None:
-    """The times of a clock.
+    """Require that the `time` of a clock (samples,), in s, is near enough to zero.
 
-    Parameters
-    ----------
-    subject : str
-        File and clock, for the message.
-    time : Array
-        (samples,), s, finite and rising.
+    `subject` names file and clock in the message.
 
     Raises
     ------
@@ -77,14 +72,7 @@ def times_of_a_recording(subject: str, time: Array) -> None:
 
 
 def period_of_a_recording(subject: str, period: float) -> None:
-    """The period of a clock.
-
-    Parameters
-    ----------
-    subject : str
-        File and clock, for the message.
-    period : float
-        s.
+    """Require that a recorder has the `period`, in s; `subject` names file and clock.
 
     Raises
     ------
@@ -100,14 +88,9 @@ def period_of_a_recording(subject: str, period: float) -> None:
 
 
 def comparable_rates(subject: str, period: float, dt: float) -> None:
-    """A clock and the plant's.
+    """Require that a recording is not much slower than the plant: its `period`, and `dt`, in s.
 
-    Parameters
-    ----------
-    subject : str
-        File, for the message.
-    period, dt : float
-        Of the recording and of the plant, s.
+    `subject` names the file in the message.
 
     Raises
     ------
@@ -123,16 +106,9 @@ def comparable_rates(subject: str, period: float, dt: float) -> None:
 
 
 def few_gaps(subject: str, time: Array, period: float) -> None:
-    """Gaps of a clock: how many instants it has beside its samples.
+    """Require that the `time` of a clock (samples,) has few gaps; its usual `period`, both in s.
 
-    Parameters
-    ----------
-    subject : str
-        File and clock, for the message.
-    time : Array
-        (samples,), s, finite and rising.
-    period : float
-        What is usual between two samples, s.
+    `subject` names file and clock in the message.
 
     Raises
     ------

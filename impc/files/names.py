@@ -17,21 +17,9 @@ LARGEST = 1_000_000_000
 
 
 def require_ordinary(path: Path, largest: int, error: type[ImpcError] = DataError) -> int:
-    """Look at a file before it is opened: a pipe would never end, a device neither.
+    """Look at the file at `path` before it is opened: a pipe would never end. Its size in bytes.
 
-    Parameters
-    ----------
-    path : Path
-        Of the file; links are followed.
-    largest : int
-        Bytes above which it is refused.
-    error : type
-        Of the exception to raise.
-
-    Returns
-    -------
-    int
-        Its size in bytes.
+    More than `largest` bytes are refused. Links are followed; `error` is the kind that is raised.
 
     Raises
     ------
@@ -65,15 +53,7 @@ def require_ordinary(path: Path, largest: int, error: type[ImpcError] = DataErro
 
 
 def damaged(source: str, fault: Exception) -> DataError:
-    """What a library says of a file that it cannot read, in one line.
-
-    Parameters
-    ----------
-    source : str
-        The file.
-    fault : Exception
-        Of any kind: struct.error, KeyError, AssertionError.
-    """
+    """What a library says of a file, the `source`, that it cannot read: a `fault` of any kind."""
     reason = brief(" ".join(str(fault).split()), 120) or type(fault).__name__
     return DataError(source, f"is damaged and cannot be read ({reason})", "copy or export it again")
 

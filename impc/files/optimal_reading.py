@@ -73,16 +73,10 @@ class OptimalTrial(Frozen):
 def read_optimal_trials(
     paths: Sequence[Path], configuration: Configuration, problem: OptimalControlProblem
 ) -> tuple[OptimalTrial, ...]:
-    """Read one recording from each file.
+    """Read one recording from each of the `paths`.
 
-    Parameters
-    ----------
-    paths : sequence of Path
-        One file a recording.
-    configuration : Configuration
-        Names a column for each disturbance, and for the states and inputs that were measured.
-    problem : OptimalControlProblem
-        Gives the names, the units and the sample time; without one that of each file is taken.
+    The `configuration` names a column for each disturbance of the `problem`, and for the states and
+    inputs that were measured. Without a sample time of the problem that of each file is taken.
 
     Raises
     ------
@@ -93,7 +87,8 @@ def read_optimal_trials(
     """
     _require_names(configuration, problem)
     require_distinct(paths)
-    return tuple(_trial(read_table(Path(path)), configuration, problem) for path in paths)
+    sheet = configuration.recording.sheet
+    return tuple(_trial(read_table(path, sheet=sheet), configuration, problem) for path in paths)
 
 
 def _require_names(configuration: Configuration, problem: OptimalControlProblem) -> None:
@@ -104,6 +99,9 @@ def _require_names(configuration: Configuration, problem: OptimalControlProblem)
             remedy = f"did you mean {near[0]}?" if near else f"it has {', '.join(known)}"
             raise InputError(f"signals.{name}", "is no signal of the problem", remedy)
         require_filled_in(name, entry)
+        if entry.shift:
+            unused = "is not used by an optimal control problem"
+            raise InputError(f"signals.{name}.shift", unused, "shift the column in the file")
         require_kind(name, entry.unit, problem.signal_units.get(name, UNKNOWN))
     for name in problem.disturbance_names:
         if name not in configuration.signals:
@@ -152,7 +150,7 @@ def _series(
     entry = configuration.signals[name]
     channel = channel_of(table, clock, name, entry)
     found = [
-        checks.unit_of_the_file(channel, told_unit(table, channel.column)),
+        checks.unit_of_the_file(channel, told_unit(table, channel.column), entry.overrule_unit),
         measurable.size(channel),
         "" if entry.limit is None else checks.beyond_the_stop(channel, entry.limit),
     ]

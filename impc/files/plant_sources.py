@@ -172,15 +172,10 @@ def _beside_the_recordings() -> Iterator[None]:
 
 
 @checked
-def make_plant(source: PlantSource, recorded: Sequence[str], **changed: float) -> Plant:
-    """Make the plant; inputs that are recorded are disturbances, the others are controls.
+def make_plant(source: PlantSource, recorded: Sequence[str], **changed: Any) -> Plant:
+    """Make the plant; inputs that are `recorded` are disturbances, the others are controls.
 
-    Parameters
-    ----------
-    recorded : sequence of str
-        Names of recorded signals; those that are no inputs are ignored.
-    **changed : float
-        Arguments that replace those of the source.
+    Names that are no inputs are ignored; what is `changed` replaces arguments of the source.
 
     Raises
     ------
@@ -193,7 +188,8 @@ def make_plant(source: PlantSource, recorded: Sequence[str], **changed: float) -
     inputs = tuple(getattr(system, "input_labels", ()))
     controls = [item for item in inputs if item not in recorded]
     if inputs and not controls:
-        raise PlantError(name, "all its inputs are recorded", "one must be the command")
+        remedy = "write command = true in [signals.NAME] of the command"
+        raise PlantError(name, "all its inputs are recorded", remedy)
     with _refused_arguments(name), users_code(name, *_REFUSED):
         return Plant(system, controls or None)
 
@@ -201,11 +197,7 @@ def make_plant(source: PlantSource, recorded: Sequence[str], **changed: float) -
 def made_by(source: PlantSource, **changed: float) -> Any:
     """What the function of a source returns: a plant as a rule, or an optimal control problem.
 
-    Parameters
-    ----------
-    source : PlantSource
-    **changed : float
-        Arguments that replace those of the source.
+    What is `changed` replaces arguments of the source.
 
     Raises
     ------
@@ -243,14 +235,9 @@ def _refused_arguments(name: str) -> Iterator[None]:
 def plant_family_of(
     source: PlantSource, recorded: Sequence[str], free: Sequence[str]
 ) -> PlantFamily | None:
-    """The plants that differ in the free arguments; None when none is free.
+    """The plants that differ in the `free` arguments; None when none is.
 
-    Parameters
-    ----------
-    recorded : sequence of str
-        Names of recorded signals, as in `make_plant`.
-    free : sequence of str
-        Names of the arguments that are fitted.
+    The names of `recorded` signals are as in `make_plant`.
 
     Raises
     ------

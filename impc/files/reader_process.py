@@ -114,7 +114,7 @@ def _answer(request: dict[str, Any]) -> tuple[dict[str, Any], Iterable[Array]]:
             return {"groups": None if found is None else found.groupdict()}, ()
         module, function, _ = READERS[request["do"]]
         read = getattr(import_module(module), function)
-        found = read(Path(request["path"]), request["largest"])
+        found = read(Path(request["path"]), request["largest"], **request.get("more", {}))
     except MemoryError:
         return {"memory": True}, ()
     except ImpcError as error:
@@ -134,6 +134,7 @@ def _columns(request: dict[str, Any], table: Table) -> tuple[dict[str, Any], Ite
         "units": dict(table.units),
         "rate": table.rate,
         "skipped": dict(table.skipped),
+        "notes": table.notes,
     }
     lengths = [table.samples] * len(table.columns)
     return {"table": told, "lengths": lengths}, table.columns.values()

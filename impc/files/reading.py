@@ -3,27 +3,30 @@
 from __future__ import annotations
 
 import difflib
+import math
 import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.checking import replace
-from impc.errors import DataError, InputError
+from impc.checking import checked, replace
+from impc.errors import DataError, FallError, InputError
 from impc.files import checks, measurable
 from impc.files.alignment import misaligned
 from impc.files.apart import match_apart
 from impc.files.clock import column_of, on_even_instants, read_clock
 from impc.files.configuration import FILL_IN
+from impc.files.digests import content_digest
 from impc.files.formats import read_table
-from impc.files.resampling import held_means, instants, resampled_samples, same_rate
+from impc.files.one_step import departures, rows_later
+from impc.files.resampling import held_means, instants, resampled_samples, same_rate, shifted
 from impc.files.units import si_unit
 from impc.model.recordings import Label, Recording
 from impc.model.signal_units import UNKNOWN
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
     from impc.arrays import Array
     from impc.files.clock import Clock
@@ -37,6 +40,7 @@ __all__ = [
     "disturbances_of",
     "label_of",
     "read_recordings",
+    "read_unit",
     "recording_of",
     "require_distinct",
     "require_filled_in",
@@ -44,10 +48,13 @@ __all__ = [
     "told_unit",
 ]
 
+# Shares of half the range above which an offset and a drift are findings.
+_OFFSET, _DRIFT = 0.12, 0.25
 # Samples for each state of the plant below which nothing can be fitted.
 _SAMPLES_A_STATE = 5
 
 
+@checked
 def read_recordings(
     paths: Sequence[Path], configuration: Configuration, plant: Plant
 ) -> tuple[Recording, ...]:
@@ -92,19 +99,46 @@ def read_recordings(
     >>> trials[0].outputs[:2].round(4).tolist()
     [[1.5708], [1.4137]]
     """
+    trials, fallen = read_unit(paths, configuration, plant)
+    if fallen:
+        raise fallen[0]
+    return trials
+
+
+def read_unit(
+    paths: Sequence[Path], configuration: Configuration, plant: Plant
+) -> tuple[tuple[Recording, ...], tuple[FallError, ...]]:
+    """The trials of the `paths` in which the subject did not fall, and the falls.
+
+    Raises
+    ------
+    InputError, DataError
+        As `read_recordings`, and where the subject fell in every trial.
+    """
     plant.require_discrete()
     _require_names(configuration, plant)  # before files are read, which may take long
     require_distinct(paths)
     if not paths:
         raise InputError("recordings", "no file is given", "name at least one")
-    trials = [recording_of(read_table(Path(path)), configuration, plant) for path in paths]
-    longest = max(trial.samples for trial in trials)
-    return tuple(
+    sheet = configuration.recording.sheet
+    tables = (read_table(path, sheet=sheet) for path in paths)
+    read: list[tuple[Path, Recording]] = []
+    fallen: list[FallError] = []
+    for path, table in zip(paths, tables, strict=True):
+        try:
+            read.append((path, recording_of(table, configuration, plant)))
+        except FallError as fall:
+            fallen.append(fall)
+    if not read:
+        raise fallen[0]
+    longest = max(trial.samples for _, trial in read)
+    trials = (
         trial
         if trial.samples == longest
         else replace(trial, findings=(*trial.findings, _shorter(path, trial.samples, longest)))
-        for path, trial in zip(paths, trials, strict=True)
+        for path, trial in read
     )
+    return tuple(trials), tuple(fallen)
 
 
 def recording_of(table: Table, configuration: Configuration, plant: Plant) -> Recording:
@@ -124,24 +158,36 @@ def recording_of(table: Table, configuration: Configuration, plant: Plant) -> Re
     measurable.comparable_rates(table.source, clock.period, plant.dt)
     samples = resampled_samples(int(clock.steps[-1]) + 1, clock.period, plant.dt)
     checks.too_few(table.source, samples, _SAMPLES_A_STATE * plant.n)
-    findings = list(clock.findings)
+    findings = [*(f"{table.source}: {note}" for note in table.notes), *clock.findings]
+    findings += [clock.note] if clock.note else []
     acting = [name for name in plant.disturbances if name in configuration.signals]
-    series: dict[str, Array] = {}
+    findings += [
+        f"{table.source}: {name} is a command; the fit does not use its recording"
+        for name in plant.controls
+        if name in configuration.signals
+    ]
+    even: dict[str, Array] = {}
     for name in (*plant.outputs, *acting):
         channel = channel_of(table, clock, name, configuration.signals[name])
         response = name in plant.outputs
         findings += _checked(table, channel, configuration.signals[name], entry, response)
-        even = on_even_instants(clock, channel.values * channel.unit.factor)
-        resample = instants if response else held_means
-        series[name] = resample(even, clock.period, plant.dt)
+        even[name] = on_even_instants(clock, channel.values * channel.unit.factor)
+    even = shifted(even, _shifts(table.source, clock, configuration, even))
+    series = {
+        name: (instants if name in plant.outputs else held_means)(values, clock.period, plant.dt)
+        for name, values in even.items()
+    }
     samples = len(series[plant.outputs[0]])
     findings += _slower(table.source, clock, plant)
+    findings += _departing(table.source, series, configuration, plant)
     disturbance = np.zeros((samples, len(plant.disturbances)))
     for index, name in enumerate(plant.disturbances):
         if name in series:
             disturbance[:, index] = series[name]
             findings += _order(table.source, series, name, plant)
     outputs = np.column_stack([series[name] for name in plant.outputs])
+    if clock.even and same_rate(len(clock.time), clock.period, plant.dt):
+        findings += _later(table.source, outputs, series, plant)
     return Recording(
         plant, outputs, disturbance, np.zeros(plant.n), label=label, findings=tuple(findings)
     )
@@ -149,13 +195,6 @@ def recording_of(table: Table, configuration: Configuration, plant: Plant) -> Re
 
 def disturbances_of(table: Table, configuration: Configuration, plant: Plant) -> Array:
     """Perturbations of one table on the plant's clock (samples, d), in SI base units.
-
-    Parameters
-    ----------
-    table : Table
-    configuration : Configuration
-        Names a column for each disturbance.
-    plant : Plant
 
     Raises
     ------
@@ -175,17 +214,76 @@ def disturbances_of(table: Table, configuration: Configuration, plant: Plant) ->
         channel = channel_of(table, clock, name, signal)
         _checked(table, channel, signal, entry, response=False)
         even = on_even_instants(clock, channel.values * channel.unit.factor)
-        columns.append(held_means(even, clock.period, plant.dt))
-    return np.column_stack(columns)
+        shift = _shifts(table.source, clock, configuration, [name])
+        columns.append(held_means(shifted({name: even}, shift)[name], clock.period, plant.dt))
+    shortest = min(map(len, columns))
+    return np.column_stack([values[:shortest] for values in columns])
+
+
+def _shifts(
+    source: str, clock: Clock, configuration: Configuration, names: Iterable[str]
+) -> dict[str, float]:
+    """By how many samples of the recording each signal is moved: whole numbers count those."""
+    given = {name: configuration.signals[name].shift for name in names}
+    rows = {
+        name: float(shift) if isinstance(shift, int) else shift / clock.period
+        for name, shift in given.items()
+    }
+    for name, shift in rows.items():
+        if abs(shift) > (len(clock.time) - 1) / 2:
+            problem = f"moves it by {shift:.4g} of {len(clock.time)} samples"
+            raise DataError(f"{source}: signals.{name}.shift", problem, "give a smaller one")
+    return rows
+
+
+def _departing(
+    source: str, series: dict[str, Array], configuration: Configuration, plant: Plant
+) -> list[str]:
+    """Offsets and drifts that are large compared with the motion."""
+    found = []
+    acting = [series[name] for name in plant.disturbances if name in series]
+    for name in plant.outputs:
+        entry = configuration.signals[name]
+        values = series[name] / (si_unit(entry.unit).factor * entry.sign)
+        offset, drift = departures(values, acting)
+        motion = float(np.ptp(values)) / 2
+        moves = f"{entry.unit}, and moves by {motion:.3g}"
+        digits = 2 - math.floor(math.log10(motion)) if motion > 0 else 0
+        key = f"signals.{name}.offset = {round(entry.offset + offset, digits):g}"
+        if abs(drift) > _DRIFT * motion:
+            remedy = "take a drift of the sensor out of the file"
+            found.append(f"{source}: {name} drifts by about {drift:.2g} {moves}: {remedy}")
+        elif abs(offset) > _OFFSET * motion:
+            remedy = f"if the sensor's zero is off, write {key}"
+            found.append(f"{source}: {name} is off by about {offset:.2g} {moves}: {remedy}")
+    return found
+
+
+def _later(source: str, outputs: Array, series: dict[str, Array], plant: Plant) -> list[str]:
+    """Rows of a disturbance that act earlier or later than the plant's."""
+    found = []
+    for index, name in enumerate(plant.disturbances):
+        if name not in series:
+            continue
+        after = [np.linalg.matrix_power(plant.A, samples) for samples in range(3)]
+        effects = np.array([plant.C @ power @ plant.E[:, index] for power in after])
+        rows = rows_later(outputs, series[name], effects)
+        if rows:
+            how = f"{abs(rows)} sample{'s' * (abs(rows) > 1)} {'later' if rows > 0 else 'earlier'}"
+            found.append(
+                f"{source}: {name} acts {how} than its rows say: try signals.{name}.shift = {rows}"
+            )
+    return found
 
 
 def _require_names(configuration: Configuration, plant: Plant) -> None:
-    known = (*plant.outputs, *plant.disturbances)
-    for name in configuration.signals:
+    for name, entry in configuration.signals.items():
+        known = plant.controls if entry.command else (*plant.outputs, *plant.disturbances)
         if name not in known:
             near = difflib.get_close_matches(name, known, n=1)
             remedy = f"did you mean {near[0]}?" if near else f"the plant has {', '.join(known)}"
-            raise InputError(f"signals.{name}", "is no output or disturbance of the plant", remedy)
+            what = "command" if entry.command else "output or disturbance"
+            raise InputError(f"signals.{name}", f"is no {what} of the plant", remedy)
     absent = [name for name in plant.outputs if name not in configuration.signals]
     if absent:
         raise InputError(
@@ -199,13 +297,7 @@ def _require_names(configuration: Configuration, plant: Plant) -> None:
 
 
 def require_filled_in(name: str, entry: SignalTable) -> None:
-    """Column and unit of the signal `name` are said.
-
-    Parameters
-    ----------
-    name : str
-        Of the signal.
-    entry : SignalTable
+    """Require that column and unit of the signal `name` are no longer `FILL_IN`.
 
     Raises
     ------
@@ -218,16 +310,9 @@ def require_filled_in(name: str, entry: SignalTable) -> None:
 
 
 def require_kind(name: str, written: str, expected: str) -> None:
-    """A force cannot stand for an angle; what has no unit may stand for anything.
+    """Require that a `written` unit may stand for the `expected` one of the signal `name`.
 
-    Parameters
-    ----------
-    name : str
-        Of the signal.
-    written : str
-        Unit of its column.
-    expected : str
-        Unit of the plant's.
+    What has no unit may stand for anything.
 
     Raises
     ------
@@ -252,29 +337,35 @@ def require_kind(name: str, written: str, expected: str) -> None:
 
 
 def require_distinct(paths: Sequence[Path]) -> None:
-    """None of the `paths` is given twice, by whatever name.
+    """None of the `paths` is given twice, by whatever name, nor a copy of another to the byte.
 
     Raises
     ------
     InputError
         When one is.
     """
-    seen: set[str] = set()
+    places: dict[str, Path] = {}
+    sizes: dict[int, list[Path]] = {}
     for path in paths:
         place = os.path.realpath(path)  # Path.resolve raises on a circle of links
-        if place in seen:
-            raise InputError(str(path), "is given twice", "name each trial once")
-        seen.add(place)
+        if place in places:
+            same = "" if str(places[place]) == str(path) else f", as {places[place]} too"
+            raise InputError(str(path), f"is given twice{same}", "name each trial once")
+        places[place] = Path(path)
+        if os.path.isfile(place):
+            sizes.setdefault(os.path.getsize(place), []).append(Path(path))
+    for alike in sizes.values():
+        contents: dict[str, Path] = {}
+        for path in alike if len(alike) > 1 else ():
+            other = contents.setdefault(content_digest(path), path)
+            if other is not path:
+                raise InputError(
+                    str(path), f"is a copy of {other}, byte for byte", "name each trial once"
+                )
 
 
 def label_of(source: str, entry: RecordingTable) -> Label:
-    """Whose trial a file is, by its name and the [recording] table.
-
-    Parameters
-    ----------
-    source : str
-        The file.
-    entry : RecordingTable
+    """Whose trial the file `source` is, by its name and the [recording] table.
 
     Raises
     ------
@@ -301,15 +392,7 @@ def label_of(source: str, entry: RecordingTable) -> Label:
 
 
 def channel_of(table: Table, clock: Clock, name: str, entry: SignalTable) -> checks.Channel:
-    """The column of a signal, in its own unit, after offset and sign.
-
-    Parameters
-    ----------
-    table : Table
-    clock : Clock
-    name : str
-        Of the signal.
-    entry : SignalTable
+    """The column of the signal `name`, in its own unit, after offset and sign.
 
     Raises
     ------
@@ -332,7 +415,7 @@ def _checked(
 ) -> list[str]:
     """Every check of one channel, those first whose fault would explain the others."""
     found = [
-        checks.unit_of_the_file(channel, told_unit(table, channel.column)),
+        checks.unit_of_the_file(channel, told_unit(table, channel.column), entry.overrule_unit),
         measurable.size(channel),
         checks.missing(channel, recorded.fill_gaps),
         checks.constant(channel),
@@ -340,6 +423,7 @@ def _checked(
         "" if entry.limit is None else checks.beyond_the_stop(channel, entry.limit),
         # A perturbation of two or three levels rests on its extremes by design.
         checks.clipped(channel) if response else "",
+        checks.stretches(channel) if response else "",
     ]
     return [finding for finding in found if finding]
 

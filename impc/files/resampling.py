@@ -13,15 +13,18 @@ the first and behind the last sample x is continued by its point reflection 2 x_
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.signal
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from impc.arrays import Array
 
-__all__ = ["held_means", "instants", "resampled_samples", "same_rate"]
+__all__ = ["held_means", "instants", "resampled_samples", "same_rate", "shifted"]
 
 # Attenuation in dB of what would alias, and the largest ripple below: 10^(-70/20) = 3e-4.
 _ATTENUATION = 70.0
@@ -34,14 +37,25 @@ _CHUNK = 2_000_000  # numbers in memory at a time: 16 MB
 
 
 def same_rate(samples: int, period: float, dt: float) -> bool:
-    """Whether two clocks stay together over a recording of so many `samples`.
-
-    Parameters
-    ----------
-    period, dt : float
-        Of the two clocks, s.
-    """
+    """Whether clocks of `period` and `dt`, in s, stay together over so many `samples`."""
     return samples * abs(period - dt) <= _SAME * dt
+
+
+def shifted(series: Mapping[str, Array], samples: Mapping[str, float]) -> dict[str, Array]:
+    """The `series` (samples,), each moved later by so many `samples`, where all have values (any,).
+
+    A part of a sample is interpolated linearly.
+    """
+    first = max(0, *map(math.ceil, samples.values()))
+    size = min(map(len, series.values()))
+    last = size - 1 + min(0, *map(math.floor, samples.values()))
+    places = np.arange(first, last + 1)
+    return {
+        name: values[first : last + 1]
+        if samples[name] == 0
+        else np.interp(places - samples[name], np.arange(len(values)), values)
+        for name, values in series.items()
+    }
 
 
 def resampled_samples(samples: int, period: float, dt: float) -> int:
@@ -50,19 +64,9 @@ def resampled_samples(samples: int, period: float, dt: float) -> int:
 
 
 def instants(values: Array, period: float, dt: float) -> Array:
-    """Values at the instants k dt, without what the lower of the two rates cannot show.
+    """The `values` (samples,), every `period` s, at the instants k dt (resampled,).
 
-    Parameters
-    ----------
-    values : Array
-        (samples,), recorded every `period` seconds.
-    period, dt : float
-        s.
-
-    Returns
-    -------
-    Array
-        (resampled,). The values themselves when the rates are the same.
+    Without what the lower of the two rates cannot show; themselves when `dt`, in s, is the period.
     """
     if same_rate(len(values), period, dt):
         return values
@@ -86,21 +90,10 @@ def instants(values: Array, period: float, dt: float) -> Array:
 
 
 def held_means(values: Array, period: float, dt: float) -> Array:
-    """Means over [k dt, (k + 1) dt) of a signal that is linear between its samples.
+    """Means of the `values` (samples,), every `period` s, over [k dt, (k + 1) dt) (resampled,).
 
-    The last interval reaches beyond the recording; there the last value is held.
-
-    Parameters
-    ----------
-    values : Array
-        (samples,), recorded every `period` seconds.
-    period, dt : float
-        s.
-
-    Returns
-    -------
-    Array
-        (resampled,). The values themselves when the rates are the same.
+    The signal is linear between its samples. The last interval reaches beyond the recording; there
+    the last value is held. The values themselves when `dt`, in s, is the period.
     """
     if same_rate(len(values), period, dt):
         return values

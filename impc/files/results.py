@@ -6,6 +6,7 @@ reads results sees from it whether it knows them.
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -115,12 +116,14 @@ def read_result(path: str | Path) -> ResultFile:
     ('explained', ['x[0]'])
     """
     place = Path(path)
-    file = place / "result.json" if place.is_dir() else place
+    file = place / "result.json" if os.path.isdir(place) else place
     try:
         require_ordinary(file)
         content = msgspec.json.decode(file.read_bytes(), type=dict[str, Any])
     except (OSError, msgspec.DecodeError, RecursionError) as error:
-        raise _refused(file, f"is no result ({error})") from None
+        raise _refused(
+            file, f"is no result ({getattr(error, 'strerror', None) or error})"
+        ) from None
     schema = content.get("schema", 1)
     if schema != SCHEMA:
         raise _refused(file, f"is of another version of impc (schema {schema}, not {SCHEMA})")

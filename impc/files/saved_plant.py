@@ -34,17 +34,9 @@ _MOST = 1e70
 
 
 def read_matrices(path: Path) -> dict[str, Any]:
-    """What a file holds, by name; A, B, C and dt are among it. No pickles are opened.
+    """What the file at `path` holds, by name, not checked; A, B, C and dt are among it.
 
-    Parameters
-    ----------
-    path : Path
-        Of a .mat file up to version 7, .npz or .json.
-
-    Returns
-    -------
-    dict of str to object
-        As the file has them, not checked.
+    It is .mat up to version 7, .npz or .json. No pickles are opened.
 
     Raises
     ------

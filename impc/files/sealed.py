@@ -14,12 +14,11 @@ import hashlib
 import json
 import os
 import re
-import shutil
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from impc.errors import InputError, OutputError
-from impc.files.writing import require_ordinary, write_whole
+from impc.files.writing import remove_empty, require_ordinary, write_whole
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -78,28 +77,18 @@ class Kept:
     def recall_all(self, digest: str) -> dict[str, Any]:
         """All that runs with that `digest` kept, name -> content, oldest first."""
         found = {}
-        files = [
-            path
-            for path in self.folder.rglob("*.json")
-            if path.is_file() and os.access(path, os.R_OK)
-        ]
-        for path in sorted(files, key=lambda path: (path.stat().st_mtime_ns, path.name)):
+        for path in sorted(self._files(), key=lambda path: (path.stat().st_mtime_ns, path.name)):
             one = _unsealed(path.read_bytes())
             if one is not None and one["digest"] == digest and self.path(one["name"]) == path:
                 found[one["name"]] = one["content"]
         return found
 
-    def keep(self, name: str, digest: str, content: Any) -> None:
-        """Write a result down.
+    def _files(self) -> list[Path]:
+        files = self.folder.rglob("*.json")
+        return [path for path in files if path.is_file() and os.access(path, os.R_OK)]
 
-        Parameters
-        ----------
-        name : str
-            What it is.
-        digest : str
-            Of all that it was made of.
-        content : JSON
-            Dictionaries with text as keys, lists, text, numbers, None.
+    def keep(self, name: str, digest: str, content: Any) -> None:
+        """Write the result `name` down: `content`, as JSON has it, and the `digest` of its origin.
 
         Raises
         ------
@@ -126,7 +115,7 @@ class Kept:
             ) from None
 
     def forget(self) -> None:
-        """Remove the folder: the final results have been written.
+        """Remove what was kept: the final results have been written. Files of others stay.
 
         Raises
         ------
@@ -134,9 +123,11 @@ class Kept:
             When that cannot be done.
         """
         try:
-            shutil.rmtree(self.folder)
-        except FileNotFoundError:
-            return
+            for path in self._files():
+                found = _unsealed(path.read_bytes())
+                if found is not None and self.path(found["name"]) == path:
+                    path.unlink()
+            remove_empty(self.folder)
         except OSError as error:
             raise OutputError(
                 f"folder {self.folder}", f"cannot be removed ({error.strerror})", "remove it"

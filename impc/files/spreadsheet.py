@@ -1,8 +1,8 @@
 """Workbooks of Excel (.xlsx) and LibreOffice (.ods), by python-calamine (the extra `excel`).
 
-The first sheet with rows of numbers that is not hidden is the recording; the others are named.
-Above the numbers stand the headings and, if there is one, a row of units, as in delimited text. Of
-a formula the value counts that was saved with it.
+The recording is the sheet that is asked for, else the first that is not hidden and has a block of
+rows of numbers; the others are named. What stands above and below the block is as in delimited
+text. Of a formula the value counts that was saved with it.
 """
 
 from __future__ import annotations
@@ -16,8 +16,9 @@ import numpy as np
 
 from impc.errors import DataError
 from impc.extras import optional
+from impc.files.blocks import EMPTY, HEAD, NUMBER, WORD, Block, first_block
 from impc.files.delimited import is_number
-from impc.files.headings import are_units, named_columns
+from impc.files.headings import find_headings
 from impc.files.table import make_table
 from impc.files.thousands import require_no_thousands
 
@@ -30,52 +31,60 @@ if TYPE_CHECKING:
 
 __all__ = ["read_cells", "read_spreadsheet"]
 
-_HEAD = 100  # rows in which the first row of numbers must stand
 _DAY = 86_400.0
 _TIMES = (datetime.datetime, datetime.date, datetime.time, datetime.timedelta)
 
 
-def read_spreadsheet(path: Path, largest: int) -> Table:
-    """Read the columns of the first sheet that has rows of numbers.
+def read_spreadsheet(path: Path, largest: int, sheet: str = "") -> Table:
+    """Read the columns of the first sheet that has a block of rows of numbers, or of `sheet`.
 
     Dates and times become seconds after the first. Numbers that were saved as text, with decimal
-    commas too, are numbers.
-
-    Parameters
-    ----------
-    path : Path
-        Of the file.
-    largest : int
-        The most bytes that it may unpack to, and its arrays take.
+    commas too, are numbers. The file at `path` may unpack to `largest` bytes.
 
     Raises
     ------
     DataError
-        When it is damaged, locked by a password, or no sheet has rows of numbers.
+        When it is damaged, locked by a password, lacks that sheet, or no sheet has rows of numbers.
     ImpcError
         When python-calamine is not installed.
     """
     source = str(path)
     sheets = list(_sheets(path, largest))
-    for index, sheet in enumerate(sheets):
-        first = _first_numbers(sheet.rows[:_HEAD])
-        if first is not None:
-            others = sheets[:index] + sheets[index + 1 :]
-            skipped = {f"sheet {other.name}": "is another sheet" for other in others}
-            return _table(source, sheet, first, skipped)
-    problem = f"has no rows of numbers in the first {_HEAD} rows of a sheet"
-    raise DataError(source, problem, "save one signal a column, its name above it")
+    if sheet and sheet not in [item.name for item in sheets]:
+        named = ", ".join(item.name for item in sheets[:12])
+        raise DataError(source, f"has no sheet {sheet!r}", f"recording.sheet may be {named}")
+    found = [
+        (item, block)
+        for item in sheets
+        if (not sheet or item.name == sheet) and (block := _block(item)) is not None
+    ]
+    if not found:
+        problem = f"has no rows of numbers in the first {HEAD} rows of a sheet"
+        raise DataError(source, problem, "save one signal a column, its name above it")
+    full = [item for item in found if item[1].several]
+    chosen, block = (full or found)[0]
+    skipped = {f"sheet {item.name}": "is another sheet" for item in sheets if item is not chosen}
+    notes = (f"sheet {chosen.name!r} is read, and others have rows of numbers too",)
+    return _table(source, chosen, block, skipped, notes if len(full) > 1 else ())
+
+
+def _block(sheet: _Sheet) -> Block | None:
+    return first_block([_kinds(row) for row in sheet.rows[: 3 * HEAD]], alone=True)
+
+
+def _kinds(row: Sequence[Any]) -> list[int]:
+    return [_kind_of(cell) for cell in row]
+
+
+def _kind_of(cell: Any) -> int:
+    if isinstance(cell, str):
+        text = cell.strip()
+        return (NUMBER if any(is_number(text, mark) for mark in ".,") else WORD) if text else EMPTY
+    return WORD if isinstance(cell, bool) else NUMBER
 
 
 def read_cells(path: Path, largest: int) -> dict[str, Any]:
-    """The cells of the first sheet as texts, a row in each list.
-
-    Parameters
-    ----------
-    path : Path
-        Of the file.
-    largest : int
-        The most bytes that it may unpack to.
+    """The cells of the first sheet at `path` as texts, a row in each list; `largest` as above.
 
     Raises
     ------
@@ -124,44 +133,52 @@ def _sheets(path: Path, largest: int) -> Iterator[_Sheet]:
         raise DataError(source, "is locked by a password", "save it without one") from None
 
 
-def _first_numbers(rows: Sequence[Sequence[Any]]) -> int | None:
-    """The first row in which more than half of the columns that have numbers have one."""
-    counts = [sum(_is_value(cell) for cell in row) for row in rows]
-    most = max(counts, default=0)
-    return next((place for place, count in enumerate(counts) if 0 < most < 2 * count), None)
-
-
-def _is_value(cell: Any) -> bool:
-    """Whether a cell is a number or a time, saved as such or as text."""
-    if isinstance(cell, str):
-        return any(is_number(cell.strip(), mark) for mark in ".,")
-    return not isinstance(cell, bool)
-
-
-def _table(source: str, sheet: _Sheet, first: int, skipped: dict[str, str]) -> Table:
-    above = [[_text(cell) for cell in row] for row in sheet.rows[:first] if any(map(_text, row))]
-    columns: dict[str, Array] = {}
-    width = len(sheet.rows[first])
-    units, heads = [""] * width, [""] * width
-    if len(above) > 1 and are_units(above[-1]):
-        units = above.pop()
-    if above:
-        heads = above[-1]
-    names, told = named_columns(source, heads, units)
-    for index, name in enumerate(names):
-        cells = [row[index] for row in sheet.rows[first:]]
-        if all(cell == "" for cell in cells):
-            if name:
-                skipped[name] = "is empty"
+def _body(sheet: _Sheet, block: Block) -> tuple[list[list[Any]], str]:
+    """The rows of a block, and a note on what stands below it."""
+    last, blank = block.first, False
+    for index, row in enumerate(sheet.rows[block.first :], start=block.first):
+        kinds = _kinds(row)
+        if not any(kinds):
+            blank = True
             continue
-        found = _column(source, sheet, (first, index), name, cells)
+        if not block.fits(kinds, blank) and block.ends_at(kinds, _following(sheet, index), blank):
+            place = next(cell for cell, kind in enumerate(kinds) if kind)
+            where, what = sheet.cell(index, place), str(row[place])[:40]
+            note = f"row {where} and those below are not read: they begin with {what!r}"
+            return sheet.rows[block.first : last + 1], note
+        last, blank = index, False
+    return sheet.rows[block.first : last + 1], ""
+
+
+def _following(sheet: _Sheet, index: int) -> list[int]:
+    """The kinds of the next row that is not empty."""
+    below = (_kinds(sheet.rows[place]) for place in range(index + 1, len(sheet.rows)))
+    return next((kinds for kinds in below if any(kinds)), [])
+
+
+def _table(
+    source: str, sheet: _Sheet, block: Block, skipped: dict[str, str], notes: tuple[str, ...]
+) -> Table:
+    rows, rest = _body(sheet, block)
+    above = [[_text(cell) for cell in row] for row in sheet.rows[: block.first]]
+    places = list(zip(*rows, strict=True))
+    empty = [all(cell == "" for cell in cells) for cells in places]
+    heads = find_headings(source, above, empty, named_rows=isinstance(rows[0][0], str))
+    units = dict(heads.units)
+    columns: dict[str, Array] = {}
+    for index, (name, cells) in enumerate(zip(heads.names, places, strict=True)):
+        if empty[index]:
+            skipped |= {name: "is empty"} if name else {}
+            continue
+        found = _column(source, sheet, (block.first, index), name, cells)
         if isinstance(found, str):
             skipped[name or f"column_{index + 1}"] = found
             continue
         columns[name or f"column_{index + 1}"] = found
         if isinstance(cells[0], _TIMES):
-            told[name] = "s"
-    return make_table(source, columns, told, None, skipped)
+            units[name] = "s"
+    notes = (*heads.notes, *notes, *([rest] if rest else []))
+    return make_table(source, columns, units, None, skipped, notes)
 
 
 def _column(

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
-
-import numpy as np
+from typing import TYPE_CHECKING, Any
 
 from impc.arrays import Frozen, frozen
+from impc.checking import checked
 from impc.errors import DataError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+
+    from numpy.typing import ArrayLike
 
     from impc.arrays import Array
 
@@ -37,6 +38,9 @@ class Table(Frozen):
         Samples per second, where the file tells it itself (TDMS, C3D).
     skipped : mapping of str to str
         What else the file holds, and why it is no column.
+    notes : tuple of str
+        What a user of the columns has to know of the file: names that were changed, rows that
+        were not read.
     """
 
     source: str
@@ -44,6 +48,7 @@ class Table(Frozen):
     units: Mapping[str, str]
     rate: float | None
     skipped: Mapping[str, str] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
     @property
     def samples(self) -> int:
@@ -51,12 +56,14 @@ class Table(Frozen):
         return len(next(iter(self.columns.values())))
 
 
+@checked
 def make_table(
     source: str,
-    columns: Mapping[str, Array],
+    columns: Mapping[str, ArrayLike],
     units: Mapping[str, str] | None = None,
     rate: float | None = None,
     skipped: Mapping[str, str] | None = None,
+    notes: tuple[str, ...] = (),
 ) -> Table:
     """Keep the columns of the length that most have; the others are named among the skipped.
 
@@ -64,14 +71,16 @@ def make_table(
     ----------
     source : str
         File, for messages.
-    columns : mapping of str to Array
-        (samples,) each, by name.
+    columns : mapping of str to array_like
+        (samples,) each, by name. What a masked array masks is missing: NaN.
     units : mapping of str to str, optional
         As the file writes them, of the columns that have one.
     rate : float, optional
         Samples per second, where the file tells it.
     skipped : mapping of str to str, optional
         What was not read, and why.
+    notes : tuple of str, optional
+        What a user of the columns has to know.
 
     Raises
     ------
@@ -85,14 +94,14 @@ def make_table(
     >>> table.samples, dict(table.units)
     (2, {'tilt': 'deg'})
     """
-    given, columns = columns, {_line(name): value for name, value in columns.items()}
-    if len(columns) < len(given):
+    vectors: dict[str, Any] = {_line(name): value for name, value in columns.items()}
+    if len(vectors) < len(columns):
         raise DataError(source, "has two columns of one name", "give each its own")
     units = {_line(name): _line(unit) for name, unit in (units or {}).items()}
     left_out = {_line(name): _line(reason) for name, reason in (skipped or {}).items()}
-    lengths = Counter(len(values) for values in columns.values() if len(values) > 1)
+    lengths = Counter(len(values) for values in vectors.values() if len(values) > 1)
     if not lengths:
-        left_out |= {name: f"has {len(values)} values" for name, values in columns.items()}
+        left_out |= {name: f"has {len(values)} values" for name, values in vectors.items()}
         found = next((f"{name} {reason}" for name, reason in left_out.items()), "nothing in it")
         raise DataError(
             source, f"holds no column of numbers ({found})", "save each signal as a column"
@@ -100,13 +109,13 @@ def make_table(
     # The longer one where two are equally frequent.
     usual = max(lengths, key=lambda length: (lengths[length], length))
     kept = {}
-    for name, values in columns.items():
+    for name, values in vectors.items():
         if len(values) == usual:
-            kept[name] = frozen(np.asarray(values, dtype=np.float64))
+            kept[name] = values if not values.flags.writeable else frozen(values)
         else:
             left_out[name] = f"has {len(values)} values where most columns have {usual}"
     told = {name: unit for name, unit in units.items() if name in kept and unit}
-    return Table(source, kept, told, rate, left_out)
+    return Table(source, kept, told, rate, left_out, tuple(map(_line, notes)))
 
 
 def _line(text: str) -> str:

@@ -23,23 +23,26 @@ if TYPE_CHECKING:
 
 __all__ = ["encode_tdms", "read_tdms"]
 
+# Kinds of scales that nptdms applies.
+_SCALES = (
+    *("Linear", "Polynomial", "Table", "Add", "Subtract", "AdvancedAPI"),
+    *("RTD", "Strain", "Thermistor", "Thermocouple"),
+)
+_BETWEEN = 0.1  # of a sample, by which two channels may be apart
+
 
 def read_tdms(path: Path, largest: int) -> Table:
-    """Read the channels of all groups; `group/channel` where two groups name one alike.
+    """Read the channels of all groups at `path`; `group/channel` where two groups name one alike.
 
-    Time stamps become seconds after the first. The rate is 1 / wf_increment, where it is told.
-
-    Parameters
-    ----------
-    path : Path
-        Of the file.
-    largest : int
-        The most bytes that its arrays may take.
+    Time stamps become seconds after the first. The rate is 1 / wf_increment, where it is given.
+    Channels that begin at different times are cut to the time that they have in common. Arrays take
+    `largest` bytes at most.
 
     Raises
     ------
     DataError
-        When the file was cut off while it was written or copied, or has no numeric channel.
+        When the file was cut off while it was written or copied, has no numeric channel, or
+        channels whose samples are not simultaneous.
     ImpcError
         When nptdms is not installed.
     """
@@ -52,11 +55,17 @@ def read_tdms(path: Path, largest: int) -> Table:
                 source, "ends in the middle of its data", "copy it again, or close it in LabVIEW"
             )
         channels = [channel for group in file.groups() for channel in group.channels()]
+        unknown = {
+            channel.path: scale
+            for group in file.groups()
+            for channel in group.channels()
+            if (scale := _unknown_scale(channel, group, file))
+        }
         claimed = sum(len(channel) for channel in channels)
         if 8 * claimed > largest or claimed > path.stat().st_size:
             problem = f"is too large or damaged: it says that it has {claimed} values"
             raise DataError(source, problem, "export only the channels that are needed")
-        return _table(source, channels)
+        return _table(source, channels, unknown)
 
 
 def encode_tdms(table: Table) -> bytes:
@@ -95,15 +104,28 @@ class _Bounded(io.BufferedReader):
         return super().read(min(size, max(0, end - here)))
 
 
-def _table(source: str, channels: list[Any]) -> Table:
+def _unknown_scale(channel: Any, *owners: Any) -> str:
+    """The kind of a scale that nptdms does not apply, so that its samples are raw counts."""
+    for owner in (channel, *owners):
+        for key, kind in owner.properties.items():
+            counts = kind == "AdvancedAPI" and channel.dtype.kind in "iu"
+            if key.endswith("_Scale_Type") and (counts or kind not in _SCALES):
+                return str(kind)
+    return ""
+
+
+def _table(source: str, channels: list[Any], unknown: dict[str, str]) -> Table:
     names = Counter(channel.name for channel in channels)
     columns: dict[str, Array] = {}
     units: dict[str, str] = {}
     skipped: dict[str, str] = {}
-    rates: dict[str, float] = {}
+    timed: dict[str, Any] = {}
     for channel in channels:
         twice = names[channel.name] > 1
         name = f"{channel.group_name}/{channel.name}" if twice else channel.name
+        if channel.path in unknown:
+            skipped[name] = f"has a scale of the unknown kind {unknown[channel.path]!r}: raw counts"
+            continue
         if channel.dtype.kind not in "fiubM":
             skipped[name] = "is complex" if channel.dtype.kind == "c" else "is text"
             continue
@@ -114,11 +136,11 @@ def _table(source: str, channels: list[Any]) -> Table:
             unit = "s"
         columns[name] = np.asarray(data, dtype=np.float64)
         units[name] = unit
-        step = float(channel.properties.get("wf_increment", 0) or 0)
-        if step > 0:
-            rates[name] = 1 / step
+        if float(channel.properties.get("wf_increment", 0) or 0) > 0:
+            timed[name] = channel.properties
+    columns = _simultaneous(source, columns, timed)
     table = make_table(source, columns, units, None, skipped)
-    told = {rates[name] for name in table.columns if name in rates}
+    told = {1 / float(timed[name]["wf_increment"]) for name in table.columns if name in timed}
     if len(told) > 1:
         raise DataError(
             source,
@@ -126,6 +148,46 @@ def _table(source: str, channels: list[Any]) -> Table:
             "export those of one rate into a file of their own",
         )
     return make_table(source, table.columns, table.units, next(iter(told), None), table.skipped)
+
+
+def _simultaneous(
+    source: str, columns: dict[str, Array], timed: dict[str, Any]
+) -> dict[str, Array]:
+    """The columns, cut to the time that those with a clock have in common.
+
+    Raises
+    ------
+    DataError
+        When they have none, or begin between two samples of each other.
+    """
+    moments = {name: item.get("wf_start_time") for name, item in timed.items()}
+    earliest = min((moment for moment in moments.values() if moment is not None), default=None)
+    begins: dict[str, float] = {}
+    for name, item in timed.items():
+        begins[name] = float(item.get("wf_start_offset", 0) or 0)
+        if moments[name] is not None:
+            begins[name] += float((moments[name] - earliest) / np.timedelta64(1, "s"))
+    if len(set(begins.values())) < 2:
+        return columns
+    last = max(begins, key=begins.__getitem__)
+    step = float(timed[last]["wf_increment"])
+    rows = {name: (begins[last] - begin) / step for name, begin in begins.items()}
+    left = min(len(columns[name]) - lost for name, lost in rows.items())
+    for name, lost in rows.items():
+        if left < 2 or abs(lost - round(lost)) > _BETWEEN:
+            raise DataError(
+                source,
+                f"channel {name} begins at {_when(moments, begins, name)} and {last} at "
+                f"{_when(moments, begins, last)}, no whole number of samples apart",
+                "export channels that are recorded together into a file of their own",
+            )
+    whole = {name: round(lost) for name, lost in rows.items()}
+    return columns | {name: columns[name][lost : lost + int(left)] for name, lost in whole.items()}
+
+
+def _when(moments: dict[str, Any], begins: dict[str, float], name: str) -> str:
+    moment = moments[name]
+    return f"{begins[name]:g} s" if moment is None else f"{begins[name]:g} s ({moment})"
 
 
 @contextlib.contextmanager

@@ -16,22 +16,12 @@ __all__ = ["require_no_thousands"]
 def require_no_thousands(
     source: str, names: Mapping[int, str], rows: Iterable[tuple[int, Sequence[str]]], sign: str
 ) -> None:
-    """Refuse a column whose decimal sign may divide thousands.
+    """Refuse a column whose decimal `sign` may divide thousands.
 
     It may where the sign always stands before three digits and behind one to three that do not
     begin with 0, and other values are whole numbers without a sign. A program that writes decimals
-    writes 999.000 there, or 1.
-
-    Parameters
-    ----------
-    source : str
-        File, for the message.
-    names : mapping of int to str
-        Name of each column that is looked at, by its place in a row.
-    rows : iterable of (int, sequence of str)
-        Number of the line and its fields.
-    sign : str
-        What was taken for the decimal sign.
+    writes 999.000 there, or 1. `names` are those of the columns by their place in `rows`, which are
+    numbers of lines with their fields; `source` is the file.
 
     Raises
     ------

@@ -5,22 +5,54 @@ from __future__ import annotations
 import functools
 import math
 import re
+import unicodedata
 from dataclasses import dataclass
 from typing import Any
 
 from impc.checking import checked
 from impc.errors import InputError, brief
 
-__all__ = ["USUAL", "Unit", "as_pint_says", "is_unit", "si_unit"]
+__all__ = ["USUAL", "Unit", "as_pint_says", "guessed_unit", "is_unit", "si_unit"]
 
 # pint would take Nm for "number metre" and a.u. for "year times atomic mass unit".
 _TORQUE = re.compile(r"(?<![A-Za-z])([kmM]?)N[ ·.\-⋅]?([cm]?)m(?![A-Za-z0-9])")
+_DEGREES = str.maketrans("º˚", "°°")  # the marks of ordinals and of rings, typed for degrees
+_PRESSURE = "kilogram / meter / second ** 2"  # of which a million is usual
 _NO_UNIT = ("", "1", "-", "none", "unitless", "dimensionless", "n.d.")
+# Words that pint knows and that mean something else in half of the files that have them.
 _UNCLEAR = {
     "g": "write g_0 for the acceleration of gravity, gram for a mass",
     "a.u.": 'write unit = "1" for arbitrary units',
+    "a.u": 'write unit = "1" for arbitrary units',
     "au": 'write unit = "1" for arbitrary units',
+    "nm": "write N*m for a torque, nanometer for a length",
+    "px": 'write unit = "1" for pixels',
 }
+# The same within products and quotients: Grad/s.
+_UNCLEAR_WORDS = {
+    **dict.fromkeys(("grad", "grads", "grade", "grades"), "write deg for degrees, gon otherwise"),
+    "rads": "write rad",
+    "pct": "write %",
+    "u": "write rpm for revolutions a minute",
+}
+# Words of German, French, Spanish and Italian laboratories, without accents.
+_FOREIGN = {
+    "deg": "grad grade degre degres grado grados gradi graus",
+    "rad": "radiant radiante radianti radianes bogenmass",
+    "s": "sek sekunde sekunden seconde secondes seg segundo segundos secondo secondi",
+    "ms": "msek millisekunde millisekunden milliseconde millisecondes milisegundo milisegundos"
+    " millisecondo millisecondi",
+    "m": "metro metri metros",
+    "cm": "zentimeter centimetro centimetri centimetros",
+    "mm": "millimetro millimetri milimetro milimetros",
+    "N*m": "newtonmeter newtonmetre newtonmetres newtonmetro newtonmetri newtonmetros",
+    "V": "voltio voltios",
+    "%": "prozent pourcent",
+    "turn": "umdrehung umdrehungen tour tours tr giro giri",
+    "min": "minuten minuto minuti minutos mn",
+}
+_MEANT = {word: unit for unit, words in _FOREIGN.items() for word in words.split()}
+_WORD = re.compile(r"[^\W\d_]+")
 # Letters, products, quotients and one-digit exponents. Longer numbers would be computed by pint,
 # and 9**9**9 takes as long as it likes.
 _WRITTEN = re.compile(r"[A-Za-zµμ°Ω%_·⋅.*/^ ()0-9²³-]{1,40}")
@@ -68,17 +100,19 @@ def si_unit(written: str) -> Unit:
     InputError
         When pint does not know it, when it has an offset (degC), or when its name is ambiguous.
     """
-    text = written.strip()
+    text = written.strip().translate(_DEGREES)
     if text.lower() in _NO_UNIT:
         return Unit(written, 1.0, "dimensionless")
-    if text.lower() in _UNCLEAR:
-        raise InputError(f"unit {written!r}", "can be read in two ways", _UNCLEAR[text.lower()])
+    unclear = _unclear(text)
+    if unclear:
+        raise InputError(f"unit {written!r}", "can be read in two ways", unclear)
     if not _WRITTEN.fullmatch(text) or _HOSTILE.search(text):
         raise _unknown(written)
     text = text.replace("⋅", "*").replace("²", "^2").replace("³", "^3")
     text = _TORQUE.sub(lambda found: f"{found[1]}N*{found[2]}m", text)
-    text = re.sub(r"(?<=[A-Za-z0-9])\.(?=[A-Za-z])", "*", text)
-    for spelling in (text, re.sub(r"(?<=[a-z])(\d)", r"^\1", text), text.lower()):
+    text = re.sub(r"(?<=[A-Za-z0-9°])\.(?=[A-Za-z])", "*", text)
+    text = re.sub(r"(?<=[a-z])(-?\d)", r"^\1", text)  # m/s2, rad.s-1
+    for spelling in (text, text.lower()):
         found = _base(spelling)
         if found is not None:
             factor, zero, base = found
@@ -86,17 +120,41 @@ def si_unit(written: str) -> Unit:
                 raise InputError(
                     f"unit {written!r}", "has an offset", "record in a unit with its zero at zero"
                 )
+            if factor >= (1e4 if base.startswith("radian") else 1e6) and base != _PRESSURE:
+                problem = f"is {factor:g} {base}: a capital M is mega, G giga"
+                raise InputError(f"unit {written!r}", problem, "write m for milli")
             return Unit(written, factor, base)
     raise _unknown(written)
 
 
 def is_unit(text: str) -> bool:
-    """Whether the `text` behind a column's name is a unit."""
+    """Whether the `text` behind a column's name is a unit, or a word for one."""
     try:
         si_unit(text)
     except InputError:
-        return text.strip().lower() in _UNCLEAR
+        return bool(_unclear(text.strip()) or guessed_unit(text))
     return bool(text.strip())
+
+
+def guessed_unit(written: str) -> str:
+    """The unit that a `written` word of another language means: Grad/s -> deg/s; else empty."""
+    parts = unicodedata.normalize("NFKD", written.strip().translate(_DEGREES)).casefold()
+    plain = "".join(mark for mark in parts if not unicodedata.combining(mark)).rstrip(".")
+    joined = re.sub(r"\bnewtons?[ ·*._-]+(met)", r"newton\1", plain)
+    found = _WORD.sub(lambda word: _MEANT.get(word[0], word[0]), joined)
+    if found == joined:
+        return ""
+    try:
+        return si_unit(found).written
+    except InputError:
+        return ""
+
+
+def _unclear(text: str) -> str:
+    """What to do about a unit that can be read in two ways; empty for the others."""
+    whole = "" if text == "Nm" else _UNCLEAR.get(text.lower(), "")
+    parts = (_UNCLEAR_WORDS.get(word, "") for word in _WORD.findall(text.lower()))
+    return whole or next(filter(None, parts), "")
 
 
 def _base(text: str) -> tuple[float, float, str] | None:
@@ -130,8 +188,6 @@ def _registry() -> Any:
 
 
 def _unknown(written: str) -> InputError:
-    return InputError(
-        f"unit {brief(written, 40)!r}",
-        "is not known",
-        'write it as in "deg", "rad/s", "N*m", "mV", "1"',
-    )
+    meant = guessed_unit(written)
+    remedy = f'as "{meant}"' if meant else 'as in "deg", "rad/s", "N*m", "mV", "1"'
+    return InputError(f"unit {brief(written, 40)!r}", "is not known", f"write it {remedy}")

@@ -32,22 +32,10 @@ _DATA = (".mat", ".npz", ".json")
 def consented_name(
     where: str, named: str, given: str | None, allowed: bool, option: str, known: tuple[str, ...]
 ) -> str:
-    """The plant or model that may be run, when a file names one.
+    """The plant or model that may be run, when the place `where` in a file has `named` one.
 
-    Parameters
-    ----------
-    where : str
-        How messages call the place in the file.
-    named : str
-        What the file names; empty when it does not.
-    given : str or None
-        What the command line names: it replaces what the file does.
-    allowed : bool
-        Whether the command line allows what the file names.
-    option : str
-        "plant" or "model".
-    known : tuple of str
-        Short names of this package's own.
+    What the command line has `given` replaces it; `allowed` says whether it allows what the file
+    names. `option` is "plant" or "model", and `known` are short names of this package's own.
 
     Raises
     ------
@@ -58,7 +46,8 @@ def consented_name(
     if not name:
         raise InputError(where, "is missing", f'write {option} = "module:function"')
     module = name.partition(":")[0]
-    if name in known or Path(name).suffix in _DATA or module == "plants" or ":" not in name:
+    data = option == "plant" and Path(name).suffix in _DATA  # a model is never a file
+    if name in known or data or module == "plants" or ":" not in name:
         return name  # the last: no name of code at all, and told so by who looks for it
     if given is None and not allowed:
         raise InputError(
@@ -82,14 +71,9 @@ def _require_users_module(where: str, module: str, name: str) -> None:
 
 
 def require_users_function(where: str, function: Callable[..., Any]) -> None:
-    """Refuse what is no function of the user's or of this package's plants.
+    """Refuse a `function` that is not of the user's or of this package's plants.
 
-    Parameters
-    ----------
-    where : str
-        How messages call the place in the file.
-    function : callable
-        What was found under the name.
+    `where` is how messages call the place in the file.
 
     Raises
     ------
@@ -110,14 +94,9 @@ def _not_yours(where: str, name: str) -> InputError:
 
 
 def module_file(name: str, beside: Path | None) -> Path | None:
-    """Where a module comes from, without importing it; None for what is built in or not found.
+    """Where the module `name` comes from, without importing it; None for built in or not found.
 
-    Parameters
-    ----------
-    name : str
-        Of the module.
-    beside : Path or None
-        A folder that is looked in too.
+    The folder `beside`, if there is one, is looked in too.
     """
     if name in sys.modules:
         file = getattr(sys.modules[name], "__file__", None)

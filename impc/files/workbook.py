@@ -34,13 +34,10 @@ _HEAD = '<?xml version="1.0" encoding="UTF-8" standalone="yes"?>\n'
 
 
 def workbook_bytes(sheets: Mapping[str, tuple[Sequence[str], Iterable[Sequence[Any]]]]) -> bytes:
-    """The bytes of a workbook; numbers keep all their digits.
+    """The bytes of a workbook of `sheets`; numbers keep all their digits.
 
-    Parameters
-    ----------
-    sheets : mapping of str to (sequence of str, iterable of sequences)
-        By name, of at most 31 signs: heads, and the cells of each row. None and what is not
-        finite are empty cells.
+    By name, of at most 31 signs: heads, and the cells of each row. None and what is not finite are
+    empty cells.
     """
     names = [escape(name.translate(_FORBIDDEN)[:_LONGEST_NAME]) for name in sheets]
     places = range(1, len(names) + 1)

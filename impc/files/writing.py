@@ -15,6 +15,7 @@ __all__ = [
     "IN_ITS_PLACE",
     "NO_ROOM",
     "flush_folder",
+    "remove_empty",
     "require_ordinary",
     "unwritable",
     "write_whole",
@@ -27,16 +28,9 @@ NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 def unwritable(subject: str, error: OSError | ValueError, remedy: str) -> OutputError:
-    """What to say of something that cannot be written: `remedy`, or to make room if there is none.
+    """What to say of the `error` of a `subject` that cannot be written.
 
-    Parameters
-    ----------
-    subject : str
-        The file or folder.
-    error : OSError or ValueError
-        Of the attempt.
-    remedy : str
-        What to do about it otherwise.
+    The `remedy`, or to make room if there is none.
     """
     number = getattr(error, "errno", None)
     reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
@@ -83,6 +77,13 @@ def write_whole(path: Path, content: bytes) -> None:
         flush_folder(path.parent)
     except (OSError, ValueError) as error:
         raise unwritable(f"file {path}", error, IN_ITS_PLACE) from None
+
+
+def remove_empty(folder: Path) -> None:
+    """Remove a `folder` and those in it, as far as there are no files in them."""
+    for path in (*sorted(folder.rglob("*"), reverse=True), folder):
+        if path.is_dir() and not path.is_symlink() and not os.listdir(path):
+            path.rmdir()
 
 
 def flush_folder(folder: Path) -> None:

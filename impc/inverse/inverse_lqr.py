@@ -250,12 +250,16 @@ def _result(
 ) -> InverseLqr:
     error = float(np.linalg.norm(solution.K - target))
     weights = normalised(solution.weights)
+    # A gain of zero, as of a delay, is found to the round-off of the matrices that it is made of.
+    plant = solution.plant
+    usual = float(np.linalg.norm(plant.A) / np.linalg.norm(plant.B))
+    size = float(np.linalg.norm(target)) + 1e-4 * usual
     return InverseLqr(
         weights,
         solution.K,
         error,
         condition_number(weights),
-        error <= 1e-8 * max(float(np.linalg.norm(target)), 1e-300),
+        error <= 1e-8 * size,
         method,
         evaluations,
         status,

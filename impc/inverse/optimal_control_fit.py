@@ -19,6 +19,7 @@ import numpy as np
 import scipy.stats
 
 from impc.arrays import Array, Frozen, IntArray
+from impc.checking import checked
 from impc.control.nlp_solvers import require_solver
 from impc.errors import DataError, InfeasibleError, InputError, SolverError
 from impc.inverse.optimal_control_residuals import EXPLAINED, begin, first_plan, residuals_of
@@ -122,6 +123,7 @@ class OptimalControlEstimate(Frozen):
         return found
 
 
+@checked
 def fit_optimal_control(
     problem: OptimalControlProblem,
     recordings: Sequence[OptimalRecording],

@@ -166,6 +166,12 @@ def _check_pair(name: str, signals: tuple[str, ...], lower: Array, upper: Array)
     for signal, low, high in zip(signals, lower, upper, strict=True):
         if low >= high:
             raise BoundsError(name, f"cross for {signal}: {low:g} >= {high:g}", "swap them")
+        if low == 0 or high == 0:
+            raise BoundsError(
+                name,
+                f"leave {signal} no room on one side of 0: [{low:g}, {high:g}]",
+                "count the signal from its value at rest: subtract it from u_min and u_max too",
+            )
         if not low < 0 < high:
             raise BoundsError(
                 name,

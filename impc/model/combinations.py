@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 __all__ = ["linear_combination"]
 
+# Of the largest factor of a feature: its square is a number still, and its norm none too small.
+_SIZES = 1e-50, 1e50
 _NUMBER = re.compile(r"(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 
 
@@ -49,6 +51,9 @@ def linear_combination(text: str, names: Sequence[str]) -> Array:
         at = _blank(text, at + len(names[known[0]]))
     if not np.any(row):
         raise InputError(f"feature {text!r}", "is zero", "give a combination of states")
+    largest = float(np.max(np.abs(row)))
+    if not _SIZES[0] <= largest <= _SIZES[1]:
+        raise InputError(f"feature {text!r}", f"has a factor of {largest:g}", "scale it to about 1")
     return row
 
 

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 import scipy.linalg
 
-from impc.arrays import Array, frozen
+from impc.arrays import Array, System, frozen
 from impc.checking import Value, checked, replace
 from impc.errors import PlantError, brief
 from impc.model.body import Body, read_body
@@ -104,7 +104,7 @@ class Plant(Value):
     @checked
     def __init__(
         self,
-        system: Any,
+        system: System,
         controls: Sequence[str] | None = None,
         units: Mapping[str, Any] | None = None,
         words: Mapping[str, Any] | None = None,

@@ -19,7 +19,7 @@ import scipy.linalg
 
 from impc.arrays import Array, frozen
 from impc.checking import Value, checked
-from impc.errors import InputError, WeightsError
+from impc.errors import InputError, WeightsError, brief
 from impc.model.combinations import linear_combination
 from impc.model.weights import Weights
 
@@ -216,7 +216,7 @@ def _features(
     if isinstance(given, str) and given not in _WORDS:
         words = ", ".join(f'"{word}"' for word in _WORDS)
         raise InputError(which, f"got {given!r}", f"give {words} or a list of features")
-    if given == "outputs":
+    if isinstance(given, str) and given == "outputs":
         if over is not None:
             raise InputError("over", "goes with diagonal and full", "leave it out for outputs")
         return tuple(plant.outputs), np.array(plant.C)
@@ -244,7 +244,7 @@ def _inputs(plant: Plant, given: Any) -> tuple[tuple[str, ...], Array]:
 
 def _texts(which: str, given: Any) -> tuple[str, ...]:
     if not isinstance(given, (list, tuple)) or not all(isinstance(item, str) for item in given):
-        raise InputError(which, f"got {given!r}", "give a list of features by name")
+        raise InputError(which, f"got {brief(repr(given))}", "give a list of features by name")
     return tuple(given)
 
 

@@ -2,7 +2,7 @@
 
 A spreadsheet takes a cell that begins with = + - or @ for a formula, and runs it; names come from
 files of others. Numbers stay numbers, and text that would be taken for a formula gets an
-apostrophe, which spreadsheets know as the mark of text.
+apostrophe (`text_cell`), which spreadsheets know as the mark of text.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import re
 from typing import TYPE_CHECKING, Any
 
 from impc.errors import one_line
+from impc.files.delimited import text_cell
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -25,7 +26,6 @@ _NUMBER = r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?"
 _HARMLESS = re.compile(
     rf"-|{_NUMBER}%?( [a-z]+[²³]?)?( \({_NUMBER}, {_NUMBER}\))?|[+-]?(inf|nan)", re.IGNORECASE
 )
-_FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n")
 _ANY_LENGTH = 10**9
 
 
@@ -43,5 +43,4 @@ def _cell(value: Any) -> Any:
         return ""
     if not isinstance(value, str):
         return value
-    formula = value.startswith(_FORMULA) and not _HARMLESS.fullmatch(value)
-    return one_line(f"'{value}" if formula else value, _ANY_LENGTH)
+    return one_line(value if _HARMLESS.fullmatch(value) else text_cell(value), _ANY_LENGTH)

@@ -111,7 +111,9 @@ STATE_MARKS = (Mark(BLUE, "o", "-"), Mark(VERMILLION, "s", "--"))
 @contextmanager
 def journal_style() -> Iterator[None]:
     """Apply the style inside the block; matplotlib's settings are as before after it."""
-    with mpl.rc_context(_RC):
+    with mpl.rc_context():
+        mpl.rcdefaults()  # not the user's own: text.usetex alone ends a figure where TeX is missing
+        mpl.rcParams.update(_RC)
         yield
 
 

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from impc.errors import OutputError
-from impc.files.writing import require_ordinary, unwritable, write_whole
+from impc.files.writing import remove_empty, require_ordinary, unwritable, write_whole
 from impc.reporting.lock import locked
 
 if TYPE_CHECKING:
@@ -30,6 +30,7 @@ __all__ = ["owned", "require_writable", "write_files"]
 
 _REMEDY = "give another folder"
 _LIST, _NOTICE = ".impc", "INCOMPLETE.txt"
+_STAGING = ".impc-"  # how the name of the folder begins from which files are moved
 _SAID = b"A run was stopped while it wrote these files: they may be of two runs. Run it again.\n"
 # Files by which results are known that have no list: of an older version, or not of this program.
 _TELLING = ("report.html", "result.json", "study.toml", "truth.json")
@@ -62,9 +63,13 @@ class _Run:
         if not self.written and self.before:
             write_whole(self.folder / _NOTICE, _SAID)
         found = {name: hashlib.sha256(content).hexdigest() for name, content in new.items()}
-        with (self.folder / _LIST).open("a", encoding="utf-8") as stream:
-            stream.writelines(json.dumps([name, seal]) + "\n" for name, seal in found.items())
+        self.note(found)
         self.written |= found
+
+    def note(self, seals: Mapping[str, str]) -> None:
+        """Add files to the list, by name and SHA-256."""
+        with (self.folder / _LIST).open("a", encoding="utf-8") as stream:
+            stream.writelines(json.dumps([name, seal]) + "\n" for name, seal in seals.items())
 
     def undo(self, names: Iterable[str]) -> None:
         """These files were put back as they were."""
@@ -125,9 +130,16 @@ def owned(folder: Path, command: str) -> Iterator[None]:
 
 
 def _begun(folder: Path, command: str, undo: ExitStack) -> _Run:
-    run = _Run(folder, command, _listed(folder, command))
-    for left in folder.glob(".impc-*/"):  # of `write_files` in a run that was killed
-        shutil.rmtree(left)
+    listed = _listed(folder, command)
+    staged = [name for name in listed if name.startswith(_STAGING)]
+    here = Path(os.path.realpath(folder))
+    for name in staged:  # of `write_files` in a run that was killed; never through a link
+        if Path(os.path.realpath((here / name).parent)) == (here / name).parent:
+            (here / name).unlink(missing_ok=True)
+    for name in {Path(name).parts[0] for name in staged}:
+        remove_empty(folder / name)
+    before = {name: seal for name, seal in listed.items() if name not in staged}
+    run = _Run(folder, command, before)
     if not (folder / _LIST).exists():
         there = set(os.listdir(folder))
         write_whole(folder / _LIST, f"{command}\n".encode())
@@ -240,8 +252,13 @@ def write_files(folder: Path, files: Mapping[str, bytes]) -> tuple[Path, ...]:
     # In the folder that is owned: the next run finds there what a killed one left.
     beside = folder if run is None else run.folder
     try:
-        with _made(folder), tempfile.TemporaryDirectory(prefix=".impc-", dir=beside) as staging:
+        with _made(folder), tempfile.TemporaryDirectory(prefix=_STAGING, dir=beside) as staging:
             new, old = Path(staging, "new"), Path(staging, "old")
+            if run is not None:
+                parts = (
+                    f"{new.parent.name}/{part}/{name}" for part in ("new", "old") for name in files
+                )
+                run.note(dict.fromkeys(parts, ""))
             for name, content in files.items():
                 (new / name).parent.mkdir(parents=True, exist_ok=True)
                 (old / name).parent.mkdir(parents=True, exist_ok=True)

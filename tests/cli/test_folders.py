@@ -29,13 +29,33 @@ def test_a_run_replaces_the_one_before_whole(tmp_path: Path) -> None:
     with owned(folder, "fit"):
         write_files(folder, PAGE | {"old.png": b"", "deep/er/old.csv": b""})
     (folder / "notes.txt").write_text("mine")
-    (folder / ".impc-k3" / "new").mkdir(parents=True)  # what a killed run leaves
+    # What a killed run leaves: its files are in the list, those of the user are not.
+    for left in (".impc-k3/new/old.png", ".impc-k3/old/new.png", ".impc-notes/thesis.txt"):
+        (folder / left).parent.mkdir(parents=True, exist_ok=True)
+        (folder / left).write_text("left")
+    with (folder / ".impc").open("a") as stream:
+        stream.writelines(
+            f'["{left}", ""]\n' for left in (".impc-k3/new/old.png", ".impc-k3/old/new.png")
+        )
     with owned(folder, "fit"):
         write_files(folder, {"new.png": b""})
         write_files(folder / "sub", {"x.csv": b""})
-    assert names(folder) == {"notes.txt", "new.png", "sub/x.csv", ".impc"}
+    mine = {"notes.txt", ".impc-notes/thesis.txt"}
+    assert names(folder) == {*mine, "new.png", "sub/x.csv", ".impc"}
     assert not (folder / "deep").exists()
     assert not (folder / ".impc-k3").exists()
+
+
+def test_no_list_removes_through_a_link(tmp_path: Path) -> None:
+    (tmp_path / "home").mkdir()
+    (tmp_path / "home" / "thesis.txt").write_text("mine")
+    folder = tmp_path / "out"
+    folder.mkdir()
+    (folder / ".impc-a").symlink_to(tmp_path / "home")
+    (folder / ".impc").write_text('fit\n[".impc-a/thesis.txt", ""]\n[".impc-b/../x", ""]\n')
+    with owned(folder, "fit"):
+        write_files(folder, PAGE)
+    assert (tmp_path / "home" / "thesis.txt").read_text() == "mine"
 
 
 def test_another_command_and_files_of_ones_own_are_refused(tmp_path: Path) -> None:

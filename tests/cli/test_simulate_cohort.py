@@ -11,8 +11,9 @@ from click.testing import CliRunner
 
 from impc.cli.main import main
 from impc.cli.seat import PLANT
+from impc.errors import FallError
 from impc.files.plant_sources import make_plant, plant_source
-from impc.files.reading import read_recordings
+from impc.files.reading import read_recordings, read_unit
 from impc.studies.cohort.study import read_study
 
 if TYPE_CHECKING:
@@ -51,3 +52,37 @@ def test_the_next_command_is_said(tmp_path: Path) -> None:
     given = ("--subjects", "2", "--trials", "1", "--duration", "5", "--out", str(out))
     done = CliRunner().invoke(main, ["simulate", "cohort", *given])
     assert done.stdout.splitlines()[-1] == f"next: impc cohort '{out}'/study.toml"
+
+
+def test_falls_are_said_and_their_trials_left_out(tmp_path: Path) -> None:
+    """A torque of 1.8 N m is too little for a subject: the other trial of the unit stays."""
+    given = ("--subjects", "2", "--trials", "2", "--duration", "8", "--replicates", "0")
+    more = ("--torque-limit", "1.8", "--seed", "1", "--out", str(tmp_path))
+    done = CliRunner().invoke(main, ["simulate", "cohort", *given, *more])
+    assert done.exit_code == 0, done.stderr
+    said = [line for line in done.stdout.splitlines() if "the subject fell at" in line]
+    truth = json.loads((tmp_path / "truth.json").read_text())["subjects"]
+    fell = {file: time for person in truth.values() for file, time in person["fell"].items()}
+    assert said == [f"{file}: the subject fell at {time:.2f} s" for file, time in fell.items()]
+    assert fell
+    study = read_study(tmp_path / "study.toml")
+    lost = 0
+    for unit in study.units:
+        plant = make_plant(plant_source(PLANT, dict(unit.person)), ("perturbation",))
+        try:
+            trials, falls = read_unit(unit.files, study.configuration, plant)
+        except FallError:
+            lost += len(unit.files)
+            continue
+        lost += len(falls)
+        assert len(trials) + len(falls) == len(unit.files)
+    assert lost == len(fell)
+
+
+@pytest.mark.parametrize("count", ["1", "5", "19"])
+def test_a_study_that_cohort_would_refuse_is_not_written(tmp_path: Path, count: str) -> None:
+    given = ("--replicates", count, "--out", str(tmp_path / "out"))
+    done = CliRunner().invoke(main, ["simulate", "cohort", *given])
+    assert done.exit_code == 2
+    assert f"[fit] replicates: got {count}; give 0 or at least 20" in done.stderr
+    assert not (tmp_path / "out").exists()

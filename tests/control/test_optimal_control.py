@@ -84,6 +84,13 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "a horizon of half a sample": ({"horizon": 0.5}, "horizon: got 0.5; give a whole number"),
     "no horizon": ({"horizon": 0}, "horizon: got 0; give 1 to 10000"),
+    "a comparison": (
+        {"constraints": lambda x, u, p: {"force": ca.vertcat(u, -u) <= p["limit"]}},
+        "constraint force: is a comparison; write what must not exceed 0: u - 1 for u <= 1",
+    ),
+    "constraints without names": (
+        {"terminal_constraints": lambda x, u, p: x <= 1}, "give a dictionary"
+    ),
     "signed, and not there": ({"signed": ["pace"]}, "parameter pace: is not among the parameters"),
 }  # fmt: skip
 
@@ -108,6 +115,13 @@ def test_a_problem_that_is_none_is_refused_in_a_line(case: str) -> None:
 def test_values_that_are_none_are_refused(theta: dict[str, Any], words: str) -> None:
     with pytest.raises(InputError, match=words):
         made().plan(theta, [1, 0])
+
+
+def test_values_without_names_are_refused() -> None:
+    with pytest.raises(InputError, match="theta: got list of 2; give a dictionary"):
+        made().plan([1, 2], [1, 0])  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="plan: missing a required argument: 'x0'"):
+        made().plan([1, 2])  # type: ignore[call-arg, arg-type]
 
 
 def test_initial_states_solvers_and_mu_are_checked() -> None:

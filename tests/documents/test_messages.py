@@ -9,6 +9,7 @@ import math
 import os
 import re
 import resource
+import shutil
 import sys
 import tempfile
 import time
@@ -23,6 +24,7 @@ import openpyxl
 import pytest
 import scipy.io
 from click.testing import CliRunner
+from nptdms import ChannelObject, TdmsWriter
 
 from impc.cli.consent import require_consent
 from impc.cli.main import main
@@ -44,6 +46,7 @@ from impc.files.reading import read_recordings, recording_of
 from impc.files.results import read_result
 from impc.files.sealed import Kept
 from impc.files.table import Table, make_table
+from impc.files.units import si_unit
 from impc.inverse.likelihood_fit import fit_person
 from impc.inverse.methods import estimate
 from impc.inverse.problem import Problem
@@ -58,6 +61,7 @@ from impc.model.structure import Structure
 from impc.model.weights import Weights
 from impc.reporting.writer import owned, require_writable, write_files
 from impc.studies.cohort import cluster
+from impc.studies.cohort.finding import find_by_pattern
 from impc.studies.cohort.names import checked_name
 from impc.studies.cohort.sheet import Sheet, column_values, read_sheet
 from impc.studies.cohort.store import Store, open_store
@@ -73,6 +77,8 @@ from tests.documents.blocks import PAGES
 from tests.files.damaged import DAMAGED, PLANT
 from tests.files.hostile_files import HOSTILE
 from tests.files.samples import csv_text, hdf5_mat, pushed_seat, settings
+from tests.files.test_blocks import DATA, book
+from tests.files.test_one_step import balanced, fallen, read, stick
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -178,6 +184,58 @@ def late_push(_: Path) -> str:
     push = np.random.default_rng(2).standard_normal(3000)
     lean = np.convolve(push, np.exp(-np.arange(100) / 30))[: len(push)]
     return misaligned(push, np.roll(lean, -60), 0.01)
+
+
+TILT, TAP = balanced(1)
+
+
+def finding(folder: Path, *trial: Any) -> str:
+    return read(folder, *trial)[1][0]
+
+
+def lost_rows(values: Any) -> Any:
+    return np.r_[values[:100], np.zeros(20), values[120:300], np.zeros(15), values[315:]]
+
+
+def lost_samples(values: Any) -> Any:
+    lost = np.random.default_rng(0).choice(len(values), 12, replace=False)
+    return np.where(np.isin(np.arange(len(values)), lost), 0.0, values)
+
+
+def stick_settings(folder: Path) -> Any:
+    read(folder, TILT, TAP)
+    return read_configuration(folder / "a.toml"), Plant(stick(), ["finger"])
+
+
+def copied_trial(folder: Path) -> None:
+    settings = stick_settings(folder)
+    shutil.copy(folder / "a.csv", folder / "b.csv")
+    read_recordings([folder / "a.csv", folder / "b.csv"], *settings)
+
+
+def deep_table(folder: Path) -> None:
+    (folder / "c.toml").write_text("plant." + "a." * 500 + "a = 1")
+    read_configuration(folder / "c.toml")
+
+
+def trial_twice(folder: Path, other: str = "../data/1.csv") -> None:
+    data = folder / "data"
+    data.mkdir()
+    for name in ("1.csv", "1.xlsx"):
+        (data / name).write_text("x")
+    (data / "t.csv").write_text(f"file,subject,trial\n1.csv,a,1\n{other},a,2\n")
+    (data / "s.toml").write_text(
+        '[study]\ntable = "t.csv"\n[signals.x]\ncolumn = "x"\nunit = "1"\n'
+    )
+    read_study(data / "s.toml")
+
+
+def late_channel(folder: Path) -> None:
+    with TdmsWriter(str(folder / "a.tdms")) as writer:
+        for name, offset in (("push", 0.0), ("seat", 0.013)):
+            step = {"wf_increment": 0.02, "wf_start_offset": offset}
+            writer.write_segment([ChannelObject("g", name, np.arange(99.0), step)])
+    read_table(folder / "a.tdms")
 
 
 def far_start(_: Path) -> None:
@@ -512,9 +570,7 @@ def beyond_feasibility(_: Path) -> str:
 
 PROVOKED: dict[str, Callable[[Path], object]] = {
     "does not exist; check the path": damaged("missing file"),
-    "has the ending '...', and not .csv, .tsv, .txt, .xlsx, .ods, .mat, .tdms, .c3d": damaged(
-        "old excel workbook"
-    ),
+    "has the ending '...', and not ...; export": damaged("old excel workbook"),
     "ends in ... and is a zip archive or an Excel workbook": damaged("excel workbook called csv"),
     "ends in ... and is an Excel workbook that is old or locked by a password": locked_workbook,
     "cannot be written as .ods": lambda _: encode_table(
@@ -528,7 +584,7 @@ PROVOKED: dict[str, Callable[[Path], object]] = {
         ["x", "y"], [1, 2], [2, datetime.date(2026, 1, 1)]
     ),
     "has no rows of numbers divided by": damaged("csv of a header alone"),
-    "line ... names ... columns, and the rows below have ... values": damaged(
+    "the header names ... columns, and the rows below have ... values": damaged(
         "decimal commas between commas"
     ),
     "column '...' has text in ... of ... rows": damaged("text in a column"),
@@ -638,6 +694,26 @@ PROVOKED: dict[str, Callable[[Path], object]] = {
     "samples at the plant's rate, ... are needed": damaged("too few samples"),
     "serve to find where it starts": short_trial,
     "comes before it: their correlation is ...": late_push,
+    "the subject fell at ...": lambda folder: read(folder, fallen(TILT, 8.0), TAP),
+    "stands still ... times, ... samples in all": lambda folder: finding(
+        folder, lost_rows(TILT), TAP
+    ),
+    "jumps to ... and back ... times": lambda folder: finding(folder, lost_samples(TILT), TAP),
+    "is off by about ...": lambda folder: finding(folder, TILT + 1, TAP),
+    "drifts by about ...": lambda folder: finding(folder, TILT + np.linspace(0, 2, 600), TAP),
+    "acts ... than its rows say": lambda folder: finding(folder, TILT, np.roll(TAP, 1)),
+    "is given twice": lambda folder: read_recordings([folder] * 2, *stick_settings(folder)),
+    "is a copy of ..., byte for byte": copied_trial,
+    "can be read in two ways": lambda _: si_unit("Grad"),
+    "a capital M is mega, G giga": lambda _: si_unit("Mm"),
+    "has no sheet '...'": lambda folder: read_table(book(folder / "a.xlsx", a=DATA), sheet="b"),
+    "is nested too deep": deep_table,
+    "has nothing between {...}{...}": lambda folder: find_by_pattern(
+        "s", folder, "{subject}{trial}"
+    ),
+    "names the same file twice": trial_twice,
+    "the same trial in two formats": lambda folder: trial_twice(folder, "1.xlsx"),
+    "no whole number of samples apart": late_channel,
     "cannot be imported (...)": lambda _: plant_source("nowhere:stick", {}),
     "refuses its arguments (...)": lambda _: make_plant(
         plant_source("plants:cursor_plant", {"size": 3}), ()

@@ -174,7 +174,7 @@ def _row_with_a_value_more(folder: Path) -> Made:
     return written(folder, "\n".join(lines)), settings()
 
 
-@_damage("names two columns 'seat'")
+@_damage("signals.theta2.column may be time, seat, seat_2, push", in_file=False)
 def _two_columns_of_one_name(folder: Path) -> Made:
     return written(folder, csv_text(pushed_seat()).replace("trunk", "seat", 1)), settings()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from typing import TYPE_CHECKING
 
 import pytest
@@ -110,6 +111,29 @@ def test_one_line_with_the_path_of_the_fault(
         read_configuration(written(tmp_path, settings((old, new))))
     assert phrase in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        ".".join(["a"] * 16_000) + " = 1",
+        "[plant]\n" + ".".join(["a"] * 500) + " = 1",
+        "[" + ".".join(['"a b"'] * 9_000) + "]\nb = 1",
+        "x = {" + " . ".join(["'a'"] * 9_000) + " = 1}",
+        "plant = " + "{a = " * 100 + "1" + "}" * 100,
+        "[plant]\na = " + "[" * 100 + "]" * 100,
+    ],
+)
+def test_what_is_nested_deep_takes_no_memory(tmp_path: Path, text: str) -> None:
+    """tomllib takes 1 GB for the first of them."""
+    path = written(tmp_path, text)
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError, match="nested too deep"):
+            read_configuration(path)
+        assert tracemalloc.get_traced_memory()[1] < 10_000_000
+    finally:
+        tracemalloc.stop()
 
 
 def test_files_that_are_no_configuration(tmp_path: Path) -> None:

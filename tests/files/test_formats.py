@@ -6,7 +6,7 @@ import importlib.util
 import re
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import c3d
 import h5py
@@ -271,6 +271,61 @@ def test_tdms_by_nptdms(tmp_path: Path) -> None:
     assert table.units == {"stamp": "s", "a/seat": "deg"}
     assert table.rate == 100.0
     assert table.skipped == {"event": "is text"}
+
+
+def tdms(path: Path, *channels: tuple[str, Any, dict[str, Any]]) -> Path:
+    with TdmsWriter(str(path)) as writer:
+        writer.write_segment([ChannelObject("g", *channel) for channel in channels])
+    return path
+
+
+@pytest.mark.parametrize(
+    "late",
+    [
+        {"wf_start_offset": 0.4},
+        {"wf_start_time": np.datetime64("2026-01-01T00:00:00.400")},
+        {"wf_start_time": np.datetime64("2026-01-01T00:00:00.100"), "wf_start_offset": 0.3},
+    ],
+)
+def test_tdms_channels_that_begin_at_different_times(tmp_path: Path, late: dict[str, Any]) -> None:
+    begins = {"wf_start_time": np.datetime64("2026-01-01"), "wf_increment": 0.02}
+    signal = np.sin(0.1 * np.arange(100.0))
+    apart = {"push": signal[:80], "seat": signal[20:]}
+    path = tdms(
+        tmp_path / "a.tdms", ("push", apart["push"], begins), ("seat", apart["seat"], begins | late)
+    )
+    table = read_table(path)
+    assert_columns(table, {"push": signal[20:80], "seat": signal[20:80]}, 0)
+    assert table.rate == 50.0
+
+
+@pytest.mark.parametrize(
+    ("offset", "said"), [(0.41, "begins at 0 s and seat at 0.41 s"), (90.0, "and seat at 90 s")]
+)
+def test_tdms_channels_without_simultaneous_samples(
+    tmp_path: Path, offset: float, said: str
+) -> None:
+    step = {"wf_increment": 0.02}
+    path = tdms(
+        tmp_path / "a.tdms",
+        ("push", np.arange(99.0), step),
+        ("seat", np.arange(99.0), step | {"wf_start_offset": offset}),
+    )
+    with pytest.raises(DataError, match=said):
+        read_table(path)
+
+
+@pytest.mark.parametrize("kind", ["AdvancedAPI", "Bridge"])
+def test_a_tdms_scale_that_nobody_applies(tmp_path: Path, kind: str) -> None:
+    scale = {"NI_Number_Of_Scales": 1, "NI_Scale[0]_Scale_Type": kind, "unit_string": "deg"}
+    path = tdms(
+        tmp_path / "a.tdms",
+        ("time", np.arange(99.0), {}),
+        ("seat", np.arange(99, dtype=np.int16), scale),
+    )
+    table = read_table(path)
+    assert table.skipped == {"seat": f"has a scale of the unknown kind {kind!r}: raw counts"}
+    assert "seat" not in table.columns
 
 
 def test_c3d_by_c3d(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -42,6 +43,16 @@ def trial(tmp_path: Path) -> Path:
     path = tmp_path / "trial.csv"
     path.write_text("\n".join([header + ",side", *(row + ",left" for row in rows)]) + "\n")
     return path
+
+
+def test_units_of_other_languages_are_guesses(tmp_path: Path) -> None:
+    path = tmp_path / "t.csv"
+    path.write_text("Zeit (Sek);theta1 (Grad);theta2 (degrés);push (Ellen)\n0;1;1;2\n0,1;2;3;4\n")
+    text = inspect(path).stdout
+    for unit, word in (("deg", "Grad"), ("deg", "degrés")):
+        assert re.search(rf'unit = "{unit}" +# a guess: the file says {word!r}', text)
+    assert re.search(r"time_unit = \"s\" +# a guess: the file says 'Sek'", text)
+    assert '[signals."push (Ellen)"]' in text  # no unit that is known
 
 
 def test_the_table_of_columns(trial: Path) -> None:
@@ -114,11 +125,53 @@ def test_a_column_is_not_taken_for_a_signal_of_another_kind(tmp_path: Path) -> N
     assert found["theta2"].column == FILL_IN
     text = out.read_text()
     assert '# Columns that are not used: "emg" (mV)' in text
-    assert "A GUESS, by its place: check it" in text
+    assert "A GUESS, by its unit: check it" in text
     assert "no column is left that fits: name it" in text
     plant = Plant(seated_balance_plant(), ["command"])
     with pytest.raises(InputError, match=r"theta2.column: is still '\?'; fill in its name"):
         read_recordings([path], read_configuration(out), plant)
+
+
+def test_counters_constants_and_second_clocks_are_no_guesses(tmp_path: Path) -> None:
+    columns = pushed_seat(600)
+    count = np.arange(600.0)
+    made = {
+        "Frame": count, "Time": columns["time"], "EMG time": columns["time"] + 5,
+        "gain": 0 * count + 2, "SeatAngle (deg)": columns["seat"],
+        "lean_deg": columns["trunk"], "shove": columns["push"],
+    }  # fmt: skip
+    path, out = tmp_path / "trial.csv", tmp_path / "new.toml"
+    path.write_text(csv_text(made))
+    assert inspect(path, "--out", out, "--plant", PLANT).exit_code == 0
+    text = out.read_text()
+    found = read_configuration(out)
+    assert found.recording.time == "Time"
+    assert [found.signals[name].column for name in ("theta1", "theta2", "perturbation")] == [
+        *("SeatAngle", "lean_deg", "shove"),
+    ]
+    assert re.search(r'unit = "deg" +# a guess: by its name', text)
+    assert (
+        '# Columns that are not used: "Frame" (a clock or counter), '
+        '"EMG time" (a clock or counter), "gain" (constant)'
+    ) in text
+    assert "# an input: without this table, or with command = true, a command" in text
+
+
+def test_day_numbers_of_excel_are_a_clock(tmp_path: Path) -> None:
+    columns = pushed_seat(600)
+    days = [f"{45352.4 + second / 86_400:.11f}" for second in columns["time"]]
+    header, *rows = csv_text(columns).strip().split("\n")
+    cells = [",".join([day, *row.split(",")[1:]]) for day, row in zip(days, rows, strict=True)]
+    path = tmp_path / "trial.csv"
+    path.write_text("\n".join([header, *cells]) + "\n")
+    assert re.search(
+        r'time_unit = "day" +# a guess: day numbers of a spreadsheet', inspect(path).stdout
+    )
+    (tmp_path / "a.toml").write_text(settings())
+    plant = Plant(seated_balance_plant(), ["command"])
+    trial = read_recordings([path], read_configuration(tmp_path / "a.toml"), plant)[0]
+    assert trial.samples == 600
+    assert "read as day numbers of a spreadsheet" in trial.findings[0]
 
 
 def test_settings_that_only_the_user_knows_are_asked_for(trial: Path, tmp_path: Path) -> None:

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from matplotlib.text import Text
 
+from impc.files.formats import encode_table
+from impc.files.table import make_table
 from impc.reporting.csv_text import csv_bytes
 from impc.reporting.rendering import plain
 from impc.reporting.style import journal_style, new_figure, render
@@ -58,9 +60,17 @@ def test_no_cell_of_a_table_is_a_formula_and_numbers_stay_numbers() -> None:
     assert set(heads) == {"'=head"}
     for text, cell in zip(texts, found, strict=False):
         assert cell.startswith("'")
-        assert cell[1:] == text.replace("\t", r"\t")
+        assert cell.replace("'", "") == text.replace("\t", r"\t").replace("'", "")
+        assert not any(part.startswith("=") for part in cell.split(";"))
     assert found[len(texts) : len(texts) + len(plain_texts)] == plain_texts
     assert found[-6:] == ["-1.5", "0.1", "3", "", "", "True"]
+    # German Excel ends a cell at a semicolon, quoted or not.
+    name = "a;=cmd|'/C calc'!A0;b"
+    table = make_table("simulated", {name: np.zeros(2), "=1+1": np.zeros(2)})
+    for content in (csv_bytes([name], []), encode_table(".csv", table)):
+        divided = next(csv.reader([content.decode().splitlines()[0]], delimiter=";"))
+        assert divided[:2] == ["a", "'=cmd|'/C calc'!A0"]
+    assert b",'=1+1" in encode_table(".csv", table)
     assert csv_bytes(["a"], [["\udcff\n"]]) == rb"a" + b"\n" + rb"\xff\n" + b"\n"
 
 

@@ -8,7 +8,7 @@ import control
 import numpy as np
 import pytest
 
-from impc.errors import InputError
+from impc.errors import DataError, InputError
 from impc.files.alignment import misaligned
 from impc.files.configuration import read_configuration
 from impc.files.reading import read_recordings
@@ -56,7 +56,25 @@ def test_values_in_si_units_with_offset_and_sign(tmp_path: Path, seat: Plant) ->
     np.testing.assert_allclose(trial.outputs[:, 1], -np.deg2rad(columns["trunk"] - 2), atol=1e-10)
     np.testing.assert_allclose(trial.disturbance[:, 0], columns["push"] / 100, rtol=1e-12)
     np.testing.assert_array_equal(trial.x0, np.zeros(seat.n))
-    assert trial.findings == ()
+    # An offset that the sensor does not have is one that is left.
+    assert "theta2 is off by about -2 deg" in trial.findings[0]
+    assert trial.findings[0].endswith("write signals.theta2.offset = 0")
+
+
+def test_a_unit_of_the_file_is_overruled_in_so_many_words(tmp_path: Path, seat: Plant) -> None:
+    columns = seated()
+    radians = csv_text(columns).replace(",trunk", ",trunk (rad)", 1)
+    with pytest.raises(DataError, match=r"write signals.theta2.overrule_unit = true if the file"):
+        read(tmp_path, seat, radians)
+    column = 'column = "trunk"\nunit = "deg"'
+    trial = read(tmp_path, seat, radians, (column, f"{column}\noverrule_unit = true"))
+    np.testing.assert_allclose(trial.outputs[:, 1], np.deg2rad(columns["trunk"]), atol=1e-10)
+    assert "taken in 'deg' by signals.theta2, where the file says 'rad'" in trial.findings[0]
+    none = read(tmp_path, seat, csv_text(columns).replace(",trunk", ",trunk (1)", 1))
+    assert "where the file says '1'" in none.findings[0]
+    assert (
+        read(tmp_path, seat, csv_text(columns).replace(",trunk", ",trunk (Grad)", 1)).findings == ()
+    )
 
 
 def test_labels_from_the_configuration_and_from_the_name(tmp_path: Path, seat: Plant) -> None:
@@ -168,6 +186,12 @@ def test_trials_of_unequal_length_in_the_order_given(tmp_path: Path, seat: Plant
     assert "2500 samples where the longest has 3000" in trials[1].findings[0]
     with pytest.raises(InputError, match="is given twice"):
         read_recordings([paths[0], tmp_path / "." / "b.csv"], configured(tmp_path), seat)
+    (tmp_path / "link.csv").symlink_to(paths[0])
+    with pytest.raises(InputError, match=r"link.csv: is given twice, as .*b.csv too"):
+        read_recordings([paths[0], tmp_path / "link.csv"], configured(tmp_path), seat)
+    (tmp_path / "copy.csv").write_bytes(paths[0].read_bytes())
+    with pytest.raises(InputError, match=r"copy.csv: is a copy of .*b.csv, byte for byte"):
+        read_recordings([paths[0], tmp_path / "copy.csv"], configured(tmp_path), seat)
     with pytest.raises(InputError, match="no file is given"):
         read_recordings([], configured(tmp_path), seat)
 

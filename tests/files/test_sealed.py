@@ -69,3 +69,20 @@ def test_a_file_in_the_way_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="cannot be written") as caught:
         Kept(tmp_path / "kept").keep("a", "d", 1)
     assert "\n" not in str(caught.value)
+
+
+def test_only_what_was_kept_is_forgotten(tmp_path: Path) -> None:
+    kept = Kept(tmp_path / "fit-in-progress")
+    for name in ("one", "two/three"):
+        kept.keep(name, "digest", [1.0])
+    (tmp_path / "fit-in-progress" / "notes.txt").write_text("mine")
+    (tmp_path / "fit-in-progress" / "table.json").write_text("[1]")
+    kept.forget()
+    left = [path.name for path in tmp_path.rglob("*") if path.is_file()]
+    assert sorted(left) == ["notes.txt", "table.json"]
+    (tmp_path / "fit-in-progress" / "notes.txt").unlink()
+    (tmp_path / "fit-in-progress" / "table.json").unlink()
+    kept.keep("one", "digest", [1.0])
+    kept.forget()
+    assert list(tmp_path.iterdir()) == []
+    kept.forget()

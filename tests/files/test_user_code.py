@@ -47,6 +47,12 @@ def test_the_users_own_needs_it() -> None:
         consent("", allowed=True)
 
 
+@pytest.mark.parametrize("name", ["evil:f.json", "evil:f.mat", "evil:f.npz", "a.json:f.json"])
+def test_a_model_that_looks_like_a_file_is_code(name: str) -> None:
+    with pytest.raises(InputError, match="names code that would be run"):
+        consented_name("s.toml: study.model", name, None, False, "model", ())
+
+
 @pytest.mark.parametrize(
     "name", ["os:system", "subprocess:run", "os.path:join", "numpy:load", "click:echo", "sys:exit"]
 )

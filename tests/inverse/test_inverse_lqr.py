@@ -50,6 +50,15 @@ def test_lmi_of_a_gain_that_does_not_stabilise_is_infeasible() -> None:
     assert not inverse_lqr_lmi(EXAMPLE, [[0.0, 0.0]]).feasible
 
 
+@pytest.mark.parametrize("samples", [1, 2, 3])
+def test_lmi_of_no_gain_on_a_delay_is_feasible(samples: int) -> None:
+    """What is delayed leaves by itself: any weights have the gain 0, to round-off."""
+    delay = Plant(control.ss(np.eye(samples, k=1), np.eye(samples)[:, -1:], np.eye(samples), 0, 1))
+    found = inverse_lqr_lmi(delay, np.zeros((1, samples)))
+    assert found.feasible
+    assert found.gain_error < 1e-12
+
+
 def test_lmi_branches_on_the_two_gains_of_the_example() -> None:
     assert not inverse_lqr_lmi(EXAMPLE, NO_WEIGHTS_GAIN).feasible
     found = inverse_lqr_lmi(EXAMPLE, GAIN)

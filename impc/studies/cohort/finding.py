@@ -5,21 +5,17 @@ from __future__ import annotations
 import glob
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from impc.errors import InputError
+from impc.files.formats import FORMATS
 from impc.studies.cohort.names import checked_name
 from impc.studies.cohort.sheet import read_sheet
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 __all__ = ["KEYS", "Found", "find_by_entities", "find_by_pattern", "find_by_table"]
 
 #: Labels of a trial.
 KEYS = ("subject", "visit", "condition", "trial")
 _ENTITIES = {"subject": "sub", "visit": "ses", "condition": "task", "trial": "run"}
-_ENDINGS = {".csv", ".tsv", ".txt", ".mat", ".tdms", ".c3d"}
 _NAME = r"[^/\\_]+?"
 
 #: A recording with its labels, by `KEYS`.
@@ -71,6 +67,11 @@ def _expression(where: str, pattern: str) -> str:
         raise InputError(
             where, f"cannot be {pattern[:80]!a}", "write a path with names in {braces}"
         )
+    together = re.search(r"\{\w+\}\{\w+\}", pattern)
+    if together:
+        raise InputError(
+            where, f"has nothing between {together[0]}", "write a character between, or use `table`"
+        )
     expression, seen = "", set()
     for part in re.split(r"(\{\w+\})", Path(pattern).as_posix()):
         name = part[1:-1]
@@ -95,7 +96,7 @@ def find_by_entities(folder: Path) -> list[Found]:
     found = []
     for file in sorted(folder.rglob("sub-*")):
         hidden = any(part.startswith(".") for part in file.relative_to(folder).parts)
-        if hidden or file.suffix.lower() not in _ENDINGS or not file.is_file():
+        if hidden or file.suffix.lower() not in FORMATS or not file.is_file():
             continue
         entities = dict(re.findall(r"(?:^|_)([a-z]+)-([^_.]+)", file.name))
         labels = {key: entities.get(short, "") for key, short in _ENTITIES.items()}
@@ -120,16 +121,7 @@ def find_by_table(path: Path) -> list[Found]:
         if not row["file"] or not row["subject"]:
             raise InputError(sheet.where, "has a row without file or subject", "fill every row")
         found.append((_labels(sheet.where, row), path.parent / row["file"]))
-    _require_once(sheet.where, [file for _, file in found])
     return found
-
-
-def _require_once(where: str, files: Sequence[Path]) -> None:
-    seen = set()
-    for file in files:
-        if file in seen:
-            raise InputError(where, f"names {file.name!a} twice", "a trial counts once")
-        seen.add(file)
 
 
 def _labels(where: str, given: dict[str, str]) -> dict[str, str]:

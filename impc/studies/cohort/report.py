@@ -9,6 +9,7 @@ import pandas as pd
 from markupsafe import Markup
 
 from impc.errors import DataError
+from impc.files.checks import FELL
 from impc.reporting.document import (
     Block,
     Lines,
@@ -98,6 +99,7 @@ def write_report(study: Study, store: Store, failures: Failures, command: str) -
         *_structure_lines(units),
         *not_told_sentences(left_out, len(units)),
         *_limits(units),
+        *_falls(study.units, store, failures),
     ]
     report = Report(
         "impc cohort",
@@ -284,6 +286,24 @@ def _limits(units: pd.DataFrame) -> list[str]:
     return [
         f"{never} of {len(units)} units never reach the limit of their command: they cannot tell "
         "inverse MPC from inverse LQR, nor where the limit is."
+    ]
+
+
+def _falls(units: Sequence[Unit], store: Store, failures: Failures) -> list[str]:
+    """Trials that were left out because the subject fell, and what that does to a comparison."""
+    fallen: dict[str, int] = {}
+    for unit in units:
+        fit, group = store.fit(unit.name), unit.group or "all"
+        all_fell = FELL in failures.units.get(unit.name, "")
+        kept = 0 if all_fell else len(unit.files) if fit is None else int(fit["trials"])
+        fallen[group] = fallen.get(group, 0) + len(unit.files) - kept
+    counts = ", ".join(f"{lost} of group {group}" for group, lost in sorted(fallen.items()))
+    if not any(fallen.values()):
+        return []
+    return [
+        f"Trials in which the subject fell are left out ({counts}). Where one group falls more "
+        "often than another, what is left may understate how the groups differ: compare the "
+        "numbers of falls as well."
     ]
 
 

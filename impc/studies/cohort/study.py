@@ -17,6 +17,7 @@ subject, visit and condition make a unit: one fit.
 
 from __future__ import annotations
 
+import os
 import re
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -129,7 +130,9 @@ def read_study(path: Path) -> Study:
     table = _table(path, configuration)
     people = _people(path.parent / table.participants) if table.participants else None
     together: dict[tuple[str, str, str], list[tuple[str, Path]]] = {}
-    for labels, file in _found(path, table):
+    found = _found(path, table)
+    _require_once(path, found)
+    for labels, file in found:
         key = (labels["subject"], labels["visit"], labels["condition"])
         together.setdefault(key, []).append((labels["trial"], file))
     units = []
@@ -211,6 +214,21 @@ def _natural(text: str) -> tuple[Any, ...]:
         (0, int(part), "") if part.isdecimal() else (1, 0, part)
         for part in re.findall(r"\d+|\D+", text)
     )
+
+
+def _require_once(path: Path, found: Iterable[Found]) -> None:
+    """No file twice, by whatever name, and no trial in two formats."""
+    places: dict[str, Path] = {}
+    stems: dict[Path, Path] = {}
+    for _, file in found:
+        other = places.setdefault(os.path.realpath(file), file)
+        if other is not file:
+            problem = f"names the same file twice, {str(other)!a} and {str(file)!a}"
+            raise InputError(f"{path}: study", problem, "a trial counts once")
+        other = stems.setdefault(file.with_suffix(""), file)
+        if other is not file:
+            problem = f"finds {str(other)!a} and {file.name!a}, the same trial in two formats"
+            raise InputError(f"{path}: study", problem, "move one of them elsewhere")
 
 
 def _require_distinct(path: Path, units: Iterable[Unit]) -> None:

@@ -28,7 +28,7 @@ from impc.assess.variance_accounted_for import saturated_share
 from impc.checking import replace
 from impc.errors import ImpcError
 from impc.files.plant_sources import make_plant, plant_family_of, plant_source
-from impc.files.reading import read_recordings
+from impc.files.reading import read_unit
 from impc.inverse.noisy_fit import fit_controller
 from impc.model.signal_units import price_unit
 from impc.reporting.rendering import plain
@@ -129,10 +129,13 @@ def unit_problem(task: FitTask) -> tuple[Problem, FitSettings]:
     # A worker on another machine, or one that has run for days, may have other files and code.
     here = unit_digest(task.files, source.name, task.arguments, task.configuration)
     require_same_inputs(here, task.digest)
-    recorded = tuple(task.configuration.signals)
+    recorded = task.configuration.recorded
     plant = make_plant(source, recorded)
     family = plant_family_of(source, recorded, settings.free)
-    recordings = read_recordings([Path(name) for name in task.files], task.configuration, plant)
+    paths = [Path(name) for name in task.files]
+    (first, *others), fallen = read_unit(paths, task.configuration, plant)
+    left = (f"{fall.subject}: {fall.problem}; the trial is left out" for fall in fallen)
+    recordings = (replace(first, findings=(*first.findings, *left)), *others)
     return fit_problem(plant, recordings, settings, family), settings
 
 

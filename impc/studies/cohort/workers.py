@@ -16,6 +16,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
+from impc.settings_files import ignore_settings_files
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Hashable, Iterator
     from multiprocessing.connection import Connection
@@ -220,6 +222,7 @@ def _replaced(worker: _Worker) -> _Worker:
 def _serve(pipe: Connection) -> None:
     """What a worker does all its life."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # whoever presses Ctrl-C means the client
+    ignore_settings_files("matplotlib", "numba")
     threading.Thread(target=_die_with_client, daemon=True).start()
     while True:
         try:

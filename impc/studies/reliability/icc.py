@@ -46,6 +46,7 @@ from impc.errors import DataError, InputError
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
+_ALIKE = 1e-24  # of mean squares: round-off of means
 __all__ = [
     "FORMS",
     "Form",
@@ -171,7 +172,9 @@ def icc(scores: ArrayLike, form: Form = "A,k", level: float = 0.95, method: Meth
     squares = mean_squares(complete)
     value = _estimate(squares, form)
     limits = _interval if method == "F" else _generalised
-    low, high = limits(squares, form, value, level)
+    # Of subjects whose means are the same number nothing says how far others might differ.
+    alike = squares.subjects <= _ALIKE * (squares.within + squares.occasions)
+    low, high = (np.nan, np.nan) if alike else limits(squares, form, value, level)
     return Icc(form, value, low, high, level, squares.n, squares.k, left_out)
 
 

@@ -50,7 +50,7 @@ def _icc_table(result: Reliability, measure: str) -> TextTable:
             (
                 item.condition,
                 item.output,
-                f"{found.value:.2f} ({found.low:.2f}, {found.high:.2f})",
+                f"{found.value:.2f} ({found.low:.2f}, {found.high:.2f})".replace("nan", "-"),
                 interval_band(found.low, found.high),
                 f"{factor * error.sem:.3g} {unit}",
                 f"{factor * error.mdc:.3g} {unit}",

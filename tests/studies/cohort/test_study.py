@@ -63,6 +63,25 @@ def test_bids_names(tmp_path: Path) -> None:
     ]
 
 
+def test_bids_finds_all_formats_and_no_trial_twice(tmp_path: Path) -> None:
+    runs = ("1.csv", "2.CSV", "3.tsv", "4.txt", "5.xlsx", "6.XLSX", "7.ods", "8.mat", "9.sto")
+    touch(tmp_path, *(f"sub-01/sub-01_task-x_run-{run}" for run in runs))
+    (found,) = read_study(study(tmp_path, 'bids = "."')).units
+    assert [file.name[-len(run) :] for file, run in zip(found.files, runs, strict=True)] == [*runs]
+    touch(tmp_path, "sub-01/sub-01_task-x_run-1.xlsx")
+    with pytest.raises(InputError, match=r"run-1\.xlsx', the same trial in two formats"):
+        read_study(study(tmp_path, 'bids = "."'))
+
+
+@pytest.mark.parametrize("again", ["1.csv", "x/../1.csv", "link.csv", "./1.csv"])
+def test_a_trial_counts_once_whatever_its_name(tmp_path: Path, again: str) -> None:
+    touch(tmp_path, "1.csv", "x/.keep")
+    (tmp_path / "link.csv").symlink_to("1.csv")
+    (tmp_path / "t.csv").write_text(f"file,subject,trial\n1.csv,a,1\n{again},b,2\n")
+    with pytest.raises(InputError, match="names the same file twice"):
+        read_study(study(tmp_path, 'table = "t.csv"'))
+
+
 def test_a_table_and_participants(tmp_path: Path) -> None:
     touch(tmp_path, "x.csv", "y.csv")
     (tmp_path / "t.tsv").write_text("file\tsubject\ttrial\nx.csv\tA\t1\ny.csv\tA\t2\n")
@@ -138,6 +157,7 @@ HOSTILE = [
     ("recordings = '**/{subject}.csv'", "", "cannot be"),
     ("recordings = '{subject}.{csv'", "", "cannot be"),
     ("recordings = '{}{subject}.csv'", "", "cannot be"),
+    ("recordings = '{subject}{trial}{visit}.csv'", "", "nothing between {subject}{trial}"),
     ("recordings = '{subject!r}.csv'", "", "names no subject"),
     ("recordings = '[{subject}.csv'", "", "matches no file"),
     ("recordings = '{subject}*.csv'", "", "matches no file"),

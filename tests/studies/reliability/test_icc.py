@@ -85,6 +85,20 @@ def test_perfect_agreement_and_no_variance() -> None:
     assert np.isnan(icc(np.ones((4, 3)), "A,1").value)
 
 
+@pytest.mark.parametrize("form", FORMS)
+def test_subjects_that_are_alike_have_no_interval(form: Form) -> None:
+    """Not [1, 1] about 0: who repeats exactly what the others repeat says nothing of others."""
+    rows = np.tile([1.0, 2.0, 3.0], (5, 1))
+    turned = np.array([[1.0, 2.0, 3.0], [3.0, 1.0, 2.0], [2.0, 3.0, 1.0]])
+    for scores in (rows, turned):
+        found = icc(scores, form)
+        assert np.isnan([found.low, found.high]).all()
+        assert not found.value > 0
+    if form in ("A,1", "A,k"):
+        assert icc(rows, form).value == 0
+        assert np.isnan(icc(rows, form, method="generalised").high)
+
+
 def test_consistency_ignores_a_shift_of_occasions_and_agreement_does_not() -> None:
     shifted = SHROUT_FLEISS + np.array([0, 5, 10, 15])
     assert icc(shifted, "C,1").value == pytest.approx(icc(SHROUT_FLEISS, "C,1").value)

@@ -1,0 +1,88 @@
+"""Keep libraries from obeying settings files of the working folder.
+
+matplotlib reads `matplotlibrc`, numba `.numba_config.yaml` and IPOPT `ipopt.opt` of the folder in
+which a command is typed. Recordings of other people may lie there (docs/security.md).
+"""
+
+from __future__ import annotations
+
+import importlib.abc
+import os
+import sys
+from contextlib import chdir, contextmanager, nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+    from importlib.machinery import ModuleSpec
+    from types import ModuleType
+
+__all__ = ["IPOPT_ALONE", "ignore_settings_files"]
+
+#: Options with which IPOPT prints nothing and reads no file. ipopt.opt may have it write over any
+#: file, and load a library as its linear solver.
+IPOPT_ALONE: dict[str, Any] = {"print_level": 0, "sb": "yes", "option_file_name": ""}
+
+
+def ignore_settings_files(*libraries: str) -> None:
+    """Import these `libraries`, whoever imports them first, as if their settings files were absent.
+
+    Parameters
+    ----------
+    *libraries : str
+        Names of packages, each "matplotlib" or "numba".
+    """
+    for library in libraries:
+        if not any(isinstance(item, _Finder) and item.name == library for item in sys.meta_path):
+            sys.meta_path.insert(0, _Finder(library))
+
+
+class _Finder(importlib.abc.MetaPathFinder):
+    """Find one library as the other finders do, and run its `__init__` away from the folder."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        """The specification of the library; None for other modules."""
+        if fullname != self.name:
+            return None
+        others = (finder for finder in sys.meta_path if finder is not self)
+        found = (finder.find_spec(fullname, path, target) for finder in others)
+        spec = next((item for item in found if item is not None), None)
+        if spec is not None and spec.loader is not None:
+            loader: Any = spec.loader
+            execute = loader.exec_module
+
+            def away(module: ModuleType) -> None:
+                with _away():
+                    execute(module)
+                if fullname == "numba":
+                    # numba looks again before each compilation: by no name it finds nothing.
+                    sys.modules["numba.core.config"].__dict__["_config_fname"] = ""
+
+            loader.exec_module = away
+        return spec
+
+
+@contextmanager
+def _away() -> Iterator[None]:
+    """In this package's folder, and without yaml, by which numba would read its file later."""
+    try:
+        os.getcwd()
+    except OSError:  # the folder is gone, and its files with it
+        elsewhere: Any = nullcontext()
+    else:
+        elsewhere = chdir(Path(__file__).parent)
+    yaml = sys.modules.get("yaml")
+    sys.modules["yaml"] = None  # type: ignore[assignment]
+    try:
+        with elsewhere:
+            yield
+    finally:
+        del sys.modules["yaml"]
+        if yaml is not None:
+            sys.modules["yaml"] = yaml
