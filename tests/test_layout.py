@@ -87,11 +87,12 @@ ELSEWHERE = {
         inverse/groundwork.py inverse/coordinates.py inverse/initial_states.py
         inverse/natural_search.py model/plant_family.py""",
     "inverse/test_several_inputs.py": """
-        inverse/consistent_pairs.py inverse/explaining_weights.py inverse/one_step.py
-        inverse/quiet_samples.py""",
+        inverse/consistent_metrics.py inverse/explaining_weights.py
+        inverse/inactive_samples.py""",
+    "inverse/test_default_answer.py": "inverse/starting_regulators.py",
     "inverse/test_likelihood_fit.py": "inverse/likelihood_start.py inverse/person_coordinates.py",
     "inverse/test_likelihood_search.py": "inverse/person_prior.py",
-    "inverse/test_arrow.py": "inverse/trial_span.py",
+    "assess/test_person_covariance.py": "inverse/trial_span.py",
     "inverse/test_structured_fit.py": "inverse/structured_search.py",
     "inverse/test_optimal_control_fit.py": """
         inverse/optimal_control_residuals.py inverse/optimal_control_search.py

@@ -30,7 +30,7 @@ from impc.control import (
 )
 from impc.files import configuration, formats, reading, table, units
 from impc.files import plant_sources as plant_source
-from impc.inverse import cross_term, equivalent_weights, inverse_lqr, optimal_control_fit
+from impc.inverse import cross_term, equivalent_weights, inverse_lqr, optimal_control_fit, residuals
 from impc.inverse import direct_and_reduced as inverse_mpc
 from impc.inverse import gain_search as gain
 from impc.inverse import noisy_fit as fitted_controller
@@ -321,8 +321,8 @@ def calls() -> list[Call]:
             },
         ),
         (inverse_mpc.inverse_mpc_reduced, {**problem, "condition_weight": 0.0}),
-        (inverse_mpc.verify_hard, {**problem, "weights": v["weights"]}),
-        (gain.fit_gain, {**problem, "attempts": 1, "max_evaluations": 3, "spread": 10.0}),
+        (residuals.verify_hard, {**problem, "weights": v["weights"]}),
+        (gain.fit_gain, problem),
         (fitted_controller.fit_controller, {**problem, "start": v["weights"]}),
         (identifiability.identifiability, {**problem, "weights": v["weights"]}),
         (mpc.build_mpc, {"controller": v["controller"], "solver": "daqp"}),

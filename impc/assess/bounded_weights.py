@@ -112,7 +112,7 @@ def weights_set(fibre: GainFibre, ratio: float = 10.0, *, rough: bool = False) -
     traces = np.trace(raw[:, n:, n:], axis1=1, axis2=2)
     first = view.block * (m / np.trace(view.R))
     level = np.tensordot(scipy.linalg.null_space(traces[None]).T, raw, 1)
-    limit = ratio * least.condition
+    limit = ratio * (least.least or least.condition)
     if centre is None:  # X <= limit I, since the least eigenvalue is at most that of R
         trace = limit * float(np.linalg.norm(inverse)) ** 2
     else:

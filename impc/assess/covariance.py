@@ -28,9 +28,9 @@ import numpy as np
 
 from impc.arrays import Array, BoolArray, Frozen, frozen
 from impc.assess.long_run_covariance import ResidualNoise, residual_noise, spread_of_sum
-from impc.inverse.coordinates import metric_directions, scaled_changes
+from impc.inverse.coordinates import metric_directions
 from impc.inverse.problem import recorded_size
-from impc.inverse.residuals import evaluate, residual_only, residual_or_reason
+from impc.inverse.residuals import evaluate, residual_only, residual_or_reason, scaled_changes
 from impc.inverse.solution_set import natural_coordinates
 from impc.inverse.trial_span import trial_span
 

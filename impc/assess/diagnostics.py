@@ -36,6 +36,11 @@ class ResidualDiagnostics:
     loop: LoopNoise | None
     structure: ResidualStructure | None
 
+    @property
+    def contradicted(self) -> bool:
+        """Whether either finds something."""
+        return any(test is not None and test.found for test in (self.loop, self.structure))
+
 
 def residual_diagnostics(problem: Problem, gain: Array, metric: Array) -> ResidualDiagnostics:
     """Run both tests.

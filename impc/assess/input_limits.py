@@ -135,7 +135,8 @@ def at_another_limit(fitted: Estimate, known: LimitEstimate | None = None) -> Ot
     if limit.value is None:
         return None
     posed = with_limit(fitted.problem, limit.value)
-    return OtherLimit(given, limit, fit_controller(posed, fitted.weights))
+    # From nothing: the weights that fit best at a wrong limit are a poor start.
+    return OtherLimit(given, limit, fit_controller(posed))
 
 
 def with_limit(problem: Problem, limit: float, control: int = 0) -> Problem:

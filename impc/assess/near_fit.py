@@ -19,7 +19,7 @@ import scipy.optimize
 
 from impc.arrays import Array
 from impc.errors import WeightsError
-from impc.inverse.coordinates import scaled_changes
+from impc.inverse.residuals import scaled_changes
 from impc.inverse.solution_set import natural_coordinates
 from impc.inverse.structured_search import regulator_slopes
 from impc.model.riccati import solve_lqr

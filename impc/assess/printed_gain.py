@@ -26,9 +26,8 @@ from impc.arrays import Array, frozen
 from impc.assess.covariance import GainCovariance, gain_covariance
 from impc.assess.long_run_covariance import white_noise
 from impc.inverse.coordinates import Coordinates, descend
-from impc.inverse.gain_search import EXPLAINED
 from impc.inverse.least_squares import Stop
-from impc.inverse.problem import recorded_size
+from impc.inverse.problem import EXPLAINED, recorded_size
 from impc.inverse.residuals import evaluate
 from impc.model.riccati import is_stable
 
@@ -41,9 +40,8 @@ __all__ = ["GainEstimate", "ToldGain", "gain_estimate", "told_gain"]
 
 # On 60 random plants 51 searches ended after two rounds, 9 after three.
 _ROUNDS = 4
-_SETTLED = 1e-4
 _EVALUATIONS = 40
-# Nats at which a search ends.
+# Nats at which a search ends, and a round is the last.
 _TOLERANCE = 0.01
 
 
@@ -157,7 +155,8 @@ def _search(problem: Problem, gain: Array, metric: Array) -> _Here:
             break
         before, here = here, there
         same = np.count_nonzero(here.linear.told) == np.count_nonzero(before.linear.told)
-        if same and here.misfit > (1 - _SETTLED) * before.misfit:
+        gained = len(here.evaluation.residual) * np.log(before.misfit / here.misfit)
+        if same and gained < _TOLERANCE:
             break
     return here
 

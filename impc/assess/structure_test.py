@@ -26,8 +26,7 @@ from impc.arrays import Frozen
 from impc.assess.covariance import TOLD, by_trial
 from impc.assess.long_run_covariance import residual_noise, spread_of_sum
 from impc.assess.near_fit import NearFit
-from impc.inverse.gain_search import EXPLAINED
-from impc.inverse.problem import recorded_size
+from impc.inverse.problem import EXPLAINED, recorded_size
 from impc.model.riccati import solve_lqr
 from impc.model.weights import Weights
 

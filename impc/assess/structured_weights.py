@@ -26,8 +26,8 @@ from impc.assess.long_run_covariance import (
     spread_of_sum,
     white_noise,
 )
-from impc.inverse.coordinates import metric_directions, scaled_changes
-from impc.inverse.residuals import evaluate
+from impc.inverse.coordinates import metric_directions
+from impc.inverse.residuals import evaluate, scaled_changes
 from impc.inverse.solution_set import natural_coordinates
 from impc.inverse.structured_search import regulator_slopes
 from impc.inverse.trial_span import trial_span
@@ -128,7 +128,7 @@ class Tangent(Frozen):
         on_gain = self.found.dK.reshape(len(self.residual), -1) @ np.kron(G, np.linalg.inv(T).T)
         along = scaled_changes(metric, metric_directions(metric))
         on_metric = self.found.dS.reshape(len(self.residual), -1)
-        return np.asarray(on_gain), np.asarray(on_metric @ along.reshape(len(along), -1).T)
+        return np.asarray(on_gain), np.asarray(on_metric @ along.reshape(len(along), metric.size).T)
 
 
 def tangent(structure: Structure, problem: Problem, prices: Array) -> Tangent:
@@ -137,8 +137,8 @@ def tangent(structure: Structure, problem: Problem, prices: Array) -> Tangent:
     K, S = np.array(solution.K), np.array(solution.S)
     found = evaluate(problem, K, S)
     dK, dS = regulator_slopes(problem, structure, prices, solution)
-    seen = found.dK.reshape(len(found.residual), -1) @ dK.reshape(len(dK), -1).T
-    seen += found.dS.reshape(len(seen), -1) @ scaled_changes(S, dS).reshape(len(dS), -1).T
+    seen = found.dK.reshape(len(found.residual), -1) @ dK.reshape(len(dK), K.size).T
+    seen += found.dS.reshape(len(seen), -1) @ scaled_changes(S, dS).reshape(len(dS), S.size).T
     count = structure.count
     return Tangent(
         structure,

@@ -24,8 +24,7 @@ from impc.assess.structure_test import StructureTest, structure_test
 from impc.assess.structured_weights import PriceCovariance, price_covariance, tangent
 from impc.assess.variance_accounted_for import vaf
 from impc.control.closed_loop import simulate
-from impc.inverse.gain_search import EXPLAINED
-from impc.inverse.problem import scenarios
+from impc.inverse.problem import EXPLAINED, scenarios
 from impc.inverse.structured_fit import feature_sizes, structured_estimate
 from impc.inverse.structured_search import search_from
 

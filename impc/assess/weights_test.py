@@ -5,10 +5,13 @@
 K is the best gain of any kind, K(Q, R) the best one that weights have, s_i the standard errors for
 noise of the colour that the residuals show. If the true gain is that of some weights, D is at most
 chi-squared with as many degrees of freedom as there are directions. If D is much larger, no weights
-explain the recordings, and what any of them say of the subject's intent is void.
+explain the recordings, and what any of them say of the subject's intent is void. Where residuals
+contradict the model itself, noise is not all that moves the gain: then weights have to leave more
+than a twentieth more, too.
 
 Whether weights have K itself is a linear matrix inequality. With one input and an invertible A
-there is an explanation: the return difference of an optimal regulator keeps
+there is an explanation: the return difference of an optimal regulator keeps (docs/theory.md,
+section 2)
 
     |1 + K (zI - A)^-1 B|^2  >=  R / S  =  det(A - BK) / det A      for all |z| = 1.
 """
@@ -35,6 +38,8 @@ __all__ = ["ReturnDifference", "WeightsTest", "return_difference", "weights_test
 
 # Probability below which the true gain is said to have no weights.
 _LEVEL = 1e-3
+# How much more, of the misfit, weights have to leave where the model is contradicted.
+_MORE = 1.05
 _FREQUENCIES = 2000
 
 
@@ -72,6 +77,10 @@ class WeightsTest:
         Directions of the gain that are identified.
     p_value : float
         Of chi-squared: an upper limit.
+    more : float
+        Misfit of the weights, of that of the gain.
+    contradicted : bool
+        Whether the residuals contradict the model.
     exist : bool
         Whether positive definite weights have the identified gain itself.
     difference : ReturnDifference or None
@@ -81,13 +90,15 @@ class WeightsTest:
     statistic: float
     freedom: int
     p_value: float
+    more: float
+    contradicted: bool
     exist: bool
     difference: ReturnDifference | None
 
     @property
     def rejected(self) -> bool:
         """Whether no cost weights explain the gain."""
-        return self.p_value < _LEVEL
+        return self.p_value < _LEVEL and (not self.contradicted or self.more > _MORE)
 
     @property
     def sentence(self) -> str:
@@ -107,7 +118,9 @@ class WeightsTest:
         )
 
 
-def weights_test(fitted: Estimate, estimate: GainEstimate) -> WeightsTest:
+def weights_test(
+    fitted: Estimate, estimate: GainEstimate, *, contradicted: bool = False
+) -> WeightsTest:
     """Compare the gain of the fitted weights with the gain that is identified.
 
     Parameters
@@ -116,6 +129,8 @@ def weights_test(fitted: Estimate, estimate: GainEstimate) -> WeightsTest:
         Of inverse MPC.
     estimate : GainEstimate
         Of `gain_estimate`, from that fit.
+    contradicted : bool
+        Whether the residuals contradict the model.
     """
     covariance, plant = estimate.covariance, estimate.problem.plant
     identified = covariance.told
@@ -128,18 +143,24 @@ def weights_test(fitted: Estimate, estimate: GainEstimate) -> WeightsTest:
         exist = weights_margin(gain_fibre(plant, estimate.K)).exist
     except (WeightsError, SolverError):  # unstable, or at the edge of what a program can tell
         exist = False
-    return WeightsTest(statistic, freedom, p_value, exist, return_difference(plant, estimate.K))
+    more = 1.0 if exact else fitted.misfit / estimate.misfit
+    difference = return_difference(plant, estimate.K)
+    return WeightsTest(statistic, freedom, p_value, more, contradicted, exist, difference)
 
 
 def return_difference(plant: Plant, gain: Array) -> ReturnDifference | None:
-    """The inequality at a gain (1, n); None for several inputs, or a singular A."""
+    """The inequality at a gain (1, n); None for several inputs, or a singular A.
+
+    By det(zI - A + BK) / det(zI - A), which is 1 + K (zI - A)^-1 B.
+    """
     A, B, n = plant.A, plant.B, plant.n
     if plant.m > 1 or np.linalg.matrix_rank(A) < n:
         return None
     angles = np.linspace(0, np.pi, _FREQUENCIES)
-    states = np.linalg.solve(np.exp(1j * angles)[:, None, None] * np.eye(n) - A, B.astype(complex))
-    sizes = np.abs(1 + (gain @ states)[:, 0, 0]) ** 2
-    place = int(np.argmin(sizes))
+    circle = np.exp(1j * angles)[:, None, None] * np.eye(n)
+    with np.errstate(divide="ignore", invalid="ignore"):  # at a pole the ratio has no bound
+        sizes = np.abs(np.linalg.det(circle - A + B @ gain) / np.linalg.det(circle - A)) ** 2
+    place = int(np.nanargmin(sizes))
     needed = float(np.linalg.det(A - B @ gain) / np.linalg.det(A))
     return ReturnDifference(
         float(sizes[place]), needed, float(angles[place] / (2 * np.pi * plant.dt))

@@ -126,7 +126,8 @@ def prepare_loop(
 ) -> PreparedLoop:
     """Build all that does not depend on the recording, so that several trials share it.
 
-    `moves` are A, B and E of what moves in place of the plant; the controller predicts by its own.
+    `moves` are A (n, n), B (n, m) and E (n, d) of what moves in place of the plant; the controller
+    predicts by its own.
     """
     plant = controller.plant
     A, B, E = (plant.A, plant.B, plant.E) if moves is None else moves

@@ -22,8 +22,7 @@ import numpy as np
 import scipy.optimize
 
 from impc.arrays import Array
-from impc.inverse.coordinates import scaled_changes
-from impc.inverse.residuals import evaluate, misfit_or_reason
+from impc.inverse.residuals import evaluate, misfit_or_reason, scaled_changes
 
 if TYPE_CHECKING:
     from impc.inverse.problem import Problem
@@ -69,7 +68,7 @@ class MetricFamily:
         return np.asarray((self.rows.T * np.exp(logs)) @ self.rows + D @ C @ C.T @ D.T)
 
     def changes(self, z: Array) -> Array:
-        """Derivatives of S (count, m, m)."""
+        """Derivatives of S (count, m, m) at `z` (count,)."""
         logs, C = self._split(z)
         D = self.others
         found = [
@@ -82,7 +81,7 @@ class MetricFamily:
         return np.array(found)
 
     def nearest(self, metric: Array) -> Array:
-        """z (count,) of a member (m, m), or of one next to a metric that is none."""
+        """z (count,) of a `metric` (m, m) that is a member, or of one next to it."""
         inverse, extra = np.linalg.inv(metric), self.others.shape[1]
         sizes = np.einsum("ri,ij,rj->r", self.rows, inverse, self.rows)
         square: Array = self.idle.T @ metric @ self.idle
@@ -141,10 +140,13 @@ def fitted_metric(
 
 
 def unidentified_metrics(problem: Problem, gain: Array, family: MetricFamily, z: Array) -> Array:
-    """The metric at z (count,), then directions (k, m, m) of the family that nothing identifies."""
+    """The metric at z (count,), then directions (k, m, m) that nothing identifies.
+
+    Of the family of a `gain` (m, n).
+    """
     S, changes = family.metric(z), family.changes(z)
     found = evaluate(problem, gain, S)
-    scaled = scaled_changes(S, changes).reshape(len(changes), -1)
+    scaled = scaled_changes(S, changes).reshape(len(changes), S.size)
     seen = found.dS.reshape(len(found.residual), -1) @ scaled.T
     # Of the triangle: the left vectors of all samples would take memory in their square.
     _, values, rows = np.linalg.svd(np.linalg.qr(seen, mode="r"))

@@ -11,7 +11,7 @@ No optimal regulator has a K T of norm above (tr(B'PB)/R)^(1/2), because white n
 tr(B'PB) a sample, of which R u^2 is a part.
 
 Initial states are measured in those of the trials themselves (`start_unit`), and a parameter in
-thirds of itself.
+thirds of itself (docs/fitting.md).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from impc.arrays import Array
 from impc.control.closed_loop import simulate
 from impc.inverse.least_squares import Prior, Rows, minimise, triangular_rows
 from impc.inverse.problem import controller_for, recorded_size, scenarios
-from impc.inverse.residuals import evaluate, residual_or_reason
+from impc.inverse.residuals import evaluate, residual_or_reason, scaled_changes
 from impc.inverse.solution_set import floored_covariance, natural_coordinates
 
 if TYPE_CHECKING:
@@ -43,7 +43,6 @@ __all__ = [
     "Point",
     "descend",
     "metric_directions",
-    "scaled_changes",
     "start_unit",
 ]
 
@@ -201,7 +200,7 @@ class Coordinates:
         return None if reason else residual
 
     def pulled(self, z: Array, change: Array) -> Array:
-        """J' of a change (r,) of the residual, J the derivative at z (q,)."""
+        """J' (q,) of a change (r,) of the residual, J the derivative at z (q,)."""
         found, _ = self.evaluated(z)
         dK, dS = self.changes(self.unpack(z), z)
         on_gain, on_metric = np.tensordot(change, found.dK, 1), np.tensordot(change, found.dS, 1)
@@ -328,7 +327,7 @@ def descend(
     Returns
     -------
     z, evaluations, converged : Array, int, bool
-        As `minimise`.
+        Where it ends (q,), and as `minimise`.
     """
     model = _Along(space, z, along)
     centre = model.apart(space.start)
@@ -394,16 +393,6 @@ def metric_directions(metric: Array) -> Array:
         change = np.outer(first[:, row], first[:, column])
         found.append(change + change.T)
     return np.array(found).reshape(-1, *metric.shape)
-
-
-def scaled_changes(metric: Array, changes: Array) -> Array:
-    """Changes (k, m, m) of a metric (m, m) as those of the metric scaled to a mean diagonal of 1.
-
-    That is how the controller scales it before it is differentiated (`Evaluation.dS`).
-    """
-    trace = np.trace(metric)
-    shares = np.trace(changes, axis1=1, axis2=2)[:, None, None] / trace
-    return np.asarray(len(metric) / trace * (changes - shares * metric))
 
 
 def start_unit(problem: Problem, gain: Array) -> Array:

@@ -5,7 +5,7 @@
 
 Each candidate is simulated once, in the model and at the initial states of the answer that it might
 replace. One that leaves less is where that search begins again; what still leaves more afterwards
-says so (`Estimate.doubts`).
+says so (`Estimate.doubts`; docs/fitting.md).
 """
 
 from __future__ import annotations

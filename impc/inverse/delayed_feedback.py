@@ -74,10 +74,9 @@ def preliminary_gain(problem: Problem, states: Sequence[str]) -> PreliminaryGain
             "[fit] feedback_states", f"{unknown or 'is empty'}", f"known: {list(names)}"
         )
     kept: BoolArray = np.isin(names, states)
-    gain, metric = _start(loose, kept), np.eye(problem.plant.m)
-    space = Coordinates(loose, gain, metric, _basis(loose.plant, gain, kept))
-    stop = Stop(_FINE, 0.0, _EVALUATIONS)
-    z, _, _ = descend(space, space.start, stop)
+    gain, centre = _start(loose, kept)
+    space = Coordinates(loose, centre, np.eye(problem.plant.m), _basis(loose.plant, centre, kept))
+    z, _, _ = descend(space, space.at_gain(gain), Stop(_FINE, 0.0, _EVALUATIONS))
     found = space.unpack(z)
     misfit = float(np.linalg.norm(space.at(z).residual))
     return PreliminaryGain(frozen(found.K), found.problem, misfit)
@@ -91,17 +90,20 @@ def _basis(plant: Plant, gain: Array, kept: BoolArray) -> Array:
     return np.asarray(G @ natural.T.reshape(entries.shape) @ np.linalg.inv(T))
 
 
-def _start(problem: Problem, kept: BoolArray) -> Array:
-    """The best stabilising multiple of a balanced regulator's gains on the kept states."""
+def _start(problem: Problem, kept: BoolArray) -> tuple[Array, Array]:
+    """The best multiple of a balanced regulator's gains on the kept states, and all its gains.
+
+    Over a recording that is short enough the best one need not stabilise.
+    """
     metric = np.eye(problem.plant.m)
-    best: Array | None = None
+    best: tuple[Array, Array] | None = None
     least = np.inf
     for solution in regulators(problem):
         gain: Array = np.asarray(solution.K * kept, dtype=np.float64)
         for scale in _SCALES:
             misfit, reason = misfit_or_reason(problem, scale * gain, metric)
             if not reason and misfit < least:
-                best, least = scale * gain, misfit
+                best, least = (scale * gain, np.array(solution.K)), misfit
     if best is None:
         raise SolverError(
             "preliminary gain",

@@ -14,20 +14,18 @@ import numpy as np
 
 from impc.arrays import Array
 from impc.checking import checked, replace
-from impc.control.closed_loop import simulate
-from impc.control.controller import Controller
 from impc.errors import InputError, SolverError, WeightsError
 from impc.inverse.explaining_weights import weights_behind
-from impc.inverse.gain_search import EXPLAINED, GainFit, fit_gain, refine_gain
+from impc.inverse.gain_search import GainFit, fit_gain, refine_gain
 from impc.inverse.inverse_lqr import inverse_lqr_gradient, inverse_lqr_lmi
 from impc.inverse.nearest_regulator import (
     AUXILIARY_CONDITION_WEIGHT,
     auxiliary_weights,
     definite,
 )
-from impc.inverse.problem import recorded_size, scenarios, typical_output
+from impc.inverse.problem import EXPLAINED, recorded_size, typical_output
 from impc.inverse.proximal_search import ConditionedFit, Objective, Residual, conditioned_fit
-from impc.inverse.residuals import evaluate
+from impc.inverse.residuals import evaluate, verify_hard
 from impc.inverse.starting_regulators import regulators
 from impc.model.riccati import solve_lqr
 from impc.model.weights import Weights
@@ -35,7 +33,6 @@ from impc.model.weights import Weights
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from impc.control.simulation import Simulation
     from impc.control.terminal_set import TerminalSet
     from impc.inverse.equivalent_weights import EquivalentWeights
     from impc.inverse.explaining_weights import WeightsBehind
@@ -54,7 +51,6 @@ __all__ = [
     "inverse_mpc_reduced",
     "output_penalty_weights",
     "starting_point",
-    "verify_hard",
 ]
 
 # c of (3.5) to (3.7) is lost. Small enough that the exact fit wins in the 2-norm (docs/theory.md).
@@ -435,23 +431,6 @@ def output_penalty_weights(
 
 
 @checked
-def verify_hard(problem: Problem, weights: Weights) -> list[Simulation]:
-    """Simulate every recording with hard state bounds and terminal set.
-
-    The search softens those rows; this says whether the controller found keeps them. Pass each
-    result to `require_complete` to turn a failure into an error.
-    """
-    controller = Controller(
-        problem.plant,
-        weights,
-        problem.bounds,
-        problem.horizon,
-        terminal_set=bool(problem.terminal_set),
-        solver=problem.solver,
-    )
-    return [simulate(controller, drive) for drive in scenarios(problem)]
-
-
 def _closed_loop_residual(problem: Problem) -> Callable[[LqrSolution], Residual]:
     near: TerminalSet | None = None
 

@@ -83,9 +83,11 @@ class EquivalentWeights(Frozen):
         ||K(Q, R) - K||_F / ||K||_F, with K(Q, R) from that solution.
     status : str
         How they were found, and the solver's own word.
+    least : float or None
+        Of `least_condition_weights`: the least condition number, which these weights exceed by up
+        to 2e-5 of it. None for weights that were not chosen by it.
     gap : float or None
-        Of `least_condition_weights`: how much lower, relatively, the condition number could be by
-        the dual bound. None for weights that were not chosen by it.
+        How much lower, relatively, that could be by the dual bound.
     """
 
     weights: Weights
@@ -93,6 +95,7 @@ class EquivalentWeights(Frozen):
     condition: float
     gain_error: float
     status: str
+    least: float | None
     gap: float | None
 
 
@@ -194,7 +197,7 @@ def least_condition_weights(
         chosen = _least_norm(fibre, best, (1 + SLACK) * least)
         if condition_number(chosen) <= (1 + 2 * SLACK) * least:
             best = chosen
-    return _member(fibre, best, f"least condition number, Clarabel: {status}", gap)
+    return _member(fibre, best, f"least condition number, Clarabel: {status}", least, gap)
 
 
 @checked
@@ -225,7 +228,7 @@ def analytic_centre(fibre: GainFibre) -> EquivalentWeights:
         X = X + np.tensordot(step, level, 1) / (1 + decrement if decrement > 0.25 else 1)
         if decrement < 1e-9:
             status = f"analytic centre, {iteration} Newton steps"
-            return _member(fibre, fibre.from_natural(X), status, None)
+            return _member(fibre, fibre.from_natural(X), status)
         if np.linalg.cond(X) > 1e14:
             break
     raise WeightsError(
@@ -276,7 +279,7 @@ def other_weights(
         chosen.append(ends.pop(int(np.argmax(nearest))))
     status = f"{condition_ratio:g} times the least condition number"
     return tuple(
-        _member(fibre, fibre.from_natural(frame @ X @ frame.T), status, None) for X in chosen[1:]
+        _member(fibre, fibre.from_natural(frame @ X @ frame.T), status) for X in chosen[1:]
     )
 
 
@@ -410,9 +413,16 @@ def inverse_factor(fibre: GainFibre, weights: Weights) -> Array:
     return np.linalg.inv(factor) @ scipy.linalg.block_diag(fibre.T, fibre.G).T
 
 
-def _member(fibre: GainFibre, found: Weights, status: str, gap: float | None) -> EquivalentWeights:
+def _member(
+    fibre: GainFibre,
+    found: Weights,
+    status: str,
+    least: float | None = None,
+    gap: float | None = None,
+) -> EquivalentWeights:
     checked = normalised(Weights(found.Q, found.R))
     solution = solve_lqr(fibre.plant, checked)
     size = max(float(np.linalg.norm(fibre.gain)), 1e-300)
     error = float(np.linalg.norm(solution.K - fibre.gain)) / size
-    return EquivalentWeights(checked, solution.P, condition_number(checked), error, status, gap)
+    condition = condition_number(checked)
+    return EquivalentWeights(checked, solution.P, condition, error, status, least, gap)

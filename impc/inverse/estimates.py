@@ -293,7 +293,10 @@ def goodness(problem: Problem, gain: Array, metric: Array) -> tuple[float, Goodn
 
 
 def gain_rank(problem: Problem, gain: Array, metric: Array) -> int:
-    """How many directions of the gain the recordings identify to first order."""
+    """How many directions of a `gain` (m, n) with a `metric` (m, m) the recordings identify.
+
+    To first order: docs/fitting.md.
+    """
     found = evaluate(problem, gain, metric)
     if found.reason:
         return 0

@@ -17,8 +17,7 @@ import numpy as np
 from impc.errors import SolverError, WeightsError
 from impc.inverse.consistent_metrics import fitted_metric, metric_family, unidentified_metrics
 from impc.inverse.equivalent_weights import least_condition_weights
-from impc.inverse.gain_search import EXPLAINED
-from impc.inverse.problem import recorded_size
+from impc.inverse.problem import EXPLAINED, recorded_size
 from impc.inverse.residuals import residual_only
 from impc.inverse.solution_set import gain_fibre
 from impc.model.riccati import solve_lqr
@@ -66,7 +65,7 @@ def weights_behind(fit: GainFit) -> WeightsBehind:
 
     Raises
     ------
-    SolverError
+    SolverError, WeightsError
         When the plant under the fitted gain cannot be simulated.
     """
     problem = fit.problem

@@ -27,7 +27,7 @@ from impc.inverse.coordinates import Coordinates, Point, descend
 from impc.inverse.inactive_samples import pair_of_inactive_samples
 from impc.inverse.least_squares import Stop
 from impc.inverse.prediction import correction
-from impc.inverse.problem import recorded_size
+from impc.inverse.problem import EXPLAINED, recorded_size
 from impc.inverse.residuals import misfit_or_reason
 from impc.inverse.starting_regulators import balanced_regulator, drawn_start, state_sizes
 from impc.model.riccati import is_stable
@@ -38,10 +38,8 @@ if TYPE_CHECKING:
     from impc.inverse.problem import Problem
     from impc.model.riccati import LqrSolution
 
-__all__ = ["EXPLAINED", "GainFit", "fit_gain", "refine_gain"]
+__all__ = ["GainFit", "fit_gain", "refine_gain"]
 
-#: Misfit, of the recorded outputs, up to which they are explained.
-EXPLAINED = 1e-9
 # Numbers recorded up to which searches are made until three agree on the least misfit, to this
 # share of it; longer recordings are searched again, until two agree, where the simulation leaves
 # this much more than the prediction. Predictions this much worse than the best end there.
@@ -54,8 +52,8 @@ _RATIOS = (10.0, 1.0)
 # One over the standard deviation of the prior, in natural coordinates, of a search from nothing.
 _WEAK = 1e-3
 # Evaluations of predictions and simulations, and nats per recorded number at which each ends: a
-# squared misfit that falls by less than that share of itself.
-_PREDICTED, _SIMULATED, _ROUGH, _FINE = 25, 80, 1e-3, 1e-6
+# squared misfit that falls by less than that share of itself; and nats at which it ends at last.
+_PREDICTED, _SIMULATED, _ROUGH, _FINE, _NATS = 25, 80, 1e-3, 1e-6, 1e-3
 # Misfit of rounding, of the recorded outputs.
 _ROUNDING = 1e-13
 # Factor by which each step back is shorter.
@@ -176,6 +174,7 @@ def refine_gain(
         raise SolverError("gain", f"the start cannot be simulated: {reason}", "start elsewhere")
     space = Coordinates(problem, gain, metric)
     stop = _stop(problem, _FINE, max_evaluations)
+    stop = replace(stop, nats=min(stop.nats, _NATS))
     z, spent, _ = descend(space, space.start, stop, shared=prior, own=prior)
     return _gain_fit(space, z, spent)
 

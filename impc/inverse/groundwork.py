@@ -31,13 +31,13 @@ from impc.inverse.direct_and_reduced import (
 from impc.inverse.equivalent_weights import least_condition_weights
 from impc.inverse.estimates import Estimate
 from impc.inverse.explaining_weights import weights_behind
-from impc.inverse.gain_search import EXPLAINED, GainFit, fit_gain
+from impc.inverse.gain_search import GainFit, fit_gain, refine_gain
 from impc.inverse.initial_states import with_fitted_starts
 from impc.inverse.inverse_lqr import InverseLqr, inverse_lqr_gradient, inverse_lqr_lmi
 from impc.inverse.natural_search import in_plant_units, inverse_mpc_natural
 from impc.inverse.nearest_regulator import auxiliary_weights
 from impc.inverse.noisy_fit import fit_controller, free_gain, noise_of
-from impc.inverse.problem import recorded_size
+from impc.inverse.problem import EXPLAINED, recorded_size
 from impc.inverse.solution_set import gain_fibre, natural_coordinates
 from impc.model.plant import change_coordinates
 from impc.model.riccati import is_stable, solve_lqr
@@ -218,8 +218,13 @@ class NaturalUnits:
 
     @cached_property
     def feedback(self) -> GainFit:
-        """The best gain without bounds (3.12)."""
-        return free_gain(self.fitted.problem.without_bounds(), self.fitted.stage_weights)
+        """The best gain without bounds (3.12).
+
+        Searched again from where it ends: the prior is about the start, which may be far.
+        """
+        first = free_gain(self.fitted.problem.without_bounds(), self.fitted.stage_weights)
+        again = refine_gain(first.problem, np.array(first.K), np.array(first.S), prior=1.0)
+        return replace(again, evaluations=first.evaluations + again.evaluations)
 
     @property
     def starting_gain(self) -> Array:

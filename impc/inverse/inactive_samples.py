@@ -7,7 +7,7 @@ From a sample at which no bound is met within the horizon the plan is the gain's
 exactly. Any n of them give B K, and to how many of the others it applies shows whether they were
 such: runs of neighbours are tried, since they come in runs, and sets from anywhere. The metric is
 then one of the family that weights can have with this gain (`consistent_metrics`). With noise
-there are no such samples, and no start from here.
+there are no such samples, and no start from here (docs/theory.md, section 2).
 """
 
 from __future__ import annotations

@@ -65,7 +65,17 @@ class Rows:
 
 @dataclass(frozen=True)
 class Prior:
-    """Centre u (a,), v (trials, n) of a normal prior, and one over its standard deviations."""
+    """A normal prior.
+
+    Attributes
+    ----------
+    u, v : Array
+        Its centre (a,), (trials, n).
+    shared : Array
+        One over the standard deviations of u (a,).
+    own : float
+        One over that of each entry of v.
+    """
 
     u: Array
     v: Array
@@ -73,7 +83,7 @@ class Prior:
     own: float
 
     def square(self, u: Array, v: Array) -> float:
-        """Minus twice the logarithm of its density, but for a constant."""
+        """-2 log of its density at `u` (a,), `v` (trials, n), but for a constant."""
         return float(np.sum((self.shared * (u - self.u)) ** 2) + self.own**2 * _square(v - self.v))
 
 
@@ -104,13 +114,16 @@ class Model(Protocol):
         """N."""
 
     def rows(self, u: Array, v: Array) -> Rows | None:
-        """Residual and derivatives; None where the model cannot be evaluated."""
+        """Residual and derivatives at `u` (a,), `v` (trials, n); None where there are none."""
 
     def square(self, u: Array, v: Array) -> float:
-        """Squared residual, infinite where there is none."""
+        """Squared residual at `u` (a,), `v` (trials, n); infinite where there is none."""
 
     def bend(self, du: Array, dv: Array, share: float) -> tuple[Array, Array] | None:
-        """J' (r(z + share d) - r(z)) at the last point z of `rows`, with respect to u and v."""
+        """J' (r(z + share d) - r(z)), (a,) and (trials, n), of `du` (a,), `dv` (trials, n).
+
+        At the last point z of `rows`.
+        """
 
 
 def minimise(
@@ -123,7 +136,7 @@ def minimise(
     model : Model
     prior : Prior
     begin : (Array, Array)
-        u and v.
+        u (a,) and v (trials, n).
     stop : Stop
     """
     u, v = begin

@@ -20,9 +20,9 @@ from impc.checking import checked, replace
 from impc.errors import ImpcError, InputError
 from impc.inverse.delayed_feedback import preliminary_gain
 from impc.inverse.estimates import Estimate, Goodness, Status, goodness
-from impc.inverse.gain_search import EXPLAINED, GainFit
+from impc.inverse.gain_search import GainFit
 from impc.inverse.groundwork import Found, Groundwork, NaturalUnits, PlantUnits, regulator
-from impc.inverse.problem import recorded_size
+from impc.inverse.problem import EXPLAINED, recorded_size
 from impc.inverse.stationarity import inverse_kkt
 from impc.inverse.structured_fit import fit_structured
 from impc.model.bounds import Bounds

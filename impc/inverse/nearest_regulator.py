@@ -85,12 +85,13 @@ def weights_near(
     Parameters
     ----------
     form : Array
-        (r, m n).
+        Of the entries of a gain (r, columns), row by row.
     gain : Array
         (m, n).
     start : Weights
         Positive definite: where the search begins.
     condition_share : float
+        Of the condition number, at a distance of one.
 
     Raises
     ------

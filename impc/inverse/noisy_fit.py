@@ -14,17 +14,17 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy.special
 
 from impc.arrays import Array, frozen
 from impc.checking import checked, replace
 from impc.errors import InputError, SolverError, WeightsError
 from impc.inverse.consistent_metrics import metric_family, unidentified_metrics
 from impc.inverse.coordinates import Coordinates
-from impc.inverse.direct_and_reduced import verify_hard
 from impc.inverse.equivalent_weights import least_condition_weights
 from impc.inverse.estimates import Estimate, Status, goodness
 from impc.inverse.explaining_weights import weights_behind
-from impc.inverse.gain_search import EXPLAINED, GainFit, fit_gain, refine_gain
+from impc.inverse.gain_search import GainFit, fit_gain, refine_gain
 from impc.inverse.initial_states import with_fitted_starts
 from impc.inverse.natural_search import (
     CONDITION_SHARE,
@@ -34,7 +34,8 @@ from impc.inverse.natural_search import (
     inverse_mpc_natural,
 )
 from impc.inverse.nearest_regulator import weights_near
-from impc.inverse.problem import recorded_size
+from impc.inverse.problem import EXPLAINED, misfit, recorded_size
+from impc.inverse.residuals import verify_hard
 from impc.inverse.solution_set import gain_fibre, natural_coordinates
 from impc.inverse.starting_regulators import regulators
 from impc.model.plant import change_coordinates
@@ -52,9 +53,9 @@ if TYPE_CHECKING:
 
 __all__ = ["fit_controller", "free_gain", "noise_of"]
 
-# Weights that leave this much more than the free gain are looked for again: a tenth of a point of
-# VAF where noise leaves 90 %.
-_POOR = 1.005
+# Weights that leave more than the free gain by what noise does in one of a hundred recordings are
+# looked for again.
+_RARE = 0.01
 # Regulators from which weights are looked for, at most.
 _BEGINNINGS = 3
 
@@ -82,7 +83,7 @@ def fit_controller(problem: Problem, start: Weights | None = None) -> Estimate:
     if problem.terminal_set is not None:
         return _fitted(problem, start)
     without = _fitted(replace(problem, terminal_set=False), start)
-    if without.explained or without.fit.white:
+    if without.explained or (without.fit.white and not _set_matters(without)):
         return without
     try:
         within = _fitted(replace(problem, terminal_set=True), start)
@@ -90,6 +91,21 @@ def fit_controller(problem: Problem, start: Weights | None = None) -> Estimate:
         return without
     kept = all(run.complete for run in verify_hard(within.problem, within.stage_weights))
     return within if kept and within.misfit < without.misfit else without
+
+
+def _set_matters(found: Estimate) -> bool:
+    """Whether the controller found would do otherwise, had it to end in its terminal set.
+
+    Few samples tell white from what a set leaves no better than chance.
+    """
+    posed = replace(found.problem, terminal_set=True)
+    try:
+        runs = verify_hard(posed, found.stage_weights)
+    except (WeightsError, SolverError, InputError):  # it has no such set
+        return False
+    if not all(run.complete for run in runs):
+        return False
+    return abs(misfit(posed, runs) - found.misfit) > EXPLAINED * recorded_size(posed)
 
 
 def _fitted(problem: Problem, start: Weights | None) -> Estimate:
@@ -125,6 +141,7 @@ def noise_of(free: GainFit) -> float:
 def _weights(free: GainFit, start: Weights | None) -> tuple[ConditionedFit, int]:
     """Weights of the direct form from a few beginnings, until one leaves what noise does."""
     best, spent, reason = None, 0, ""
+    enough = _unlikely(free) * free.misfit
     for begin in _beginnings(free, start):
         try:
             found = inverse_mpc_natural(free.problem, begin, noise_of(free))
@@ -133,20 +150,32 @@ def _weights(free: GainFit, start: Weights | None) -> tuple[ConditionedFit, int]
             continue
         spent += found.evaluations
         best = found if best is None or found.misfit < best.misfit else best
-        if best.misfit <= _POOR * free.misfit:
+        if best.misfit <= enough:
             break
     if best is None:
         raise SolverError("weights", f"none can be simulated: {reason}", "give a start of your own")
     return best, spent
 
 
+def _unlikely(free: GainFit) -> float:
+    """Ratio of misfits of the truth and of the best gain that noise rarely exceeds."""
+    plant, problem = free.problem.plant, free.problem
+    unknowns = plant.m * plant.n + plant.m * (plant.m + 1) // 2 - 1 + len(problem.logarithms)
+    unknowns += plant.n * len(problem.recordings) if problem.unknown_start else 0
+    samples = sum(trial.outputs.size for trial in problem.recordings)
+    return float(np.exp(scipy.special.chdtri(unknowns, _RARE) / (2 * samples)))
+
+
 def _beginnings(free: GainFit, start: Weights | None) -> Iterator[Weights]:
-    """The given weights, then those nearest to the free gain, from several regulators."""
+    """The given weights, then those of some regulators, and those nearest to the free gain.
+
+    A free gain wanders off along what the recordings hardly identify, and weights near it with it.
+    """
     if start is not None:
         yield start
     for regulator in regulators(free.problem)[:_BEGINNINGS]:
-        yield _nearest(free, regulator)
         yield regulator.weights
+        yield _nearest(free, regulator)
 
 
 def _nearest(free: GainFit, regulator: LqrSolution) -> Weights:
@@ -176,8 +205,8 @@ def _finish(
     weights = _by_convention(problem.plant, weights, metrics)
     solution = solve_lqr(problem.plant, weights)
     K, S = np.array(solution.K), np.array(solution.S)
-    misfit, fit = goodness(problem, K, S)
-    explained = misfit <= EXPLAINED * recorded_size(problem)
+    left, fit = goodness(problem, K, S)
+    explained = left <= EXPLAINED * recorded_size(problem)
     status = Status.SETTLED if converged else Status.STOPPED
     return Estimate(
         method="inverse_mpc",
@@ -186,7 +215,7 @@ def _finish(
         S=solution.S,
         weights=weights,
         metrics=frozen(metrics),
-        misfit=misfit,
+        misfit=left,
         noise=noise_of(free),
         status=Status.EXPLAINED if explained else status,
         reason="",

@@ -19,7 +19,7 @@ import numpy as np
 import scipy.stats
 
 from impc.arrays import Array, Frozen, IntArray
-from impc.checking import checked
+from impc.checking import checked, replace
 from impc.control.nlp_solvers import require_solver
 from impc.errors import DataError, InfeasibleError, InputError, SolverError
 from impc.inverse.optimal_control_residuals import EXPLAINED, begin, first_plan, residuals_of
@@ -204,20 +204,21 @@ def fit_optimal_control(
     given = residuals_of(problem, tuple(recordings), solver)
     if any(one.problem is not problem for one in recordings):
         raise InputError("recordings", "are of another problem", "record them with this one")
-    best, settled, refused = None, False, None
+    held = _at_first_samples(given)
+    best, settled, refused, posed = None, False, None, given
     for begun in _starts(problem, theta, starts):
         try:
-            found = _from_start(given, begun, mu_steps, count)
-        except (InfeasibleError, SolverError) as error:  # no plan there: told if none has one
+            residuals, found = _held_then_free(held, given, begun, mu_steps, count)
+        except (InfeasibleError, SolverError) as error:  # no plan there: said if none has one
             refused = refused or error
             continue
         if found is not None and (best is None or found[0].loss < best.loss):
-            best, settled = found
+            (best, settled), posed = found, residuals
         if best is not None and best.loss < EXPLAINED * given.size:
             break
     if best is None:
         raise refused or SolverError("start", "no search got away from it", "begin nearer")
-    return _estimate(given, theta, best, settled, count.all, time.perf_counter() - began)
+    return _estimate(posed, theta, best, settled, count.all, time.perf_counter() - began)
 
 
 def _starts(problem: OptimalControlProblem, theta: Array, count: int) -> Iterator[Array]:
@@ -226,6 +227,38 @@ def _starts(problem: OptimalControlProblem, theta: Array, count: int) -> Iterato
     for index in range(1, count):
         noise = _SPREAD * np.random.default_rng(index).normal(size=len(theta))
         yield np.where(problem.positive, theta * np.exp(noise), theta * (1 + noise))
+
+
+def _at_first_samples(given: Residuals) -> Residuals | None:
+    """The same with unknown initial states held at their samples; None where none has one.
+
+    Exact recordings are explained so, and of others the parameters are a start for the search of
+    the initial states too, which from afar ends elsewhere.
+    """
+    held = tuple(
+        replace(one, unknown_start=one.unknown_start and not np.array_equal(one.x0, one.x[0]))
+        for one in given.recordings
+    )
+    pairs = zip(held, given.recordings, strict=True)
+    if all(one.unknown_start == two.unknown_start for one, two in pairs):
+        return None
+    return residuals_of(given.problem, held, given.solver)
+
+
+def _held_then_free(
+    held: Residuals | None,
+    given: Residuals,
+    theta: Array,
+    mu_steps: Sequence[float],
+    count: Count,
+) -> tuple[Residuals, tuple[Evaluation, bool] | None]:
+    """What a search from a start finds, and with which initial states."""
+    if held is not None:
+        first = _from_start(held, theta, mu_steps, count)
+        if first is not None and first[0].loss < EXPLAINED * given.size:
+            return held, first
+        theta = theta if first is None else first[0].theta
+    return given, _from_start(given, theta, mu_steps, count)
 
 
 def _from_start(

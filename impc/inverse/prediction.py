@@ -8,7 +8,7 @@
 M = 0 is the simulation; with the gain M of a steady Kalman filter e is a one-step prediction error.
 Then the effect of a wrong gain on x dies within the memory of the filter, so that the loop does
 not diverge and the sum of squares is that of many short pieces: it has few local minima in K where
-that of a simulation has many (experiments/search_study.py has the rates). What moves is linear in
+that of a simulation has many (docs/fitting.md has the rates). What moves is linear in
 (x_f, u, d, y):
 
     x_f+ = (I - MC)(A x_f + B u + E d) + M y+,        e = (I - CM)^-1 (y - C x_f)
@@ -51,7 +51,7 @@ class Correction:
     M: Array
 
     def moves(self, problem: Problem) -> tuple[Array, Array, Array]:
-        """A, B and (E, M) that move the corrected state."""
+        """A (n, n), B (n, m) and (E, M) (n, columns) that move the corrected state."""
         plant, kept = problem.plant, self.kept(problem)
         return kept @ plant.A, kept @ plant.B, np.hstack([kept @ plant.E, self.M])
 

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from impc.model.structure import Structure
 
 __all__ = [
+    "EXPLAINED",
     "Problem",
     "controller_for",
     "follows_plant",
@@ -47,6 +48,8 @@ __all__ = [
     "typical_output",
 ]
 
+#: Misfit, of the recorded outputs, up to which they are explained.
+EXPLAINED = 1e-9
 # Of the states: noise that a laboratory would call none is above, rounding in files is below.
 _EXACT = 1e-9
 

@@ -17,6 +17,7 @@ from impc.arrays import Array, frozen
 from impc.checking import replace
 from impc.control.closed_loop import prepare_loop, run_loop, simulate
 from impc.control.constraint_rows import Directions, directions
+from impc.control.controller import Controller
 from impc.control.simulation import Scenario, Status
 from impc.errors import ImpcError
 from impc.inverse.problem import controller_for, scenarios
@@ -27,13 +28,13 @@ from impc.model.riccati import is_stable
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from impc.control.controller import Controller
     from impc.control.simulation import Simulation
     from impc.control.terminal_set import TerminalSet
     from impc.inverse.prediction import Correction
     from impc.inverse.problem import Problem
     from impc.model.plant_family import PlantDifferential
     from impc.model.recordings import Recording
+    from impc.model.weights import Weights
 
     StartResidual = Callable[[Array], tuple[Array, Array]]
 
@@ -43,8 +44,10 @@ __all__ = [
     "misfit_or_reason",
     "residual_only",
     "residual_or_reason",
+    "scaled_changes",
     "start_residual",
     "unusable",
+    "verify_hard",
 ]
 
 # What a sample that a trial controller does not reach counts for, in root-mean-square outputs.
@@ -378,3 +381,30 @@ def unusable(problem: Problem, reason: str) -> Evaluation:
         0,
         None,
     )
+
+
+def scaled_changes(metric: Array, changes: Array) -> Array:
+    """`changes` (k, m, m) of a metric (m, m) as those of one with a mean diagonal of 1 (k, m, m).
+
+    That is how the controller scales it before it is differentiated (`Evaluation.dS`).
+    """
+    trace = np.trace(metric)
+    shares = np.trace(changes, axis1=1, axis2=2)[:, None, None] / trace
+    return np.asarray(len(metric) / trace * (changes - shares * metric))
+
+
+def verify_hard(problem: Problem, weights: Weights) -> list[Simulation]:
+    """Simulate every recording with hard state bounds and terminal set.
+
+    The search softens those rows; this says whether the controller found keeps them. Pass each
+    result to `require_complete` to turn a failure into an error.
+    """
+    controller = Controller(
+        problem.plant,
+        weights,
+        problem.bounds,
+        problem.horizon,
+        terminal_set=bool(problem.terminal_set),
+        solver=problem.solver,
+    )
+    return [simulate(controller, drive) for drive in scenarios(problem)]

@@ -1,7 +1,7 @@
 """Regulators at which searches begin: balanced ones, and random ones about these.
 
 The balanced regulator is that of Bryson's rule: outputs of recorded size cost as much as commands
-of full size (their bound). Every regulator stabilises.
+of full size (their bound). Every regulator stabilises (docs/fitting.md).
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def drawn_start(
 ) -> tuple[Problem, LqrSolution]:
     """A random regulator, and initial states that are random where no output sees them.
 
-    `sizes` (n, n) are those of `state_sizes`.
+    `sizes` (n, n) are those of `state_sizes`; `rng` draws.
     """
     plant, regulator = problem.plant, None
     while regulator is None:

@@ -26,8 +26,7 @@ from impc.control.closed_loop import simulate
 from impc.errors import SolverError, WeightsError
 from impc.inverse.coordinates import Coordinates
 from impc.inverse.estimates import Estimate, Status, goodness
-from impc.inverse.gain_search import EXPLAINED
-from impc.inverse.problem import controller_for, recorded_size, scenarios
+from impc.inverse.problem import EXPLAINED, controller_for, recorded_size, scenarios
 from impc.inverse.residuals import misfit_or_reason
 from impc.inverse.structured_search import StructuredEnd, regulator_slopes, search_from
 from impc.model.riccati import solve_lqr

@@ -23,10 +23,10 @@ import scipy.linalg
 from impc.arrays import Array, frozen
 from impc.checking import replace
 from impc.errors import WeightsError
-from impc.inverse.coordinates import PARAMETER_UNIT, Coordinates, Point, descend, scaled_changes
+from impc.inverse.coordinates import PARAMETER_UNIT, Coordinates, Point, descend
 from impc.inverse.least_squares import Stop
 from impc.inverse.problem import recorded_size
-from impc.inverse.residuals import evaluate, unusable
+from impc.inverse.residuals import evaluate, scaled_changes, unusable
 from impc.model.plant_family import plant_differential
 from impc.model.riccati import LqrSolution, regulator_changes, solve_lqr
 

@@ -21,12 +21,9 @@ from impc.assess.long_run_covariance import ResidualNoise
 from impc.assess.printed_gain import gain_estimate
 from impc.checking import replace
 from impc.inverse.problem import Problem
-from impc.inverse.proximal_step import block_basis
 from impc.inverse.residuals import residual_only
-from impc.inverse.solution_set import split_blocks
 from impc.model.plant import Plant
 from impc.model.plant_family import PlantFamily
-from impc.model.riccati import solve_lqr
 from impc.studies.fit.settings import FitSettings
 from impc.studies.fit.subject import fit_problem
 from tests.support import saturated_problem
@@ -39,15 +36,18 @@ def differences(problem: Problem, K: Array, S: Array) -> Array:
     """Derivative of the residual by central differences: K, S up to scale, x0; (r, q), to 1e-8."""
     (trial,) = problem.recordings
     m, n = K.shape
+    rows, columns = (part[1:] for part in np.tril_indices(m))
+    others = m * n + len(rows)
 
     def residual(step: Array) -> Array:
-        gain = K + step[: m * n].reshape(m, n)
-        off, ratio = step[m * n], step[m * n + 1]
-        metric = S + np.array([[0.0, off], [off, ratio]])
-        there = replace(problem, recordings=(replace(trial, x0=frozen(trial.x0 + step[-n:])),))
+        gain, metric = K + step[: m * n].reshape(m, n), S.copy()
+        metric[rows, columns] = metric[columns, rows] = S[rows, columns] + step[m * n : others]
+        there = replace(problem, recordings=(replace(trial, x0=frozen(trial.x0 + step[others:])),))
         return residual_only(there, gain, metric)
 
-    steps = STEP * np.eye(m * n + 2 + n)
+    steps = STEP * np.eye(others + n)
+    if not problem.unknown_start:
+        steps = steps[:others]
     return np.array([(residual(step) - residual(-step)) / (2 * STEP) for step in steps]).T
 
 
@@ -85,33 +85,24 @@ def stronger(plant: Plant) -> PlantFamily:
 
 
 @pytest.mark.parametrize(("m", "seed"), [(2, 6), (3, 2)])
-def test_deviations_where_a_parameter_is_fitted_are_those_of_weights(m: int, seed: int) -> None:
-    """Unit white noise: (J'J)^-1 over Q, R and the parameter, J by differences of simulations.
-
-    At (2, 6) a metric that stands while the parameter moves halves the parameter's deviation, and
-    takes a third off one of the gain's.
-    """
+def test_deviations_where_a_parameter_is_fitted(m: int, seed: int) -> None:
+    """Unit white noise: (J'J)^-1 over K, S and the parameter, J by differences of simulations."""
     rng = np.random.default_rng([14, m, seed])
-    weights, controller, problem = saturated_problem(rng, 2 + seed % 5, m)
+    _, controller, problem = saturated_problem(rng, 2 + seed % 5, m)
     n, K, S = problem.plant.n, np.array(controller.K), np.array(controller.S)
     problem = replace(problem, family=stronger(problem.plant), logarithms=np.zeros(1))
     white = ResidualNoise(np.zeros(n), np.eye(n)[None])
     found = gain_covariance(problem, K, S, lambda _residuals, _lost: white)
-    units = block_basis(n, m)
-
-    def moved(step: Array) -> tuple[Array, Array]:
-        there = problem.at(problem.recordings[0].x0[None], step[-1:])
-        X = weights.block + np.tensordot(step[:-1], units, 1)
-        solution = solve_lqr(there.plant, split_blocks(X, n))
-        return residual_only(there, np.array(solution.K), np.array(solution.S)), solution.K
-
-    pairs = [(moved(step), moved(-step)) for step in STEP * np.eye(len(units) + 1)]
-    J, dK = (np.array([(a[i] - b[i]) / (2 * STEP) for a, b in pairs]) for i in (0, 1))
-    # What weights cannot be told apart by has singular values of 1e-8, the others 6e-3 and more.
-    back = np.linalg.pinv(J.T, 1e-7)
-    np.testing.assert_allclose(found.parameters, np.linalg.norm(back[-1]), rtol=1e-4)
-    gain = np.linalg.norm(np.tensordot(dK, back, (0, 0)), axis=-1)
-    np.testing.assert_allclose(found.entries, gain, rtol=1e-4)
+    on_parameter = [
+        residual_only(problem.at(problem.recordings[0].x0[None], np.array([step])), K, S)
+        for step in (STEP, -STEP)
+    ]
+    column = (on_parameter[0] - on_parameter[1]) / (2 * STEP)
+    J = np.column_stack([differences(problem, K, S), column])
+    size = np.linalg.norm(J, axis=0)
+    deviations = np.linalg.norm(np.linalg.pinv(J / size, 1e-6), axis=1) / size
+    np.testing.assert_allclose(found.parameters, deviations[-1], rtol=1e-4)
+    np.testing.assert_allclose(np.ravel(found.entries), deviations[: K.size], rtol=1e-4)
 
 
 @pytest.mark.parametrize("seed", [52])

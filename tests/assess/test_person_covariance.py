@@ -72,6 +72,5 @@ def test_a_direction_that_nothing_tells_leaves_the_others_as_they_are() -> None:
     assert np.linalg.eigvalsh(robust.covariance)[0] > 0
     np.testing.assert_allclose(robust.deviations, expected.deviations, rtol=0.3)
     np.testing.assert_allclose(robust.entries, expected.entries, rtol=0.3)
-    assert robust.deviations[-1] > 100
     off = (np.array(found.K) - np.array(who.controller.K)) / robust.entries
     assert np.all(np.abs(off) < 3)

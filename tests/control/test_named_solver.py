@@ -90,7 +90,7 @@ def test_fits_with_other_solvers_end_at_the_same_gain(solver: str) -> None:
 def test_what_no_input_keeps_is_proved(solver: str, example_plant: Plant) -> None:
     bounds = Bounds(example_plant, u_min=-1, u_max=1)
     controller = Controller(example_plant, Weights(np.eye(2), 1), bounds, 3, solver=solver)
-    with pytest.warns(UserWarning, match="no input sequence keeps the bounds"):
+    with pytest.warns(UserWarning, match="no input sequence keeps the bound"):
         run = controller.simulate([30, 1], steps=3)
     assert run.status[0] == Status.INFEASIBLE
     assert run.failed_row >= 0

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from impc.arrays import Array
 from impc.errors import DataError, WeightsError
 from impc.inverse.equivalent_weights import (
+    SLACK,
     EquivalentWeights,
     analytic_centre,
     least_condition_weights,
@@ -74,7 +75,9 @@ def rescaled(plant: Plant, states: Array) -> Plant:
 
 def test_published_example_has_the_least_condition_number_of_the_reference() -> None:
     found = least_condition_weights(gain_fibre(PRIESS, PRIESS_GAIN))
-    assert found.condition == pytest.approx(15.84287, abs=5e-6)
+    assert found.least is not None
+    assert found.least == pytest.approx(15.84287, abs=5e-6)
+    assert found.least <= found.condition <= found.least * (1 + 2 * SLACK)
     assert found.gain_error < 1e-11
     assert found.gap is not None
     assert found.gap < 1e-8
@@ -91,8 +94,9 @@ def test_published_example_has_the_least_condition_number_of_the_reference() -> 
         [6.5105, 1.8088, 6.9223, -0.4818],
         [-1.7114, 3.5052, -0.4818, 6.5442],
     ]
-    np.testing.assert_allclose(scaled[:4, :4], Q, atol=2e-4)
-    np.testing.assert_allclose(scaled[4:, 4:], R, atol=2e-4)
+    # The reference ends anywhere within 1e-5 of the least; here it is the least norm of those.
+    np.testing.assert_allclose(scaled[:4, :4], Q, atol=15 * np.sqrt(SLACK))
+    np.testing.assert_allclose(scaled[4:, 4:], R, atol=15 * np.sqrt(SLACK))
 
 
 @pytest.mark.parametrize(
@@ -109,7 +113,7 @@ def test_least_condition_of_the_examples(
 ) -> None:
     found = least_condition_weights(gain_fibre(plant, gain))
     assert found.condition == pytest.approx(condition, abs=7e-5)  # the gain has six decimals
-    np.testing.assert_allclose(found.weights.Q, Q, atol=3e-5)
+    np.testing.assert_allclose(found.weights.Q, Q, atol=np.sqrt(SLACK) / 5)
     assert found.gain_error < 1e-14
 
 
@@ -122,8 +126,9 @@ def test_least_condition_agrees_with_a_fine_grid_over_the_fibre() -> None:
     least, largest = values.min(axis=1), values.max(axis=1)
     conditions = np.where(least > 0, largest / np.maximum(least, 1e-300), np.inf)
     found = least_condition_weights(fibre)
-    assert found.condition <= conditions.min()
-    assert found.condition == pytest.approx(conditions.min(), rel=1e-4)
+    assert found.least is not None
+    assert found.least <= conditions.min()
+    assert found.least == pytest.approx(conditions.min(), rel=1e-4)
     # The analytic centre, against the same grid.
     volumes = np.where(least > 0, np.linalg.det(Q) / R[:, 0, 0] ** 2, 0.0)
     best = Q[np.argmax(volumes)] / R[np.argmax(volumes)]

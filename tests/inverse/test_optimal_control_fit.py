@@ -204,3 +204,30 @@ def test_a_search_that_is_stopped_says_so() -> None:
     )
     assert not found.settled
     assert found.evaluations <= 6  # three guided, three not
+
+
+def turned(bend: float) -> tuple[OptimalControlProblem, dict[str, float]]:
+    """A point whose motion has a force of f (1 + bend f) over its mass: a scaling without bend."""
+    x, u = ca.SX.sym("x", 1), ca.SX.sym("u")
+    force, mass, price = ca.SX.sym("force"), ca.SX.sym("mass"), ca.SX.sym("price")
+    problem = OptimalControlProblem(
+        x, u, {"force": force, "mass": mass, "price": price},
+        next_state=0.9 * x + 0.1 * u * force * (1 + bend * force) / mass,
+        stage_cost=price * x**2 + u**2, horizon=6,
+    )  # fmt: skip
+    return problem, {"force": 2.0, "mass": 1.5, "price": 4.0}
+
+
+@pytest.mark.parametrize("bend", [0.0, 0.5])
+def test_a_scaling_is_one_where_it_holds_far_from_the_estimate(bend: float) -> None:
+    """Force and mass stay in one ratio; with a bend the ratio is no power, but a tangent."""
+    problem, truth = turned(bend)
+    loop = problem.closed_loop(truth, [1.0], 12)
+    recording = problem.recorded_loop(loop.x, loop.u)
+    found = fit_optimal_control(problem, [recording], truth).combinations
+    (one,) = found.untold
+    assert set(one.exponents) == {"force", "mass"}
+    assert one.scaling == (bend == 0.0)
+    words = "any factor a is possible" if one.scaling else "Near these values"
+    assert any(words in sentence for sentence in found.sentences)
+    assert all(abs(item) <= 4 for said in found.told for item in said.exponents.values())

@@ -137,7 +137,7 @@ def test_no_search_without_derivatives_does_better() -> None:
     prices = np.log([4.0, 1.0])
     truth, push = pushed(structure, plant, prices)
     trial = with_noise(truth, push, np.random.default_rng(1), 80.0, 0.0)
-    problem = posed(truth, trial)
+    problem = posed(truth, trial, unknown_start=False)
     found = fit_structure(problem, structure, 0.8 * truth.K, np.array(truth.S))
 
     def objective(z: np.ndarray) -> float:

@@ -60,7 +60,7 @@ def _gain(result: FitResult) -> TextTable:
         "high",
         "level",
         "identified",
-        "excludes zero",
+        "excludes_zero",
     )
     return TextTable("", heads, rows)
 

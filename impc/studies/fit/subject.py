@@ -22,7 +22,6 @@ from impc.assess.all_intervals import assess, count_stages
 from impc.assess.diagnostics import (
     ResidualDiagnostics,
     residual_diagnostics,
-    residual_warnings,
 )
 from impc.assess.held_out import predict
 from impc.assess.identified_directions import identifiability
@@ -53,7 +52,9 @@ from impc.studies.fit.settings import FitSettings
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
+    from impc.assess.all_intervals import Attempt, Certainty
     from impc.assess.held_out import HeldOut
+    from impc.assess.input_limits import OtherLimit
     from impc.assess.judged import MethodFit
     from impc.assess.person_models import PersonReport, RememberPerson
     from impc.assess.printed_gain import GainEstimate
@@ -234,69 +235,41 @@ def _fitted(problem: Problem, settings: FitSettings, progress: FitProgress) -> F
     started = time.perf_counter()
     failures: dict[str, str] = {}
     attempt = functools.partial(_attempt, failures)
-    ground = NaturalUnits(problem, progress.estimate, settings.feedback_states)
-    _ = ground.fitted
-    progress.done("inverse MPC")
-    names = _beside(settings)
-    ground, found = cross_checked(ground, estimate_all(ground, [*names, "inverse_mpc"]))
+    ground, found = _estimates(problem, settings, progress)
     fitted = found["inverse_mpc"]
     estimate = gain_estimate(fitted)
     known, weights = ground.known, fitted.stage_weights
     plant, K, metrics = known.plant, np.array(fitted.gain), np.array(fitted.metrics)
-    methods = [judge(fitted, problem.bounds)]
-    sizes = state_sizes(methods[0].runs)
-    usable = bool(np.all(methods[0].vaf >= LITTLE))
-    test = weights_test(fitted, estimate)
-    barred = "" if usable else _UNUSABLE
-    barred = barred or test.sentence
-    with _threads() as pool:
-        others = _left_out(pool, ground, settings)
-        draws: tuple[LqrSolution, ...] = ()
-        if settings.intent_draws and not barred:
-            drawn = functools.partial(drawn_gains, plant, weights, estimate.K, estimate.covariance)
-            draws = attempt("drawn gains", drawn, ())
-        whole_set = pool.submit(_weights_set, barred, plant, K, metrics, sizes, draws)
-        for name in names[::-1]:
-            methods.insert(0, judge(found[name], problem.bounds))
-            progress.done(name)
-        held_out = []
-        for index, other in enumerate(others):
-            predicted = attempt(
-                _without(index),
-                functools.partial(_predicted, problem, other, fitted, index, settings.settle),
-                None,
-            )
-            held_out += [] if predicted is None else [predicted]
-            progress.done(_without(index))
-        if len(held_out) < len(others):
-            held_out = []  # the table has a row for each trial, or none
-        if held_out:
-            shares = frozen([item.vaf for item in held_out])
-            methods[-1] = replace(methods[-1], held_out=shares)
-        weights_found = whole_set.result()
-        progress.done("set of weights")
-    structures = _structures(problem, settings, fitted, progress)
-    certainty = assess(
-        problem,
-        fitted,
-        estimate,
-        weights_found,
-        settings,
-        progress.done,
-        progress.replicate,
-        attempt,
-    )
+    own = judge(fitted, problem.bounds)
+    sizes = state_sizes(own.runs)
+    usable = bool(np.all(own.vaf >= LITTLE))
     diagnostics = attempt(
         "tests of the residuals",
         lambda: residual_diagnostics(fitted.problem, K, np.array(fitted.metric)),
         ResidualDiagnostics(None, None),
     )
+    test = weights_test(fitted, estimate, contradicted=diagnostics.contradicted)
+
+    def whole_set() -> tuple[WeightsSummary | None, str]:
+        """The set of weights with the gain, or why nothing may be said of it."""
+        if not usable or test.rejected:
+            return None, test.sentence if usable else _UNUSABLE
+        draws: tuple[LqrSolution, ...] = ()
+        if settings.intent_draws:
+            drawn = functools.partial(drawn_gains, plant, weights, estimate.K, estimate.covariance)
+            draws = attempt("drawn gains", drawn, ())
+        return weights_summary_or_reason(plant, K, metrics, sizes, draws)
+
+    methods, held_out, weights_found = _beside_it(
+        ground, own, list(found.values())[:-1], settings, progress, attempt, whole_set
+    )
+    structures = _structures(problem, settings, fitted, progress)
+    after = progress.done, progress.replicate, attempt
+    certainty = assess(problem, fitted, estimate, weights_found, settings, *after)
     trials = _agreements(known, methods[-1].runs, problem.bounds)
-    doubtful = residual_warnings(diagnostics, plant.outputs, 1.0) or not usable
-    limits, free = certainty.limits, None
-    if any(item.saturated for item in trials) and (doubtful or limits):
-        first = limits[0] if limits else None
-        free = attempt("free limit", functools.partial(at_another_limit, fitted, first), None)
+    doubted = diagnostics.contradicted or not usable
+    free = _free_limit(fitted, trials, certainty, attempt, doubted=doubted)
+    person = functools.partial(_person, problem, settings, fitted, progress)
     return FitResult(
         settings,
         problem,
@@ -307,8 +280,8 @@ def _fitted(problem: Problem, settings: FitSettings, progress: FitProgress) -> F
         identifiability(known, weights),
         certainty if usable else replace(certainty, intervals=()),
         trials,
-        tuple(held_out),
-        tuple(methods),
+        held_out,
+        methods,
         diagnostics,
         _terminal_set_difference(methods[-1]),
         time.perf_counter() - started,
@@ -316,32 +289,74 @@ def _fitted(problem: Problem, settings: FitSettings, progress: FitProgress) -> F
         free,
         failures,
         structures,
-        attempt(
-            "subject with sensory noise",
-            lambda: _person(problem, settings, fitted, progress),
-            None,
-        ),
+        attempt("subject with sensory noise", person, None),
     )
+
+
+def _estimates(
+    problem: Problem, settings: FitSettings, progress: FitProgress
+) -> tuple[NaturalUnits, dict[str, Estimate]]:
+    """What every method finds, inverse MPC last, none beaten by another's answer."""
+    ground = NaturalUnits(problem, progress.estimate, settings.feedback_states)
+    _ = ground.fitted
+    progress.done("inverse MPC")
+    return cross_checked(ground, estimate_all(ground, [*_beside(settings), "inverse_mpc"]))
+
+
+def _beside_it(
+    ground: NaturalUnits,
+    own: MethodFit,
+    others: list[Estimate],
+    settings: FitSettings,
+    progress: FitProgress,
+    attempt: Attempt,
+    whole_set: Callable[[], tuple[WeightsSummary | None, str]],
+) -> tuple[tuple[MethodFit, ...], tuple[HeldOut, ...], tuple[WeightsSummary | None, str]]:
+    """The other methods, trials predicted by the rest, and the set of weights, side by side."""
+    problem, methods, held_out = ground.problem, [own], []
+    with _threads() as pool:
+        pending = _left_out(pool, ground, settings)
+        in_background = pool.submit(whole_set)
+        for found in others[::-1]:
+            methods.insert(0, judge(found, problem.bounds))
+            progress.done(found.method)
+        for index, other in enumerate(pending):
+            predicted = functools.partial(
+                _predicted, problem, other, own.estimate, index, settings.settle
+            )
+            held_out.append(attempt(_without(index), predicted, None))
+            progress.done(_without(index))
+        found_set = in_background.result()
+        progress.done("set of weights")
+    if None in held_out:
+        held_out = []  # the table has a row for each trial, or none
+    if held_out:
+        methods[-1] = replace(own, held_out=frozen([item.vaf for item in held_out]))
+    return tuple(methods), tuple(held_out), found_set
+
+
+def _free_limit(
+    fitted: Estimate,
+    trials: tuple[TrialAgreement, ...],
+    certainty: Certainty,
+    attempt: Attempt,
+    *,
+    doubted: bool,
+) -> OtherLimit | None:
+    """The fit with the limit free, where the command meets it and something speaks against it."""
+    if not any(item.saturated for item in trials) or not (doubted or certainty.limits):
+        return None
+    known = certainty.limits[0] if certainty.limits else None
+    found: OtherLimit | None = attempt(
+        "free limit", functools.partial(at_another_limit, fitted, known), None
+    )
+    return found
 
 
 def _predicted(
     problem: Problem, other: Future[Estimate], fitted: Estimate, index: int, settle: float
 ) -> HeldOut:
     return predict(problem, other.result(), fitted, index, settle)
-
-
-def _weights_set(
-    barred: str,
-    plant: Plant,
-    K: Array,
-    metrics: Array,
-    sizes: Array,
-    draws: tuple[LqrSolution, ...],
-) -> tuple[WeightsSummary | None, str]:
-    """The set of weights with a gain (m, n), or why nothing may be said of it."""
-    if barred:
-        return None, barred
-    return weights_summary_or_reason(plant, K, metrics, sizes, draws)
 
 
 def _person(

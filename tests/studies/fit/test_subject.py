@@ -17,7 +17,7 @@ from impc.checking import replace
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
 from impc.control.simulation import scenario
-from impc.errors import DataError, InputError, SolverError
+from impc.errors import DataError, InputError
 from impc.inverse.delayed_feedback import preliminary_gain
 from impc.inverse.estimates import Estimate
 from impc.inverse.noisy_fit import fit_controller
@@ -272,10 +272,10 @@ def test_a_release_without_disturbance_is_fitted() -> None:
     np.testing.assert_allclose(fitted.problem.recordings[1].x0, [-0.2, 0.3], atol=1e-7)
 
 
-def test_a_recording_in_which_nothing_moves_is_said() -> None:
+def test_a_recording_in_which_nothing_moves_is_left_unexplained() -> None:
     plant = cart()
     rng = np.random.default_rng(SEED)
     outputs = 1e-3 * rng.standard_normal(200)
     outputs[0] = 0.0
-    with pytest.raises(SolverError, match="nothing drives them"):
-        fit_controller(fit_problem(plant, [Recording(plant, outputs)], FitSettings(u_max=1.0)))
+    found = fit_controller(fit_problem(plant, [Recording(plant, outputs)], FitSettings(u_max=1.0)))
+    assert "It leaves 100 % of the recordings." in found.doubts

@@ -89,18 +89,18 @@ def test_noise_in_the_loop_and_another_body_are_said_first() -> None:
     inside = replace(plain, diagnostics=ResidualDiagnostics(loop(True), structure))
     said = verdict(inside)
     assert "noise inside the loop: do not rely on its gain" in said
-    assert said.endswith("its weights. [fit.observer] asks for a person who senses with noise.")
+    assert said.endswith("its weights. [fit.observer] asks for a subject who senses with noise.")
     other = replace(plain, diagnostics=ResidualDiagnostics(loop(False), structure))
     assert "is not that of the model" in verdict(other)
 
 
 def test_no_limit_and_a_limit_that_is_not_reached() -> None:
     clear = ResidualDiagnostics(None, None)
-    assert "No limit of the command was given" in verdict(
+    assert "No limit of the command or of a state was given" in verdict(
         replace(fitted(np.inf), diagnostics=clear)
     )
     assert "without a limit" in abstract(fitted(np.inf))[0]
-    assert "never reaches its bound" in verdict(replace(fitted(50.0), diagnostics=clear))
+    assert "No bound is ever active" in verdict(replace(fitted(50.0), diagnostics=clear))
 
 
 def test_what_is_not_given_is_said_with_what_that_excludes() -> None:
@@ -186,4 +186,4 @@ def test_little_is_called_little(vaf: float) -> None:
     plain = replace(fitted(1.0), diagnostics=ResidualDiagnostics(None, None))
     poor = replace(plain.inverse_mpc, vaf=np.array([vaf]))
     result = replace(plain, methods=(*plain.methods[:-1], poor))
-    assert verdict(result).startswith("The controller explains less than half") == (vaf < 50)
+    assert verdict(result).startswith("The fitted controller explains less than half") == (vaf < 50)

@@ -1,0 +1,89 @@
+"""Whether cost weights explain a gain: optimal regulators do, and one that delays no."""
+
+from __future__ import annotations
+
+import control
+import numpy as np
+import pytest
+
+import impc
+from experiments.search_problems import stick
+from impc.assess.printed_gain import gain_estimate
+from impc.assess.weights_test import WeightsTest, return_difference, weights_test
+from impc.inverse.equivalent_weights import weights_margin
+from impc.inverse.problem import Problem
+from impc.inverse.solution_set import gain_fibre
+from plants import yalmip_example
+from tests.support import random_plant, random_weights
+
+
+def compared(problem: Problem) -> WeightsTest:
+    fitted = impc.estimate(problem)
+    return weights_test(fitted, gain_estimate(fitted))
+
+
+def noisy_problem(seed: int, K: np.ndarray | None = None) -> Problem:
+    """A random optimal regulator of one to three states, or a given gain, with 2 % of noise."""
+    rng = np.random.default_rng([470, seed])
+    n = 1 + seed % 3
+    plant = random_plant(rng, n, 1, rng.uniform(0.8, 1.1), d=1)
+    bounds = impc.Bounds(plant)
+    weights = impc.Weights(random_weights(rng, n), random_weights(rng, 1))
+    law = impc.Controller(plant, weights, bounds, 3, terminal_set=False)
+    push = rng.choice([-1.0, 0.0, 1.0], 40).repeat(5)
+    x = law.simulate(np.zeros(n), disturbance=push).x[:-1]
+    noisy = x + 0.02 * np.std(x, axis=0) * rng.standard_normal(x.shape)
+    return Problem(plant, bounds, 3, (impc.Recording(plant, noisy, push),))
+
+
+@pytest.mark.parametrize("wanted", [12, pytest.param(200, marks=pytest.mark.slow)])
+def test_an_optimal_regulator_has_weights(wanted: int) -> None:
+    assert [seed for seed in range(wanted) if compared(noisy_problem(seed)).rejected] == []
+
+
+def test_the_inequality_of_the_readme_holds_and_is_the_linear_matrix_inequality() -> None:
+    """0.1754 >= 0.1572; and of other gains, of the stick, it says what the program says."""
+    example = impc.Plant(yalmip_example())
+    found = return_difference(example, impc.solve_lqr(example, impc.Weights(np.eye(2), 1)).K)
+    assert found is not None
+    assert found.least == pytest.approx(0.1754, abs=1e-4)
+    assert found.needed == pytest.approx(0.1572, abs=1e-4)
+    assert found.kept
+    plant = impc.Plant(stick(), ["finger"])
+    kept, exist = [], []
+    for angle in np.linspace(-60, -16, 8):
+        for rate in np.linspace(-12, -2, 6):
+            K = np.array([[angle, rate]])
+            if np.max(np.abs(np.linalg.eigvals(plant.A - plant.B @ K))) > 0.999:
+                continue
+            found = return_difference(plant, K)
+            assert found is not None
+            kept.append(found.kept)
+            exist.append(weights_margin(gain_fibre(plant, K)).exist)
+    assert kept == exist
+    assert 0 < sum(kept) < len(kept)
+
+
+def test_a_gain_without_weights_is_said_to_have_none() -> None:
+    """A stick balanced by a gain that no weights have, recorded well."""
+    plant = impc.Plant(stick(), ["finger"])
+    K, rng = np.array([[-60.0, -4.0]]), np.random.default_rng(2)
+    assert np.max(np.abs(np.linalg.eigvals(plant.A - plant.B @ K))) < 1
+    law = impc.Controller.from_gain(plant, K, impc.Bounds(plant), 5, terminal_set=False)
+    push = rng.choice([-1.5, 0, 1.5], 60).repeat(10)
+    angle = law.simulate(np.zeros(2), disturbance=push).x[:-1, :1]
+    trial = impc.Recording(plant, angle + 3e-4 * rng.standard_normal(angle.shape), push)
+    found = compared(impc.fit_problem(plant, [trial], impc.FitSettings(horizon=5)))
+    assert found.rejected
+    assert not found.exist
+    assert found.difference is not None
+    assert not found.difference.kept
+    assert f"here it is {found.difference.least:.3g}" in found.sentence
+
+
+def test_several_inputs_and_a_delay_have_no_inequality() -> None:
+    """A chain of delays is not invertible."""
+    delay = control.ss([[0, 0], [1, 0]], [[1], [0]], np.eye(2), 0, True)
+    assert return_difference(impc.Plant(delay), np.zeros((1, 2))) is None
+    two = control.ss(0.5 * np.eye(2), np.eye(2), np.eye(2), 0, True)
+    assert return_difference(impc.Plant(two), np.zeros((2, 2))) is None

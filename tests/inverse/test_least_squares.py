@@ -1,0 +1,114 @@
+"""Unknowns of single trials are eliminated: the same minimum as with all columns side by side."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import scipy.optimize
+
+from impc.inverse.least_squares import Prior, Rows, Stop, minimise
+
+TRIALS, ROWS, SHARED, OWN = 30, 9, 3, 2
+COUNT = TRIALS * ROWS
+
+
+@dataclass
+class Curved:
+    """r_i = sin(A_i u + B_i v_i) - c_i."""
+
+    A: np.ndarray
+    B: np.ndarray
+    c: np.ndarray
+    bent: bool = False
+
+    count = COUNT
+
+    def residual(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        return np.asarray(np.sin(self.A @ u + np.einsum("twn,tn->tw", self.B, v)) - self.c)
+
+    def rows(self, u: np.ndarray, v: np.ndarray) -> Rows:
+        self.last = u, v
+        slope = np.cos(self.A @ u + np.einsum("twn,tn->tw", self.B, v))[..., None]
+        return Rows(self.residual(u, v), slope * self.A, slope * self.B, self.bent)
+
+    def square(self, u: np.ndarray, v: np.ndarray) -> float:
+        return float(np.sum(self.residual(u, v) ** 2))
+
+    def bend(self, du: np.ndarray, dv: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
+        u, v = self.last
+        here = self.rows(u, v)
+        change = self.residual(u + share * du, v + share * dv) - here.residual
+        return (
+            np.einsum("twa,tw->a", here.shared, change),
+            np.einsum("twn,tw->tn", here.own, change),
+        )
+
+
+def problem(seed: int, *, exact: bool = False, bent: bool = False) -> tuple[Curved, Prior]:
+    """Noisy, or with a zero residual near the start."""
+    rng = np.random.default_rng(seed)
+    A = rng.standard_normal((TRIALS, ROWS, SHARED))
+    B = rng.standard_normal((TRIALS, ROWS, OWN))
+    u, v = rng.standard_normal(SHARED), rng.standard_normal((TRIALS, OWN))
+    truth = u + 0.3 * rng.standard_normal(SHARED), v + 0.3 * rng.standard_normal(v.shape)
+    c = np.sin(A @ truth[0] + np.einsum("twn,tn->tw", B, truth[1]))
+    if not exact:
+        c = c + 0.3 * rng.standard_normal(c.shape)
+    return Curved(A, B, c, bent), Prior(u, v, np.full(SHARED, 0.0), 0.0)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("bent", [False, True])
+@pytest.mark.parametrize("weight", [0.0, 5.0])
+def test_the_minimum_is_that_of_another_search(seed: int, bent: bool, weight: float) -> None:
+    """N log |r|^2 and the prior, by BFGS from where the search ends: no lower value."""
+    model, prior = problem(seed, bent=bent)
+    prior = Prior(prior.u, prior.v, np.full(SHARED, weight), weight)
+    u, v, _, converged = minimise(model, prior, (prior.u, prior.v), Stop(1e-8, 0.0, 400))
+    assert converged
+
+    def value(z: np.ndarray) -> float:
+        u, v = z[:SHARED], z[SHARED:].reshape(TRIALS, OWN)
+        return float(COUNT * np.log(model.square(u, v)) + prior.square(u, v))
+
+    found = np.concatenate([u, v.ravel()])
+    began = value(np.concatenate([prior.u, prior.v.ravel()]))
+    best = scipy.optimize.minimize(value, found, method="BFGS")
+    assert value(found) < began - 1
+    assert value(found) <= best.fun + 1e-4
+
+
+@pytest.mark.parametrize("bent", [False, True])
+def test_an_exact_problem_ends_at_rounding(bent: bool) -> None:
+    """However strong the prior: its weight falls with the residual."""
+    model, prior = problem(7, exact=True, bent=bent)
+    prior = Prior(prior.u, prior.v, np.full(SHARED, 1.0), 1.0)
+    u, v, _, _ = minimise(model, prior, (prior.u, prior.v), Stop(1e-6, 1e-24, 100))
+    assert model.square(u, v) <= 1e-20
+
+
+def test_a_column_that_nothing_sees_stays() -> None:
+    model, prior = problem(3)
+    model.A[..., -1] = 0
+    u, _, _, converged = minimise(model, prior, (prior.u, prior.v), Stop(1e-8, 0.0, 100))
+    assert converged
+    assert u[-1] == prior.u[-1]
+
+
+def test_where_nothing_can_be_evaluated_the_start_is_returned() -> None:
+    model, prior = problem(3)
+
+    class Refuses(Curved):
+        def rows(self, u: np.ndarray, v: np.ndarray) -> None:  # type: ignore[override]
+            return None
+
+    begin = prior.u, prior.v
+    u, v, spent, converged = minimise(
+        Refuses(model.A, model.B, model.c), prior, begin, Stop(1e-8, 0.0, 100)
+    )
+    np.testing.assert_array_equal(u, prior.u)
+    np.testing.assert_array_equal(v, prior.v)
+    assert spent == 1
+    assert not converged

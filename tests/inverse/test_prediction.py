@@ -1,0 +1,60 @@
+"""Prediction errors, against the recursion of the filter written out, and its limits."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.linalg
+
+from experiments.search_problems import random_problem, stick_problem
+from impc.checking import replace
+from impc.inverse.prediction import Correction, correction
+from impc.inverse.residuals import evaluate
+
+
+@pytest.mark.parametrize("ratio", [1.0, 10.0])
+def test_the_corrected_loop_is_the_recursion(ratio: float) -> None:
+    """A stick with its limit: predict, correct by the innovation, clip the command (horizon 1)."""
+    known = next(one for one in map(stick_problem, range(50)) if one is not None)
+    problem = replace(known.problem, horizon=1, terminal_set=False)
+    plant, (trial,) = problem.plant, problem.recordings
+    found = evaluate(problem, known.K, known.S, correction=correction(problem, ratio))
+    M, limit = correction(problem, ratio).M, problem.bounds.u_max
+    x, errors = np.array(trial.x0), []
+    for y, d in zip(trial.outputs, trial.disturbance, strict=True):
+        error = y - plant.C @ x
+        errors.append(error)
+        x = x + M @ error
+        u = np.clip(-known.K @ x, -limit, limit)
+        x = plant.A @ x + plant.B @ u + plant.E @ d
+    scaled = np.array(errors) / problem.output_scale
+    np.testing.assert_allclose(np.abs(found.residual), np.abs(scaled.ravel()), atol=1e-10)
+
+
+def test_the_filter_is_steady_and_stable() -> None:
+    """Its gain solves the Riccati equation of the filter, by iterating the covariance."""
+    known = random_problem(3, half=True)
+    assert known is not None
+    problem, plant = known.problem, known.problem.plant
+    M = correction(problem, 1.0).M
+    loop = (np.eye(plant.n) - M @ plant.C) @ plant.A
+    assert np.max(np.abs(np.linalg.eigvals(loop))) < 1
+    sizes = np.maximum(-problem.bounds.u_min, problem.bounds.u_max)
+    driving = plant.B @ np.diag(sizes**2) @ plant.B.T
+    driving += 1e-9 * np.trace(driving) * np.eye(plant.n)
+    noise, P = np.diag(problem.output_scale**2), np.eye(plant.n)
+    for _ in range(5000):
+        gain = P @ plant.C.T @ scipy.linalg.inv(plant.C @ P @ plant.C.T + noise)
+        P = plant.A @ (P - gain @ plant.C @ P) @ plant.A.T + driving
+    np.testing.assert_allclose(M, gain, rtol=1e-6, atol=1e-9)
+
+
+def test_no_correction_is_the_simulation() -> None:
+    known = random_problem(5)
+    assert known is not None
+    problem = known.problem
+    nothing = Correction(np.zeros((problem.plant.n, len(problem.output_scale))))
+    plain = evaluate(problem, known.K, known.S)
+    same = evaluate(problem, known.K, known.S, correction=nothing)
+    np.testing.assert_allclose(same.residual, plain.residual, atol=1e-12)
+    np.testing.assert_allclose(same.dK, plain.dK, atol=1e-9)

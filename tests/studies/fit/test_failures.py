@@ -1,0 +1,82 @@
+"""What a fit says where a stage fails, little is explained, or no weights have the gain."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+import impc
+from experiments.search_problems import stick
+from impc.errors import SolverError
+from impc.reporting.provenance import Provenance
+from impc.studies.fit import subject
+from impc.studies.fit.result import FitResult
+from impc.studies.fit.schema import fit_data
+from impc.studies.fit.sentences import remarks
+from impc.studies.fit.verdict import abstract, verdict
+
+
+@cache
+def posed(angle: float, rate: float, noise: float) -> tuple[impc.Problem, impc.FitSettings]:
+    """A stick balanced by a gain, with noise (rad) in its recorder."""
+    plant, rng = impc.Plant(stick(), ["finger"]), np.random.default_rng(5)
+    bounds = impc.Bounds(plant, u_min=-6, u_max=6)
+    law = impc.Controller.from_gain(plant, [[angle, rate]], bounds, 5, terminal_set=False)
+    push = rng.choice([-1.2, 0, 1.2], 30).repeat(10)
+    seen = law.simulate(np.zeros(2), disturbance=push).x[:-1, :1]
+    trial = impc.Recording(plant, seen + noise * rng.standard_normal(seen.shape), push)
+    settings = impc.FitSettings(horizon=5, u_max=6.0)
+    return impc.fit_problem(plant, [trial], settings), settings
+
+
+def fitted(angle: float = -25.0, rate: float = -7.0, noise: float = 3e-4) -> FitResult:
+    return impc.fit_recordings(*posed(angle, rate, noise))
+
+
+def data(result: FitResult) -> dict[str, Any]:
+    return fit_data(result, Provenance())
+
+
+def test_less_than_half_explained_gives_no_interval_and_no_statement() -> None:
+    """Noise of three times the motion."""
+    result = fitted(noise=0.15)
+    found = data(result)
+    assert np.max(result.inverse_mpc.vaf) < 50
+    assert found["usable"] is False
+    assert found["intervals"] == {}
+    assert found["all_intervals"] == []
+    assert found["weights_set"] is None
+    assert verdict(result).startswith("The fitted controller explains less than half of angle")
+    assert not any("cost is" in sentence for sentence in (*abstract(result), *remarks(result)))
+    assert data(fitted())["usable"] is True
+
+
+def test_no_weights_is_said_before_any_weights() -> None:
+    """A gain that no weights have, well recorded, against the gain of a regulator."""
+    result = fitted(-60.0, -4.0)
+    assert result.weights_test.rejected
+    assert verdict(result).startswith("No cost weights explain this gain")
+    assert data(result)["weights_set"] is None
+    assert not any("dominant cost" in sentence for sentence in abstract(result))
+    assert not fitted().weights_test.rejected
+
+
+def test_a_stage_that_fails_is_one_sentence_in_its_place(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Drawn gains, residual tests and drifts of the horizon fail: the gain is reported."""
+
+    def fails(*_: Any, **__: Any) -> Any:
+        raise SolverError("stage", "did not end", "try another")
+
+    whole = fitted()
+    for name in ("drawn_gains", "residual_diagnostics"):
+        monkeypatch.setattr(subject, name, fails)
+    result = fitted()
+    assert set(result.failures) == {"drawn gains", "tests of the residuals"}
+    said = remarks(result)
+    for stage in result.failures:
+        assert sum(stage in sentence and "did not end" in sentence for sentence in said) == 1
+    np.testing.assert_array_equal(result.estimate.K, whole.estimate.K)
+    assert data(result)["failures"] == dict(result.failures)
