@@ -79,7 +79,7 @@ def preliminary_gain(problem: Problem, states: Sequence[str]) -> PreliminaryGain
     z, _, _ = descend(space, space.at_gain(gain), Stop(_FINE, 0.0, _EVALUATIONS))
     found = space.unpack(z)
     misfit = float(np.linalg.norm(space.at(z).residual))
-    return PreliminaryGain(frozen(found.K), found.problem, misfit)
+    return PreliminaryGain(frozen(np.where(kept, found.K, 0.0)), found.problem, misfit)
 
 
 def _basis(plant: Plant, gain: Array, kept: BoolArray) -> Array:

@@ -430,7 +430,6 @@ def output_penalty_weights(
     )
 
 
-@checked
 def _closed_loop_residual(problem: Problem) -> Callable[[LqrSolution], Residual]:
     near: TerminalSet | None = None
 

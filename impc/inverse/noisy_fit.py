@@ -35,7 +35,7 @@ from impc.inverse.natural_search import (
 )
 from impc.inverse.nearest_regulator import weights_near
 from impc.inverse.problem import EXPLAINED, misfit, recorded_size
-from impc.inverse.residuals import verify_hard
+from impc.inverse.residuals import misfit_or_reason, verify_hard
 from impc.inverse.solution_set import gain_fibre, natural_coordinates
 from impc.inverse.starting_regulators import regulators
 from impc.model.plant import change_coordinates
@@ -56,6 +56,10 @@ __all__ = ["fit_controller", "free_gain", "noise_of"]
 # Weights that leave more than the free gain by what noise does in one of a hundred recordings are
 # looked for again.
 _RARE = 0.01
+# Misfits that differ by less, of themselves, are the same.
+_SAME = 1e-3
+# Numbers recorded that are many.
+_FEW = 2000
 # Regulators from which weights are looked for, at most.
 _BEGINNINGS = 3
 
@@ -83,7 +87,7 @@ def fit_controller(problem: Problem, start: Weights | None = None) -> Estimate:
     if problem.terminal_set is not None:
         return _fitted(problem, start)
     without = _fitted(replace(problem, terminal_set=False), start)
-    if without.explained or (without.fit.white and not _set_matters(without)):
+    if without.explained or not _set_may_matter(without):
         return without
     try:
         within = _fitted(replace(problem, terminal_set=True), start)
@@ -93,18 +97,22 @@ def fit_controller(problem: Problem, start: Weights | None = None) -> Estimate:
     return within if kept and within.misfit < without.misfit else without
 
 
-def _set_matters(found: Estimate) -> bool:
+def _set_may_matter(found: Estimate) -> bool:
     """Whether the controller found would do otherwise, had it to end in its terminal set.
 
-    Few samples tell white from what a set leaves no better than chance.
+    Where it cannot, another one might, unless what is left is noise. A search with the set takes
+    far longer: many samples have to speak for it at the controller found.
     """
     posed = replace(found.problem, terminal_set=True)
+    if sum(trial.outputs.size for trial in posed.recordings) > _FEW:
+        left, reason = misfit_or_reason(posed, found.gain, found.metric)
+        return not reason and left < found.misfit
     try:
         runs = verify_hard(posed, found.stage_weights)
     except (WeightsError, SolverError, InputError):  # it has no such set
         return False
     if not all(run.complete for run in runs):
-        return False
+        return not found.fit.white
     return abs(misfit(posed, runs) - found.misfit) > EXPLAINED * recorded_size(posed)
 
 
@@ -139,7 +147,10 @@ def noise_of(free: GainFit) -> float:
 
 
 def _weights(free: GainFit, start: Weights | None) -> tuple[ConditionedFit, int]:
-    """Weights of the direct form from a few beginnings, until one leaves what noise does."""
+    """Weights of the direct form from a few beginnings.
+
+    Until one leaves what noise does, or two end at one misfit.
+    """
     best, spent, reason = None, 0, ""
     enough = _unlikely(free) * free.misfit
     for begin in _beginnings(free, start):
@@ -149,8 +160,9 @@ def _weights(free: GainFit, start: Weights | None) -> tuple[ConditionedFit, int]
             reason = reason or str(error)
             continue
         spent += found.evaluations
+        again = best is not None and abs(found.misfit - best.misfit) <= _SAME * best.misfit
         best = found if best is None or found.misfit < best.misfit else best
-        if best.misfit <= enough:
+        if best.misfit <= enough or again:
             break
     if best is None:
         raise SolverError("weights", f"none can be simulated: {reason}", "give a start of your own")

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.arrays import Array, frozen
-from impc.checking import replace
+from impc.checking import checked, replace
 from impc.control.closed_loop import prepare_loop, run_loop, simulate
 from impc.control.constraint_rows import Directions, directions
 from impc.control.controller import Controller
@@ -393,6 +393,7 @@ def scaled_changes(metric: Array, changes: Array) -> Array:
     return np.asarray(len(metric) / trace * (changes - shares * metric))
 
 
+@checked
 def verify_hard(problem: Problem, weights: Weights) -> list[Simulation]:
     """Simulate every recording with hard state bounds and terminal set.
 

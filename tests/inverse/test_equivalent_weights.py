@@ -293,3 +293,23 @@ def test_basis_is_orthonormal_in_natural_coordinates() -> None:
     np.testing.assert_allclose(np.tensordot(basis, basis, ((1, 2), (1, 2))), np.eye(4), atol=1e-9)
     X = fibre.to_natural(least_condition_weights(fibre).weights)
     np.testing.assert_allclose(split_blocks(X, 4).Q, X[:4, :4], atol=1e-12)
+
+
+def test_the_reported_weights_do_not_depend_on_rounding() -> None:
+    """Six states, two inputs: members of the same condition number differ by a half in Q.
+
+    The least norm of them is one point. States are rotated, which changes neither norm nor
+    condition number, but every rounding, as another processor does.
+    """
+    A = np.random.default_rng(3).normal(size=(6, 6)) / 2.2
+    B = np.random.default_rng(4).normal(size=(6, 2))
+    L = np.random.default_rng(5).normal(size=(6, 6))
+    plant = Plant(control.ss(A, B, np.eye(6), 0, True))
+    K = solve_lqr(plant, Weights(L @ L.T + 0.1 * np.eye(6), np.eye(2))).K
+    first = least_condition_weights(gain_fibre(plant, K)).weights
+    for seed in range(4):
+        U, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(6, 6)))
+        found = least_condition_weights(gain_fibre(rescaled(plant, U), K @ U)).weights
+        size = 1e-4 * np.max(np.abs(first.Q))
+        np.testing.assert_allclose(U @ found.Q @ U.T, first.Q, atol=size)
+        np.testing.assert_allclose(found.R, first.R, atol=1e-4)

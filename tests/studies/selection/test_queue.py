@@ -44,10 +44,15 @@ def test_workers_give_the_same_and_it_is_kept(tmp_path: Path) -> None:
             for one, other in zip(here[name].fits, found[name].fits, strict=True):
                 np.testing.assert_array_equal(one.theta, other.theta)
                 assert (one.free, one.misfit) == (other.free, other.misfit)
-    for file in kept.folder.iterdir():
-        file.write_bytes(file.read_bytes()[:40])
+    whole = {file: file.read_bytes() for file in kept.folder.iterdir()}
+    for file in whole:
+        file.write_bytes(whole[file][:40])
     with pytest.raises(AttributeError):
         on_workers(nobody, source, kept)(refit_subsets, Refits, arguments)
+    kept.forget()
+    assert set(kept.folder.iterdir()) == set(whole)  # damaged, they could be another's
+    for file, content in whole.items():
+        file.write_bytes(content)
     kept.forget()
     assert not kept.folder.exists()
 
