@@ -56,6 +56,9 @@ __all__ = ["fit_controller", "free_gain", "noise_of"]
 # Weights that leave more than the free gain by what noise does in one of a hundred recordings are
 # looked for again.
 _RARE = 0.01
+# Misfit, of the recordings, of weights behind an exact gain with which a search is over: where few
+# samples show S, an error of K that rounding left is answered by one of S, which no weights have.
+_NEARLY = 1e-6
 # Misfits that differ by less, of themselves, are the same.
 _SAME = 1e-3
 # Numbers recorded that are many.
@@ -121,7 +124,8 @@ def _fitted(problem: Problem, start: Weights | None) -> Estimate:
     free = fit_gain(problem) if start is None else free_gain(problem, start)
     if free.explained:  # otherwise no weights can have it: the direct form says which come near
         behind = weights_behind(free)
-        if behind.explained and behind.equivalent is not None:
+        nearly = behind.misfit <= _NEARLY * recorded_size(problem)
+        if nearly and behind.equivalent is not None:
             weights = behind.equivalent.weights
             return _finish(free, free.problem, weights, evaluations=0, converged=True)
     found, spent = _weights(free, start)
@@ -162,7 +166,7 @@ def _weights(free: GainFit, start: Weights | None) -> tuple[ConditionedFit, int]
         spent += found.evaluations
         again = best is not None and abs(found.misfit - best.misfit) <= _SAME * best.misfit
         best = found if best is None or found.misfit < best.misfit else best
-        if best.misfit <= enough or again:
+        if best.misfit <= enough or (again and not free.explained):
             break
     if best is None:
         raise SolverError("weights", f"none can be simulated: {reason}", "give a start of your own")
@@ -181,13 +185,17 @@ def _unlikely(free: GainFit) -> float:
 def _beginnings(free: GainFit, start: Weights | None) -> Iterator[Weights]:
     """The given weights, then those of some regulators, and those nearest to the free gain.
 
-    A free gain wanders off along what the recordings hardly identify, and weights near it with it.
+    With noise a free gain wanders off along what the recordings hardly identify, and weights near
+    it with it.
     """
     if start is not None:
         yield start
     for regulator in regulators(free.problem)[:_BEGINNINGS]:
-        yield regulator.weights
+        if not free.explained:
+            yield regulator.weights
         yield _nearest(free, regulator)
+        if free.explained:
+            yield regulator.weights
 
 
 def _nearest(free: GainFit, regulator: LqrSolution) -> Weights:

@@ -87,6 +87,7 @@ def test_with_limit_changes_one_input_only() -> None:
         input_limit(fitted, 1)
 
 
+@pytest.mark.slow
 def test_a_fit_at_a_wrong_limit_is_made_again_at_the_right_one() -> None:
     """Half of the true limit: the profile excludes it, and its ends lie on the quantile."""
     whole = noisy_trial(SEED, 0.0)
