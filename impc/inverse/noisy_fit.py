@@ -11,6 +11,7 @@ takes the weights that fit best (docs/fitting.md).
 
 from __future__ import annotations
 
+import contextlib
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -26,6 +27,7 @@ from impc.inverse.estimates import Estimate, Status, goodness
 from impc.inverse.explaining_weights import weights_behind
 from impc.inverse.gain_search import GainFit, fit_gain, refine_gain
 from impc.inverse.initial_states import with_fitted_starts
+from impc.inverse.inverse_lqr import inverse_lqr_gradient
 from impc.inverse.natural_search import (
     CONDITION_SHARE,
     best_conditioned,
@@ -186,7 +188,8 @@ def _beginnings(free: GainFit, start: Weights | None) -> Iterator[Weights]:
     """The given weights, then those of some regulators, and those nearest to the free gain.
 
     With noise a free gain wanders off along what the recordings hardly identify, and weights near
-    it with it.
+    it with it. Last those whose gain is nearest entry by entry: near its limit a stick falls with
+    any other.
     """
     if start is not None:
         yield start
@@ -196,6 +199,10 @@ def _beginnings(free: GainFit, start: Weights | None) -> Iterator[Weights]:
         yield _nearest(free, regulator)
         if free.explained:
             yield regulator.weights
+    with contextlib.suppress(WeightsError, SolverError):  # then there is no other
+        nearest = inverse_lqr_gradient(free.problem.plant, free.K).weights
+        if nearest is not None:
+            yield nearest
 
 
 def _nearest(free: GainFit, regulator: LqrSolution) -> Weights:

@@ -69,6 +69,15 @@ def test_sticks_at_their_limit(wanted: int) -> None:
     assert silent == 0
 
 
+def test_a_stick_that_falls_with_any_other_gain_has_its_weights() -> None:
+    """No regulator that a search begins at can be simulated, nor weights near them."""
+    known = stick_problem(418)
+    assert known is not None
+    found = fit_controller(known.problem)
+    assert is_right(known, found)
+    assert np.allclose(found.gain, known.K, rtol=2e-3)
+
+
 @pytest.mark.parametrize("wanted", [20, pytest.param(200, marks=pytest.mark.slow)])
 def test_exact_recordings_of_one_input(wanted: int) -> None:
     assert score(posed(random_problem, wanted))[0] <= wanted // 100
