@@ -208,6 +208,7 @@ def test_results_are_those_of_the_folder_without(runs: tuple[Path, Path, list[st
         assert (plain / name).read_bytes() == (trapped / name).read_bytes(), name
 
 
+@pytest.mark.full
 @pytest.mark.skipif(shutil.which("strace") is None, reason="strace is not installed")
 def test_no_library_opens_anything_of_the_folder(runs: tuple[Path, Path, list[str]]) -> None:
     """Those in C too, which tell Python nothing."""

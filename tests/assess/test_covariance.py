@@ -121,6 +121,7 @@ def test_a_direction_that_is_told_is_told_where_others_are_not(seed: int) -> Non
     assert np.max(np.abs(step[~found.told])) < 0.2
 
 
+@pytest.mark.full
 def test_told_directions_count_what_is_not_told_to_second_order() -> None:
     """Three inputs and one output: to first order the best told direction is 2.4 deviations off."""
     controller, trial = random_recording(1, 3, 90.0)
@@ -135,7 +136,7 @@ def test_told_directions_count_what_is_not_told_to_second_order() -> None:
 @pytest.mark.parametrize(
     ("inputs", "vaf", "count"),
     [
-        (1, 70.0, 25),
+        pytest.param(1, 70.0, 25, marks=pytest.mark.full),
         pytest.param(2, 90.0, 4, marks=pytest.mark.long),
         pytest.param(2, 90.0, 8, marks=pytest.mark.full),
     ],

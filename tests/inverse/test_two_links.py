@@ -36,7 +36,7 @@ def least_misfit(problem: Problem, start: np.ndarray) -> float:
 @pytest.mark.parametrize(
     ("noisy", "samples"),
     [
-        (True, 800),
+        pytest.param(True, 800, marks=pytest.mark.full),
         pytest.param(False, 4000, marks=pytest.mark.slow),
         pytest.param(True, 4000, marks=pytest.mark.slow),
     ],
