@@ -147,6 +147,7 @@ def test_false_alarms_of_structure(colour: float, most: float) -> None:
     assert alarms / 60 <= most
 
 
+@pytest.mark.full
 def test_the_default_subject_is_told_from_the_same_on_a_linear_plant() -> None:
     """Its body is nonlinear, the model's is not; six states for ten, trials of 15 s, seed 0."""
     default, linear = (diagnosed(0, name, **SHORT) for name in ("default", "linear"))
@@ -159,6 +160,7 @@ def test_the_default_subject_is_told_from_the_same_on_a_linear_plant() -> None:
     assert any("do not contain this error" in line for line in told)
 
 
+@pytest.mark.full
 def test_motor_noise_with_saturation_leads_the_page() -> None:
     """Motor noise of 1 Nm, at the limit for part of the time; noise on the angles is not told."""
     found = diagnosed(0, "motor", **SHORT)

@@ -310,6 +310,7 @@ def test_a_configuration_that_cannot_be(
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.full
 @pytest.mark.usefixtures("blank_figures")
 def test_an_interrupted_command_says_what_it_kept(
     subject: Path, quick: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
