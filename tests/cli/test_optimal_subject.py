@@ -194,7 +194,7 @@ def test_page_tables_terminal_and_numbers_say_the_same(folder: Path, done: Resul
         assert sentence in page
         assert sentence in done.stdout
     assert "they do not tell all of its parameters: far may be others" in found.content["verdict"]
-    assert "far is not told: near its value nothing that was measured depends on it." in page
+    assert "far is not identified: near its value nothing that was measured depends on it." in page
     table = pd.read_csv(out / "parameters.csv").set_index("parameter")
     for name, one in found.content["parameters"].items():
         assert table.loc[name, "value"] == one["value"]
