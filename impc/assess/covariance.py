@@ -29,8 +29,8 @@ import numpy as np
 from impc.arrays import Array, BoolArray, Frozen, frozen
 from impc.assess.long_run_covariance import ResidualNoise, residual_noise, spread_of_sum
 from impc.inverse.coordinates import metric_directions
-from impc.inverse.problem import recorded_size
-from impc.inverse.residuals import evaluate, residual_only, residual_or_reason, scaled_changes
+from impc.inverse.estimates import DETERMINED, determined
+from impc.inverse.residuals import evaluate, residual_only, residual_or_reason
 from impc.inverse.solution_set import natural_coordinates
 from impc.inverse.trial_span import trial_span
 
@@ -42,9 +42,7 @@ if TYPE_CHECKING:
     from impc.inverse.trial_span import TrialSpan
 
 __all__ = [
-    "DETERMINED",
     "FOREIGN",
-    "ROUNDING",
     "TOLD",
     "TWO_SIDED",
     "GainCovariance",
@@ -52,10 +50,6 @@ __all__ = [
     "gain_covariance",
 ]
 
-#: A direction whose singular value is below this, of the largest, is not determined at all.
-DETERMINED = 1e-6
-#: So is one along which a natural step changes the outputs by less than this share of them.
-ROUNDING = 1e-10
 #: A direction with a larger deviation, of the natural size of a gain, is not told: there the prior
 #: of a search and the curvature of the problem count beside the recordings.
 TOLD = 0.2
@@ -159,15 +153,14 @@ def gain_covariance(
     found = evaluation or evaluate(problem, gain, metric)
     in_units = np.kron(G, np.linalg.inv(T).T)
     on_gain = found.dK.reshape(-1, m * n) @ in_units
-    along = scaled_changes(metric, metric_directions(metric)).reshape(-1, m * m)
-    metric_columns = _told_metric(found.dS.reshape(len(on_gain), -1) @ along.T)
+    metric_columns = _told_metric(found.along_metric(metric, metric_directions(metric)))
     # What the rest can explain is taken out of the gain's columns; the gain's
     # block of the inverse of H is that of what is left.
     rest = _span(problem, found, metric_columns, found.dparameters)
     others = _span(problem, found, on_gain, metric_columns)
     seen = rest.without(on_gain)
     _, values, directions = np.linalg.svd(seen, full_matrices=False)
-    usable = values > max(DETERMINED * values[0], ROUNDING * recorded_size(problem))
+    usable = determined(problem, values)
     unit = seen @ directions[usable].T / values[usable]
     colour = noise(by_trial(problem, found.residual), rest.plus(unit))
     spread = spread_of_sum(colour, by_trial(problem, unit / values[usable]))
@@ -248,7 +241,7 @@ def _told_metric(alone: Array) -> Array:
 
 def _span(problem: Problem, found: Evaluation, *shared: Array) -> TrialSpan:
     """What initial states and the columns `shared` can explain."""
-    sizes = [trial.outputs.size for trial in problem.recordings]
+    sizes = problem.trial_sizes
     return trial_span(found.dx0, sizes, np.hstack(shared))
 
 

@@ -15,11 +15,11 @@ import numpy as np
 
 from impc.arrays import Array, Frozen, frozen
 from impc.checking import checked
-from impc.control.closed_loop import simulate
 from impc.errors import SolverError, WeightsError
 from impc.inverse.equivalent_weights import other_weights
+from impc.inverse.estimates import ROUNDING
 from impc.inverse.least_squares import triangular_rows
-from impc.inverse.problem import controller_for, misfit, recorded_size, scenarios
+from impc.inverse.problem import misfit, recorded_size, simulated
 from impc.inverse.proximal_search import Residual, weight_jacobian
 from impc.inverse.proximal_step import block_basis
 from impc.inverse.residuals import evaluate
@@ -38,8 +38,6 @@ __all__ = ["Identifiability", "OtherWeights", "identifiability"]
 
 # Exact derivatives leave singular values of 1e-13 where nothing is determined.
 _DETERMINED = 1e-8
-# Of the recorded outputs: what rounding leaves of their derivative where no weights have an effect.
-_ROUNDING = 1e-10
 
 
 @dataclass(frozen=True)
@@ -136,7 +134,7 @@ def identifiability(problem: Problem, weights: Weights) -> Identifiability:
     factor = np.linalg.cholesky(weights.block)
     basis = factor @ block_basis(plant.n, plant.m) @ factor.T
     values = _singular_values(solution, found, basis)
-    least = max(_DETERMINED * values[0], _ROUNDING * recorded_size(problem))
+    least = max(_DETERMINED * values[0], ROUNDING * recorded_size(problem))
     rank = int(np.count_nonzero(values > least))
     free = len(basis) - 1
     metric = solution.S if plant.m > 1 else None
@@ -170,6 +168,5 @@ def _others(problem: Problem, fibre: GainFibre) -> tuple[OtherWeights, ...]:
 
 def _explain(problem: Problem, found: EquivalentWeights) -> OtherWeights:
     solution = solve_lqr(problem.plant, found.weights)
-    controller = controller_for(problem, solution.K, solution.S)
-    runs = [simulate(controller, drive) for drive in scenarios(problem)]
-    return OtherWeights(found.weights, condition_number(found.weights), misfit(problem, runs))
+    left = misfit(problem, simulated(problem, solution.K, solution.S))
+    return OtherWeights(found.weights, condition_number(found.weights), left)

@@ -24,12 +24,12 @@ from impc.arrays import Array, Frozen, frozen
 from impc.assess.covariance import by_trial
 from impc.assess.long_run_covariance import residual_noise, spread_of_sum, white_noise
 from impc.checking import replace
-from impc.control.closed_loop import simulate, simulate_and_differentiate
+from impc.control.closed_loop import simulate_and_differentiate
 from impc.control.constraint_rows import directions
 from impc.errors import InputError, SolverError, WeightsError
 from impc.inverse.gain_search import refine_gain
 from impc.inverse.noisy_fit import fit_controller
-from impc.inverse.problem import controller_for, scenarios
+from impc.inverse.problem import controller_for, scenarios, simulated
 from impc.inverse.residuals import evaluate
 from impc.model.bounds import Bounds, bound_rows
 
@@ -245,7 +245,7 @@ class _Search:
 
     def __init__(self, fitted: Estimate, control: int) -> None:
         self.fitted, self.control = fitted, control
-        self.samples = sum(trial.outputs.size for trial in fitted.problem.recordings)
+        self.samples = sum(fitted.problem.trial_sizes)
         self.tried: dict[float, GainFit | None] = {}
 
     def fit(self, limit: float) -> GainFit:
@@ -266,18 +266,15 @@ class _Search:
         scipy.optimize.minimize_scalar(
             self.misfit, bounds=ends, method="bounded", options={"xatol": _RESOLUTION * ends[1]}
         )
-        fits = [fit for fit in self.tried.values() if fit is not None]
-        finite = [fit for fit in fits if np.isfinite(self.limit_of(fit))]
-        if not finite:
-            raise SolverError("limit", "no gain holds with any limit tried", "check the plant")
-        return min(finite, key=lambda fit: fit.misfit)
+        return self.least()[1]
 
     def least(self) -> tuple[float, GainFit]:
         """The best of all finite limits that were tried."""
         fits = [fit for fit in self.tried.values() if fit is not None]
-        best = min(
-            (fit for fit in fits if np.isfinite(self.limit_of(fit))), key=lambda fit: fit.misfit
-        )
+        finite = [fit for fit in fits if np.isfinite(self.limit_of(fit))]
+        if not finite:
+            raise SolverError("limit", "no gain holds with any limit tried", "check the plant")
+        best = min(finite, key=lambda fit: fit.misfit)
         return self.limit_of(best), best
 
     def limit_of(self, fit: GainFit) -> float:
@@ -311,9 +308,7 @@ class _Search:
 
 def _typical_peak(fitted: Estimate, control: int) -> float:
     """What the command of the weights' regulator exceeds at one sample in two hundred."""
-    K, S = np.array(fitted.gain), np.array(fitted.metric)
-    controller = controller_for(fitted.problem, K, S)
-    runs = [simulate(controller, drive) for drive in scenarios(fitted.problem)]
+    runs = simulated(fitted.problem, fitted.gain, fitted.metric)
     command = np.concatenate([np.abs(run.applied[:, control]) for run in runs])
     return float(np.quantile(command, 0.995))
 

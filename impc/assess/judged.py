@@ -12,9 +12,8 @@ import numpy as np
 
 from impc.arrays import Array, Frozen, frozen
 from impc.assess.variance_accounted_for import vaf
-from impc.control.closed_loop import simulate
 from impc.control.simulation import Simulation
-from impc.inverse.problem import scenarios
+from impc.inverse.problem import simulated
 
 if TYPE_CHECKING:
     from impc.inverse.estimates import Estimate
@@ -97,8 +96,7 @@ def judge(estimate: Estimate, bounds: Bounds) -> MethodFit:
     problem = estimate.problem
     if estimate.K is None:
         return _without_gain(estimate, bounds)
-    controller = estimate.controller()
-    runs = tuple(simulate(controller, drive) for drive in scenarios(problem))
+    runs = tuple(simulated(problem, estimate.gain, estimate.metric))
     commands = np.concatenate([run.applied for run in runs])
     beyond = (commands > bounds.u_max + 1e-6 * np.abs(bounds.u_max)) | (
         commands < bounds.u_min - 1e-6 * np.abs(bounds.u_min)

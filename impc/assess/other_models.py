@@ -150,7 +150,7 @@ def _left_out(problem: Problem, found: Estimate, index: int, settle: float) -> A
 def residuals_of(found: Estimate, problem: Problem) -> list[Array]:
     """Scaled residuals (samples, p) of each trial of a problem under the controller found."""
     flat = residual_only(problem, found.gain, found.metric)
-    ends = np.cumsum([trial.outputs.size for trial in problem.recordings])[:-1]
+    ends = np.cumsum(problem.trial_sizes)[:-1]
     parts = np.split(flat, ends)
     return [
         part.reshape(trial.outputs.shape)

@@ -29,7 +29,7 @@ from impc.inverse.coordinates import Coordinates, descend
 from impc.inverse.least_squares import Stop
 from impc.inverse.problem import EXPLAINED, recorded_size
 from impc.inverse.residuals import evaluate
-from impc.model.riccati import is_stable
+from impc.model.riccati import stabilises
 
 if TYPE_CHECKING:
     from impc.inverse.estimates import Estimate
@@ -183,6 +183,6 @@ def _round(here: _Here) -> _Here | None:
     z, _, _ = descend(space, space.start, stop, shared=shared, own=1.0, along=along)
     there = space.unpack(z)
     plant = there.problem.plant
-    if not is_stable(plant.A - plant.B @ there.K, discrete=True):
+    if not stabilises(plant, there.K):
         return None
     return _described(there.problem, there.K, there.S, space.evaluated(z)[0])

@@ -127,7 +127,7 @@ class _Search:
         )
         self.unit = np.zeros_like(direction)
         self.unit[own] = direction[own] / float(direction[own] @ direction[own])
-        self.samples = sum(trial.outputs.size for trial in problem.recordings)
+        self.samples = sum(problem.trial_sizes)
         misfit = float(np.linalg.norm(self.space.at(self.space.start).residual))
         self.noise = max(misfit, 1e-12) / np.sqrt(self.samples)
         self.pull = self.noise / _WIDTH

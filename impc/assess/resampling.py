@@ -26,8 +26,7 @@ from impc.arrays import Array, Frozen, frozen
 from impc.assess.intervals import Interval, entry_names
 from impc.assess.printed_gain import told_gain
 from impc.checking import replace
-from impc.control.closed_loop import simulate
-from impc.inverse.problem import controller_for, scenarios
+from impc.inverse.problem import simulated
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -108,8 +107,7 @@ def bootstrap_model(problem: Problem, gain: Array, metric: Array) -> BootstrapMo
     InputError, SolverError
         As `controller_for`.
     """
-    controller = controller_for(problem, gain, metric)
-    runs = [simulate(controller, drive) for drive in scenarios(problem)]
+    runs = simulated(problem, gain, metric)
     outputs = tuple(frozen(run.x @ problem.plant.C.T) for run in runs)
     return BootstrapModel(problem, frozen(gain), frozen(metric), outputs)
 

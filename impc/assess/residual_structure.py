@@ -101,7 +101,7 @@ def residual_structure(
         return None
     weights = np.tile(1 / size, len(residual))
     fitted = np.hstack([found.dK.reshape(len(weights), -1), found.dparameters])
-    sizes = [trial.outputs.size for trial in problem.recordings]
+    sizes = problem.trial_sizes
     basis = trial_span(found.dx0 * weights[:, None], sizes, fitted * weights[:, None])
     told = np.ravel(residual / size)
     shifted = _shifted(residual / size, lengths, np.random.default_rng(seed))
@@ -137,7 +137,7 @@ def _thinned(problem: Problem, found: Evaluation) -> tuple[Problem, Evaluation]:
 
     Nothing is lost that matters: of so many samples any part above `_LEAST_SHARE` is found.
     """
-    sizes = [trial.outputs.size for trial in problem.recordings]
+    sizes = problem.trial_sizes
     every = -(-sum(sizes) // _MOST)
     if every == 1:
         return problem, found

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.arrays import Array, BoolArray, Frozen, frozen
-from impc.assess.covariance import DETERMINED, TWO_SIDED, by_trial
+from impc.assess.covariance import TWO_SIDED, by_trial
 from impc.assess.long_run_covariance import (
     ResidualNoise,
     residual_noise,
@@ -27,7 +27,8 @@ from impc.assess.long_run_covariance import (
     white_noise,
 )
 from impc.inverse.coordinates import metric_directions
-from impc.inverse.residuals import evaluate, scaled_changes
+from impc.inverse.estimates import DETERMINED
+from impc.inverse.residuals import evaluate
 from impc.inverse.solution_set import natural_coordinates
 from impc.inverse.structured_search import regulator_slopes
 from impc.inverse.trial_span import trial_span
@@ -110,7 +111,7 @@ class Tangent(Frozen):
 
     def span(self, *beside: Array) -> TrialSpan:
         """What initial states, parameters and columns `beside` (r, b) can make up."""
-        sizes = [trial.outputs.size for trial in self.problem.recordings]
+        sizes = self.problem.trial_sizes
         return trial_span(self.found.dx0, sizes, np.hstack([self.on_parameters, *beside]))
 
     def gain_columns(self) -> tuple[Array, Array]:
@@ -125,10 +126,8 @@ class Tangent(Frozen):
         """
         gain, metric = np.array(self.solution.K), np.array(self.solution.S)
         T, G = natural_coordinates(self.problem.plant, gain)
-        on_gain = self.found.dK.reshape(len(self.residual), -1) @ np.kron(G, np.linalg.inv(T).T)
-        along = scaled_changes(metric, metric_directions(metric))
-        on_metric = self.found.dS.reshape(len(self.residual), -1)
-        return np.asarray(on_gain), np.asarray(on_metric @ along.reshape(len(along), metric.size).T)
+        on_metric = self.found.along_metric(metric, metric_directions(metric))
+        return self.found.along_gain(T, G), on_metric
 
 
 def tangent(structure: Structure, problem: Problem, prices: Array) -> Tangent:
@@ -138,7 +137,7 @@ def tangent(structure: Structure, problem: Problem, prices: Array) -> Tangent:
     found = evaluate(problem, K, S)
     dK, dS = regulator_slopes(problem, structure, prices, solution)
     seen = found.dK.reshape(len(found.residual), -1) @ dK.reshape(len(dK), K.size).T
-    seen += found.dS.reshape(len(seen), -1) @ scaled_changes(S, dS).reshape(len(dS), S.size).T
+    seen += found.along_metric(S, dS)
     count = structure.count
     return Tangent(
         structure,

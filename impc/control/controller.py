@@ -23,7 +23,7 @@ from impc.control.named_solver import COMPILED, require_solver
 from impc.control.simulation import Status, excluded_bound, scenario
 from impc.control.terminal_set import maximal_invariant_set
 from impc.errors import InputError
-from impc.model.riccati import is_stable, solve_lqr
+from impc.model.riccati import solve_lqr, stabilises
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -183,7 +183,7 @@ class Controller(Value):
         """
         plant.require_discrete()
         K = finite_array("gain", gain, (plant.m, plant.n))
-        if terminal_set and not is_stable(plant.A - plant.B @ K, discrete=True):
+        if terminal_set and not stabilises(plant, K):
             raise InputError(
                 "gain", "does not stabilise the plant", "give one with |eig(A - BK)| < 1"
             )

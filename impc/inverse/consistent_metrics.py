@@ -22,7 +22,7 @@ import numpy as np
 import scipy.optimize
 
 from impc.arrays import Array
-from impc.inverse.residuals import evaluate, misfit_or_reason, scaled_changes
+from impc.inverse.residuals import evaluate, misfit_or_reason
 
 if TYPE_CHECKING:
     from impc.inverse.problem import Problem
@@ -146,8 +146,7 @@ def unidentified_metrics(problem: Problem, gain: Array, family: MetricFamily, z:
     """
     S, changes = family.metric(z), family.changes(z)
     found = evaluate(problem, gain, S)
-    scaled = scaled_changes(S, changes).reshape(len(changes), S.size)
-    seen = found.dS.reshape(len(found.residual), -1) @ scaled.T
+    seen = found.along_metric(S, changes)
     # Of the triangle: the left vectors of all samples would take memory in their square.
     _, values, rows = np.linalg.svd(np.linalg.qr(seen, mode="r"))
     size = float(np.linalg.norm(found.dK.reshape(len(found.residual), -1) @ np.ravel(gain)))
@@ -185,9 +184,7 @@ def _searched(problem: Problem, gain: Array, family: MetricFamily, z: Array) -> 
             last.clear()
             S = family.metric(z)
             found = evaluate(problem, gain, S)
-            scaled = scaled_changes(S, family.changes(z)).reshape(family.count, -1)
-            seen = found.dS.reshape(len(found.residual), -1) @ scaled.T
-            last[z.tobytes()] = found.residual, seen
+            last[z.tobytes()] = found.residual, found.along_metric(S, family.changes(z))
         return last[z.tobytes()]
 
     def residual(z: Array) -> Array:

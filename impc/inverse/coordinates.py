@@ -23,9 +23,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.arrays import Array
-from impc.control.closed_loop import simulate
 from impc.inverse.least_squares import Prior, Rows, minimise, triangular_rows
-from impc.inverse.problem import controller_for, recorded_size, scenarios
+from impc.inverse.problem import recorded_size, simulated
 from impc.inverse.residuals import evaluate, residual_or_reason, scaled_changes
 from impc.inverse.solution_set import floored_covariance, natural_coordinates
 
@@ -263,13 +262,10 @@ class Coordinates:
 
     def changes(self, here: Point, z: Array) -> tuple[Array, Array]:
         """Change of K (q, m, n), and of S scaled to trace m (q, m, m), with each of z (q,)."""
-        lower, metric = self._factor(z[self.ends[0] : self.ends[1]]), []
-        for row, column in list(zip(*self.tril, strict=True))[1:]:
-            change = np.outer(self.first[:, row], lower[:, column])
-            metric.append(change + change.T)
+        lower = self._factor(z[self.ends[0] : self.ends[1]])
         dK, dS = np.zeros((len(z), self.m, self.n)), np.zeros((len(z), self.m, self.m))
         dK[: self.ends[0]] = self.gains
-        dS[self.ends[0] : self.ends[1]] = np.array(metric).reshape(-1, self.m, self.m)
+        dS[self.ends[0] : self.ends[1]] = _factor_changes(self.first, lower)
         return dK, scaled_changes(here.S, dS)
 
     def _compress(self, found: Evaluation, dK: Array, dS: Array) -> Compressed:
@@ -281,7 +277,7 @@ class Coordinates:
         if self.m > 1:
             along += found.dS.reshape(-1, self.m**2) @ dS[shared].reshape(len(shared), -1).T
         rows, row = [], 0
-        sizes = [trial.outputs.size for trial in self.problem.recordings]
+        sizes = self.problem.trial_sizes
         if not self.problem.unknown_start:  # no column belongs to one trial: all are one block
             sizes = [sum(sizes)]
         for size in sizes:
@@ -346,7 +342,7 @@ class _Along:
         self.columns = np.eye(len(z) - self.last + self.first) if along is None else along
         self.shape = (space.trials, space.n) if self.last > self.first else (1, 0)
         self.begin = self.apart(z)
-        self.count = sum(trial.outputs.size for trial in space.problem.recordings)
+        self.count = sum(space.problem.trial_sizes)
         self.here = z
 
     def apart(self, z: Array) -> tuple[Array, Array]:
@@ -387,12 +383,17 @@ class _Along:
 
 def metric_directions(metric: Array) -> Array:
     """Directions (k, m, m) of a metric (m, m) but for its scale, in its own units."""
-    first = np.linalg.cholesky(metric)
+    first: Array = np.asarray(np.linalg.cholesky(metric), dtype=np.float64)
+    return _factor_changes(first, first)
+
+
+def _factor_changes(first: Array, lower: Array) -> Array:
+    """Change (k, m, m) of L F F'L' with each entry of F but the first, of L and of L F (m, m)."""
     found = []
-    for row, column in list(zip(*np.tril_indices(len(metric)), strict=True))[1:]:
-        change = np.outer(first[:, row], first[:, column])
+    for row, column in list(zip(*np.tril_indices(len(first)), strict=True))[1:]:
+        change = np.outer(first[:, row], lower[:, column])
         found.append(change + change.T)
-    return np.array(found).reshape(-1, *metric.shape)
+    return np.array(found).reshape(-1, *first.shape)
 
 
 def start_unit(problem: Problem, gain: Array) -> Array:
@@ -403,8 +404,7 @@ def start_unit(problem: Problem, gain: Array) -> Array:
     of the outputs.
     """
     plant = problem.plant
-    controller = controller_for(problem, gain, np.eye(plant.m))
-    runs = [simulate(controller, drive) for drive in scenarios(problem)]
+    runs = simulated(problem, gain, np.eye(plant.m))
     x = np.concatenate([run.x for run in runs])
     second = x.T @ x / len(x)
     complete = all(run.complete for run in runs)

@@ -62,10 +62,10 @@ def cross_checked(
             found = estimate_all(ground, list(found))
     checked = {}
     for name, first in found.items():
-        winner = _winner(first, found)
-        better = winner is not None and name != "inverse_mpc"
-        last = _searched_again(ground, first, winner) if winner is not None and better else first
-        winner = _winner(last, found)
+        last, winner = first, _winner(first, found)
+        if winner is not None and name != "inverse_mpc":
+            last = _searched_again(ground, first, winner)
+            winner = _winner(last, found)
         beaten = "" if winner is None else winner.method
         checked[name] = replace(last, fit=replace(last.fit, beaten=beaten))
     return ground, checked

@@ -8,13 +8,13 @@ weights of least condition number among all those with that gain are one semidef
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from impc.arrays import Array
 from impc.checking import checked, replace
-from impc.errors import InputError, SolverError, WeightsError
+from impc.errors import SolverError
 from impc.inverse.explaining_weights import weights_behind
 from impc.inverse.gain_search import GainFit, fit_gain, refine_gain
 from impc.inverse.inverse_lqr import inverse_lqr_gradient, inverse_lqr_lmi
@@ -23,9 +23,9 @@ from impc.inverse.nearest_regulator import (
     auxiliary_weights,
     definite,
 )
-from impc.inverse.problem import EXPLAINED, recorded_size, typical_output
+from impc.inverse.problem import EXPLAINED, recorded_size, typical_output, with_or_without_set
 from impc.inverse.proximal_search import ConditionedFit, Objective, Residual, conditioned_fit
-from impc.inverse.residuals import evaluate, verify_hard
+from impc.inverse.residuals import evaluate, keeps_hard
 from impc.inverse.starting_regulators import regulators
 from impc.model.riccati import solve_lqr
 from impc.model.weights import Weights
@@ -192,23 +192,6 @@ def infer_weights(problem: Problem, *, condition_weight: float | None = None) ->
     return Inference(start, inverse_mpc(problem, start.weights, condition_weight=condition_weight))
 
 
-T = TypeVar("T", "DirectFit", "ReducedFit")
-
-
-def _either(problem: Problem, fit: Callable[[Problem], T]) -> T:
-    """A fit without the terminal set, and where that does not explain one with it: the better."""
-    if problem.terminal_set is not None:
-        return fit(problem)
-    without = fit(replace(problem, terminal_set=False))
-    if without.explained:
-        return without
-    try:
-        within = fit(replace(problem, terminal_set=True))
-    except (InputError, SolverError, WeightsError):  # no controller with the set comes near
-        return without
-    return within if within.misfit < without.misfit else without
-
-
 @checked
 def starting_point(problem: Problem) -> Start:
     """Lines 1 to 8 of Table 3.1: a feedback gain, and the weights of a regulator like it.
@@ -285,7 +268,7 @@ def inverse_mpc(
     def fit(problem: Problem) -> DirectFit:
         return _conditioned(problem, start, weight, *settings)
 
-    return _either(problem, fit)
+    return with_or_without_set(problem, fit, lambda found: found.explained)
 
 
 def _conditioned(
@@ -364,32 +347,37 @@ def inverse_mpc_reduced(problem: Problem, *, condition_weight: float | None = No
     def fit(problem: Problem) -> ReducedFit:
         return _reduced(problem, condition_weight)
 
-    return _either(problem, fit)
+    return with_or_without_set(problem, fit, lambda found: found.explained)
 
 
 def _reduced(problem: Problem, condition_weight: float | None) -> ReducedFit:
     first = weights_behind(fit_gain(problem))
     if first.explained:
         return _with_gain(problem, first)
-    direct = inverse_mpc(
-        problem,
-        _most_promising(problem),
-        condition_weight=condition_weight,
-        max_iterations=_DETOUR,
-        explain=False,
-    )
+    try:
+        direct = inverse_mpc(
+            problem,
+            _most_promising(problem),
+            condition_weight=condition_weight,
+            max_iterations=_DETOUR,
+            explain=False,
+        )
+    except SolverError:  # the loop falls with every regulator that a search begins at
+        if first.equivalent is None:
+            raise
+        return _with_gain(problem, first)
     K, S = np.array(direct.solution.K), np.array(direct.solution.S)
     second = weights_behind(refine_gain(problem, K, S))
     best = min(first, second, key=lambda item: item.misfit)
     if best.misfit <= direct.misfit:
         return _with_gain(problem, best)
-    kept = all(run.complete for run in verify_hard(problem, direct.weights))
+    kept = keeps_hard(problem, direct.weights)
     return ReducedFit(first.gain, first.metrics, None, direct, False, first.reason, kept)
 
 
 def _with_gain(problem: Problem, found: WeightsBehind) -> ReducedFit:
     assert found.equivalent is not None  # its misfit is finite
-    kept = all(run.complete for run in verify_hard(problem, found.equivalent.weights))
+    kept = keeps_hard(problem, found.equivalent.weights)
     return ReducedFit(
         found.gain, found.metrics, found.equivalent, None, found.explained, found.reason, kept
     )

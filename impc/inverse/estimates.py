@@ -12,17 +12,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from impc.arrays import Array, Frozen, frozen
+from impc.arrays import Array, BoolArray, Frozen, frozen
 from impc.checking import replace
-from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
 from impc.control.simulation import Status as SampleStatus
 from impc.errors import SolverError, WeightsError
-from impc.inverse.problem import controller_for, misfit, recorded_size, scenarios
+from impc.inverse.problem import controller_for, misfit, recorded_size, simulated
 from impc.inverse.residuals import evaluate
 from impc.inverse.solution_set import natural_coordinates
 from impc.inverse.trial_span import trial_span
-from impc.model.riccati import is_stable
+from impc.model.riccati import stabilises
 from impc.model.weights import Weights
 
 if TYPE_CHECKING:
@@ -30,10 +29,13 @@ if TYPE_CHECKING:
     from impc.inverse.problem import Problem
 
 __all__ = [
+    "DETERMINED",
+    "ROUNDING",
     "Estimate",
     "Goodness",
     "Status",
     "decode_estimate",
+    "determined",
     "encode_estimate",
     "gain_rank",
     "goodness",
@@ -67,8 +69,10 @@ _MUCH, _MORE = 0.5, 1.05
 # Standard deviations of the first autocorrelation of white noise beyond which a residual is not
 # white, and its least size: that of noise after a filter on the way to a lower rate is 0.15.
 _WHITE, _LEAST = 3.0, 0.3
-# Of the largest singular value, and of the recorded outputs: less is not identified.
-_DETERMINED, _ROUNDING = 1e-6, 1e-10
+#: A direction whose singular value is below this, of the largest, is not determined at all.
+DETERMINED = 1e-6
+#: So is one along which a natural step changes the outputs by less than this share of them.
+ROUNDING = 1e-10
 
 _SENTENCES = {
     Status.EXPLAINED: "The weights reproduce the recordings to 1e-9 of them.",
@@ -283,8 +287,7 @@ def goodness(problem: Problem, gain: Array, metric: Array) -> tuple[float, Goodn
     InputError, SolverError
         As `controller_for`.
     """
-    controller = controller_for(problem, gain, metric)
-    runs = [simulate(controller, drive) for drive in scenarios(problem)]
+    runs = simulated(problem, gain, metric)
     status = np.concatenate([run.status for run in runs])
     softened = int(np.count_nonzero(status == SampleStatus.SOFTENED))
     rank = gain_rank(problem, gain, metric)
@@ -300,16 +303,21 @@ def gain_rank(problem: Problem, gain: Array, metric: Array) -> int:
     found = evaluate(problem, gain, metric)
     if found.reason:
         return 0
-    plant, count = problem.plant, len(found.residual)
-    stable = is_stable(plant.A - plant.B @ gain, discrete=True)
+    plant = problem.plant
+    stable = stabilises(plant, gain)
     T, G = natural_coordinates(plant, gain) if stable else (np.eye(plant.n), np.eye(plant.m))
-    on_gain = found.dK.reshape(count, -1) @ np.kron(G, np.linalg.inv(T).T)
-    beside = np.hstack([found.dS.reshape(count, -1), found.dparameters])
-    sizes = [trial.outputs.size for trial in problem.recordings]
-    left = trial_span(found.dx0, sizes, beside).without(on_gain)
-    values = np.linalg.svd(left, compute_uv=False)
-    least = max(_DETERMINED * values[0], _ROUNDING * recorded_size(problem))
-    return int(np.count_nonzero(values > least))
+    beside = np.hstack([found.dS.reshape(len(found.residual), -1), found.dparameters])
+    left = trial_span(found.dx0, problem.trial_sizes, beside).without(found.along_gain(T, G))
+    values: Array = np.asarray(np.linalg.svd(left, compute_uv=False), dtype=np.float64)
+    return int(np.count_nonzero(determined(problem, values)))
+
+
+def determined(problem: Problem, values: Array) -> BoolArray:
+    """Which falling singular values (k,) of the outputs' derivative are more than rounding (k,).
+
+    See docs/fitting.md.
+    """
+    return np.asarray(values > max(DETERMINED * values[0], ROUNDING * recorded_size(problem)))
 
 
 def _is_white(problem: Problem, runs: list[Simulation]) -> bool:

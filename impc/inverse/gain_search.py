@@ -30,7 +30,7 @@ from impc.inverse.prediction import correction
 from impc.inverse.problem import EXPLAINED, recorded_size
 from impc.inverse.residuals import misfit_or_reason
 from impc.inverse.starting_regulators import balanced_regulator, drawn_start, state_sizes
-from impc.model.riccati import is_stable
+from impc.model.riccati import stabilises
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -38,12 +38,14 @@ if TYPE_CHECKING:
     from impc.inverse.problem import Problem
     from impc.model.riccati import LqrSolution
 
-__all__ = ["GainFit", "fit_gain", "refine_gain"]
+__all__ = ["FEW", "GainFit", "fit_gain", "refine_gain"]
 
-# Numbers recorded up to which searches are made until three agree on the least misfit, to this
-# share of it; longer recordings are searched again, until two agree, where the simulation leaves
-# this much more than the prediction. Predictions this much worse than the best end there.
-_FEW, _AGREE, _SAME, _TWICE, _SUSPECT, _HOPELESS = 2000, 3, 1e-3, 2, 1.5, 30.0
+#: Numbers recorded up to which a search may be made many times.
+FEW = 2000
+# Few numbers are searched until three agree on the least misfit, to this share of it; longer
+# recordings are searched again, until two agree, where the simulation leaves this much more than
+# the prediction. Predictions this much worse than the best end there.
+_AGREE, _SAME, _TWICE, _SUSPECT, _HOPELESS = 3, 1e-3, 2, 1.5, 30.0
 # Of a handful of numbers more searches have to agree: three wrong ones did in 2 of 80 problems.
 _HANDFUL, _SURE = 200, 5
 # Errors of commands that the filter expects, in units of their size. At 10 all 67 sticks, and at 1
@@ -111,8 +113,8 @@ def fit_gain(problem: Problem) -> GainFit:
     SolverError
         When the recordings cannot be simulated from where any search begins.
     """
-    count = sum(trial.outputs.size for trial in problem.recordings)
-    few, wanted = count <= _FEW, _SURE if count <= _HANDFUL else _AGREE
+    count = sum(problem.trial_sizes)
+    few, wanted = count <= FEW, _SURE if count <= _HANDFUL else _AGREE
     found: list[GainFit] = []
     exact = pair_of_inactive_samples(problem)
     if exact is not None and not misfit_or_reason(problem, *exact)[1]:
@@ -237,7 +239,7 @@ def _simulated(problem: Problem, begin: LqrSolution, predicted: Point) -> GainFi
     share, reason = 1.0, ""
     for _ in range(_PREDICTED):
         gain = K + share * (predicted.K - K)
-        if is_stable(problem.plant.A - problem.plant.B @ gain, discrete=True):
+        if stabilises(problem.plant, gain):
             _, reason = misfit_or_reason(there, gain, predicted.S)
             if not reason:
                 return refine_gain(there, gain, predicted.S, prior=_WEAK)
@@ -259,22 +261,22 @@ def _predictions(problem: Problem, begin: LqrSolution, ratio: float) -> Coordina
 
 
 def _stop(problem: Problem, share: float, evaluations: int) -> Stop:
-    count = sum(trial.outputs.size for trial in problem.recordings)
+    count = sum(problem.trial_sizes)
     return Stop(share * count, (_ROUNDING * recorded_size(problem)) ** 2, evaluations)
 
 
 def _gain_fit(space: Coordinates, z: Array, evaluations: int) -> GainFit:
     found = space.unpack(z)
     problem = found.problem
-    stabilises = is_stable(problem.plant.A - problem.plant.B @ found.K, discrete=True)
+    stable = stabilises(problem.plant, found.K)
     misfit = float(np.linalg.norm(space.at(z).residual))
     return GainFit(
         frozen(found.K),
         frozen(found.S),
         problem,
         misfit,
-        bool(stabilises and misfit <= EXPLAINED * recorded_size(problem)),
-        stabilises,
+        bool(stable and misfit <= EXPLAINED * recorded_size(problem)),
+        stable,
         frozen(np.linalg.svd(space.without_nuisance(z), compute_uv=False)),
         evaluations,
     )

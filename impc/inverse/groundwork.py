@@ -40,7 +40,7 @@ from impc.inverse.noisy_fit import fit_controller, free_gain, noise_of
 from impc.inverse.problem import EXPLAINED, recorded_size
 from impc.inverse.solution_set import gain_fibre, natural_coordinates
 from impc.model.plant import change_coordinates
-from impc.model.riccati import is_stable, solve_lqr
+from impc.model.riccati import solve_lqr, stabilises
 from impc.model.weights import Weights
 
 if TYPE_CHECKING:
@@ -220,9 +220,12 @@ class NaturalUnits:
     def feedback(self) -> GainFit:
         """The best gain without bounds (3.12).
 
-        Searched again from where it ends: the prior is about the start, which may be far.
+        Searched again from where it ends: the prior is about the start, which may be far. Without
+        bounds the best gain may be unstable, of a person who saturates; it has no coordinates.
         """
         first = free_gain(self.fitted.problem.without_bounds(), self.fitted.stage_weights)
+        if not stabilises(self.problem.plant, np.array(first.K)):
+            return first
         again = refine_gain(first.problem, np.array(first.K), np.array(first.S), prior=1.0)
         return replace(again, evaluations=first.evaluations + again.evaluations)
 
@@ -235,7 +238,7 @@ class NaturalUnits:
     def _coordinates(self) -> tuple[Plant, Array, Weights, Array, Array]:
         """Plant and feedback gain in natural coordinates, weights to start from, T and G."""
         plant, K = self.known.plant, np.array(self.feedback.K)
-        stable = is_stable(plant.A - plant.B @ K, discrete=True)
+        stable = stabilises(plant, K)
         T, G = natural_coordinates(plant, K if stable else self.starting_gain)
         natural = change_coordinates(plant, T, G)
         target, near = (

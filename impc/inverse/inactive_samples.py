@@ -36,7 +36,7 @@ _MOST, _MORE = 500, 3
 
 def pair_of_inactive_samples(problem: Problem) -> tuple[Array, Array] | None:
     """Gain (m, n) and metric (m, m) of exact recordings of all states; None of any others."""
-    states = recorded_states(problem)
+    states = recorded_states(problem.plant, problem.recordings)
     if states is None:
         return None
     gain = _regressed(problem, states)

@@ -19,7 +19,7 @@ from impc.errors import WeightsError
 from impc.inverse.cross_term import inverse_lqr_cross_term, lifted
 from impc.inverse.equivalent_weights import least_condition_weights, weights_margin
 from impc.inverse.solution_set import gain_fibre
-from impc.model.riccati import gain_gradients, is_stable, solve_lqr
+from impc.model.riccati import gain_gradients, solve_lqr, stabilises
 from impc.model.weights import Weights, condition_number, normalised
 
 if TYPE_CHECKING:
@@ -102,7 +102,7 @@ def inverse_lqr_lmi(plant: Plant, gain: ArrayLike) -> InverseLqr:
     (True, 1.0)
     """
     K = finite_array("gain", gain, (plant.m, plant.n))
-    if not is_stable(plant.A - plant.B @ K, discrete=plant.discrete):
+    if not stabilises(plant, K):
         return _no_weights("A - BK is not stable")
     fibre = gain_fibre(plant, K)
     margin = weights_margin(fibre)
@@ -233,7 +233,7 @@ class _FactorSpace(Frozen):
 
 
 def _default_start(plant: Plant, K: Array) -> Weights:
-    if not is_stable(plant.A - plant.B @ K, discrete=plant.discrete):
+    if not stabilises(plant, K):
         return Weights(np.eye(plant.n), np.eye(plant.m))
     found = inverse_lqr_cross_term(plant, K)
     # Q is often singular there. A lift of 1e-4 would undo the start on the seat plant, where the

@@ -206,12 +206,8 @@ def fit_person(
     first = [Point(np.array(found.gain), np.array(found.metric), problem)]
     starts: list[tuple[list[Point], Array | None]] = [(first, found.prices)]
     if found.prices is None:
-        starts.append(
-            (
-                [Point(np.array(one.K), np.array(one.S), problem) for one in regulators(problem)],
-                None,
-            )
-        )
+        begun_at = [Point(np.array(one.K), np.array(one.S), problem) for one in regulators(problem)]
+        starts.append((begun_at, None))
     elif observer.estimates:
         starts.append((first, np.array(found.prices) + _FAR))
     begun, reasons = [], []

@@ -116,7 +116,7 @@ def inverse_mpc_natural(
     residual = _residual(problem, T, G, noise)
     fits = np.linalg.norm(residual(solve_lqr(natural, best)).values) <= _FITS
     begin = best if fits else _away_from_the_edge(best, worst_start)
-    samples = sum(trial.outputs.size for trial in problem.recordings)
+    samples = sum(problem.trial_sizes)
     reference, evaluations, found = condition_number(best), 0, None
     for _ in range(_ROUNDS):
         objective = Objective(residual, 1.0, condition_share / samples / reference, squared=True)

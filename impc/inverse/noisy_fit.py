@@ -3,10 +3,11 @@
     gain with initial states and parameters  ->  weights with that gain, or the direct form (3.6)
 
 A gain that explains its recordings to 1e-9 has weights to find, and the reduced form finds them:
-one semidefinite program. With noise a fitted gain usually has none. Then the search begins at the
-weights whose gain is nearest as the recordings see it, |J (K(Q, R) - K)|^2 with J the derivative of
-the residual, which takes no simulation; the direct form in natural coordinates (`natural_search`)
-takes the weights that fit best (docs/fitting.md).
+one semidefinite program. With noise a fitted gain usually has none. Then the direct form in natural
+coordinates (`natural_search`) takes the weights that fit best. It begins at balanced weights, and
+where these leave more than noise does at those whose gain is nearest as the recordings see it,
+|J (K(Q, R) - K)|^2 with J the derivative of the residual, which takes no simulation
+(docs/fitting.md).
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from impc.inverse.coordinates import Coordinates
 from impc.inverse.equivalent_weights import least_condition_weights
 from impc.inverse.estimates import Estimate, Status, goodness
 from impc.inverse.explaining_weights import weights_behind
-from impc.inverse.gain_search import GainFit, fit_gain, refine_gain
+from impc.inverse.gain_search import FEW, GainFit, fit_gain, refine_gain
 from impc.inverse.initial_states import with_fitted_starts
 from impc.inverse.inverse_lqr import inverse_lqr_gradient
 from impc.inverse.natural_search import (
@@ -36,8 +37,8 @@ from impc.inverse.natural_search import (
     inverse_mpc_natural,
 )
 from impc.inverse.nearest_regulator import weights_near
-from impc.inverse.problem import EXPLAINED, misfit, recorded_size
-from impc.inverse.residuals import misfit_or_reason, verify_hard
+from impc.inverse.problem import EXPLAINED, misfit, recorded_size, with_or_without_set
+from impc.inverse.residuals import keeps_hard, misfit_or_reason, verify_hard
 from impc.inverse.solution_set import gain_fibre, natural_coordinates
 from impc.inverse.starting_regulators import regulators
 from impc.model.plant import change_coordinates
@@ -63,8 +64,6 @@ _RARE = 0.01
 _NEARLY = 1e-6
 # Misfits that differ by less, of themselves, are the same.
 _SAME = 1e-3
-# Numbers recorded that are many.
-_FEW = 2000
 # Regulators from which weights are looked for, at most.
 _BEGINNINGS = 3
 
@@ -89,17 +88,18 @@ def fit_controller(problem: Problem, start: Weights | None = None) -> Estimate:
     WeightsError, SolverError
         When no regulator can be simulated, or no weights can be found.
     """
-    if problem.terminal_set is not None:
-        return _fitted(problem, start)
-    without = _fitted(replace(problem, terminal_set=False), start)
-    if without.explained or not _set_may_matter(without):
-        return without
-    try:
-        within = _fitted(replace(problem, terminal_set=True), start)
-    except (WeightsError, SolverError, InputError):  # no controller with the set comes near
-        return without
-    kept = all(run.complete for run in verify_hard(within.problem, within.stage_weights))
-    return within if kept and within.misfit < without.misfit else without
+
+    def fit(posed: Problem) -> Estimate:
+        found = _fitted(posed, start)
+        tried = posed.terminal_set and problem.terminal_set is None
+        if tried and not keeps_hard(found.problem, found.stage_weights):
+            raise SolverError("terminal set", "is not kept", "leave it out")
+        return found
+
+    def settled(found: Estimate) -> bool:
+        return found.explained or not _set_may_matter(found)
+
+    return with_or_without_set(problem, fit, settled)
 
 
 def _set_may_matter(found: Estimate) -> bool:
@@ -109,7 +109,7 @@ def _set_may_matter(found: Estimate) -> bool:
     far longer: many samples have to speak for it at the controller found.
     """
     posed = replace(found.problem, terminal_set=True)
-    if sum(trial.outputs.size for trial in posed.recordings) > _FEW:
+    if sum(posed.trial_sizes) > FEW:
         left, reason = misfit_or_reason(posed, found.gain, found.metric)
         return not reason and left < found.misfit
     try:
@@ -180,7 +180,7 @@ def _unlikely(free: GainFit) -> float:
     plant, problem = free.problem.plant, free.problem
     unknowns = plant.m * plant.n + plant.m * (plant.m + 1) // 2 - 1 + len(problem.logarithms)
     unknowns += plant.n * len(problem.recordings) if problem.unknown_start else 0
-    samples = sum(trial.outputs.size for trial in problem.recordings)
+    samples = sum(problem.trial_sizes)
     return float(np.exp(scipy.special.chdtri(unknowns, _RARE) / (2 * samples)))
 
 
@@ -220,7 +220,7 @@ def _nearest(free: GainFit, regulator: LqrSolution) -> Weights:
     target = np.asarray(np.linalg.solve(G, free.K @ T))
     own = gain_fibre(natural, np.linalg.solve(G, regulator.K @ T), G.T @ regulator.S @ G)
     begin = best_conditioned(own, in_natural_units(regulator.weights, T, G))
-    samples = sum(trial.outputs.size for trial in problem.recordings)
+    samples = sum(problem.trial_sizes)
     share = CONDITION_SHARE / samples / condition_number(begin)
     return in_plant_units(weights_near(natural, form, target, begin, share).weights, T, G)
 

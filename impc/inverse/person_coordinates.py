@@ -23,7 +23,7 @@ from impc.inverse.structured_search import PriceCoordinates
 from impc.model.bounds import bound_rows
 from impc.model.observer import LEVELS
 from impc.model.plant_family import plant_differential
-from impc.model.riccati import is_stable, lyapunov_series
+from impc.model.riccati import is_stable, lyapunov_series, stabilises
 
 if TYPE_CHECKING:
     from collections.abc import Collection
@@ -254,7 +254,7 @@ class PersonCoordinates:
         here = person.point
         problem, plant = here.problem, here.problem.plant
         bounded = problem.terminal_set or len(bound_rows(problem.bounds, plant).b) > 0
-        if bounded and not is_stable(plant.A - plant.B @ here.K, discrete=True):
+        if bounded and not stabilises(plant, here.K):
             raise SolverError("gain", "does not stabilise the plant", "start elsewhere")
         controller = controller_for(problem, here.K, here.S)
         # The initial states of all trials have the same unit, so one law serves them all.

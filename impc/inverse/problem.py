@@ -11,21 +11,22 @@ at other values of these (docs/theory.md, section 6; docs/fitting.md).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar
 
 import numpy as np
 
 from impc.arrays import Array, finite_array, frozen
 from impc.checking import Value, checked, replace
+from impc.control.closed_loop import simulate
 from impc.control.controller import LONGEST_HORIZON, Controller
 from impc.control.named_solver import COMPILED, require_solver
 from impc.control.simulation import Scenario
-from impc.errors import DataError, InputError
+from impc.errors import DataError, InputError, SolverError, WeightsError
 from impc.model.bounds import Bounds
 from impc.model.plant_family import plant_at
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from numpy.typing import ArrayLike
 
@@ -45,7 +46,9 @@ __all__ = [
     "recorded_size",
     "recorded_states",
     "scenarios",
+    "simulated",
     "typical_output",
+    "with_or_without_set",
 ]
 
 #: Misfit, of the recorded outputs, up to which they are explained.
@@ -215,6 +218,11 @@ class Problem(Value):
         """Initial states of the trials, (trials, n)."""
         return frozen([trial.x0 for trial in self.recordings])
 
+    @property
+    def trial_sizes(self) -> list[int]:
+        """How many numbers were recorded in each trial."""
+        return [trial.outputs.size for trial in self.recordings]
+
 
 def _root_mean_square(recordings: Sequence[Recording]) -> Array:
     outputs = np.concatenate([trial.outputs for trial in recordings])
@@ -260,14 +268,13 @@ def recorded_size(problem: Problem) -> float:
     return float(np.linalg.norm(np.concatenate(parts)))
 
 
-def recorded_states(problem: Problem) -> list[Array] | None:
+def recorded_states(plant: Plant, recordings: Sequence[Recording]) -> list[Array] | None:
     """States (samples, n) of each trial, where the outputs determine them."""
-    C = problem.plant.C
+    C = plant.C
     if C.shape[0] != C.shape[1] or np.linalg.matrix_rank(C) < len(C):
         return None
     return [
-        np.asarray(np.linalg.solve(C, trial.outputs.T).T, dtype=np.float64)
-        for trial in problem.recordings
+        np.asarray(np.linalg.solve(C, trial.outputs.T).T, dtype=np.float64) for trial in recordings
     ]
 
 
@@ -276,22 +283,59 @@ def follows_plant(plant: Plant, recordings: Sequence[Recording]) -> bool:
 
     Where there are as many inputs as states they could do anything, and nothing says so.
     """
-    C, rank = plant.C, int(np.linalg.matrix_rank(plant.B))
-    if C.shape[0] != C.shape[1] or np.linalg.matrix_rank(C) < len(C) or rank == plant.n:
+    rank, states = int(np.linalg.matrix_rank(plant.B)), recorded_states(plant, recordings)
+    if states is None or rank == plant.n:
         return False
     left = np.linalg.svd(plant.B)[0][:, rank:]
     missed, size = 0.0, 0.0
-    for trial in recordings:
-        x = np.linalg.solve(C, trial.outputs.T).T
+    for x, trial in zip(states, recordings, strict=True):
         rest = x[1:] - x[:-1] @ plant.A.T - trial.disturbance[:-1] @ plant.E.T
         missed, size = missed + float(np.sum((rest @ left) ** 2)), size + float(np.sum(x**2))
     return missed <= _EXACT**2 * size
 
 
+class _Fitted(Protocol):
+    @property
+    def misfit(self) -> float: ...
+
+
+T = TypeVar("T", bound=_Fitted)
+
+
+def with_or_without_set(
+    problem: Problem, fit: Callable[[Problem], T], settled: Callable[[T], bool]
+) -> T:
+    """The better fit of a `problem` that leaves open whether there is a terminal set.
+
+    Without the set first; with it too where that is not `settled`.
+    """
+    if problem.terminal_set is not None:
+        return fit(problem)
+    without = fit(replace(problem, terminal_set=False))
+    if settled(without):
+        return without
+    try:
+        within = fit(replace(problem, terminal_set=True))
+    except (InputError, SolverError, WeightsError):  # no controller with the set comes near
+        return without
+    return within if within.misfit < without.misfit else without
+
+
 def typical_output(problem: Problem) -> float:
     """Root-mean-square of all recorded outputs over their scales: 1 at the default scales."""
-    count = sum(trial.outputs.size for trial in problem.recordings)
-    return recorded_size(problem) / float(np.sqrt(count)) or 1.0
+    return recorded_size(problem) / float(np.sqrt(sum(problem.trial_sizes))) or 1.0
+
+
+def simulated(problem: Problem, gain: Array, metric: Array) -> list[Simulation]:
+    """Every recording under the controller of a `gain` (m, n) and a `metric` (m, m).
+
+    Raises
+    ------
+    InputError, SolverError
+        As `controller_for`.
+    """
+    controller = controller_for(problem, gain, metric)
+    return [simulate(controller, drive) for drive in scenarios(problem)]
 
 
 def misfit(problem: Problem, simulations: list[Simulation]) -> float:

@@ -23,7 +23,7 @@ from impc.errors import ImpcError
 from impc.inverse.problem import controller_for, scenarios
 from impc.model.bounds import bound_rows
 from impc.model.plant_family import plant_differential
-from impc.model.riccati import is_stable
+from impc.model.riccati import stabilises
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -41,6 +41,7 @@ if TYPE_CHECKING:
 __all__ = [
     "Evaluation",
     "evaluate",
+    "keeps_hard",
     "misfit_or_reason",
     "residual_only",
     "residual_or_reason",
@@ -90,6 +91,15 @@ class Evaluation:
     active: int
     weakly_active: int
     terminal: TerminalSet | None
+
+    def along_gain(self, T: Array, G: Array) -> Array:
+        """Derivative (r, mn) along G^-1 K T, of natural coordinates T (n, n) and G (m, m)."""
+        return np.asarray(self.dK.reshape(len(self.residual), -1) @ np.kron(G, np.linalg.inv(T).T))
+
+    def along_metric(self, metric: Array, changes: Array) -> Array:
+        """Derivative (r, k) along `changes` (k, m, m) of the `metric` (m, m) in its own scale."""
+        scaled = scaled_changes(metric, changes).reshape(len(changes), metric.size)
+        return np.asarray(self.dS.reshape(len(self.residual), -1) @ scaled.T)
 
 
 def evaluate(
@@ -252,7 +262,7 @@ def _refused(problem: Problem, gain: Array, correction: Correction | None) -> st
     """
     plant = problem.plant
     bounded = problem.terminal_set or len(bound_rows(problem.bounds, plant).b) > 0
-    if correction is not None or not bounded or is_stable(plant.A - plant.B @ gain, discrete=True):
+    if correction is not None or not bounded or stabilises(plant, gain):
         return ""
     return "the gain does not stabilise the plant"
 
@@ -409,3 +419,8 @@ def verify_hard(problem: Problem, weights: Weights) -> list[Simulation]:
         solver=problem.solver,
     )
     return [simulate(controller, drive) for drive in scenarios(problem)]
+
+
+def keeps_hard(problem: Problem, weights: Weights) -> bool:
+    """Whether the controller of some weights keeps what the search had softened."""
+    return all(run.complete for run in verify_hard(problem, weights))

@@ -29,7 +29,7 @@ from impc.arrays import Array, Frozen, finite_array, frozen, symmetric_matrix
 from impc.checking import checked
 from impc.errors import InputError, WeightsError
 from impc.inverse.proximal_step import block_basis
-from impc.model.riccati import is_stable, lyapunov_series
+from impc.model.riccati import lyapunov_series, stabilises
 from impc.model.weights import Weights
 
 if TYPE_CHECKING:
@@ -142,7 +142,7 @@ def gain_fibre(
     2
     """
     K = finite_array("gain", gain, (plant.m, plant.n))
-    if not is_stable(plant.A - plant.B @ K, discrete=plant.discrete):
+    if not stabilises(plant, K):
         raise WeightsError("gain", "A - BK is not stable", "no weights have such a gain")
     T, G = natural_coordinates(plant, K)
     z, v = np.linalg.inv(T), np.linalg.inv(G)

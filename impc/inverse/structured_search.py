@@ -374,4 +374,4 @@ def _misfit(space: PriceCoordinates, z: Array) -> float:
 
 
 def _samples(problem: Problem) -> int:
-    return sum(trial.outputs.size for trial in problem.recordings)
+    return sum(problem.trial_sizes)

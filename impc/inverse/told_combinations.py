@@ -30,8 +30,8 @@ _NOTHING = 1e-8
 _ROUGH = 0.5  # of a logarithm: twice that is a factor of e
 _ROUND = 1e-3  # of an exponent: nearer to nothing, or to a multiple of a sixth, it is that
 _LARGEST = 4.0  # exponent of a scaling: larger ones are of tangents
-#: Factors at which a scaling has to hold.
-FACTORS = (1.2, 2.0)
+# Factors at which a scaling has to hold.
+_FACTORS = (1.2, 2.0)
 
 
 @dataclass(frozen=True)
@@ -184,7 +184,7 @@ def _is_scaling(
         return True
     if np.max(np.abs(row)) > _LARGEST or np.any(row[~positive]):
         return False
-    return all(holds(theta * factor**row) for factor in FACTORS)
+    return all(holds(theta * factor**row) for factor in _FACTORS)
 
 
 def _covariance(jacobian: Array, residual: Array, signals: IntArray, told: BoolArray) -> Array:

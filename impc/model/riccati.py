@@ -36,6 +36,7 @@ __all__ = [
     "metric_gradients",
     "regulator_changes",
     "solve_lqr",
+    "stabilises",
 ]
 
 
@@ -149,6 +150,11 @@ def is_stable(F: Array, *, discrete: bool) -> bool:
     if discrete:
         return bool(np.max(np.abs(eigenvalues)) < 1)
     return bool(np.max(eigenvalues.real) < 0)
+
+
+def stabilises(plant: Plant, gain: Array) -> bool:
+    """Whether the loop of u = -Kx is stable, K the `gain` (m, n): docs/theory.md, section 2."""
+    return is_stable(plant.A - plant.B @ gain, discrete=plant.discrete)
 
 
 def lyapunov_series(F: Array, right: Array) -> Array:

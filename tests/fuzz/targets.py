@@ -19,6 +19,7 @@ from impc.files.reading import recording_of
 from impc.files.table import make_table
 from impc.model.plant import Plant
 from tests.files.samples import csv_text, hdf5_mat, ods_file, pushed_seat, save_mat
+from tests.files.test_blocks import SHAPES
 from tests.fuzz.mutation import EDGES, mutated_bytes, mutated_text
 
 if TYPE_CHECKING:
@@ -161,6 +162,9 @@ def _sound_files(folder: Path) -> dict[str, list[bytes]]:
     found[".csv"].append(csv_text(columns, ";", ",").encode())
     ods_file(folder / "sound.ods", {"a": [list(columns), *zip(*columns.values(), strict=True)]})
     found[".ods"] = [(folder / "sound.ods").read_bytes()]
+    for suffix, lines in SHAPES.values():
+        text = "\n".join(lines).replace("tilt", "seat").replace("tap", "push")
+        found.setdefault(suffix, []).append(text.encode())
     path = folder / "sound.mat"
     more = {"c": np.array(["x", 1.0], dtype=object), "t": "text", "s": {"a": np.arange(60)}}
     found[".mat"] = []

@@ -76,6 +76,8 @@ def test_a_stick_that_falls_with_any_other_gain_has_its_weights() -> None:
     found = fit_controller(known.problem)
     assert is_right(known, found)
     assert np.allclose(found.gain, known.K, rtol=2e-3)
+    reduced = impc.inverse_mpc_reduced(known.problem)
+    assert np.allclose(reduced.gain.K, known.K, rtol=2e-3)
 
 
 @pytest.mark.parametrize("wanted", [20, pytest.param(200, marks=pytest.mark.slow)])

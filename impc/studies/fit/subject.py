@@ -36,14 +36,13 @@ from impc.assess.variance_accounted_for import agreement
 from impc.assess.weights_ranges import weights_summary_or_reason
 from impc.assess.weights_test import weights_test
 from impc.checking import checked, replace
-from impc.control.closed_loop import simulate
 from impc.errors import DataError, ImpcError, SolverError, WeightsError
 from impc.inverse.cross_check import cross_checked
 from impc.inverse.estimates import Estimate
 from impc.inverse.groundwork import NaturalUnits, Remember, afresh
 from impc.inverse.methods import estimate_all
 from impc.inverse.noisy_fit import fit_controller
-from impc.inverse.problem import Problem, controller_for, scenarios
+from impc.inverse.problem import Problem, simulated
 from impc.inverse.structured_fit import fit_structured
 from impc.studies.fit.asked import fit_bounds, fit_observer, fit_structures, moving_body
 from impc.studies.fit.result import LITTLE, FitResult, FittedParameter
@@ -484,8 +483,7 @@ def _terminal_set_difference(fitted: MethodFit) -> float:
     """Largest change of a scaled output where the terminal set is added, or taken away."""
     found = fitted.estimate
     problem = replace(found.problem, terminal_set=not found.problem.terminal_set)
-    controller = controller_for(problem, found.gain, found.metric)
-    pair = [fitted.runs, [simulate(controller, drive) for drive in scenarios(problem)]]
+    pair = [fitted.runs, simulated(problem, found.gain, found.metric)]
     if not all(run.complete for runs in pair for run in runs):
         return float("nan")
     return max(

@@ -215,7 +215,7 @@ def test_the_page_says_by_which_gain_to_go() -> None:
     assert report is not None
     assert report.fit is not None
     assert preferred(report)
-    assert verdict(result).endswith("Go by the gain of the person who senses with noise.")
+    assert verdict(result).endswith("go by the gain of that subject, in its section.")
     unsettled = replace(report.models[0], fit=replace(report.fit, converged=False))
     for first in (unsettled, replace(unsettled, fit=None)):
         other = replace(report, models=(first, *report.models[1:]))
