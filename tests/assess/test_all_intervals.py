@@ -39,6 +39,7 @@ def result() -> FitResult:
     return found
 
 
+@pytest.mark.full
 def test_every_interval_holds_the_truth(result: FitResult) -> None:
     """Seeds 11 and 12, chosen before the run; 95 % intervals of two entries and the limit."""
     truth = dict(zip(("K.force.x[0]", "K.force.x[1]"), true_controller().K[0], strict=True))
@@ -50,6 +51,7 @@ def test_every_interval_holds_the_truth(result: FitResult) -> None:
         assert item.value is not None
 
 
+@pytest.mark.full
 def test_the_set_of_weights_is_described(result: FitResult) -> None:
     found = result.certainty.weights
     assert found is not None
@@ -64,6 +66,7 @@ def test_the_set_of_weights_is_described(result: FitResult) -> None:
     assert len(found.statements) == 2
 
 
+@pytest.mark.full
 def test_the_limit_is_told_from_none_and_short_horizons_too(result: FitResult) -> None:
     """The truth has a limit of 1 and N = 10: no limit is ruled out, N = 20 is not told apart."""
     by_name = {item.name: item for item in result.certainty.alternatives}

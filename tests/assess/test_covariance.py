@@ -105,6 +105,7 @@ def test_deviations_where_a_parameter_is_fitted(m: int, seed: int) -> None:
     np.testing.assert_allclose(np.ravel(found.entries), deviations[: K.size], rtol=1e-4)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("seed", [52])
 def test_a_direction_that_is_told_is_told_where_others_are_not(seed: int) -> None:
     """A random plant on which the free gain wanders off, and takes its told directions along."""
@@ -133,12 +134,12 @@ def test_told_directions_count_what_is_not_told_to_second_order() -> None:
     assert np.all(found.deviations >= linear.deviations * (1 - 1e-9))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("inputs", "vaf", "count"),
     [
-        pytest.param(1, 70.0, 25, marks=pytest.mark.full),
-        pytest.param(2, 90.0, 4, marks=pytest.mark.long),
-        pytest.param(2, 90.0, 8, marks=pytest.mark.full),
+        (1, 70.0, 25),
+        (2, 90.0, 8),
     ],
 )
 def test_printed_intervals_hold_the_truth(inputs: int, vaf: float, count: int) -> None:

@@ -57,6 +57,7 @@ def test_who_cannot_estimate_has_a_reason() -> None:
     assert report.covariance is None
 
 
+@pytest.mark.full
 def test_a_structure_is_set_beside_any_gain() -> None:
     """Behind a delay: the same recordings, with fewer numbers and hardly less likelihood."""
     problem = late_problem(structure=Structure(late_body(), ["p", "v"]))

@@ -107,6 +107,7 @@ def test_a_level_that_may_be_none_is_told_on_one_side() -> None:
     assert 1e-4 < high < 10.0  # metres: closed above, whatever is not expected of it
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("seed", [0, 3])
 def test_a_sense_that_is_hardly_told_leaves_the_motor_noise_its_own(seed: int) -> None:
     """Without a prior of levels a sense slides to none here, and the motor noise takes its part."""

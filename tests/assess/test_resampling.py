@@ -85,6 +85,7 @@ def test_profile_agrees_with_the_sandwich(fitted: Estimate) -> None:
         assert found.low < found.value < found.high  # type: ignore[operator]
 
 
+@pytest.mark.full
 def test_plain_intervals_are_narrower_with_coloured_noise() -> None:
     trial = noisy_trial(SEED, 0.9)
     fit = fit_controller(fit_problem(cart(), [trial], FitSettings(horizon=10, u_max=1.0)))

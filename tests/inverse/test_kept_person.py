@@ -39,6 +39,7 @@ def prices() -> tuple[Estimate, Observer]:
     return fit_structured(problem, structure, estimate(problem)), person
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("make", [any_gain, gain_of_a_structure, prices])
 def test_it_is_the_one_that_was_fitted(make: object) -> None:
     assert callable(make)

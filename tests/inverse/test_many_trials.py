@@ -79,6 +79,7 @@ WORK: dict[str, Callable[[Problem], object]] = {
 }
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", WORK)
 def test_memory_grows_as_the_trials_do(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Thrice the trials: 3 times the memory; nine times when each had columns beside all others."""

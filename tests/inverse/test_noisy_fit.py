@@ -87,7 +87,8 @@ def test_inverse_mpc_against_inverse_lqr(clean: tuple[Workload, Estimate]) -> No
     assert mpc.fell == (None,) * 2
 
 
-@pytest.mark.parametrize("count", [1, pytest.param(3, marks=pytest.mark.full)])
+@pytest.mark.full
+@pytest.mark.parametrize("count", [1, 3])
 def test_noisy_subjects_reach_the_ceiling_within_their_deviations(count: int) -> None:
     """Seeds 0 to 2 at 6 Nm; `python -m experiments.simulated_subjects` has a hundred of each."""
     subjects = [simulated_subject(seed, 6.0) for seed in range(count)]

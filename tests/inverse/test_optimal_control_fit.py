@@ -88,6 +88,7 @@ TRUTH = {"drag": 0.3, "price": 5.0, "limit": 1.2}
 START = {"drag": 0.1, "price": 8.0, "limit": 1.0}
 
 
+@pytest.mark.full
 def test_several_recordings_of_both_kinds_with_missing_samples_and_disturbances() -> None:
     problem = point(disturbed=True)
     d = 0.5 * np.sin(np.arange(25.0))[:, None]

@@ -138,6 +138,7 @@ def test_a_structure_that_prices_every_state_keeps_no_gain_out() -> None:
     assert kept_to(late_problem(structure=shape, family=family)) is None
 
 
+@pytest.mark.full
 def test_a_person_is_searched_within_the_span() -> None:
     """Three numbers fewer, a gain that predicts, and derivatives that are those of differences."""
     problem = late_problem(structure=Structure(late_body(), ["p", "v"]))

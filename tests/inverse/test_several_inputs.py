@@ -99,7 +99,7 @@ def outcomes(
     return found
 
 
-@pytest.mark.parametrize("m", [2, 3])
+@pytest.mark.parametrize("m", [2, pytest.param(3, marks=pytest.mark.full)])
 @pytest.mark.parametrize("path", ["fit", "reduced"])
 def test_reported_weights_reproduce_the_recording(path: str, m: int) -> None:
     """At seeds 0 to 4 the weights missed it by 0.1 to 60 %, and were called exact."""
@@ -273,6 +273,7 @@ def test_weights_at_the_edge_of_those_that_a_program_finds() -> None:
     assert found.gain_error < 1e-8
 
 
+@pytest.mark.full
 def test_a_noisy_fit_stays_where_it_ended() -> None:
     """Begun at its own answer the gain moved by a fifth of its error along weak directions."""
     controller, clean = random_problem(1, 2)
@@ -304,7 +305,7 @@ def test_a_noisy_fit_stays_where_it_ended() -> None:
 
 
 @pytest.mark.parametrize(
-    "seed", [49, 82, *(pytest.param(seed, marks=pytest.mark.long) for seed in (89, 92))]
+    "seed", [49, *(pytest.param(seed, marks=pytest.mark.full) for seed in (82, 89, 92))]
 )
 def test_a_start_at_the_edge_of_what_weights_can_have(seed: int) -> None:
     """Two fits ended with an error of the start's program, two 4 and 7 % above the truth."""
@@ -315,7 +316,7 @@ def test_a_start_at_the_edge_of_what_weights_can_have(seed: int) -> None:
     ("m", "seed"),
     [
         (2, 76),
-        (2, 88),
+        pytest.param(2, 88, marks=pytest.mark.full),
         pytest.param(2, 59, marks=pytest.mark.full),
         pytest.param(3, 55, marks=pytest.mark.full),
         pytest.param(3, 24, marks=pytest.mark.slow),

@@ -21,6 +21,7 @@ def met() -> PersonFit:
     return fit_person(estimate(problem(0.7)), person())
 
 
+@pytest.mark.full
 def test_where_it_ends_the_score_is_what_it_is_on_average(met: PersonFit) -> None:
     """Along the gain, with the slope of the prior; fresh draws, within a third of a deviation."""
     found, reason = unbiased(met)

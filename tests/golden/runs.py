@@ -1,0 +1,215 @@
+"""Ten runs, most of them as their users type them, and the numbers at which they end.
+
+    python -m tests.golden.runs      runs all and writes golden.json again
+
+An identified number of an exact recording has to agree to 1e-6 of itself, one of a noisy recording
+to 1e-3 of its standard error; words have to be the same. Nothing is kept that another processor
+might settle differently: no sentences, no timings, no numbers that are chosen by convention only.
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+from click.testing import CliRunner
+
+import impc
+from experiments.peer_systems import SYSTEMS
+from impc.cli.main import main
+from tests.cli.test_plan import PLAN
+from tests.studies.cohort.carts import write_study
+from tests.studies.selection.test_methods import MINE, blood_study
+from tests.support import easier_seat, saturated_problem
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+__all__ = ["GOLDEN", "RUNS", "Numbers"]
+
+GOLDEN = Path(__file__).with_name("golden.json")
+_EXACT, _NOISY = 1e-6, 1e-3
+_CART = "tests.studies.cohort.carts:cart_plant"
+
+#: By name: a word, or a number or an array with the distance within which it has to be found.
+Numbers = dict[str, Any]
+
+
+def _within(value: Any, distance: Any) -> dict[str, Any]:
+    value = np.asarray(value, dtype=float)
+    return {"value": value.tolist(), "within": np.broadcast_to(distance, value.shape).tolist()}
+
+
+def _exact(value: Any) -> dict[str, Any]:
+    value = np.asarray(value, dtype=float)
+    return _within(value, _EXACT * np.max(np.abs(value)))
+
+
+def _typed(folder: Path, *arguments: str) -> dict[str, Any]:
+    """Run one command that writes to the folder `out`: its result.json."""
+    out = folder / "out"
+    done = CliRunner().invoke(main, [*arguments, "--out", str(out)])
+    assert done.exit_code == 0, done.output
+    content: dict[str, Any] = json.loads((out / "result.json").read_text(encoding="utf-8"))
+    return content
+
+
+def _fitted(found: dict[str, Any]) -> Numbers:
+    """What is identified in a fit of noisy recordings."""
+    estimate = found["estimate"]
+    return {
+        "gain": _within(found["K"], _NOISY * np.array(estimate["standard_errors"])),
+        "identified": [bool(one) for one in np.ravel(estimate["identified"])],
+        "directions": [bool(one) for one in estimate["identified_directions"]],
+        "rank": found["identifiability"]["rank"],
+        "usable": found["usable"],
+        "vaf": _within(list(found["vaf"].values()), 1e-3),
+        "weights rejected": found["weights_test"]["rejected"],
+    }
+
+
+def _example(folder: Path) -> Numbers:
+    methods = _typed(folder, "example", "--case", "A")["cases"]["A"]["methods"]
+    return {
+        f"{name} {key}": _exact(found[key])
+        for name, found in methods.items()
+        for key in ("Q", "K")
+        if key in found and (key == "K" or name.startswith("inverse_mpc"))
+    }
+
+
+def _seat(folder: Path, *more: str) -> Numbers:
+    made = CliRunner().invoke(main, [
+        "simulate", "seated-balance", "--out", str(folder), "--duration", "6", "--formats", "csv",
+        *more,
+    ])  # fmt: skip
+    assert made.exit_code == 0, made.output
+    settings = easier_seat((folder / "subject.toml").read_text(encoding="utf-8"))
+    settings = settings.replace("[fit]", "[fit]\nintent_draws = false\nheld_out = false")
+    (folder / "quick.toml").write_text(settings, encoding="utf-8")
+    trials = [str(folder / f"trial_{number}.csv") for number in (1, 2, 3)]
+    return _fitted(_typed(
+        folder, "fit", *trials, "--plant", "seated-balance", "--config", str(folder / "quick.toml")
+    ))  # fmt: skip
+
+
+def _seat_at_its_limit(folder: Path) -> Numbers:
+    return _seat(folder, "--amplitude", "7")
+
+
+def _two_inputs(_folder: Path) -> Numbers:
+    """An exact recording of three states and two commands that meet their limits at times."""
+    _, _, problem = saturated_problem(np.random.default_rng(7), 3, 2)
+    found = impc.estimate(problem)
+    return {"gain": _exact(found.gain), "status": found.status.value}
+
+
+def _cart(folder: Path) -> Numbers:
+    study = write_study(folder, 1)
+    settings = study.read_text(encoding="utf-8").partition("[recording]")
+    (folder / "cart.toml").write_text("".join(settings[1:]), encoding="utf-8")
+    return _fitted(_typed(
+        folder, "fit", str(folder / "sub-01/cart_1.csv"), "--config", str(folder / "cart.toml"),
+        "--plant", _CART,
+    ))  # fmt: skip
+
+
+def _arm(_folder: Path) -> Numbers:
+    """A demonstration of the robot arm, searched from parameters that are a tenth off."""
+    arm = SYSTEMS["robot arm"]()
+    plan = arm.problem.plan(arm.truth, arm.x0, mu=1e-12)
+    start = {name: value * (1.1 if index % 2 else 0.9) for index, (name, value) in
+             enumerate(arm.truth.items())}  # fmt: skip
+    trial = arm.problem.recorded_plan(plan.x, plan.u)
+    found = impc.fit_optimal_control(arm.problem, [trial], start)
+    combined = {
+        " ".join(f"{name}^{power:g}" for name, power in one.exponents.items()): one.value
+        for one in found.combinations.told
+    }
+    return {name: _within(value, 1e-5 * abs(value)) for name, value in combined.items()} | {
+        "settled": found.settled
+    }
+
+
+def _cohort(folder: Path) -> Numbers:
+    study = write_study(folder, 4, replicates=20)
+    _typed(folder, "cohort", str(study), "--workers", "1", "--plant", _CART)
+    units = pd.read_csv(folder / "out/units.csv").filter(regex=r"^K(_deviation)?\.")
+    replicates = pd.read_csv(folder / "out/replicates.csv").filter(regex=r"^K\.")
+    gains, deviations = np.split(units.to_numpy(), 2, axis=1)
+    return {
+        "gains": _within(gains, _NOISY * deviations),
+        "spread of the replicates": _within(replicates.std(), 0.01 * replicates.std()),
+    }
+
+
+def _plan(folder: Path) -> Numbers:
+    (folder / "plan.toml").write_text(PLAN, encoding="utf-8")
+    found = _typed(folder, "plan", str(folder / "plan.toml"), "--plant", "seated-balance")
+    table = pd.read_csv(folder / "out/experiments.csv")
+    deviations = [name for name in map(str, table.columns) if name.endswith("deviation")]
+    return {"best": found["best"], **{name: _exact(table[name]) for name in deviations}}
+
+
+def _reliability(folder: Path) -> Numbers:
+    made = CliRunner().invoke(main, [
+        "simulate", "reliability-study", "--out", str(folder), "--subjects", "5", "--visits", "2",
+        "--trials", "2",
+    ])  # fmt: skip
+    assert made.exit_code == 0, made.output
+    found = _typed(folder, "reliability", str(folder / "study.toml"))
+    numbers = {"anova": ("F", "p"), "icc": ("value", "low", "high", "sem")}
+    return {
+        f"{table} {measure}": _exact([[one[key] for key in keys] for one in conditions.values()])
+        for table, keys in numbers.items()
+        for measure, conditions in found[table].items()
+    }
+
+
+def _selection(folder: Path) -> Numbers:
+    study = blood_study(folder, 3, 1)
+    found = _typed(folder, "select", str(study), *MINE, "--workers", "1")
+    intervals = [
+        [one[end] for end in ("value", "low", "high")]
+        for subject in found["intervals"].values()
+        for one in subject.values()
+    ]
+    widths = np.ptp(intervals, axis=1, keepdims=True)
+    return {
+        "selected": found["selected"],
+        "common": found["common"],
+        "intervals": _within(intervals, _NOISY * widths),
+    }
+
+
+#: By name, in the order of the design.
+RUNS: dict[str, Callable[[Path], Numbers]] = {
+    "example": _example,
+    "seat": _seat,
+    "seat at its limit": _seat_at_its_limit,
+    "two inputs": _two_inputs,
+    "cart with noise": _cart,
+    "robot arm": _arm,
+    "cohort of four": _cohort,
+    "plan": _plan,
+    "reliability": _reliability,
+    "selection": _selection,
+}
+
+
+def main_of_all() -> None:
+    """Run all and write golden.json."""
+    found = {}
+    for name, run in RUNS.items():
+        with tempfile.TemporaryDirectory() as folder:
+            found[name] = run(Path(folder))
+        print(name, flush=True)
+    GOLDEN.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main_of_all()
