@@ -63,15 +63,7 @@ class Frozen:
 def frozen(values: ArrayLike) -> Array:
     """Return a read-only float64 copy, so that a frozen dataclass is frozen to the last entry.
 
-    Parameters
-    ----------
-    values : array_like
-        Numbers, of any shape.
-
-    Returns
-    -------
-    Array
-        Of the same shape.
+    `values` any shape; returns same shape.
     """
     array = np.array(values, dtype=np.float64)
     array.flags.writeable = False
@@ -81,17 +73,7 @@ def frozen(values: ArrayLike) -> Array:
 def percentiles(drawn: ArrayLike, level: float) -> tuple[Array, Array]:
     """Ends of the interval that holds the share `level` of draws.
 
-    Parameters
-    ----------
-    drawn : array_like
-        One draw after the other, each of any shape.
-    level : float
-        Between 0 and 1.
-
-    Returns
-    -------
-    low, high : Array
-        Of the same shape as a draw.
+    `drawn` any shape; returns same shape.
     """
     values = np.asarray(drawn, dtype=np.float64)
     low, high = np.quantile(values, [0.5 - level / 2, 0.5 + level / 2], axis=0)
@@ -104,22 +86,7 @@ def as_numbers(name: str, values: ArrayLike) -> Array:
     Lists, tuples, arrays of whole or real numbers, pandas' series and frames. Text, complex
     numbers and dates are not numbers, although numpy converts some of them.
 
-    Parameters
-    ----------
-    name : str
-        Name of the argument, for the message.
-    values : array_like
-        Of any shape.
-
-    Returns
-    -------
-    Array
-        Of the same shape.
-
-    Raises
-    ------
-    DataError
-        When the values are not real numbers, or have rows of different lengths.
+    `values` any shape; returns same shape.
     """
     if isinstance(values, np.ma.MaskedArray):
         if values.dtype.kind not in "biuf":
@@ -153,24 +120,7 @@ def _not_numbers(name: str, got: str) -> DataError:
 def finite_array(name: str, values: ArrayLike, shape: tuple[int | None, ...]) -> Array:
     """Convert to float64 and check the shape and that every entry is finite.
 
-    Parameters
-    ----------
-    name : str
-        Name of the argument, for the message.
-    values : array_like
-        What the caller gave, of any shape.
-    shape : tuple
-        Expected shape; ``None`` where any length will do.
-
-    Returns
-    -------
-    Array
-        Of that shape.
-
-    Raises
-    ------
-    DataError
-        When the values are not numbers, have another shape, or are not all finite.
+    `values` any shape; returns that shape.
     """
     array = with_shape(name, as_numbers(name, values), shape)
     require_finite(name, array)
@@ -180,24 +130,7 @@ def finite_array(name: str, values: ArrayLike, shape: tuple[int | None, ...]) ->
 def with_shape(name: str, array: Array, shape: tuple[int | None, ...]) -> Array:
     """Return the array when it has the shape.
 
-    Parameters
-    ----------
-    name : str
-        Name of the argument, for the message.
-    array : Array
-        Of any shape.
-    shape : tuple
-        Expected shape; ``None`` where any length will do.
-
-    Returns
-    -------
-    Array
-        Of that shape.
-
-    Raises
-    ------
-    DataError
-        When it has another.
+    `array` any shape; returns that shape.
     """
     wanted = "(" + ", ".join("any" if size is None else str(size) for size in shape) + ")"
 
@@ -215,17 +148,7 @@ def with_shape(name: str, array: Array, shape: tuple[int | None, ...]) -> Array:
 def require_finite(name: str, array: Array) -> None:
     """Require that every entry is finite.
 
-    Parameters
-    ----------
-    name : str
-        Name of the argument, for the message.
-    array : Array
-        Of any shape.
-
-    Raises
-    ------
-    DataError
-        With the number of those that are not, and where the first of them is.
+    `array` any shape.
     """
     if np.all(np.isfinite(array)):
         return
@@ -241,26 +164,7 @@ def require_finite(name: str, array: Array) -> None:
 def symmetric_matrix(name: str, values: ArrayLike, size: int | None = None) -> Array:
     """Convert to a square symmetric float64 matrix; asymmetry above 1e-9 relative is an error.
 
-    Parameters
-    ----------
-    name : str
-        Name of the argument, for the message.
-    values : array_like
-        (size, size), or a number for (1, 1).
-    size : int, optional
-        Expected number of rows; any by default.
-
-    Returns
-    -------
-    Array
-        (size, size).
-
-    Raises
-    ------
-    DataError
-        When the values are not a finite matrix of that size.
-    InputError
-        When the matrix is not symmetric.
+    Returns (size, size).
     """
     given = as_numbers(name, values)
     if given.ndim != 0 and (given.ndim != 2 or given.size == 0):

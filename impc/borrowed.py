@@ -23,13 +23,6 @@ def _borrowed(context: Any, value: Any) -> Any:
 
     Whoever has the arrays must keep them until the last use of what is borrowed: what a compiled
     function is given by its caller in Python is kept while it runs.
-
-    Parameters
-    ----------
-    context : Any
-        That of numba, which puts it there.
-    value : Buffer or tuple
-        What is no array in it stays as it is.
     """
 
     def generate(context: Any, builder: Any, signature: Any, given: Any) -> Any:

@@ -55,25 +55,7 @@ def checked(function: Callable[P, R], /) -> Callable[P, R]: ...
 @overload
 def checked(**rules: Rule) -> Callable[[Callable[P, R]], Callable[P, R]]: ...
 def checked(function: Any = None, /, **rules: Rule) -> Any:
-    """Check and convert every argument by its annotation and its rule, before the function runs.
-
-    Parameters
-    ----------
-    function : callable
-        Each annotation is one of the table's, or one of them ``| None``.
-    **rules : str, number or pair of numbers
-        See the module's text.
-
-    Returns
-    -------
-    callable
-        The same function; it costs some microseconds more.
-
-    Raises
-    ------
-    TypeError
-        At import, when an annotation is not in the table.
-    """
+    """Check and convert every argument by its annotation and its rule, before the function runs."""
     if function is None:
         return functools.partial(_checked, rules=rules)
     return _checked(function, {})
@@ -186,18 +168,6 @@ def replace(value: _V, **changes: Any) -> _V:
     """Return a dataclass with other fields, checked as when it was made.
 
     `dataclasses.replace` would call the constructor, which in a `Value` may take other things.
-
-    Parameters
-    ----------
-    value : dataclass
-        Any, frozen or not.
-    **changes : object
-        Fields by name.
-
-    Raises
-    ------
-    TypeError
-        When it has no such field.
     """
     if not isinstance(value, Value):
         return dataclasses.replace(value, **changes)  # type: ignore[type-var]

@@ -130,14 +130,7 @@ class DataError(InputError):
 
 
 class FallError(DataError):
-    """A recording in which the subject fell: other recordings of the subject may be used.
-
-    Examples
-    --------
-    >>> from impc.errors import FallError
-    >>> print(FallError("run-2.csv", "the subject fell at 5.14 s", "leave the trial out"))
-    run-2.csv: the subject fell at 5.14 s; leave the trial out
-    """
+    """A recording in which the subject fell: other recordings of the subject may be used."""
 
 
 class InfeasibleError(ImpcError):

@@ -25,20 +25,7 @@ EXTRAS = {
 
 
 def optional(library: str, subject: str) -> Any:
-    """The module of an optional library.
-
-    Parameters
-    ----------
-    library : str
-        One of `EXTRAS`.
-    subject : str
-        What needs it, for the message: a file, an option.
-
-    Raises
-    ------
-    ImpcError
-        When the library is not installed, with the command that installs it.
-    """
+    """The module of an optional library."""
     try:
         return importlib.import_module(library)
     except ImportError:

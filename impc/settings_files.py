@@ -26,13 +26,7 @@ IPOPT_ALONE: dict[str, Any] = {"print_level": 0, "sb": "yes", "option_file_name"
 
 
 def ignore_settings_files(*libraries: str) -> None:
-    """Import these `libraries`, whoever imports them first, as if their settings files were absent.
-
-    Parameters
-    ----------
-    *libraries : str
-        Names of packages, each "matplotlib" or "numba".
-    """
+    """Import these `libraries` as if their settings files were absent."""
     for library in libraries:
         if not any(isinstance(item, _Finder) and item.name == library for item in sys.meta_path):
             sys.meta_path.insert(0, _Finder(library))

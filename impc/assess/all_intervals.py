@@ -76,26 +76,14 @@ class Asked(Protocol):
 
 @dataclass(frozen=True)
 class Certainty:
-    """What is known beside the fit itself.
+    """What is known beside the fit itself."""
 
-    Attributes
-    ----------
-    intervals : tuple of Interval
-        By every method that was asked for; the sandwich's come first.
-    weights : WeightsSummary or None
-        The set of weights with the fitted gain; None when its programs fail.
-    weights_reason : str
-        Why there is none; empty otherwise.
-    limits : tuple of LimitEstimate
-        One an input, when asked for.
-    alternatives : tuple of Alternative
-        Other horizons and no limit, when horizons are given; the fit itself comes first.
-    """
-
-    intervals: tuple[Interval, ...]
+    intervals: tuple[Interval, ...]  # By every method that was asked for; the sandwich's come first
+    # The set of weights with the fitted gain; None when its programs fail
     weights: WeightsSummary | None
-    weights_reason: str
-    limits: tuple[LimitEstimate, ...]
+    weights_reason: str  # Why there is none; empty otherwise
+    limits: tuple[LimitEstimate, ...]  # One an input, when asked for
+    # Other horizons and no limit, when horizons are given; the fit itself comes first
     alternatives: tuple[Alternative, ...]
 
 
@@ -124,28 +112,7 @@ def assess(
 ) -> Certainty:
     """Run what the settings ask for.
 
-    Parameters
-    ----------
-    problem : Problem
-        As it was posed.
-    fitted : Estimate
-        Its fit.
-    estimate : GainEstimate
-        Of `gain_estimate`.
-    weights : tuple
-        Of `weights_summary_or_reason`.
-    settings : Asked
-    done : callable
-        Told each stage.
-    remember : callable
-        (name, compute) -> a replicate, from memory or computed now.
-    attempt : callable
-        (stage, compute, default) -> what the stage finds, or the default where it fails.
-
-    Raises
-    ------
-    InputError
-        When a profile names no number of this fit.
+    `remember` (name, compute); `attempt` (stage, compute, default).
     """
     intervals = [
         *covariance_intervals(estimate, estimate.covariance, "sandwich"),

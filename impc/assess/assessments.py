@@ -27,31 +27,16 @@ __all__ = ["ASSESSMENTS", "Assessment", "assessed"]
 
 @dataclass(frozen=True)
 class Assessment:
-    """One function of a method's estimate and its simulation of all trials (docs/results.md).
+    """One function of a method's estimate and its simulation of all trials (docs/results.md)."""
 
-    Attributes
-    ----------
-    name : str
-        In result.json and in the heads of CSV files.
-    label : str
-        Head of its column; `{}` stands for the signal's name and `{unit}` for its unit.
-    sentence : str
-        For readers who do not know it.
-    signals : callable
-        Plant -> names of what it has a number for, (k,): outputs, inputs, or `whole` for one number
-        of the method.
-    find : callable
-        MethodFit -> the numbers (k,); NaN where there is none.
-    digits : int
-        That are shown.
-    """
-
-    name: str
-    label: str
-    sentence: str
+    name: str  # In result.json and in the heads of CSV files
+    label: str  # Head of its column; `{}` stands for the signal's name and `{unit}` for its unit
+    sentence: str  # For readers who do not know it
+    # Plant -> names of what it has a number for, (k,): outputs, inputs, or `whole` for one number
+    # of the method
     signals: Callable[[Plant], tuple[str, ...]]
-    find: Callable[[MethodFit], Array]
-    digits: int = 3
+    find: Callable[[MethodFit], Array]  # MethodFit -> the numbers (k,); NaN where there is none
+    digits: int = 3  # That are shown
 
     def heads(self, plant: Plant) -> list[str]:
         """Heads of its columns in a table for readers."""

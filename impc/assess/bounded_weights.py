@@ -38,31 +38,17 @@ __all__ = ["WeightsSet", "weights_set"]
 
 @dataclass(frozen=True)
 class WeightsSet(Frozen):
-    """The set of the module's text, ready for programs over it.
-
-    Attributes
-    ----------
-    fibre : GainFibre
-    least : EquivalentWeights
-        The member of least condition number.
-    limit : float
-        Largest condition number in the set.
-    first, level : Array
-        blkdiag(Q, R) = first + sum_i y_i level_i spans the members: (n + m, n + m) and
-        (k, n + m, n + m), the levels orthonormal as seen from the analytic centre.
-    inverse : Array
-        L^-1 of that centre, (n + m, n + m).
-    reach : float
-        No member has a larger |y|.
-    """
+    """The set of the module's text, ready for programs over it."""
 
     fibre: GainFibre
-    least: EquivalentWeights
-    limit: float
+    least: EquivalentWeights  # The member of least condition number
+    limit: float  # Largest condition number in the set
+    # blkdiag(Q, R) = first + sum_i y_i level_i spans the members: (n + m, n + m) and (k, n + m, n +
+    # m), the levels orthonormal as seen from the analytic centre
     first: Array
     level: Array
-    inverse: Array
-    reach: float
+    inverse: Array  # L^-1 of that centre, (n + m, n + m)
+    reach: float  # No member has a larger |y|
 
     @cached_property
     def cones(self) -> list[Cone]:
@@ -88,13 +74,6 @@ def weights_set(fibre: GainFibre, ratio: float = 10.0, *, rough: bool = False) -
     """Prepare the set of weights with condition number up to `ratio` times the least.
 
     `rough` as in `least_condition_weights`.
-
-    Raises
-    ------
-    InputError
-        When the ratio is not above 1.
-    WeightsError, SolverError
-        As `least_condition_weights` and `analytic_centre`.
     """
     if not 1 < ratio < np.inf:
         raise InputError("ratio", f"got {ratio}", "give a number above 1")

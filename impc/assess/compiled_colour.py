@@ -17,17 +17,7 @@ __all__ = ["coloured_nearby"]
 def coloured_nearby(columns: Buffer, gammas: Buffer) -> Buffer:
     """sum_s Gamma_{t-s} columns_s, Gamma_{-l} = Gamma_l'.
 
-    Parameters
-    ----------
-    columns : Buffer
-        (samples, p, k).
-    gammas : Buffer
-        Gamma_l of the lags from 0 (lags, p, p).
-
-    Returns
-    -------
-    Buffer
-        (samples, p, k).
+    `columns` (samples, p, k); `gammas` (lags, p, p); returns (samples, p, k).
     """
     samples, outputs, count = columns.shape
     result = np.zeros((samples, outputs, count))

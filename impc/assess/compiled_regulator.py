@@ -18,14 +18,7 @@ def doubled_gain(A: Buffer, B: Buffer, Q: Buffer, R: Buffer, enough: float) -> t
 
     A singular matrix on the way is numpy's error.
 
-    Parameters
-    ----------
-    A, B : Buffer
-        Of the plant, (n, n) and (n, m).
-    Q, R : Buffer
-        Its weights, (n, n) and (m, m).
-    enough : float
-        Of the largest entry of P: what a step adds at most where this ends.
+    `A` (n, n); `B` (n, m); `Q` (n, n); `R` (m, m).
     """
     n = len(A)
     driven, unit, first = np.ascontiguousarray(B.T), np.eye(n), A

@@ -72,40 +72,25 @@ class GainCovariance(Frozen):
     Directions are of the gain in natural coordinates, G^-1 K T with x = T z and u = G v, row by row
     (`gain_fibre`): a step of 1 moves the command by one unit of the white input noise that T stands
     for. No optimal gain is far beyond 1 on this scale.
-
-    Attributes
-    ----------
-    T, G : Array
-        Natural coordinates of states (n, n) and inputs (m, m).
-    singular_values : Array
-        Of the scaled residual's derivative with respect to G^-1 K T, once everything else has taken
-        what it can; largest first (m * n,).
-    directions : Array
-        Right singular vectors, one a row (m * n, m * n).
-    deviations : Array
-        Standard deviation along each direction (m * n,); infinite below 1e-6 of the largest
-        singular value.
-    entries : Array
-        Standard deviation of each entry of K (m, n), in its unit; infinite when a direction
-        without a value takes part in it.
-    foreign : Array
-        What the directions that are not told could move each entry by, were they wrong by the
-        natural size of a gain, over its deviation by those that are (m, n).
-    parameters : Array
-        Standard deviation of the logarithm of each physical parameter (k,).
-    noise : ResidualNoise
-        The colour of the residuals.
     """
 
-    T: Array
+    T: Array  # Natural coordinates of states (n, n) and inputs (m, m)
     G: Array
+    # Of the scaled residual's derivative with respect to G^-1 K T, once everything else has taken
+    # what it can; largest first (m * n,)
     singular_values: Array
-    directions: Array
+    directions: Array  # Right singular vectors, one a row (m * n, m * n)
+    # Standard deviation along each direction (m * n,); infinite below 1e-6 of the largest singular
+    # value
     deviations: Array
+    # Standard deviation of each entry of K (m, n), in its unit; infinite when a direction without a
+    # value takes part in it
     entries: Array
+    # What the directions that are not told could move each entry by, were they wrong by the natural
+    # size of a gain, over its deviation by those that are (m, n)
     foreign: Array
-    parameters: Array
-    noise: ResidualNoise
+    parameters: Array  # Standard deviation of the logarithm of each physical parameter (k,)
+    noise: ResidualNoise  # The colour of the residuals
 
     def along(self, step: Array) -> Array:
         """A step of the gain (m, n) as steps along the directions (m * n,)."""
@@ -133,20 +118,7 @@ def gain_covariance(
 ) -> GainCovariance:
     """Covariance of a gain fitted by least squares, and of the parameters fitted with it.
 
-    Parameters
-    ----------
-    problem : Problem
-        At the initial states and the parameters that were found.
-    gain, metric : Array
-        K (m, n) and S (m, m) that were found.
-    noise : callable
-        How the noise is estimated from the residuals, (samples, p) for each trial, and what was
-        fitted to them: `residual_noise`, or `white_noise` for the plain Cramér-Rao bound.
-    curvature : bool
-        Whether the deviations of told directions count what those that are not told do to them to
-        second order, were these wrong by their deviation, or by the natural size of a gain.
-    evaluation : Evaluation, optional
-        Of the problem at this gain and metric, where it is known.
+    `gain` (m, n); `metric` (m, m); `noise` (samples, p).
     """
     m, n = problem.plant.m, problem.plant.n
     T, G = natural_coordinates(problem.plant, gain)

@@ -25,13 +25,7 @@ __all__ = ["ResidualDiagnostics", "residual_diagnostics", "residual_warnings"]
 
 @dataclass(frozen=True)
 class ResidualDiagnostics:
-    """Both tests; each None where there is nothing to test.
-
-    Attributes
-    ----------
-    loop : LoopNoise or None
-    structure : ResidualStructure or None
-    """
+    """Both tests; each None where there is nothing to test."""
 
     loop: LoopNoise | None
     structure: ResidualStructure | None
@@ -45,12 +39,7 @@ class ResidualDiagnostics:
 def residual_diagnostics(problem: Problem, gain: Array, metric: Array) -> ResidualDiagnostics:
     """Run both tests.
 
-    Parameters
-    ----------
-    problem : Problem
-        At the initial states and parameters of the fit.
-    gain, metric : Array
-        K (m, n) and S (m, m) of the fit.
+    `gain` (m, n); `metric` (m, m).
     """
     found = evaluate(problem, gain, metric)
     if found.reason:
@@ -69,17 +58,7 @@ def residual_diagnostics(problem: Problem, gain: Array, metric: Array) -> Residu
 def residual_warnings(
     found: ResidualDiagnostics, outputs: tuple[str, ...], saturated: float
 ) -> tuple[str, ...]:
-    """What to tell first: one sentence or two for each test that is positive.
-
-    Parameters
-    ----------
-    found : ResidualDiagnostics
-    outputs : tuple of str
-        Their names.
-    saturated : float
-        Share of samples at which the command stands on its bound. With saturation noise inside the
-        loop leads.
-    """
+    """What to tell first: one sentence or two for each test that is positive."""
     told = []
     if found.loop is not None and found.loop.found:
         told.append(_loop_sentence(found.loop, outputs, saturated))

@@ -36,19 +36,11 @@ _SHARES = np.linspace(0.0, 1.0, 11)
 
 @dataclass(frozen=True)
 class EigenvalueRange:
-    """Least and largest value of one eigenvalue that a member is known to have.
+    """Least and largest value of one eigenvalue that a member is known to have."""
 
-    Attributes
-    ----------
-    low, high : float
-        At the scale of the set, trace R = m.
-    low_proved, high_proved : bool
-        Whether no member goes beyond; otherwise one may.
-    """
-
-    low: float
+    low: float  # At the scale of the set, trace R = m
     high: float
-    low_proved: bool
+    low_proved: bool  # Whether no member goes beyond; otherwise one may
     high_proved: bool
 
 
@@ -57,18 +49,7 @@ def eigenvalue_ranges(
 ) -> tuple[EigenvalueRange, ...]:
     """Range of every eigenvalue of Q, ascending as `numpy.linalg.eigvalsh` gives them.
 
-    Parameters
-    ----------
-    found : WeightsSet
-    members : sequence of Array
-        blkdiag(Q, R), (n + m, n + m), of members known already, at the scale of the set (trace
-        R = m): where the searches begin. By default the ends along the eigenvectors of the
-        centre's Q.
-
-    Raises
-    ------
-    SolverError
-        When a program returns no finite point.
+    `members` (n + m, n + m).
     """
     n, m = found.fibre.plant.n, found.fibre.plant.m
     centre = found.least.weights.block

@@ -46,39 +46,15 @@ _UNSEEN = 1e-12
 
 @dataclass(frozen=True)
 class Expectation(Frozen):
-    """What the recordings of a problem would tell.
+    """What the recordings of a problem would tell."""
 
-    Attributes
-    ----------
-    prices : PriceCovariance
-        Of the unknowns of the structure, to first order.
-    intervals : tuple of PriceInterval
-        Of each unknown, by its profile; by its deviation where products of features have prices.
-    gain : GainCovariance
-        Of a gain that is fitted without a structure, to second order as a fit prints it.
-    limits : Array
-        Standard deviation of the logarithm of the limit of each input (m,), with a free gain;
-        infinite where it is never met, or the input has none.
-
-    Examples
-    --------
-    A regulator that is never at its limit tells nothing of it.
-
-    >>> import control
-    >>> import numpy as np
-    >>> import impc
-    >>> plant = impc.Plant(control.ss([[0.9]], [[1]], [[1]], 0, 1))
-    >>> bounds, structure = impc.Bounds(plant, u_max=9), impc.Structure(plant, "diagonal")
-    >>> law = impc.Controller(plant, structure.weights([0.0]), bounds, horizon=3)
-    >>> trial = impc.Recording(plant, law.simulate([1.0], steps=30).x)
-    >>> problem = impc.Problem(plant, bounds, 3, [trial], structure=structure)
-    >>> impc.expected_intervals(problem, [0.0], 0.01).limits
-    array([inf])
-    """
-
-    prices: PriceCovariance
+    prices: PriceCovariance  # Of the unknowns of the structure, to first order
+    # Of each unknown, by its profile; by its deviation where products of features have prices
     intervals: tuple[PriceInterval, ...]
+    # Of a gain that is fitted without a structure, to second order as a fit prints it
     gain: GainCovariance
+    # Standard deviation of the logarithm of the limit of each input (m,), with a free gain;
+    # infinite where it is never met, or the input has none
     limits: Array
 
     @property

@@ -51,21 +51,11 @@ _GAP, _CLOSE = 1e-10, 1e-11
 
 @dataclass(frozen=True)
 class End:
-    """The member at which a program ends, its value, and what no member goes beyond.
+    """The member at which a program ends, its value, and what no member goes beyond."""
 
-    Attributes
-    ----------
-    value : float
-        Of the function at the member.
-    weights : Weights
-        The member, at trace R = m.
-    prove : callable
-        Computes `bound`.
-    """
-
-    value: float
-    weights: Weights
-    prove: Callable[[], float]
+    value: float  # Of the function at the member
+    weights: Weights  # The member, at trace R = m
+    prove: Callable[[], float]  # Computes `bound`
 
     @cached_property
     def bound(self) -> float:
@@ -75,12 +65,7 @@ class End:
 
 @dataclass(frozen=True)
 class Range:
-    """Least and largest value of a linear function over the set, each with a member that has it.
-
-    Attributes
-    ----------
-    least, most : End
-    """
+    """Least and largest value of a linear function over the set, each with a member that has it."""
 
     least: End
     most: End
@@ -102,18 +87,7 @@ def linear_ranges(
 ) -> tuple[Range, ...]:
     """Range over the set of each trace(direction blkdiag(Q, R)).
 
-    Parameters
-    ----------
-    found : WeightsSet
-    directions : Array
-        Symmetric (k, n + m, n + m).
-    tolerance : float
-        Clarabel's, of the gap to what no member goes beyond, for a function of size one.
-
-    Raises
-    ------
-    SolverError
-        When a program returns no finite point.
+    `directions` (k, n + m, n + m).
     """
     ends = _minima(found, np.concatenate([directions, -directions]), tolerance)
     half = len(directions)
@@ -129,11 +103,6 @@ def linear_maxima(
     """Largest value over the set of each trace(direction blkdiag(Q, R)).
 
     `directions` (k, n + m, n + m) and `tolerance` as in `linear_ranges`.
-
-    Raises
-    ------
-    SolverError
-        When a program returns no finite point.
     """
     return tuple(_negative(end) for end in _minima(found, -directions, tolerance))
 
@@ -162,13 +131,7 @@ def trace_range(found: WeightsSet, scaling: Array) -> Range:
 
 @checked(scaling="n")
 def nearest_diagonal(found: WeightsSet, scaling: Array) -> End:
-    """Member whose D Q D, D = diag(scaling) (n,), has the least off-diagonal part (Frobenius).
-
-    Raises
-    ------
-    SolverError
-        When the program returns no finite point.
-    """
+    """Member whose D Q D, D = diag(scaling) (n,), has the least off-diagonal part (Frobenius)."""
     n = found.fibre.plant.n
     rows, columns = np.tril_indices(n, -1)
     size = np.sqrt(2.0) * np.outer(scaling, scaling)[rows, columns]
@@ -199,13 +162,7 @@ def nearest_diagonal(found: WeightsSet, scaling: Array) -> End:
 
 @checked
 def extreme_eigenvalue(found: WeightsSet, *, largest: bool) -> End:
-    """Least largest eigenvalue of Q over the set, or its largest least one.
-
-    Raises
-    ------
-    SolverError
-        When the program returns no finite point.
-    """
+    """Least largest eigenvalue of Q over the set, or its largest least one."""
     n, count, sign = found.fibre.plant.n, len(found.level), 1.0 if largest else -1.0
     least = found.least.weights.Q * (found.fibre.plant.m / np.trace(found.least.weights.R))
     unit = float(np.linalg.eigvalsh(least)[-1 if largest else 0])

@@ -25,39 +25,18 @@ __all__ = ["HeldOut", "left_out_vaf", "predict"]
 
 @dataclass(frozen=True)
 class HeldOut(Frozen):
-    """One trial as the fit of the others predicts it.
+    """One trial as the fit of the others predicts it."""
 
-    Attributes
-    ----------
-    vaf : Array
-        (3.24) after the settling time, % (p,); NaN when the simulation does not reach the end.
-    centred_vaf : Array
-        The same with the means removed, % (p,).
-    gain_change : float
-        ||(K_others - K) T|| / ||K T||, T natural coordinates of the full fit.
-    """
-
+    # (3.24) after the settling time, % (p,); NaN when the simulation does not reach the end
     vaf: Array
-    centred_vaf: Array
-    gain_change: float
+    centred_vaf: Array  # The same with the means removed, % (p,)
+    gain_change: float  # ||(K_others - K) T|| / ||K T||, T natural coordinates of the full fit
 
 
 def predict(
     problem: Problem, other: Estimate, fitted: Estimate, index: int, settle: float
 ) -> HeldOut:
-    """Simulate a trial that a controller has not seen.
-
-    Parameters
-    ----------
-    problem : Problem
-        With all trials.
-    other, fitted : Estimate
-        Of the other trials, and of all.
-    index : int
-        Of the trial.
-    settle : float
-        Seconds that serve to find where it starts, and do not count.
-    """
+    """Simulate a trial that a controller has not seen."""
     each = left_out_vaf(other, problem.recordings[index], settle)
     T, _ = natural_coordinates(fitted.problem.plant, np.array(fitted.gain))
     change = np.linalg.norm((other.gain - fitted.gain) @ T) / np.linalg.norm(fitted.gain @ T)
@@ -67,18 +46,7 @@ def predict(
 def left_out_vaf(other: Estimate, trial: Recording, settle: float) -> tuple[Array, Array]:
     """VAF of a trial under the controller that was found without it.
 
-    Parameters
-    ----------
-    other : Estimate
-        Of the other trials.
-    trial : Recording
-    settle : float
-        Time at the start that does not count, s; an unknown initial state is fitted to it.
-
-    Returns
-    -------
-    vaf, centred : Array
-        `vaf` and `centred_vaf`, % (p,); NaN when the loop ends early.
+    Returns (p,).
     """
     gain, metric = np.array(other.gain), np.array(other.metric)
     alone = replace(other.problem.known(), recordings=(trial,))

@@ -25,24 +25,7 @@ def held_person(
     higher: a straight ridge may leave the gains that stabilise, and moves a level that is all but
     none by many powers of e.
 
-    Parameters
-    ----------
-    prior : Prior
-    here : Place
-    along : Array
-        A direction of the unknowns (q,), of length one.
-    off : float
-        How far from `here`.
-    unseen : Array
-        What is taken for the slope that scores do not have (q,), nats.
-    budget : int
-        Likelihoods with derivatives, about.
-
-    Returns
-    -------
-    place, unseen : Place, Array
-        Where the search ended, and what scores do not have there (q,); None where neither
-        start has a likelihood.
+    `along` (q,); `unseen` (q,); returns (q,).
     """
     _, curvature = prior.parabola(here, unseen)
     ridge = np.asarray(np.linalg.solve(curvature, along), dtype=np.float64)

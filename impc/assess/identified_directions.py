@@ -42,62 +42,28 @@ _DETERMINED = 1e-8
 
 @dataclass(frozen=True)
 class OtherWeights:
-    """Weights other than the reported ones, and the misfit of the same recordings with them.
-
-    Attributes
-    ----------
-    weights : Weights
-    condition : float
-        kappa(blkdiag(Q, R)).
-    misfit : float
-        2-norm of the output residual.
-    """
+    """Weights other than the reported ones, and the misfit of the same recordings with them."""
 
     weights: Weights
-    condition: float
-    misfit: float
+    condition: float  # kappa(blkdiag(Q, R))
+    misfit: float  # 2-norm of the output residual
 
 
 @dataclass(frozen=True)
 class Identifiability(Frozen):
-    """Result of `identifiability`.
+    """Result of `identifiability`."""
 
-    Attributes
-    ----------
-    singular_values : Array
-        Of the outputs' derivative with respect to relative changes of blkdiag(Q, R) (s,), largest
-        first. Relative: in the coordinates D of dX = L D L', X = L L'.
-    free : int
-        Directions of (Q, R), scale not counted.
-    rank : int
-        How many of them the recordings determine: singular values above 1e-8 of the largest, and
-        above 1e-10 of the recorded outputs.
-    chosen : int
-        How many the condition number chose: free - rank.
-    tolerance : float
-        That share of the largest.
-    others : tuple of OtherWeights
-        Other weights that explain the recordings equally well; empty where they cannot be found in
-        double precision.
-
-    Examples
-    --------
-    >>> import impc
-    >>> from plants import yalmip_example
-    >>> plant = impc.Plant(yalmip_example())
-    >>> bounds, weights = impc.Bounds(plant, u_min=-1, u_max=1), impc.Weights([[1, 0], [0, 1]], 1)
-    >>> truth = impc.Controller(plant, weights, bounds, horizon=3)
-    >>> trial = impc.Recording(plant, truth.simulate([1, 3], steps=20).x)
-    >>> told = impc.identifiability(impc.Problem(plant, bounds, 3, [trial]), weights)
-    >>> type(told).__name__, len(told.singular_values), len(told.others)
-    ('Identifiability', 4, 2)
-    """
-
+    # Of the outputs' derivative with respect to relative changes of blkdiag(Q, R) (s,), largest
+    # first. Relative: in the coordinates D of dX = L D L', X = L L'.
     singular_values: Array
-    free: int
+    free: int  # Directions of (Q, R), scale not counted
+    # How many of them the recordings determine: singular values above 1e-8 of the largest, and
+    # above 1e-10 of the recorded outputs
     rank: int
-    chosen: int
-    tolerance: float
+    chosen: int  # How many the condition number chose: free - rank
+    tolerance: float  # That share of the largest
+    # Other weights that explain the recordings equally well; empty where they cannot be found in
+    # double precision
     others: tuple[OtherWeights, ...]
 
 

@@ -59,53 +59,28 @@ _ROUNDS = 5
 
 @dataclass(frozen=True)
 class LimitEstimate(Frozen):
-    """What recordings say of the limit of one input.
+    """What recordings say of the limit of one input."""
 
-    Attributes
-    ----------
-    value : float or None
-        The limit that fits best; None when none is determined.
-    low, high : float
-        Interval of the given level; `high` is infinite when no limit is determined.
-    level : float
-        Between 0 and 1, 0.95 for 95 %.
-    against_none : float
-        D(inf): how much worse no limit explains the recordings; compare with the quantile.
-    quantile : float
-        Of chi-squared at that level.
-    reason : str
-        In words.
-    limits, distances : Array
-        Limits that were tried (t,), in the input's unit, and D at each (t,), for a picture.
-    """
-
-    value: float | None
-    low: float
+    value: float | None  # The limit that fits best; None when none is determined
+    low: float  # Interval of the given level; `high` is infinite when no limit is determined
     high: float
-    level: float
+    level: float  # Between 0 and 1, 0.95 for 95 %
+    # D(inf): how much worse no limit explains the recordings; compare with the quantile
     against_none: float
-    quantile: float
-    reason: str
+    quantile: float  # Of chi-squared at that level
+    reason: str  # In words
+    # Limits that were tried (t,), in the input's unit, and D at each (t,), for a picture
     limits: Array
     distances: Array
 
 
 @dataclass(frozen=True)
 class OtherLimit:
-    """A fit whose limit of the command was searched too.
+    """A fit whose limit of the command was searched too."""
 
-    Attributes
-    ----------
-    given : float
-        The limit as it was given, in the input's unit.
-    limit : LimitEstimate
-    fitted : Estimate
-        Inverse MPC at that limit.
-    """
-
-    given: float
+    given: float  # The limit as it was given, in the input's unit
     limit: LimitEstimate
-    fitted: Estimate
+    fitted: Estimate  # Inverse MPC at that limit
 
     @property
     def contradicted(self) -> bool:
@@ -114,20 +89,7 @@ class OtherLimit:
 
 
 def at_another_limit(fitted: Estimate, known: LimitEstimate | None = None) -> OtherLimit | None:
-    """The fit with the limit of its one input free; None without one, or where none is determined.
-
-    Parameters
-    ----------
-    fitted : Estimate
-        At the limit that was given.
-    known : LimitEstimate, optional
-        Of `input_limit`, where it has been estimated already.
-
-    Raises
-    ------
-    SolverError, WeightsError
-        As `input_limit` and `fit_controller`.
-    """
+    """The fit with the limit of its one input free; None where none is determined."""
     given = float(fitted.problem.bounds.u_max[0])
     if fitted.problem.plant.m > 1 or not np.isfinite(given):
         return None
@@ -140,15 +102,7 @@ def at_another_limit(fitted: Estimate, known: LimitEstimate | None = None) -> Ot
 
 
 def with_limit(problem: Problem, limit: float, control: int = 0) -> Problem:
-    """The problem with |u_control| <= limit, or without that bound for an infinite limit.
-
-    Parameters
-    ----------
-    limit : float
-        Positive, in the input's unit.
-    control : int
-        Index of the input.
-    """
+    """The problem with |u_control| <= limit, or without that bound for an infinite limit."""
     bounds = problem.bounds
     u_min, u_max = np.array(bounds.u_min), np.array(bounds.u_max)
     u_min[control], u_max[control] = -limit, limit
@@ -159,24 +113,7 @@ def with_limit(problem: Problem, limit: float, control: int = 0) -> Problem:
 
 
 def input_limit(fitted: Estimate, control: int = 0, *, level: float = 0.95) -> LimitEstimate:
-    """Fit the symmetric limit of one input; the others keep theirs.
-
-    Parameters
-    ----------
-    fitted : Estimate
-        From any limit, or none: its gain is where the searches start.
-    control : int
-        Index of the input.
-    level : float
-        Of the interval.
-
-    Raises
-    ------
-    InputError
-        When there is no such input.
-    SolverError
-        When the recordings cannot be simulated with any limit tried.
-    """
+    """Fit the symmetric limit of one input; the others keep theirs."""
     if not 0 <= control < fitted.problem.plant.m:
         raise InputError("control", f"got {control}", f"there are {fitted.problem.plant.m} inputs")
     search, best = _searched(fitted, control)
@@ -332,15 +269,7 @@ def _colour_factor(fit: GainFit, limit: float, control: int) -> float:
 def on_limit(problem: Problem, gain: Array, metric: Array, limit: float, control: int = 0) -> Array:
     """Derivative of the residual with respect to the symmetric limit of one input (r,).
 
-    Parameters
-    ----------
-    problem : Problem
-    gain, metric : Array
-        K (m, n) and S (m, m).
-    limit : float
-        Where the bounds of the input stand, in its unit.
-    control : int
-        Index of the input.
+    `gain` (m, n); `metric` (m, m).
     """
     controller = controller_for(problem, gain, metric)
     rows = bound_rows(controller.bounds, problem.plant)

@@ -68,43 +68,25 @@ _SHARPEST = 1e-6
 
 @dataclass(frozen=True)
 class PriceRange:
-    """Price of a typical excursion of a state, d^2 Q_ii at trace R = m.
+    """Price of a typical excursion of a state, d^2 Q_ii at trace R = m."""
 
-    Attributes
-    ----------
-    state : str
-        Its name.
-    low, high : float
-        Over all weights with the fitted gain, in the cost's unit.
-    low_drawn, high_drawn : float
-        Over all weights with any gain drawn: 95 %.
-    """
-
-    state: str
-    low: float
+    state: str  # Its name
+    low: float  # Over all weights with the fitted gain, in the cost's unit
     high: float
-    low_drawn: float
+    low_drawn: float  # Over all weights with any gain drawn: 95 %
     high_drawn: float
 
 
 @dataclass(frozen=True)
 class DrawnSet:
-    """The weights of a drawn gain, and what holds for all of them.
+    """The weights of a drawn gain, and what holds for all of them."""
 
-    Attributes
-    ----------
-    least : Weights or None
-        Those of least condition number; None where the programs fail: nothing is known of this
-        gain's weights.
-    prices : tuple of (float, float)
-        Least and largest price of a typical excursion of each state that was asked for.
-    agrees : tuple of bool
-        Whether each statement that was asked for says the same here.
-    """
-
+    # Those of least condition number; None where the programs fail: nothing is known of this gain's
+    # weights
     least: Weights | None
+    # Least and largest price of a typical excursion of each state that was asked for
     prices: tuple[tuple[float, float], ...]
-    agrees: tuple[bool, ...]
+    agrees: tuple[bool, ...]  # Whether each statement that was asked for says the same here
 
 
 def drawn_gains(
@@ -117,19 +99,7 @@ def drawn_gains(
 ) -> tuple[LqrSolution, ...]:
     """Regulators whose gains the recordings allow.
 
-    Parameters
-    ----------
-    plant : Plant
-    weights : Weights
-        Of the fit.
-    gain : Array
-        What the recordings tell of the gain (m, n), of `gain_estimate`.
-    covariance : GainCovariance
-        Of that estimate.
-    count : int
-        How many.
-    seed : int
-        All numbers drawn follow from it.
+    `gain` (m, n).
     """
     rng = np.random.default_rng(seed)
     n = plant.n
@@ -188,15 +158,7 @@ def _directions(
 def with_confidence(
     statements: tuple[Statement, ...], sets: tuple[DrawnSet, ...]
 ) -> tuple[Statement, ...]:
-    """Statements with the share of the drawn gains for which they hold as well.
-
-    Parameters
-    ----------
-    statements : tuple of Statement
-        Over the weights with the fitted gain; those that do not hold there are left as they are.
-    sets : tuple of DrawnSet
-        Of the drawn gains, asked for these statements.
-    """
+    """Statements with the share of the drawn gains for which they hold as well."""
     shares = np.mean([one.agrees for one in sets], axis=0)
     return tuple(
         item if item.holds is None else replace(item, confidence=float(share))
@@ -209,12 +171,7 @@ def prices_over_gains(
 ) -> tuple[PriceRange, ...]:
     """Prices of some states, over the weights of the fitted gain and of those drawn.
 
-    Parameters
-    ----------
-    own : mapping of str to (float, float)
-        Least and largest price of each state over the weights of the fitted gain.
-    sets : tuple of DrawnSet
-        Of the drawn gains, asked for these states.
+    `own` (float, float).
     """
     result = []
     for position, (name, (low, high)) in enumerate(own.items()):
@@ -235,23 +192,7 @@ def set_of_gain(
 ) -> DrawnSet:
     """What holds for all weights of a drawn gain.
 
-    Parameters
-    ----------
-    plant : Plant
-    solution : LqrSolution
-        Of `drawn_gains`.
-    metrics : Array
-        Basis of the metrics that the recordings do not tell apart (k, m, m), that of the fit first:
-        the drawn metric takes its place.
-    ratio : float
-        As in `weights_set`.
-    sizes : Array
-        Typical excursions of the states (n,), in their units.
-    states : tuple of str
-        Whose prices are asked for.
-    statements : tuple of Statement
-        Those that are tried, over the weights with the fitted gain; nothing is asked of one that
-        does not hold there.
+    `metrics` (k, m, m); `sizes` (n,).
     """
     tried = [item for item in statements if item.holds is not None]
     try:

@@ -37,30 +37,14 @@ _NAMED = 0.05
 
 @dataclass(frozen=True)
 class Reading(Frozen):
-    """The intent as one choice of weights shows it.
+    """The intent as one choice of weights shows it."""
 
-    Attributes
-    ----------
-    rule : str
-        How the weights were chosen among those with the gain.
-    weights : Weights
-        In plant units, scaled to R[0, 0] = 1.
-    condition : float
-        kappa(blkdiag(Q, R)) in plant units.
-    eigenvalues : Array
-        Of Q, ascending (n,).
-    vectors : Array
-        Eigenvectors, one a column (n, n); each with its largest entry positive.
-    angle : float
-        Between the dominant direction and that of the first reading, degrees.
-    """
-
-    rule: str
-    weights: Weights
-    condition: float
-    eigenvalues: Array
-    vectors: Array
-    angle: float
+    rule: str  # How the weights were chosen among those with the gain
+    weights: Weights  # In plant units, scaled to R[0, 0] = 1
+    condition: float  # kappa(blkdiag(Q, R)) in plant units
+    eigenvalues: Array  # Of Q, ascending (n,)
+    vectors: Array  # Eigenvectors, one a column (n, n); each with its largest entry positive
+    angle: float  # Between the dominant direction and that of the first reading, degrees
 
     @property
     def dominant(self) -> Array:
@@ -70,19 +54,11 @@ class Reading(Frozen):
 
 @dataclass(frozen=True)
 class Intent(Frozen):
-    """Readings of the intent behind one gain; the first is the dissertation's.
-
-    Attributes
-    ----------
-    readings : tuple of Reading
-    missing : tuple of str
-        Choices that could not be made, and why.
-    sizes : Array
-        Typical size of each state (n,): its root-mean-square in the recordings' simulation.
-    """
+    """Readings of the intent behind one gain; the first is the dissertation's."""
 
     readings: tuple[Reading, ...]
-    missing: tuple[str, ...]
+    missing: tuple[str, ...]  # Choices that could not be made, and why
+    # Typical size of each state (n,): its root-mean-square in the recordings' simulation
     sizes: Array
 
     @property
@@ -99,18 +75,7 @@ class Intent(Frozen):
 def intent(plant: Plant, gain: Array, metrics: Array, sizes: Array, fallback: Weights) -> Intent:
     """Read the intent from the weights that have a gain.
 
-    Parameters
-    ----------
-    plant : Plant
-    gain : Array
-        K (m, n).
-    metrics : Array
-        Basis of the metrics that the recordings do not tell apart (k, m, m), see `GainFit`.
-    sizes : Array
-        Typical size of each state (n,), positive, in its unit.
-    fallback : Weights
-        Weights known to have the gain: the first reading when the least condition number cannot
-        be certified.
+    `gain` (m, n); `metrics` (k, m, m); `sizes` (n,).
     """
     readings: list[Reading] = []
     missing: list[str] = []

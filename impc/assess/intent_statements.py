@@ -48,33 +48,19 @@ _AGREE = 38 / 39 - 1e-9
 
 @dataclass(frozen=True)
 class Statement:
-    """A statement about two states.
+    """A statement about two states."""
 
-    Attributes
-    ----------
-    first, second : str
-        Names of the states.
-    says : str
-        In words.
-    holds : bool or None
-        True or False for every member of the set; None when members disagree.
-    low, high : float
-        Range of the linear function whose sign decides, relative to the price of `first` in the
-        member of least condition number.
-    kind : str
-        "order" or "sense".
-    confidence : float or None
-        Share of the gains that the recordings allow for which it holds as well (`intent_draws`);
-        None when that was not looked into, or it does not hold at the fitted gain.
-    """
-
-    first: str
+    first: str  # Names of the states
     second: str
-    says: str
-    holds: bool | None
+    says: str  # In words
+    holds: bool | None  # True or False for every member of the set; None when members disagree
+    # Range of the linear function whose sign decides, relative to the price of `first` in the
+    # member of least condition number
     low: float
     high: float
-    kind: str
+    kind: str  # "order" or "sense"
+    # Share of the gains that the recordings allow for which it holds as well (`intent_draws`); None
+    # when that was not looked into, or it does not hold at the fitted gain
     confidence: float | None = None
 
     @property
@@ -86,13 +72,7 @@ class Statement:
 def price_direction(plant: Plant, sizes: Array, state: str) -> Array:
     """The linear function trace(. blkdiag(Q, R)) that is the price of a state (n + m, n + m).
 
-    Parameters
-    ----------
-    plant : Plant
-    sizes : Array
-        Typical excursion of every state (n,), in its unit.
-    state : str
-        Its name.
+    `sizes` (n,).
     """
     index = plant.states.index(state)
     direction = np.zeros((plant.n + plant.m, plant.n + plant.m))
@@ -105,12 +85,7 @@ def order_statements(
 ) -> tuple[Statement, ...]:
     """Whether the price of one state is above that of another, for every pair of the given ones.
 
-    Parameters
-    ----------
-    sizes : Array
-        Typical excursion of every state (n,), in its unit.
-    states : tuple of str
-        The states to compare; those of the plant's own that a reader can name.
+    `sizes` (n,).
     """
     names = found.fibre.plant.states
     pairs = list(itertools.combinations(states, 2))
@@ -135,14 +110,7 @@ def sense_statements(
 ) -> tuple[Statement, ...]:
     """Whether two states are priced together (Q_ij > 0: the same sign costs more).
 
-    Parameters
-    ----------
-    sizes : Array
-        Typical excursions d_i (n,), in the units of the states.
-    states : tuple of str
-        Names of those compared, in pairs.
-    ranges : mapping
-        Of `entry_ranges`, for these states at least.
+    `sizes` (n,).
     """
     names = found.fibre.plant.states
     statements = []

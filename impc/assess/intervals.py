@@ -33,34 +33,19 @@ PARAMETER = 0.5
 
 @dataclass(frozen=True)
 class Interval:
-    """One interval.
+    """One interval."""
 
-    Attributes
-    ----------
-    name : str
-        K.<control>.<state>, the name of a parameter, or u_max.<control>.
-    method : str
-        See the module's text.
-    level : float
-        Between 0 and 1, 0.95 for 95 %.
-    value : float or None
-        The estimate; None when nothing determines it.
-    low, high : float
-        Infinite where the recordings set no end.
-    told : bool
-        Whether this number is individually identified: an entry of the gain by `GainCovariance`, a
-        parameter when the standard error of its logarithm is below 0.5. Where it is not, a
-        covariance's interval is that of a plain least-squares estimate, while the value is kept
-        near where the search began: it covers the truth more often than its level. A bootstrap's
-        has no ends.
-    """
-
-    name: str
-    method: str
-    level: float
-    value: float | None
-    low: float
+    name: str  # K.<control>.<state>, the name of a parameter, or u_max.<control>
+    method: str  # See the module's text
+    level: float  # Between 0 and 1, 0.95 for 95 %
+    value: float | None  # The estimate; None when nothing determines it
+    low: float  # Infinite where the recordings set no end
     high: float
+    # Whether this number is individually identified: an entry of the gain by `GainCovariance`, a
+    # parameter when the standard error of its logarithm is below 0.5. Where it is not, a
+    # covariance's interval is that of a plain least-squares estimate, while the value is kept near
+    # where the search began: it covers the truth more often than its level. A bootstrap's has no
+    # ends.
     told: bool = True
 
     @property
@@ -77,18 +62,7 @@ def entry_names(plant: Plant) -> tuple[str, ...]:
 def covariance_intervals(
     estimate: GainEstimate, covariance: GainCovariance, method: str, level: float = LEVEL
 ) -> tuple[Interval, ...]:
-    """Normal intervals of the entries of K and of the parameters.
-
-    Parameters
-    ----------
-    estimate : GainEstimate
-    covariance : GainCovariance
-        Its own, for coloured residuals or for white ones.
-    method : str
-        Name of the covariance, for the record.
-    level : float
-        Of the interval, between 0 and 1.
-    """
+    """Normal intervals of the entries of K and of the parameters."""
     z = float(scipy.special.ndtri(0.5 + level / 2))
     names = entry_names(estimate.problem.plant)
     found = [

@@ -25,40 +25,21 @@ __all__ = ["MethodFit", "judge"]
 
 @dataclass(frozen=True)
 class MethodFit(Frozen):
-    """One method on all recordings.
+    """One method on all recordings."""
 
-    Attributes
-    ----------
-    estimate : Estimate
-        What it found; its problem has the bounds that the method knows.
-    bounds : Bounds
-        Those of the subject.
-    runs : tuple of Simulation
-        One a trial; empty without a gain.
-    vaf : Array
-        (3.24) over all trials, % (p,); NaN when a simulation does not reach the end.
-    trial_vaf : Array
-        (trials, p), the same for each.
-    held_out : Array
-        (trials, p), VAF of each trial predicted from the others; NaN where there is no gain or the
-        simulation ends early; (0, p) where none was left out, as `judge` has it.
-    largest_input : Array
-        Largest magnitude of each input (m,).
-    exceeded : float
-        Share of the samples that were reached at which an input bound is exceeded, by more than
-        1e-6 of it.
-    fell : tuple of float or None
-        For each trial the time in s at which the loop left every reasonable range.
-    """
-
-    estimate: Estimate
-    bounds: Bounds
-    runs: tuple[Simulation, ...]
-    vaf: Array
-    trial_vaf: Array
+    estimate: Estimate  # What it found; its problem has the bounds that the method knows
+    bounds: Bounds  # Those of the subject
+    runs: tuple[Simulation, ...]  # One a trial; empty without a gain
+    vaf: Array  # (3.24) over all trials, % (p,); NaN when a simulation does not reach the end
+    trial_vaf: Array  # (trials, p), the same for each
+    # (trials, p), VAF of each trial predicted from the others; NaN where there is no gain or the
+    # simulation ends early; (0, p) where none was left out, as `judge` has it
     held_out: Array
-    largest_input: Array
+    largest_input: Array  # Largest magnitude of each input (m,)
+    # Share of the samples that were reached at which an input bound is exceeded, by more than 1e-6
+    # of it
     exceeded: float
+    # For each trial the time in s at which the loop left every reasonable range
     fell: tuple[float | None, ...]
 
     @property
@@ -79,20 +60,7 @@ class MethodFit(Frozen):
 
 
 def judge(estimate: Estimate, bounds: Bounds) -> MethodFit:
-    """Simulate all recordings with what a method found.
-
-    Parameters
-    ----------
-    estimate : Estimate
-        What is judged.
-    bounds : Bounds
-        Those of the subject, which it may exceed.
-
-    Raises
-    ------
-    InputError, SolverError
-        As `controller_for`.
-    """
+    """Simulate all recordings with what a method found."""
     problem = estimate.problem
     if estimate.K is None:
         return _without_gain(estimate, bounds)

@@ -51,26 +51,15 @@ _PLACES, _AT_EACH, _LOST = 5, 10, 0.8
 
 
 class LikelyPerson(NamedTuple):
-    """Somebody who explains the recordings.
-
-    Attributes
-    ----------
-    fit : PersonFit
-    covariance : PersonCovariance
-        By the sandwich; zero of somebody who is at the end of an interval.
-    """
+    """Somebody who explains the recordings."""
 
     fit: PersonFit
+    # By the sandwich; zero of somebody who is at the end of an interval
     covariance: PersonCovariance
 
 
 def people_as_likely(fit: PersonFit) -> list[LikelyPerson]:
-    """The fit, the first, and people as likely: with one sense after the other exact, and far off.
-
-    Parameters
-    ----------
-    fit : PersonFit
-    """
+    """The fit, the first, and people as likely: with one sense exact, or far off."""
     prior, unseen = fit.prior, np.array(fit.unseen)
     found = [fit]
     for index in fit.space.senses:
@@ -124,33 +113,19 @@ def _farthest(fit: PersonFit, along: Array, step: float, least: float) -> Person
 
 
 def entry_intervals(people: Sequence[LikelyPerson]) -> Array:
-    """Intervals of 95 % of the entries of the gain (entries, 2), in their units.
-
-    Parameters
-    ----------
-    people : sequence of LikelyPerson
-    """
+    """Intervals of 95 % of the entries of the gain (entries, 2), in their units."""
     return _united([covariance.entry_intervals(one.K) for one, covariance in people])
 
 
 def level_intervals(people: Sequence[LikelyPerson]) -> Array:
-    """Intervals of 95 % of all levels (l, 2), in their units.
-
-    Parameters
-    ----------
-    people : sequence of LikelyPerson
-    """
+    """Intervals of 95 % of all levels (l, 2), in their units."""
     return _united([covariance.level_intervals(one.levels) for one, covariance in people])
 
 
 def direction_intervals(people: Sequence[LikelyPerson], ways: Array) -> Array:
     """Intervals of 95 % of combinations of the coordinates of gain or prices (k, 2).
 
-    Parameters
-    ----------
-    people : sequence of LikelyPerson
-    ways : Array
-        One a row (k, g).
+    `ways` (k, g).
     """
     found = []
     for one, covariance in people:

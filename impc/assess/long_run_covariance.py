@@ -53,18 +53,10 @@ _ROUNDS = 3
 
 @dataclass(frozen=True)
 class ResidualNoise(Frozen):
-    """A model of residuals.
+    """A model of residuals."""
 
-    Attributes
-    ----------
-    root : Array
-        a, one for each output (p,).
-    gammas : Array
-        Tapered autocovariances of eps, lags 0 to `bandwidth`, (lags, p, p).
-    """
-
-    root: Array
-    gammas: Array
+    root: Array  # a, one for each output (p,)
+    gammas: Array  # Tapered autocovariances of eps, lags 0 to `bandwidth`, (lags, p, p)
 
     @property
     def bandwidth(self) -> int:
@@ -75,12 +67,7 @@ class ResidualNoise(Frozen):
 def residual_noise(trials: list[Array], fitted: TrialSpan | None = None) -> ResidualNoise:
     """Estimate the colour of residuals.
 
-    Parameters
-    ----------
-    trials : list of Array
-        Residuals (samples, p) of each trial.
-    fitted : TrialSpan or None
-        What was fitted to them; None if nothing was.
+    `trials` (samples, p).
     """
     return _restored(_first_order, trials, fitted)
 
@@ -88,12 +75,7 @@ def residual_noise(trials: list[Array], fitted: TrialSpan | None = None) -> Resi
 def white_noise(trials: list[Array], fitted: TrialSpan | None = None) -> ResidualNoise:
     """As `residual_noise` if the residuals were white: outputs may be correlated, samples not.
 
-    Parameters
-    ----------
-    trials : list of Array
-        Residuals (samples, p) of each trial.
-    fitted : TrialSpan or None
-        What was fitted to them; None if nothing was.
+    `trials` (samples, p).
     """
     return _restored(_white, trials, fitted)
 
@@ -101,10 +83,7 @@ def white_noise(trials: list[Array], fitted: TrialSpan | None = None) -> Residua
 def spread_of_sum(noise: ResidualNoise, columns: list[Array]) -> Array:
     """Covariance of sum over trials and samples of columns_t' e_t, (k, k).
 
-    Parameters
-    ----------
-    columns : list of Array
-        (samples, p, k) for each trial.
+    `columns` (samples, p, k).
     """
     count = columns[0].shape[2]
     result = np.zeros((count, count))

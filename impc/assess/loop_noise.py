@@ -43,24 +43,12 @@ _LEVEL, _LEAST_SHARE = 0.99, 0.2
 
 @dataclass(frozen=True)
 class LoopNoise:
-    """How much of the residuals looks like noise inside the fitted loop.
+    """How much of the residuals looks like noise inside the fitted loop."""
 
-    Attributes
-    ----------
-    shares : Array
-        Share of each output's residual variance that is laid to the loop (p,), 0 to 1.
-    statistic : float
-        Twice the gain in log-likelihood.
-    threshold : float
-        What output noise exceeds in one of a hundred recordings.
-    root : float
-        Of the noise at the loop's input: 0 when it is white.
-    """
-
-    shares: Array
-    statistic: float
-    threshold: float
-    root: float
+    shares: Array  # Share of each output's residual variance that is laid to the loop (p,), 0 to 1
+    statistic: float  # Twice the gain in log-likelihood
+    threshold: float  # What output noise exceeds in one of a hundred recordings
+    root: float  # Of the noise at the loop's input: 0 when it is white
 
     @property
     def found(self) -> bool:
@@ -71,18 +59,7 @@ class LoopNoise:
 def loop_noise(plant: Plant, gain: Array, residuals: list[Array]) -> LoopNoise | None:
     """Compare the two models on the residuals of a fit.
 
-    Parameters
-    ----------
-    plant : Plant
-    gain : Array
-        K (m, n) of the fit; A - B K stable.
-    residuals : list of Array
-        Recorded minus simulated outputs (samples, p) of each trial, in the outputs' units.
-
-    Returns
-    -------
-    LoopNoise or None
-        None when a residual is zero throughout or trials are too short to have a spectrum.
+    `gain` (m, n); `residuals` (samples, p).
     """
     found = spectrum(residuals)
     if found is None:

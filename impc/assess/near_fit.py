@@ -36,12 +36,7 @@ _TRIES = 30
 
 
 class NearFit:
-    """The quadratic form near a fit.
-
-    Parameters
-    ----------
-    at : Tangent
-    """
+    """The quadratic form near a fit."""
 
     def __init__(self, at: Tangent) -> None:
         self.at = at
@@ -64,21 +59,7 @@ class NearFit:
     def least(self, z: Array, along: Array, aim: LqrSolution | None = None) -> tuple[float, Array]:
         """Least m^2 from z along columns, and the unknowns there.
 
-        Parameters
-        ----------
-        z : Array
-            Unknowns (count,); those at minus infinity stay there.
-        along : Array
-            Columns of those that move (moving, a), orthonormal.
-        aim : LqrSolution, optional
-            Its gain and metric explain the recordings, in the place of what was recorded.
-
-        Returns
-        -------
-        float
-            m^2.
-        Array
-            Unknowns (count,).
+        `z` (count,); `along` (moving, a); returns (count,).
         """
         moving = np.isfinite(z)
         offset, rest = self.inside, self.rest

@@ -44,30 +44,14 @@ _SAME, _RULED_OUT = 2.0, 10.0
 
 @dataclass(frozen=True)
 class Alternative:
-    """One way to fit the same recordings.
+    """One way to fit the same recordings."""
 
-    Attributes
-    ----------
-    name : str
-        "as fitted", "no limit" or "horizon N".
-    horizon : int
-        In samples.
-    misfit : float
-        2-norm of the residual; infinite when no controller was found.
-    aic : float
-        Above the least of all alternatives.
-    held_out : float
-        Mean VAF over outputs and trials left out, %; NaN with a single trial.
-    reason : str
-        Why there is no controller; empty otherwise.
-    """
-
-    name: str
-    horizon: int
-    misfit: float
-    aic: float
-    held_out: float
-    reason: str
+    name: str  # "as fitted", "no limit" or "horizon N"
+    horizon: int  # In samples
+    misfit: float  # 2-norm of the residual; infinite when no controller was found
+    aic: float  # Above the least of all alternatives
+    held_out: float  # Mean VAF over outputs and trials left out, %; NaN with a single trial
+    reason: str  # Why there is no controller; empty otherwise
 
 
 def fit_alternatives(
@@ -77,21 +61,7 @@ def fit_alternatives(
     settle: float,
     progress: Callable[[str], None] = lambda _: None,
 ) -> tuple[Alternative, ...]:
-    """Fit again without the limit, if there is one, and with each other horizon.
-
-    Parameters
-    ----------
-    problem : Problem
-        As it was posed.
-    fitted : Estimate
-        Its fit, from whose weights the others start.
-    horizons : sequence of int
-        In samples; that of the problem is passed over.
-    settle : float
-        Seconds at the start of a left-out trial that do not count.
-    progress : callable
-        Told the name of each alternative when it is done.
-    """
+    """Fit again without the limit, if there is one, and with each other horizon."""
     posed = [("as fitted", problem)]
     if np.any(np.isfinite(problem.bounds.u_max)):
         posed.append(("no limit", problem.without_bounds()))

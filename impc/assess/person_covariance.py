@@ -43,41 +43,20 @@ _STEP = 1e-4
 
 @dataclass(frozen=True)
 class PersonCovariance(Frozen):
-    """Covariance of what was searched.
+    """Covariance of what was searched."""
 
-    Attributes
-    ----------
-    kind : str
-        One of `KINDS`.
-    covariance : Array
-        Of the unknowns of the fit (q, q).
-    names : tuple of str
-        Of the levels (l,).
-    levels : Array
-        Standard deviations of the logarithms of the levels (l,).
-    entries : Array
-        Standard deviations of the entries of the gain (m, n), in their units.
-    directions : Array
-        Of the coordinates of gain or prices, one a row (g, g), the best told first.
-    deviations : Array
-        Standard deviation along each (g,).
-    """
-
-    kind: str
-    covariance: Array
-    names: tuple[str, ...]
-    levels: Array
-    entries: Array
-    directions: Array
-    deviations: Array
+    kind: str  # One of `KINDS`
+    covariance: Array  # Of the unknowns of the fit (q, q)
+    names: tuple[str, ...]  # Of the levels (l,)
+    levels: Array  # Standard deviations of the logarithms of the levels (l,)
+    entries: Array  # Standard deviations of the entries of the gain (m, n), in their units
+    directions: Array  # Of the coordinates of gain or prices, one a row (g, g), the best told first
+    deviations: Array  # Standard deviation along each (g,)
 
     def level_intervals(self, values: Array) -> Array:
         """Intervals of 95 % of the levels (l, 2), in their units.
 
-        Parameters
-        ----------
-        values : Array
-            The levels they are about (l,).
+        `values` (l,).
         """
         factors = np.exp(np.minimum(TWO_SIDED * self.levels, 700.0))  # still numbers
         return frozen(np.stack([values / factors, values * factors], axis=-1))
@@ -85,10 +64,7 @@ class PersonCovariance(Frozen):
     def entry_intervals(self, K: Array) -> Array:
         """Intervals of 95 % of the entries of a gain (entries, 2), in their units.
 
-        Parameters
-        ----------
-        K : Array
-            The gain they are about (m, n).
+        `K` (m, n).
         """
         about = TWO_SIDED * np.ravel(self.entries)[:, None] * [-1, 1]
         return frozen(np.ravel(K)[:, None] + about)
@@ -96,37 +72,16 @@ class PersonCovariance(Frozen):
 
 @dataclass(frozen=True)
 class Confusion(Frozen):
-    """The step of gain and levels together that the recordings tell least apart.
+    """The step of gain and levels together that the recordings tell least apart."""
 
-    Attributes
-    ----------
-    correlation : float
-        Largest correlation of a combination of gain coordinates with one of levels.
-    gain : Array
-        The step of the gain (m, n), one deviation long, in its units.
-    levels : Array
-        The logarithms of the levels that go with it (l,).
-    """
-
+    # Largest correlation of a combination of gain coordinates with one of levels
     correlation: float
-    gain: Array
-    levels: Array
+    gain: Array  # The step of the gain (m, n), one deviation long, in its units
+    levels: Array  # The logarithms of the levels that go with it (l,)
 
 
 def person_covariance(fit: PersonFit, kind: str = "sandwich") -> PersonCovariance:
-    """Covariance of a fit of `fit_person`.
-
-    Parameters
-    ----------
-    fit : PersonFit
-    kind : str
-        One of `KINDS`.
-
-    Raises
-    ------
-    InputError
-        When the kind is none of them.
-    """
+    """Covariance of a fit of `fit_person`."""
     if kind not in KINDS:
         raise InputError("kind", f"got {kind!r}", f"give one of {', '.join(KINDS)}")
     information = _observed(fit) if kind == "observed" else np.array(fit.told.information)

@@ -60,21 +60,11 @@ _LEAST_LAGS = 10
 
 @dataclass(frozen=True)
 class PersonModel:
-    """One model.
+    """One model."""
 
-    Attributes
-    ----------
-    name : str
-        In words.
-    fit : PersonFit or None
-        None where it has no likelihood.
-    reason : str
-        Why it has none.
-    """
-
-    name: str
-    fit: PersonFit | None
-    reason: str
+    name: str  # In words
+    fit: PersonFit | None  # None where it has no likelihood
+    reason: str  # Why it has none
 
 
 #: (name, problem, person, compute) -> the model: from memory, or computed now.
@@ -90,54 +80,32 @@ def afresh_person(
 
 @dataclass(frozen=True)
 class PersonReport(Frozen):
-    """What is said of a person who senses with noise.
+    """What is said of a person who senses with noise."""
 
-    Attributes
-    ----------
-    models : tuple of PersonModel
-        The first is the one that was asked for.
-    fit : PersonFit or None
-        That one, at a limit without the bias of its score (`unbiased`); None where it has no
-        likelihood.
-    biased : str
-        Why that bias was not taken away, or not wholly; empty where it was, or there is none.
-    moved : float
-        How far the gain is from the likeliest for that, along the direction where it is farthest,
-        in standard deviations.
-    covariance : PersonCovariance or None
-        Of `fit`, by the sandwich; None where it has no likelihood.
-    profiled : bool
-        Whether intervals follow the likelihood.
-    levels : Array
-        Intervals of 95 % of its levels (l, 2), in their units; where profiled, by profile for a
-        level that is weakly told, else of all people as likely.
-    entries : Array
-        The same of the entries of its gain (entries, 2), in their units; where profiled, all by
-        profile, and NaN where an entry is not told by itself.
-    confusion : Confusion or None
-        What of gain and noise is told least apart.
-    whiteness : Array
-        p-values that the innovations of each output are white (p,).
-    ahead : tuple of int
-        Samples ahead.
-    errors : Array
-        Root-mean-square errors of predictions so far ahead (k, p), in the outputs' units.
-    runaways : int
-        In how many of sixty simulated trials like the recorded ones the person runs away.
-    """
-
-    models: tuple[PersonModel, ...]
+    models: tuple[PersonModel, ...]  # The first is the one that was asked for
+    # That one, at a limit without the bias of its score (`unbiased`); None where it has no
+    # likelihood
     fit: PersonFit | None
+    # Why that bias was not taken away, or not wholly; empty where it was, or there is none
     biased: str
+    # How far the gain is from the likeliest for that, along the direction where it is farthest, in
+    # standard deviations
     moved: float
+    # Of `fit`, by the sandwich; None where it has no likelihood
     covariance: PersonCovariance | None
-    profiled: bool
+    profiled: bool  # Whether intervals follow the likelihood
+    # Intervals of 95 % of its levels (l, 2), in their units; where profiled, by profile for a level
+    # that is weakly told, else of all people as likely
     levels: Array
+    # The same of the entries of its gain (entries, 2), in their units; where profiled, all by
+    # profile, and NaN where an entry is not told by itself
     entries: Array
-    confusion: Confusion | None
-    whiteness: Array
-    ahead: tuple[int, ...]
+    confusion: Confusion | None  # What of gain and noise is told least apart
+    whiteness: Array  # p-values that the innovations of each output are white (p,)
+    ahead: tuple[int, ...]  # Samples ahead
+    # Root-mean-square errors of predictions so far ahead (k, p), in the outputs' units
     errors: Array
+    # In how many of sixty simulated trials like the recorded ones the person runs away
     runaways: int
 
 
@@ -152,21 +120,7 @@ def person_report(
 ) -> PersonReport:
     """Fit a person and the models beside, from a fit of least squares.
 
-    Parameters
-    ----------
-    found : Estimate
-    asked : Observer
-        What is sensed, and which levels are searched.
-    walk : Array
-        Where the steps of an unknown perturbation begin to be searched (d,).
-    profiled : bool
-        Whether intervals of the gain and of levels that are weakly told follow the likelihood:
-        ten minutes and more on the seat.
-    done : callable
-        Told the name of each model once it is fitted, "mean score of the person" and "intervals of
-        the person".
-    remember : callable
-        (name, problem, person, compute) -> the model, from memory when it is there.
+    `walk` (d,); `remember` (name, problem, person, compute).
     """
     models: list[PersonModel] = []
     problem = found.problem
@@ -236,13 +190,7 @@ def _model(name: str, first: Estimate, person: Observer, budget: int) -> PersonM
 def persons(problem: Problem, asked: Observer, walk: Array) -> list[tuple[str, Problem, Observer]]:
     """Each model that is compared: its name, the problem and the person; what is asked for first.
 
-    Parameters
-    ----------
-    problem : Problem
-    asked : Observer
-        What is sensed, and which levels are searched.
-    walk : Array
-        Where the steps of an unknown perturbation begin to be searched (d,).
+    `walk` (d,).
     """
     seeing = replace(asked, sensed=(), C=asked.C[:0], sensory=asked.sensory[:0], walk=None)
     quiet = replace(seeing, motor=0 * asked.motor, share=0 * asked.share, process=0 * asked.process)

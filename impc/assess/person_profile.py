@@ -41,14 +41,7 @@ _TRIES, _BUDGET = 12, 25
 
 
 def level_intervals(fit: PersonFit, covariance: PersonCovariance) -> Array:
-    """Intervals of 95 % of all levels (l, 2), in their units: by profile if weakly told.
-
-    Parameters
-    ----------
-    fit : PersonFit
-    covariance : PersonCovariance
-        Gives the intervals of levels that are well told.
-    """
+    """Intervals of 95 % of all levels (l, 2), in their units: by profile if weakly told."""
     found = np.array(covariance.level_intervals(fit.levels))
     for k in np.flatnonzero(covariance.levels > _HARDLY):
         found[k] = level_interval(fit, int(k))
@@ -56,16 +49,7 @@ def level_intervals(fit: PersonFit, covariance: PersonCovariance) -> Array:
 
 
 def entry_intervals(fit: PersonFit, covariance: PersonCovariance) -> Array:
-    """Intervals of 95 % of the entries of the gain (entries, 2) by profile, in their units.
-
-    Parameters
-    ----------
-    fit : PersonFit
-        Where prices were searched, an entry is held along its slope.
-    covariance : PersonCovariance
-        An entry whose deviation is more than a quarter of a coordinate has no numbers, NaN: the
-        recordings do not tell it by itself.
-    """
+    """Intervals of 95 % of the entries of the gain (entries, 2) by profile, in their units."""
     dK, _ = fit.space.changes(fit.theta)
     found = []
     for value, slopes, deviation in zip(
@@ -83,20 +67,7 @@ def entry_intervals(fit: PersonFit, covariance: PersonCovariance) -> Array:
 
 
 def level_interval(fit: PersonFit, index: int) -> tuple[float, float]:
-    """Interval of 95 % of a level by profile.
-
-    Parameters
-    ----------
-    fit : PersonFit
-    index : int
-        Of the level among `fit.space.names`.
-
-    Returns
-    -------
-    low, high : float
-        In the level's unit; 0 or infinite where the likelihood does not fall as far as a level is
-        searched.
-    """
+    """Interval of 95 % of a level by profile."""
     low, high = profile(fit, np.eye(len(fit.theta))[fit.space.own + index])
     return float(np.exp(low)), float(np.exp(high))
 
@@ -104,16 +75,7 @@ def level_interval(fit: PersonFit, index: int) -> tuple[float, float]:
 def profile(fit: PersonFit, along: Array) -> tuple[float, float]:
     """Interval of 95 % of along'theta by profile.
 
-    Parameters
-    ----------
-    fit : PersonFit
-    along : Array
-        A direction of the unknowns of the fit (q,), of length one.
-
-    Returns
-    -------
-    low, high : float
-        Infinite where the likelihood does not fall as far as is searched.
+    `along` (q,).
     """
     low, high = (_end(fit, along, side) for side in (-1, 1))
     return low, high
@@ -122,18 +84,7 @@ def profile(fit: PersonFit, along: Array) -> tuple[float, float]:
 def fallen(fit: PersonFit, along: Array, value: float) -> float:
     """By how much the likelihood falls with along'theta held at a value, all else at its best.
 
-    Parameters
-    ----------
-    fit : PersonFit
-    along : Array
-        As in `profile` (q,).
-    value : float
-        In the coordinates of the fit.
-
-    Returns
-    -------
-    float
-        Nats; infinite where nothing was found.
+    `along` (q,).
     """
     prior, unseen = fit.prior.freed(along), np.array(fit.unseen)
     top = prior.placed(np.array(fit.theta), fit.told)

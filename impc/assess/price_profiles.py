@@ -45,22 +45,12 @@ _HUGE = 1e12
 
 @dataclass(frozen=True)
 class PriceInterval:
-    """An interval of a price or of a ratio of two.
+    """An interval of a price or of a ratio of two."""
 
-    Attributes
-    ----------
-    value : float
-        Its logarithm in the fit; minus infinity for a price of zero.
-    low, high : float
-        Ends of the logarithm: minus infinity where the price may be zero, or sets no end.
-    level : float
-        Between 0 and 1.
-    """
-
-    value: float
-    low: float
+    value: float  # Its logarithm in the fit; minus infinity for a price of zero
+    low: float  # Ends of the logarithm: minus infinity where the price may be zero, or sets no end
     high: float
-    level: float
+    level: float  # Between 0 and 1
 
     def holds(self, value: float) -> bool:
         """Whether a logarithm, `value`, lies in it."""
@@ -68,15 +58,7 @@ class PriceInterval:
 
 
 class PriceProfiles:
-    """Intervals from the misfit near a fit, and near each end.
-
-    Parameters
-    ----------
-    at : Tangent
-        Of a structure whose features are priced one by one.
-    covariance : PriceCovariance
-        Of the same fit.
-    """
+    """Intervals from the misfit near a fit, and near each end."""
 
     def __init__(self, at: Tangent, covariance: PriceCovariance) -> None:
         self.at, self.covariance, self.near = at, covariance, NearFit(at)
@@ -87,12 +69,7 @@ class PriceProfiles:
     def interval(self, combination: Array, level: float = LEVEL) -> PriceInterval:
         """Interval of a'z.
 
-        Parameters
-        ----------
-        combination : Array
-            a (count,), of unknowns that are not zero in the fit.
-        level : float
-            Between 0 and 1.
+        `combination` (count,).
         """
         deviation, wider = self.covariance.spread(combination)
         quantile = float(scipy.stats.chi2.ppf(level, 1)) * wider**2
@@ -108,15 +85,7 @@ class PriceProfiles:
         return PriceInterval(value, low, high, level)
 
     def zero(self, index: int, level: float = LEVEL) -> PriceInterval:
-        """Interval of the price `index` that is zero in the fit: at most its upper end.
-
-        Parameters
-        ----------
-        index : int
-            Of the unknown.
-        level : float
-            Between 0 and 1.
-        """
+        """Interval of the price `index` that is zero in the fit: at most its upper end."""
         near = np.array(self.at.prices)
         near[index] = self._smallest_seen(index)
         line = _Line(np.eye(len(near))[index], near, float(near[index]), 0.5)

@@ -47,24 +47,12 @@ _TOLERANCE = 0.01
 
 @dataclass(frozen=True)
 class ToldGain:
-    """The gain that the recordings tell.
+    """The gain that the recordings tell."""
 
-    Attributes
-    ----------
-    problem : Problem
-        At the initial states and parameters found with this gain.
-    K : Array
-        (m, n); the weights' along what the recordings do not tell.
-    S : Array
-        (m, m); the weights' where the recordings do not tell it.
-    misfit : float
-        2-norm of the residual.
-    """
-
-    problem: Problem
-    K: Array
-    S: Array
-    misfit: float
+    problem: Problem  # At the initial states and parameters found with this gain
+    K: Array  # (m, n); the weights' along what the recordings do not tell
+    S: Array  # (m, m); the weights' where the recordings do not tell it
+    misfit: float  # 2-norm of the residual
 
     @property
     def parameters(self) -> Array:
@@ -77,36 +65,15 @@ class ToldGain:
 
 @dataclass(frozen=True)
 class GainEstimate(ToldGain):
-    """The gain that the recordings tell, and how far it is determined.
+    """The gain that the recordings tell, and how far it is determined."""
 
-    Attributes
-    ----------
-    linear : GainCovariance
-        To first order.
-    covariance : GainCovariance
-        For noise of the colour that the residuals show, with curvature.
-    white : GainCovariance
-        As if the residuals were white.
-    """
-
-    linear: GainCovariance
-    covariance: GainCovariance
-    white: GainCovariance
+    linear: GainCovariance  # To first order
+    covariance: GainCovariance  # For noise of the colour that the residuals show, with curvature
+    white: GainCovariance  # As if the residuals were white
 
 
 def gain_estimate(fitted: Estimate) -> GainEstimate:
-    """Estimate the gain behind a fit, and how far it is determined.
-
-    Parameters
-    ----------
-    fitted : Estimate
-        The search begins at the gain of its weights.
-
-    Raises
-    ------
-    SolverError
-        As `told_gain`.
-    """
+    """Estimate the gain behind a fit, and how far it is determined."""
     here = _search(fitted.problem, np.array(fitted.gain), np.array(fitted.metric))
     at = here.problem, frozen(here.K), frozen(here.S)
     return GainEstimate(
@@ -121,18 +88,7 @@ def gain_estimate(fitted: Estimate) -> GainEstimate:
 def told_gain(problem: Problem, gain: Array, metric: Array) -> ToldGain:
     """Estimate the gain behind recordings from one near it: that of the weights of a fit.
 
-    Parameters
-    ----------
-    problem : Problem
-        At the initial states and the parameters that belong to the gain.
-    gain, metric : Array
-        K (m, n) and S (m, m) where the search begins. The gain that explains its recordings to
-        rounding stays.
-
-    Raises
-    ------
-    SolverError
-        When the residual at that gain is not finite.
+    `gain` (m, n); `metric` (m, m).
     """
     here = _search(problem, gain, metric)
     return ToldGain(here.problem, frozen(here.K), frozen(here.S), here.misfit)

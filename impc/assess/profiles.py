@@ -50,38 +50,16 @@ _ROUNDS = 6
 
 @dataclass(frozen=True)
 class Profile(Frozen):
-    """Profile of one number.
+    """Profile of one number."""
 
-    Attributes
-    ----------
-    interval : Interval
-        Method "profile".
-    values, distances : Array
-        Values tried (t,), ascending, in the number's unit, and D at each (t,), for a picture.
-    """
-
-    interval: Interval
+    interval: Interval  # Method "profile"
+    # Values tried (t,), ascending, in the number's unit, and D at each (t,), for a picture
     values: Array
     distances: Array
 
 
 def profile_likelihood(estimate: GainEstimate, name: str, level: float = LEVEL) -> Profile:
-    """Profile an entry of K (name K.<control>.<state>) or a parameter fitted with it.
-
-    Parameters
-    ----------
-    estimate : GainEstimate
-        Where the profile begins.
-    name : str
-        K.<control>.<state>, or that of the parameter.
-    level : float
-        Of the interval, between 0 and 1.
-
-    Raises
-    ------
-    InputError
-        When there is no such entry or parameter.
-    """
+    """Profile an entry of K (name K.<control>.<state>) or a parameter fitted with it."""
     require_numbers(estimate, [name])
     search = _Search(estimate, name)
     quantile = float(scipy.special.chdtri(1, 1 - level))
@@ -97,13 +75,7 @@ def profile_likelihood(estimate: GainEstimate, name: str, level: float = LEVEL) 
 
 
 def require_numbers(estimate: GainEstimate, names: Sequence[str]) -> None:
-    """Require that every name is of an entry of K or a parameter that was fitted.
-
-    Raises
-    ------
-    InputError
-        When one is not.
-    """
+    """Require that every name is of an entry of K or a parameter that was fitted."""
     family = estimate.problem.family
     known = [*entry_names(estimate.problem.plant), *(() if family is None else family.names)]
     for name in names:

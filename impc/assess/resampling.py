@@ -56,56 +56,26 @@ _BEFORE = 500
 
 @dataclass(frozen=True)
 class Replicate(Frozen):
-    """Estimates of one replicate.
+    """Estimates of one replicate."""
 
-    Attributes
-    ----------
-    K : Array
-        (m, n), of `told_gain`.
-    parameters : Array
-        Physical parameters in their units (k,).
-    """
-
-    K: Array
-    parameters: Array
+    K: Array  # (m, n), of `told_gain`
+    parameters: Array  # Physical parameters in their units (k,)
 
 
 @dataclass(frozen=True)
 class BootstrapModel(Frozen):
-    """The estimate that replicates are drawn from.
+    """The estimate that replicates are drawn from."""
 
-    Attributes
-    ----------
-    problem : Problem
-        At its initial states and parameters.
-    K : Array
-        (m, n).
-    S : Array
-        (m, m).
-    outputs : tuple of Array
-        Simulated without noise, (samples, p) of each trial.
-    """
-
-    problem: Problem
-    K: Array
-    S: Array
-    outputs: tuple[Array, ...]
+    problem: Problem  # At its initial states and parameters
+    K: Array  # (m, n)
+    S: Array  # (m, m)
+    outputs: tuple[Array, ...]  # Simulated without noise, (samples, p) of each trial
 
 
 def bootstrap_model(problem: Problem, gain: Array, metric: Array) -> BootstrapModel:
     """Simulate an estimate once, for all replicates.
 
-    Parameters
-    ----------
-    problem : Problem
-        At the initial states and parameters of the estimate.
-    gain, metric : Array
-        K (m, n) and S (m, m).
-
-    Raises
-    ------
-    InputError, SolverError
-        As `controller_for`.
+    `gain` (m, n); `metric` (m, m).
     """
     runs = simulated(problem, gain, metric)
     outputs = tuple(frozen(run.x @ problem.plant.C.T) for run in runs)
@@ -113,23 +83,7 @@ def bootstrap_model(problem: Problem, gain: Array, metric: Array) -> BootstrapMo
 
 
 def replicate(model: BootstrapModel, index: int, seed: int, resample: Draw) -> Replicate:
-    """One replicate, by its number.
-
-    Parameters
-    ----------
-    model : BootstrapModel
-    index : int
-        The child of the seed that it draws from, from 0.
-    seed : int
-        That of the whole bootstrap.
-    resample : Draw
-        `block_residuals` or `model_residuals`.
-
-    Raises
-    ------
-    SolverError
-        When it cannot be fitted.
-    """
+    """One replicate, by its number."""
     recordings = model.problem.recordings
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index,)))
     residuals = [
@@ -148,15 +102,7 @@ def replicate(model: BootstrapModel, index: int, seed: int, resample: Draw) -> R
 def bootstrap_intervals(
     estimate: GainEstimate, replicates: Sequence[Replicate], method: str, level: float
 ) -> tuple[Interval, ...]:
-    """Percentile intervals of the entries of K and of the parameters; no ends where not told.
-
-    Parameters
-    ----------
-    method : str
-        Name of the bootstrap, kept in each interval.
-    level : float
-        Share of the replicates inside, between 0 and 1.
-    """
+    """Percentile intervals of the entries of K and of the parameters; no ends where not told."""
     names = list(entry_names(estimate.problem.plant))
     if estimate.problem.family is not None:
         names += estimate.problem.family.names

@@ -48,19 +48,12 @@ _EXACT = 1e-7
 
 @dataclass(frozen=True)
 class ResidualStructure:
-    """What of the residuals follows the perturbation.
+    """What of the residuals follows the perturbation."""
 
-    Attributes
-    ----------
-    p_linear, p_nonlinear : float
-        Probabilities of as much among shifted residuals, of 200 at least.
-    share : float
-        Of the residuals' variance: what the family of the smaller probability explains, beyond what
-        it explains of shifted ones.
-    """
-
-    p_linear: float
+    p_linear: float  # Probabilities of as much among shifted residuals, of 200 at least
     p_nonlinear: float
+    # Of the residuals' variance: what the family of the smaller probability explains, beyond what
+    # it explains of shifted ones
     share: float
 
     @property
@@ -75,21 +68,7 @@ def residual_structure(
 ) -> ResidualStructure | None:
     """Test both families.
 
-    Parameters
-    ----------
-    problem : Problem
-        At the initial states and parameters of the fit.
-    gain : Array
-        K (m, n) of the fit.
-    found : Evaluation
-        Of the problem at that gain.
-    seed : int
-        Of the shifts.
-
-    Returns
-    -------
-    ResidualStructure or None
-        None when the fit leaves nothing but rounding or trials are too short.
+    `gain` (m, n).
     """
     problem, found = _thinned(problem, found)
     p = len(problem.plant.outputs)

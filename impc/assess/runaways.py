@@ -35,16 +35,6 @@ def runaways(fit: PersonFit) -> int:
     """In how many of sixty trials like the recorded ones the person runs away.
 
     None does where no bound was met in the recordings.
-
-    Parameters
-    ----------
-    fit : PersonFit
-        Of `fit_person`.
-
-    Returns
-    -------
-    int
-        Trials in which an output goes beyond ten times its largest recorded value.
     """
     if all(np.all(trial.status == Status.FREE) for trial in fit.told.trials):
         return 0
@@ -64,17 +54,7 @@ def running_away(
 ) -> int:
     """In how many of sixty simulated trials an output goes beyond some size.
 
-    Parameters
-    ----------
-    law : Controller
-    person : Observer
-    trials : sequence of pairs of Array
-        Perturbation (samples, d) or (samples,) and first estimate (n,), one after the other.
-    beyond : Array or float
-        Of each output (p,) or of all, in their units.
-    seed, first : int
-        All numbers drawn in a trial follow from the seed and from the trial's own number; that of
-        the first one.
+    `beyond` (p,).
     """
     found = 0
     for number in range(SIMULATED):

@@ -14,15 +14,7 @@ def holm(p: Array) -> Array:
 
     statsmodels has the same, and collects the garbage of the whole process at every call.
 
-    Parameters
-    ----------
-    p : Array
-        (k,); a test that could not be made has NaN, keeps it, and is not counted.
-
-    Returns
-    -------
-    Array
-        (k,).
+    `p` (k,); returns (k,).
     """
     order = np.argsort(p)[: np.count_nonzero(np.isfinite(p))]
     corrected = np.full(len(p), np.nan)

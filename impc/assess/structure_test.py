@@ -43,42 +43,25 @@ _CROSS = 0.5
 
 @dataclass(frozen=True)
 class CrossTerm:
-    """A departure from the structure, and how probably the test would refuse it.
+    """A departure from the structure, and how probably the test would refuse it."""
 
-    Attributes
-    ----------
-    first, second : str
-        Features that are priced together too, with half the geometric mean of their prices.
-    power : float
-        Probability that the test refuses it at its level, between 0 and 1.
-    """
-
+    # Features that are priced together too, with half the geometric mean of their prices
     first: str
     second: str
-    power: float
+    power: float  # Probability that the test refuses it at its level, between 0 and 1
 
 
 @dataclass(frozen=True)
 class StructureTest(Frozen):
-    """Result of `structure_test`.
+    """Result of `structure_test`."""
 
-    Attributes
-    ----------
-    statistic : float
-        T.
-    freedom : int
-        Degrees of freedom; 0 where the recordings tell nothing of the gain beyond the structure, or
-        the structure explains them to the last digit.
-    probability : float
-        Of a T at least as large if the structure holds; 1 where there is nothing to test.
-    powers : tuple of CrossTerm
-        For each pair of features that both have a price.
-    """
-
-    statistic: float
+    statistic: float  # T
+    # Degrees of freedom; 0 where the recordings tell nothing of the gain beyond the structure, or
+    # the structure explains them to the last digit
     freedom: int
+    # Of a T at least as large if the structure holds; 1 where there is nothing to test
     probability: float
-    powers: tuple[CrossTerm, ...]
+    powers: tuple[CrossTerm, ...]  # For each pair of features that both have a price
 
     @property
     def refused(self) -> bool:

@@ -55,37 +55,18 @@ _SHARE = 1e-3
 
 @dataclass(frozen=True)
 class Tangent(Frozen):
-    """The residual of a structured fit, and where it can move.
-
-    Attributes
-    ----------
-    structure : Structure
-    problem : Problem
-        At the initial states and the parameters.
-    solution : LqrSolution
-        The regulator of the weights.
-    prices : Array
-        Unknowns (count,); minus infinity is a price of zero.
-    residual : Array
-        (r,).
-    found : Evaluation
-    on_prices : Array
-        Derivative with respect to the unknowns (r, count), or to a price itself where it is zero.
-    on_parameters : Array
-        With respect to the parameters, the weights held (r, k).
-    noise : float
-        Root-mean-square of the noise: of the residual, where recordings were made.
-    """
+    """The residual of a structured fit, and where it can move."""
 
     structure: Structure
-    problem: Problem
-    solution: LqrSolution
-    prices: Array
-    residual: Array
+    problem: Problem  # At the initial states and the parameters
+    solution: LqrSolution  # The regulator of the weights
+    prices: Array  # Unknowns (count,); minus infinity is a price of zero
+    residual: Array  # (r,)
     found: Evaluation
+    # Derivative with respect to the unknowns (r, count), or to a price itself where it is zero
     on_prices: Array
-    on_parameters: Array
-    noise: float
+    on_parameters: Array  # With respect to the parameters, the weights held (r, k)
+    noise: float  # Root-mean-square of the noise: of the residual, where recordings were made
 
     @property
     def moving(self) -> BoolArray:
@@ -95,17 +76,7 @@ class Tangent(Frozen):
     def without_nuisance(self, columns: Array, *beside: Array) -> Array:
         """What initial states, parameters and others cannot make up of columns.
 
-        Parameters
-        ----------
-        columns : Array
-            (r, a).
-        *beside : Array
-            Others (r, b).
-
-        Returns
-        -------
-        Array
-            (r, a).
+        `columns` (r, a); `*beside` (r, b); returns (r, a).
         """
         return self.span(*beside).without(columns)
 
@@ -117,12 +88,7 @@ class Tangent(Frozen):
     def gain_columns(self) -> tuple[Array, Array]:
         """Derivatives with respect to gain and metric.
 
-        Returns
-        -------
-        Array
-            Along G^-1 K T (r, mn).
-        Array
-            Along the metric (r, b).
+        Returns (r, mn), (r, b).
         """
         gain, metric = np.array(self.solution.K), np.array(self.solution.S)
         T, G = natural_coordinates(self.problem.plant, gain)
@@ -154,40 +120,24 @@ def tangent(structure: Structure, problem: Problem, prices: Array) -> Tangent:
 
 @dataclass(frozen=True)
 class PriceCovariance(Frozen):
-    """What the recordings say of the unknowns of a structure, to first order.
-
-    Attributes
-    ----------
-    structure : Structure
-    values : Array
-        As told: logarithms of prices, and correlations (count,); minus infinity for a price of 0.
-    singular_values : Array
-        Of the residual's derivative with respect to those that move, once initial states and
-        parameters have taken what they can; largest first (a,).
-    directions : Array
-        Right singular vectors over all unknowns, one a row (a, count).
-    deviations : Array
-        Standard deviation along each (a,); infinite below 1e-6 of the largest singular value.
-    covariance : Array
-        Over all unknowns (count, count), without the directions that have no deviation.
-    each : Array
-        Standard deviation of each unknown (count,); infinite where a direction without a value
-        takes part, and for a price of zero.
-    white : Array
-        The covariance as if the residuals were white (count, count).
-    noise : ResidualNoise
-        The colour of the residuals.
-    """
+    """What the recordings say of the unknowns of a structure, to first order."""
 
     structure: Structure
+    # As told: logarithms of prices, and correlations (count,); minus infinity for a price of 0
     values: Array
+    # Of the residual's derivative with respect to those that move, once initial states and
+    # parameters have taken what they can; largest first (a,)
     singular_values: Array
-    directions: Array
+    directions: Array  # Right singular vectors over all unknowns, one a row (a, count)
+    # Standard deviation along each (a,); infinite below 1e-6 of the largest singular value
     deviations: Array
+    # Over all unknowns (count, count), without the directions that have no deviation
     covariance: Array
+    # Standard deviation of each unknown (count,); infinite where a direction without a value takes
+    # part, and for a price of zero
     each: Array
-    white: Array
-    noise: ResidualNoise
+    white: Array  # The covariance as if the residuals were white (count, count)
+    noise: ResidualNoise  # The colour of the residuals
 
     @property
     def rank(self) -> int:
@@ -216,12 +166,7 @@ def price_covariance(
 ) -> PriceCovariance:
     """Covariance of the unknowns of a structured fit.
 
-    Parameters
-    ----------
-    at : Tangent
-    noise, white : callable
-        How the noise is estimated from the residuals, (samples, p) for each trial, and what was
-        fitted to them: with its colour, and as if it had none.
+    `noise, white` (samples, p).
     """
     values, chain = at.structure.reported(at.prices)
     moving = at.moving

@@ -39,62 +39,32 @@ __all__ = ["Ratio", "StructureFit", "assess_structure", "criterion_of", "no_stru
 
 @dataclass(frozen=True)
 class Ratio:
-    """What one feature costs over another, both at the size that they have in the recordings.
+    """What one feature costs over another, both at the size that they have in the recordings."""
 
-    Attributes
-    ----------
-    first, second : str
-        Labels of the features.
-    interval : PriceInterval
-        Of the logarithm of the ratio.
-    """
-
-    first: str
+    first: str  # Labels of the features
     second: str
-    interval: PriceInterval
+    interval: PriceInterval  # Of the logarithm of the ratio
 
 
 @dataclass(frozen=True)
 class StructureFit(Frozen):
-    """A structure fitted to recordings, and what they say of it.
-
-    Attributes
-    ----------
-    structure : Structure
-    estimate : Estimate or None
-        None when no regulator of it can be simulated.
-    reason : str
-        Why there is none; empty otherwise.
-    sizes : Array
-        Root-mean-square of each feature of the states in the simulation (k,), in its unit.
-    effort : float
-        Mean square of the first feature of the inputs.
-    covariance : PriceCovariance or None
-    intervals : tuple of PriceInterval
-        Of each unknown, as told: of logarithms of prices, or of correlations.
-    ratios : tuple of Ratio
-        Of each two features that have a price, when they are priced one by one.
-    test : StructureTest or None
-    vaf : Array
-        Of each output, all trials together (p,), %.
-    held_out : Array
-        Mean over trials left out, of each output (p,), %; NaN when none is.
-    aic : float
-        Akaike's criterion.
-    """
+    """A structure fitted to recordings, and what they say of it."""
 
     structure: Structure
-    estimate: Estimate | None
-    reason: str
+    estimate: Estimate | None  # None when no regulator of it can be simulated
+    reason: str  # Why there is none; empty otherwise
+    # Root-mean-square of each feature of the states in the simulation (k,), in its unit
     sizes: Array
-    effort: float
+    effort: float  # Mean square of the first feature of the inputs
     covariance: PriceCovariance | None
+    # Of each unknown, as told: of logarithms of prices, or of correlations
     intervals: tuple[PriceInterval, ...]
+    # Of each two features that have a price, when they are priced one by one
     ratios: tuple[Ratio, ...]
     test: StructureTest | None
-    vaf: Array
-    held_out: Array
-    aic: float
+    vaf: Array  # Of each output, all trials together (p,), %
+    held_out: Array  # Mean over trials left out, of each output (p,), %; NaN when none is
+    aic: float  # Akaike's criterion
 
     @property
     def refused(self) -> bool:
@@ -124,22 +94,7 @@ def assess_structure(
     *,
     held_out: bool,
 ) -> StructureFit:
-    """Say what recordings tell of a structure.
-
-    Parameters
-    ----------
-    problem : Problem
-        As it was posed.
-    structure : Structure
-    found : Estimate
-        Of `fit_structured`.
-    near : Estimate
-        Of weights of any kind on the same recordings.
-    settle : float
-        Seconds at the start of a left-out trial that do not count.
-    held_out : bool
-        Whether each trial is predicted from the others.
-    """
+    """Say what recordings tell of a structure."""
     there, prices = found.problem, np.array(found.prices)
     at = tangent(structure, there, prices)
     covariance = price_covariance(at)

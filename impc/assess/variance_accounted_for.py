@@ -32,27 +32,14 @@ _LEAST_LAGS = 10
 
 @dataclass(frozen=True)
 class TrialAgreement(Frozen):
-    """One trial against its simulation.
+    """One trial against its simulation."""
 
-    Attributes
-    ----------
-    vaf : Array
-        (3.24) of each output, % (p,).
-    centred_vaf : Array
-        The same with the means removed, 1 - var(y - y_sim)/var(y), % (p,).
-    whiteness : Array
-        p-value of Ljung and Box's test that the residual is white, one second of lags (p,).
-    rms : Array
-        Root-mean-square residual in the outputs' units (p,).
-    saturated : float
-        Share of the samples at which an input bound is reached.
-    """
-
-    vaf: Array
-    centred_vaf: Array
+    vaf: Array  # (3.24) of each output, % (p,)
+    centred_vaf: Array  # The same with the means removed, 1 - var(y - y_sim)/var(y), % (p,)
+    # p-value of Ljung and Box's test that the residual is white, one second of lags (p,)
     whiteness: Array
-    rms: Array
-    saturated: float
+    rms: Array  # Root-mean-square residual in the outputs' units (p,)
+    saturated: float  # Share of the samples at which an input bound is reached
 
 
 @checked(recorded="i j", simulated="i j")
@@ -88,15 +75,7 @@ def vaf(recorded: Array, simulated: Array) -> Array:
 def centred_vaf(recorded: Array, simulated: Array) -> Array:
     """As `vaf`, with the means removed from what was recorded and from what is left.
 
-    Parameters
-    ----------
-    recorded, simulated : Array
-        Outputs (samples, p), in one unit.
-
-    Returns
-    -------
-    Array
-        % (p,); NaN where the recorded output is constant.
+    `recorded, simulated` (samples, p); returns (p,).
     """
     left = np.var(recorded - simulated, axis=0)
     total = np.var(recorded, axis=0)
@@ -158,10 +137,7 @@ def agreement(
 ) -> TrialAgreement:
     """Compare a trial with its simulation from the first sample to the last.
 
-    Parameters
-    ----------
-    u_min, u_max : Array
-        Input bounds (m,), for the share of saturated samples.
+    `u_min, u_max` (m,).
     """
     simulated = run.x @ plant.C.T
     residual = trial.outputs - simulated
@@ -179,12 +155,7 @@ def agreement(
 def saturated_share(u: Array, u_min: Array, u_max: Array) -> float:
     """Share of samples at which any input stands on a bound, to 1e-6 of it.
 
-    Parameters
-    ----------
-    u : Array
-        Inputs (samples, m).
-    u_min, u_max : Array
-        Their bounds (m,); infinite where there is none.
+    `u` (samples, m); `u_min, u_max` (m,).
     """
     near = (u >= u_max * (1 - 1e-6)) | (u <= u_min * (1 - 1e-6))  # the origin is strictly inside
     return float(np.count_nonzero(np.any(near, axis=1)) / max(len(u), 1))

@@ -40,59 +40,31 @@ _NAMED = 4
 
 @dataclass(frozen=True)
 class EntryRange:
-    """Range of Q_ij over the set, i and j by name.
+    """Range of Q_ij over the set, i and j by name."""
 
-    Attributes
-    ----------
-    first, second : str
-        Names of the states i and j.
-    low, high : float
-        At trace R = m.
-    """
-
-    first: str
+    first: str  # Names of the states i and j
     second: str
-    low: float
+    low: float  # At trace R = m
     high: float
 
 
 @dataclass(frozen=True)
 class WeightsSummary:
-    """The set of weights of a gain.
+    """The set of weights of a gain."""
 
-    Attributes
-    ----------
-    dimension : int
-        Free directions of the weights that have the gain, scale not counted.
-    least_condition, limit : float
-        Condition numbers: the least, and the largest in the set.
-    entries : tuple of EntryRange
-        Of the states that are recorded or cost most.
-    eigenvalues : tuple of EigenvalueRange
-        Of Q, ascending.
-    statements : tuple of Statement
-        Order and sense of these states.
-    widest_angle : float
-        Widest angle found between the dominant direction of D Q D in the least conditioned member
-        and in another, degrees; D the typical sizes of the states.
-    drawn : int
-        Number of gains drawn beside the fitted one, for all that follows.
-    prices : tuple of PriceRange
-        Of the named states; empty without draws.
-    angle_of_gain : float
-        Widest angle, over the drawn gains, of the dominant direction of the least conditioned
-        member from that of the fitted gain, degrees; NaN without draws.
-    """
-
-    dimension: int
-    least_condition: float
+    dimension: int  # Free directions of the weights that have the gain, scale not counted
+    least_condition: float  # Condition numbers: the least, and the largest in the set
     limit: float
-    entries: tuple[EntryRange, ...]
-    eigenvalues: tuple[EigenvalueRange, ...]
-    statements: tuple[Statement, ...]
+    entries: tuple[EntryRange, ...]  # Of the states that are recorded or cost most
+    eigenvalues: tuple[EigenvalueRange, ...]  # Of Q, ascending
+    statements: tuple[Statement, ...]  # Order and sense of these states
+    # Widest angle found between the dominant direction of D Q D in the least conditioned member and
+    # in another, degrees; D the typical sizes of the states
     widest_angle: float
-    drawn: int
-    prices: tuple[PriceRange, ...]
+    drawn: int  # Number of gains drawn beside the fitted one, for all that follows
+    prices: tuple[PriceRange, ...]  # Of the named states; empty without draws
+    # Widest angle, over the drawn gains, of the dominant direction of the least conditioned member
+    # from that of the fitted gain, degrees; NaN without draws
     angle_of_gain: float
 
 
@@ -106,24 +78,7 @@ def summarise_weights(
 ) -> WeightsSummary:
     """Run the programs over the set of weights of a gain.
 
-    Parameters
-    ----------
-    plant : Plant
-    gain : Array
-        K (m, n).
-    metrics : Array
-        Basis of the metrics that the recordings do not tell apart (k, m, m), see `GainFit`.
-    sizes : Array
-        Typical size of each state (n,), positive, in its unit.
-    ratio : float
-        The set's condition number, in multiples of the least.
-    draws : tuple of LqrSolution
-        Other gains that the recordings allow, of `drawn_gains`.
-
-    Raises
-    ------
-    WeightsError, SolverError
-        When no weights have the gain, or a program fails.
+    `gain` (m, n); `metrics` (k, m, m); `sizes` (n,).
     """
     found = weights_set(gain_fibre(plant, gain, metrics), ratio)
     named = _shown(plant, found.least.weights, sizes)
@@ -171,16 +126,7 @@ def weights_summary_or_reason(
 ) -> tuple[WeightsSummary | None, str]:
     """The summary, or None and why there is none.
 
-    Parameters
-    ----------
-    gain : Array
-        K (m, n).
-    metrics : Array
-        (k, m, m), as above.
-    sizes : Array
-        Typical excursions of the states (n,), in their units.
-    draws : tuple of LqrSolution
-        As in `summarise_weights`.
+    `gain` (m, n); `metrics` (k, m, m); `sizes` (n,).
     """
     try:
         return summarise_weights(plant, gain, metrics, sizes, draws=draws), ""

@@ -45,19 +45,11 @@ _FREQUENCIES = 2000
 
 @dataclass(frozen=True)
 class ReturnDifference:
-    """The inequality of one input.
+    """The inequality of one input."""
 
-    Attributes
-    ----------
-    least, needed : float
-        The least |1 + K (zI - A)^-1 B|^2, and det(A - BK) / det A.
-    frequency : float
-        Where it is least, Hz.
-    """
-
-    least: float
+    least: float  # The least |1 + K (zI - A)^-1 B|^2, and det(A - BK) / det A
     needed: float
-    frequency: float
+    frequency: float  # Where it is least, Hz
 
     @property
     def kept(self) -> bool:
@@ -67,33 +59,15 @@ class ReturnDifference:
 
 @dataclass(frozen=True)
 class WeightsTest:
-    """Result of `weights_test`.
+    """Result of `weights_test`."""
 
-    Attributes
-    ----------
-    statistic : float
-        D.
-    freedom : int
-        Directions of the gain that are identified.
-    p_value : float
-        Of chi-squared: an upper limit.
-    more : float
-        Misfit of the weights, of that of the gain.
-    contradicted : bool
-        Whether the residuals contradict the model.
-    exist : bool
-        Whether positive definite weights have the identified gain itself.
-    difference : ReturnDifference or None
-        Of that gain, with one input and an invertible A.
-    """
-
-    statistic: float
-    freedom: int
-    p_value: float
-    more: float
-    contradicted: bool
-    exist: bool
-    difference: ReturnDifference | None
+    statistic: float  # D
+    freedom: int  # Directions of the gain that are identified
+    p_value: float  # Of chi-squared: an upper limit
+    more: float  # Misfit of the weights, of that of the gain
+    contradicted: bool  # Whether the residuals contradict the model
+    exist: bool  # Whether positive definite weights have the identified gain itself
+    difference: ReturnDifference | None  # Of that gain, with one input and an invertible A
 
     @property
     def rejected(self) -> bool:
@@ -121,17 +95,7 @@ class WeightsTest:
 def weights_test(
     fitted: Estimate, estimate: GainEstimate, *, contradicted: bool = False
 ) -> WeightsTest:
-    """Compare the gain of the fitted weights with the gain that is identified.
-
-    Parameters
-    ----------
-    fitted : Estimate
-        Of inverse MPC.
-    estimate : GainEstimate
-        Of `gain_estimate`, from that fit.
-    contradicted : bool
-        Whether the residuals contradict the model.
-    """
+    """Compare the gain of the fitted weights with the gain that is identified."""
     covariance, plant = estimate.covariance, estimate.problem.plant
     identified = covariance.told
     steps = covariance.along(estimate.K - fitted.gain)[identified]

@@ -51,27 +51,13 @@ _REFLECTION, _ROOT, _DIAGONAL, _VARIANCE = 5.0, 3.0, 10.0, (-25.0, 10.0)
 
 @dataclass(frozen=True)
 class Spectrum:
-    """Binned periodograms of outputs over their size.
+    """Binned periodograms of outputs over their size."""
 
-    Attributes
-    ----------
-    angles : Array
-        Middle of each bin (b,), rad a sample.
-    edges : Array
-        Of the bins (b + 1,), rad a sample.
-    counts : Array
-        Independent ordinates in each (b,).
-    power : Array
-        (b, p, p), complex.
-    size : Array
-        Standard deviation of each output (p,), in its unit.
-    """
-
-    angles: Array
-    edges: Array
-    counts: Array
-    power: Complex
-    size: Array
+    angles: Array  # Middle of each bin (b,), rad a sample
+    edges: Array  # Of the bins (b + 1,), rad a sample
+    counts: Array  # Independent ordinates in each (b,)
+    power: Complex  # (b, p, p), complex
+    size: Array  # Standard deviation of each output (p,), in its unit
 
 
 def spectrum(residuals: list[Array]) -> Spectrum | None:
@@ -105,12 +91,7 @@ def spectrum(residuals: list[Array]) -> Spectrum | None:
 def loop_shapes(plant: Plant, gain: Array, found: Spectrum) -> Complex:
     """G_j G_j* of each input, averaged over each bin, outputs over their size (b, m, p, p).
 
-    Parameters
-    ----------
-    plant : Plant
-    gain : Array
-        K (m, n), A - B K stable.
-    found : Spectrum
+    `gain` (m, n).
     """
     closed = plant.A - plant.B @ gain
     shares = (np.arange(_INSIDE) + 0.5) / _INSIDE
@@ -129,12 +110,7 @@ def size(p: int) -> int:
 def outputs(theta: Array, found: Spectrum) -> tuple[Complex, Callable[[Complex], Array]]:
     """S_0 (b, p, p), and what reads its gradient off W (b, p, p) as in the module's text.
 
-    Parameters
-    ----------
-    theta : Array
-        Reflection coefficients of each output before tanh, the Cholesky factor of V with logarithms
-        on its diagonal, logarithms of white variances (any,), `size` of them.
-    found : Spectrum
+    `theta` (any,).
     """
     p = len(found.size)
     H, slopes = _filters(theta[: ORDER * p].reshape(p, ORDER), found.angles)
@@ -185,13 +161,7 @@ def loops(
 ) -> tuple[Complex, Callable[[Complex], Array]]:
     """G W G* (b, p, p), and what reads its gradient off as for `outputs`.
 
-    Parameters
-    ----------
-    theta : Array
-        Logarithms of the variances at the inputs, and their root before tanh (m + 1,).
-    shapes : Array
-        Of `loop_shapes` (b, m, p, p), complex.
-    found : Spectrum
+    `theta` (m + 1,); `shapes` (b, m, p, p).
     """
     logs, moving = _clipped(theta[:-1], *_VARIANCE)
     root, variances = root_of(theta), np.exp(logs)

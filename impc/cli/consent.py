@@ -23,22 +23,7 @@ FEWER_STARTS = "lower replicates or starts in [select], or shorten the trials"
 
 
 def require_consent(effort: Effort, given: bool, lower: str = FEWER) -> None:
-    """Ask before a large request is begun, unless consent is `given` by --yes.
-
-    Parameters
-    ----------
-    effort : Effort
-        What the request would take.
-    given : bool
-        Whether --yes is.
-    lower : str
-        What would make it smaller.
-
-    Raises
-    ------
-    InputError
-        When the answer is no, there is nobody to ask, or this machine has not that much memory.
-    """
+    """Ask before a large request is begun, unless consent is `given` by --yes."""
     import psutil  # noqa: PLC0415  # --help needs none
 
     from impc.errors import InputError  # noqa: PLC0415

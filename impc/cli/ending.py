@@ -70,17 +70,7 @@ def ended(run: Callable[[], Any]) -> int:
 
 @contextlib.contextmanager
 def interruptions() -> Iterator[None]:
-    """Turn what click would end the program for into what `ended` tells.
-
-    Raises
-    ------
-    InterruptionError
-        For an interruption from the keyboard.
-    UnreadError
-        When the program's output is a pipe that nobody reads.
-    StrayError
-        For a call of `sys.exit`, or another broken pipe.
-    """
+    """Turn what click would end the program for into what `ended` tells."""
     try:
         yield
     except KeyboardInterrupt as interruption:

@@ -38,32 +38,7 @@ __all__ = ["fit_optimal"]
 def fit_optimal(
     files: Sequence[Path], plant_name: str, config: Path, out: Path, solver: str | None
 ) -> bool:
-    """Read, fit, write and print, if the plant is an optimal control problem; else do nothing.
-
-    Parameters
-    ----------
-    files : sequence of Path
-        The recordings.
-    plant_name : str
-        As `impc fit` was given it.
-    config : Path
-        The configuration.
-    out : Path
-        Folder of the result.
-    solver : str or None
-        In place of the one that the configuration names.
-
-    Returns
-    -------
-    bool
-        Whether it is one.
-
-    Raises
-    ------
-    ImpcError
-        When a file, the configuration or the problem cannot be used, or there is no plan at the
-        start; nothing has been written.
-    """
+    """Read, fit, write and print, if the plant is an optimal control problem; else do nothing."""
     configuration = read_configuration(config)
     source = find_plant(plant_name, configuration.plant)
     problem = made_by(source) if ":" in source.name else None  # a file holds matrices

@@ -134,13 +134,7 @@ def scheduler_options(command: F) -> F:
 
 
 def code_options(kind: str) -> Callable[[F], F]:
-    """--plant and --allow-plant, or --model and --allow-model: consent to run what a file names.
-
-    Parameters
-    ----------
-    kind : str
-        "plant" or "model".
-    """
+    """--plant and --allow-plant, or --model and --allow-model: consent to run what a file names."""
     name = click.option(
         f"--{kind}", f"{kind}_name", help=f"The {kind}, in place of the one that the study names."
     )

@@ -27,16 +27,6 @@ def print_files(out: Path, written: Sequence[Path]) -> None:
 
 
 def print_next(command: str, out: Path, *names: str) -> None:
-    """Say in one line what to type next: `command` with files of the folder `out`.
-
-    Parameters
-    ----------
-    command : str
-        With {} for each file.
-    out : Path
-        The folder.
-    *names : str
-        Of the files, in their order; they may be patterns.
-    """
+    """Say in one line what to type next: `command` with files of the folder `out`."""
     folder = shlex.quote(one_line(out))
     click.echo(f"next: {command.format(*(f'{folder}/{name}' for name in names))}")

@@ -22,11 +22,6 @@ def find_plant(name: str, arguments: Mapping[str, Any]) -> PlantSource:
     """The plant of a short name, an import path ``module:function`` or a file.
 
     `arguments` are those of its function.
-
-    Raises
-    ------
-    InputError
-        As `plant_source`; when an argument is a date or an integer beyond 64 bits.
     """
     from impc.errors import InputError  # noqa: PLC0415
     from impc.files.plant_sources import plant_source  # noqa: PLC0415
@@ -50,37 +45,14 @@ def _kept(value: object) -> bool:
 
 
 def load_plant(path: str) -> Plant:
-    """Make the plant of an import path ``module:function`` without arguments.
-
-    Raises
-    ------
-    InputError
-        When there is no such module or function.
-    """
+    """Make the plant of an import path ``module:function`` without arguments."""
     from impc.files.plant_sources import make_plant, plant_source  # noqa: PLC0415
 
     return make_plant(plant_source(path, {}), ())
 
 
 def named_plant(study_file: Path, study: Study, given: str | None, allowed: bool) -> PlantSource:
-    """The plant of a study, when the command line consents to it.
-
-    Parameters
-    ----------
-    study_file : Path
-        For messages.
-    study : Study
-        As it was read from the file.
-    given : str or None
-        Plant that the command line names.
-    allowed : bool
-        Whether the command line allows the plant that the file names.
-
-    Raises
-    ------
-    InputError
-        When it needs consent and has none, is no code of the user's, or cannot be found.
-    """
+    """The plant of a study, when the command line consents to it."""
     from impc.files.user_code import consented_name, require_users_function  # noqa: PLC0415
 
     where = f"{study_file}: study.plant"

@@ -29,24 +29,7 @@ _TICK = 1.0
 def progress(
     total: int, unit: str, kept: Callable[[int], str] | None = None, begun: int = 0
 ) -> Iterator[Callable[[str], None]]:
-    """A bar while the block lasts; what the block gets is told the name of each step that is done.
-
-    Parameters
-    ----------
-    total : int
-        Number of steps.
-    unit : str
-        What a step is called.
-    kept : callable, optional
-        Number of steps done -> what to say when the block is interrupted from the keyboard.
-    begun : int
-        Steps that were done before.
-
-    Raises
-    ------
-    KeyboardInterrupt
-        When the block is interrupted, with what `kept` says.
-    """
+    """A bar while the block lasts; the block gets what is called with each step done."""
     quiet = os.environ.get("IMPC_QUIET", "") not in ("", "0")
     count = begun  # the bar's own stands still where there is no bar
     began = said = time.monotonic()

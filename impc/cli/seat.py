@@ -100,15 +100,7 @@ def between_samples(torque: Array) -> Array:
     So a recording is read again (docs/recordings.md). Held instead, the torque would come half a
     sample late: 0.5 ms, which moves a fitted gain by eight of its deviations.
 
-    Parameters
-    ----------
-    torque : Array
-        At the samples (samples,), Nm.
-
-    Returns
-    -------
-    Array
-        (samples,), Nm.
+    `torque` (samples,).
     """
     import numpy as np  # noqa: PLC0415
 

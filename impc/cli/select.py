@@ -75,22 +75,7 @@ def kept_results(out: Path) -> Kept:
 def study_runner(
     source: ModelSource, out: Path, cluster: Cluster, tasks: int
 ) -> Iterator[tuple[Runner, int]]:
-    """Workers with a progress bar, and how many; a message of what is kept when interrupted.
-
-    Parameters
-    ----------
-    out : Path
-        Folder in which results wait, see `kept_results`.
-    cluster : Cluster
-        Which workers.
-    tasks : int
-        Of the progress bar.
-
-    Raises
-    ------
-    KeyboardInterrupt
-        When it is interrupted, after the message.
-    """
+    """Workers with a progress bar, and how many; a message of what is kept when interrupted."""
     from impc.studies.cohort.cluster import connected  # noqa: PLC0415
     from impc.studies.selection.queue import on_workers  # noqa: PLC0415
 
@@ -106,22 +91,7 @@ def study_runner(
 def read_model_study(
     path: Path, given: str | None, allowed: bool
 ) -> tuple[Study, ModelSource, dict[tuple[str, str], tuple[Trial, ...]], Inputs]:
-    """The study at `path`, its model, all recordings, and the digests of these.
-
-    Parameters
-    ----------
-    path : Path
-        The study file.
-    given : str or None
-        Model that the command line names.
-    allowed : bool
-        Whether the command line allows the model that the file names.
-
-    Raises
-    ------
-    InputError, DataError
-        When the file, the model or a recording cannot be used, or the model needs consent.
-    """
+    """The study at `path`, its model, all recordings, and the digests of these."""
     from impc.files.inputs import study_inputs  # noqa: PLC0415
     from impc.files.plant_sources import import_function  # noqa: PLC0415
     from impc.files.reading import require_distinct  # noqa: PLC0415

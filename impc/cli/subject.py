@@ -30,31 +30,15 @@ __all__ = ["Subject", "read_subject"]
 
 @dataclass(frozen=True)
 class Subject:
-    """The recordings of a subject as an inverse problem.
-
-    Attributes
-    ----------
-    problem : Problem
-    settings : FitSettings
-    source : PlantSource
-        Of the plant.
-    inputs : Inputs
-        Digests of all files that went in.
-    command : str
-        The command line, without folders.
-    files : tuple of str
-        Names of the recordings.
-    angles : str
-        "degrees" or "radians", as [report] says.
-    """
+    """The recordings of a subject as an inverse problem."""
 
     problem: Problem
     settings: FitSettings
-    source: PlantSource
-    inputs: Inputs
-    command: str
-    files: tuple[str, ...]
-    angles: str = "degrees"
+    source: PlantSource  # Of the plant
+    inputs: Inputs  # Digests of all files that went in
+    command: str  # The command line, without folders
+    files: tuple[str, ...]  # Names of the recordings
+    angles: str = "degrees"  # "degrees" or "radians", as [report] says
 
     @property
     def provenance(self) -> Provenance:
@@ -71,26 +55,7 @@ def read_subject(
     config: Path,
     solver: str | None = None,
 ) -> Subject:
-    """Read recordings, one file a trial.
-
-    Parameters
-    ----------
-    command : str
-        Which command asks for them.
-    files : sequence of Path
-        The recordings.
-    plant_name : str
-        Short name, import path or file of the plant.
-    config : Path
-        The configuration.
-    solver : str, optional
-        In place of the one that the configuration names.
-
-    Raises
-    ------
-    ImpcError
-        When a file, the configuration or the plant cannot be used; nothing has been written.
-    """
+    """Read recordings, one file a trial."""
     configuration = read_configuration(config)
     settings = fit_settings(configuration.fit)
     if solver is not None:

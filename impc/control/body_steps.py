@@ -25,13 +25,6 @@ def body_tape(body: Body | None, n: int, given: int, *, moving: bool) -> BodyTap
     """A body for the compiled loop, empty where there is none.
 
     With arrays of its own each time, because trials are simulated side by side.
-
-    Parameters
-    ----------
-    n, given : int
-        Numbers of states, and of states, inputs and disturbances.
-    moving : bool
-        Whether derivatives are wanted too.
     """
     if body is None:
         return BodyTape(0, np.zeros(0), np.zeros(0), np.zeros(0), np.zeros((0, 0)))
@@ -52,15 +45,7 @@ def next_state(plant: Plant, x: Array, u: Array, d: Array) -> Array:
 def pushes(along: Directions, x: Array, u: Array, d: Array) -> Array:
     """What the parameters in the body add to each derivative of the next state.
 
-    Parameters
-    ----------
-    x, u, d : Array
-        (steps, n), (steps, m) and (steps, d).
-
-    Returns
-    -------
-    Array
-        (steps, n, p).
+    `x` (steps, n); `u` (steps, m); `d` (steps, d); returns (steps, n, p).
     """
     found = np.zeros((*x.shape, along.count))
     for index, bodies in enumerate(along.bodies):
@@ -80,15 +65,7 @@ def _ahead(body: Body, x: Array, u: Array, d: Array) -> Array:
 def slopes_along(plant: Plant, x: Array, u: Array, d: Array) -> tuple[Array, Array, Array]:
     """Derivatives of the next state by state, input and disturbance, at every sample.
 
-    Parameters
-    ----------
-    x, u, d : Array
-        (steps, n), (steps, m) and (steps, d).
-
-    Returns
-    -------
-    tuple of Array
-        (steps, n, n), (steps, n, m) and (steps, n, d): A, B and E where the plant has no body.
+    `x` (steps, n); `u` (steps, m); `d` (steps, d).
     """
     n, m, steps = plant.n, plant.m, len(x)
     if plant.body is None:

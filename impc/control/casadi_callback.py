@@ -29,15 +29,9 @@ _alive: list[Any] = []
 
 @dataclass(frozen=True)
 class Signature:
-    """Names and shapes of what goes in and comes out.
+    """Names and shapes of what goes in and comes out."""
 
-    Attributes
-    ----------
-    inputs, outputs : dict of str to pair of int
-        Rows and columns of each.
-    """
-
-    inputs: dict[str, tuple[int, int]]
+    inputs: dict[str, tuple[int, int]]  # Rows and columns of each
     outputs: dict[str, tuple[int, int]]
 
 
@@ -47,48 +41,31 @@ class Linear(Protocol):
     def forward(self, seeds: list[Array]) -> list[Array]:
         """Directions of the outputs, (k, rows, columns) of each.
 
-        Parameters
-        ----------
-        seeds : list of Array
-            Directions of the inputs, (k, rows, columns) of each.
+        `seeds` (k, rows, columns).
         """
 
     def reverse(self, seeds: list[Array]) -> list[Array]:
         """Weights of the inputs, (k, rows, columns) of each.
 
-        Parameters
-        ----------
-        seeds : list of Array
-            Weights of the outputs, (k, rows, columns) of each.
+        `seeds` (k, rows, columns).
         """
 
 
 class Map(Protocol):
-    """What `differentiable` makes a function of; NaN where there is no value.
-
-    Attributes
-    ----------
-    signature : Signature
-    """
+    """What `differentiable` makes a function of; NaN where there is no value."""
 
     signature: Signature
 
     def value(self, point: list[Array]) -> list[Array]:
         """The outputs, (rows, columns) of each as in the signature.
 
-        Parameters
-        ----------
-        point : list of Array
-            The inputs, (rows, columns) of each.
+        `point` (rows, columns).
         """
 
     def linearised(self, point: list[Array]) -> Linear:
         """The linear map of changes.
 
-        Parameters
-        ----------
-        point : list of Array
-            The inputs, (rows, columns) of each.
+        `point` (rows, columns).
         """
 
 
@@ -101,41 +78,20 @@ class Matrix:
     def forward(self, seeds: list[Array]) -> list[Array]:
         """As in `Linear`.
 
-        Parameters
-        ----------
-        seeds : list of Array
-            Of the inputs, (k, rows, columns) of each.
-
-        Returns
-        -------
-        list of Array
-            Of the outputs, (k, rows, columns) of each.
+        `seeds` (k, rows, columns); returns (k, rows, columns).
         """
         return _parts(_flat(seeds) @ self._matrix.T, self._signature.outputs)
 
     def reverse(self, seeds: list[Array]) -> list[Array]:
         """As in `Linear`.
 
-        Parameters
-        ----------
-        seeds : list of Array
-            Of the outputs, (k, rows, columns) of each.
-
-        Returns
-        -------
-        list of Array
-            Of the inputs, (k, rows, columns) of each.
+        `seeds` (k, rows, columns); returns (k, rows, columns).
         """
         return _parts(_flat(seeds) @ self._matrix, self._signature.inputs)
 
 
 def differentiable(name: str, inner: Map) -> ca.Function:
-    """A map as a function of CasADi by that `name`.
-
-    Parameters
-    ----------
-    inner : Map
-    """
+    """A map as a function of CasADi by that `name`."""
     return _Callback(name, _Remembered(inner), "value", 0)
 
 

@@ -56,73 +56,37 @@ SOLVERS = ("daqp", "qpoases", "ipopt")
 
 @dataclass(frozen=True)
 class MpcSolver:
-    """A controller and its program, ready to be solved; made by `build_mpc`.
-
-    Attributes
-    ----------
-    controller : Controller
-    rows : Rows
-    name : str
-        Name of the CasADi plugin.
-    function : casadi.Function
-        The solver, taking the state as parameter ``p``. Rows are divided by their bounds: a
-        call of it needs ``lbg=-inf, ubg=1``, and slacks that are at least zero, as in `solve_mpc`.
-    soft : BoolArray
-        Which rows have a slack (r,).
-    """
+    """A controller and its program, ready to be solved; made by `build_mpc`."""
 
     controller: Controller
     rows: Rows
-    name: str
+    name: str  # Name of the CasADi plugin
+    # The solver, taking the state as parameter ``p``. Rows are divided by their bounds: a call of
+    # it needs ``lbg=-inf, ubg=1``, and slacks that are at least zero, as in `solve_mpc`.
     function: Any
-    soft: BoolArray
+    soft: BoolArray  # Which rows have a slack (r,)
 
 
 @dataclass(frozen=True)
 class MpcStep:
-    """Answer of one program.
+    """Answer of one program."""
 
-    Attributes
-    ----------
-    u : Array
-        Input to apply (m,); the plain gain's when the status is a failure, for inspection only.
-    plan : Array
-        Planned inputs (N, m).
-    states : Array
-        Planned states (N + 1, n).
-    status : Status
-        UNSOLVED when the solver found no plan that keeps the hard rows; INFEASIBLE when it is
-        proved that there is none. What a solver says of that is not believed: on a plant that
-        runs away IPOPT and qpOASES call feasible programs infeasible.
-    excess : float
-        Largest violation of a hard row relative to its bound, recomputed from the answer.
-    failed_row : int
-        Row of `Rows` that no plan keeps beside the others, -1 when there is none.
-    """
-
+    # Input to apply (m,); the plain gain's when the status is a failure, for inspection only
     u: Array
-    plan: Array
-    states: Array
+    plan: Array  # Planned inputs (N, m)
+    states: Array  # Planned states (N + 1, n)
+    # UNSOLVED when the solver found no plan that keeps the hard rows; INFEASIBLE when it is proved
+    # that there is none. What a solver says of that is not believed: on a plant that runs away
+    # IPOPT and qpOASES call feasible programs infeasible.
     status: Status
+    # Largest violation of a hard row relative to its bound, recomputed from the answer
     excess: float
-    failed_row: int
+    failed_row: int  # Row of `Rows` that no plan keeps beside the others, -1 when there is none
 
 
 @checked
 def build_mpc(controller: Controller, solver: str = "daqp") -> MpcSolver:
-    """Write the controller's program in CasADi and hand it to a solver.
-
-    Parameters
-    ----------
-    controller : Controller
-    solver : str
-        One of `SOLVERS`.
-
-    Raises
-    ------
-    InputError
-        When the solver is not one of them.
-    """
+    """Write the controller's program in CasADi and hand it to a solver."""
     if solver not in SOLVERS:
         raise InputError("solver", f"got {solver!r}", f"choose one of {', '.join(SOLVERS)}")
     rows = build_rows(controller)
@@ -161,20 +125,7 @@ def build_mpc(controller: Controller, solver: str = "daqp") -> MpcSolver:
 def solve_mpc(mpc: MpcSolver, x: ArrayLike) -> MpcStep:
     """Solve the program at a state.
 
-    Parameters
-    ----------
-    x : array_like
-        (n,).
-
-    Returns
-    -------
-    MpcStep
-        Check its status before applying its input.
-
-    Raises
-    ------
-    DataError
-        When the state is not finite or of the wrong size.
+    `x` (n,).
     """
     controller, rows = mpc.controller, mpc.rows
     state = finite_array("x", x, (controller.plant.n,))

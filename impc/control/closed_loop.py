@@ -54,45 +54,21 @@ __all__ = [
 
 @dataclass(frozen=True)
 class PreparedLoop:
-    """A controller with its rows and derivatives built; made by `prepare_loop`.
-
-    Attributes
-    ----------
-    controller : Controller
-    along : Directions
-        The p directions of the derivatives.
-    rows : Rows
-    row_directions : RowDirections
-        Derivatives of the rows.
-    matrices : LoopMatrices
-        Plant, gain and inverse metric.
-    matrix_directions : LoopMatrices
-        Derivatives of plant, gain and metric.
-    unit : Array
-        The nearer bound of each input (m,): what its error is measured by.
-    program : Program or None
-        For the controller's solver, where that is one of CasADi's.
-    """
+    """A controller with its rows and derivatives built; made by `prepare_loop`."""
 
     controller: Controller
-    along: Directions
+    along: Directions  # The p directions of the derivatives
     rows: Rows
-    row_directions: RowDirections
-    matrices: LoopMatrices
-    matrix_directions: LoopMatrices
-    unit: Array
-    program: Program | None
+    row_directions: RowDirections  # Derivatives of the rows
+    matrices: LoopMatrices  # Plant, gain and inverse metric
+    matrix_directions: LoopMatrices  # Derivatives of plant, gain and metric
+    unit: Array  # The nearer bound of each input (m,): what its error is measured by
+    program: Program | None  # For the controller's solver, where that is one of CasADi's
 
 
 @checked
 def simulate(controller: Controller, given: Scenario) -> Simulation:
-    """Simulate the plant of the controller; never raises for what happens on the way.
-
-    Returns
-    -------
-    Simulation
-        With a status for each sample; `require_complete` turns a failure into an error.
-    """
+    """Simulate the plant of the controller; never raises for what happens on the way."""
     simulation, _ = run_loop(prepare_loop(controller, directions(controller, 0)), given)
     return simulation
 

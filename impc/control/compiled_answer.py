@@ -54,25 +54,7 @@ def answer(
 ) -> tuple[int, bool]:
     """Write v and dv0 of `work` from the multipliers of one sample, where they tell the input.
 
-    Parameters
-    ----------
-    loop, dloop, rows, drows
-        As in `compiled_loop.run`.
-    unit : Buffer
-        What the error of each input is measured by (m,).
-    work : Workspace
-        With the slack of the gain, and the factor of the free rows.
-    x, dx : Buffer
-        State (n,) and its derivatives (n, p).
-    lam : Buffer
-        Multipliers (r,).
-    active : int
-        How many rows are free.
-
-    Returns
-    -------
-    status, near : int, bool
-        ACTIVE, SOFTENED or UNSOLVED; whether the active set is about to change.
+    `unit` (m,); `x` (n,); `dx` (n, p); `lam` (r,).
     """
     _recover(rows, lam, work)
     soft, near, told = _check(loop.K, rows, lam, work, active, x, unit)

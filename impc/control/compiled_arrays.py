@@ -38,55 +38,31 @@ _KEPT = 1e-13
 
 
 class LoopMatrices(NamedTuple):
-    """Plant, gain and inverse metric; or derivatives (those of S itself) along p directions.
+    """Plant, gain and inverse metric; or derivatives (those of S itself) along p directions."""
 
-    Attributes
-    ----------
-    A, B, E : Buffer
-        (n, n), (n, m) and (n, d); derivatives have a last axis more, (n, n, p) and so on.
-    K : Buffer
-        (m, n), derivatives (m, n, p).
-    S : Buffer
-        S^-1 (m, m); derivatives are those of S, (m, m, p).
-    """
-
-    A: Buffer
+    A: Buffer  # (n, n), (n, m) and (n, d); derivatives have a last axis more, (n, n, p) and so on
     B: Buffer
     E: Buffer
-    K: Buffer
-    S: Buffer
+    K: Buffer  # (m, n), derivatives (m, n, p)
+    S: Buffer  # S^-1 (m, m); derivatives are those of S, (m, m, p)
 
 
 class Workspace(NamedTuple):
-    """Arrays that one sample after the other uses.
+    """Arrays that one sample after the other uses."""
 
-    Attributes
-    ----------
-    slack, kept, free : Buffer
-        Of the rows (r,), the violation of each that counts as kept (r,), the free rows (a + 1,).
-    factor, basis : Buffer
-        As in `solve_dual`, (a + 1, a + 1) and (a + 1, N m).
-    v, rounding : Buffer
-        Inputs ahead beside the gain's, and what rounding makes of them (N m,).
-    dv0 : Buffer
-        Derivatives of the first of them (m, p).
-    T, M : Buffer
-        Columns of the rows, one after the other: (n, r) and (N m, r).
-    active : Buffer
-        How many rows are free at the last sample (1,). The problem of the next one begins with
-        them, for its plan is much like that of the one before.
-    """
-
+    # Of the rows (r,), the violation of each that counts as kept (r,), the free rows (a + 1,)
     slack: Buffer
     kept: Buffer
     free: Buffer
-    factor: Buffer
+    factor: Buffer  # As in `solve_dual`, (a + 1, a + 1) and (a + 1, N m)
     basis: Buffer
-    v: Buffer
+    v: Buffer  # Inputs ahead beside the gain's, and what rounding makes of them (N m,)
     rounding: Buffer
-    dv0: Buffer
-    T: Buffer
+    dv0: Buffer  # Derivatives of the first of them (m, p)
+    T: Buffer  # Columns of the rows, one after the other: (n, r) and (N m, r)
     M: Buffer
+    # How many rows are free at the last sample (1,). The problem of the next one begins with them,
+    # for its plan is much like that of the one before.
     active: Buffer
 
 

@@ -23,27 +23,14 @@ __all__ = ["BodyTape", "move_along", "move_body", "states_along"]
 
 
 class BodyTape(NamedTuple):
-    """The operations of a `Body` as machine code, with what it reads and writes.
+    """The operations of a `Body` as machine code, with what it reads and writes."""
 
-    Attributes
-    ----------
-    address : int
-        Where it begins; 0 where the linear plant moves.
-    constants : Buffer
-        (c,).
-    given : Buffer
-        Written at every sample: state, input and disturbance (g,).
-    found : Buffer
-        Written by the code: the next state and behind it its slopes (n + n*g,).
-    slopes : Buffer
-        The same numbers as `found` has there: derivatives of the next state by what is given
-        (n, g). Zero where the code does not write.
-    """
-
-    address: int
-    constants: Buffer
-    given: Buffer
-    found: Buffer
+    address: int  # Where it begins; 0 where the linear plant moves
+    constants: Buffer  # (c,)
+    given: Buffer  # Written at every sample: state, input and disturbance (g,)
+    found: Buffer  # Written by the code: the next state and behind it its slopes (n + n*g,)
+    # The same numbers as `found` has there: derivatives of the next state by what is given (n, g).
+    # Zero where the code does not write.
     slopes: Buffer
 
 
@@ -60,16 +47,8 @@ def move_body(
 ) -> None:
     """x+ = f(x, u, d) and its derivative.
 
-    Parameters
-    ----------
-    body : BodyTape
-        That with derivatives, unless p = 0.
-    x, u, disturbance : Buffer
-        (n,), (m,) and (d,).
-    dx, du : Buffer
-        Their derivatives (n, p) and (m, p); the disturbance has none.
-    ahead, dahead : Buffer
-        Written: the next state (n,) and its derivative (n, p).
+    `x` (n,); `u` (m,); `disturbance` (d,); `dx` (n, p); `du` (m, p); `ahead` (n,); `dahead`
+    (n, p).
     """
     n, p = len(x), dx.shape[1]
     _find(body, x, u, disturbance)
@@ -95,14 +74,7 @@ def move_body(
 def states_along(body: BodyTape, x: Buffer, u: Buffer, disturbance: Buffer, ahead: Buffer) -> None:
     """The next state at every sample of a trajectory.
 
-    Parameters
-    ----------
-    body : BodyTape
-        With derivatives or without.
-    x, u, disturbance : Buffer
-        (steps, n), (steps, m) and (steps, d).
-    ahead : Buffer
-        Written: (steps, n).
+    `x` (steps, n); `u` (steps, m); `disturbance` (steps, d); `ahead` (steps, n).
     """
     for t in range(len(ahead)):
         _find(body, x[t], u[t], disturbance[t])
@@ -113,14 +85,7 @@ def states_along(body: BodyTape, x: Buffer, u: Buffer, disturbance: Buffer, ahea
 def move_along(body: BodyTape, x: Buffer, u: Buffer, disturbance: Buffer, slopes: Buffer) -> None:
     """Derivatives of one sample by all that is given, at every sample of a trajectory.
 
-    Parameters
-    ----------
-    body : BodyTape
-        With derivatives.
-    x, u, disturbance : Buffer
-        (steps, n), (steps, m) and (steps, d).
-    slopes : Buffer
-        Written: (steps, n, n + m + d).
+    `x` (steps, n); `u` (steps, m); `disturbance` (steps, d); `slopes` (steps, n, n + m + d).
     """
     for t in range(len(slopes)):
         _find(body, x[t], u[t], disturbance[t])

@@ -27,48 +27,25 @@ class Clip(NamedTuple):
         E clip,   its slope  P(low < g + s xi < high) times that of g,   and a variance beside
 
     follow from the normal distribution (statistical linearisation).
-
-    Attributes
-    ----------
-    used : bool
-        Whether it is clipped at all; several inputs take the law as it is, with its slope.
-    low, high : float
-        Bounds of the input, in its unit.
-    unit : float
-        A deviation of s below 1e-12 of this is none.
     """
 
-    used: bool
-    low: float
+    used: bool  # Whether it is clipped at all; several inputs take the law as it is, with its slope
+    low: float  # Bounds of the input, in its unit
     high: float
-    unit: float
+    unit: float  # A deviation of s below 1e-12 of this is none
 
 
 class Clipped(NamedTuple):
-    """What is expected of min(max(g + s xi, low), high), xi normal, and its derivatives.
+    """What is expected of min(max(g + s xi, low), high), xi normal, and its derivatives."""
 
-    Attributes
-    ----------
-    beyond : int
-        1 where g itself is beyond a bound, else 0.
-    near : bool
-        Whether a bound is anywhere near; where none is, nothing is clipped.
-    value, value_s : float
-        The expectation, and its derivative along s; that along g is `inside`.
-    inside, inside_g, inside_s : float
-        Probability of no bound, by which slopes are multiplied, and its derivatives.
-    variance, variance_g, variance_s : float
-        What no slope explains, and its derivatives.
-    """
-
-    beyond: int
-    near: bool
-    value: float
+    beyond: int  # 1 where g itself is beyond a bound, else 0
+    near: bool  # Whether a bound is anywhere near; where none is, nothing is clipped
+    value: float  # The expectation, and its derivative along s; that along g is `inside`
     value_s: float
-    inside: float
+    inside: float  # Probability of no bound, by which slopes are multiplied, and its derivatives
     inside_g: float
     inside_s: float
-    variance: float
+    variance: float  # What no slope explains, and its derivatives
     variance_g: float
     variance_s: float
 

@@ -39,15 +39,7 @@ COMPILED_WITH = {
 
 @njit(cache=True, inline="always")
 def weigh(joint: JointLoop, djoint: JointLoop, room: Room) -> None:
-    """Write all that follows from P and dP, which are the room's.
-
-    Parameters
-    ----------
-    joint, djoint : JointLoop
-        The system, and its derivatives along k directions.
-    room : Room
-        Its covariance is completed.
-    """
+    """Write all that follows from P and dP, which are the room's."""
     here, plant = room.here, room.moves.plant
     C, dC, dR, P, CP, S, dCP, dS = (
         joint.C, djoint.C, djoint.R, here.P, here.CP, here.S, here.dCP, here.dS
@@ -95,17 +87,7 @@ def weigh(joint: JointLoop, djoint: JointLoop, room: Room) -> None:
 
 @njit(cache=True, inline="always")
 def advance(joint: JointLoop, djoint: JointLoop, room: Room, at: int) -> None:
-    """P and dP become those before the next sample.
-
-    Parameters
-    ----------
-    joint, djoint : JointLoop
-        The system, and its derivatives along k directions.
-    room : Room
-        Of this sample, with the slope of its commands and the noise that enters with them.
-    at : int
-        Where the estimate stands in z.
-    """
+    """P and dP become those before the next sample."""
     here, way, slope, noise = room.here, room.way, room.slope, room.noise
     (m, n), size = slope.shape, len(here.P)
     P, B, G, F, FP, ahead = here.P, joint.B, joint.G, way.F, way.FP, way.ahead
@@ -198,15 +180,7 @@ def _add_moves(moves: Moves, way: Way, rest: Buffer) -> None:
 
 @njit(cache=True, inline="always")
 def variance_changes(joint: JointLoop, djoint: JointLoop, room: Room) -> Buffer:
-    """Derivatives (k,) of seen' P|t seen, what is seen held; the room's way keeps them.
-
-    Parameters
-    ----------
-    joint, djoint : JointLoop
-        The system, and its derivatives along k directions.
-    room : Room
-        With what is seen of z.
-    """
+    """Derivatives (k,) of seen' P|t seen, what is seen held; the room's way keeps them."""
     here, way, moves, seen = room.here, room.way, room.moves, room.seen
     size, k, dR, known, before = len(seen), here.dP.shape[2], djoint.R, way.known, way.before
     known[:], before[0] = 0.0, seen

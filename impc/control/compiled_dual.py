@@ -63,25 +63,11 @@ def solve_dual(
 ) -> tuple[int, int]:
     """Solve the dual, from the free rows of a problem with the same rows and another slack.
 
-    Parameters
-    ----------
-    whitened, gram : Buffer
-        W = M L^-T with S = L L', (r, N m), and W W', (r, r).
-    d, limit, tolerance : Buffer
-        Slack of the rows at v = 0, upper limits, and the violation below which a row counts as
-        kept, (r,) each.
-    lam, free, factor, basis : Buffer
-        Written: multipliers (r,), the rows with 0 < lam < limit in the order of the factor, and
-        the lower factor of their Gram matrix. Sizes r, a + 1, (a + 1, a + 1) and (a + 1, N m) with
-        a = min(r, N m).
-    begin : int
-        How many rows of `free` it begins with, whose factor is there; with 0, from lam = 0.
-
-    Returns
-    -------
-    status, count : int
-        CONVERGED and the number of free rows, an answer to be checked; INCONSISTENT and the row at
-        which it was found, with the combination of rows that should prove it in `lam`; UNFINISHED.
+    `whitened` W = M L^-T (r, N m), S = L L'; `gram` W W' (r, r); `d`, `limit`, `tolerance` (r,).
+    Written: `lam` (r,), the rows with 0 < lam < limit in `free` (a + 1,), the lower `factor` of
+    their Gram matrix (a + 1, a + 1) and their `basis` (a + 1, N m), a = min(r, N m). `begin` rows
+    of `free` are there with their factor. Returns a status, and how many rows are free or which
+    one was inconsistent, with the combination of rows that should prove it in `lam`.
     """
     rows = len(d)
     slack, change, lengths = d.copy(), np.empty(len(d)), np.empty(len(d))
@@ -238,22 +224,8 @@ def refine(
 ) -> None:
     """Solve once more for the final active set, so that the steps leave no rounding behind.
 
-    Parameters
-    ----------
-    gram : Buffer
-        W W' (r, r), as in `solve_dual`.
-    d, limit : Buffer
-        Slack of the rows at v = 0 and upper limits (r,).
-    at_limit : Buffer
-        Which multipliers are at their limits (r,).
-    lam : Buffer
-        Written: multipliers of the free rows, in (r,).
-    free : Buffer
-        Which rows are free (a + 1,).
-    count : int
-        How many.
-    factor : Buffer
-        The lower factor of their Gram matrix (a + 1, a + 1).
+    `gram` (r, r); `d, limit` (r,); `at_limit` (r,); `lam` (r,); `free` (a + 1,); `factor` (a
+    + 1, a + 1).
     """
     right = np.empty(count)
     for i in range(count):
@@ -274,14 +246,7 @@ def append_row(whitened: Buffer, row: int, count: int, factor: Buffer, basis: Bu
     The new part itself goes to basis[count], not normalised. Working with the rows instead of their
     Gram matrix keeps twice as many digits of it.
 
-    Parameters
-    ----------
-    whitened : Buffer
-        All rows (r, N m), as in `solve_dual`.
-    row, count : int
-        The one that is new, and how many are in the basis.
-    factor, basis : Buffer
-        Written at `count`: (a + 1, a + 1) and (a + 1, N m).
+    `whitened` (r, N m); `factor` (a + 1, a + 1); `basis` (a + 1, N m).
     """
     width = whitened.shape[1]
     new = basis[count]
@@ -306,14 +271,7 @@ def append_row(whitened: Buffer, row: int, count: int, factor: Buffer, basis: Bu
 def accept_row(count: int, length: float, factor: Buffer, basis: Buffer) -> None:
     """Take the row of `append_row` into the basis.
 
-    Parameters
-    ----------
-    count : int
-        How many rows are in the basis without it.
-    length : float
-        What is new of it, in the unit of the whitened rows.
-    factor, basis : Buffer
-        Written at `count`: (a + 1, a + 1) and (a + 1, N m).
+    `factor` (a + 1, a + 1); `basis` (a + 1, N m).
     """
     factor[count, count] = length
     for k in range(basis.shape[1]):
@@ -324,14 +282,7 @@ def accept_row(count: int, length: float, factor: Buffer, basis: Buffer) -> None
 def substitute(factor: Buffer, count: int, right: Buffer) -> None:
     """Solve L L' x = right in place.
 
-    Parameters
-    ----------
-    factor : Buffer
-        Its leading (count, count) is L, lower triangular.
-    count : int
-        How many equations.
-    right : Buffer
-        The right side, and the answer (count,).
+    `factor` (count, count); `right` (count,).
     """
     for i in range(count):
         total = right[i]

@@ -53,83 +53,44 @@ _STEADY, _STEADY_SLOPE = 1e-10, 1e-8
 
 
 class Steady(NamedTuple):
-    """The stationary filter where no bound is active, and its derivatives along k directions.
+    """The stationary filter where no bound is active, and its derivatives along k directions."""
 
-    Attributes
-    ----------
-    P, dP : Buffer
-        Covariance of z given all earlier outputs (z, z), and (z, z, k).
-    known : bool
-        Whether there is one.
-    """
-
-    P: Buffer
+    P: Buffer  # Covariance of z given all earlier outputs (z, z), and (z, z, k)
     dP: Buffer
-    known: bool
+    known: bool  # Whether there is one
 
 
 class Course(NamedTuple):
-    """Trials that are filtered together, and where each leaves.
+    """Trials that are filtered together, and where each leaves."""
 
-    Attributes
-    ----------
-    begin : Buffer
-        The row at which each trial begins, and the one after the last (trials + 1,).
-    first : int
-        The sample at which all are.
-    corrected : bool
-        Whether z knows the outputs of that sample.
-    shared : bool
-        Whether trials share a covariance, and leave where a bound is near; one alone need not.
-    reached : Buffer
-        Written: the sample at which each leaves, or how many it has (trials,).
-    known : Buffer
-        Written: whether its z knows the outputs of that sample (trials,).
-    P, dP : Buffer
-        Covariance before the first sample (trials, z, z), and its derivatives (trials, z, z, k);
-        written, of each that leaves before its end: those before the sample at which it does.
-    """
-
-    begin: Buffer
-    first: int
-    corrected: bool
+    begin: Buffer  # The row at which each trial begins, and the one after the last (trials + 1,)
+    first: int  # The sample at which all are
+    corrected: bool  # Whether z knows the outputs of that sample
+    # Whether trials share a covariance, and leave where a bound is near; one alone need not
     shared: bool
-    reached: Buffer
-    known: Buffer
+    reached: Buffer  # Written: the sample at which each leaves, or how many it has (trials,)
+    known: Buffer  # Written: whether its z knows the outputs of that sample (trials,)
+    # Covariance before the first sample (trials, z, z), and its derivatives (trials, z, z, k);
+    # written, of each that leaves before its end: those before the sample at which it does
     P: Buffer
     dP: Buffer
 
 
 class FilterParts(NamedTuple):
-    """What is filtered with, along q directions of which the first k move covariances.
+    """What is filtered with, along q directions of which the first k move covariances."""
 
-    Attributes
-    ----------
-    loop, dloop, rows, drows, unit
-        Of the controller's law, as in `compiled_loop.run`, along all q directions; unit (m,).
-    clip : Clip
-        What is done to the law's command.
-    joint, djoint : JointLoop
-        The system, and its derivatives along the first k directions.
-    steady : Steady
-        The stationary filter.
-    at : int
-        Where the estimate stands in z.
-    lasting : int
-        How many directions, the first ones, move more than the first state.
-    """
-
+    # Of the controller's law, as in `compiled_loop.run`, along all q directions; unit (m,)
     loop: LoopMatrices
     dloop: LoopMatrices
     rows: Rows
     drows: RowDirections
     unit: Buffer
-    clip: Clip
-    joint: JointLoop
+    clip: Clip  # What is done to the law's command
+    joint: JointLoop  # The system, and its derivatives along the first k directions
     djoint: JointLoop
-    steady: Steady
-    at: int
-    lasting: int
+    steady: Steady  # The stationary filter
+    at: int  # Where the estimate stands in z
+    lasting: int  # How many directions, the first ones, move more than the first state
 
 
 @njit(cache=True, nogil=True)
@@ -150,20 +111,7 @@ def run_filter(
     covariances are shared; and where they are not, at the first one that remembers nothing of the
     first state, from where `lasting` directions are enough.
 
-    Parameters
-    ----------
-    parts : FilterParts
-    outputs, disturbance : Buffer
-        Of all trials, one after the other, (rows, p) and (rows, d).
-    z, dz : Buffer
-        Expected states at the sample where all are (trials, z), and their derivatives
-        (trials, z, q); overwritten.
-    room : Room
-        With the covariance there; overwritten.
-    result : FilterResult
-        Written.
-    course : Course
-        Which trials, and from where on; completed.
+    `outputs` (rows, p); `disturbance` (rows, d); `z` (trials, z); `dz` (trials, z, q).
     """
     # The caller keeps all of these while this runs.
     parts, room, result, course = borrowed((parts, room, result, course))

@@ -65,22 +65,7 @@ def law(
 ) -> tuple[int, bool, int]:
     """Write the input of one state, with its derivatives.
 
-    Parameters
-    ----------
-    loop, dloop, rows, drows, unit, lam, gain_only
-        As in `run`; unit (m,) and lam (r,).
-    work : Workspace
-        Its multipliers and active rows are those of this state afterwards.
-    x, dx : Buffer
-        State (n,) and its derivatives (n, p).
-    u, du : Buffer
-        Written: input (m,) and its derivatives (m, p).
-
-    Returns
-    -------
-    status, near, row : int, bool, int
-        Whether the gain keeps every bound, a bound is active, and so on; whether the active set is
-        about to change; the row that proved the problem inconsistent, or -1.
+    `x` (n,); `dx` (n, p); `u` (m,); `du` (m, p).
     """
     v = work.v
     needs_qp, near = _look(work.T, rows.b, work.kept, x, work.slack)
@@ -174,27 +159,8 @@ def answer_with(
 ) -> tuple[int, bool]:
     """Input of one sample and its derivative, where another solver has found the active set.
 
-    Parameters
-    ----------
-    loop, dloop : LoopMatrices
-        Of the loop and its derivatives, as in `run`.
-    rows, drows : Rows, RowDirections
-        Likewise.
-    unit : Buffer
-        What the error of each input is measured by (m,).
-    x, dx : Buffer
-        State (n,) and its derivative (n, p).
-    tight : Buffer
-        Rows that hold with equality, linearly independent, (a,).
-    given_up : Buffer of bool
-        Soft rows that are exceeded (r,).
-    u, du, lam, v : Buffer
-        Written: input (m,) and its derivative (m, p), multipliers (r,), all of v (N m,).
-
-    Returns
-    -------
-    status, weak : int, bool
-        ACTIVE or SOFTENED when the answer keeps what `answer` asks for, UNSOLVED otherwise.
+    `unit` (m,); `x` (n,); `dx` (n, p); `tight` (a,); `given_up` (r,); `u` (m,); `du` (m, p);
+    `lam` (r,); `v` (N m,).
     """
     work, active = workspace(rows, du.shape[0], du.shape[1]), len(tight)
     if active >= len(work.free):

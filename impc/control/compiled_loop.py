@@ -57,44 +57,8 @@ def run(
 ) -> tuple[int, int]:
     """Simulate from x[first] and dx[first], with derivatives along p directions (p may be 0).
 
-    Parameters
-    ----------
-    dloop, drows : LoopMatrices, RowDirections
-        Derivatives of the loop and of its rows.
-    body : BodyTape
-        What moves, unless it is empty.
-    pushes : Buffer
-        What its parameters add to each derivative, (steps, n, p), or nothing, (0, n, p).
-    disturbance : Buffer
-        (steps, d).
-    divergence : float
-        Entry of a state, in its unit, at which the simulation ends.
-    unit : Buffer
-        What the error of each input is measured by (m,): its nearer bound.
-    work : Workspace
-        For the rows.
-    first : int
-        Where to begin. When `status` has an answer there, u and du have it too.
-    x, u : Buffer
-        Written: states (steps + 1, n) after the first, inputs (steps, m).
-    dx, du : Buffer
-        Written: their derivatives (steps + 1, n, p) after the first, (steps, m, p).
-    status : Buffer
-        Written up to the sample that ends it: the value of `closed_loop.Status`, (steps,).
-    lam : Buffer
-        Written: the multipliers of the last problem (r,), or the combination of rows that should
-        prove it inconsistent.
-    gain_only : bool
-        Whether to end, UNSOLVED, at the first sample where the gain breaks a bound.
-    local : bool
-        Whether every sample has the directions dx[0] in place of what came of them: du is then the
-        derivative of each input with respect to its own state and to what is common to all.
-
-    Returns
-    -------
-    weak, row : int
-        Number of samples at which the active set is about to change; the row that proved the last
-        problem inconsistent, or -1.
+    `disturbance` (steps, d); `unit` (m,); `x` (steps + 1, n); `u` (steps, m); `dx` (steps +
+    1, n, p); `du` (steps, m, p); `status` (steps,); `lam` (r,).
     """
     # The caller keeps all of these while this runs.
     loop, dloop, rows, drows, body = borrowed((loop, dloop, rows, drows, body))

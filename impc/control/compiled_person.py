@@ -39,21 +39,9 @@ def run_person(
 ) -> int:
     """Simulate from z[0] with noise that has been drawn, without derivatives.
 
-    Parameters
-    ----------
-    loop, dloop, rows, drows, unit, joint, at
-        As in `run_filter`, along no direction; unit (m,).
-    disturbance, noise : Buffer
-        (samples, d), and what is added to the next z (samples, z).
-    shared : Buffer
-        Normal numbers (samples, m), for the noise that is a share of the command.
-    z, u, status : Buffer
-        Written: (samples + 1, z) after the first, (samples, m) and (samples,).
-
-    Returns
-    -------
-    int
-        Samples before the one at which the law has no answer; all when it always has.
+    `loop, dloop, rows, drows, unit, joint, at` (m,); `disturbance` (samples, d); `noise`
+    (samples, z); `shared` (samples, m); `z` (samples + 1, z); `u` (samples, m); `status`
+    (samples,).
     """
     n = loop.K.shape[1]
     work = workspace(rows, u.shape[1], 0)

@@ -32,14 +32,7 @@ def combine(weights: Buffer, rows: Buffer, step: int, result: Buffer) -> None:
     the first three. Indices begin at 0: where one might be negative numba takes one number at a
     time.
 
-    Parameters
-    ----------
-    weights, rows : Buffer
-        (i, j) and (j, w).
-    step : int
-        By how many numbers each line is longer than the one before; 0 for all of each.
-    result : Buffer
-        Written (i, w).
+    `result` (i, w).
     """
     lines, width = len(weights), rows.shape[1]
     whole = lines - lines % 4 if len(rows) > 3 else 0
@@ -105,12 +98,7 @@ def _times(w: tuple[float, float, float, float], x: tuple[float, float, float, f
 def both_sides(G: Buffer, dP: Buffer, product: Buffer) -> None:
     """The lower half of G dP G' takes the place of dP; what is above is left to `add_both`.
 
-    Parameters
-    ----------
-    G : Buffer
-        (z, z).
-    dP, product : Buffer
-        (z, z, k); the second is room on the way.
+    `G` (z, z); `dP, product` (z, z, k).
     """
     size, k = len(G), dP.shape[2]
     flat, room = dP.reshape(size, size * k), product.reshape(size, size * k)
@@ -126,12 +114,7 @@ def both_sides(G: Buffer, dP: Buffer, product: Buffer) -> None:
 def turn(weight: float, changes: Buffer, rows: Buffer, turned: Buffer) -> None:
     """Add weight times sum_j rows_j changes_j' to what is turned.
 
-    Parameters
-    ----------
-    weight : float
-        By which the sum is multiplied.
-    changes, rows, turned : Buffer
-        (j, k), (j, z) and (z, k).
+    `changes` (j, k); `rows` (j, z); `turned` (z, k).
     """
     for j in range(len(rows)):
         for b in range(len(turned)):
@@ -143,10 +126,7 @@ def turn(weight: float, changes: Buffer, rows: Buffer, turned: Buffer) -> None:
 def add_both(rest: Buffer, dP: Buffer) -> None:
     """Add `rest` and its transpose to the lower half of dP, and write the upper.
 
-    Parameters
-    ----------
-    rest, dP : Buffer
-        (z, z, k); the second is overwritten.
+    `rest, dP` (z, z, k).
     """
     size, k = len(dP), dP.shape[2]
     for i in range(size):
@@ -161,14 +141,7 @@ def add_both(rest: Buffer, dP: Buffer) -> None:
 def noise_products(inverse: Buffer, dS: Buffer, told: Buffer, half: Buffer) -> None:
     """Write tr(S^-1 dS S^-1 dS) / 2 for each pair of directions, the lower half.
 
-    Parameters
-    ----------
-    inverse, dS : Buffer
-        S^-1 (p, p), and the derivatives of S (p, p, k).
-    told : Buffer
-        Room (p, p, k).
-    half : Buffer
-        Written (k, k).
+    `inverse` (p, p); `dS` (p, p, k); `told` (p, p, k); `half` (k, k).
     """
     p, k = len(inverse), dS.shape[2]
     told[:] = 0.0
@@ -189,10 +162,7 @@ def noise_products(inverse: Buffer, dS: Buffer, told: Buffer, half: Buffer) -> N
 def invert(S: Buffer, inverse: Buffer) -> float:
     """Write the inverse of a covariance, one pivot after the other; return log det S.
 
-    Parameters
-    ----------
-    S, inverse : Buffer
-        (p, p); the second is written.
+    `S, inverse` (p, p).
     """
     inverse[:] = S
     p, volume = len(S), 0.0

@@ -23,160 +23,86 @@ COMPILED_WITH = {"compiled_arrays": "f9299fe715d0d2a3"}
 
 
 class Covariance(NamedTuple):
-    """Covariance of z before a sample of the outputs is known, and what that sample does to it.
+    """Covariance of z before a sample of the outputs is known, and what that sample does to it."""
 
-    Attributes
-    ----------
-    P, dP : Buffer
-        Before the sample (z, z) and (z, z, k).
-    CP, S, inverse, gain : Buffer
-        C P (p, z), S and S^-1 (p, p), g (z, p).
-    volume : Buffer
-        log det S (1,).
-    dCP, dS : Buffer
-        Derivatives of C P (p, z, k) and of S (p, p, k).
-    half : Buffer
-        tr(S^-1 dS S^-1 dS) / 2 for each pair of directions (k, k), the lower half.
-    left : Buffer
-        P|t, once the sample is known (z, z).
-    """
-
-    P: Buffer
+    P: Buffer  # Before the sample (z, z) and (z, z, k)
     dP: Buffer
-    CP: Buffer
+    CP: Buffer  # C P (p, z), S and S^-1 (p, p), g (z, p)
     S: Buffer
     inverse: Buffer
     gain: Buffer
-    volume: Buffer
-    dCP: Buffer
+    volume: Buffer  # log det S (1,)
+    dCP: Buffer  # Derivatives of C P (p, z, k) and of S (p, p, k)
     dS: Buffer
-    half: Buffer
-    left: Buffer
+    half: Buffer  # tr(S^-1 dS S^-1 dS) / 2 for each pair of directions (k, k), the lower half
+    left: Buffer  # P|t, once the sample is known (z, z)
 
 
 class Way(NamedTuple):
-    """Room for what a sample makes on its way, so that none is asked for at every sample.
+    """Room for what a sample makes on its way, so that none is asked for at every sample."""
 
-    Attributes
-    ----------
-    F, FP, ahead, G : Buffer
-        F at the slope of the command, F P|t, (F P|t)' and F - L C (z, z).
-    L : Buffer
-        F g (z, p).
-    columns, lines, changes : Buffer
-        What enters by one column each, B, G and the L of the sample (z, j), the same as lines
-        (j, z), and how each of the 2 m + p changes (j, z, k).
-    estimate : Buffer
-        Of F P|t, the columns of the estimate (z, n).
-    picked, moved : Buffer
-        Of F P|t, the columns that move (z, j), and what their moves make (z, v), v being z times
-        the width of `Moves`.
-    told : Buffer
-        S^-1 dS (p, p, k).
-    product : Buffer
-        (z, z, k).
-    known, before : Buffer
-        What is seen of the outputs (p,), and of z before them (1, z).
-    turned, change : Buffer
-        Its changes (1, z k), and those of its variance (1, k).
-    """
-
-    F: Buffer
+    F: Buffer  # F at the slope of the command, F P|t, (F P|t)' and F - L C (z, z)
     FP: Buffer
     ahead: Buffer
     G: Buffer
-    L: Buffer
+    L: Buffer  # F g (z, p)
+    # What enters by one column each, B, G and the L of the sample (z, j), the same as lines (j, z),
+    # and how each of the 2 m + p changes (j, z, k)
     columns: Buffer
     lines: Buffer
     changes: Buffer
-    estimate: Buffer
+    estimate: Buffer  # Of F P|t, the columns of the estimate (z, n)
+    # Of F P|t, the columns that move (z, j), and what their moves make (z, v), v being z times the
+    # width of `Moves`
     picked: Buffer
     moved: Buffer
-    told: Buffer
-    product: Buffer
-    known: Buffer
+    told: Buffer  # S^-1 dS (p, p, k)
+    product: Buffer  # (z, z, k)
+    known: Buffer  # What is seen of the outputs (p,), and of z before them (1, z)
     before: Buffer
-    turned: Buffer
+    turned: Buffer  # Its changes (1, z k), and those of its variance (1, k)
     change: Buffer
 
 
 class Moves(NamedTuple):
-    """What is not zero of dF and dQ: few directions move either, and few columns of F.
+    """What is not zero of dF and dQ: few directions move either, and few columns of F."""
 
-    Attributes
-    ----------
-    first, width : int
-        Which directions move either: `width` of them beginning at the first.
-    column : Buffer
-        Which columns of F any direction moves (j,).
-    F, Q : Buffer
-        Of these directions dF, the columns that move (j, v), and dQ / 2 (z, v), v being z times
-        the width.
-    plant : bool
-        Whether any direction moves B, C, E or G.
-    """
-
-    first: int
+    first: int  # Which directions move either: `width` of them beginning at the first
     width: int
-    column: Buffer
+    column: Buffer  # Which columns of F any direction moves (j,)
+    # Of these directions dF, the columns that move (j, v), and dQ / 2 (z, v), v being z times the
+    # width
     F: Buffer
     Q: Buffer
-    plant: bool
+    plant: bool  # Whether any direction moves B, C, E or G
 
 
 class Room(NamedTuple):
-    """What a filter works in along q directions, of which the first k move covariances.
+    """What a filter works in along q directions, of which the first k move covariances."""
 
-    Attributes
-    ----------
-    work : Workspace
-        Of the law.
-    lam, u, du : Buffer
-        Multipliers (r,), and the commands (m,) with their derivatives (m, q).
-    slope, dslope : Buffer
-        Of the commands with the estimate (m, n), and its derivatives (m, n, k).
-    noise, dnoise : Buffer
-        Variance of noise that enters with each command, by B and by G, (2, m), and its derivatives
-        (2, m, k).
-    e, we : Buffer
-        An innovation and S^-1 times it (p,).
-    de, wde : Buffer
-        Derivatives of the innovation and S^-1 times them (p, q).
-    moved : Buffer
-        dS S^-1 e (p, k).
-    before, dbefore : Buffer
-        z once the outputs are known (z,), and its derivatives (z, q).
-    seen, weighed, ds : Buffer
-        The slope in z and its covariance with z (z,); derivatives of its deviation (k,).
-    here : Covariance
-        Of z, before the sample that is next.
-    way : Way
-        Where its next one is made.
-    moves : Moves
-        What the k directions move.
-    """
-
-    work: Workspace
-    lam: Buffer
+    work: Workspace  # Of the law
+    lam: Buffer  # Multipliers (r,), and the commands (m,) with their derivatives (m, q)
     u: Buffer
     du: Buffer
-    slope: Buffer
+    slope: Buffer  # Of the commands with the estimate (m, n), and its derivatives (m, n, k)
     dslope: Buffer
+    # Variance of noise that enters with each command, by B and by G, (2, m), and its derivatives
+    # (2, m, k)
     noise: Buffer
     dnoise: Buffer
-    e: Buffer
+    e: Buffer  # An innovation and S^-1 times it (p,)
     we: Buffer
-    de: Buffer
+    de: Buffer  # Derivatives of the innovation and S^-1 times them (p, q)
     wde: Buffer
-    moved: Buffer
-    before: Buffer
+    moved: Buffer  # dS S^-1 e (p, k)
+    before: Buffer  # z once the outputs are known (z,), and its derivatives (z, q)
     dbefore: Buffer
-    seen: Buffer
+    seen: Buffer  # The slope in z and its covariance with z (z,); derivatives of its deviation (k,)
     weighed: Buffer
     ds: Buffer
-    here: Covariance
-    way: Way
-    moves: Moves
+    here: Covariance  # Of z, before the sample that is next
+    way: Way  # Where its next one is made
+    moves: Moves  # What the k directions move
 
 
 @njit(cache=True)
@@ -185,14 +111,7 @@ def filter_room(
 ) -> Room:
     """Room for a filter from a covariance on.
 
-    Parameters
-    ----------
-    rows, joint, djoint
-        As in `run_filter`.
-    P, dP : Buffer
-        Covariance of z before the sample that is next (z, z), and its derivatives (z, z, k).
-    n, q : int
-        How many states the estimate has, and how many directions there are.
+    `P` (z, z); `dP` (z, z, k).
     """
     (size, m), p, k = joint.B.shape, len(joint.C), dP.shape[2]
     moves = _moves(djoint, k)

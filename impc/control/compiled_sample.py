@@ -45,37 +45,20 @@ _FORGOTTEN = 1e-9
 
 
 class FilterResult(NamedTuple):
-    """What the filter writes, sample by sample, the trials one after the other.
+    """What the filter writes, sample by sample, the trials one after the other."""
 
-    Attributes
-    ----------
-    told : Buffer
-        Log-likelihood of each sample given the earlier ones of its trial (rows,).
-    score : Buffer
-        Its derivatives along the q directions (rows, q).
-    information : Buffer
-        Of each trial, the sum of their expected products (trials, q, q), the lower half.
-    innovation, spread : Buffer
-        Recorded outputs minus what is expected (rows, p), and their covariance (rows, p, p).
-    filtered : Buffer
-        Expected z given all outputs so far (rows, z).
-    u : Buffer
-        Command expected there (rows, m).
-    status : Buffer
-        Of each sample: the value of `closed_loop.Status` (rows,).
-    counted : int
-        The first sample of a trial that is told: those before it tell nothing, and are what the
-        others are told given.
-    """
-
-    told: Buffer
-    score: Buffer
+    told: Buffer  # Log-likelihood of each sample given the earlier ones of its trial (rows,)
+    score: Buffer  # Its derivatives along the q directions (rows, q)
+    # Of each trial, the sum of their expected products (trials, q, q), the lower half
     information: Buffer
+    # Recorded outputs minus what is expected (rows, p), and their covariance (rows, p, p)
     innovation: Buffer
     spread: Buffer
-    filtered: Buffer
-    u: Buffer
-    status: Buffer
+    filtered: Buffer  # Expected z given all outputs so far (rows, z)
+    u: Buffer  # Command expected there (rows, m)
+    status: Buffer  # Of each sample: the value of `closed_loop.Status` (rows,)
+    # The first sample of a trial that is told: those before it tell nothing, and are what the
+    # others are told given
     counted: int
 
 
@@ -95,23 +78,7 @@ def update(
 ) -> bool:
     """Likelihood and score of one sample; z and dz become those given the sample.
 
-    Parameters
-    ----------
-    joint, djoint, result, lasting
-        As in `run_filter`.
-    room : Room
-        With what follows from the covariance of z before the sample.
-    output : Buffer
-        What is recorded (p,).
-    z, dz : Buffer
-        The state that is expected (z,) and its derivatives (z, q); overwritten.
-    i, row, t : int
-        The trial, and the sample among all rows and in the trial.
-
-    Returns
-    -------
-    bool
-        Whether directions from `lasting` on move the innovation and its covariance by nothing.
+    `output` (p,); `z` (z,); `dz` (z, q).
     """
     _innovate(joint, djoint, room, output, z, dz)
     result.innovation[row], result.spread[row] = room.e, room.here.S
@@ -219,14 +186,7 @@ def _inform(information: Buffer, de: Buffer, wde: Buffer, half: Buffer) -> None:
 def expected_command(clip: Clip, room: Room, at: int, u: Buffer) -> tuple[Clipped, float]:
     """What is expected of a command, and the deviation of what the person would do without bounds.
 
-    Parameters
-    ----------
-    clip, at
-        As in `run_filter`.
-    room : Room
-        With the command's slope; what is seen of z, and its covariance with z, are written.
-    u : Buffer
-        The command (1,).
+    `u` (1,).
     """
     slope, here, seen, weighed = room.slope, room.here, room.seen, room.weighed
     n = slope.shape[1]
@@ -248,18 +208,7 @@ def clip_command(
 
     The variance that no slope explains goes to the first row of the room's noise.
 
-    Parameters
-    ----------
-    found : Clipped
-        From `expected_command`.
-    s : float
-        Likewise.
-    joint, djoint, at
-        As in `run_filter`.
-    room : Room
-        With the command's slope and derivatives, which are overwritten.
-    u : Buffer
-        The command (1,); overwritten.
+    `u` (1,).
     """
     slope, dslope, du = room.slope, room.dslope, room.du
     noise, dnoise, weighed, ds = room.noise[0], room.dnoise[0], room.weighed, room.ds
@@ -294,12 +243,7 @@ def share_noise(
 ) -> None:
     """Write the variance of noise that is a share of the commands, and its derivatives.
 
-    Parameters
-    ----------
-    share, dshare, u, du : Buffer
-        The shares (m,) and (m, k), and the commands (m,) and (m, q).
-    noise, dnoise : Buffer
-        Written (m,) and (m, k).
+    `share` (m,); `dshare` (m, k); `u` (m,); `du` (m, q); `noise` (m,); `dnoise` (m, k).
     """
     for a in range(len(u)):
         noise[a] = (share[a] * u[a]) ** 2
@@ -320,16 +264,7 @@ def ahead(
 ) -> None:
     """z becomes F z + B u + E d, and dz its derivative.
 
-    Parameters
-    ----------
-    joint, djoint
-        As in `run_filter`.
-    room : Room
-        With the derivatives of the commands.
-    u, disturbance : Buffer
-        Of this sample (m,) and (d,).
-    z, dz : Buffer
-        The state that is expected (z,) and its derivatives (z, q); overwritten.
+    `u` (m,); `disturbance` (d,); `z` (z,); `dz` (z, q).
     """
     F, B, E, du, moves, q = joint.F, joint.B, joint.E, room.du, room.moves, dz.shape[1]
     before, dbefore = room.before, room.dbefore

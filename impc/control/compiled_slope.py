@@ -35,14 +35,7 @@ def slope_of_law(
 
     With the active rows a it is -K - (Gram_aa^-1 N_a0)' T_a, N_a0 the columns of the first stage.
 
-    Parameters
-    ----------
-    loop, dloop, rows, drows
-        As in `compiled_loop.run`.
-    work : Workspace
-        As the law has left it.
-    slope, dslope : Buffer
-        Written (m, n) and (m, n, k).
+    `slope` (m, n); `dslope` (m, n, k).
     """
     (m, n), active, free = loop.K.shape, work.active[0], work.free
     k = dslope.shape[2]

@@ -34,36 +34,18 @@ class Rows(NamedTuple):
     """T x + M v <= b, and what the solver needs of it.
 
     A named tuple rather than a dataclass because compiled code takes it as it is.
-
-    Attributes
-    ----------
-    T : Array
-        (r, n).
-    M : Array
-        (r, N m), the columns of one stage beside each other.
-    N : Array
-        M S^-1, (r, N m), with the metric S of each stage.
-    W : Array
-        M L^-T with S = L L', (r, N m): the rows in coordinates in which S is the identity.
-    gram : Array
-        W W' = M S^-1 M', (r, r).
-    b : Array
-        (r,).
-    limit : Array
-        Largest multiplier of each row (r,): infinite for a hard row, the price of a unit of
-        excess for a soft one.
-    family, stage : IntArray
-        Which bound, and how many samples ahead (r,).
     """
 
-    T: Array
-    M: Array
-    N: Array
-    W: Array
-    gram: Array
-    b: Array
+    T: Array  # (r, n)
+    M: Array  # (r, N m), the columns of one stage beside each other
+    N: Array  # M S^-1, (r, N m), with the metric S of each stage
+    W: Array  # M L^-T with S = L L', (r, N m): the rows in coordinates in which S is the identity
+    gram: Array  # W W' = M S^-1 M', (r, r)
+    b: Array  # (r,)
+    # Largest multiplier of each row (r,): infinite for a hard row, the price of a unit of excess
+    # for a soft one
     limit: Array
-    family: IntArray
+    family: IntArray  # Which bound, and how many samples ahead (r,)
     stage: IntArray
 
 
@@ -71,49 +53,25 @@ class RowDirections(NamedTuple):
     """Derivatives of `Rows` along p directions, which are the last axis of every array.
 
     The axis is last so that the innermost loops of the compiled code run over contiguous memory.
-
-    Attributes
-    ----------
-    T : Array
-        (r, n, p).
-    M : Array
-        (r, N m, p).
-    b : Array
-        (r, p).
     """
 
-    T: Array
-    M: Array
-    b: Array
+    T: Array  # (r, n, p)
+    M: Array  # (r, N m, p)
+    b: Array  # (r, p)
 
 
 @dataclass(frozen=True)
 class Directions:
-    """Directions along which a closed loop is differentiated, the last axis of every array.
+    """Directions along which a closed loop is differentiated, the last axis of every array."""
 
-    Attributes
-    ----------
-    A, B, E : Array
-        Plant matrices: (n, n, p), (n, m, p), (n, d, p).
-    K : Array
-        Gain (m, n, p).
-    S : Array
-        Metric (m, m, p), of the scaled metric of `Controller`.
-    bounds : Array
-        Right sides b of `bound_rows` (c, p).
-    x0 : Array
-        Initial state (n, p).
-    bodies : tuple
-        For each direction, bodies nearby with factors (`PlantDifferential`); may be left empty.
-    """
-
-    A: Array
+    A: Array  # Plant matrices: (n, n, p), (n, m, p), (n, d, p)
     B: Array
     E: Array
-    K: Array
-    S: Array
-    bounds: Array
-    x0: Array
+    K: Array  # Gain (m, n, p)
+    S: Array  # Metric (m, m, p), of the scaled metric of `Controller`
+    bounds: Array  # Right sides b of `bound_rows` (c, p)
+    x0: Array  # Initial state (n, p)
+    # For each direction, bodies nearby with factors (`PlantDifferential`); may be left empty
     bodies: tuple[tuple[tuple[float, Body], ...], ...] = ()
 
     @property

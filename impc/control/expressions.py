@@ -36,14 +36,7 @@ _COMPARISONS = (ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE, ca.OP_NOT, ca.OP_AND, ca
 def with_values(function: Any, free: list[int], values: Array) -> Any:
     """A function of (x, u, d, theta) as one of the free entries of theta.
 
-    Parameters
-    ----------
-    function : casadi.Function
-        Of `function_of`.
-    free : list of int
-        Which entries of theta stay.
-    values : Array
-        All of theta (any,); those that are free count for nothing.
+    `values` (any,).
     """
     given = [ca.MX.sym(letter, function.numel_in(k)) for k, letter in enumerate("xud")]
     left = ca.MX.sym("p", len(free))
@@ -53,20 +46,7 @@ def with_values(function: Any, free: list[int], values: Array) -> Any:
 
 
 def symbols_of(subject: str, given: Any) -> list[Any]:
-    """Symbols of SX or MX; SX are taken apart, so that each has its name.
-
-    Parameters
-    ----------
-    subject : str
-        What an error is about.
-    given : SX, MX or list of them
-        What should be symbols.
-
-    Raises
-    ------
-    InputError
-        When something is no symbol.
-    """
+    """Symbols of SX or MX; SX are taken apart, so that each has its name."""
     items = given if isinstance(given, list | tuple) else [given]
     found: list[Any] = []
     for item in items:
@@ -79,20 +59,7 @@ def symbols_of(subject: str, given: Any) -> list[Any]:
 
 
 def scalar(name: str, symbol: Any) -> Any:
-    """The symbol of a parameter.
-
-    Parameters
-    ----------
-    name : str
-        That of the parameter.
-    symbol : SX or MX
-        What should be one.
-
-    Raises
-    ------
-    InputError
-        When it is not one scalar symbol.
-    """
+    """The symbol of a parameter."""
     if len(found := symbols_of(f"parameter {name}", symbol)) != 1 or found[0].numel() != 1:
         raise InputError(f"parameter {name}", "is not a scalar symbol", "give one symbol a name")
     return found[0]
@@ -112,13 +79,7 @@ def names_of(symbols: Iterable[Any]) -> tuple[str, ...]:
 
 
 def stacked(given: Mapping[str, Any]) -> tuple[Any, tuple[str, ...]]:
-    """The expressions of `given` below each other, by name, and a name for each row.
-
-    Raises
-    ------
-    InputError
-        When one is a comparison.
-    """
+    """The expressions of `given` below each other, by name, and a name for each row."""
     parts: list[Any] = []
     names: list[str] = []
     for name, expression in given.items():
@@ -140,26 +101,7 @@ def _compares(item: Any) -> bool:
 def function_of(
     name: str, expression: Any, symbols: Sequence[list[Any]], size: tuple[int], alone: bool = False
 ) -> Any:
-    """A function of (x, u, d, theta) in SX where CasADi can.
-
-    Parameters
-    ----------
-    name : str
-        Of the function, and what an error is about.
-    expression : SX, MX or number
-        A column of that many rows.
-    symbols : sequence of list
-        Those of states, inputs, disturbances and parameters.
-    size : tuple of int
-        Rows that the expression has to have.
-    alone : bool
-        Whether it may be of x and theta only.
-
-    Raises
-    ------
-    InputError
-        When the expression is none, is of another size, or has other symbols.
-    """
+    """A function of (x, u, d, theta) in SX where CasADi can."""
     flat = [item for group in symbols for item in group]
     kind: Any = ca.SX if isinstance(flat[0], ca.SX) else ca.MX
     if any(not isinstance(item, kind) for item in flat):
@@ -198,20 +140,7 @@ def _expanded(made: Any) -> Any:
 
 
 def require_influence(names: Sequence[str], functions: Sequence[Any]) -> None:
-    """Every parameter is in an expression.
-
-    Parameters
-    ----------
-    names : sequence of str
-        Of the parameters.
-    functions : sequence of casadi.Function
-        Of `function_of`.
-
-    Raises
-    ------
-    InputError
-        When one is in none.
-    """
+    """Every parameter is in an expression."""
     seen = np.zeros(len(names), dtype=bool)
     for function in functions:
         if function.numel_out(0):

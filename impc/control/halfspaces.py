@@ -59,28 +59,7 @@ def supports(
 ) -> tuple[Array, IntArray]:
     """Support of each target row d over {z : Z z <= 1, d z <= 2}.
 
-    Parameters
-    ----------
-    Z : Array
-        Rows (s, q) of the set, of sizes near 1.
-    targets : Array
-        Rows d, shape (t, q).
-    own : IntArray, optional
-        Index (t,) of each target among the rows of Z, which is then left out for that target.
-    hints : IntArray, optional
-        Bases (t, q) from an earlier call, -1 for none. They change the time, never the answer.
-
-    Returns
-    -------
-    values : Array
-        Supports (t,), at most 2.
-    bases : IntArray
-        The q active rows (t, q) at each optimum; s stands for the cap; -1 where they are not q.
-
-    Raises
-    ------
-    SolverError
-        When HiGHS fails.
+    `Z` (s, q); `targets` (t, q); `own` (t,); `hints` (t, q); returns (t,), (t, q).
     """
     count, q = targets.shape
     values, bases = np.zeros(count), np.full((count, q), -1)
@@ -104,26 +83,7 @@ def redundant_rows(
 
     A row that the ray along itself meets inside the set is clearly needed, without a program.
 
-    Parameters
-    ----------
-    new, Z : Array
-        Rows (c, q) to judge, rows (s, q) of the set.
-    tolerance : float
-        Relative to the bound of 1.
-    hints : IntArray or None
-        Bases (c, q) of an earlier call, see `supports`.
-
-    Returns
-    -------
-    redundant : BoolArray
-        (c,).
-    bases : IntArray
-        Hints (c, q) for the next call.
-
-    Raises
-    ------
-    SolverError
-        When HiGHS fails.
+    `Z` (s, q); `hints` (c, q); returns (c,), (c, q).
     """
     reach = np.max(Z @ new.T, axis=0, initial=0.0)  # t * new leaves the set at t = 1 / reach
     inside = np.sum(new**2, axis=1) > (1 + tolerance + _TOUCHING) * reach
@@ -142,28 +102,7 @@ def needed_rows(
     Of rows that follow from one another the earlier is kept. A row is also needed when a ray from
     the origin meets it clearly before all others, which saves its program.
 
-    Parameters
-    ----------
-    Z : Array
-        (s, q).
-    mirrored : bool
-        Whether the set is symmetric about the origin, and Z one half of its rows.
-    tolerance : float
-        How far a row may exceed 1 and still follow.
-    hints : IntArray, optional
-        Bases (s, q) of an earlier call, see `supports`.
-
-    Returns
-    -------
-    kept : IntArray
-        Increasing indices (k,).
-    bases : IntArray
-        Hints (s, q) for the next call.
-
-    Raises
-    ------
-    SolverError
-        When HiGHS fails.
+    `Z` (s, q); `hints` (s, q); returns (k,), (s, q).
     """
     kept, bases = np.arange(len(Z)), np.full(Z.shape, -1)
     doubtful = kept[~_first_hit(Z, mirrored, 1 + tolerance + _TOUCHING)]

@@ -43,10 +43,7 @@ def excluded_row(controller: Controller, rows: Rows, x: Array) -> int:
     The multipliers are those of the least share t of their bounds by which all rows are exceeded,
     T x + M v <= (1 + t) b, by HiGHS; the row is the one that weighs most in the proof.
 
-    Parameters
-    ----------
-    x : Array
-        State (n,).
+    `x` (n,).
     """
     hard = np.isinf(rows.limit)
     width, b = rows.M.shape[1], rows.b[hard]
@@ -67,12 +64,7 @@ def excluded_row(controller: Controller, rows: Rows, x: Array) -> int:
 def proves_infeasible(controller: Controller, rows: Rows, y: Array, x: Array) -> bool:
     """Whether multipliers prove that a state has no input sequence that keeps the hard rows.
 
-    Parameters
-    ----------
-    y : Array
-        One for each row (r,), at least zero; those of input bounds are not used.
-    x : Array
-        State (n,).
+    `y` (r,); `x` (n,).
     """
     plant, horizon = controller.plant, controller.horizon
     bounds = bound_rows(controller.bounds, plant)

@@ -60,71 +60,34 @@ _FAILED = (Status.INFEASIBLE, Status.UNSOLVED, Status.DIVERGED)
 
 @dataclass(frozen=True)
 class NoiseDirections:
-    """What else moves along q directions, beside what `Directions` has; the last axis of each.
+    """What else moves along q directions, beside what `Directions` has; the last axis of each."""
 
-    Attributes
-    ----------
-    C : Array
-        Outputs of the plant (p, n, q).
-    levels : Array
-        Levels of the person's noise, then of the recorder's (levels + p, q).
-    covariances : int
-        How many of the directions, the first ones, move more than the first state.
-    """
-
-    C: Array
-    levels: Array
-    covariances: int
+    C: Array  # Outputs of the plant (p, n, q)
+    levels: Array  # Levels of the person's noise, then of the recorder's (levels + p, q)
+    covariances: int  # How many of the directions, the first ones, move more than the first state
 
 
 @dataclass(frozen=True)
 class PreparedFilter:
-    """All that recordings share; made by `prepare_filter`.
+    """All that recordings share; made by `prepare_filter`."""
 
-    Attributes
-    ----------
-    law : PreparedLoop
-        Of one input without its bounds at the present sample, see `Clip`.
-    parts : FilterParts
-        With it, and with the system.
-    """
-
-    law: PreparedLoop
-    parts: FilterParts
+    law: PreparedLoop  # Of one input without its bounds at the present sample, see `Clip`
+    parts: FilterParts  # With it, and with the system
 
 
 @dataclass(frozen=True)
 class Likelihood(Frozen):
-    """What a recording says, sample by sample.
+    """What a recording says, sample by sample."""
 
-    Attributes
-    ----------
-    told : Array
-        Log-likelihood of each sample given those before (samples,), nats.
-    score : Array
-        Its derivatives along q directions (samples, q).
-    information : Array
-        Fisher's, expected (q, q).
-    innovations : Array
-        Recorded outputs minus what the filter expects (samples, p), in the outputs' units.
-    spreads : Array
-        Their covariances (samples, p, p).
-    filtered : Array
-        Expected z given the outputs so far (samples, z).
-    u : Array
-        Commands there (samples, m).
-    status : Array
-        `Status` of each sample (samples,).
-    """
-
-    told: Array
-    score: Array
-    information: Array
+    told: Array  # Log-likelihood of each sample given those before (samples,), nats
+    score: Array  # Its derivatives along q directions (samples, q)
+    information: Array  # Fisher's, expected (q, q)
+    # Recorded outputs minus what the filter expects (samples, p), in the outputs' units
     innovations: Array
-    spreads: Array
-    filtered: Array
-    u: Array
-    status: np.ndarray[tuple[int], np.dtype[np.int8]]
+    spreads: Array  # Their covariances (samples, p, p)
+    filtered: Array  # Expected z given the outputs so far (samples, z)
+    u: Array  # Commands there (samples, m)
+    status: np.ndarray[tuple[int], np.dtype[np.int8]]  # `Status` of each sample (samples,)
 
     @property
     def value(self) -> float:
@@ -141,21 +104,7 @@ def prepare_filter(
 ) -> PreparedFilter:
     """Build all that does not depend on a recording.
 
-    Parameters
-    ----------
-    controller : Controller
-    person : Observer
-    recorder : Array
-        Standard deviations of the noise in the recorded outputs (p,), positive.
-    along : Directions
-        Of plant, controller and first state, q of them.
-    noise : NoiseDirections
-        What else moves along them.
-
-    Raises
-    ------
-    SolverError
-        When the person's filter has no stationary gain.
+    `recorder` (p,).
     """
     plant = controller.plant
     law, clip = _unclipped(prepare_loop(controller, along))
@@ -185,22 +134,7 @@ def prepare_filter(
 def joint_likelihoods(
     prepared: PreparedFilter, recordings: Sequence[Recording], counted: int = 0
 ) -> list[Likelihood]:
-    """Likelihood of each recording.
-
-    Parameters
-    ----------
-    prepared : PreparedFilter
-    recordings : sequence of Recording
-        Each begins where the person takes the state for its `x0`.
-    counted : int
-        The first sample that is told: the likelihood is that of it and the later ones given those
-        before it.
-
-    Raises
-    ------
-    SolverError
-        When the command of a sample could not be told, or the expectation diverges.
-    """
+    """Likelihood of each recording."""
     law, at, size = prepared.law, prepared.parts.at, len(prepared.parts.joint.F)
     plant, q = law.controller.plant, law.along.count
     begin = np.concatenate([[0], np.cumsum([each.samples for each in recordings])])

@@ -38,43 +38,27 @@ class JointLoop(NamedTuple):
     """The system, or its derivatives along k directions, which are then a last axis.
 
     A named tuple because compiled code takes it as it is.
-
-    Attributes
-    ----------
-    F, B, E, G : Buffer
-        (z, z), (z, m), (z, d) and (z, m): transition, commands, perturbations, motor noise.
-    C : Buffer
-        (p, z).
-    Q, R, P0 : Buffer
-        Covariances of the noise (z, z), of the recorder's (p, p) and of the first state (z, z).
-    share : Buffer
-        Of the command that is motor noise (m,).
     """
 
-    F: Buffer
+    F: Buffer  # (z, z), (z, m), (z, d) and (z, m): transition, commands, perturbations, motor noise
     B: Buffer
     E: Buffer
     G: Buffer
-    C: Buffer
+    C: Buffer  # (p, z)
+    # Covariances of the noise (z, z), of the recorder's (p, p) and of the first state (z, z)
     Q: Buffer
     R: Buffer
     P0: Buffer
-    share: Buffer
+    share: Buffer  # Of the command that is motor noise (m,)
 
 
 class PlantMoves(NamedTuple):
-    """Changes of a plant along k directions, which are the first axis.
+    """Changes of a plant along k directions, which are the first axis."""
 
-    Attributes
-    ----------
-    A, B, E, C : Array
-        (k, n, n), (k, n, m), (k, n, d) and (k, p, n).
-    """
-
-    A: Array
-    B: Array
-    E: Array
-    C: Array
+    A: Array  # (k, n, n)
+    B: Array  # (k, n, m)
+    E: Array  # (k, n, d)
+    C: Array  # (k, p, n)
 
 
 def joint_loop(
@@ -82,19 +66,7 @@ def joint_loop(
 ) -> JointLoop:
     """The system of a `person` at a `plant`.
 
-    Parameters
-    ----------
-    plant : Plant
-    person : Observer
-    recorder : Array
-        Standard deviations of the noise in the recorded outputs (p,).
-    believes : Observer, optional
-        What the person takes for true, when that is something else; the same signals are sensed.
-
-    Raises
-    ------
-    SolverError
-        When the person's filter has no stationary gain.
+    `recorder` (p,).
     """
     R = np.diag(np.asarray(recorder) ** 2)
     share = np.array(person.share)
@@ -123,16 +95,7 @@ def joint_directions(
 ) -> JointLoop:
     """Derivatives of `joint_loop` along k directions, for a person who believes what is true.
 
-    Parameters
-    ----------
-    plant : Plant
-    person : Observer
-    recorder : Array
-        As in `joint_loop` (p,).
-    moves : PlantMoves
-        Changes of the plant.
-    levels : Array
-        Changes of the levels of the person and of the recorder's after them (k, levels + p).
+    `recorder` (p,); `levels` (k, levels + p).
     """
     count, sizes = len(levels), [len(person.level(name)) for name in LEVELS]
     motor, share, process, sensory, walk, white = np.split(levels, np.cumsum(sizes), axis=1)

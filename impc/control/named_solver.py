@@ -116,74 +116,32 @@ class _Shape(NamedTuple):
 
 @dataclass(frozen=True)
 class Program:
-    """The problem of the module's text for one controller; made by `build_program`.
+    """The problem of the module's text for one controller; made by `build_program`."""
 
-    Attributes
-    ----------
-    solver : str
-        One of `SOLVERS`.
-    A : Array
-        Rows in the problem's numbers (r, N m).
-    squares : Array
-        Squared length of each row of A (r,).
-    unit : float
-        What z is multiplied by to become L'v, S = LL'.
-    b : Array
-        Bounds (r,).
-    soft : BoolArray
-        Which rows may be exceeded (r,).
-    price : float
-        Of the excess, in the problem's numbers.
-    hard, softened : tuple of casadi.DM
-        What does not change from sample to sample, with all rows hard and with slacks.
-    """
-
-    solver: str
-    A: Array
-    squares: Array
-    unit: float
-    b: Array
-    soft: BoolArray
-    price: float
+    solver: str  # One of `SOLVERS`
+    A: Array  # Rows in the problem's numbers (r, N m)
+    squares: Array  # Squared length of each row of A (r,)
+    unit: float  # What z is multiplied by to become L'v, S = LL'
+    b: Array  # Bounds (r,)
+    soft: BoolArray  # Which rows may be exceeded (r,)
+    price: float  # Of the excess, in the problem's numbers
+    # What does not change from sample to sample, with all rows hard and with slacks
     hard: tuple[ca.DM, ...]
     softened: tuple[ca.DM, ...]
 
 
 @dataclass(frozen=True)
 class ActiveSet:
-    """What a solver found at one sample.
+    """What a solver found at one sample."""
 
-    Attributes
-    ----------
-    tight : IntArray
-        Rows that hold with equality, linearly independent (a,).
-    given_up : BoolArray
-        Soft rows that are exceeded (r,).
-    w : Array
-        The solver's own answer L'v with S = LL' (N m,).
-    agrees : float
-        What w may differ from that of the equations by, in its unit.
-    """
-
-    tight: IntArray
-    given_up: BoolArray
-    w: Array
-    agrees: float
+    tight: IntArray  # Rows that hold with equality, linearly independent (a,)
+    given_up: BoolArray  # Soft rows that are exceeded (r,)
+    w: Array  # The solver's own answer L'v with S = LL' (N m,)
+    agrees: float  # What w may differ from that of the equations by, in its unit
 
 
 def require_solver(name: str) -> str:
-    """Return the name of a solver that there is.
-
-    Parameters
-    ----------
-    name : str
-        "compiled", or one of `SOLVERS`, in small letters or capitals.
-
-    Raises
-    ------
-    InputError
-        When it is not one of them, or CasADi as it is installed has it not.
-    """
+    """Return the name of a solver that there is."""
     given, name = name, name.lower()
     if name not in (COMPILED, *SOLVERS):
         known = ", ".join((COMPILED, *SOLVERS))
@@ -207,13 +165,7 @@ def described(name: str) -> str:
 
 
 def plugin(name: str) -> tuple[str, dict[str, Any]]:
-    """CasADi's name of the plugin of a solver, as `conic` and `qpsol` take it, and its options.
-
-    Parameters
-    ----------
-    name : str
-        One of `SOLVERS`.
-    """
+    """CasADi's name of the plugin of a solver, as `conic` and `qpsol` take it, and its options."""
     return _PLUGINS[name]
 
 
@@ -245,14 +197,7 @@ def silent() -> Iterator[None]:
 
 
 def build_program(solver: str, rows: Rows) -> Program:
-    """Write the problem of rows for a solver.
-
-    Parameters
-    ----------
-    solver : str
-        One of `SOLVERS`.
-    rows : Rows
-    """
+    """Write the problem of rows for a solver."""
     squares = np.diag(rows.gram)
     reaching = squares > 0
     distances = rows.b[reaching] / np.sqrt(squares[reaching])
@@ -275,11 +220,7 @@ def build_program(solver: str, rows: Rows) -> Program:
 def active_set(program: Program, d: Array) -> ActiveSet | None:
     """Ask a solver which rows hold; None when its answer breaks the conditions of optimality.
 
-    Parameters
-    ----------
-    program : Program
-    d : Array
-        Slack of the rows at v = 0, b - T x (r,).
+    `d` (r,).
     """
     A, right, soft = program.A, d / program.b, program.soft
     found = _solve(program, program.hard, right, np.zeros(len(d)))

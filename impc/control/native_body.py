@@ -64,22 +64,7 @@ _one_at_a_time = threading.Lock()
 
 
 def address(body: Body, states: int, *, moving: bool) -> int:
-    """Where the machine code of a body begins; it stays there as long as the process.
-
-    Parameters
-    ----------
-    states : int
-        Number n of states.
-    moving : bool
-        Whether derivatives are written too, behind the n next states.
-
-    Returns
-    -------
-    int
-        Of a C function without a value, of three pointers to numbers: the constants (c,), what is
-        given (g,) and what is found (n + n g,), where derivatives that are always zero are left as
-        they are.
-    """
+    """Where the machine code of a body begins; it stays there as long as the process."""
     with _one_at_a_time:
         place, _ = _translated(body.code.tobytes(), len(body.constants), None if moving else states)
     return place

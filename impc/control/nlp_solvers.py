@@ -30,13 +30,7 @@ _SILENT: dict[str, Any] = {"print_time": False, "error_on_fail": False}
 
 
 def require_solver(name: str) -> str:
-    """Return the name of one of `SOLVERS` that CasADi has; it may be given in capitals.
-
-    Raises
-    ------
-    InputError
-        When it is another.
-    """
+    """Return the name of one of `SOLVERS` that CasADi has; it may be given in capitals."""
     given, name = name, name.lower()
     if name not in SOLVERS:
         raise InputError("solver", f"got {given!r:.40}", f"choose one of {', '.join(SOLVERS)}")
@@ -124,16 +118,7 @@ def start_of(
 ) -> Point:
     """What a solver makes of a guess: no claim, it may be anything.
 
-    Parameters
-    ----------
-    name : str
-        One of `SOLVERS`.
-    theta, d : Array
-        (p,) and (N, d).
-    x, u : Array
-        Guess (N + 1, n) and (N, m); x[0] is the initial state.
-    mu : float
-        Of the relaxed conditions; the solvers but IPOPT solve the program itself.
+    `theta` (p,); `d` (N, d); `x` (N + 1, n); `u` (N, m).
     """
     equal = np.concatenate([_equal(problem, k) for k in range(problem.horizon + 1)])
     answer = _solver(problem, name, mu if name == "ipopt" else 0.0)(

@@ -32,25 +32,13 @@ __all__ = ["PersonTrial", "run_joint", "simulate_person"]
 
 @dataclass(frozen=True)
 class PersonTrial(Frozen):
-    """What a person does, and what is recorded of it.
+    """What a person does, and what is recorded of it."""
 
-    Attributes
-    ----------
-    outputs : Array
-        Recorded, with the recorder's noise (samples, p).
-    states, estimates : Array
-        What is, and what the person takes it for (samples, n).
-    u : Array
-        Commands without motor noise (samples, m).
-    status : Array
-        `Status` of each sample (samples,).
-    """
-
-    outputs: Array
-    states: Array
+    outputs: Array  # Recorded, with the recorder's noise (samples, p)
+    states: Array  # What is, and what the person takes it for (samples, n)
     estimates: Array
-    u: Array
-    status: np.ndarray[tuple[int], np.dtype[np.int8]]
+    u: Array  # Commands without motor noise (samples, m)
+    status: np.ndarray[tuple[int], np.dtype[np.int8]]  # `Status` of each sample (samples,)
 
     @property
     def reached(self) -> int:
@@ -72,32 +60,7 @@ def simulate_person(
 ) -> PersonTrial:
     """Simulate one trial.
 
-    Parameters
-    ----------
-    controller : Controller
-        What the person does with the estimate.
-    person : Observer
-        What is sensed, and the noise that there is.
-    disturbance : array_like, optional
-        (samples, d), or (samples,) for one.
-    steps : int, optional
-        Number of samples, where there is no disturbance.
-    recorder : array_like
-        Standard deviation of the noise in the recorded outputs, in their units, one or (p,).
-    x0 : array_like, optional
-        What the person takes for the state at first (n,); rest by default. A person who estimates
-        errs there by as much as always.
-    believes : Observer, optional
-        What the person takes for true, when that is not what is; the same signals are sensed.
-    seed : int or SeedSequence
-        All numbers drawn follow from it.
-
-    Raises
-    ------
-    DataError
-        When the disturbance is not of the plant's shape.
-    SolverError
-        When the person's filter has no stationary gain.
+    `recorder` (p,); `x0` (n,).
     """
     plant = controller.plant
     given = scenario(plant, np.zeros(plant.n) if x0 is None else x0, steps, disturbance)
@@ -128,23 +91,7 @@ def run_joint(
 ) -> tuple[Array, Array, np.ndarray[tuple[int], np.dtype[np.int8]]]:
     """States of plant and estimate, and commands, with noise that has been drawn.
 
-    Parameters
-    ----------
-    law : PreparedLoop
-        Along no direction.
-    joint : JointLoop
-    start : Array
-        (z,).
-    disturbance : Array
-        (steps, d).
-    noise : pair of Array
-        What is added to each next state (steps, z), and normal numbers for the share of the
-        commands (steps, m).
-
-    Returns
-    -------
-    z, u, status : Array
-        (steps + 1, z), (steps, m) and (steps,). What is not reached repeats the last.
+    `start` (z,); `disturbance` (steps, d).
     """
     steps, (m, n) = len(disturbance), law.controller.K.shape
     z, u = np.zeros((steps + 1, len(start))), np.zeros((steps, m))

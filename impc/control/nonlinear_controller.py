@@ -47,54 +47,22 @@ _FALLEN = 1e6
 
 @dataclass(frozen=True)
 class NonlinearMpc:
-    """A nonlinear controller, built.
+    """A nonlinear controller, built."""
 
-    Attributes
-    ----------
-    step : casadi.Function
-        (state (n), all inputs (m + d)) -> next state: the plant, with its disturbances.
-    solver : Any
-        CasADi's nlpsol: start x and parameters -> sequence.
-    horizon, n, m : int
-        N in samples, number of states, number of inputs.
-    u_min, u_max : Array
-        (m,).
-    scale : Array
-        Typical inputs (m,), by which the decisions are divided.
-    """
-
-    step: Any
-    solver: Any
-    horizon: int
+    step: Any  # (state (n), all inputs (m + d)) -> next state: the plant, with its disturbances
+    solver: Any  # CasADi's nlpsol: start x and parameters -> sequence
+    horizon: int  # N in samples, number of states, number of inputs
     n: int
     m: int
-    u_min: Array
+    u_min: Array  # (m,)
     u_max: Array
-    scale: Array
+    scale: Array  # Typical inputs (m,), by which the decisions are divided
 
 
 def build_nonlinear_mpc(
     step: Any, plant: Plant, weights: Weights, bounds: Bounds, horizon: int
 ) -> NonlinearMpc:
-    """Build the program.
-
-    Parameters
-    ----------
-    step : casadi.Function
-        (state (n), inputs (m + d)) -> next state after one sample of the plant; controls first.
-    plant : Plant
-        The same plant, linear: gives P.
-    weights : Weights
-    bounds : Bounds
-        Its input bounds are kept; state bounds are not.
-    horizon : int
-        Samples.
-
-    Raises
-    ------
-    WeightsError
-        When the weights have no stabilising Riccati solution.
-    """
+    """Build the program."""
     n, m, d = plant.n, plant.m, plant.E.shape[1]
     P = solve_lqr(plant, weights).P
     finite = np.where(np.isfinite(bounds.u_max), np.abs(bounds.u_max), 1.0)
@@ -117,13 +85,7 @@ def build_nonlinear_mpc(
 
 
 def simulate_nonlinear(mpc: NonlinearMpc, given: Scenario) -> Simulation:
-    """Simulate the nonlinear plant under the nonlinear controller; never raises on the way.
-
-    Returns
-    -------
-    Simulation
-        As `impc.control.closed_loop.simulate`; a sample at which IPOPT found no answer ends it.
-    """
+    """Simulate the nonlinear plant under the nonlinear controller; never raises on the way."""
     steps = given.steps
     x, u = np.zeros((steps + 1, mpc.n)), np.zeros((steps, mpc.m))
     status = np.full(steps, Status.NOT_REACHED, dtype=np.int8)

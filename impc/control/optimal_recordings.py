@@ -21,33 +21,16 @@ __all__ = ["OptimalRecording", "optimal_recording"]
 
 @dataclass(frozen=True, eq=False)
 class OptimalRecording(Frozen):
-    """States and inputs over T samples; NaN where they are not measured.
+    """States and inputs over T samples; NaN where they are not measured."""
 
-    Attributes
-    ----------
-    problem : OptimalControlProblem
-        Whose plan or closed loop it is.
-    x : Array
-        States (steps + 1, n).
-    u : Array
-        Inputs (steps, m).
-    d : Array
-        Disturbances, of shape (steps, d).
-    x0 : Array
-        Initial state (n,): the true one, or a guess when it is unknown.
-    closed_loop : bool
-        Whether every input is the first of a plan of its own, and not all of one plan.
-    unknown_start : bool
-        Whether the initial state is searched too.
-    """
-
-    problem: OptimalControlProblem
-    x: Array
-    u: Array
-    d: Array
-    x0: Array
+    problem: OptimalControlProblem  # Whose plan or closed loop it is
+    x: Array  # States (steps + 1, n)
+    u: Array  # Inputs (steps, m)
+    d: Array  # Disturbances, of shape (steps, d)
+    x0: Array  # Initial state (n,): the true one, or a guess when it is unknown
+    # Whether every input is the first of a plan of its own, and not all of one plan
     closed_loop: bool
-    unknown_start: bool
+    unknown_start: bool  # Whether the initial state is searched too
 
 
 def optimal_recording(
@@ -62,27 +45,7 @@ def optimal_recording(
 ) -> OptimalRecording:
     """A recording, checked.
 
-    Parameters
-    ----------
-    problem : OptimalControlProblem
-    x : array_like
-        States (steps + 1, n); T is the horizon for one plan.
-    u : array_like, optional
-        Inputs (steps, m); not measured by default.
-    closed_loop : bool
-        Whether it is one; else it is one plan.
-    d : array_like, optional
-        Disturbances (steps, d); none by default.
-    x0 : array_like, optional
-        (n,); the first of x by default.
-    unknown_start : bool, optional
-        Whether x0 is only a guess, and searched; by default where it is the first of x.
-
-    Raises
-    ------
-    DataError
-        When a size is not that of the problem, an entry is infinite, nothing is measured, or
-        the initial state or a disturbance is missing.
+    `x` (steps + 1, n); `u` (steps, m); `d` (steps, d); `x0` (n,).
     """
     states = _table("states", x, problem.n)
     T = len(states) - 1

@@ -49,32 +49,15 @@ _EXCESS = 1e-6  # of a row, above which a problem without a plan is called infea
 
 @dataclass(frozen=True, eq=False)
 class Plan(Frozen):
-    """A solution of the relaxed conditions, with a positive reduced second derivative.
-
-    Attributes
-    ----------
-    problem : OptimalControlProblem
-    theta : Array
-        Parameters (p,).
-    d : Array
-        Disturbances that the plan reckons with (N, d).
-    point : Point
-        States, inputs, multipliers, slacks.
-    mu : float
-        Product of slack and multiplier of every row.
-    cost : float
-        Without the relaxation.
-    residual : float
-        Largest of the conditions, relative as the test takes them.
-    """
+    """A solution of the relaxed conditions, with a positive reduced second derivative."""
 
     problem: OptimalControlProblem
-    theta: Array
-    d: Array
-    point: Point
-    mu: float
-    cost: float
-    residual: float
+    theta: Array  # Parameters (p,)
+    d: Array  # Disturbances that the plan reckons with (N, d)
+    point: Point  # States, inputs, multipliers, slacks
+    mu: float  # Product of slack and multiplier of every row
+    cost: float  # Without the relaxation
+    residual: float  # Largest of the conditions, relative as the test takes them
 
     @property
     def x(self) -> Array:
@@ -99,28 +82,7 @@ def solve_plan(
 ) -> Plan:
     """Solve from nothing.
 
-    Parameters
-    ----------
-    problem : OptimalControlProblem
-    theta, x0 : Array
-        (p,) and (n,).
-    d : Array, optional
-        Disturbances that the plan reckons with (N, d); none by default.
-    solver : str
-        Which makes the start.
-    mu : float
-        At least 1e-12.
-    guesses : tuple of pairs
-        States (N + 1, n) and inputs (N, m) to begin at; then x_0 held with no input, then zeros.
-
-    Raises
-    ------
-    InputError
-        When the solver is not known, or a function is not finite at the start.
-    InfeasibleError
-        When no plan keeps the constraints, as far as a search for the least excess tells.
-    SolverError
-        When the search did not end.
+    `theta` (p,); `x0` (n,); `d` (N, d).
     """
     solver = require_solver(solver)
     if not 1e-12 <= mu <= 1e6:
@@ -192,11 +154,6 @@ def _require_finite_start(
     """Require that every function is finite along a guess x (N + 1, n), u (N, m).
 
     At theta (p,) and d (N, d).
-
-    Raises
-    ------
-    InputError
-        With the function and the sample.
     """
     for function in problem.functions:
         for k in range(problem.horizon + 1):

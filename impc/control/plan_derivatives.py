@@ -42,24 +42,14 @@ _REFINEMENTS = 2
 
 @dataclass(frozen=True, eq=False)
 class PlanDerivatives(Frozen):
-    """With respect to theta and x_0: the last axis has p + n entries.
+    """With respect to theta and x_0: the last axis has p + n entries."""
 
-    Attributes
-    ----------
-    x, u, nu : Array
-        (N + 1, n, p + n), (N, m, p + n), (N, n, p + n).
-    lam, s : Array
-        (N, q, p + n).
-    lam_end, s_end : Array
-        (qN, p + n).
-    """
-
-    x: Array
-    u: Array
-    nu: Array
-    lam: Array
+    x: Array  # (N + 1, n, p + n)
+    u: Array  # (N, m, p + n)
+    nu: Array  # (N, n, p + n)
+    lam: Array  # (N, q, p + n)
     s: Array
-    lam_end: Array
+    lam_end: Array  # (qN, p + n)
     s_end: Array
 
     def step(self, change: Array) -> Point:

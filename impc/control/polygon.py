@@ -18,13 +18,7 @@ __all__ = ["as_pytope", "polygon"]
 
 
 def polygon(terminal: TerminalSet) -> Array:
-    """Corners (v, 2) of a bounded set of two states, counter-clockwise, in the units of x.
-
-    Raises
-    ------
-    InputError
-        When the plant does not have two states, or the set is unbounded.
-    """
+    """Corners (v, 2) of a bounded set of two states, counter-clockwise, in the units of x."""
     n = terminal.H.shape[1]
     if n != 2:
         raise InputError("terminal set", f"has {n} states", "corners are drawn for two")
@@ -44,15 +38,7 @@ def polygon(terminal: TerminalSet) -> Array:
 
 
 def as_pytope(terminal: TerminalSet) -> Any:
-    """Return the set as a `pytope.Polytope` in half-space form; pytope finds corners when asked.
-
-    Raises
-    ------
-    InputError
-        When the set has no rows: pytope has no whole space.
-    ImpcError
-        When pytope is not installed.
-    """
+    """Return the set as a `pytope.Polytope` in half-space form; pytope finds corners when asked."""
     pytope = optional("pytope", "terminal set")
     if not len(terminal.h):
         raise InputError("terminal set", "is the whole space", "give at least one bound")

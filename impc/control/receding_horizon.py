@@ -32,29 +32,14 @@ __all__ = ["ClosedLoop", "closed_loop_from", "shifted", "simulate_receding"]
 
 @dataclass(frozen=True, eq=False)
 class ClosedLoop(Frozen):
-    """A simulation of T samples and its derivatives with respect to theta and x_0.
+    """A simulation of T samples and its derivatives with respect to theta and x_0."""
 
-    Attributes
-    ----------
-    x : Array
-        States (steps + 1, n).
-    u : Array
-        Inputs (steps, m).
-    dx : Array
-        Derivative of x (steps + 1, n, p + n).
-    du : Array
-        Derivative of u (steps, m, p + n).
-    plans : tuple of Plan
-        T of them.
-    slopes : tuple of PlanDerivatives
-        Of each plan, with respect to theta and its own first state.
-    """
-
-    x: Array
-    u: Array
-    dx: Array
-    du: Array
-    plans: tuple[Plan, ...]
+    x: Array  # States (steps + 1, n)
+    u: Array  # Inputs (steps, m)
+    dx: Array  # Derivative of x (steps + 1, n, p + n)
+    du: Array  # Derivative of u (steps, m, p + n)
+    plans: tuple[Plan, ...]  # T of them
+    # Of each plan, with respect to theta and its own first state
     slopes: tuple[PlanDerivatives, ...]
 
 
@@ -94,13 +79,6 @@ def simulate_receding(
     """Simulate from nothing, at theta (p,), from x0 (n,), disturbed by d of shape (steps, d).
 
     `solver` and `mu` are those of `impc.control.plan.solve_plan`.
-
-    Raises
-    ------
-    InputError, InfeasibleError
-        As `impc.control.plan.solve_plan`, of the first sample.
-    SolverError
-        When no plan was found at a sample.
     """
     first = solve_plan(problem, theta, x0, solver=solver, mu=mu)
     found = closed_loop_from(first, theta, x0, d, mu, solver)
@@ -123,25 +101,7 @@ def closed_loop_from(
 ) -> ClosedLoop | int:
     """Simulate, beginning at a plan near the first, and near those of a simulation before.
 
-    Parameters
-    ----------
-    first : Plan
-        Near the first sample's; of another theta, state or mu perhaps.
-    theta, x0 : Array
-        (p,) and (n,).
-    d : Array
-        Disturbances, of shape (steps, d).
-    mu : float
-        Of the relaxed conditions.
-    solver : str
-        One of `impc.control.nlp_solvers.SOLVERS`.
-    before : ClosedLoop, optional
-        At a theta near by: its plans, moved along their derivatives, are the guesses.
-
-    Returns
-    -------
-    ClosedLoop or int
-        The sample at which no plan was found.
+    `theta` (p,); `x0` (n,); `d` (steps, d).
     """
     problem, steps, p = first.problem, len(d), len(theta)
     x, u = np.zeros((steps + 1, problem.n)), np.zeros((steps, problem.m))

@@ -46,82 +46,42 @@ __all__ = [
 
 @dataclass(frozen=True, eq=False)
 class Point(Frozen):
-    """States, inputs, multipliers and slacks.
+    """States, inputs, multipliers and slacks."""
 
-    Attributes
-    ----------
-    x, u : Array
-        (N + 1, n) and (N, m).
-    nu : Array
-        Multipliers of the dynamics (N, n).
-    lam, s : Array
-        Multipliers and slacks of the rows (N, q).
-    lam_end, s_end : Array
-        Of those at the end (qN,).
-    """
-
-    x: Array
-    u: Array
-    nu: Array
-    lam: Array
+    x: Array  # (N + 1, n)
+    u: Array  # (N, m)
+    nu: Array  # Multipliers of the dynamics (N, n)
+    lam: Array  # Multipliers and slacks of the rows (N, q)
     s: Array
-    lam_end: Array
+    lam_end: Array  # Of those at the end (qN,)
     s_end: Array
 
 
 class Conditions(NamedTuple):
-    """Values and derivatives at a point; w = (x, u), sizes as in `Point`.
+    """Values and derivatives at a point; w = (x, u), sizes as in `Point`."""
 
-    Attributes
-    ----------
-    cost : float
-        Of all stages and the end.
-    gradient : Array
-        Of l + nu'f + lam'h by w (N, n + m).
-    f, h : Array
-        (N, n) and (N, q); rows that are not asked for have -1.
-    H, F, G : Array
-        Second derivative (N, n + m, n + m), f_w (N, n, n + m) and h_w (N, q, n + m).
-    gradient_end, h_end, H_end, G_end : Array
-        The same at the end: (n,), (qN,), (n, n), (qN, n).
-    """
-
-    cost: float
-    gradient: Array
-    f: Array
+    cost: float  # Of all stages and the end
+    gradient: Array  # Of l + nu'f + lam'h by w (N, n + m)
+    f: Array  # (N, n) and (N, q); rows that are not asked for have -1
     h: Array
-    H: Array
+    H: Array  # Second derivative (N, n + m, n + m), f_w (N, n, n + m) and h_w (N, q, n + m)
     F: Array
     G: Array
-    gradient_end: Array
+    gradient_end: Array  # The same at the end: (n,), (qN,), (n, n), (qN, n)
     h_end: Array
     H_end: Array
     G_end: Array
 
 
 class System(NamedTuple):
-    """A factorised system.
+    """A factorised system."""
 
-    Attributes
-    ----------
-    lu, pivots : Array
-        Of gbtrf: (3 diagonals + 1, size) and (size,).
-    bandwidth : int
-        Diagonals on either side.
-    H : Array
-        H + G'SG of each stage (N, n + m, n + m).
-    H_end : Array
-        The same at the end (n, n).
-    regular : bool
-        Whether no pivot is zero.
-    """
-
-    lu: Array
+    lu: Array  # Of gbtrf: (3 diagonals + 1, size) and (size,)
     pivots: Array
-    bandwidth: int
-    H: Array
-    H_end: Array
-    regular: bool
+    bandwidth: int  # Diagonals on either side
+    H: Array  # H + G'SG of each stage (N, n + m, n + m)
+    H_end: Array  # The same at the end (n, n)
+    regular: bool  # Whether no pivot is zero
 
     def solve(self, sides: Array) -> Array:
         """Solutions (size, k) for right sides (size, k)."""
@@ -212,26 +172,14 @@ def conditions(problem: OptimalControlProblem, theta: Array, d: Array, point: Po
 
 
 class Residuals(NamedTuple):
-    """What is left of each condition, in the order of the module's text.
+    """What is left of each condition, in the order of the module's text."""
 
-    Attributes
-    ----------
-    u, x : Array
-        Gradient by u_k (N, m) and by x_{k+1} (N, n).
-    c : Array
-        Dynamics (N, n).
-    rows, rows_end : Array
-        h + s: (N, q), (qN,).
-    products, products_end : Array
-        s lam - mu: (N, q), (qN,).
-    """
-
-    u: Array
+    u: Array  # Gradient by u_k (N, m) and by x_{k+1} (N, n)
     x: Array
-    c: Array
-    rows: Array
+    c: Array  # Dynamics (N, n)
+    rows: Array  # h + s: (N, q), (qN,)
     rows_end: Array
-    products: Array
+    products: Array  # s lam - mu: (N, q), (qN,)
     products_end: Array
 
 
@@ -323,23 +271,7 @@ def solve_conditions(
 ) -> Point:
     """Steps that take away the residuals `sides`, to first order; c of them beside each other.
 
-    Parameters
-    ----------
-    problem, point, at, factors
-        The system, where it was made.
-    sides : Residuals
-        Each with one more axis (..., c).
-    first : Array
-        Step of x_0 (n, c).
-    refinements : int
-        How often what is left is solved for again. Where a row is active S is 1e10 and more, and
-        the multiplier's step, S times a difference of two numbers that agree, loses as many digits;
-        one refinement brings them back (measured on the cart-pole: 2e-5 becomes 2e-9).
-
-    Returns
-    -------
-    Point
-        Each with one more axis (..., c).
+    `sides` (..., c); `first` (n, c); returns (..., c).
     """
     found = _reduced(problem, point, at, factors, sides, first)
     for _ in range(refinements):

@@ -38,30 +38,16 @@ _TOLERANCE = 1e-8
 
 
 class Plan(NamedTuple):
-    """Inputs over the horizon with what their derivative needs.
+    """Inputs over the horizon with what their derivative needs."""
 
-    Attributes
-    ----------
-    u, x : Array
-        Inputs (N, m) and states (N + 1, n).
-    at : Array of int
-        -1 and 1 for an input at its lower and upper bound, 0 for a free one, (N, m).
-    L, P, q : Array
-        Of the recursion: (N, m, n), (N + 1, n, n), (N + 1, n).
-    H : Array
-        Second derivative by the inputs of each stage, S + B'P_{k+1} B, (N, m, m).
-    told : bool
-        Whether the first input is told from rounding; the rest is of no use otherwise.
-    """
-
-    u: Array
+    u: Array  # Inputs (N, m) and states (N + 1, n)
     x: Array
-    at: Array
-    L: Array
+    at: Array  # -1 and 1 for an input at its lower and upper bound, 0 for a free one, (N, m)
+    L: Array  # Of the recursion: (N, m, n), (N + 1, n, n), (N + 1, n)
     P: Array
     q: Array
-    H: Array
-    told: bool
+    H: Array  # Second derivative by the inputs of each stage, S + B'P_{k+1} B, (N, m, m)
+    told: bool  # Whether the first input is told from rounding; the rest is of no use otherwise
 
 
 def solve_saturated(
@@ -75,18 +61,7 @@ def solve_saturated(
 ) -> Plan:
     """Return the best plan from a state under bounds on the inputs alone.
 
-    Parameters
-    ----------
-    S : Array
-        The metric (m, m); that of `loop` is its inverse.
-    low, high : Array
-        Bounds (m,), infinite where there is none.
-    N : int
-        Horizon, in samples.
-    x : Array
-        State (n,).
-    last : Plan, optional
-        That of the sample before: a start that saves most of the steps.
+    `S` (m, m); `low, high` (m,); `x` (n,).
     """
     u, at = np.zeros((N, len(S))), np.zeros((N, len(S)), dtype=np.int8)
     if last is None:
@@ -330,21 +305,7 @@ def differentiate_plan(
     that gives is the same program with other constants, and has the same L and P (docs/theory.md,
     section 4).
 
-    Parameters
-    ----------
-    dloop : LoopMatrices
-        Directions of plant, gain and metric.
-    S : Array
-        The metric (m, m).
-    dbound : Array
-        Of the bound that each input of the plan holds, (N, m, p); not read at free inputs.
-    dx : Array
-        Of the state (n, p).
-
-    Returns
-    -------
-    Array
-        (m, p).
+    `S` (m, m); `dbound` (N, m, p); `dx` (n, p); returns (m, p).
     """
     A, B, K = loop.A, loop.B, loop.K
     s = np.zeros(dx.shape)

@@ -168,18 +168,10 @@ class Simulation(Frozen):
 
 @dataclass(frozen=True)
 class Sensitivity(Frozen):
-    """Derivatives of a `Simulation` along p directions.
+    """Derivatives of a `Simulation` along p directions."""
 
-    Attributes
-    ----------
-    x : Array
-        Of the states (steps + 1, n, p).
-    u : Array
-        Of the inputs (steps, m, p).
-    """
-
-    x: Array
-    u: Array
+    x: Array  # Of the states (steps + 1, n, p)
+    u: Array  # Of the inputs (steps, m, p)
 
 
 @checked(x0="n", steps=(1, 10_000_000))

@@ -45,30 +45,7 @@ def system_equations(
 ) -> Any:
     """f(x, u, d; theta) of a system.
 
-    Parameters
-    ----------
-    system : control.NonlinearIOSystem
-        Discrete, or continuous and then stepped over dt.
-    symbols : sequence of three
-        States, inputs and disturbances.
-    names : sequence of three
-        Their names. Where they are those of the system's states, or of its inputs, they say which
-        is which; else the order does.
-    parameters : mapping
-        Symbols by name; they take the place of the system's own of those names.
-    dt : float or None
-        Sample time, s.
-
-    Returns
-    -------
-    casadi expression
-        (n,).
-
-    Raises
-    ------
-    InputError
-        When the system has no such equations, other sizes, depends on time, or its function does
-        not work on symbols.
+    `dt` in s; returns (n,).
     """
     if not isinstance(system, control.NonlinearIOSystem):
         kind = type(system).__name__

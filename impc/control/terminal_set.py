@@ -204,11 +204,6 @@ def invariance_violation(terminal: TerminalSet) -> float:
     At most about the tolerance when the set is invariant; capped at 1; 0 for a set without rows.
     With `maximality_violation` it proves the set: invariant and inside the bounds, hence within
     O; bounded by rows of O only, hence not smaller.
-
-    Raises
-    ------
-    SolverError
-        When a linear program fails.
     """
     normal = terminal.H / terminal.h[:, None]
     return _excess(terminal, normal @ terminal.F)
@@ -222,11 +217,6 @@ def maximality_violation(terminal: TerminalSet) -> float:
     afresh, by powers of F: every trajectory that keeps the bounds obeys those, so the set is not
     too small. Second, the largest violation, over the set, of any removed row (c, k <= k*): the
     set is not too large.
-
-    Raises
-    ------
-    SolverError
-        When a linear program fails.
     """
     rows, count = terminal.rows, terminal.determinedness + 1
     normal = (rows.E - rows.F @ terminal.gain) / rows.b[:, None]

@@ -65,12 +65,6 @@ def read_apart(kind: str, path: Path, largest: int, sheet: str = "") -> Table:
     """Read the file at `path` in a process of its own: `kind` is a key of `READERS`.
 
     Its arrays take `largest` bytes at most; `sheet` is that of a workbook, where one is asked for.
-
-    Raises
-    ------
-    DataError
-        When the file cannot be read: the reader's own reason, or that reading took too much memory,
-        too long, or ended the process.
     """
     source = str(path)
     named = {"sheet": sheet} if sheet else {}
@@ -92,11 +86,6 @@ def matrices_apart(path: Path, largest: int) -> dict[str, Any]:
     """What a .mat file of version 5 to 7 at `path` holds of a saved plant, by name.
 
     Real arrays, (rows, columns) or more, of `largest` bytes at most, and lists of text.
-
-    Raises
-    ------
-    InputError
-        When the file cannot be read, as in `read_apart`, or holds anything else.
     """
     reply, arrays = _asked(_request("matrices", path, largest))
     if "refused" in reply:
@@ -113,11 +102,6 @@ def cells_apart(path: Path, largest: int) -> list[list[str]]:
     """The rows of the first sheet of the workbook at `path`, cells as texts.
 
     It may unpack to `largest` bytes.
-
-    Raises
-    ------
-    InputError
-        When the file cannot be read, as in `read_apart`.
     """
     reply, _ = _asked(_request("cells", path, largest))
     if "refused" in reply:
@@ -131,11 +115,6 @@ def match_apart(subject: str, pattern: str, text: str) -> dict[str, str | None] 
 
     Some patterns of users, such as ``(a+)+x``, take longer than anybody lives; `subject` is for the
     message.
-
-    Raises
-    ------
-    InputError
-        When matching takes too long or too much memory.
     """
     request = {
         "do": "match",
@@ -163,13 +142,7 @@ class _Process:
     served: bool = False
 
     def ask(self, request: dict[str, Any]) -> tuple[dict[str, Any], list[Array]]:
-        """Send a request and wait for its answer.
-
-        Raises
-        ------
-        EOFError, OSError
-            When the process ended instead.
-        """
+        """Send a request and wait for its answer."""
         assert self.popen.stdin is not None
         with _watched(self.popen, request["room"]):
             self.popen.stdin.write(json.dumps(request).encode("ascii") + b"\n")

@@ -24,18 +24,10 @@ _SEVERAL, _NAMED = 3, 20
 
 @dataclass
 class Block:
-    """Rows of one shape: the index of the first, kinds of each place of all, and counts.
+    """Rows of one shape: the index of the first, kinds of each place of all, and counts."""
 
-    Attributes
-    ----------
-    first, rows, numbers, words : int
-        Index of the first row, and how many rows, numbers and words it has.
-    kinds : list of int
-        Of each place, of all rows together.
-    """
-
-    first: int
-    kinds: list[int] = field(default_factory=list)
+    first: int  # Index of the first row, and how many rows, numbers and words it has
+    kinds: list[int] = field(default_factory=list)  # Of each place, of all rows together
     rows: int = 0
     numbers: int = 0
     words: int = 0

@@ -26,13 +26,6 @@ def read_c3d(path: Path, largest: int) -> Table:
     """Read the analog channels of the file at `path`, with their units and rate.
 
     Its arrays take `largest` bytes at most.
-
-    Raises
-    ------
-    DataError
-        When the file has no analog channels, or fewer frames than its header says.
-    ImpcError
-        When c3d is not installed.
     """
     source = str(path)
     c3d = optional("c3d", source)
@@ -64,15 +57,7 @@ def read_c3d(path: Path, largest: int) -> Table:
 
 
 def encode_c3d(table: Table) -> bytes:
-    """The bytes of a C3D file with the columns as analog channels, in single precision.
-
-    Raises
-    ------
-    OutputError
-        When the table has no rate.
-    ImpcError
-        When c3d is not installed.
-    """
+    """The bytes of a C3D file with the columns as analog channels, in single precision."""
     c3d = optional("c3d", "C3D")
     if table.rate is None:
         raise OutputError("C3D", "needs the rate of the samples", "give the table a rate")

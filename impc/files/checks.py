@@ -52,25 +52,14 @@ _TURN, _WIDE, _TINY = np.pi, 1.0, np.deg2rad(0.2)
 
 @dataclass(frozen=True)
 class Channel:
-    """One recorded signal, before it is resampled.
+    """One recorded signal, before it is resampled."""
 
-    Attributes
-    ----------
-    source, signal, column : str
-        File, name in the plant, name in the file.
-    unit : Unit
-    time : Array
-        (samples,), s, on the file's clock.
-    values : Array
-        (samples,), in `unit`, after offset and sign.
-    """
-
-    source: str
+    source: str  # File, name in the plant, name in the file
     signal: str
     column: str
     unit: Unit
-    time: Array
-    values: Array
+    time: Array  # (samples,), s, on the file's clock
+    values: Array  # (samples,), in `unit`, after offset and sign
 
     @property
     def name(self) -> str:
@@ -86,11 +75,6 @@ def unit_of_the_file(channel: Channel, told: Unit | None, overruled: bool) -> st
     """The unit that the file gives must be that of the configuration, unless it is overruled.
 
     A file that says "1" gives none.
-
-    Raises
-    ------
-    DataError
-        When it is another one.
     """
     if told is None or (
         told.base == channel.unit.base and np.isclose(told.factor, channel.unit.factor)
@@ -110,13 +94,7 @@ def unit_of_the_file(channel: Channel, told: Unit | None, overruled: bool) -> st
 
 
 def missing(channel: Channel, fill_gaps: float) -> str:
-    """Samples of a `channel` that are missing or not finite; `fill_gaps`, in s, may be bridged.
-
-    Raises
-    ------
-    DataError
-        When a longer run is missing, or an end of the recording.
-    """
+    """Samples of a `channel` that are missing or not finite; `fill_gaps`, in s, may be bridged."""
     finite = np.isfinite(channel.values)
     lost = np.flatnonzero(~finite)
     if len(lost) == 0:
@@ -141,13 +119,7 @@ def missing(channel: Channel, fill_gaps: float) -> str:
 
 
 def constant(channel: Channel) -> str:
-    """A channel that never changes: an unplugged sensor, a perturbation that never acted.
-
-    Raises
-    ------
-    DataError
-        When it does not change.
-    """
+    """A channel that never changes: an unplugged sensor, a perturbation that never acted."""
     values = channel.values[np.isfinite(channel.values)]
     if np.ptp(values) <= 1e-12 * np.max(np.abs(values)):
         raise DataError(
@@ -159,13 +131,7 @@ def constant(channel: Channel) -> str:
 
 
 def clipped(channel: Channel) -> str:
-    """A response that rests on its extreme values: an amplifier or converter at its end.
-
-    Raises
-    ------
-    DataError
-        When it rests there too often to be used.
-    """
+    """A response that rests on its extreme values: an amplifier or converter at its end."""
     finite = channel.values[np.isfinite(channel.values)]
     span = np.ptp(finite)
     levels = np.unique(finite)
@@ -223,13 +189,7 @@ def stretches(channel: Channel) -> str:
 
 
 def beyond_the_stop(channel: Channel, limit: float) -> str:
-    """A value that the mechanical stop does not let happen; limit in the channel's unit.
-
-    Raises
-    ------
-    DataError
-        When there is one.
-    """
+    """A value that the mechanical stop does not let happen; limit in the channel's unit."""
     beyond = np.abs(channel.values) > limit * (1 + 1e-9)
     if not beyond.any():
         return ""
@@ -245,13 +205,7 @@ def beyond_the_stop(channel: Channel, limit: float) -> str:
 
 
 def degrees_for_radians(channel: Channel) -> str:
-    """An angle that is too large for a posture, or too small for a movement.
-
-    Raises
-    ------
-    DataError
-        When it spans more than half a turn, or next to nothing in a unit below the radian.
-    """
+    """An angle that is too large for a posture, or too small for a movement."""
     if not channel.unit.angle:
         return ""
     finite = channel.values[np.isfinite(channel.values)] * channel.unit.factor
@@ -296,13 +250,7 @@ def _fault(channel: Channel, beyond: float, problem: str, remedy: str) -> DataEr
 
 
 def too_few(source: str, samples: int, needed: int) -> str:
-    """Fewer samples of a `source` at the analysis rate than the `needed` ones.
-
-    Raises
-    ------
-    DataError
-        When there are fewer.
-    """
+    """Fewer samples of a `source` at the analysis rate than the `needed` ones."""
     if samples < needed:
         raise DataError(
             source,

@@ -30,31 +30,15 @@ _RATE = 1e-3
 
 @dataclass(frozen=True)
 class Clock:
-    """When the samples were taken.
+    """When the samples were taken."""
 
-    Attributes
-    ----------
-    time : Array
-        (samples,), s, on the file's clock.
-    rows : slice
-        The rows of the file that are used, after the cut.
-    steps : IntArray
-        (samples,): even instant at which each sample was taken; 0 for the first.
-    start, period : float
-        s; the even instants are start + k period.
-    findings : tuple of str
-        Gaps and jitter that were let pass.
-    note : str
-        How its numbers were read, where nothing says it; empty otherwise.
-    """
-
-    time: Array
-    rows: slice
-    steps: IntArray
-    start: float
+    time: Array  # (samples,), s, on the file's clock
+    rows: slice  # The rows of the file that are used, after the cut
+    steps: IntArray  # (samples,): even instant at which each sample was taken; 0 for the first
+    start: float  # s; the even instants are start + k period
     period: float
-    findings: tuple[str, ...] = ()
-    note: str = ""
+    findings: tuple[str, ...] = ()  # Gaps and jitter that were let pass
+    note: str = ""  # How its numbers were read, where nothing says it; empty otherwise
 
     @property
     def even(self) -> bool:
@@ -63,14 +47,7 @@ class Clock:
 
 
 def read_clock(table: Table, recording: RecordingTable) -> Clock:
-    """Read the clock, cut the recording, and check that its instants are even.
-
-    Raises
-    ------
-    DataError
-        When the rate is unknown, a time is missing, repeated or before the last, when the cut
-        leaves nothing, or when a gap is longer than may be filled.
-    """
+    """Read the clock, cut the recording, and check that its instants are even."""
     if recording.time is None:
         rate = _told_rate(table, recording)
         measurable.period_of_a_recording(table.source, 1 / rate)
@@ -110,11 +87,6 @@ def column_of(table: Table, name: str, place: str) -> tuple[str, Array]:
     """A column by its `name`, with or without the unit behind it: its name in the file, its values.
 
     The values are (samples,); `place` is the key of the configuration that gives the name.
-
-    Raises
-    ------
-    DataError
-        When there is none; the message names those that there are.
     """
     short = name.rpartition(" (")[0] or name.rpartition(" [")[0]
     for known in (name, short):

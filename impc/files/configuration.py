@@ -47,113 +47,59 @@ _STUDY = ("study", "model", "select")
 
 
 class RecordingTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The [recording] table.
+    """The [recording] table."""
 
-    Attributes
-    ----------
-    time : str or None
-        Column with the clock.
-    time_unit : str or None
-        Its unit; None takes the one that the file tells, or seconds.
-    rate : float or None
-        Samples per second, where there is no clock. Neither is needed for TDMS and C3D.
-    subject, visit, condition, trial : str
-        The label of the trial; empty where it is not said.
-    pattern : str or None
-        Regular expression that the file's name without its ending must match as a whole; its named
-        groups subject, visit, condition and trial give the label.
-    fill_gaps : float
-        Seconds; the longest gap that may be filled by interpolation. 0 fills none.
-    start, stop : float or None
-        Seconds on the file's clock, which begins at 0 where there is only a rate.
-    sheet : str
-        Of a workbook; empty for the first one with rows of numbers.
-    """
-
-    time: str | None = None
-    time_unit: str | None = None
+    time: str | None = None  # Column with the clock
+    time_unit: str | None = None  # Its unit; None takes the one that the file tells, or seconds
+    # Samples per second, where there is no clock. Neither is needed for TDMS and C3D.
     rate: float | None = None
-    subject: str = ""
+    subject: str = ""  # The label of the trial; empty where it is not said
     visit: str = ""
     condition: str = ""
     trial: str = ""
+    # Regular expression that the file's name without its ending must match as a whole; its named
+    # groups subject, visit, condition and trial give the label
     pattern: str | None = None
+    # Seconds; the longest gap that may be filled by interpolation. 0 fills none.
     fill_gaps: float = 0.0
+    # Seconds on the file's clock, which begins at 0 where there is only a rate
     start: float | None = None
     stop: float | None = None
-    sheet: str = ""
+    sheet: str = ""  # Of a workbook; empty for the first one with rows of numbers
 
 
 class SignalTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A [signals.NAME] table: si value = sign * (column - offset) in SI base units.
+    """A [signals.NAME] table: si value = sign * (column - offset) in SI base units."""
 
-    Attributes
-    ----------
-    column : str
-        Column of the file.
-    unit : str
-        Its unit, as pint knows it.
-    limit : float or None
-        Mechanical stop in this unit: the largest magnitude after offset and sign.
-    offset : float
-        In this unit.
-    sign : int
-        1 or -1.
-    overrule_unit : bool
-        Whether `unit` counts where the file gives another one.
-    shift : int or float
-        By how much the signal is moved later: a whole number of samples, or seconds with a point.
-    command : bool
-        Whether it is a command of the subject that was recorded, and not a disturbance.
-    """
-
-    column: str
-    unit: str
+    column: str  # Column of the file
+    unit: str  # Its unit, as pint knows it
+    # Mechanical stop in this unit: the largest magnitude after offset and sign
     limit: float | None = None
-    offset: float = 0.0
-    sign: Literal[1, -1] = 1
-    overrule_unit: bool = False
+    offset: float = 0.0  # In this unit
+    sign: Literal[1, -1] = 1  # 1 or -1
+    overrule_unit: bool = False  # Whether `unit` counts where the file gives another one
+    # By how much the signal is moved later: a whole number of samples, or seconds with a point
     shift: int | float = 0
+    # Whether it is a command of the subject that was recorded, and not a disturbance
     command: bool = False
 
 
 class ReportTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The [report] table.
+    """The [report] table."""
 
-    Attributes
-    ----------
-    angles : str
-        "degrees" or "radians": in which all pages and figures of a run show angles.
-    """
-
+    # "degrees" or "radians": in which all pages and figures of a run show angles
     angles: Literal["degrees", "radians"] = "degrees"
 
 
 class Configuration(msgspec.Struct, frozen=True):
-    """What a configuration file says.
-
-    Attributes
-    ----------
-    recording : RecordingTable
-    signals : dict of str to SignalTable
-        By the name of an output or disturbance of the plant.
-    plant : dict
-        Arguments of the plant's function; not interpreted here.
-    fit : dict
-        Settings of the fit; not interpreted here.
-    plan : dict
-        Of an experiment that is planned; not interpreted here.
-    study, model, select : dict
-        Tables of a study; not interpreted here.
-    report : ReportTable
-    """
+    """What a configuration file says."""
 
     recording: RecordingTable
-    signals: dict[str, SignalTable]
-    plant: dict[str, Any] = {}
-    fit: dict[str, Any] = {}
-    plan: dict[str, Any] = {}
-    study: dict[str, Any] = {}
+    signals: dict[str, SignalTable]  # By the name of an output or disturbance of the plant
+    plant: dict[str, Any] = {}  # Arguments of the plant's function; not interpreted here
+    fit: dict[str, Any] = {}  # Settings of the fit; not interpreted here
+    plan: dict[str, Any] = {}  # Of an experiment that is planned; not interpreted here
+    study: dict[str, Any] = {}  # Tables of a study; not interpreted here
     model: dict[str, Any] = {}
     select: dict[str, Any] = {}
     report: ReportTable = ReportTable()

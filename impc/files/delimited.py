@@ -121,12 +121,6 @@ def read_delimited(path: Path, largest: int = LARGEST) -> Table:
     """Read the text file at `path`, whose ending says which delimiters it may have.
 
     Its numbers may take `largest` bytes.
-
-    Raises
-    ------
-    DataError
-        When it is not text, when no delimiter divides it into columns, when a row has more or
-        fewer values than the others, or when a column of numbers has text in it.
     """
     source = str(path)
     content, encoding = _decoded(source, path.read_bytes())
@@ -229,13 +223,7 @@ def _block(text: _Text) -> tuple[Block | None, float]:
 
 
 def _body(text: _Text, block: Block) -> _Body:
-    """The rows from the first of the block to the last one that has as many fields.
-
-    Raises
-    ------
-    DataError
-        When a row between others, or the last one, has another number of fields.
-    """
+    """The rows from the first of the block to the last one that has as many fields."""
     width, rows, kept, before = len(block.kinds), 0, 0, 0
     lines = text.lines()
     for _ in range(block.first):
@@ -378,13 +366,7 @@ def _first(text: _Text, body: _Body) -> Iterator[str]:
 
 
 def _words(text: _Text, body: _Body, name: str, column: _Column) -> str:
-    """Why a column with words is none of numbers.
-
-    Raises
-    ------
-    DataError
-        When it has numbers too.
-    """
+    """Why a column with words is none of numbers."""
     row = body.start + column.row
     line = next(number for index, (number, _) in enumerate(text.lines()) if index == row)
     if column.truths:

@@ -47,11 +47,6 @@ def digest(*parts: object) -> str:
 
     None, numbers, text, bytes, paths, dates, arrays of numbers, and mappings, sequences, sets,
     dataclasses and msgspec structs of such.
-
-    Raises
-    ------
-    TypeError
-        When a part is of another kind: a function has no content that could be compared.
     """
     text = hashlib.sha256()
     for piece in _pieces(parts):
@@ -100,13 +95,7 @@ def _fields(value: Any) -> dict[str, Any]:
 
 
 def content_digest(path: Path) -> str:
-    """SHA-256 of the whole file at `path`, hexadecimal; 0.4 to 2 GB a second.
-
-    Raises
-    ------
-    DataError
-        When it cannot be read.
-    """
+    """SHA-256 of the whole file at `path`, hexadecimal; 0.4 to 2 GB a second."""
     try:
         if path.exists() and not path.is_file():
             raise DataError(f"file {path.name}", "is no ordinary file", "name a file")
@@ -142,11 +131,6 @@ def source_digest(name: str, arguments: Mapping[str, Any] | None = None) -> str:
     The code is the module that is named and all modules that it imports, as long as they are no
     part of Python, of this package or of what is installed: those are told by `versions`. The
     module has to be imported already. Of `arguments` that name a file its content counts.
-
-    Raises
-    ------
-    DataError
-        When a file cannot be read.
     """
     given = {
         key: (value, content_digest(Path(value)) if _names_a_file(value) else None)

@@ -38,22 +38,14 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Format:
-    """How files of one ending are recognised, read and written.
+    """How files of one ending are recognised, read and written."""
 
-    Attributes
-    ----------
-    read : callable
-        (path, most bytes that its arrays may take) -> table; of a workbook also the name of a
-        sheet, where one is asked for. Whatever it raises becomes one line.
-    encode : callable
-        Table -> the bytes of a file.
-    begins : callable
-        Whether the first kilobyte of a file is that of this format; by default, of any text: of
-        what does not begin as something else.
-    """
-
+    # (path, most bytes that its arrays may take) -> table; of a workbook also the name of a sheet,
+    # where one is asked for. Whatever it raises becomes one line.
     read: Callable[..., Table]
-    encode: Callable[[Table], bytes]
+    encode: Callable[[Table], bytes]  # Table -> the bytes of a file
+    # Whether the first kilobyte of a file is that of this format; by default, of any text: of what
+    # does not begin as something else
     begins: Callable[[bytes], bool] = lambda head: not _what_it_is(head)
 
 
@@ -148,24 +140,12 @@ def write_table(path: Path | str, table: Table) -> None:
 
 
 def encode_table(ending: str, table: Table) -> bytes:
-    """The bytes of a table in the format of an ending, a key of `FORMATS`; .mat is v5.
-
-    Raises
-    ------
-    OutputError
-        When the ending is not known or the format cannot hold the table.
-    """
+    """The bytes of a table in the format of an ending, a key of `FORMATS`; .mat is v5."""
     return FORMATS[_suffix(Path(f"table{ending}"), OutputError)].encode(table)
 
 
 def write_matlab73(path: Path, table: Table) -> None:
-    """Write the .mat file of version 7.3 at `path`, whole or not at all.
-
-    Raises
-    ------
-    OutputError
-        When a column cannot be a MATLAB name, or the file cannot be written.
-    """
+    """Write the .mat file of version 7.3 at `path`, whole or not at all."""
     _write(path, matlab73_bytes(table))
 
 

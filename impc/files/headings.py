@@ -44,21 +44,11 @@ def are_units(row: Sequence[str]) -> bool:
 
 @dataclass(frozen=True)
 class Headings:
-    """What stands above the numbers.
+    """What stands above the numbers."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        Of all columns; empty for one without a name.
-    units : dict of str to str
-        Of the columns that have one.
-    notes : tuple of str
-        Which names are not those of the file.
-    """
-
-    names: tuple[str, ...]
-    units: dict[str, str]
-    notes: tuple[str, ...] = ()
+    names: tuple[str, ...]  # Of all columns; empty for one without a name
+    units: dict[str, str]  # Of the columns that have one
+    notes: tuple[str, ...] = ()  # Which names are not those of the file
 
 
 def find_headings(
@@ -68,11 +58,6 @@ def find_headings(
 
     `empty` says which columns below have no value, `named_rows` whether the first may be names of
     rows, above which nothing stands; `source` is the file.
-
-    Raises
-    ------
-    DataError
-        When the header has another number of columns than the rows below.
     """
     width = len(empty)
     rows = [row for row in map(_trimmed, above) if row]

@@ -17,27 +17,14 @@ __all__ = ["Inputs", "Recorded", "gather_inputs", "study_inputs"]
 
 @dataclass(frozen=True)
 class Inputs:
-    """SHA-256 of what went into a result.
+    """SHA-256 of what went into a result."""
 
-    Attributes
-    ----------
-    recordings : tuple of str, or mapping of str to tuple of str
-        Of each file, in the order given; of a study, by the name of the unit.
-    configuration : str
-        Of the configuration or the study file.
-    code : str
-        Of the plant's or model's code or file, and its arguments.
-    versions : str
-        Of Python, of the packages that compute, and of this package's source.
-    kind : str
-        What the code is: "plant" or "model".
-    """
-
+    # Of each file, in the order given; of a study, by the name of the unit
     recordings: tuple[str, ...] | Mapping[str, tuple[str, ...]]
-    configuration: str
-    code: str
-    versions: str
-    kind: str = "plant"
+    configuration: str  # Of the configuration or the study file
+    code: str  # Of the plant's or model's code or file, and its arguments
+    versions: str  # Of Python, of the packages that compute, and of this package's source
+    kind: str = "plant"  # What the code is: "plant" or "model"
 
     @property
     def digest(self) -> str:
@@ -61,11 +48,6 @@ def gather_inputs(
     """Digests of the recordings `files`, of the `configuration` and of a plant as they are now.
 
     The plant is a file or an import path, the `name`, imported already, with its `arguments`.
-
-    Raises
-    ------
-    DataError
-        When a file cannot be read.
     """
     recordings = tuple(content_digest(path) for path in files)
     return Inputs(
@@ -91,11 +73,6 @@ def study_inputs(
     """Digests of the recordings of `units`, of the `study` file and of its plant or model.
 
     `kind` is "plant" or "model"; `name` and `arguments` are as in `gather_inputs`.
-
-    Raises
-    ------
-    DataError
-        When a file cannot be read.
     """
     recordings = {unit.name: tuple(content_digest(path) for path in unit.files) for unit in units}
     return Inputs(

@@ -62,26 +62,15 @@ def clock_column(table: Table) -> str | None:
 
 @dataclass(frozen=True)
 class Wanted:
-    """What a plant needs a configuration for.
+    """What a plant needs a configuration for."""
 
-    Attributes
-    ----------
-    outputs, disturbances, controls : sequence of str
-        Names of its signals.
-    units : mapping of str to str
-        Of those whose unit the plant says.
-    arguments : mapping of str to object
-        Of its function, with their defaults; `FILL_IN` for one that has none.
-    dt : float
-        Sample time, s.
-    """
-
-    outputs: Sequence[str]
+    outputs: Sequence[str]  # Names of its signals
     disturbances: Sequence[str]
     controls: Sequence[str]
-    units: Mapping[str, str]
+    units: Mapping[str, str]  # Of those whose unit the plant says
+    # Of its function, with their defaults; `FILL_IN` for one that has none
     arguments: Mapping[str, object]
-    dt: float
+    dt: float  # Sample time, s
 
 
 @np.errstate(all="ignore")

@@ -44,15 +44,7 @@ _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,62}")
 
 
 def read_matlab(path: Path, largest: int) -> Table:
-    """Read the .mat file of version 5 to 7 at `path`; unpacked it takes `largest` bytes at most.
-
-    Raises
-    ------
-    DataError
-        When it holds no numeric vector or matrix: cells, tables and objects cannot be read.
-    ValueError
-        When it is damaged, or unpacks to more than it says.
-    """
+    """Read the .mat file of version 5 to 7 at `path`; unpacked it takes `largest` bytes at most."""
     columns: dict[str, Array] = {}
     skipped: dict[str, str] = {}
     for name, value in _variables(path, largest).items():
@@ -65,13 +57,6 @@ def read_matrices(path: Path, largest: int) -> dict[str, Array | list[str | None
 
     Real numbers in MATLAB's sizes, (rows, columns) or more, of `largest` bytes at most; of a text
     its rows, of a cell array its texts, None for what is no text.
-
-    Raises
-    ------
-    DataError
-        When it holds something else, or too much.
-    ValueError
-        When it is damaged, or unpacks to more than it says.
     """
     found: dict[str, Array | list[str | None]] = {}
     left = largest
@@ -123,11 +108,6 @@ def nested_columns(source: str, columns: Mapping[str, Array]) -> dict[str, Any]:
     """The `columns`, (samples,) each, as MATLAB variables; `s.field` as the field of a struct.
 
     `source` is the file, for the message.
-
-    Raises
-    ------
-    OutputError
-        When a column cannot be the name of a MATLAB variable.
     """
     nested: dict[str, Any] = {}
     for name, values in columns.items():

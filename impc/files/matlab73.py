@@ -46,15 +46,7 @@ class _Found:
 
 
 def read_matlab73(path: Path, largest: int) -> Table:
-    """Read the .mat file of version 7.3 at `path`; unpacked it takes `largest` bytes at most.
-
-    Raises
-    ------
-    DataError
-        When it holds no numeric vector or matrix, or refers to another file.
-    ValueError
-        When it is damaged.
-    """
+    """Read the .mat file of version 7.3 at `path`; unpacked it takes `largest` bytes at most."""
     import h5py  # noqa: PLC0415  # a fifth of a second, for who reads text only
 
     found = _Found(str(path), largest)
@@ -64,13 +56,7 @@ def read_matlab73(path: Path, largest: int) -> Table:
 
 
 def matlab73_bytes(table: Table) -> bytes:
-    """The bytes of a v7.3 .mat file with one column vector for each column.
-
-    Raises
-    ------
-    OutputError
-        When a column cannot be the name of a MATLAB variable.
-    """
+    """The bytes of a v7.3 .mat file with one column vector for each column."""
     import h5py  # noqa: PLC0415
 
     content = io.BytesIO()

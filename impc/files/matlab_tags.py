@@ -33,13 +33,6 @@ def look_at_tags(path: Path, largest: int) -> None:
     """Require types that exist, lengths that are there, and `largest` bytes unpacked at the most.
 
     The header of the file at `path` is not looked at.
-
-    Raises
-    ------
-    DataError
-        When they take more than `largest` bytes.
-    ValueError
-        When a tag is not sound, or a variable cannot be unpacked to the length that it says.
     """
     content = memoryview(path.read_bytes())
     order = "<" if bytes(content[126:128]) == b"IM" else ">"  # as scipy has it

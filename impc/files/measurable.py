@@ -28,13 +28,7 @@ _GAPS = 10  # even instants for each sample, where gaps may be filled
 
 
 def size(channel: Channel) -> str:
-    """A channel whose values are too large, or all but nothing.
-
-    Raises
-    ------
-    DataError
-        When a value or the whole span is none that is measured.
-    """
+    """A channel whose values are too large, or all but nothing."""
     finite = np.abs(channel.values[np.isfinite(channel.values)])
     largest = float(finite.max(initial=0.0))
     if largest > _LARGEST / channel.unit.factor:
@@ -58,11 +52,6 @@ def times_of_a_recording(subject: str, time: Array) -> None:
     """Require that the `time` of a clock (samples,), in s, is near enough to zero.
 
     `subject` names file and clock in the message.
-
-    Raises
-    ------
-    DataError
-        When it is further from zero than any clock.
     """
     furthest = float(max(abs(time[0]), abs(time[-1])))
     if furthest > _LONGEST:
@@ -72,13 +61,7 @@ def times_of_a_recording(subject: str, time: Array) -> None:
 
 
 def period_of_a_recording(subject: str, period: float) -> None:
-    """Require that a recorder has the `period`, in s; `subject` names file and clock.
-
-    Raises
-    ------
-    DataError
-        When no recorder has it.
-    """
+    """Require that a recorder has the `period`, in s; `subject` names file and clock."""
     if not _PERIODS[0] <= period <= _PERIODS[1]:
         raise DataError(
             subject,
@@ -91,11 +74,6 @@ def comparable_rates(subject: str, period: float, dt: float) -> None:
     """Require that a recording is not much slower than the plant: its `period`, and `dt`, in s.
 
     `subject` names the file in the message.
-
-    Raises
-    ------
-    DataError
-        When the recording is so slow that nearly all of the plant's samples would be made up.
     """
     if period > _SLOWER * dt:
         raise DataError(
@@ -109,11 +87,6 @@ def few_gaps(subject: str, time: Array, period: float) -> None:
     """Require that the `time` of a clock (samples,) has few gaps; its usual `period`, both in s.
 
     `subject` names file and clock in the message.
-
-    Raises
-    ------
-    DataError
-        When nearly all of its even instants would have to be filled.
     """
     instants = (time[-1] - time[0]) / period
     if instants > _GAPS * len(time):

@@ -20,12 +20,6 @@ def require_ordinary(path: Path, largest: int, error: type[ImpcError] = DataErro
     """Look at the file at `path` before it is opened: a pipe would never end. Its size in bytes.
 
     More than `largest` bytes are refused. Links are followed; `error` is the kind that is raised.
-
-    Raises
-    ------
-    ImpcError
-        Of the type `error`, when there is no such file, or it is a folder, a pipe, a device, empty
-        or too large.
     """
     source = str(path)
     try:

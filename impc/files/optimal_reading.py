@@ -45,29 +45,14 @@ __all__ = ["OptimalTrial", "read_optimal_trials"]
 
 @dataclass(frozen=True, eq=False)
 class OptimalTrial(Frozen):
-    """One file, in SI units on the problem's clock.
-
-    Attributes
-    ----------
-    label : Label
-    x : Array
-        States (steps + 1, n); NaN where they were not measured.
-    u : Array
-        Inputs (steps, m); NaN where they were not measured.
-    d : Array
-        Disturbances, of shape (steps, d).
-    dt : float
-        Sample time, s.
-    findings : tuple of str
-        What was let pass.
-    """
+    """One file, in SI units on the problem's clock."""
 
     label: Label
-    x: Array
-    u: Array
-    d: Array
-    dt: float
-    findings: tuple[str, ...]
+    x: Array  # States (steps + 1, n); NaN where they were not measured
+    u: Array  # Inputs (steps, m); NaN where they were not measured
+    d: Array  # Disturbances, of shape (steps, d)
+    dt: float  # Sample time, s
+    findings: tuple[str, ...]  # What was let pass
 
 
 def read_optimal_trials(
@@ -77,13 +62,6 @@ def read_optimal_trials(
 
     The `configuration` names a column for each disturbance of the `problem`, and for the states and
     inputs that were measured. Without a sample time of the problem that of each file is taken.
-
-    Raises
-    ------
-    InputError
-        When the configuration does not name the problem's signals, or a file is given twice.
-    DataError
-        When a file cannot be read or a check fails.
     """
     _require_names(configuration, problem)
     require_distinct(paths)

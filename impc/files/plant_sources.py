@@ -50,21 +50,11 @@ OWN = ("mass", "height")
 
 @dataclass(frozen=True)
 class PlantSource:
-    """How to make a plant.
+    """How to make a plant."""
 
-    Attributes
-    ----------
-    name : str
-        Import path ``module:function`` or file.
-    make : callable
-        Keyword arguments -> `control.StateSpace`.
-    arguments : mapping
-        Arguments as the configuration's [plant] table gives them.
-    """
-
-    name: str
-    make: Callable[..., Any]
-    arguments: Mapping[str, Any]
+    name: str  # Import path ``module:function`` or file
+    make: Callable[..., Any]  # Keyword arguments -> `control.StateSpace`
+    arguments: Mapping[str, Any]  # Arguments as the configuration's [plant] table gives them
 
     def defaults(self) -> dict[str, object]:
         """Arguments of the function with their defaults, `FILL_IN` for one that has none."""
@@ -87,11 +77,6 @@ def plant_source(name: str, arguments: Mapping[str, Any]) -> PlantSource:
 
     A file holds A, B, C and dt, and may hold D, and the names `states`, `inputs`, `outputs`, which
     the arguments may give as well. A .npz file is read without pickles.
-
-    Raises
-    ------
-    InputError
-        When there is no such module, function or file, or a matrix is missing.
     """
     if Path(name).suffix in SAVED:
         matrices = read_matrices(Path(name))
@@ -103,13 +88,7 @@ def plant_source(name: str, arguments: Mapping[str, Any]) -> PlantSource:
 
 @checked
 def import_function(path: str) -> Callable[..., Any]:
-    """The function of an import path ``module:function``; see the module's text for where.
-
-    Raises
-    ------
-    InputError
-        When there is no such module or function, or the module cannot be imported.
-    """
+    """The function of an import path ``module:function``; see the module's text for where."""
     module, _, function = path.partition(":")
     first = module.partition(".")[0]
     if not (first and function):
@@ -139,11 +118,6 @@ def users_code(name: str, *passing: type[Exception]) -> Iterator[None]:
 
     Errors of the package, those of the kinds in `passing` and an interruption from the keyboard
     stay what they are.
-
-    Raises
-    ------
-    InputError
-        For anything else, a call of `sys.exit` among it.
     """
     foreseen: tuple[type[Exception], ...] = (ImpcError, *passing)
     try:
@@ -176,11 +150,6 @@ def make_plant(source: PlantSource, recorded: Sequence[str], **changed: Any) -> 
     """Make the plant; inputs that are `recorded` are disturbances, the others are controls.
 
     Names that are no inputs are ignored; what is `changed` replaces arguments of the source.
-
-    Raises
-    ------
-    InputError, PlantError
-        When the arguments do not fit the function, or what it returns is no usable plant.
     """
     name, system = f"plant {source.name}", made_by(source, **changed)
     if isinstance(system, OptimalControlProblem):
@@ -198,11 +167,6 @@ def made_by(source: PlantSource, **changed: float) -> Any:
     """What the function of a source returns: a plant as a rule, or an optimal control problem.
 
     What is `changed` replaces arguments of the source.
-
-    Raises
-    ------
-    InputError, PlantError
-        When the arguments do not fit the function, or it fails.
     """
     arguments = {**source.arguments, **changed}
     for key, value in arguments.items():
@@ -238,11 +202,6 @@ def plant_family_of(
     """The plants that differ in the `free` arguments; None when none is.
 
     The names of `recorded` signals are as in `make_plant`.
-
-    Raises
-    ------
-    InputError
-        When a free argument has no nominal value, neither given nor as the function's default.
     """
     if not free:
         return None

@@ -108,13 +108,7 @@ def read_recordings(
 def read_unit(
     paths: Sequence[Path], configuration: Configuration, plant: Plant
 ) -> tuple[tuple[Recording, ...], tuple[FallError, ...]]:
-    """The trials of the `paths` in which the subject did not fall, and the falls.
-
-    Raises
-    ------
-    InputError, DataError
-        As `read_recordings`, and where the subject fell in every trial.
-    """
+    """The trials of the `paths` in which the subject did not fall, and the falls."""
     plant.require_discrete()
     _require_names(configuration, plant)  # before files are read, which may take long
     require_distinct(paths)
@@ -142,15 +136,7 @@ def read_unit(
 
 
 def recording_of(table: Table, configuration: Configuration, plant: Plant) -> Recording:
-    """Make the trial of one table: checks, even clock, plant's rate.
-
-    Raises
-    ------
-    InputError
-        When the configuration does not name the plant's signals.
-    DataError
-        When a check fails.
-    """
+    """Make the trial of one table: checks, even clock, plant's rate."""
     _require_names(configuration, plant)
     entry = configuration.recording
     label = label_of(table.source, entry)
@@ -194,15 +180,7 @@ def recording_of(table: Table, configuration: Configuration, plant: Plant) -> Re
 
 
 def disturbances_of(table: Table, configuration: Configuration, plant: Plant) -> Array:
-    """Perturbations of one table on the plant's clock (samples, d), in SI base units.
-
-    Raises
-    ------
-    InputError
-        When a disturbance has no column.
-    DataError
-        When a check fails.
-    """
+    """Perturbations of one table on the plant's clock (samples, d), in SI base units."""
     entry, columns = configuration.recording, []
     clock = read_clock(table, entry)
     measurable.comparable_rates(table.source, clock.period, plant.dt)
@@ -297,13 +275,7 @@ def _require_names(configuration: Configuration, plant: Plant) -> None:
 
 
 def require_filled_in(name: str, entry: SignalTable) -> None:
-    """Require that column and unit of the signal `name` are no longer `FILL_IN`.
-
-    Raises
-    ------
-    InputError
-        When one of them is what `impc inspect` writes for a reader to fill in.
-    """
+    """Require that column and unit of the signal `name` are no longer `FILL_IN`."""
     for key, meant in (("column", "its name in the file"), ("unit", "the column's unit")):
         if getattr(entry, key) == FILL_IN:
             raise InputError(f"signals.{name}.{key}", f"is still {FILL_IN!r}", f"fill in {meant}")
@@ -313,11 +285,6 @@ def require_kind(name: str, written: str, expected: str) -> None:
     """Require that a `written` unit may stand for the `expected` one of the signal `name`.
 
     What has no unit may stand for anything.
-
-    Raises
-    ------
-    InputError
-        When they are of different kinds, or the plant's is no SI unit.
     """
     if expected == UNKNOWN:
         return
@@ -337,13 +304,7 @@ def require_kind(name: str, written: str, expected: str) -> None:
 
 
 def require_distinct(paths: Sequence[Path]) -> None:
-    """None of the `paths` is given twice, by whatever name, nor a copy of another to the byte.
-
-    Raises
-    ------
-    InputError
-        When one is.
-    """
+    """None of the `paths` is given twice, by whatever name, nor a copy of another to the byte."""
     places: dict[str, Path] = {}
     sizes: dict[int, list[Path]] = {}
     for path in paths:
@@ -365,13 +326,7 @@ def require_distinct(paths: Sequence[Path]) -> None:
 
 
 def label_of(source: str, entry: RecordingTable) -> Label:
-    """Whose trial the file `source` is, by its name and the [recording] table.
-
-    Raises
-    ------
-    DataError
-        When the name does not match the pattern.
-    """
+    """Whose trial the file `source` is, by its name and the [recording] table."""
     stem = Path(source).stem
     groups: dict[str, str | None] = {}
     if entry.pattern is not None:
@@ -392,13 +347,7 @@ def label_of(source: str, entry: RecordingTable) -> Label:
 
 
 def channel_of(table: Table, clock: Clock, name: str, entry: SignalTable) -> checks.Channel:
-    """The column of the signal `name`, in its own unit, after offset and sign.
-
-    Raises
-    ------
-    DataError
-        When the file has no such column.
-    """
+    """The column of the signal `name`, in its own unit, after offset and sign."""
     column, values = column_of(table, entry.column, f"signals.{name}.column")
     # Beyond the largest number, or a NaN that signals: not finite, and told below.
     with np.errstate(over="ignore", invalid="ignore"):

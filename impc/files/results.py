@@ -25,26 +25,15 @@ Matrix = list[list[float]]
 
 
 class MethodRecord(msgspec.Struct, frozen=True):
-    """What a method found, as result.json has it.
+    """What a method found, as result.json has it."""
 
-    Attributes
-    ----------
-    K, S : list of list of float or None
-        Gain (m, n) and metric (m, m), in SI units; None without a gain.
-    Q, R : list of list of float or None
-        Weights (n, n) and (m, m), at R[0][0] = 1; None without weights.
-    seconds : float
-        Of the method, s.
-    status, reason : str
-        How the method ended (`impc.inverse.estimates.Status`), and why without an answer; empty for
-        the methods of the example, which end in an answer.
-    """
-
-    seconds: float
-    K: Matrix | None = None
+    seconds: float  # Of the method, s
+    K: Matrix | None = None  # Gain (m, n) and metric (m, m), in SI units; None without a gain
     S: Matrix | None = None
-    Q: Matrix | None = None
+    Q: Matrix | None = None  # Weights (n, n) and (m, m), at R[0][0] = 1; None without weights
     R: Matrix | None = None
+    # How the method ended (`impc.inverse.estimates.Status`), and why without an answer; empty for
+    # the methods of the example, which end in an answer
     status: str = ""
     reason: str = ""
 
@@ -54,36 +43,17 @@ class _Case(msgspec.Struct, frozen=True):
 
 
 class ResultFile(msgspec.Struct, frozen=True):
-    """result.json of any command.
+    """result.json of any command."""
 
-    Attributes
-    ----------
-    schema : int
-        Which version of docs/results.md it follows.
-    command : str
-        The command line, without folders.
-    made : str
-        Date and time, UTC, ISO 8601.
-    versions : dict
-        Of Python and of the packages that compute.
-    files : list of str
-        Names of the recordings.
-    sha256 : dict or None
-        Digests of all files that went in.
-    methods : dict of str to MethodRecord
-        Of `impc fit`, `impc compare` and `impc.report`; empty for the other commands.
-    content : dict
-        All of the file, as JSON has it.
-    """
-
-    schema: int
-    command: str
-    made: str
-    versions: dict[str, str]
-    files: list[str]
-    sha256: dict[str, Any] | None
+    schema: int  # Which version of docs/results.md it follows
+    command: str  # The command line, without folders
+    made: str  # Date and time, UTC, ISO 8601
+    versions: dict[str, str]  # Of Python and of the packages that compute
+    files: list[str]  # Names of the recordings
+    sha256: dict[str, Any] | None  # Digests of all files that went in
+    # Of `impc fit`, `impc compare` and `impc.report`; empty for the other commands
     methods: dict[str, MethodRecord] = {}
-    content: dict[str, Any] = {}
+    content: dict[str, Any] = {}  # All of the file, as JSON has it
 
 
 @checked

@@ -37,11 +37,6 @@ def read_matrices(path: Path) -> dict[str, Any]:
     """What the file at `path` holds, by name, not checked; A, B, C and dt are among it.
 
     It is .mat up to version 7, .npz or .json. No pickles are opened.
-
-    Raises
-    ------
-    InputError
-        When the `path` is no ordinary file, or it is too large, damaged, or lacks a matrix.
     """
     require_ordinary(path, _LARGEST, InputError)
     subject = f"plant {path}"
@@ -66,14 +61,7 @@ def read_matrices(path: Path) -> dict[str, Any]:
 
 
 def state_space(name: str, given: Mapping[str, Any]) -> Any:
-    """The `control.StateSpace` of the matrices that are given; `name` of the file, for messages.
-
-    Raises
-    ------
-    InputError
-        When a matrix is not made of real numbers, sizes do not agree with one another or with the
-        names, or dt is none.
-    """
+    """The `control.StateSpace` of the matrices that are given; `name` of the file, for messages."""
     subject = f"plant {name}"
     unknown = [key for key in given if key not in (*_MATRICES, "dt", *_NAMES, "units")]
     if unknown:

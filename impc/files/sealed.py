@@ -30,28 +30,16 @@ _UNSAFE = re.compile(r"[^A-Za-z0-9+._/-]")
 
 @dataclass(frozen=True)
 class Kept:
-    """Results by name, in a folder.
+    """Results by name, in a folder."""
 
-    Attributes
-    ----------
-    folder : Path
-        Made when the first result is kept.
-    """
-
-    folder: Path
+    folder: Path  # Made when the first result is kept
 
     def path(self, name: str) -> Path:
         """The file of the result `name`; a slash in it makes a folder."""
         return self.folder / f"{_UNSAFE.sub('-', name)}.json"
 
     def find(self, name: str, digest: str) -> Any:
-        """The content that was kept under a `name` by a run with that `digest`; None when none was.
-
-        Raises
-        ------
-        InputError
-            When the file is damaged, or of another run.
-        """
+        """The content kept under a `name` by a run with that `digest`, or None."""
         path = self.path(name)
         try:
             require_ordinary(path)
@@ -88,25 +76,13 @@ class Kept:
         return [path for path in files if path.is_file() and os.access(path, os.R_OK)]
 
     def keep(self, name: str, digest: str, content: Any) -> None:
-        """Write the result `name` down: `content`, as JSON has it, and the `digest` of its origin.
-
-        Raises
-        ------
-        OutputError
-            When that cannot be done.
-        """
+        """Write a result down: its `name`, its `content`, the `digest` of its origin."""
         body = {"content": content, "digest": digest, "name": name}
         sealed = f'{{"sha256": "{_seal(body)}", {_text(body)[1:]}\n'
         write_whole(self.path(name), sealed.encode())
 
     def discard(self, name: str) -> None:
-        """Remove the result of that `name`, if there is one.
-
-        Raises
-        ------
-        OutputError
-            When that cannot be done.
-        """
+        """Remove the result of that `name`, if there is one."""
         try:
             self.path(name).unlink(missing_ok=True)
         except OSError as error:
@@ -115,13 +91,7 @@ class Kept:
             ) from None
 
     def forget(self) -> None:
-        """Remove what was kept: the final results have been written. Files of others stay.
-
-        Raises
-        ------
-        OutputError
-            When that cannot be done.
-        """
+        """Remove what was kept: the final results have been written. Files of others stay."""
         try:
             for path in self._files():
                 found = _unsealed(path.read_bytes())

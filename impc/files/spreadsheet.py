@@ -40,13 +40,6 @@ def read_spreadsheet(path: Path, largest: int, sheet: str = "") -> Table:
 
     Dates and times become seconds after the first. Numbers that were saved as text, with decimal
     commas too, are numbers. The file at `path` may unpack to `largest` bytes.
-
-    Raises
-    ------
-    DataError
-        When it is damaged, locked by a password, lacks that sheet, or no sheet has rows of numbers.
-    ImpcError
-        When python-calamine is not installed.
     """
     source = str(path)
     sheets = list(_sheets(path, largest))
@@ -84,15 +77,7 @@ def _kind_of(cell: Any) -> int:
 
 
 def read_cells(path: Path, largest: int) -> dict[str, Any]:
-    """The cells of the first sheet at `path` as texts, a row in each list; `largest` as above.
-
-    Raises
-    ------
-    DataError
-        As of `read_spreadsheet`.
-    ImpcError
-        When python-calamine is not installed.
-    """
+    """The cells of the first sheet at `path` as texts, a row in each list; `largest` as above."""
     sheet = next(_sheets(path, largest), None)
     return {"cells": [[_text(cell) for cell in row] for row in sheet.rows] if sheet else []}
 

@@ -24,30 +24,18 @@ _LONGEST = 160  # characters of a name, a unit or a reason: they stand in messag
 
 @dataclass(frozen=True)
 class Table(Frozen):
-    """The numeric columns of one file.
+    """The numeric columns of one file."""
 
-    Attributes
-    ----------
-    source : str
-        Where they come from, for messages.
-    columns : mapping of str to Array
-        By name, in the order of the file, each (samples,). NaN where the file has no value.
-    units : mapping of str to str
-        Units of the columns for which the file tells them, as it writes them.
-    rate : float or None
-        Samples per second, where the file tells it itself (TDMS, C3D).
-    skipped : mapping of str to str
-        What else the file holds, and why it is no column.
-    notes : tuple of str
-        What a user of the columns has to know of the file: names that were changed, rows that
-        were not read.
-    """
-
-    source: str
+    source: str  # Where they come from, for messages
+    # By name, in the order of the file, each (samples,). NaN where the file has no value.
     columns: Mapping[str, Array]
+    # Units of the columns for which the file tells them, as it writes them
     units: Mapping[str, str]
-    rate: float | None
+    rate: float | None  # Samples per second, where the file tells it itself (TDMS, C3D)
+    # What else the file holds, and why it is no column
     skipped: Mapping[str, str] = field(default_factory=dict)
+    # What a user of the columns has to know of the file: names that were changed, rows that were
+    # not read
     notes: tuple[str, ...] = ()
 
     @property

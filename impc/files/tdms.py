@@ -37,14 +37,6 @@ def read_tdms(path: Path, largest: int) -> Table:
     Time stamps become seconds after the first. The rate is 1 / wf_increment, where it is given.
     Channels that begin at different times are cut to the time that they have in common. Arrays take
     `largest` bytes at most.
-
-    Raises
-    ------
-    DataError
-        When the file was cut off while it was written or copied, has no numeric channel, or
-        channels whose samples are not simultaneous.
-    ImpcError
-        When nptdms is not installed.
     """
     source = str(path)
     nptdms = optional("nptdms", source)
@@ -69,13 +61,7 @@ def read_tdms(path: Path, largest: int) -> Table:
 
 
 def encode_tdms(table: Table) -> bytes:
-    """The bytes of a TDMS file with one group.
-
-    Raises
-    ------
-    ImpcError
-        When nptdms is not installed.
-    """
+    """The bytes of a TDMS file with one group."""
     nptdms = optional("nptdms", "TDMS")
     channels = []
     for name, values in table.columns.items():
@@ -153,13 +139,7 @@ def _table(source: str, channels: list[Any], unknown: dict[str, str]) -> Table:
 def _simultaneous(
     source: str, columns: dict[str, Array], timed: dict[str, Any]
 ) -> dict[str, Array]:
-    """The columns, cut to the time that those with a clock have in common.
-
-    Raises
-    ------
-    DataError
-        When they have none, or begin between two samples of each other.
-    """
+    """The columns, cut to the time that those with a clock have in common."""
     moments = {name: item.get("wf_start_time") for name, item in timed.items()}
     earliest = min((moment for moment in moments.values() if moment is not None), default=None)
     begins: dict[str, float] = {}

@@ -22,11 +22,6 @@ def require_no_thousands(
     begin with 0, and other values are whole numbers without a sign. A program that writes decimals
     writes 999.000 there, or 1. `names` are those of the columns by their place in `rows`, which are
     numbers of lines with their fields; `source` is the file.
-
-    Raises
-    ------
-    DataError
-        When a column can be read in two ways.
     """
     grouped = re.compile(rf"[+-]?[1-9]\d{{0,2}}(?:{re.escape(sign)}\d{{3}})+")
     left = dict(names)

@@ -68,21 +68,11 @@ USUAL = {
 
 @dataclass(frozen=True)
 class Unit:
-    """A unit and what it is in SI base units.
+    """A unit and what it is in SI base units."""
 
-    Attributes
-    ----------
-    written : str
-        As the user or the file writes it.
-    factor : float
-        Value in SI base units = factor times value in this unit.
-    base : str
-        Its SI base units as pint prints them; "radian" for an angle, "second" for a time.
-    """
-
-    written: str
-    factor: float
-    base: str
+    written: str  # As the user or the file writes it
+    factor: float  # Value in SI base units = factor times value in this unit
+    base: str  # Its SI base units as pint prints them; "radian" for an angle, "second" for a time
 
     @property
     def angle(self) -> bool:
@@ -93,13 +83,7 @@ class Unit:
 @checked
 @functools.cache
 def si_unit(written: str) -> Unit:
-    """What a `written` unit is in SI base units: deg -> 0.01745 rad, "N*m" and "Nm" -> 1 N m.
-
-    Raises
-    ------
-    InputError
-        When pint does not know it, when it has an offset (degC), or when its name is ambiguous.
-    """
+    """What a `written` unit is in SI base units: deg -> 0.01745 rad, "N*m" and "Nm" -> 1 N m."""
     text = written.strip().translate(_DEGREES)
     if text.lower() in _NO_UNIT:
         return Unit(written, 1.0, "dimensionless")
@@ -163,13 +147,7 @@ def _base(text: str) -> tuple[float, float, str] | None:
 
 
 def as_pint_says(text: str) -> tuple[float, float, str] | None:
-    """Ask pint for factor, value of its zero, and base units of the unit in a `text`.
-
-    Returns
-    -------
-    tuple or None
-        None for what it cannot read.
-    """
+    """Ask pint for factor, value of its zero, and base units of the unit in a `text`."""
     registry = _registry()
     try:
         unit = registry.parse_units(text)

@@ -36,11 +36,6 @@ def consented_name(
 
     What the command line has `given` replaces it; `allowed` says whether it allows what the file
     names. `option` is "plant" or "model", and `known` are short names of this package's own.
-
-    Raises
-    ------
-    InputError
-        When nobody names one, the command line does not allow it, or it is no code of the user's.
     """
     name = given or named
     if not name:
@@ -74,11 +69,6 @@ def require_users_function(where: str, function: Callable[..., Any]) -> None:
     """Refuse a `function` that is not of the user's or of this package's plants.
 
     `where` is how messages call the place in the file.
-
-    Raises
-    ------
-    InputError
-        When it is something else, or was only imported into the user's module from elsewhere.
     """
     module = getattr(function, "__module__", None) or ""
     file = module_file(module, None)

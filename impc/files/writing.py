@@ -39,13 +39,7 @@ def unwritable(subject: str, error: OSError | ValueError, remedy: str) -> Output
 
 
 def require_ordinary(path: Path) -> None:
-    """Refuse a pipe or a device at `path`, in the place of a file: to open it may wait for ever.
-
-    Raises
-    ------
-    OSError
-        When something is there that is no ordinary file.
-    """
+    """Refuse a pipe or a device at `path`, in the place of a file: to open it may wait for ever."""
     if path.exists() and not path.is_file():
         raise OSError(errno.EINVAL, "no ordinary file")
 
@@ -54,11 +48,6 @@ def write_whole(path: Path, content: bytes) -> None:
     """Write `content` beside `path`, flush to the disk, rename: the whole file, or the one before.
 
     Its folder is made when it is missing.
-
-    Raises
-    ------
-    OutputError
-        When that cannot be done; a file that was there is as it was.
     """
     staging = path.with_name(f".{path.name}.part")
     try:

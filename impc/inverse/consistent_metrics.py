@@ -41,18 +41,10 @@ _IDENTIFIED = 1e-8
 
 @dataclass(frozen=True)
 class MetricFamily:
-    """All consistent metrics of one gain.
+    """All consistent metrics of one gain."""
 
-    Attributes
-    ----------
-    rows : Array
-        V^-1 V1' (r, m), of length one each.
-    others, idle : Array
-        D and V2 (m, e), of the inputs beyond the rank of B.
-    """
-
-    rows: Array
-    others: Array
+    rows: Array  # V^-1 V1' (r, m), of length one each
+    others: Array  # D and V2 (m, e), of the inputs beyond the rank of B
     idle: Array
 
     @property

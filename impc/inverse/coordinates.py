@@ -54,21 +54,11 @@ _EXPLAINED = 1e-12
 
 @dataclass(frozen=True)
 class Point:
-    """What a point of a search stands for.
+    """What a point of a search stands for."""
 
-    Attributes
-    ----------
-    K : Array
-        Gain (m, n).
-    S : Array
-        Metric (m, m).
-    problem : Problem
-        At the initial states and the parameters.
-    """
-
-    K: Array
-    S: Array
-    problem: Problem
+    K: Array  # Gain (m, n)
+    S: Array  # Metric (m, m)
+    problem: Problem  # At the initial states and the parameters
 
 
 @dataclass(frozen=True)
@@ -77,16 +67,10 @@ class Compressed:
 
     A search uses their norms and inner products only, which are those of the full ones; a
     recording of thousands of samples becomes a few dozen rows.
-
-    Attributes
-    ----------
-    rows : Rows
-        Gain, metric and parameters are shared, initial states the trial's own.
-    split : int
-        How many of the shared columns stand before those of initial states; the rest after.
     """
 
-    rows: Rows
+    rows: Rows  # Gain, metric and parameters are shared, initial states the trial's own
+    # How many of the shared columns stand before those of initial states; the rest after
     split: int
 
     @property
@@ -111,16 +95,7 @@ class Coordinates:
 
     Caches the last evaluation, because the residual and its derivative come from one pass.
 
-    Parameters
-    ----------
-    problem : Problem
-    gain, metric : Array
-        K (m, n), stabilising, and S (m, m): the origin of the coordinates.
-    gains : Array, optional
-        Basis of the gains that are searched (k, m, n), orthonormal in natural coordinates; all
-        gains by default.
-    correction : Correction, optional
-        Of the simulated state by the recorded outputs; none by default.
+    `gain` (m, n); `metric` (m, m); `gains` (k, m, n).
     """
 
     def __init__(
@@ -172,12 +147,7 @@ class Coordinates:
     def problem_at(self, starts: Array, parameters: Array) -> Problem:
         """The problem at coordinates of its other unknowns.
 
-        Parameters
-        ----------
-        starts : Array
-            Of initial states (trials * n,); (0,) when they are known.
-        parameters : Array
-            (k,).
+        `parameters` (k,).
         """
         given = np.array([trial.x0 for trial in self.problem.recordings])
         if len(starts):
@@ -228,11 +198,7 @@ class Coordinates:
     def without_nuisance(self, z: Array) -> Array:
         """Derivative at z (q,) with respect to gain and metric that the rest leaves.
 
-        Returns
-        -------
-        Array
-            (r, g), g coordinates of gain and metric: orthogonal to the columns of initial states
-            and parameters.
+        Returns (r, g).
         """
         rows = self.at(z).rows
         left, values, _ = np.linalg.svd(rows.own, full_matrices=False)
@@ -308,22 +274,7 @@ def descend(
 ) -> tuple[Array, int, bool]:
     """Least squares from z (q,) with a normal prior about the origin of the coordinates.
 
-    Parameters
-    ----------
-    space : Coordinates
-    z : Array
-        Where the search begins (q,).
-    stop : Stop
-    shared, own : Array or float
-        One over the prior's standard deviation: along the shared coordinates, or the columns
-        `along` (a,), and of each coordinate of an initial state.
-    along : Array, optional
-        Orthonormal columns along which gain, metric and parameters may move (g, a); all by default.
-
-    Returns
-    -------
-    z, evaluations, converged : Array, int, bool
-        Where it ends (q,), and as `minimise`.
+    `shared, own` (a,); `along` (g, a).
     """
     model = _Along(space, z, along)
     centre = model.apart(space.start)

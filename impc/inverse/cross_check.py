@@ -37,20 +37,7 @@ _WEIGHTS = ("inverse_mpc", "inverse_lqr_output")
 def cross_checked(
     ground: NaturalUnits, found: dict[str, Estimate]
 ) -> tuple[NaturalUnits, dict[str, Estimate]]:
-    """The estimates of some methods, inverse MPC among them, none beaten in its own model.
-
-    Parameters
-    ----------
-    ground : NaturalUnits
-        What the methods started from.
-    found : dict of str to Estimate
-        By the name of the method, of `estimate_all`.
-
-    Returns
-    -------
-    NaturalUnits, dict of str to Estimate
-        Others where inverse MPC itself began again.
-    """
+    """The estimates of some methods, inverse MPC among them, none beaten in its own model."""
     own = found["inverse_mpc"]
     winner = _winner(own, found)
     if winner is not None:

@@ -31,23 +31,13 @@ __all__ = ["CrossTerm", "inverse_lqr_cross_term", "lifted"]
 
 @dataclass(frozen=True)
 class CrossTerm(Frozen):
-    """Weights of  x'Qx + 2 x'Su + u'Ru  that have the gain exactly, with the least cross term.
+    """Weights of  x'Qx + 2 x'Su + u'Ru  that have the gain exactly, with the least cross term."""
 
-    Attributes
-    ----------
-    Q, R, S : Array
-        Shapes (n, n), (m, m), (n, m); R >= I sets the scale.
-    norm : float
-        ||S||_F.
-    status : str
-        The solver's word.
-    """
-
-    Q: Array
+    Q: Array  # Shapes (n, n), (m, m), (n, m); R >= I sets the scale
     R: Array
     S: Array
-    norm: float
-    status: str
+    norm: float  # ||S||_F
+    status: str  # The solver's word
 
 
 @checked(gain="m n")
@@ -61,25 +51,6 @@ def inverse_lqr_cross_term(plant: Plant, gain: ArrayLike) -> CrossTerm:
         continuous:  S' = RK - B'P,     Q = -F'P - PF + SK + K'S' - K'RK
 
     P >= 0 follows, for F is stable. Dropping S gives a start for `inverse_lqr_gradient`.
-
-    Raises
-    ------
-    WeightsError
-        When A - BK is not stable: no quadratic cost has such a gain.
-    SolverError
-        When the semidefinite program ends without an answer.
-
-    Examples
-    --------
-    A gain that some weights have needs no cross term.
-
-    >>> import impc
-    >>> from impc.inverse.cross_term import inverse_lqr_cross_term
-    >>> from plants import yalmip_example
-    >>> plant = impc.Plant(yalmip_example())
-    >>> gain = impc.solve_lqr(plant, impc.Weights([[1, 0], [0, 1]], 1)).K
-    >>> inverse_lqr_cross_term(plant, gain).norm < 1e-6
-    True
     """
     n, m = plant.n, plant.m
     K = finite_array("gain", gain, (m, n))
@@ -122,17 +93,7 @@ def inverse_lqr_cross_term(plant: Plant, gain: ArrayLike) -> CrossTerm:
 def lifted(matrix: Array, least: float) -> Array:
     """A symmetric matrix with its eigenvalues raised to a least one.
 
-    Parameters
-    ----------
-    matrix : Array
-        (k, k).
-    least : float
-        In the unit of its entries.
-
-    Returns
-    -------
-    Array
-        (k, k).
+    `matrix` (k, k); returns (k, k).
     """
     values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
     raised: Array = (vectors * np.maximum(values, least)) @ vectors.T

@@ -37,34 +37,17 @@ _FINE, _EVALUATIONS = 0.01, 60
 
 @dataclass(frozen=True)
 class PreliminaryGain(Frozen):
-    """Result of `preliminary_gain`.
+    """Result of `preliminary_gain`."""
 
-    Attributes
-    ----------
-    K : Array
-        (m, n), zero outside the chosen states.
-    problem : Problem
-        Without bounds, at the initial states and parameters found.
-    misfit : float
-        2-norm of the scaled residual.
-    """
-
-    K: Array
-    problem: Problem
-    misfit: float
+    K: Array  # (m, n), zero outside the chosen states
+    problem: Problem  # Without bounds, at the initial states and parameters found
+    misfit: float  # 2-norm of the scaled residual
 
 
 def preliminary_gain(problem: Problem, states: Sequence[str]) -> PreliminaryGain:
     """Fit gains on some states, with initial states and physical parameters, without bounds.
 
     From the gains of balanced regulators on those states, at the scale at which they fit best.
-
-    Raises
-    ------
-    InputError
-        When a state is unknown.
-    SolverError
-        When no gain of that form that stabilises the plant was found.
     """
     loose = problem.without_bounds()
     names = problem.plant.states

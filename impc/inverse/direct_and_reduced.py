@@ -62,49 +62,29 @@ _DETOUR = 60
 
 @dataclass(frozen=True)
 class DirectFit(ConditionedFit):
-    """Result of `inverse_mpc`: what every `ConditionedFit` says, and whether it explains.
+    """Result of `inverse_mpc`: what every `ConditionedFit` says, and whether it explains."""
 
-    Attributes
-    ----------
-    explained : bool
-        Whether the constrained controller of the weights reproduces the recordings to 1e-9 of
-        them. Where `converged` is true and this is not, the search ended in a minimum of its
-        objective that leaves a misfit: noise, a model that is wrong, or a local minimum.
-    """
-
+    # Whether the constrained controller of the weights reproduces the recordings to 1e-9 of them.
+    # Where `converged` is true and this is not, the search ended in a minimum of its objective that
+    # leaves a misfit: noise, a model that is wrong, or a local minimum.
     explained: bool
 
 
 @dataclass(frozen=True)
 class ReducedFit:
-    """Result of `inverse_mpc_reduced`.
+    """Result of `inverse_mpc_reduced`."""
 
-    Attributes
-    ----------
-    gain : GainFit
-        What the recordings determine.
-    metrics : Array
-        The metric, then directions along which they do not identify it (k, m, m).
-    equivalent : EquivalentWeights or None
-        Weights of least condition number with exactly that gain; None when there are none.
-    direct : DirectFit or None
-        Weights of the direct form, when none have exactly that gain, or those that do fit worse.
-    explained : bool
-        Whether the constrained controller of these weights reproduces the recordings to 1e-9 of
-        them.
-    reason : str
-        Why not; empty when it does.
-    kept_hard : bool
-        Whether the controller found reaches every sample with hard state bounds and terminal set,
-        which the search had softened; see `verify_hard`.
-    """
-
-    gain: GainFit
-    metrics: Array
+    gain: GainFit  # What the recordings determine
+    metrics: Array  # The metric, then directions along which they do not identify it (k, m, m)
+    # Weights of least condition number with exactly that gain; None when there are none
     equivalent: EquivalentWeights | None
+    # Weights of the direct form, when none have exactly that gain, or those that do fit worse
     direct: DirectFit | None
+    # Whether the constrained controller of these weights reproduces the recordings to 1e-9 of them
     explained: bool
-    reason: str
+    reason: str  # Why not; empty when it does
+    # Whether the controller found reaches every sample with hard state bounds and terminal set,
+    # which the search had softened; see `verify_hard`
     kept_hard: bool
 
     @property
@@ -122,43 +102,21 @@ class ReducedFit:
 
 @dataclass(frozen=True)
 class Start:
-    """Lines 1 to 8 of Table 3.1; what the branch taken did not need is None.
+    """Lines 1 to 8 of Table 3.1; what the branch taken did not need is None."""
 
-    Attributes
-    ----------
-    gain : GainFit
-        Line 1: feedback gain without bounds.
-    lmi : InverseLqr
-        Line 2; whether it is feasible decides the branch.
-    gradient : InverseLqr or None
-        Line 4.
-    auxiliary : ConditionedFit or None
-        Line 5.
-    weights : Weights
-        Line 5 or 7: where (3.6) starts.
-    """
-
-    gain: GainFit
-    lmi: InverseLqr
-    gradient: InverseLqr | None
-    auxiliary: ConditionedFit | None
-    weights: Weights
+    gain: GainFit  # Line 1: feedback gain without bounds
+    lmi: InverseLqr  # Line 2; whether it is feasible decides the branch
+    gradient: InverseLqr | None  # Line 4
+    auxiliary: ConditionedFit | None  # Line 5
+    weights: Weights  # Line 5 or 7: where (3.6) starts
 
 
 @dataclass(frozen=True)
 class Inference:
-    """Table 3.1 from end to end.
+    """Table 3.1 from end to end."""
 
-    Attributes
-    ----------
-    start : Start
-        Lines 1 to 8.
-    fit : DirectFit
-        Line 9.
-    """
-
-    start: Start
-    fit: DirectFit
+    start: Start  # Lines 1 to 8
+    fit: DirectFit  # Line 9
 
 
 @checked(condition_weight=0)
@@ -194,13 +152,7 @@ def infer_weights(problem: Problem, *, condition_weight: float | None = None) ->
 
 @checked
 def starting_point(problem: Problem) -> Start:
-    """Lines 1 to 8 of Table 3.1: a feedback gain, and the weights of a regulator like it.
-
-    Raises
-    ------
-    WeightsError, SolverError
-        As `infer_weights`.
-    """
+    """Lines 1 to 8 of Table 3.1: a feedback gain, and the weights of a regulator like it."""
     plant = problem.plant
     gain = fit_gain(problem.without_bounds())
     lmi = inverse_lqr_lmi(plant, gain.K)
@@ -399,20 +351,7 @@ def output_penalty_weights(
     *,
     condition_weight: float | None = None,
 ) -> ConditionedFit:
-    """Inverse LQR on the outputs (3.16): as `inverse_mpc`, but the loop is the plain regulator.
-
-    Parameters
-    ----------
-    start : Weights
-        Positive definite.
-    condition_weight : float, optional
-        Against a fit weight of 1, see `inverse_mpc`.
-
-    Raises
-    ------
-    WeightsError, SolverError
-        As `inverse_mpc`.
-    """
+    """Inverse LQR on the outputs (3.16): as `inverse_mpc`, but the loop is the plain regulator."""
     return inverse_mpc(
         problem.without_bounds(), start, condition_weight=condition_weight, explain=False
     )

@@ -49,66 +49,34 @@ _GAP, _LARGEST_GAP = 1e-9, 1e-4
 
 @dataclass(frozen=True)
 class WeightsMargin:
-    """Whether a fibre has positive definite members, and by how much.
+    """Whether a fibre has positive definite members, and by how much."""
 
-    Attributes
-    ----------
-    margin : float
-        Largest t with blkdiag(Q, R) >= t I in natural coordinates, at a mean eigenvalue of 1: at
-        most 1, independent of units, negative when no member is even semidefinite.
-    exist : bool
-        Whether the margin is above 1e-9.
-    weights : Weights or None
-        The member of that margin, when they exist.
-    """
-
+    # Largest t with blkdiag(Q, R) >= t I in natural coordinates, at a mean eigenvalue of 1: at most
+    # 1, independent of units, negative when no member is even semidefinite
     margin: float
-    exist: bool
-    weights: Weights | None
+    exist: bool  # Whether the margin is above 1e-9
+    weights: Weights | None  # The member of that margin, when they exist
 
 
 @dataclass(frozen=True)
 class EquivalentWeights(Frozen):
-    """Weights that have the gain of a fibre.
+    """Weights that have the gain of a fibre."""
 
-    Attributes
-    ----------
-    weights : Weights
-        Scaled to R[0, 0] = 1.
-    P : Array
-        Their Riccati solution (n, n), solved anew.
-    condition : float
-        Condition number of blkdiag(Q, R).
-    gain_error : float
-        ||K(Q, R) - K||_F / ||K||_F, with K(Q, R) from that solution.
-    status : str
-        How they were found, and the solver's own word.
-    least : float or None
-        Of `least_condition_weights`: the least condition number, which these weights exceed by up
-        to 2e-5 of it. None for weights that were not chosen by it.
-    gap : float or None
-        How much lower, relatively, that could be by the dual bound.
-    """
-
-    weights: Weights
-    P: Array
-    condition: float
-    gain_error: float
-    status: str
+    weights: Weights  # Scaled to R[0, 0] = 1
+    P: Array  # Their Riccati solution (n, n), solved anew
+    condition: float  # Condition number of blkdiag(Q, R)
+    gain_error: float  # ||K(Q, R) - K||_F / ||K||_F, with K(Q, R) from that solution
+    status: str  # How they were found, and the solver's own word
+    # Of `least_condition_weights`: the least condition number, which these weights exceed by up to
+    # 2e-5 of it. None for weights that were not chosen by it.
     least: float | None
-    gap: float | None
+    gap: float | None  # How much lower, relatively, that could be by the dual bound
 
 
 @checked
 @functools.lru_cache(maxsize=1)  # whoever looks for one member of a fibre looks for others next
 def weights_margin(fibre: GainFibre) -> WeightsMargin:
-    """Say whether any weights have the gain: max t such that X >= t I, mean eigenvalue of X is 1.
-
-    Raises
-    ------
-    SolverError
-        When neither a member nor the dual bound decides.
-    """
+    """Whether any weights have the gain: max t such that X >= t I, X of mean eigenvalue 1."""
     basis, n, size = fibre.natural_basis(), fibre.plant.n, fibre.plant.n + fibre.plant.m
     traces = np.trace(basis, axis1=1, axis2=2)
     if np.linalg.norm(traces) < 1e-12:  # no member has a positive trace, or there is none but 0
@@ -206,13 +174,6 @@ def analytic_centre(fibre: GainFibre) -> EquivalentWeights:
 
     N is the metric of the natural coordinates, so the choice does not depend on the coordinates
     of states and inputs. With a single input it is the largest det Q with R fixed. Damped Newton.
-
-    Raises
-    ------
-    WeightsError
-        When no weights have the gain, or when the members with that trace are unbounded, which
-        they are if and only if (A, B) is not controllable or, discrete, A - BK is singular: the
-        cost on a combination of states that is out of reach, or gone in one step, is then free.
     """
     n, basis = fibre.plant.n, fibre.natural_basis()
     X = fibre.to_natural(_interior(fibre))

@@ -43,13 +43,7 @@ __all__ = [
 
 
 class Status(Enum):
-    """How a method ended; each has a sentence.
-
-    Attributes
-    ----------
-    EXPLAINED, SETTLED, STOPPED, GAIN_ONLY, NONE : Status
-        See `sentence`.
-    """
+    """How a method ended; each has a sentence."""
 
     EXPLAINED = "explained"
     SETTLED = "settled"
@@ -85,28 +79,16 @@ _SENTENCES = {
 
 @dataclass(frozen=True)
 class Goodness:
-    """What the simulation of the recordings says of an answer.
+    """What the simulation of the recordings says of an answer."""
 
-    Attributes
-    ----------
-    white : bool
-        Whether what is left of no output is autocorrelated from one sample to the next; of an exact
-        answer it is rounding.
-    softened, samples : int
-        How many samples exceed a soft bound or the terminal set, and of how many.
-    rank : int
-        Directions of the gain that the recordings identify.
-    lone : bool
-        Whether the best of several searches was alone: the others ended at more.
-    beaten : str
-        Method whose answer leaves less in the model of this one; empty where there is none.
-    """
-
+    # Whether what is left of no output is autocorrelated from one sample to the next; of an exact
+    # answer it is rounding
     white: bool
-    softened: int
+    softened: int  # How many samples exceed a soft bound or the terminal set, and of how many
     samples: int
-    rank: int
-    lone: bool = False
+    rank: int  # Directions of the gain that the recordings identify
+    lone: bool = False  # Whether the best of several searches was alone: the others ended at more
+    # Method whose answer leaves less in the model of this one; empty where there is none
     beaten: str = ""
 
 
@@ -280,13 +262,7 @@ class Estimate(Frozen):
 
 
 def goodness(problem: Problem, gain: Array, metric: Array) -> tuple[float, Goodness]:
-    """Misfit of a gain (m, n) with a metric (m, m), and what else its simulation says.
-
-    Raises
-    ------
-    InputError, SolverError
-        As `controller_for`.
-    """
+    """Misfit of a gain (m, n) with a metric (m, m), and what else its simulation says."""
     runs = simulated(problem, gain, metric)
     status = np.concatenate([run.status for run in runs])
     softened = int(np.count_nonzero(status == SampleStatus.SOFTENED))
@@ -357,15 +333,7 @@ def encode_estimate(estimate: Estimate) -> dict[str, Any]:
 
 
 def decode_estimate(seen: Problem, kept: dict[str, Any]) -> Estimate:
-    """Make an estimate again.
-
-    Parameters
-    ----------
-    seen : Problem
-        As the method saw it.
-    kept : dict
-        Of `encode_estimate`.
-    """
+    """Make an estimate again."""
     m = seen.plant.m
     posed = replace(seen, terminal_set=kept["terminal_set"])
     return Estimate(

@@ -34,40 +34,18 @@ __all__ = ["WeightsBehind", "weights_behind", "weights_misfit"]
 
 @dataclass(frozen=True)
 class WeightsBehind:
-    """Result of `weights_behind`.
+    """Result of `weights_behind`."""
 
-    Attributes
-    ----------
-    gain : GainFit
-        The gain that the weights have.
-    metrics : Array
-        The metric, then directions along which nothing identifies it (k, m, m).
-    equivalent : EquivalentWeights or None
-        None when there are none.
-    misfit : float
-        2-norm of the residual of these weights; infinite without.
-    explained : bool
-        Whether that is at most 1e-9 of the recorded outputs.
-    reason : str
-        Why there are none, or why they do not explain; empty when they do.
-    """
-
-    gain: GainFit
-    metrics: Array
-    equivalent: EquivalentWeights | None
-    misfit: float
-    explained: bool
-    reason: str
+    gain: GainFit  # The gain that the weights have
+    metrics: Array  # The metric, then directions along which nothing identifies it (k, m, m)
+    equivalent: EquivalentWeights | None  # None when there are none
+    misfit: float  # 2-norm of the residual of these weights; infinite without
+    explained: bool  # Whether that is at most 1e-9 of the recorded outputs
+    reason: str  # Why there are none, or why they do not explain; empty when they do
 
 
 def weights_behind(fit: GainFit) -> WeightsBehind:
-    """Find the weights of least condition number that reproduce the recordings as a gain does.
-
-    Raises
-    ------
-    SolverError, WeightsError
-        When the plant under the fitted gain cannot be simulated.
-    """
+    """Find the weights of least condition number that reproduce the recordings as a gain does."""
     problem = fit.problem
     metrics = np.array(fit.S)[None]
     try:

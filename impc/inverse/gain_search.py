@@ -67,52 +67,27 @@ _MORE, _ROUNDS, _DRAWN, _QUICK, _KEPT = 2, 2, 100, 4, 12
 
 @dataclass(frozen=True)
 class GainFit(Frozen):
-    """A gain fitted to recordings.
+    """A gain fitted to recordings."""
 
-    Attributes
-    ----------
-    K : Array
-        (m, n).
-    S : Array
-        Metric (m, m); the one it started from where the recordings do not determine it.
-    problem : Problem
-        The problem at the initial states and the parameters found; the given one when these are
-        known.
-    misfit : float
-        2-norm of the output residual.
-    explained : bool
-        Whether the gain stabilises and the misfit is at most 1e-9 of the recorded outputs.
-    stabilises : bool
-        Whether A - BK is stable. Without a terminal set the search may end where it is not.
-    singular_values : Array
-        Of the residual's derivative with respect to K and S in natural coordinates, after initial
-        states and parameters have taken what they can (g,); largest first.
-    evaluations : int
-        Simulations with derivatives.
-    lone : bool
-        Whether several searches were made, and one only ended at this misfit.
-    """
-
-    K: Array
-    S: Array
+    K: Array  # (m, n)
+    S: Array  # Metric (m, m); the one it started from where the recordings do not determine it
+    # The problem at the initial states and the parameters found; the given one when these are known
     problem: Problem
-    misfit: float
+    misfit: float  # 2-norm of the output residual
+    # Whether the gain stabilises and the misfit is at most 1e-9 of the recorded outputs
     explained: bool
+    # Whether A - BK is stable. Without a terminal set the search may end where it is not.
     stabilises: bool
+    # Of the residual's derivative with respect to K and S in natural coordinates, after initial
+    # states and parameters have taken what they can (g,); largest first
     singular_values: Array
-    evaluations: int
-    lone: bool = False
+    evaluations: int  # Simulations with derivatives
+    lone: bool = False  # Whether several searches were made, and one only ended at this misfit
 
 
 @checked
 def fit_gain(problem: Problem) -> GainFit:
-    """Fit K, and S for several inputs, with initial states and parameters that are not known.
-
-    Raises
-    ------
-    SolverError
-        When the recordings cannot be simulated from where any search begins.
-    """
+    """Fit K, and S for several inputs, with initial states and parameters that are not known."""
     count = sum(problem.trial_sizes)
     few, wanted = count <= FEW, _SURE if count <= _HANDFUL else _AGREE
     found: list[GainFit] = []
@@ -157,19 +132,7 @@ def refine_gain(
 ) -> GainFit:
     """One search of the simulation's misfit from a gain and a metric.
 
-    Parameters
-    ----------
-    gain, metric : Array
-        K (m, n) and S (m, m).
-    max_evaluations : int
-        Simulations with derivatives, at most.
-    prior : float
-        One over the standard deviation of a normal prior about the start, in natural coordinates.
-
-    Raises
-    ------
-    SolverError
-        When the recordings cannot be simulated from there.
+    `gain` (m, n); `metric` (m, m).
     """
     _, reason = misfit_or_reason(problem, gain, metric)
     if reason:
@@ -227,11 +190,6 @@ def _simulated(problem: Problem, begin: LqrSolution, predicted: Point) -> GainFi
     """The least simulation error from the end of a search of predictions.
 
     Where that does not stabilise, or cannot be simulated, from a point on the way there.
-
-    Raises
-    ------
-    SolverError
-        When the recordings cannot be simulated near the regulator either.
     """
     K = np.array(begin.K)
     starts = np.array(predicted.problem.starts)

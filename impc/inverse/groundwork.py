@@ -65,42 +65,21 @@ def afresh(_name: str, make: Callable[[], Estimate]) -> Estimate:
 
 @dataclass(frozen=True)
 class Found(Frozen):
-    """What a method hands back, before it is simulated.
+    """What a method hands back, before it is simulated."""
 
-    Attributes
-    ----------
-    K : Array
-        (m, n).
-    weights : Weights or None
-    evaluations : int
-        Simulations with derivatives.
-    S : Array or None
-        Metric (m, m) where it is not that of inverse MPC: without bounds it has no effect.
-    reason : str
-        Why there are no weights; empty otherwise.
-    settled : bool
-        Whether the search ended by itself.
-    problem : Problem or None
-        At the initial states and parameters found, where they are the method's own.
-    """
-
-    K: Array
+    K: Array  # (m, n)
     weights: Weights | None = None
-    evaluations: int = 0
+    evaluations: int = 0  # Simulations with derivatives
+    # Metric (m, m) where it is not that of inverse MPC: without bounds it has no effect
     S: Array | None = None
-    reason: str = ""
-    settled: bool = True
+    reason: str = ""  # Why there are no weights; empty otherwise
+    settled: bool = True  # Whether the search ended by itself
+    # At the initial states and parameters found, where they are the method's own
     problem: Problem | None = None
 
 
 class PlantUnits:
-    """Table 3.1 for recordings without noise, in the units of the plant.
-
-    Parameters
-    ----------
-    problem : Problem
-        Its initial states are taken as known.
-    """
+    """Table 3.1 for recordings without noise, in the units of the plant."""
 
     def __init__(self, problem: Problem) -> None:
         self.problem = self.known = problem
@@ -164,15 +143,7 @@ class PlantUnits:
 class NaturalUnits:
     """For recordings with noise, in natural coordinates.
 
-    Parameters
-    ----------
-    problem : Problem
-    remember : callable
-        (name, compute) -> the estimate: from memory, or computed now.
-    feedback_states : sequence of str
-        Those that the preliminary gains (3.20) are on.
-    fitted : Estimate, optional
-        Inverse MPC, where it is known.
+    `remember` (name, compute).
     """
 
     def __init__(
@@ -293,21 +264,7 @@ Groundwork = PlantUnits | NaturalUnits
 
 
 def regulator(ground: Groundwork, weights: Weights | None, evaluations: int = 0) -> Found:
-    """The gain of some weights.
-
-    Parameters
-    ----------
-    ground : Groundwork
-        Whose plant is regulated.
-    weights : Weights or None
-    evaluations : int
-        Simulations that finding them took.
-
-    Raises
-    ------
-    WeightsError
-        When there are none.
-    """
+    """The gain of some weights."""
     if weights is None:
         raise WeightsError("weights", "none have the feedback gain", "see the gradient method")
     return Found(np.array(solve_lqr(ground.known.plant, weights).K), weights, evaluations)

@@ -35,12 +35,7 @@ def with_fitted_starts(
     is given a normal prior of the size of the trial's other states (`start_unit`), which weighs as
     the residual's own noise does.
 
-    Parameters
-    ----------
-    gain, metric : Array
-        K (m, n) and S (m, m) of that controller.
-    samples : int, optional
-        How many samples of each trial may be looked at; all by default.
+    `gain` (m, n); `metric` (m, m).
     """
     fitted = []
     for trial in problem.recordings:

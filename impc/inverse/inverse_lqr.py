@@ -37,36 +37,17 @@ __all__ = [
 
 @dataclass(frozen=True)
 class InverseLqr(Frozen):
-    """Weights for a gain, or the finding that there are none.
+    """Weights for a gain, or the finding that there are none."""
 
-    Attributes
-    ----------
-    weights : Weights or None
-        Scaled to R[0, 0] = 1; None when the method found that there are none.
-    gain : Array or None
-        K(Q, R) of these weights, (m, n).
-    gain_error : float
-        ||K(Q, R) - K||_F; infinite without weights.
-    condition : float
-        Condition number of blkdiag(Q, R); infinite without weights.
-    feasible : bool
-        Whether weights with exactly this gain were found: a relative error of 1e-8 or less.
-    method : str
-        "lmi" or "gradient".
-    evaluations : int
-        Riccati equations solved.
-    status : str
-        Why the method ended.
-    """
-
-    weights: Weights | None
-    gain: Array | None
-    gain_error: float
-    condition: float
+    weights: Weights | None  # Scaled to R[0, 0] = 1; None when the method found that there are none
+    gain: Array | None  # K(Q, R) of these weights, (m, n)
+    gain_error: float  # ||K(Q, R) - K||_F; infinite without weights
+    condition: float  # Condition number of blkdiag(Q, R); infinite without weights
+    # Whether weights with exactly this gain were found: a relative error of 1e-8 or less
     feasible: bool
-    method: str
-    evaluations: int
-    status: str
+    method: str  # "lmi" or "gradient"
+    evaluations: int  # Riccati equations solved
+    status: str  # Why the method ended
 
 
 @checked(gain="m n")

@@ -26,13 +26,7 @@ __all__ = ["decode_person", "encode_person"]
 
 
 def encode_person(fit: PersonFit) -> dict[str, Any]:
-    """What coordinates and prior of the search began with, and where it ended.
-
-    Parameters
-    ----------
-    fit : PersonFit
-        Of `fit_person` with no kinds of levels held, a prior of spread 1 and every sample told.
-    """
+    """What coordinates and prior of the search began with, and where it ended."""
     own, space = fit.space.space, fit.space
     K, S = own.given
     return {
@@ -50,17 +44,7 @@ def encode_person(fit: PersonFit) -> dict[str, Any]:
 
 
 def decode_person(problem: Problem, observer: Observer, kept: dict[str, Any]) -> PersonFit:
-    """Make the fit again.
-
-    Parameters
-    ----------
-    problem : Problem
-        As it was posed.
-    observer : Observer
-        As `fit_person` was given it.
-    kept : dict
-        Of `encode_person`.
-    """
+    """Make the fit again."""
     posed = problem.at(np.array(kept["starts"]), np.array(kept["logarithms"], dtype=np.float64))
     point = Point(np.array(kept["K"]), np.array(kept["S"]), posed)
     levels, split = np.array(kept["levels"]), len(observer.levels)

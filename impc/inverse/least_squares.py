@@ -40,22 +40,13 @@ _PROBE, _BEND = 0.1, 0.375
 
 @dataclass(frozen=True)
 class Rows:
-    """Residual and derivatives at a point; trials with fewer rows are filled up with zeros.
+    """Residual and derivatives at a point; trials with fewer rows are filled up with zeros."""
 
-    Attributes
-    ----------
-    residual : Array
-        (trials, w).
-    shared, own : Array
-        Its derivative with respect to u, (trials, w, a), and to the trial's v, (trials, w, n).
-    curved : bool
-        Whether a second derivative says something: steps from here are bent.
-    """
-
-    residual: Array
+    residual: Array  # (trials, w)
+    # Its derivative with respect to u, (trials, w, a), and to the trial's v, (trials, w, n)
     shared: Array
     own: Array
-    curved: bool = False
+    curved: bool = False  # Whether a second derivative says something: steps from here are bent
 
     @property
     def square(self) -> float:
@@ -65,22 +56,12 @@ class Rows:
 
 @dataclass(frozen=True)
 class Prior:
-    """A normal prior.
+    """A normal prior."""
 
-    Attributes
-    ----------
-    u, v : Array
-        Its centre (a,), (trials, n).
-    shared : Array
-        One over the standard deviations of u (a,).
-    own : float
-        One over that of each entry of v.
-    """
-
-    u: Array
+    u: Array  # Its centre (a,), (trials, n)
     v: Array
-    shared: Array
-    own: float
+    shared: Array  # One over the standard deviations of u (a,)
+    own: float  # One over that of each entry of v
 
     def square(self, u: Array, v: Array) -> float:
         """-2 log of its density at `u` (a,), `v` (trials, n), but for a constant."""
@@ -89,21 +70,11 @@ class Prior:
 
 @dataclass(frozen=True)
 class Stop:
-    """When a search ends.
+    """When a search ends."""
 
-    Attributes
-    ----------
-    nats : float
-        Predicted decrease of the objective.
-    square : float
-        Squared residual of rounding.
-    evaluations : int
-        Evaluations with derivatives, at most.
-    """
-
-    nats: float
-    square: float
-    evaluations: int
+    nats: float  # Predicted decrease of the objective
+    square: float  # Squared residual of rounding
+    evaluations: int  # Evaluations with derivatives, at most
 
 
 class Model(Protocol):
@@ -129,16 +100,7 @@ class Model(Protocol):
 def minimise(
     model: Model, prior: Prior, begin: tuple[Array, Array], stop: Stop
 ) -> tuple[Array, Array, int, bool]:
-    """Search for u (a,) and v (trials, n): where it ends, evaluations, and whether it converged.
-
-    Parameters
-    ----------
-    model : Model
-    prior : Prior
-    begin : (Array, Array)
-        u (a,) and v (trials, n).
-    stop : Stop
-    """
+    """Search for u (a,) and v (trials, n): where it ends, evaluations, and whether it converged."""
     u, v = begin
     here, spent, damping = model.rows(u, v), 1, _DAMPING
     scale: tuple[Array, Array] = np.zeros(len(u)), np.zeros(v.shape)

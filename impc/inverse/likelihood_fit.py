@@ -58,55 +58,24 @@ _FAR = 4.0
 
 @dataclass(frozen=True)
 class PersonFit(Frozen):
-    """A person behind recordings, at the largest likelihood.
+    """A person behind recordings, at the largest likelihood."""
 
-    Attributes
-    ----------
-    K, S : Array
-        Gain (m, n) and metric (m, m).
-    problem : Problem
-        At the initial states, as the person takes them, and the parameters.
-    observer : Observer
-        At the levels found; a level of zero was not searched.
-    recorder : Array
-        Standard deviations of the recorder's noise (p,), in the outputs' units.
-    prices : Array or None
-        Unknowns of the problem's structure, where it has one (count,).
-    log_likelihood : float
-        Of all samples of all trials, nats; without the prior.
-    value : float
-        What the search made largest: likelihood times prior, less what levels lose, nats.
-    count : int
-        How many numbers were searched.
-    converged : bool
-        Whether the search ended by itself.
-    evaluations : int
-        Filters of all recordings with derivatives, about.
-    theta : Array
-        The unknowns, in the coordinates of `space` (count,).
-    told : Told
-        What the recordings say there.
-    unseen : Array
-        Slope that scores do not have (q,), nats: see `unseen_slope`.
-    prior : Prior
-        What the search was held by.
-    """
-
-    K: Array
+    K: Array  # Gain (m, n) and metric (m, m)
     S: Array
-    problem: Problem
-    observer: Observer
-    recorder: Array
-    prices: Array | None
-    log_likelihood: float
+    problem: Problem  # At the initial states, as the person takes them, and the parameters
+    observer: Observer  # At the levels found; a level of zero was not searched
+    recorder: Array  # Standard deviations of the recorder's noise (p,), in the outputs' units
+    prices: Array | None  # Unknowns of the problem's structure, where it has one (count,)
+    log_likelihood: float  # Of all samples of all trials, nats; without the prior
+    # What the search made largest: likelihood times prior, less what levels lose, nats
     value: float
-    count: int
-    converged: bool
-    evaluations: int
-    theta: Array
-    told: Told
-    unseen: Array
-    prior: Prior
+    count: int  # How many numbers were searched
+    converged: bool  # Whether the search ended by itself
+    evaluations: int  # Filters of all recordings with derivatives, about
+    theta: Array  # The unknowns, in the coordinates of `space` (count,)
+    told: Told  # What the recordings say there
+    unseen: Array  # Slope that scores do not have (q,), nats: see `unseen_slope`
+    prior: Prior  # What the search was held by
 
     @property
     def space(self) -> PersonCoordinates:
@@ -288,18 +257,7 @@ def _searched(start: _End, asked: Asked, budget: int) -> _End:
 def person_at(prior: Prior, place: Place, unseen: Array, settled: bool, spent: int) -> PersonFit:
     """What is said of a person where a search has come to.
 
-    Parameters
-    ----------
-    prior : Prior
-        What the search was held by.
-    place : Place
-        Where it ended.
-    unseen : Array
-        Slope that scores do not have (q,), nats.
-    settled : bool
-        Whether it ended by itself.
-    spent : int
-        Likelihoods with derivatives.
+    `unseen` (q,).
     """
     space = prior.space
     person, prices = space.unpack(place.theta), prices_at(space, place.theta)

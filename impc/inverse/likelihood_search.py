@@ -55,24 +55,7 @@ def climb(
 ) -> tuple[Place, Array, int, bool]:
     """The largest likelihood near a place, times the prior and less what levels lose.
 
-    Parameters
-    ----------
-    prior : Prior
-    begin : Place
-        Where it begins.
-    budget : int
-        Likelihoods with derivatives, about, that of `begin` among them.
-    along : Array, optional
-        Orthonormal directions in which it may move (q, r); all by default.
-    unseen : Array, optional
-        What is taken for the slope that scores do not have (q,), learned on the way; by default it
-        is found by differences where the search ends, and the search goes on from there.
-
-    Returns
-    -------
-    place, unseen, spent, settled : Place, Array, int, bool
-        The highest place, slope that scores do not have (q,), likelihoods with derivatives, and
-        whether the search ended by itself.
+    `along` (q, r); `unseen` (q,); returns (q,).
     """
     way = np.eye(len(begin.theta)) if along is None else along
     others = way[:, ~np.any(way[prior.space.own :] != 0, axis=0)]
@@ -141,17 +124,7 @@ def _followed(prior: Prior, here: Place, others: Array, unseen: Array) -> tuple[
 def boxed_step(gradient: Array, curvature: Array, radius: Array | float) -> tuple[Array, float]:
     """The step that promises most, g's - s'C s / 2, and moves no coordinate by more than a radius.
 
-    Parameters
-    ----------
-    gradient, curvature : Array
-        g (q,) and C (q, q), positive definite.
-    radius : Array or float
-        Of all or of each (q,); infinite for none.
-
-    Returns
-    -------
-    step, promised : Array, float
-        (q,), and what it promises.
+    `gradient` (q,); `curvature` (q, q); `radius` (q,); returns (q,).
     """
     unit = 1 / np.sqrt(np.diag(curvature))
     scaled = unit[:, None] * curvature * unit + _ROUNDING * np.eye(len(unit))

@@ -41,27 +41,14 @@ _LEAST = 1e-6
 
 @dataclass(frozen=True)
 class Asked:
-    """What a search is asked for.
+    """What a search is asked for."""
 
-    Attributes
-    ----------
-    observer : Observer
-        Which levels there are; those that are not searched, at what they are.
-    recorder : Array or None
-        Standard deviations where a search begins (p,); of the size of the residuals by default.
-    held : sequence of str
-        Kinds of levels that are not searched.
-    spread : float
-        Standard deviation of the prior.
-    counted : int
-        The first sample of each trial that is told.
-    """
-
-    observer: Observer
+    observer: Observer  # Which levels there are; those that are not searched, at what they are
+    # Standard deviations where a search begins (p,); of the size of the residuals by default
     recorder: Array | None
-    held: Sequence[str]
-    spread: float
-    counted: int
+    held: Sequence[str]  # Kinds of levels that are not searched
+    spread: float  # Standard deviation of the prior
+    counted: int  # The first sample of each trial that is told
 
 
 def gain_space(point: Point, prices: Array | None) -> Coordinates:
@@ -97,22 +84,7 @@ def likeliest_start(
 ) -> tuple[Prior, Array]:
     """Where a search begins, of several points.
 
-    Parameters
-    ----------
-    points : sequence of Point
-    prices : Array or None
-        Where these are searched, those of the one point (count,).
-    asked : Asked
-
-    Returns
-    -------
-    prior, theta : Prior, Array
-        About the point, in coordinates of its own, and the unknowns there (q,).
-
-    Raises
-    ------
-    SolverError
-        When none has a likelihood.
+    `prices` (count,); returns (q,).
     """
     found, highest, reason = None, -np.inf, "no number"
     for point in points:

@@ -38,27 +38,14 @@ __all__ = ["METHODS", "Method", "estimate", "estimate_all", "estimate_of", "meth
 
 @dataclass(frozen=True)
 class Method:
-    """A way from recordings to a controller.
+    """A way from recordings to a controller."""
 
-    Attributes
-    ----------
-    name : str
-        In result.json, in TOML and at the command line.
-    label : str
-        In tables and figures.
-    sentence : str
-        For readers who do not know it.
-    sees : callable
-        The problem as posed -> as the method sees it: inverse LQR knows no bounds.
-    find : callable
-        What it finds on a `Groundwork`.
-    """
-
-    name: str
-    label: str
-    sentence: str
+    name: str  # In result.json, in TOML and at the command line
+    label: str  # In tables and figures
+    sentence: str  # For readers who do not know it
+    # The problem as posed -> as the method sees it: inverse LQR knows no bounds
     sees: Callable[[Problem], Problem]
-    find: Callable[[Groundwork], Found | GainFit | Estimate]
+    find: Callable[[Groundwork], Found | GainFit | Estimate]  # What it finds on a `Groundwork`
 
     def estimate(self, ground: Groundwork) -> Estimate:
         """Run the method; one that ends without a gain says why in its estimate.
@@ -82,18 +69,7 @@ class Method:
 def estimate_of(
     ground: Groundwork, name: str, found: Found | GainFit, started: float | None = None
 ) -> Estimate:
-    """What a method found, simulated: its estimate.
-
-    Parameters
-    ----------
-    ground : Groundwork
-        What the method started from.
-    name : str
-        Of the method.
-    found : Found or GainFit
-    started : float, optional
-        Of `time.perf_counter`.
-    """
+    """What a method found, simulated: its estimate."""
     if isinstance(found, GainFit):
         found = Found(np.array(found.K), None, found.evaluations, problem=found.problem.known())
     S = ground.metric if found.S is None else found.S
@@ -269,13 +245,7 @@ METHODS: dict[str, Method] = {method.name: method for method in _TABLE}
 
 @checked
 def method_named(name: str) -> Method:
-    """Return the method of the registry that is called `name`.
-
-    Raises
-    ------
-    InputError
-        When there is none of that name.
-    """
+    """Return the method of the registry that is called `name`."""
     if name not in METHODS:
         raise InputError("method", f"got {name!r}", f"choose one of {', '.join(METHODS)}")
     return METHODS[name]
@@ -332,20 +302,7 @@ def estimate_all(
     ground: Groundwork,
     names: Sequence[str],
 ) -> dict[str, Estimate]:
-    """Run methods on the same recordings.
-
-    Parameters
-    ----------
-    ground : Groundwork
-        What they start from, and the recordings.
-    names : sequence of str
-        Keys of `METHODS`.
-
-    Raises
-    ------
-    WeightsError, SolverError
-        When no regulator can be simulated on the recordings.
-    """
+    """Run methods on the same recordings."""
     found = {}
     for name in names:
         make = functools.partial(METHODS[name].estimate, ground)

@@ -77,36 +77,7 @@ def inverse_mpc_natural(
     condition_share: float = CONDITION_SHARE,
     max_iterations: int = 40,
 ) -> ConditionedFit:
-    """Direct inverse MPC in natural coordinates, at given initial states and plant.
-
-    Parameters
-    ----------
-    problem : Problem
-    start : Weights
-        Positive definite. The search begins at the weights of least condition number with the same
-        gain and metric, in natural coordinates.
-    noise : float
-        2-norm of the residual that no weights are asked to explain; positive.
-    worst_start : float
-        Where those are worse conditioned than this, and leave more than noise, the search begins at
-        these with a price on every direction that makes them so.
-    condition_share : float
-        What the condition number of the start counts, against the squared noise of one sample.
-    max_iterations : int
-        Steps that are solved at most.
-
-    Returns
-    -------
-    ConditionedFit
-        Weights and solution in the units of the plant; `misfit` is the 2-norm of the residual,
-        `condition` and `objective` are those of the search, in natural coordinates; `converged`
-        says that the last step promised less than 1e-5 of the objective.
-
-    Raises
-    ------
-    WeightsError, SolverError
-        When the start has no stabilising solution, or the recordings cannot be simulated with it.
-    """
+    """Direct inverse MPC in natural coordinates, at given initial states and plant."""
     plant = problem.plant
     solution = solve_lqr(plant, start)
     T, G = natural_coordinates(plant, solution.K)
@@ -142,10 +113,7 @@ def inverse_mpc_natural(
 def in_plant_units(weights: Weights, T: Array, G: Array) -> Weights:
     """Weights of z = T^-1 x and v = G^-1 u as weights of x and u, scaled to R[0, 0] = 1.
 
-    Parameters
-    ----------
-    T, G : Array
-        (n, n) and (m, m).
+    `T` (n, n); `G` (m, m).
     """
     z, v = np.linalg.inv(T), np.linalg.inv(G)
     block = pair_blocks((z.T @ weights.Q @ z)[None], (v.T @ weights.R @ v)[None])[0]

@@ -39,21 +39,7 @@ def auxiliary_weights(
 
     minimise  ||K(Q, R) - gain||_2 + condition_weight kappa(blkdiag(Q, R))
 
-    Parameters
-    ----------
-    gain : Array
-        (m, n).
-    start : Weights or None
-        Where the search begins; the identity for None.
-    metric : Array, optional
-        S (m, m), up to scale, of which the regulator's is to be near too.
-    condition_weight : float
-        Against 1 for the distance.
-
-    Raises
-    ------
-    WeightsError
-        When the start has no stabilising Riccati solution.
+    `gain` (m, n); `metric` (m, m).
     """
     m, size = plant.m, gain.size
     target = None if metric is None else m * metric / np.trace(metric)
@@ -82,21 +68,7 @@ def weights_near(
 
     minimise  1 + |form vec(K(Q, R) - gain)|^2 + condition_share kappa(blkdiag(Q, R))
 
-    Parameters
-    ----------
-    form : Array
-        Of the entries of a gain (r, columns), row by row.
-    gain : Array
-        (m, n).
-    start : Weights
-        Positive definite: where the search begins.
-    condition_share : float
-        Of the condition number, at a distance of one.
-
-    Raises
-    ------
-    WeightsError
-        When the start has no stabilising Riccati solution.
+    `form` (r, columns); `gain` (m, n).
     """
     dK = np.concatenate([form, np.zeros((1, gain.size))]).reshape(-1, *gain.shape)
     dS = np.zeros((len(dK), plant.m, plant.m))

@@ -70,24 +70,7 @@ _BEGINNINGS = 3
 
 @checked
 def fit_controller(problem: Problem, start: Weights | None = None) -> Estimate:
-    """Fit the weights of the constrained controller behind recordings.
-
-    Parameters
-    ----------
-    problem : Problem
-    start : Weights, optional
-        Where the search begins; by default it begins at nothing.
-
-    Returns
-    -------
-    Estimate
-        Of the method "inverse_mpc".
-
-    Raises
-    ------
-    WeightsError, SolverError
-        When no regulator can be simulated, or no weights can be found.
-    """
+    """Fit the weights of the constrained controller behind recordings."""
 
     def fit(posed: Problem) -> Estimate:
         found = _fitted(posed, start)

@@ -46,56 +46,27 @@ _UNMOVED, _LITTLE = 1e-5, 0.3
 
 @dataclass(frozen=True, eq=False)
 class OptimalControlEstimate(Frozen):
-    """What was found, and which part of it the recordings tell.
-
-    Attributes
-    ----------
-    problem : OptimalControlProblem
-    recordings : tuple of OptimalRecording
-    start : dict
-        Values by name at which the search began.
-    theta : dict
-        Values by name.
-    loss : float
-        Sum of squares of all that was measured, in its units.
-    residual : Array
-        Differences over their scales (r,).
-    jacobian : Array
-        Its derivative (r, k) by logarithms of positive parameters, by signed ones, and by unknown
-        initial states over their scales.
-    signals : IntArray
-        Of each residual the index of its state, or n and the index of its input (r,).
-    scales : Array
-        Root-mean-square of each state and input in the recordings (n + m,).
-    combinations : Combinations
-        What is told and what is not, with the singular values that say so.
-    x0 : tuple of Array
-        Initial state of each recording (n,).
-    runs : tuple
-        Of each recording the states (steps + 1, n) and inputs (steps, m) that the estimate has.
-    settled : bool
-        Whether the search ended by itself.
-    evaluations : int
-        How often all recordings were solved and differentiated.
-    seconds : float
-        Of the search, s.
-    """
+    """What was found, and which part of it the recordings tell."""
 
     problem: OptimalControlProblem
     recordings: tuple[OptimalRecording, ...]
-    start: dict[str, float]
-    theta: dict[str, float]
-    loss: float
-    residual: Array
+    start: dict[str, float]  # Values by name at which the search began
+    theta: dict[str, float]  # Values by name
+    loss: float  # Sum of squares of all that was measured, in its units
+    residual: Array  # Differences over their scales (r,)
+    # Its derivative (r, k) by logarithms of positive parameters, by signed ones, and by unknown
+    # initial states over their scales
     jacobian: Array
+    # Of each residual the index of its state, or n and the index of its input (r,)
     signals: IntArray
-    scales: Array
-    combinations: Combinations
-    x0: tuple[Array, ...]
+    scales: Array  # Root-mean-square of each state and input in the recordings (n + m,)
+    combinations: Combinations  # What is told and what is not, with the singular values that say so
+    x0: tuple[Array, ...]  # Initial state of each recording (n,)
+    # Of each recording the states (steps + 1, n) and inputs (steps, m) that the estimate has
     runs: tuple[tuple[Array, Array], ...]
-    settled: bool
-    evaluations: int
-    seconds: float
+    settled: bool  # Whether the search ended by itself
+    evaluations: int  # How often all recordings were solved and differentiated
+    seconds: float  # Of the search, s
 
     def intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
         """Low and high end of each parameter by its name, at a `level` between 0 and 1.
@@ -103,11 +74,6 @@ class OptimalControlEstimate(Frozen):
         Normal in the logarithms of positive parameters; the noise of each signal is the root mean
         square of what is left of it. A parameter that is part of an untold combination has an
         infinite interval.
-
-        Raises
-        ------
-        InputError
-            When the level is not between 0 and 1.
         """
         if not 0 < level < 1:
             raise InputError("level", f"got {level:g}", "give one between 0 and 1")
@@ -264,13 +230,7 @@ def _held_then_free(
 def _from_start(
     given: Residuals, theta: Array, mu_steps: Sequence[float], count: Count
 ) -> tuple[Evaluation, bool] | None:
-    """The better of two searches, guided and not; the second only where the first explains little.
-
-    Raises
-    ------
-    InputError, InfeasibleError, SolverError
-        When there is no plan at the start.
-    """
+    """The better of two searches; the second only where the first explains little."""
     for one in given.recordings:  # an error at the first parameters is one of the start
         first_plan(one, theta, one.x0, mu_steps[0], given.solver)
     loops = any(one.closed_loop for one in given.recordings)

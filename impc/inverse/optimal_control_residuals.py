@@ -43,26 +43,13 @@ _STILL = 1e-9  # of the largest signal: what is smaller stands still
 
 @dataclass(frozen=True, eq=False)
 class Residuals:
-    """The recordings, with what is fixed in a search.
+    """The recordings, with what is fixed in a search."""
 
-    Attributes
-    ----------
-    problem : OptimalControlProblem
-        Whose parameters are searched.
-    recordings : tuple of OptimalRecording
-    solver : str
-        One of `impc.control.nlp_solvers.SOLVERS`.
-    scales : Array
-        Of states and inputs (n + m,).
-    size : float
-        Sum of squares of all that was measured, over the scales.
-    """
-
-    problem: OptimalControlProblem
+    problem: OptimalControlProblem  # Whose parameters are searched
     recordings: tuple[OptimalRecording, ...]
-    solver: str
-    scales: Array
-    size: float
+    solver: str  # One of `impc.control.nlp_solvers.SOLVERS`
+    scales: Array  # Of states and inputs (n + m,)
+    size: float  # Sum of squares of all that was measured, over the scales
 
     def unknowns(self, theta: Array) -> Array:
         """Unknowns (k,) at parameters theta (p,)."""
@@ -95,27 +82,14 @@ class Residuals:
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """The residual somewhere.
+    """The residual somewhere."""
 
-    Attributes
-    ----------
-    unknowns : Array
-        (k,).
-    theta : Array
-        Parameters (p,).
-    mu : float
-        Of the relaxed conditions.
-    residual, jacobian : Array
-        (r,) and (r, k).
-    runs : tuple
-        Of each recording its `ClosedLoop`, or its `Plan` with the derivatives.
-    """
-
-    unknowns: Array
-    theta: Array
-    mu: float
-    residual: Array
-    jacobian: Array
+    unknowns: Array  # (k,)
+    theta: Array  # Parameters (p,)
+    mu: float  # Of the relaxed conditions
+    residual: Array  # (r,)
+    jacobian: Array  # (r, k)
+    # Of each recording its `ClosedLoop`, or its `Plan` with the derivatives
     runs: tuple[tuple[Plan, PlanDerivatives] | ClosedLoop, ...]
 
     @property
@@ -149,15 +123,7 @@ def residuals_of(
 
 
 def begin(given: Residuals, unknowns: Array, mu: float) -> Evaluation:
-    """Solve every recording from what was recorded, at unknowns (k,) and mu.
-
-    Raises
-    ------
-    InputError, InfeasibleError
-        As `impc.control.plan.solve_plan`.
-    SolverError
-        When there is no plan at a sample of a closed loop.
-    """
+    """Solve every recording from what was recorded, at unknowns (k,) and mu."""
     theta, starts = given.split(unknowns)
     runs: list[tuple[Plan, PlanDerivatives] | ClosedLoop] = []
     for one, x0 in zip(given.recordings, starts, strict=True):
@@ -175,13 +141,7 @@ def begin(given: Residuals, unknowns: Array, mu: float) -> Evaluation:
 
 
 def first_plan(one: OptimalRecording, theta: Array, x0: Array, mu: float, solver: str) -> Plan:
-    """The plan from a recording's initial state x0 (n,) at theta (p,) and mu, by a `solver`.
-
-    Raises
-    ------
-    InputError, InfeasibleError, SolverError
-        As `impc.control.plan.solve_plan`.
-    """
+    """The plan from a recording's initial state x0 (n,) at theta (p,) and mu, by a `solver`."""
     problem = one.problem
     whole = bool(np.all(np.isfinite(one.x)) and np.all(np.isfinite(one.u)))
     guesses = ((one.x, one.u),) if whole and not one.closed_loop else ()

@@ -37,13 +37,7 @@ _LEAST_DAMPING, _MOST_DAMPING = 1e-14, 1e6
 
 
 class Count:
-    """Evaluations that are done, and how many may be.
-
-    Parameters
-    ----------
-    most : int
-        After which a search stops.
-    """
+    """Evaluations that are done, and how many may be."""
 
     def __init__(self, most: int) -> None:
         self.most, self.done, self.before = most, 0, 0

@@ -42,62 +42,28 @@ _SQUARED = 300.0
 
 @dataclass(frozen=True)
 class Person:
-    """A point of a search.
+    """A point of a search."""
 
-    Attributes
-    ----------
-    point : Point
-        Gain, metric, and the problem at initial states and parameters.
-    observer : Observer
-        At its levels.
-    recorder : Array
-        Standard deviations of the recorder's noise (p,).
-    """
-
-    point: Point
-    observer: Observer
-    recorder: Array
+    point: Point  # Gain, metric, and the problem at initial states and parameters
+    observer: Observer  # At its levels
+    recorder: Array  # Standard deviations of the recorder's noise (p,)
 
 
 @dataclass(frozen=True)
 class Told:
-    """What all recordings say at a point.
+    """What all recordings say at a point."""
 
-    Attributes
-    ----------
-    value : float
-        Log-likelihood, nats.
-    gradient : Array
-        Along theta (q,).
-    information : Array
-        Fisher's, expected (q, q).
-    scores : list of Array
-        Derivative of each sample's log-likelihood (samples, q), trial by trial.
-    trials : list of Likelihood
-    """
-
-    value: float
-    gradient: Array
-    information: Array
-    scores: list[Array]
+    value: float  # Log-likelihood, nats
+    gradient: Array  # Along theta (q,)
+    information: Array  # Fisher's, expected (q, q)
+    scores: list[Array]  # Derivative of each sample's log-likelihood (samples, q), trial by trial
     trials: list[Likelihood]
 
 
 class PersonCoordinates:
     """The unknowns of one search.
 
-    Parameters
-    ----------
-    space : Coordinates
-        Those of gain or prices, initial states and parameters.
-    observer : Observer
-        Levels where the search begins.
-    recorder : Array
-        The recorder's (p,), positive.
-    held : collection of str
-        Kinds of the person's levels that are not searched, of `LEVELS`.
-    counted : int
-        The first sample of each trial that is told, given those before it.
+    `recorder` (p,).
     """
 
     def __init__(
@@ -131,13 +97,7 @@ class PersonCoordinates:
         return [every[index] for index in self.moving]
 
     def levels(self, theta: Array) -> Array:
-        """All levels (levels + p,) at theta (q,), those of zero among them.
-
-        Raises
-        ------
-        SolverError
-            When one has no square in double precision.
-        """
+        """All levels (levels + p,) at theta (q,), those of zero among them."""
         logarithms = theta[self.own :]
         if not np.all(np.abs(logarithms) <= _SQUARED):
             raise SolverError("level of noise", "has no square in double precision", "begin nearer")
@@ -150,39 +110,20 @@ class PersonCoordinates:
         return self.space.changes(self.space.unpack(theta[: self.own]), theta[: self.own])
 
     def unpack(self, theta: Array) -> Person:
-        """The person at theta (q,).
-
-        Raises
-        ------
-        WeightsError
-            When prices have no regulator there.
-        """
+        """The person at theta (q,)."""
         levels = self.levels(theta)
         split = len(self.observer.levels)
         person = self.observer.with_levels(levels[:split])
         return Person(self.space.unpack(theta[: self.own]), person, frozen(levels[split:]))
 
     def value(self, theta: Array) -> float:
-        """Log-likelihood at theta (q,), in a fraction of the time of `told`.
-
-        Raises
-        ------
-        ImpcError
-            When there is none.
-        """
+        """Log-likelihood at theta (q,), in a fraction of the time of `told`."""
         person = self.unpack(theta)
         nothing = _Moved(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), 0)
         return sum(item.value for item in self._trials(theta, person, [nothing]))
 
     def told(self, theta: Array) -> Told:
-        """Log-likelihood and its derivatives at theta (q,).
-
-        Raises
-        ------
-        ImpcError
-            When the gain does not stabilise while there are bounds, or the filter ends before the
-            recording.
-        """
+        """Log-likelihood and its derivatives at theta (q,)."""
         person, q = self.unpack(theta), len(theta)
         columns = [self._columns(trial) for trial in range(self.space.trials)]
         trials = self._trials(theta, person, columns)
@@ -202,18 +143,7 @@ class PersonCoordinates:
 
         It grows without end towards the border of gains that stabilise. Prices never meet it.
 
-        Parameters
-        ----------
-        theta : Array
-            (q,).
-
-        Returns
-        -------
-        value : float
-            log tr(T^-1 X T^-T) / n, X = A_c X A_c' + B G G'B' at theta, T and G of the start;
-            infinite beyond the border.
-        gradient : Array
-            Its derivatives (q,).
+        `theta` (q,); returns (q,).
         """
         space, gradient = self.space, np.zeros(len(theta))
         if isinstance(space, PriceCoordinates):

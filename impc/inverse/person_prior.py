@@ -38,24 +38,12 @@ _UNLIKE = 0.25
 
 
 class Place(NamedTuple):
-    """A point of a search.
+    """A point of a search."""
 
-    Attributes
-    ----------
-    theta : Array
-        (q,).
-    told : Told
-        What the recordings say there.
-    value : float
-        What is to be largest, nats.
-    lost : float
-        What levels lose there (`Prior.lost`), nats.
-    """
-
-    theta: Array
-    told: Told
-    value: float
-    lost: float
+    theta: Array  # (q,)
+    told: Told  # What the recordings say there
+    value: float  # What is to be largest, nats
+    lost: float  # What levels lose there (`Prior.lost`), nats
 
 
 class Prior:
@@ -67,16 +55,7 @@ class Prior:
     that of a half-Cauchy level (Gelman 2006), x / (1 + x^2): far away, a quarter of a nat for each
     factor of e on either side.
 
-    Parameters
-    ----------
-    space : PersonCoordinates
-    spread : float
-        Standard deviation; infinite for no prior, and no barrier either.
-    scales : Array
-        Logarithm of the size that each level is expected to have (levels,).
-    driven : Array, optional
-        Covariance of the states that noise in the loop adds to what recorded perturbations drive
-        (n, n); none by default.
+    `scales` (levels,); `driven` (n, n).
     """
 
     def __init__(
@@ -99,13 +78,7 @@ class Prior:
         self.used = bool(np.isfinite(spread))
 
     def at(self, theta: Array) -> Place:
-        """What is to be largest, at theta (q,): likelihood times prior, less what levels lose.
-
-        Raises
-        ------
-        ImpcError
-            When there is no likelihood there.
-        """
+        """What is to be largest, at theta (q,): likelihood times prior, less what levels lose."""
         return self.placed(theta, self.space.told(theta))
 
     def placed(self, theta: Array, told: Told) -> Place:
@@ -130,12 +103,7 @@ class Prior:
     def parabola(self, here: Place, unseen: Array) -> tuple[Array, Array]:
         """Slope (q,) and curvature (q, q), positive definite, of what is to be largest.
 
-        Parameters
-        ----------
-        here : Place
-            Where they are asked for.
-        unseen : Array
-            What is taken for the slope that scores do not have (q,), see `unseen_slope`.
+        `unseen` (q,).
         """
         slope, bend = self.slopes(here.theta)
         gradient = here.told.gradient + slope + unseen
@@ -172,15 +140,7 @@ class Prior:
     def slopes(self, theta: Array) -> tuple[Array, Array]:
         """Derivatives at theta; the barrier is taken to bend as the logarithm of a distance does.
 
-        Parameters
-        ----------
-        theta : Array
-            (q,).
-
-        Returns
-        -------
-        gradient, bend : Array
-            (q,), and what is taken for minus the second derivatives (q, q).
+        `theta` (q,).
         """
         if not self.used:
             return np.zeros(len(theta)), np.zeros((len(theta), len(theta)))

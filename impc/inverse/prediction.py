@@ -40,15 +40,9 @@ _EVERYWHERE = (1e-9, 1e-6, 1e-3)
 
 @dataclass(frozen=True)
 class Correction:
-    """The correction of one problem.
+    """The correction of one problem."""
 
-    Attributes
-    ----------
-    M : Array
-        Gain of the correction (n, p).
-    """
-
-    M: Array
+    M: Array  # Gain of the correction (n, p)
 
     def moves(self, problem: Problem) -> tuple[Array, Array, Array]:
         """A (n, n), B (n, m) and (E, M) (n, columns) that move the corrected state."""

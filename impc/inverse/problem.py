@@ -238,11 +238,6 @@ def controller_for(
     """Return the controller of the problem with that `gain` (m, n) and `metric` (m, m).
 
     `near` is the terminal set of a gain nearby: the same answer in less time.
-
-    Raises
-    ------
-    InputError, SolverError
-        As `Controller`.
     """
     return Controller.from_gain(
         problem.plant,
@@ -327,13 +322,7 @@ def typical_output(problem: Problem) -> float:
 
 
 def simulated(problem: Problem, gain: Array, metric: Array) -> list[Simulation]:
-    """Every recording under the controller of a `gain` (m, n) and a `metric` (m, m).
-
-    Raises
-    ------
-    InputError, SolverError
-        As `controller_for`.
-    """
+    """Every recording under the controller of a `gain` (m, n) and a `metric` (m, m)."""
     controller = controller_for(problem, gain, metric)
     return [simulate(controller, drive) for drive in scenarios(problem)]
 

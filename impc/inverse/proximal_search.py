@@ -50,80 +50,40 @@ _LEAST_RADIUS = 1e-10
 
 @dataclass(frozen=True)
 class Residual(Frozen):
-    """A residual with its derivatives with respect to K and S.
+    """A residual with its derivatives with respect to K and S."""
 
-    Attributes
-    ----------
-    values : Array
-        (r,).
-    dK : Array
-        (r, m, n).
-    dS : Array
-        (r, m, m).
-    usable : bool
-        Whether it could be computed; otherwise the step that led there is shortened.
-    """
-
-    values: Array
-    dK: Array
-    dS: Array
-    usable: bool
+    values: Array  # (r,)
+    dK: Array  # (r, m, n)
+    dS: Array  # (r, m, m)
+    usable: bool  # Whether it could be computed; otherwise the step that led there is shortened
 
 
 @dataclass(frozen=True)
 class Objective:
-    """What is minimised.
+    """What is minimised."""
 
-    Attributes
-    ----------
-    residual : callable
-        `LqrSolution` -> `Residual`.
-    fit_weight, condition_weight : float
-        w_fit, and w_cond with the c of (3.5) in it.
-    squared : bool
-        Whether phi is the squared norm. The norm itself does not trade fit for conditioning when
-        w_cond is small enough (it is an exact penalty); its square always does.
-    """
-
-    residual: Callable[[LqrSolution], Residual]
-    fit_weight: float
+    residual: Callable[[LqrSolution], Residual]  # `LqrSolution` -> `Residual`
+    fit_weight: float  # w_fit, and w_cond with the c of (3.5) in it
     condition_weight: float
+    # Whether phi is the squared norm. The norm itself does not trade fit for conditioning when
+    # w_cond is small enough (it is an exact penalty); its square always does.
     squared: bool
 
 
 @dataclass(frozen=True)
 class ConditionedFit:
-    """Result of `conditioned_fit`.
+    """Result of `conditioned_fit`."""
 
-    Attributes
-    ----------
-    weights : Weights
-        Scaled to R[0, 0] = 1.
-    solution : LqrSolution
-        The regulator that they make.
-    misfit : float
-        2-norm of the residual.
-    condition : float
-        kappa(blkdiag(Q, R)).
-    objective : float
-        What was minimised, at these weights.
-    iterations, evaluations : int
-        Steps solved, and residuals computed.
-    stationarity : float
-        Decrease that the last step promised, relative to the objective and to the step's size.
-    converged : bool
-        Whether that is at most 1e-5.
-    """
-
-    weights: Weights
-    solution: LqrSolution
-    misfit: float
-    condition: float
-    objective: float
-    iterations: int
+    weights: Weights  # Scaled to R[0, 0] = 1
+    solution: LqrSolution  # The regulator that they make
+    misfit: float  # 2-norm of the residual
+    condition: float  # kappa(blkdiag(Q, R))
+    objective: float  # What was minimised, at these weights
+    iterations: int  # Steps solved, and residuals computed
     evaluations: int
+    # Decrease that the last step promised, relative to the objective and to the step's size
     stationarity: float
-    converged: bool
+    converged: bool  # Whether that is at most 1e-5
 
 
 def conditioned_fit(
@@ -134,26 +94,7 @@ def conditioned_fit(
     max_iterations: int = 200,
     tolerance: float = 1e-11,
 ) -> ConditionedFit:
-    """Minimise the objective from the given weights.
-
-    Parameters
-    ----------
-    plant : Plant
-    objective : Objective
-    start : Weights
-        Positive definite.
-    max_iterations : int
-        Steps that are solved at most.
-    tolerance : float
-        Decrease, relative to the objective, below which a step is not worth taking.
-
-    Raises
-    ------
-    WeightsError
-        When the start has no stabilising Riccati solution.
-    SolverError
-        When the residual cannot be computed at the start, or no step at all.
-    """
+    """Minimise the objective from the given weights."""
     here = _first(plant, objective, start)
     radius, evaluations, iteration, stationarity = 0.5, 1, 0, np.inf
     while iteration < max_iterations:
@@ -204,10 +145,7 @@ def _step(program: StepProgram, radius: float) -> tuple[Array, float, float]:
 def weight_jacobian(solution: LqrSolution, residual: Residual, basis: Array) -> Array:
     """Derivative of the residual along directions of blkdiag(Q, R): (r, k).
 
-    Parameters
-    ----------
-    basis : Array
-        Directions (k, n + m, n + m), block diagonal.
+    `basis` (k, n + m, n + m).
     """
     n = solution.plant.n
     dQ, dR = basis[:, :n, :n], basis[:, n:, n:]

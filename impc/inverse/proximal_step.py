@@ -31,36 +31,19 @@ __all__ = ["StepProgram", "block_basis", "solve_step"]
 
 @dataclass(frozen=True)
 class StepProgram(Frozen):
-    """Data of the program above.
+    """Data of the program above."""
 
-    Attributes
-    ----------
-    X, L : Array
-        blkdiag(Q, R) (n + m, n + m), scaled to a least eigenvalue of 1, and its Cholesky factor.
-    n : int
-        Size of Q.
-    basis : Array
-        (k, n + m, n + m), of `block_basis`.
-    jacobian, residual : Array
-        (r, k) and (r,).
-    rest : float
-        Norm of the part of the residual that no step changes.
-    fit_weight, condition_weight : float
-        w_fit and w_cond.
-    squared : bool
-        Whether the fit counts by its square.
-    """
-
+    # blkdiag(Q, R) (n + m, n + m), scaled to a least eigenvalue of 1, and its Cholesky factor
     X: Array
     L: Array
-    n: int
-    basis: Array
-    jacobian: Array
-    residual: Array
-    rest: float
-    fit_weight: float
+    n: int  # Size of Q
+    basis: Array  # (k, n + m, n + m), of `block_basis`
+    jacobian: Array  # (r, k)
+    residual: Array  # (r,)
+    rest: float  # Norm of the part of the residual that no step changes
+    fit_weight: float  # w_fit and w_cond
     condition_weight: float
-    squared: bool
+    squared: bool  # Whether the fit counts by its square
 
 
 @lru_cache(maxsize=16)
@@ -79,13 +62,7 @@ def block_basis(n: int, m: int) -> Array:
 
 
 def solve_step(program: StepProgram, radius: float) -> tuple[Array, float]:
-    """Solve for the step d (k,), at most `radius` long, and the objective that it predicts.
-
-    Raises
-    ------
-    SolverError
-        When Clarabel returns no usable point; d = 0 is always feasible, so this is numerical.
-    """
+    """Solve for the step d (k,), at most `radius` long, and the objective that it predicts."""
     count, kappa = len(program.basis), float(scipy.linalg.eigvalsh(program.X)[-1])
     price, effort = program.condition_weight * kappa, program.fit_weight
     scale = max(price, effort)

@@ -53,19 +53,7 @@ def regulators_alone(plant: Plant, structure: Structure, T: Array) -> Array:
 
     Orthonormal in natural coordinates.
 
-    Parameters
-    ----------
-    plant : Plant
-        Of one input.
-    structure : Structure
-        All products of its features are taken to have prices.
-    T : Array
-        Natural coordinates of the states (n, n).
-
-    Raises
-    ------
-    WeightsError
-        When weights over the features have no regulator in double precision.
+    `T` (n, n).
     """
     _, values, rows = np.linalg.svd(_regulators(plant, structure, T), full_matrices=False)
     kept = rows[values > _BESIDE * values[0]]

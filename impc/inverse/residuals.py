@@ -57,40 +57,20 @@ _NOT_REACHED = 1e3
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Residual at one gain and metric.
+    """Residual at one gain and metric."""
 
-    Attributes
-    ----------
-    residual : Array
-        (r,), simulated minus recorded outputs, each divided by its scale.
-    dK : Array
-        (r, m, n).
-    dS : Array
-        (r, m, m), with respect to the metric scaled as in `Controller`.
-    dx0 : Array
-        (r, n), with respect to the initial state of the trial that the row belongs to; (r, 0)
-        when the initial states are known.
-    dparameters : Array
-        (r, k), with respect to the logarithms of the parameters of the family; k may be 0.
-    reason : str
-        Why some samples were not reached; empty when all were.
-    active : int
-        Samples with an active bound.
-    weakly_active : int
-        Samples at which the derivative is one-sided.
-    terminal : TerminalSet or None
-        The terminal set, as a hint for the next evaluation nearby.
-    """
-
-    residual: Array
-    dK: Array
-    dS: Array
+    residual: Array  # (r,), simulated minus recorded outputs, each divided by its scale
+    dK: Array  # (r, m, n)
+    dS: Array  # (r, m, m), with respect to the metric scaled as in `Controller`
+    # (r, n), with respect to the initial state of the trial that the row belongs to; (r, 0) when
+    # the initial states are known
     dx0: Array
+    # (r, k), with respect to the logarithms of the parameters of the family; k may be 0
     dparameters: Array
-    reason: str
-    active: int
-    weakly_active: int
-    terminal: TerminalSet | None
+    reason: str  # Why some samples were not reached; empty when all were
+    active: int  # Samples with an active bound
+    weakly_active: int  # Samples at which the derivative is one-sided
+    terminal: TerminalSet | None  # The terminal set, as a hint for the next evaluation nearby
 
     def along_gain(self, T: Array, G: Array) -> Array:
         """Derivative (r, mn) along G^-1 K T, of natural coordinates T (n, n) and G (m, m)."""
@@ -162,20 +142,7 @@ def evaluate(
 def start_residual(problem: Problem, gain: Array, metric: Array) -> StartResidual:
     """Residual of the only trial of a problem as a function of its initial state.
 
-    Parameters
-    ----------
-    gain, metric : Array
-        K (m, n) and S (m, m), which stay: rows and their derivatives are built once.
-
-    Returns
-    -------
-    callable
-        x0 (n,) -> residual (r,) and its derivative (r, n).
-
-    Raises
-    ------
-    InputError, SolverError
-        As `controller_for`.
+    `gain` (m, n); `metric` (m, m).
     """
     controller = controller_for(problem, gain, metric)
     n = problem.plant.n
@@ -230,20 +197,7 @@ def residual_or_reason(
 def residual_only(problem: Problem, gain: Array, metric: Array) -> Array:
     """Residual without derivatives, for differences and comparisons.
 
-    Parameters
-    ----------
-    gain, metric : Array
-        K (m, n) and S (m, m).
-
-    Returns
-    -------
-    Array
-        Simulated minus recorded outputs over their scales (r,), trial by trial, sample by sample.
-
-    Raises
-    ------
-    InputError, SolverError
-        As `controller_for`.
+    `gain` (m, n); `metric` (m, m); returns (r,).
     """
     controller, seen = controller_for(problem, gain, metric), _Seen.of(problem, None)
     return np.concatenate(

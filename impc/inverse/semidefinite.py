@@ -36,41 +36,22 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Cone:
-    """right - rows @ y lies in a cone of Clarabel's.
+    """right - rows @ y lies in a cone of Clarabel's."""
 
-    Attributes
-    ----------
-    rows : Array
-        (r, k).
-    right : Array
-        (r,).
-    kind : Any
-        Clarabel's object for the cone.
-    """
-
-    rows: Array
-    right: Array
-    kind: Any
+    rows: Array  # (r, k)
+    right: Array  # (r,)
+    kind: Any  # Clarabel's object for the cone
 
 
 @dataclass(frozen=True)
 class SemidefiniteSolution:
-    """What Clarabel returned.
+    """What Clarabel returned."""
 
-    Attributes
-    ----------
-    y : Array
-        The variables (k,), finite.
-    status : str
-        Clarabel's word. It may say that a point good to 1e-12 is almost solved: judge by the
-        residuals of what is built from ``y``.
-    prove : callable
-        Computes `bound`, which takes a fifth of the time of the program.
-    """
-
-    y: Array
+    y: Array  # The variables (k,), finite
+    # Clarabel's word. It may say that a point good to 1e-12 is almost solved: judge by the
+    # residuals of what is built from ``y``.
     status: str
-    prove: Callable[[], float]
+    prove: Callable[[], float]  # Computes `bound`, which takes a fifth of the time of the program
 
     @cached_property
     def bound(self) -> float:
@@ -94,16 +75,7 @@ def norm_bound(
 ) -> Cone:
     """||offset + sum y_i vectors_i|| <= constant + bound @ y.
 
-    Parameters
-    ----------
-    vectors : Array
-        (k, r), one a row.
-    bound : Array
-        (k,).
-    offset : Array, optional
-        (r,); zero by default.
-    constant : float
-        Zero by default.
+    `vectors` (k, r); `bound` (k,); `offset` (r,).
     """
     rows = -np.vstack([bound, vectors.T])
     right = np.concatenate([[constant], np.zeros(len(rows) - 1) if offset is None else offset])
@@ -121,28 +93,7 @@ def solve_semidefinite(
 ) -> SemidefiniteSolution:
     """Minimise objective @ y + squares @ y^2 over the cones.
 
-    Parameters
-    ----------
-    objective : Array
-        (k,).
-    cones : list of Cone
-        All of them hold.
-    squares : Array, optional
-        (k,), not negative; zero by default.
-    reach : Array, optional
-        (k,), no feasible point of interest has a larger |y_i|: makes the bound a proof. Only
-        without `squares`.
-    scaled : bool
-        Whether the entries of the program are of size one already; who knows the reach has seen to
-        that.
-    tolerance : float
-        Clarabel's, on gap and feasibility. Its own default of 1e-8 would be the error of the
-        weights.
-
-    Raises
-    ------
-    SolverError
-        When no finite point comes back, or the solver breaks off.
+    `objective` (k,); `squares` (k,); `reach` (k,).
     """
     (found,) = solve_each(
         objective[None], cones, squares=squares, reach=reach, scaled=scaled, tolerance=tolerance
@@ -163,23 +114,7 @@ def solve_each(
 
     That is a sixth of the time of a program on the seat.
 
-    Parameters
-    ----------
-    objectives : Array
-        (programs, k).
-    cones : list of Cone
-        All of them hold.
-    squares, reach : Array, optional
-        (k,), as in `solve_semidefinite`.
-    scaled : bool
-        As there.
-    tolerance : float
-        As there.
-
-    Raises
-    ------
-    SolverError
-        As there, for the first objective that has no finite point.
+    `objectives` (programs, k); `squares, reach` (k,).
     """
     settings = clarabel.DefaultSettings()
     settings.verbose = False

@@ -44,18 +44,10 @@ _AGAIN = 20
 
 
 class SimulatedScore(NamedTuple):
-    """The mean slope of sets of trials of one person, as many in each as were recorded.
+    """The mean slope of sets of trials of one person, as many in each as were recorded."""
 
-    Attributes
-    ----------
-    mean : Array
-        Along the unknowns (q,), nats.
-    spread : Array
-        Covariance of that mean, for the sets are drawn (q, q).
-    """
-
-    mean: Array
-    spread: Array
+    mean: Array  # Along the unknowns (q,), nats
+    spread: Array  # Covariance of that mean, for the sets are drawn (q, q)
 
 
 def simulated_score(prior: Prior, theta: Array, seed: int, sets: int) -> SimulatedScore:
@@ -63,23 +55,7 @@ def simulated_score(prior: Prior, theta: Array, seed: int, sets: int) -> Simulat
 
     Trials that run away are drawn anew, as those were that are recorded.
 
-    Parameters
-    ----------
-    prior : Prior
-        Of the search; its own slope is no part of the score.
-    theta : Array
-        The point (q,).
-    seed : int
-        Of all numbers drawn.
-    sets : int
-        How often all trials are simulated: five at least, so that the jumps of two are asked for.
-
-    Raises
-    ------
-    SolverError
-        When all trials run away.
-    ImpcError
-        When there is no likelihood of a simulated trial.
+    `theta` (q,).
     """
     person = prior.space.unpack(theta)
     law = controller_for(person.point.problem, person.point.K, person.point.S)
@@ -108,13 +84,7 @@ def _spread(found: Sequence[Array]) -> Array:
 
 
 def left_behind(trials: tuple[Recording, ...]) -> Array:
-    """The size of each output (p,) beyond which a trial has run away from all that was recorded.
-
-    Parameters
-    ----------
-    trials : tuple of Recording
-        Those that were recorded.
-    """
+    """The size of each output (p,) beyond which a trial has run away from all that was recorded."""
     largest = np.max([np.max(np.abs(trial.outputs), axis=0) for trial in trials], axis=0)
     # An output that never moved has no size to leave behind.
     return np.where(largest > 0, _FAR * largest, np.inf)

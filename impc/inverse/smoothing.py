@@ -36,18 +36,10 @@ _DIFFUSE = 1e6
 
 @dataclass(frozen=True)
 class Smoothed(Frozen):
-    """One trial, in the units of the plant.
+    """One trial, in the units of the plant."""
 
-    Attributes
-    ----------
-    x : Array
-        States (samples, n).
-    u : Array
-        Commands (samples, m).
-    """
-
-    x: Array
-    u: Array
+    x: Array  # States (samples, n)
+    u: Array  # Commands (samples, m)
 
 
 def smoothed_trials(problem: Problem) -> tuple[Smoothed, ...]:

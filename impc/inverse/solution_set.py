@@ -57,29 +57,18 @@ _STATE_FLOOR, _INPUT_FLOOR = 1e-8, 1e-3
 
 @dataclass(frozen=True, eq=False)  # a fibre is itself only: what is found of it may be kept by it
 class GainFibre(Frozen):
-    """The linear space of the pairs (Q, R) for which the gain is stationary.
-
-    Attributes
-    ----------
-    plant : Plant
-    gain : Array
-        K, (m, n).
-    Q, R : Array
-        Basis of k pairs, (k, n, n) and (k, m, m), in the units of the plant; orthonormal in
-        natural coordinates, where a pair is blkdiag(T'QT, G'RG).
-    T, G : Array
-        Natural coordinates of states x = T z (n, n) and inputs u = G v (m, m).
-    singular_values : Array
-        Of the gain condition in natural coordinates (s,), largest first: those below 1e-10 of the
-        first count as zero.
-    """
+    """The linear space of the pairs (Q, R) for which the gain is stationary."""
 
     plant: Plant
-    gain: Array
+    gain: Array  # K, (m, n)
+    # Basis of k pairs, (k, n, n) and (k, m, m), in the units of the plant; orthonormal in natural
+    # coordinates, where a pair is blkdiag(T'QT, G'RG)
     Q: Array
     R: Array
-    T: Array
+    T: Array  # Natural coordinates of states x = T z (n, n) and inputs u = G v (m, m)
     G: Array
+    # Of the gain condition in natural coordinates (s,), largest first: those below 1e-10 of the
+    # first count as zero
     singular_values: Array
 
     @property
@@ -169,13 +158,7 @@ def gain_fibre(
 
 
 def natural_coordinates(plant: Plant, K: Array) -> tuple[Array, Array]:
-    """Natural coordinates x = T z, u = G v of a plant under a stabilising gain K (m, n).
-
-    Returns
-    -------
-    T, G : Array
-        (n, n) and (m, m).
-    """
+    """Natural coordinates x = T z, u = G v of a plant under a stabilising gain K (m, n)."""
     F = plant.A - plant.B @ K
     input_factor = np.linalg.cholesky(floored_covariance(_input_metric(plant, K, F), _INPUT_FLOOR))
     G = np.asarray(np.linalg.inv(input_factor).T, dtype=np.float64)

@@ -32,13 +32,7 @@ _DEFINITE, _DECADES = 0.05, 2.0
 
 
 def balanced_regulator(problem: Problem, effort: float = 1.0) -> LqrSolution:
-    """The regulator with R = effort diag(1/u^2), u the size of the commands, Q = C'diag(1/y^2)C.
-
-    Raises
-    ------
-    WeightsError
-        When its Riccati equation has no solution in double precision.
-    """
+    """The regulator with R = effort diag(1/u^2), u the size of the commands, Q = C'diag(1/y^2)C."""
     plant, scale = problem.plant, np.asarray(problem.output_scale)
     Q = plant.C.T @ np.diag(1 / scale**2) @ plant.C
     Q += _UNSEEN * np.trace(Q) / plant.n * np.eye(plant.n)
@@ -47,13 +41,7 @@ def balanced_regulator(problem: Problem, effort: float = 1.0) -> LqrSolution:
 
 
 def regulators(problem: Problem) -> list[LqrSolution]:
-    """Those over eight decades of effort that double precision allows, the balanced one first.
-
-    Raises
-    ------
-    WeightsError
-        When there is none.
-    """
+    """Those over eight decades of effort that double precision allows, the balanced one first."""
     found: list[LqrSolution] = []
     refused: list[WeightsError] = []
     for effort in sorted(_EFFORTS, key=lambda one: abs(np.log(one))):

@@ -49,19 +49,7 @@ _FLOOR, _RIDGE = 1e-6, 1e-6
 def inverse_kkt(problem: Problem, gain: Array) -> Weights:
     """Weights of least stationarity residual on smoothed trajectories.
 
-    Parameters
-    ----------
-    problem : Problem
-        Its horizon is the length of the stretches, its input bounds decide which rows count.
-    gain : Array
-        A stabilising gain (m, n), for the units in which the program is solved only.
-
-    Raises
-    ------
-    DataError
-        When every stretch is saturated or the trials are shorter than one.
-    SolverError
-        When the program returns no finite point.
+    `gain` (m, n).
     """
     return stationarity_weights(
         problem.plant,
@@ -77,20 +65,7 @@ def stationarity_weights(
 ) -> Weights:
     """The same for given states and commands.
 
-    Parameters
-    ----------
-    trials : sequence of Smoothed
-    length : int
-        N, samples in a stretch; more than n / m.
-    u_max : Array
-        Bounds of the inputs (m,), infinite where there is none.
-    gain : Array
-        (m, n), as in `inverse_kkt`.
-
-    Raises
-    ------
-    DataError, SolverError
-        As `inverse_kkt`.
+    `u_max` (m,); `gain` (m, n).
     """
     n, m = plant.n, plant.m
     T, G = natural_coordinates(plant, gain)

@@ -63,20 +63,7 @@ def fit_structure(
 ) -> StructuredEnd:
     """Fit the unknowns of a structure.
 
-    Parameters
-    ----------
-    problem : Problem
-        At initial states and parameters near the answer.
-    structure : Structure
-    gain, metric : Array
-        K (m, n), stabilising, and S (m, m) that fit the recordings.
-    *starts : Array
-        Unknowns (count,) that are searched from too.
-
-    Raises
-    ------
-    SolverError
-        When no regulator of the structure can be simulated on the recordings.
+    `gain` (m, n); `metric` (m, m); `*starts` (count,).
     """
     target = _Target(problem, structure, gain, metric)
     ladder = bryson_prices(problem, structure, gain, metric)
@@ -101,21 +88,7 @@ def fit_structure(
 
 
 def fit_structured(problem: Problem, structure: Structure, near: Estimate) -> Estimate:
-    """Fit a structure from an estimate that fits, with its initial states and parameters.
-
-    Parameters
-    ----------
-    problem : Problem
-        As it was posed.
-    structure : Structure
-    near : Estimate
-        Of weights of any kind on the same recordings.
-
-    Raises
-    ------
-    SolverError
-        When no regulator of the structure can be simulated.
-    """
+    """Fit a structure from an estimate that fits, with its initial states and parameters."""
     started = time.perf_counter()
     posed = problem.at(np.array(near.problem.starts), np.array(near.problem.logarithms))
     end = fit_structure(posed, structure, np.array(near.gain), np.array(near.metric))
@@ -245,14 +218,7 @@ def structured_estimate(
 ) -> Estimate:
     """The end of a search as the estimate of the method "structured".
 
-    Parameters
-    ----------
-    problem : Problem
-        As it was posed.
-    structure : Structure
-    end : StructuredEnd
-    seconds : float
-        Time that it took, s.
+    `seconds` in s.
     """
     _, fit = goodness(end.problem, np.array(end.K), np.array(end.S))
     explained = end.misfit <= EXPLAINED * recorded_size(problem)

@@ -63,15 +63,7 @@ def regulator_slopes(
 ) -> tuple[Array, Array]:
     """Change of K (q, m, n) and S (q, m, m) with the unknowns (count,), then with the parameters.
 
-    Parameters
-    ----------
-    problem : Problem
-        At the parameters.
-    structure : Structure
-    z : Array
-        Unknowns (count,).
-    solution : LqrSolution
-        Of their weights.
+    `z` (count,).
     """
     plant = problem.plant
     dQ, dR = structure.changes(z)
@@ -89,12 +81,7 @@ def regulator_slopes(
 class PriceCoordinates(Coordinates):
     """The unknowns of a structure in the place of gain and metric; z is the way from the start.
 
-    Parameters
-    ----------
-    problem : Problem
-    structure : Structure
-    prices : Array
-        Unknowns where the search begins (count,); those at minus infinity stay there.
+    `prices` (count,).
     """
 
     def __init__(self, problem: Problem, structure: Structure, prices: Array) -> None:
@@ -125,13 +112,7 @@ class PriceCoordinates(Coordinates):
         return found
 
     def unpack(self, z: Array) -> Point:
-        """The values at z (q,).
-
-        Raises
-        ------
-        WeightsError
-            When the weights there have no regulator.
-        """
+        """The values at z (q,)."""
         _, _, starts, parameters = np.split(z, self.ends[:-1])
         problem = self.problem_at(starts, parameters)
         if self.solved[0] != z.tobytes():
@@ -172,19 +153,7 @@ class PriceCoordinates(Coordinates):
     def deviations(self, z: Array, noise: float) -> tuple[Array, Array]:
         """How far the unknowns that move (a,) are told, once all else has taken what it can.
 
-        Parameters
-        ----------
-        z : Array
-            (q,).
-        noise : float
-            Root-mean-square of the residual.
-
-        Returns
-        -------
-        Array
-            Right singular vectors, one a row (a, a).
-        Array
-            Standard deviation along each (a,).
+        `z` (q,); returns (a, a), (a,).
         """
         _, values, rows = np.linalg.svd(self.without_nuisance(z), full_matrices=False)
         return rows, noise / np.maximum(values, 1e-300)
@@ -192,31 +161,15 @@ class PriceCoordinates(Coordinates):
 
 @dataclass(frozen=True)
 class StructuredEnd:
-    """Where a search ended.
+    """Where a search ended."""
 
-    Attributes
-    ----------
-    prices : Array
-        Unknowns of the structure (count,); minus infinity is a price of zero.
-    K, S : Array
-        (m, n) and (m, m).
-    problem : Problem
-        At the initial states and the parameters.
-    misfit : float
-        2-norm of the residual.
-    evaluations : int
-        Simulations with derivatives.
-    settled : bool
-        Whether it ended by itself.
-    """
-
-    prices: Array
-    K: Array
-    S: Array
-    problem: Problem
-    misfit: float
-    evaluations: int
-    settled: bool
+    prices: Array  # Unknowns of the structure (count,); minus infinity is a price of zero
+    K: Array  # (m, n)
+    S: Array  # (m, m)
+    problem: Problem  # At the initial states and the parameters
+    misfit: float  # 2-norm of the residual
+    evaluations: int  # Simulations with derivatives
+    settled: bool  # Whether it ended by itself
 
 
 def search_from(
@@ -224,19 +177,7 @@ def search_from(
 ) -> StructuredEnd:
     """One search from given unknowns.
 
-    Parameters
-    ----------
-    problem : Problem
-    structure : Structure
-    prices : Array
-        Unknowns to start from (count,).
-    max_evaluations : int
-        Simulations with derivatives, at most.
-
-    Raises
-    ------
-    WeightsError
-        When the start has no regulator.
+    `prices` (count,).
     """
     space = PriceCoordinates(problem, structure, prices)
     beside = len(problem.logarithms)

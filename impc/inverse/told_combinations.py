@@ -36,27 +36,15 @@ _FACTORS = (1.2, 2.0)
 
 @dataclass(frozen=True)
 class Combination:
-    """A product of powers of parameters.
+    """A product of powers of parameters."""
 
-    Attributes
-    ----------
-    exponents : dict
-        By name; of a signed parameter the factor of its difference.
-    value : float
-        Of the product at the estimate, 1 for an untold one.
-    deviation : float
-        Standard deviation of its logarithm; infinite for an untold one.
-    difference : bool
-        Whether it is a signed parameter by itself, and deviation that of its value.
-    scaling : bool
-        Of an unidentified one: whether any factor is possible, as simulated; else it holds near
-        these values.
-    """
-
-    exponents: dict[str, float]
-    value: float
-    deviation: float
+    exponents: dict[str, float]  # By name; of a signed parameter the factor of its difference
+    value: float  # Of the product at the estimate, 1 for an untold one
+    deviation: float  # Standard deviation of its logarithm; infinite for an untold one
+    # Whether it is a signed parameter by itself, and deviation that of its value
     difference: bool = False
+    # Of an unidentified one: whether any factor is possible, as simulated; else it holds near these
+    # values
     scaling: bool = True
 
     @property
@@ -79,22 +67,13 @@ class Combination:
 
 @dataclass(frozen=True, eq=False)
 class Combinations(Frozen):
-    """What is told and what is not.
+    """What is told and what is not."""
 
-    Attributes
-    ----------
-    told, untold : tuple of Combination
-        Together as many as there are parameters.
-    singular_values : Array
-        (p,), falling.
-    deviations : Array
-        Standard deviation of each logarithm or signed parameter (p,); infinite where it is part
-        of an untold combination.
-    """
-
-    told: tuple[Combination, ...]
+    told: tuple[Combination, ...]  # Together as many as there are parameters
     untold: tuple[Combination, ...]
-    singular_values: Array
+    singular_values: Array  # (p,), falling
+    # Standard deviation of each logarithm or signed parameter (p,); infinite where it is part of an
+    # untold combination
     deviations: Array
 
     @property
@@ -124,19 +103,7 @@ def combinations(
 ) -> Combinations:
     """Split the parameters.
 
-    Parameters
-    ----------
-    problem : OptimalControlProblem
-    theta : Array
-        (p,).
-    jacobian : Array
-        (r, k), the parameters first, unknown initial states behind.
-    residual : Array
-        (r,).
-    signals : IntArray
-        Which signal each residual is of (r,); each has its own noise.
-    holds : callable
-        Parameters (p,) -> whether the recordings are as well explained there.
+    `theta` (p,); `jacobian` (r, k); `residual` (r,); `signals` (r,); `holds` (p,).
     """
     p = len(theta)
     own, rest = jacobian[:, :p], jacobian[:, p:]

@@ -24,18 +24,10 @@ _ROUNDING = 1e-10
 
 @dataclass(frozen=True)
 class TrialSpan:
-    """An orthonormal basis.
+    """An orthonormal basis."""
 
-    Attributes
-    ----------
-    own : tuple of Array
-        Of each trial (rows, k), k at most n; zero in the rows of the others.
-    shared : Array
-        Of the rest (r, c), orthogonal to those.
-    """
-
-    own: tuple[Array, ...]
-    shared: Array
+    own: tuple[Array, ...]  # Of each trial (rows, k), k at most n; zero in the rows of the others
+    shared: Array  # Of the rest (r, c), orthogonal to those
 
     def without(self, columns: Array) -> Array:
         """What the basis does not explain of `columns` (r, k), of that shape."""
@@ -50,14 +42,7 @@ class TrialSpan:
 def trial_span(own: Array, sizes: Sequence[int], shared: Array) -> TrialSpan:
     """Span of columns, each in its own scale, to 1e-10.
 
-    Parameters
-    ----------
-    own : Array
-        Derivative with respect to the initial state of the row's trial (r, n).
-    sizes : sequence of int
-        Rows of each trial.
-    shared : Array
-        Other columns (r, c).
+    `own` (r, n); `shared` (r, c).
     """
     parts = np.split(own, np.cumsum(sizes)[:-1])
     bases = tuple(_basis(_scaled(part)) for part in parts)

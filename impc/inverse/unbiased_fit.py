@@ -54,15 +54,7 @@ _SHARES, _APART = (1.0, 0.5, 0.25, 0.125), 1.0
 class TiltedPrior(Prior):
     """A prior, and a slope that the likelihood lacks near a point.
 
-    Parameters
-    ----------
-    prior : Prior
-    about : Array
-        Where the slope was found (q,).
-    slope : Array
-        (q,), nats.
-    curvature : Array
-        Of what is to be largest there (q, q).
+    `about` (q,); `slope` (q,); `curvature` (q, q).
     """
 
     def __init__(self, prior: Prior, about: Array, slope: Array, curvature: Array) -> None:
@@ -83,30 +75,18 @@ class TiltedPrior(Prior):
 
 
 class Unbiased(NamedTuple):
-    """A fit without the bias of its score.
+    """A fit without the bias of its score."""
 
-    Attributes
-    ----------
-    fit : PersonFit
-        The fit as it was where no bound was met, where it was made without a prior, or where there
-        is a reason.
-    reason : str
-        Why the mean of the score was not taken away, or not wholly; empty where it was, and where
-        no bound was met.
-    """
-
+    # The fit as it was where no bound was met, where it was made without a prior, or where there is
+    # a reason
     fit: PersonFit
+    # Why the mean of the score was not taken away, or not wholly; empty where it was, and where no
+    # bound was met
     reason: str
 
 
 def unbiased(fit: PersonFit) -> Unbiased:
-    """The person whose score is what it is on average, from the likeliest.
-
-    Parameters
-    ----------
-    fit : PersonFit
-        Of `fit_person`.
-    """
+    """The person whose score is what it is on average, from the likeliest."""
     first = fit.prior
     met = any(np.any(trial.status != Status.FREE) for trial in fit.told.trials)
     if not (met and first.used):

@@ -34,13 +34,7 @@ _LONGEST = 0.25
 
 
 def unseen_slope(prior: Prior, here: Place) -> Array:
-    """What scores do not have (q,), nats, by differences about a place; none without a prior.
-
-    Parameters
-    ----------
-    prior : Prior
-    here : Place
-    """
+    """What scores do not have (q,), nats, by differences about a place; none without a prior."""
     slope = np.zeros(len(here.theta))
     if prior.used:
         slope[prior.space.own :] = _lost(prior, here)
@@ -54,13 +48,7 @@ def learned_slope(prior: Prior, slope: Array, here: Place, there: Place) -> Arra
 
     Short steps tell little. Of the gain a step tells nothing: a jump more or less is as much.
 
-    Parameters
-    ----------
-    prior : Prior
-    slope : Array
-        What was taken for it (q,).
-    here, there : Place
-        The two ends of the step.
+    `slope` (q,).
     """
     own, slope = prior.space.own, slope.copy()
     moved = (there.theta - here.theta)[own:]
@@ -94,11 +82,6 @@ def jumps(prior: Prior, here: Place) -> Array:
     From one deviation below to one above along each direction that is told apart from the others:
     from a quarter to one and a half they say the same, and a longer step is less rough. Where there
     is no likelihood a step away the slope is taken for zero.
-
-    Parameters
-    ----------
-    prior : Prior
-    here : Place
     """
     own, gain = prior.space.own, prior.space.gain
     gradient, curvature = prior.parabola(here, np.zeros(len(here.theta)))

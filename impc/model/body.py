@@ -39,41 +39,20 @@ class Body(Value):
 
     A value has a slot. The first slots hold the constants, those behind them the g states, inputs
     and disturbances that are given, the rest what is computed.
-
-    Attributes
-    ----------
-    code : IntArray
-        (k, 4): operation, by its place in `OPERATIONS`; slot of the answer; slots of its two
-        operands, of which one may not be used. The answer of an OUTPUT is a place among the n next
-        states and, behind them and row by row, their n x g derivatives by what is given. A
-        derivative that is zero wherever the body is has none.
-    constants : Array
-        (c,).
     """
 
     _rules: ClassVar[Mapping[str, Any]] = {"constants": "*"}
 
+    # (k, 4): operation, by its place in `OPERATIONS`; slot of the answer; slots of its two
+    # operands, of which one may not be used. The answer of an OUTPUT is a place among the n next
+    # states and, behind them and row by row, their n x g derivatives by what is given. A derivative
+    # that is zero wherever the body is has none.
     code: IntArray
-    constants: Array
+    constants: Array  # (c,)
 
 
 def read_body(function: Any, order: Sequence[int], n: int) -> Body:
-    """The operations of a function (state, input) -> next state.
-
-    Parameters
-    ----------
-    function : casadi.Function
-        Of the states (n) and of all inputs in the order of their `control.StateSpace`.
-    order : sequence of int
-        Which of those inputs are the controls, then which are the disturbances.
-    n : int
-        Number of states.
-
-    Raises
-    ------
-    PlantError
-        When it is no such function, or has operations that are not in `OPERATIONS`.
-    """
+    """The operations of a function (state, input) -> next state."""
     import casadi as ca  # noqa: PLC0415  # a third of a second, and most plants have no body
 
     if not isinstance(function, ca.Function):

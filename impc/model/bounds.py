@@ -96,23 +96,13 @@ class Bounds(Value):
 
 @dataclass(frozen=True)
 class BoundRows(Value):
-    """The finite bounds as rows  E x + F u <= b  of one stage.
+    """The finite bounds as rows  E x + F u <= b  of one stage."""
 
-    Attributes
-    ----------
-    E, F, b : Array
-        Shapes (c, n), (c, m) and (c,).
-    on_state : BoolArray
-        Whether the row bounds a state (c,); the others bound an input.
-    names : tuple of str
-        One name a row, such as ``"u <= 1"``.
-    """
-
-    E: Array
+    E: Array  # Shapes (c, n), (c, m) and (c,)
     F: Array
     b: Array
-    on_state: BoolArray
-    names: tuple[str, ...]
+    on_state: BoolArray  # Whether the row bounds a state (c,); the others bound an input
+    names: tuple[str, ...]  # One name a row, such as ``"u <= 1"``
 
 
 @checked

@@ -24,13 +24,7 @@ _NUMBER = re.compile(r"(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 
 
 def linear_combination(text: str, names: Sequence[str]) -> Array:
-    """Coefficients (n,) of a text such as ``theta2 - 0.5 theta1`` over `names` (n,).
-
-    Raises
-    ------
-    InputError
-        When something else than signs, numbers and names stands there.
-    """
+    """Coefficients (n,) of a text such as ``theta2 - 0.5 theta1`` over `names` (n,)."""
     row, at = np.zeros(len(names)), 0
     longest_first = sorted(range(len(names)), key=lambda index: -len(names[index]))
     while at < len(text.rstrip()):

@@ -33,52 +33,25 @@ _LARGEST = 1e100
 
 
 class StationaryFilter(NamedTuple):
-    """A stationary filter.
+    """A stationary filter."""
 
-    Attributes
-    ----------
-    P : Array
-        Covariance of the state given all earlier outputs (n, n).
-    L : Array
-        Gain (n, p) from an innovation to the next state.
-    S : Array
-        Covariance of an innovation (p, p).
-    """
-
-    P: Array
-    L: Array
-    S: Array
+    P: Array  # Covariance of the state given all earlier outputs (n, n)
+    L: Array  # Gain (n, p) from an innovation to the next state
+    S: Array  # Covariance of an innovation (p, p)
 
 
 class FilterChanges(NamedTuple):
-    """Derivatives of a `StationaryFilter` along k directions, which are the first axis.
+    """Derivatives of a `StationaryFilter` along k directions, which are the first axis."""
 
-    Attributes
-    ----------
-    P, L, S : Array
-        (k, n, n), (k, n, p) and (k, p, p).
-    """
-
-    P: Array
-    L: Array
-    S: Array
+    P: Array  # (k, n, n)
+    L: Array  # (k, n, p)
+    S: Array  # (k, p, p)
 
 
 def stationary_filter(F: Array, C: Array, Q: Array, R: Array) -> StationaryFilter:
     """Solve the Riccati equation by doubling (Anderson 1978), which no scale of units disturbs.
 
-    Parameters
-    ----------
-    F, C : Array
-        (n, n) and (p, n).
-    Q, R : Array
-        Covariances (n, n), positive semidefinite, and (p, p), positive definite.
-
-    Raises
-    ------
-    SolverError
-        When F - L C is not stable: something that does not decay is not seen, or nothing
-        disturbs it; or when double precision cannot hold the covariances together.
+    `F` (n, n); `C` (p, n); `Q` (n, n); `R` (p, p).
     """
     try:
         P = _doubled(F, C, Q, R)
@@ -115,13 +88,7 @@ def filter_changes(
 ) -> FilterChanges:
     """Differentiate a stationary filter along k directions.
 
-    Parameters
-    ----------
-    found : StationaryFilter
-    given : pair of Array
-        F (n, n) and C (p, n).
-    dF, dC, dQ, dR : Array
-        (k, n, n), (k, p, n), (k, n, n) and (k, p, p).
+    `dF` (k, n, n); `dC` (k, p, n); `dQ` (k, n, n); `dR` (k, p, p).
     """
     F, C = given
     P, L, S = found

@@ -184,13 +184,7 @@ class Observer(Value):
 
 
 def believed_matrices(plant: Plant, person: Observer) -> tuple[Array, Array, Array, Array]:
-    """F, C, Q and R of what a person who estimates believes: states, then unknown perturbations.
-
-    Returns
-    -------
-    F, C, Q, R : Array
-        (h, h), (s, h), (h, h) and (s, s), h = n or n + d.
-    """
+    """F, C, Q and R of what a person who estimates believes: states, then unknown perturbations."""
     unknown = person.walk is not None
     d = plant.E.shape[1] if unknown else 0
     F = scipy.linalg.block_diag(plant.A, np.diag(person.persistence[:d]))
@@ -203,13 +197,7 @@ def believed_matrices(plant: Plant, person: Observer) -> tuple[Array, Array, Arr
 
 
 def believed_filter(plant: Plant, person: Observer) -> StationaryFilter:
-    """The stationary filter of a person who estimates.
-
-    Raises
-    ------
-    SolverError
-        When what is sensed does not tell all that does not decay, or nothing disturbs it.
-    """
+    """The stationary filter of a person who estimates."""
     return stationary_filter(*believed_matrices(plant, person))
 
 

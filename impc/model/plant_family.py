@@ -100,21 +100,14 @@ class PlantFamily(Frozen):
 
 
 class PlantDifferential(NamedTuple):
-    """Derivatives of A, B, E and C with respect to the logarithms; the parameters' axis is last.
+    """Derivatives of A, B, E and C with respect to the logarithms; the parameters' axis is last."""
 
-    Attributes
-    ----------
-    A, B, E, C : Array
-        (n, n, k), (n, m, k), (n, d, k) and (p, n, k).
-    bodies : tuple
-        For each parameter, bodies nearby with their factors: the sum of what they do at a sample is
-        the derivative of the plant's own. Empty where it has none.
-    """
-
-    A: Array
-    B: Array
-    E: Array
-    C: Array
+    A: Array  # (n, n, k)
+    B: Array  # (n, m, k)
+    E: Array  # (n, d, k)
+    C: Array  # (p, n, k)
+    # For each parameter, bodies nearby with their factors: the sum of what they do at a sample is
+    # the derivative of the plant's own. Empty where it has none.
     bodies: tuple[tuple[tuple[float, Body], ...], ...]
 
 
@@ -128,11 +121,6 @@ def plant_differential(family: PlantFamily, logarithms: Array) -> PlantDifferent
     """Derivatives of the plant's matrices with respect to the logarithms of its parameters.
 
     At `logarithms` (k,) of the parameters over their nominal values.
-
-    Raises
-    ------
-    PlantError
-        When the plant jumps as a parameter moves by a thousandth.
     """
     parts: list[tuple[Array, ...]] = []
     bodies: list[tuple[tuple[float, Body], ...]] = []

@@ -42,52 +42,22 @@ __all__ = [
 
 @dataclass(frozen=True)
 class LqrSolution(Frozen):
-    """A plant, its weights, and the regulator that they make.
-
-    Attributes
-    ----------
-    plant : Plant
-    weights : Weights
-    P : Array
-        Riccati solution (n, n), the terminal weight.
-    K : Array
-        Gain (m, n) of u = -Kx.
-    S : Array
-        Metric (m, m) in which the constrained controller stays near the gain: R + B'PB.
-    F : Array
-        Closed loop A - BK, (n, n).
-
-    Examples
-    --------
-    >>> import impc
-    >>> from plants import yalmip_example
-    >>> found = impc.solve_lqr(impc.Plant(yalmip_example()), impc.Weights([[1, 0], [0, 1]], 1))
-    >>> type(found).__name__, found.P.shape, found.S.shape
-    ('LqrSolution', (2, 2), (1, 1))
-    """
+    """A plant, its weights, and the regulator that they make."""
 
     plant: Plant
     weights: Weights
-    P: Array
-    K: Array
-    S: Array
-    F: Array
+    P: Array  # Riccati solution (n, n), the terminal weight
+    K: Array  # Gain (m, n) of u = -Kx
+    S: Array  # Metric (m, m) in which the constrained controller stays near the gain: R + B'PB
+    F: Array  # Closed loop A - BK, (n, n)
 
 
 @dataclass(frozen=True)
 class Gradients(Frozen):
-    """Derivatives of every entry of a matrix (a, b) with respect to the weights.
+    """Derivatives of every entry of a matrix (a, b) with respect to the weights."""
 
-    Attributes
-    ----------
-    Q : Array
-        Shape (a, b, n, n), symmetric in the last two: d entry = sum(Q[a, b] * dQ).
-    R : Array
-        Shape (a, b, m, m), symmetric in the last two.
-    """
-
-    Q: Array
-    R: Array
+    Q: Array  # Shape (a, b, n, n), symmetric in the last two: d entry = sum(Q[a, b] * dQ)
+    R: Array  # Shape (a, b, m, m), symmetric in the last two
 
 
 @checked
@@ -164,22 +134,7 @@ def lyapunov_series(F: Array, right: Array) -> Array:
     logarithm of the time constant and the whole stack shares the powers. The relative truncation
     error is below the unit round-off when the loop ends.
 
-    Parameters
-    ----------
-    F : Array
-        (n, n), stable.
-    right : Array
-        (p, n, n).
-
-    Returns
-    -------
-    Array
-        X of each right side (p, n, n).
-
-    Raises
-    ------
-    WeightsError
-        When F is not stable to working precision.
+    `F` (n, n); `right` (p, n, n); returns (p, n, n).
     """
     if not is_stable(F, discrete=True):
         raise _no_solution("the closed loop is not stable")
@@ -239,16 +194,7 @@ def regulator_changes(
     With dF = dA - dB K and the gain held:  dP = F'dP F + dF'PF + F'P dF + dQ + K'dR K,
     S dK = dB'PF + B'dP F + B'P dF - dR K,  dS = dR + dB'PB + B'dP B + B'P dB.
 
-    Parameters
-    ----------
-    solution : LqrSolution
-    dQ, dR, dA, dB : Array
-        Directions of the weights (k, n, n), (k, m, m) and of the plant (k, n, n), (k, n, m).
-
-    Returns
-    -------
-    dK, dS : Array
-        (k, m, n) and (k, m, m).
+    `dQ` (k, n, n); `dR` (k, m, m); `dA` (k, n, n); `dB` (k, n, m).
     """
     B, P, K, F = solution.plant.B, solution.P, solution.K, solution.F
     dF = dA - dB @ K

@@ -95,31 +95,14 @@ class Weights(Value):
 
 @checked
 def condition_number(weights: Weights) -> float:
-    """Condition number of blkdiag(Q, R), the kappa of (3.5); infinite when Q is singular.
-
-    Examples
-    --------
-    >>> import impc
-    >>> from impc.model.weights import condition_number
-    >>> condition_number(impc.Weights([[1, 0], [0, 4]], 2))
-    4.0
-    """
+    """Condition number of blkdiag(Q, R), the kappa of (3.5); infinite when Q is singular."""
     eigenvalues = np.linalg.eigvalsh(weights.block)
     return float(eigenvalues[-1] / eigenvalues[0]) if eigenvalues[0] > 0 else float("inf")
 
 
 @checked
 def normalised(weights: Weights) -> Weights:
-    """Return the same weights scaled to R[0, 0] = 1.
-
-    Examples
-    --------
-    >>> import impc
-    >>> from impc.model.weights import normalised
-    >>> normalised(impc.Weights([[1, 0], [0, 4]], 2)).Q
-    array([[0.5, 0. ],
-           [0. , 2. ]])
-    """
+    """Return the same weights scaled to R[0, 0] = 1."""
     scale = float(weights.R[0, 0])
     return replace(weights, Q=weights.Q / scale, R=weights.R / scale)
 
@@ -146,11 +129,6 @@ def cholesky_parameters(weights: Weights) -> Array:
 
     R is scaled to R[0, 0] = 1 first and its first entry, then always 1, is left out, so that
     k = n(n+1)/2 + m(m+1)/2 - 1: scale is not one of them. Equation (3.6).
-
-    Raises
-    ------
-    WeightsError
-        When Q is singular.
     """
     scaled = normalised(weights)
     try:
@@ -166,17 +144,7 @@ def cholesky_parameters(weights: Weights) -> Array:
 def weights_from_parameters(parameters: Array, n: int, m: int) -> Weights:
     """Inverse of `cholesky_parameters`: Q = LL' (n, n), R = GG' (m, m) with G[0, 0] = 1.
 
-    Parameters
-    ----------
-    parameters : Array
-        (k,), as `cholesky_parameters` gives them.
-    n, m : int
-        Sizes of Q and R.
-
-    Raises
-    ------
-    WeightsError
-        When there are not as many numbers as these sizes need.
+    `parameters` (k,).
     """
     count, total = n * (n + 1) // 2, (n * (n + 1) + m * (m + 1)) // 2 - 1
     if len(parameters) != total:

@@ -43,21 +43,11 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class TextTable:
-    """A table of texts, or of numbers when it is only written as CSV.
+    """A table of texts, or of numbers when it is only written as CSV."""
 
-    Attributes
-    ----------
-    caption : str
-        Above the table.
-    heads : sequence of str
-        One a column.
-    rows : sequence of sequences
-        Their first cell is a head of its own.
-    """
-
-    caption: str
-    heads: Sequence[str]
-    rows: Sequence[Sequence[Any]]
+    caption: str  # Above the table
+    heads: Sequence[str]  # One a column
+    rows: Sequence[Sequence[Any]]  # Their first cell is a head of its own
 
     def csv(self) -> bytes:
         """As a file for spreadsheets, without the caption."""
@@ -71,141 +61,71 @@ class TextTable:
 def table_of(
     caption: str, items: Iterable[T], columns: Mapping[str, Callable[[T], str]]
 ) -> TextTable:
-    """A table with a row for each of the `items`.
-
-    Parameters
-    ----------
-    caption : str
-        Above it.
-    items : iterable
-        What the rows are about.
-    columns : mapping of str to callable
-        Head -> what its cell says of an item.
-    """
+    """A table with a row for each of the `items`."""
     rows = [tuple(cell(item) for cell in columns.values()) for item in items]
     return TextTable(caption, tuple(columns), rows)
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure of the report.
+    """A figure of the report."""
 
-    Attributes
-    ----------
-    name : str
-        Of its PNG among the report's figures, without the ending.
-    alternative : str
-        In place of the picture for those who do not see it.
-    caption : str
-        Below it.
-    narrow : bool
-        Whether its words can be read at the width of a phone.
-    """
-
-    name: str
-    alternative: str
-    caption: str
-    narrow: bool = False
+    name: str  # Of its PNG among the report's figures, without the ending
+    alternative: str  # In place of the picture for those who do not see it
+    caption: str  # Below it
+    narrow: bool = False  # Whether its words can be read at the width of a phone
 
 
 @dataclass(frozen=True)
 class Chart:
-    """A figure whose curves the page's script lets a reader move, zoom and switch on and off.
+    """A figure whose curves the page's script lets a reader move, zoom and switch on and off."""
 
-    Attributes
-    ----------
-    picture : Picture
-        What is seen without scripts, in print, and before a reader asks for more.
-    data : mapping
-        The curves, as `impc.studies.charts` makes them.
-    """
-
-    picture: Picture
-    data: Mapping[str, Any]
+    picture: Picture  # What is seen without scripts, in print, and before a reader asks for more
+    data: Mapping[str, Any]  # The curves, as `impc.studies.charts` makes them
 
 
 @dataclass(frozen=True)
 class Lines:
-    """Sentences as a list.
+    """Sentences as a list."""
 
-    Attributes
-    ----------
-    lines : sequence of str
-        One an entry.
-    """
-
-    lines: Sequence[str]
+    lines: Sequence[str]  # One an entry
 
 
 @dataclass(frozen=True)
 class Terms:
-    """Terms, and what is said of each.
+    """Terms, and what is said of each."""
 
-    Attributes
-    ----------
-    terms : sequence of (str, sequence of str)
-        Each term with its paragraphs.
-    """
-
-    terms: Sequence[tuple[str, Sequence[str]]]
+    terms: Sequence[tuple[str, Sequence[str]]]  # Each term with its paragraphs
 
 
 @dataclass(frozen=True)
 class Heading:
-    """Heading of a part of a section.
+    """Heading of a part of a section."""
 
-    Attributes
-    ----------
-    text : str
-        Its words.
-    """
-
-    text: str
+    text: str  # Its words
 
 
 @dataclass(frozen=True)
 class Note:
-    """A paragraph that stands out.
+    """A paragraph that stands out."""
 
-    Attributes
-    ----------
-    title : str
-        Its first words, in bold.
-    text : str
-        The others.
-    """
-
-    title: str
-    text: str
+    title: str  # Its first words, in bold
+    text: str  # The others
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """The one sentence that answers what the page was made for.
+    """The one sentence that answers what the page was made for."""
 
-    Attributes
-    ----------
-    text : str
-        The sentence.
-    """
-
-    text: str
+    text: str  # The sentence
 
 
 @dataclass(frozen=True)
 class Details:
-    """What is folded until a reader asks for it.
+    """What is folded until a reader asks for it."""
 
-    Attributes
-    ----------
-    summary : str
-        What is inside, always shown.
-    blocks : sequence of Block
-        What is folded, in this order.
-    """
-
-    summary: str
-    blocks: Sequence[Block]
+    summary: str  # What is inside, always shown
+    blocks: Sequence[Block]  # What is folded, in this order
 
 
 #: What a section is made of; a str is a paragraph.
@@ -214,68 +134,33 @@ Block = str | TextTable | Picture | Chart | Lines | Terms | Heading | Note | Ver
 
 @dataclass(frozen=True)
 class Section:
-    """A section of the page.
+    """A section of the page."""
 
-    Attributes
-    ----------
-    title : str
-        Its heading.
-    blocks : sequence of Block
-        What stands in it, in this order.
-    contents : str
-        Its name in the table of contents; without one it is not there.
-    together : bool
-        Whether it stays on the page of what is before it when it is printed.
-    folded : bool
-        Whether its blocks show only when a reader opens it.
-    """
-
-    title: str
-    blocks: Sequence[Block]
-    contents: str = ""
-    together: bool = False
-    folded: bool = False
+    title: str  # Its heading
+    blocks: Sequence[Block]  # What stands in it, in this order
+    contents: str = ""  # Its name in the table of contents; without one it is not there
+    together: bool = False  # Whether it stays on the page of what is before it when it is printed
+    folded: bool = False  # Whether its blocks show only when a reader opens it
 
 
 @dataclass(frozen=True)
 class Report:
-    """All that a command leaves behind; nothing is written here.
+    """All that a command leaves behind; nothing is written here."""
 
-    Attributes
-    ----------
-    window : str
-        Title of the browser's window.
-    title : str
-        First heading.
-    opening : sequence of Block
-        Before the first section.
-    sections : sequence of Section
-    figures : mapping of str to bytes
-        By the name of the file.
-    tables : mapping of str to TextTable
-        Written as CSV under these names, and together as tables.xlsx and tables.mat.
-    data : mapping
-        Content of result.json, beside what every one has (docs/results.md).
-    provenance : Provenance
-        Where the result comes from.
-    words : sequence of (str, str)
-        What the page is about, signals and parameters: with these its glossary begins.
-    template : str
-        page.html, or one that extends it, by its path in this package.
-    values : mapping
-        What such a template names beside the report.
-    """
-
-    window: str
-    title: str
-    opening: Sequence[Block]
+    window: str  # Title of the browser's window
+    title: str  # First heading
+    opening: Sequence[Block]  # Before the first section
     sections: Sequence[Section]
-    figures: Mapping[str, bytes] = field(default_factory=dict)
+    figures: Mapping[str, bytes] = field(default_factory=dict)  # By the name of the file
+    # Written as CSV under these names, and together as tables.xlsx and tables.mat
     tables: Mapping[str, TextTable] = field(default_factory=dict)
+    # Content of result.json, beside what every one has (docs/results.md)
     data: Mapping[str, Any] = field(default_factory=dict)
-    provenance: Provenance = field(default_factory=Provenance)
+    provenance: Provenance = field(default_factory=Provenance)  # Where the result comes from
+    # What the page is about, signals and parameters: with these its glossary begins
     words: Sequence[tuple[str, str]] = ()
-    template: str = "page.html"
+    template: str = "page.html"  # page.html, or one that extends it, by its path in this package
+    # What such a template names beside the report
     values: Mapping[str, Any] = field(default_factory=dict)
 
     def page(self) -> str:

@@ -96,15 +96,9 @@ WORDS: dict[str, str] = {
 
 @dataclass(frozen=True)
 class Glossary:
-    """The words of one page; each is linked where it stands first.
+    """The words of one page; each is linked where it stands first."""
 
-    Attributes
-    ----------
-    words : sequence of (str, str)
-        Word and what it means, in the order of the glossary.
-    """
-
-    words: tuple[tuple[str, str], ...] = ()
+    words: tuple[tuple[str, str], ...] = ()  # Word and what it means, in the order of the glossary
     _linked: set[str] = field(default_factory=set, compare=False)
 
     def anchor(self, word: str) -> str:

@@ -26,13 +26,7 @@ LOCK = ".impc-lock"
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Hold an existing `folder` while the block lasts; the system lets go when the process dies.
-
-    Raises
-    ------
-    OutputError
-        When another process, or another block of this one, holds it, or nothing can be written.
-    """
+    """Hold an existing `folder` while the block lasts; the system lets go when the process dies."""
     path = folder / LOCK
     stream = _opened(path)
     try:

@@ -34,33 +34,17 @@ def _now() -> str:
 
 @dataclass(frozen=True)
 class Provenance:
-    """What a reader needs to make a result again; versions and date are those of its making.
+    """What a reader needs to make a result again; versions and date are those of its making."""
 
-    Attributes
-    ----------
-    plant_name : str
-        Import path or file; empty where a result has none.
-    command : str
-        Command line that made the result.
-    plant_arguments : mapping
-        What the plant's function was called with.
-    files : tuple of str
-        Names of the recordings, without their folders.
-    inputs : Inputs or None
-        Digests of all files that went in; None where there were none.
-    versions : mapping of str to str
-        Of Python and of the packages that compute.
-    made : str
-        Date and time, UTC, ISO 8601.
-    """
-
-    plant_name: str = ""
-    command: str = ""
+    plant_name: str = ""  # Import path or file; empty where a result has none
+    command: str = ""  # Command line that made the result
+    # What the plant's function was called with
     plant_arguments: Mapping[str, object] = field(default_factory=dict)
-    files: tuple[str, ...] = ()
-    inputs: Inputs | None = None
+    files: tuple[str, ...] = ()  # Names of the recordings, without their folders
+    inputs: Inputs | None = None  # Digests of all files that went in; None where there were none
+    # Of Python and of the packages that compute
     versions: Mapping[str, str] = field(default_factory=_versions)
-    made: str = field(default_factory=_now)
+    made: str = field(default_factory=_now)  # Date and time, UTC, ISO 8601
 
     def data(self) -> dict[str, Any]:
         """As result.json has it."""

@@ -42,14 +42,7 @@ def shown_angle() -> tuple[float, str]:
 
 
 def shown_unit(plant: Plant, name: str) -> tuple[float, str]:
-    """Factor from the plant's unit of a signal, and the unit that is shown.
-
-    Parameters
-    ----------
-    plant : Plant
-    name : str
-        Of the signal.
-    """
+    """Factor from the plant's unit of a signal, and the unit that is shown."""
     unit = plant.unit(name)
     if unit == UNKNOWN and name.lower().startswith(_ANGLES):
         unit = "rad/s" if name.endswith("_rate") else "rad"
@@ -57,13 +50,7 @@ def shown_unit(plant: Plant, name: str) -> tuple[float, str]:
 
 
 def shown_as(unit: str) -> tuple[float, str]:
-    """Factor from a `unit` to the one that is shown, and that one.
-
-    Parameters
-    ----------
-    unit : str
-        SI.
-    """
+    """Factor from a `unit` to the one that is shown, and that one."""
     if unit in _DEGREES and _CHOSEN.get() == "degrees":
         return math.degrees(1.0), _DEGREES[unit]
     return 1.0, "-" if unit == "1" else unit

@@ -87,21 +87,11 @@ _RC: dict[Any, Any] = {
 
 @dataclass(frozen=True)
 class Mark:
-    """How one signal is drawn, in the words of matplotlib.
+    """How one signal is drawn, in the words of matplotlib."""
 
-    Attributes
-    ----------
-    color : str
-        Such as "#0072B2".
-    marker : str
-        Empty for none.
-    line : str
-        Its style, such as "--".
-    """
-
-    color: str
-    marker: str
-    line: str
+    color: str  # Such as "#0072B2"
+    marker: str  # Empty for none
+    line: str  # Its style, such as "--"
 
 
 #: Of the first state and of the second.
@@ -125,15 +115,7 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def drawn(figures: Mapping[str, Figure], *, mathematics: bool = False) -> dict[str, bytes]:
-    """Each of the `figures` as PNG and PDF, by the name of its file.
-
-    Parameters
-    ----------
-    figures : mapping of str to Figure
-        By their names without an ending.
-    mathematics : bool
-        As for `render`.
-    """
+    """Each of the `figures` as PNG and PDF, by the name of its file."""
     return {
         f"{name}.{kind}": content
         for name, figure in figures.items()
@@ -145,12 +127,6 @@ def render(figure: Figure, *, mathematics: bool = False) -> dict[str, bytes]:
     r"""Return the figure as ``"png"`` and ``"pdf"``, without date or program name.
 
     The same figure gives the same bytes, so that a committed picture changes only when it does.
-
-    Parameters
-    ----------
-    mathematics : bool
-        Whether signs between dollars are set as mathematics: in figures without a name of a user's.
-        Elsewhere a signal called ``$\frac$`` is text as any other.
     """
     files = {}
     if not mathematics:

@@ -46,13 +46,7 @@ class _Run:
     written: dict[str, str] = field(default_factory=dict)
 
     def begin(self, new: dict[str, bytes]) -> None:
-        """List files before they are written: a run that is killed leaves none that is not listed.
-
-        Raises
-        ------
-        OutputError
-            When one is there already that no run of this command wrote.
-        """
+        """List files before they are written, so that a killed run leaves none unlisted."""
         for name in new:
             known = name in self.before or name in self.written
             if not known and os.path.lexists(self.folder / name):
@@ -100,11 +94,6 @@ def owned(folder: Path, command: str) -> Iterator[None]:
     """Hold a `folder` for one run of a `command`; what `write_files` writes meanwhile replaces.
 
     Nothing is left of a folder that is made here and in which nothing was written.
-
-    Raises
-    ------
-    OutputError
-        When it cannot be written to, another run holds it, or it holds results of another command.
     """
     require_writable(folder)
     with ExitStack() as undo:
@@ -154,13 +143,7 @@ def _unlist(folder: Path, before: set[str]) -> None:
 
 
 def _listed(folder: Path, command: str) -> dict[str, str]:
-    """What a run of the `command` wrote to the folder before: SHA-256 by name.
-
-    Raises
-    ------
-    OutputError
-        When the results in the folder are of another command, or have no list.
-    """
+    """What a run of the `command` wrote to the folder before: SHA-256 by name."""
     try:
         require_ordinary(folder / _LIST)
         owner, *lines = (folder / _LIST).read_text(encoding="utf-8").split("\n")
@@ -205,11 +188,6 @@ def require_writable(folder: Path) -> None:
     """Check, before a long computation, that files can be written to a folder or it can be made.
 
     Nothing is created. What happens later (a full disk) is left to `write_files`.
-
-    Raises
-    ------
-    OutputError
-        When the folder or what it would be made in is a file, or may not be written to.
     """
     try:
         existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
@@ -226,24 +204,6 @@ def write_files(folder: Path, files: Mapping[str, bytes]) -> tuple[Path, ...]:
 
     They are written into a temporary folder first and moved from there one by one. When anything
     fails, files that were there before are put back and what was made is removed.
-
-    Parameters
-    ----------
-    folder : Path
-        Where they go.
-    files : mapping of str to bytes
-        A slash in a name makes a folder.
-
-    Returns
-    -------
-    tuple of Path
-        What was written, in the order given.
-
-    Raises
-    ------
-    OutputError
-        When the folder cannot be made or a file cannot be written, and in an `owned` folder when a
-        file is there that no run of the command wrote.
     """
     require_writable(folder)
     run = _RUN.get()

@@ -28,28 +28,14 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Codec(Generic[T]):
-    """How a result is written down.
+    """How a result is written down."""
 
-    Attributes
-    ----------
-    encode : callable
-        Result -> JSON.
-    decode : callable
-        Its inverse.
-    """
-
-    encode: Callable[[T], Any]
-    decode: Callable[[Any], T]
+    encode: Callable[[T], Any]  # Result -> JSON
+    decode: Callable[[Any], T]  # Its inverse
 
 
 def by_fields(kind: type[T]) -> Codec[T]:
-    """A dataclass as its fields, arrays as lists.
-
-    Parameters
-    ----------
-    kind : type
-        The dataclass.
-    """
+    """A dataclass as its fields, arrays as lists."""
     return Codec(
         lambda value: msgspec.to_builtins(value, enc_hook=np.ndarray.tolist),
         lambda content: msgspec.convert(content, kind, dec_hook=lambda _, array: frozen(array)),
@@ -58,44 +44,19 @@ def by_fields(kind: type[T]) -> Codec[T]:
 
 @dataclass(frozen=True)
 class Cache:
-    """Results of the steps of a command.
+    """Results of the steps of a command."""
 
-    Attributes
-    ----------
-    files : Kept
-        Its folder is made when the first result is kept.
-    digest : str
-        Of all that the results are made of.
-    done : callable
-        Told the name of each result when it is there.
-    stages : dict
-        Name -> content of what is there, at first what the folder has for this digest.
-    """
-
-    files: Kept
-    digest: str
-    done: Callable[[str], None] = lambda _: None
+    files: Kept  # Its folder is made when the first result is kept
+    digest: str  # Of all that the results are made of
+    done: Callable[[str], None] = lambda _: None  # Told the name of each result when it is there
+    # Name -> content of what is there, at first what the folder has for this digest
     stages: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.stages.update(self.files.recall_all(self.digest))
 
     def get(self, name: str, compute: Callable[[], T], codec: Codec[T]) -> T:
-        """The result `name`, from the folder or computed now and then written down.
-
-        Parameters
-        ----------
-        name : str
-            Of the step.
-        compute : callable
-            Without arguments.
-        codec : Codec
-
-        Raises
-        ------
-        OutputError
-            When the file cannot be written.
-        """
+        """The result `name`, from the folder or computed now and then written down."""
         if name not in self.stages:
             found = compute()
             self.keep(name, found, codec)
@@ -104,13 +65,7 @@ class Cache:
         return codec.decode(self.stages[name])
 
     def keep(self, name: str, value: T, codec: Codec[T]) -> None:
-        """Write the result `name` down: `value`, as `codec` has it.
-
-        Raises
-        ------
-        OutputError
-            When the file cannot be written.
-        """
+        """Write the result `name` down: `value`, as `codec` has it."""
         content = codec.encode(value)
         self.files.keep(name, self.digest, content)
         self.stages[name] = content
@@ -124,11 +79,5 @@ class Cache:
         return f"kept in {self.files.folder}: {done}; the same command goes on from there"
 
     def forget(self) -> None:
-        """Remove the folder: the result has been written.
-
-        Raises
-        ------
-        OutputError
-            When that cannot be done.
-        """
+        """Remove the folder: the result has been written."""
         self.files.forget()

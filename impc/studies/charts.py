@@ -62,17 +62,7 @@ _RECORDED = {"label": "recorded", "color": "#8C8C8C", "dash": ""}
 
 
 def methods_chart(problem: Problem, fits: Sequence[MethodFit], trial: int) -> dict[str, Any]:
-    """Every method's outputs and commands on one trial, beside what was recorded.
-
-    Parameters
-    ----------
-    problem : Problem
-        With the bounds of the subject.
-    fits : sequence of MethodFit
-        Those without a gain are left out.
-    trial : int
-        Its place among the recordings.
-    """
+    """Every method's outputs and commands on one trial, beside what was recorded."""
     drawn = [fit for fit in fits if fit.runs]
     plant, given = problem.plant, problem.recordings[trial]
     stride = -(-given.samples // _SAMPLES)
@@ -89,15 +79,7 @@ def methods_chart(problem: Problem, fits: Sequence[MethodFit], trial: int) -> di
 
 
 def chart_figure(data: dict[str, Any], shown: int) -> Figure:
-    """The first `shown` curves of a chart as a picture, for a page without scripts.
-
-    Parameters
-    ----------
-    data : dict
-        Of `methods_chart`.
-    shown : int
-        At least one.
-    """
+    """The first `shown` curves of a chart as a picture, for a page without scripts."""
     figure = new_figure(DOUBLE_COLUMN, 0.6 + 1.3 * len(data["panels"]))
     axes = figure.subplots(len(data["panels"]), 1, sharex=True, squeeze=False)[:, 0]
     for ax, panel in zip(axes, data["panels"], strict=True):
@@ -125,12 +107,6 @@ def weights_chart(problem: Problem, found: Intent) -> dict[str, Any]:
 
     Of weights with one gain every mixture has it too (docs/equivalent-weights.md), so the way from
     one rule to the next is a straight line; the closed loop of each is simulated, not taken over.
-
-    Parameters
-    ----------
-    problem : Problem
-        At the initial states and parameters that were found.
-    found : Intent
     """
     plant, drive = problem.plant, scenarios(problem)[0]
     few = replace(drive, disturbance=drive.disturbance[:_FEW])

@@ -35,18 +35,10 @@ _FIT, _REPLICATE, _PROFILE = 300, 40, 1000
 
 @dataclass(frozen=True)
 class Effort:
-    """An estimate of what a request takes.
+    """An estimate of what a request takes."""
 
-    Attributes
-    ----------
-    seconds : float
-        s, on one core of an ordinary machine.
-    gigabytes : float
-        Of the arrays that are alive at a time.
-    """
-
-    seconds: float
-    gigabytes: float
+    seconds: float  # s, on one core of an ordinary machine
+    gigabytes: float  # Of the arrays that are alive at a time
 
     def shared(self, parts: float, threads: int) -> Effort:
         """Of so many such `parts`, as many at a time as there are `threads`."""

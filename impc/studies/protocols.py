@@ -25,24 +25,12 @@ __all__ = ["CriticalStiffness", "TorqueAmplitude", "critical_stiffness", "torque
 
 @dataclass(frozen=True)
 class CriticalStiffness:
-    """Result of the stiffness protocol, all in Nm/rad.
+    """Result of the stiffness protocol, all in Nm/rad."""
 
-    Attributes
-    ----------
-    coarse : float
-        Lower of the two coarse searches.
-    fine : float
-        Mean of the fine searches: the critical stiffness.
-    levels : tuple of float
-        First failing level of every search, coarse ones first.
-    trials : int
-        Trials that the subject did.
-    """
-
-    coarse: float
-    fine: float
-    levels: tuple[float, ...]
-    trials: int
+    coarse: float  # Lower of the two coarse searches
+    fine: float  # Mean of the fine searches: the critical stiffness
+    levels: tuple[float, ...]  # First failing level of every search, coarse ones first
+    trials: int  # Trials that the subject did
 
     @property
     def experimental(self) -> float:
@@ -52,21 +40,11 @@ class CriticalStiffness:
 
 @dataclass(frozen=True)
 class TorqueAmplitude:
-    """Result of the torque protocol, in Nm.
+    """Result of the torque protocol, in Nm."""
 
-    Attributes
-    ----------
-    coarse : float
-        Least pulse at which the seat reached the angle.
-    amplitude : float
-        Largest amplitude of the trials that were passed.
-    trials : int
-        Trials that the subject did, pulses included.
-    """
-
-    coarse: float
-    amplitude: float
-    trials: int
+    coarse: float  # Least pulse at which the seat reached the angle
+    amplitude: float  # Largest amplitude of the trials that were passed
+    trials: int  # Trials that the subject did, pulses included
 
 
 def critical_stiffness(
@@ -79,24 +57,7 @@ def critical_stiffness(
     coarse_searches: int = 2,
     fine_searches: int = 3,
 ) -> CriticalStiffness:
-    """Run the stiffness protocol.
-
-    Parameters
-    ----------
-    balances : callable
-        Stiffness in Nm/rad -> whether the subject kept the seat inside its stops for a trial.
-    start, coarse_step, fine_step, margin : float
-        Nm/rad; the fine searches begin `margin` above the coarse result.
-    coarse_searches, fine_searches : int
-        How often each is done; of the coarse ones the least counts, of the fine ones the mean.
-
-    Raises
-    ------
-    InputError
-        When a step is not positive.
-    SolverError
-        When balance is lost at the first level already, or never.
-    """
+    """Run the stiffness protocol."""
     if coarse_step <= 0 or fine_step <= 0:
         raise InputError("step", f"got {min(coarse_step, fine_step):g}", "give positive ones")
     levels, trials = [], 0
@@ -123,21 +84,7 @@ def torque_amplitude(
 ) -> TorqueAmplitude:
     """Run the torque protocol.
 
-    Parameters
-    ----------
-    pulse_angle : callable
-        Size of a one-second pulse in Nm -> largest angle of the seat, in the unit of `angle`.
-    keeps_balance : callable
-        Amplitude in Nm -> whether a trial like the real ones was passed.
-    angle : float
-        Angle that the coarse search goes up to; 8 degrees in the dissertation.
-    step, largest : float
-        Nm.
-
-    Raises
-    ------
-    SolverError
-        When no pulse reaches the angle, or no amplitude is passed twice.
+    `angle` in degrees.
     """
     coarse, trials = step, 1
     while pulse_angle(coarse) < angle:

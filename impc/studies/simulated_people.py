@@ -34,33 +34,16 @@ __all__ = ["SubjectTrial", "simulate_subject"]
 
 @dataclass(frozen=True)
 class SubjectTrial(Frozen):
-    """One simulated trial at the recording's rate.
+    """One simulated trial at the recording's rate."""
 
-    Attributes
-    ----------
-    time : Array
-        s (samples,).
-    outputs : Array
-        With sensor noise (samples, p), in the plant's units.
-    disturbance : Array
-        (samples, d).
-    states : Array
-        True states (samples, n).
-    commands : Array
-        What the controller asked for, without motor noise, (samples, m).
-    saturated : float
-        Share of the controller's samples at which its command stands on a bound.
-    fell : float or None
-        Time in s at which no command kept the bounds or an output went beyond `largest`; what
-        follows repeats the last state.
-    """
-
-    time: Array
-    outputs: Array
-    disturbance: Array
-    states: Array
-    commands: Array
-    saturated: float
+    time: Array  # s (samples,)
+    outputs: Array  # With sensor noise (samples, p), in the plant's units
+    disturbance: Array  # (samples, d)
+    states: Array  # True states (samples, n)
+    commands: Array  # What the controller asked for, without motor noise, (samples, m)
+    saturated: float  # Share of the controller's samples at which its command stands on a bound
+    # Time in s at which no command kept the bounds or an output went beyond `largest`; what follows
+    # repeats the last state
     fell: float | None
 
 
@@ -78,33 +61,7 @@ def simulate_subject(
 ) -> SubjectTrial:
     """Simulate one trial from rest.
 
-    Parameters
-    ----------
-    controller : Controller
-        On the linear plant, at its sample time.
-    step : casadi.Function
-        (state (n), inputs (m + d), controls first) -> next state, one sample of the recording on.
-    disturbance : array_like
-        (samples, d) at the recording's rate.
-    rate : float
-        Samples per second of the recording, a whole multiple of the controller's.
-    motor : array_like
-        Standard deviation of the motor noise, in the commands' units, one or (m,).
-    sensor : array_like
-        Standard deviation of the sensor noise, in the outputs' units, one or (p,).
-    person : Observer, optional
-        Someone who acts on estimates, with the linear plant in mind; the motor noise is then that
-        of the person, and `motor` is not used. By default the true state is seen.
-    largest : float
-        An output beyond this, in its unit, is a fall.
-    seed : int or SeedSequence
-        All numbers drawn follow from it.
-
-    Raises
-    ------
-    InputError
-        When the rate is no whole multiple of the controller's, or a person has process noise, for
-        which the nonlinear plant has no place.
+    `disturbance` (samples, d); `rate` in second; `motor` (m,); `sensor` (p,).
     """
     plant, within = controller.plant, _samples_within(rate, controller.plant.dt)
     columns = np.asarray(disturbance, dtype=np.float64)

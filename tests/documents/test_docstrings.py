@@ -1,9 +1,8 @@
 """Every public name says what it takes, what it gives, how it fails and where it comes from.
 
-Checked of every name in `__all__`, and of the public methods of its class:
+Checked of what users import from `impc` and `plants`, of the public methods of its classes, and of
+commands; what is not public has a plain line, and comments beside its fields:
 
-- it has a docstring of its own; a constant has a `#:` comment or is named by its module; a command
-  and each of its options have a help text;
 - every parameter is described in `Parameters`, or named in the text above the sections; one whose
   type is a class of this project may do without, for that class describes it. Every field of a
   class is described in `Attributes`, every member of an enumeration is named;
@@ -28,7 +27,6 @@ import builtins
 import enum
 import importlib
 import inspect
-import itertools
 import pkgutil
 import re
 import sys
@@ -51,37 +49,8 @@ if TYPE_CHECKING:
 
 ROOT = Path(__file__).parents[2]
 
-# Modules and packages without an equation to cite, by what they are about instead.
-PLUMBING = {
-    "checks and exceptions": ("impc.arrays", "impc.checking", "impc.errors", "plants._checks"),
-    "the command line": ("impc.cli", "impc.__main__"),
-    "files and what is in them": (
-        "impc.files",
-        "impc.studies.fit.memory",
-        "impc.model.recordings",
-    ),
-    "import paths": ("impc.studies.selection.model_source",),
-    "queues and settings of a study": (
-        "impc.studies.cache",
-        "impc.studies.selection.queue",
-        "impc.studies.selection.settings",
-    ),
-    "a study from its folder to its pages": ("impc.studies.cohort",),
-    "pages and figures": (
-        "impc.reporting",
-        "impc.studies.compare.report",
-        "impc.studies.example",
-        "impc.studies.fit",
-        "impc.studies.reliability.figures",
-        "impc.studies.reliability.report",
-    ),
-    "pages and tables": (
-        "impc.studies.reliability.tables",
-        "impc.studies.selection.key_report",
-        "impc.studies.selection.report",
-    ),
-}
-ROOMS = [name for names in PLUMBING.values() for name in names]
+# Without an equation to cite: errors, files, commands, recordings, settings.
+PLUMBING = ("impc.errors", "impc.files.", "impc.cli.", "impc.model.recordings", "impc.studies.fit.")
 
 ARRAY = re.compile(r"\b(?:(?:Bool|Int|Complex)?Array|ArrayLike|NDArray|ndarray|Buffer)\b")
 NUMBER = r"(?:\d+|N m|N|[a-z]\w*)"
@@ -109,36 +78,38 @@ def modules() -> Iterator[ModuleType]:
 
 
 def public_names() -> Iterator[tuple[str, Any]]:
-    """Each constant, function, class and method by module:name, where it is defined."""
+    """What users import, with the public methods of classes, and commands: by module:name."""
+    given = [getattr(place, name) for place in (impc, plants) for name in place.__all__]
+    for value in map(inspect.unwrap, given):
+        if not (inspect.isclass(value) or inspect.isfunction(value)):
+            continue  # a constant
+        place = f"{value.__module__}:{value.__name__}"
+        yield place, value
+        for member, found in vars(value).items() if inspect.isclass(value) else ():
+            method = getattr(found, "__func__", getattr(found, "fget", found))
+            method = getattr(method, "func", method)  # of a cached property
+            default = member in vars(value).get("__annotations__", {})  # of a field
+            if inspect.isfunction(method) and not (default or member.startswith("_")):
+                yield f"{place}.{member}", method
     for module in modules():
-        for name in getattr(module, "__all__", ()):
-            value = inspect.unwrap(getattr(module, name))
-            code = inspect.isclass(value) or inspect.isfunction(value)
-            if code and value.__module__ != module.__name__:
-                continue
-            yield f"{module.__name__}:{name}", value
-            for member, found in vars(value).items() if inspect.isclass(value) else ():
-                method = getattr(found, "__func__", getattr(found, "fget", found))
-                method = getattr(method, "func", method)  # of a cached property
-                default = member in vars(value).get("__annotations__", {})  # of a field
-                if inspect.isfunction(method) and not (default or member.startswith("_")):
-                    yield f"{module.__name__}:{name}.{member}", method
+        for name in module.__all__:
+            if isinstance(value := getattr(module, name), click.Command):
+                yield f"{module.__name__}:{name}", value
 
 
 NAMES = dict(public_names())
-CLASSES = {key.split(":")[1] for key, value in NAMES.items() if inspect.isclass(value)}
+CLASSES = {
+    name for each in modules() for name in each.__all__ if inspect.isclass(getattr(each, name))
+}
 
 
 def faults(key: str, value: Any) -> list[str]:
     """What the docstring of a public name lacks."""
-    place, name = key.split(":")
-    module = sys.modules[place]
+    module = sys.modules[key.partition(":")[0]]
     if isinstance(value, click.Command):
         options = [each for each in value.params if isinstance(each, click.Option)]
         bare = [f"--{each.name}: no help" for each in options if not each.help]
         return bare if value.help else ["no help", *bare]
-    if not (inspect.isclass(value) or inspect.isfunction(value)):
-        return [*constant_faults(name, module)]
     text = vars(value).get("__doc__") if inspect.isclass(value) else value.__doc__
     if not text or text.startswith(f"{value.__name__}("):  # what a dataclass writes
         return ["no docstring"]
@@ -149,15 +120,6 @@ def faults(key: str, value: Any) -> list[str]:
     elif issubclass(value, enum.Enum):
         found += [f"{each}: not named" for each in value.__members__ if each not in text]
     return found
-
-
-def constant_faults(name: str, module: ModuleType) -> Iterator[str]:
-    lines = inspect.getsource(module).splitlines()
-    given = re.compile(rf"(?:\w+, )*{name}\b[^()]* = ")
-    above = [before for before, line in itertools.pairwise(lines) if given.match(line)]
-    named = re.search(rf"\b{name}\b", module.__doc__ or "")
-    if not named and not all(line.startswith("#:") for line in above):
-        yield "no comment #:"
 
 
 def prose(doc: NumpyDocString) -> str:
@@ -251,8 +213,8 @@ def inside(node: ast.AST) -> Iterator[ast.AST]:
 
 
 def source_faults(module: ModuleType, text: str) -> Iterator[str]:
-    whole, room = f"{text}\n{module.__doc__}", f"{module.__name__}."
-    if not (SOURCE.search(whole) or any(room.startswith(f"{name}.") for name in ROOMS)):
+    whole = f"{text}\n{module.__doc__}"
+    if not (SOURCE.search(whole) or module.__name__.startswith(PLUMBING)):
         yield "no source"
     for page, section in PAGE.findall(whole):
         there = (ROOT / page).read_text(encoding="utf-8") if (ROOT / page).exists() else ""
@@ -262,7 +224,6 @@ def source_faults(module: ModuleType, text: str) -> Iterator[str]:
 
 def test_every_module_names_what_is_public() -> None:
     assert [module.__name__ for module in modules() if not getattr(module, "__all__", None)] == []
-    assert [room for room in ROOMS if importlib.util.find_spec(room) is None] == []
 
 
 @pytest.mark.parametrize("key", NAMES)

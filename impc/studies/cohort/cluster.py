@@ -27,20 +27,11 @@ _PATIENCE = "10s"
 
 @dataclass(frozen=True)
 class Cluster:
-    """Which workers to use.
+    """Which workers to use."""
 
-    Attributes
-    ----------
-    scheduler : str or None
-        Address of a running Dask scheduler; None for this machine.
-    workers : int or None
-        How many on this machine; None for as many as there are processors.
-    tls_ca, tls_cert, tls_key : Path or None
-        For an address tls://: certificate of the authority, one's own, and its private key.
-    """
-
-    scheduler: str | None = None
-    workers: int | None = None
+    scheduler: str | None = None  # Address of a running Dask scheduler; None for this machine
+    workers: int | None = None  # How many on this machine; None for as many as there are processors
+    # For an address tls://: certificate of the authority, one's own, and its private key
     tls_ca: Path | None = None
     tls_cert: Path | None = None
     tls_key: Path | None = None
@@ -48,15 +39,7 @@ class Cluster:
 
 @contextmanager
 def connected(cluster: Cluster) -> Iterator[Workers]:
-    """The workers of a `cluster` while the block lasts.
-
-    Raises
-    ------
-    InputError
-        When no scheduler answers at the address, or its certificates are missing or refused.
-    ImpcError
-        When distributed, which a scheduler needs and this machine alone does not, is not installed.
-    """
+    """The workers of a `cluster` while the block lasts."""
     if cluster.scheduler is None:
         if any((cluster.tls_ca, cluster.tls_cert, cluster.tls_key)):
             raise InputError("--tls-ca", "is given without --scheduler", "leave it out")

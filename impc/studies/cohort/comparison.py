@@ -42,43 +42,21 @@ _PRICE = "log_price."
 
 @dataclass(frozen=True)
 class Comparison:
-    """One question asked of one measure in one condition.
+    """One question asked of one measure in one condition."""
 
-    Attributes
-    ----------
-    question : str
-        "group", "visit", "change", "mixed" or "reliability".
-    measure, condition : str
-        Of which, by name.
-    first, second : str
-        What is compared; empty for the reliability.
-    estimate : float
-        Difference of means (second minus first), or the ICC.
-    low, high : float
-        Interval of 95 %; NaN where the method gives none.
-    effect : float
-        Hedges' g or d_z; NaN for the others.
-    p, p_holm : float
-        NaN for the reliability.
-    n : int
-        Subjects.
-    note : str
-        Why there is no number; empty otherwise.
-    """
-
-    question: str
-    measure: str
+    question: str  # "group", "visit", "change", "mixed" or "reliability"
+    measure: str  # Of which, by name
     condition: str
-    first: str
+    first: str  # What is compared; empty for the reliability
     second: str
-    estimate: float
-    low: float
+    estimate: float  # Difference of means (second minus first), or the ICC
+    low: float  # Interval of 95 %; NaN where the method gives none
     high: float
-    effect: float
-    p: float
+    effect: float  # Hedges' g or d_z; NaN for the others
+    p: float  # NaN for the reliability
     p_holm: float
-    n: int
-    note: str = ""
+    n: int  # Subjects
+    note: str = ""  # Why there is no number; empty otherwise
 
 
 def measures_of(units: pd.DataFrame) -> tuple[str, ...]:
@@ -102,20 +80,7 @@ def measures_of(units: pd.DataFrame) -> tuple[str, ...]:
 def compare_cohort(
     units: pd.DataFrame, measures: Sequence[str] | None = None
 ) -> tuple[Comparison, ...]:
-    """Answer every question that the units allow; gains that a unit does not tell are left out.
-
-    Parameters
-    ----------
-    units : DataFrame
-        Table "units" of `cohort_tables`.
-    measures : sequence of str, optional
-        Columns; those of `measures_of` by default.
-
-    Raises
-    ------
-    DataError
-        When there is no unit.
-    """
+    """Answer every question that the units allow; gains that a unit does not tell are left out."""
     if len(units) == 0:
         raise DataError("cohort", "has no unit with a result", "see the reasons in the report")
     chosen = measures_of(units) if measures is None else tuple(measures)

@@ -38,17 +38,10 @@ _NEEDED = ("starts", "logarithms", "K", "S", "Q", "R")
 
 @dataclass
 class Failures:
-    """What could not be done, and why.
+    """What could not be done, and why."""
 
-    Attributes
-    ----------
-    units : dict
-        Unit -> reason why it has no fit.
-    replicates : dict
-        Unit -> number of the replicate, from 1 -> reason.
-    """
-
-    units: dict[str, str] = field(default_factory=dict)
+    units: dict[str, str] = field(default_factory=dict)  # Unit -> reason why it has no fit
+    # Unit -> number of the replicate, from 1 -> reason
     replicates: dict[str, dict[int, str]] = field(default_factory=dict)
 
     @property
@@ -78,13 +71,7 @@ class _Work:
 
 
 def work_left(study: Study, store: Store) -> tuple[int, int]:
-    """Number of tasks done and of all tasks; a unit that failed counts as not begun.
-
-    Raises
-    ------
-    InputError
-        When a result in the folder is damaged, or of another run.
-    """
+    """Number of tasks done and of all tasks; a unit that failed counts as not begun."""
     count = int(study.configuration.fit.get("replicates", 0))
     done = 0
     for unit in study.units:
@@ -102,28 +89,7 @@ def run_study(
     done: Callable[[str], None] = lambda _: None,
     log: Callable[[str], None] = lambda _: None,
 ) -> Failures:
-    """Do what is left of a study.
-
-    Parameters
-    ----------
-    study : Study
-    tasks : mapping of str to FitTask
-        Of `study_tasks`; a unit without one is left out.
-    store : Store
-        Held open by this run.
-    workers : Workers
-    done : callable
-        Told each unit and what was done to it.
-    log : callable
-        Told what goes to the log.
-
-    Raises
-    ------
-    InputError
-        When a result in the folder is damaged, or of other recordings, settings, plant or versions.
-    OutputError
-        When a result cannot be written.
-    """
+    """Do what is left of a study."""
     run = _Run(study, tasks, store, workers, done, log)
     for unit in study.units:
         if unit.name in tasks:

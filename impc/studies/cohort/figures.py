@@ -28,15 +28,6 @@ def group_figure(units: pd.DataFrame, measures: Sequence[str], names: Mapping[st
     """Measures of every unit by group and visit; bars are means.
 
     A line joins the visits of one subject in one condition.
-
-    Parameters
-    ----------
-    units : DataFrame
-        Table "units" of `cohort_tables`.
-    measures : sequence of str
-        Columns of it.
-    names : mapping of str to str
-        Units of the measures; those of prices within a structure and of VAF need not be there.
     """
     groups = sorted(set(units["group"])) or [""]
     visits = list(dict.fromkeys(units["visit"]))

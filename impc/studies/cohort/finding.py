@@ -23,22 +23,7 @@ Found = tuple[dict[str, str], Path]
 
 
 def find_by_pattern(where: str, folder: Path, pattern: str) -> list[Found]:
-    """Files whose path matches a pattern with {subject}, {visit}, {condition} and {trial}.
-
-    Parameters
-    ----------
-    where : str
-        How messages call the pattern.
-    folder : Path
-        What a pattern that is not absolute is relative to.
-    pattern : str
-        A name that comes twice must be the same twice.
-
-    Raises
-    ------
-    InputError
-        When the pattern cannot be used, or a label cannot be a name.
-    """
+    """Files whose path matches a pattern with {subject}, {visit}, {condition} and {trial}."""
     if Path(pattern).is_absolute():
         folder = Path(Path(pattern).anchor)
         pattern = pattern[len(folder.as_posix()) :]
@@ -86,13 +71,7 @@ def _expression(where: str, pattern: str) -> str:
 
 
 def find_by_entities(folder: Path) -> list[Found]:
-    """Files in a `folder` and below whose names have sub-, and may have ses-, task- and run-.
-
-    Raises
-    ------
-    InputError
-        When a label cannot be a name.
-    """
+    """Files in a `folder` and below whose names have sub-, and may have ses-, task- and run-."""
     found = []
     for file in sorted(folder.rglob("sub-*")):
         hidden = any(part.startswith(".") for part in file.relative_to(folder).parts)
@@ -106,13 +85,7 @@ def find_by_entities(folder: Path) -> list[Found]:
 
 
 def find_by_table(path: Path) -> list[Found]:
-    """Files and labels from the table at `path`, with the columns file and subject, maybe more.
-
-    Raises
-    ------
-    InputError
-        When the table cannot be used, or a label cannot be a name.
-    """
+    """Files and labels from the table at `path`, with the columns file and subject, maybe more."""
     sheet = read_sheet(path)
     if not {"file", "subject"} <= set(sheet.heads):
         raise InputError(sheet.where, "lacks a column", "name the columns file, subject")

@@ -17,23 +17,7 @@ _LONGEST = 64
 
 
 def checked_name(where: str, what: str, text: str) -> str:
-    """The name as it is used: its ends stripped, its accents composed (NFC).
-
-    Parameters
-    ----------
-    where : str
-        File that has the name.
-    what : str
-        "subject", "visit", "condition", "trial" or "group".
-    text : str
-        The name; it may be empty.
-
-    Raises
-    ------
-    InputError
-        When it has other characters, begins with another one than a letter or digit, or has more
-        than 64.
-    """
+    """The name as it is used: its ends stripped, its accents composed (NFC)."""
     name = unicodedata.normalize("NFC", text.strip())
     bad = [letter for letter in name if not (letter.isalnum() or letter in _BETWEEN)]
     if bad:

@@ -62,23 +62,7 @@ _GROUPS = Picture(
 
 
 def write_report(study: Study, store: Store, failures: Failures, command: str) -> None:
-    """Write units.csv, replicates.csv, intervals.csv, comparisons.csv, result.json, pages, figures.
-
-    Parameters
-    ----------
-    study : Study
-    store : Store
-        With the results.
-    failures : Failures
-        What the run that has just ended could not do.
-    command : str
-        The pages end with it.
-
-    Raises
-    ------
-    OutputError
-        When a file cannot be written.
-    """
+    """Write the tables, result.json, pages and figures of a study."""
     tables = cohort_tables(study, store)
     units = tables["units"]
     try:

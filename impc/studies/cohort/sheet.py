@@ -26,21 +26,11 @@ _THOUSANDS = re.compile(r"[+-]?\d{1,3}(,\d{3})+|[+-]?\d{1,3}(\.\d{3})+")
 
 @dataclass(frozen=True)
 class Sheet:
-    """The rows of a table.
+    """The rows of a table."""
 
-    Attributes
-    ----------
-    name : str
-        Of its file.
-    heads : tuple of str
-        Names of the columns.
-    rows : tuple of dict
-        Head -> text, its ends stripped.
-    """
-
-    name: str
-    heads: tuple[str, ...]
-    rows: tuple[dict[str, str], ...]
+    name: str  # Of its file
+    heads: tuple[str, ...]  # Names of the columns
+    rows: tuple[dict[str, str], ...]  # Head -> text, its ends stripped
 
     @property
     def where(self) -> str:
@@ -49,14 +39,7 @@ class Sheet:
 
 
 def read_sheet(path: Path) -> Sheet:
-    """Read the table at `path`.
-
-    Raises
-    ------
-    InputError
-        When it cannot be read, is no text, two columns have one name, a row has more or fewer cells
-        than there are columns, or there is no row.
-    """
+    """Read the table at `path`."""
     where = f"table {path.name}"
     workbook = path.suffix.lower() in (".xlsx", ".ods")
     lines = _cells(where, path) if workbook else _divided(where, _text(where, path))
@@ -119,12 +102,6 @@ def column_values(sheet: Sheet, name: str) -> list[float | str | None]:
     """The cells of a column `name`: numbers where all are, else text; None where a cell is empty.
 
     Decimal commas are read where the column has them throughout.
-
-    Raises
-    ------
-    InputError
-        When a column has decimal points and decimal commas, numbers that may be thousands, or a
-        number that is not finite.
     """
     cells = [row[name] for row in sheet.rows]
     given = [cell for cell in cells if cell not in ("", "n/a")]

@@ -31,81 +31,38 @@ _FIT = "fit"
 
 @dataclass(frozen=True)
 class Store:
-    """A folder of results.
+    """A folder of results."""
 
-    Attributes
-    ----------
-    folder : Path
-        Where the files are.
-    digests : mapping of str to str
-        Of every unit, by its name, as the study is now (`unit_digest`). A unit without one, because
-        a recording cannot be read, has no results.
-    """
-
-    folder: Path
+    folder: Path  # Where the files are
+    # Of every unit, by its name, as the study is now (`unit_digest`). A unit without one, because a
+    # recording cannot be read, has no results.
     digests: Mapping[str, str] = field(default_factory=dict)
 
     def fit(self, unit: str) -> dict[str, Any] | None:
-        """The fit of a unit, or None.
-
-        Raises
-        ------
-        InputError
-            When the file is damaged, or of another run.
-        """
+        """The fit of a unit, or None."""
         return self._find(unit, _FIT)
 
     def replicate(self, unit: str, index: int) -> dict[str, Any] | None:
-        """The replicate `index` of a `unit`, or None.
-
-        Raises
-        ------
-        InputError
-            When the file is damaged, or of another run.
-        """
+        """The replicate `index` of a `unit`, or None."""
         return self._find(unit, _replicate(index))
 
     def keep_fit(self, unit: str, content: Mapping[str, Any]) -> None:
-        """Write the fit of a `unit` down: `content`.
-
-        Raises
-        ------
-        OutputError
-            When that cannot be done.
-        """
+        """Write the fit of a `unit` down: `content`."""
         self._keep(unit, _FIT, "failed", content)
 
     def keep_replicate(self, unit: str, index: int, content: Mapping[str, Any]) -> None:
-        """Write the replicate `index` of a `unit` down: `content`.
-
-        Raises
-        ------
-        OutputError
-            When that cannot be done.
-        """
+        """Write the replicate `index` of a `unit` down: `content`."""
         name = _replicate(index)
         self._keep(unit, name, f"{name}-failed", content)
 
     def keep_failure(self, unit: str, index: int | None, reason: str) -> None:
-        """Write down why a `unit` has no fit, or no replicate `index`: the `reason`.
-
-        Raises
-        ------
-        OutputError
-            When that cannot be done.
-        """
+        """Write down why a `unit` has no fit, or no replicate `index`: the `reason`."""
         name = "failed" if index is None else f"{_replicate(index)}-failed"
         digest = self.digests.get(unit, "")
         self._kept.keep(f"{unit}/{name}", digest, {"reason": reason})
 
     def log(self, line: str) -> None:
-        """Add a `line` to cohort.log.
-
-        Raises
-        ------
-        OutputError
-            When that cannot be done.
-        """
+        """Add a `line` to cohort.log."""
         path = self.folder / "cohort.log"
         try:
             require_ordinary(path)
@@ -131,13 +88,7 @@ class Store:
 
 @contextmanager
 def open_store(folder: Path, digests: Mapping[str, str]) -> Iterator[Store]:
-    """Hold a folder for one run of a study whose units have these `digests`.
-
-    Raises
-    ------
-    OutputError
-        When it cannot be made, another run holds it, or it holds results of another command.
-    """
+    """Hold a folder for one run of a study whose units have these `digests`."""
     with owned(folder, "cohort"):
         yield Store(folder, digests)
 

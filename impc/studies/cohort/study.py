@@ -42,47 +42,26 @@ _UNSAFE = re.compile(r"[^A-Za-z0-9.+-]")
 
 
 class StudyTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The [study] table.
+    """The [study] table."""
 
-    Attributes
-    ----------
-    plant, model : str or None
-        As the option of `impc fit`; a model for `impc select`.
-    recordings, table, bids : str or None
-        Where the recordings are: one of the three.
-    participants : str or None
-        Table of the subjects.
-    """
-
-    plant: str | None = None
+    plant: str | None = None  # As the option of `impc fit`; a model for `impc select`
     model: str | None = None
-    recordings: str | None = None
+    recordings: str | None = None  # Where the recordings are: one of the three
     table: str | None = None
     bids: str | None = None
-    participants: str | None = None
+    participants: str | None = None  # Table of the subjects
 
 
 @dataclass(frozen=True)
 class Unit:
-    """All trials of one subject, visit and condition.
+    """All trials of one subject, visit and condition."""
 
-    Attributes
-    ----------
-    subject, visit, condition : str
-        Empty where the study has none.
-    files : tuple of Path
-        By trial.
-    group : str
-        Empty where participants have none.
-    person : dict
-        Other columns of the participants, for this subject.
-    """
-
-    subject: str
+    subject: str  # Empty where the study has none
     visit: str
     condition: str
-    files: tuple[Path, ...]
-    group: str = ""
+    files: tuple[Path, ...]  # By trial
+    group: str = ""  # Empty where participants have none
+    # Other columns of the participants, for this subject
     person: Mapping[str, float | str] = field(default_factory=dict)
 
     @property
@@ -99,33 +78,17 @@ def safe_name(name: str) -> str:
 
 @dataclass(frozen=True)
 class Study:
-    """A study that has been read.
+    """A study that has been read."""
 
-    Attributes
-    ----------
-    plant, model : str
-        Name, import path or file of the plant; import path of the model. Empty when not given.
-    configuration : Configuration
-        Signals and settings of every fit.
-    units : tuple of Unit
-        In the order of subject, visit and condition.
-    """
-
+    # Name, import path or file of the plant; import path of the model. Empty when not given.
     plant: str
-    configuration: Configuration
-    units: tuple[Unit, ...]
+    configuration: Configuration  # Signals and settings of every fit
+    units: tuple[Unit, ...]  # In the order of subject, visit and condition
     model: str = ""
 
 
 def read_study(path: Path) -> Study:
-    """Read the study at `path` and find its recordings; none of them is opened.
-
-    Raises
-    ------
-    InputError
-        When the file or a table cannot be used, no recording is found, a recording has no
-        participant, a name cannot be one, or two units or subjects would have the same.
-    """
+    """Read the study at `path` and find its recordings; none of them is opened."""
     configuration = read_configuration(path, "study", "model", "select")
     table = _table(path, configuration)
     people = _people(path.parent / table.participants) if table.participants else None

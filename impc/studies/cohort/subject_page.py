@@ -26,17 +26,7 @@ __all__ = ["kept_words", "or_nan", "subject_files"]
 def subject_files(
     subject: str, units: list[Unit], store: Store, failures: Failures
 ) -> dict[str, bytes]:
-    """The page of a subject and the figures on it, by path.
-
-    Parameters
-    ----------
-    subject : str
-        Its name.
-    units : list of Unit
-        Those of the subject.
-    store : Store
-    failures : Failures
-    """
+    """The page of a subject and the figures on it, by path."""
     sections: list[Section] = []
     figures: dict[str, bytes] = {}
     for unit in units:
@@ -77,13 +67,7 @@ def _subject_verdict(units: list[Unit], store: Store) -> tuple[Verdict, ...]:
 
 
 def kept_words(units: Sequence[Unit], store: Store) -> list[tuple[str, str]]:
-    """What the signals are, as the first unit that was fitted tells.
-
-    Parameters
-    ----------
-    units : sequence of Unit
-    store : Store
-    """
+    """What the signals are, as the first unit that was fitted tells."""
     fits = (store.fit(unit.name) for unit in units)
     first = next((fit for fit in fits if fit is not None), {})
     return [(name, meaning) for name, meaning in first.get("words", ())]

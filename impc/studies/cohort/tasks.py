@@ -26,11 +26,6 @@ def unused_columns(study: Study, source: PlantSource) -> tuple[str, ...]:
     """Columns of the participants that are no arguments of the plant of this `study`.
 
     They stay out of the fit: age and sex of a subject are no fault of the table.
-
-    Parameters
-    ----------
-    source : PlantSource
-        Of the plant.
     """
     names = {name: None for unit in study.units for name in unit.person}
     return tuple(name for name in names if not _takes(source, name))
@@ -49,11 +44,6 @@ def study_tasks(study: Study, source: PlantSource) -> tuple[dict[str, FitTask], 
     """Tasks of all units by name, and the reason for each unit that has none.
 
     All recordings are read from their first byte to their last, for the digests.
-
-    Parameters
-    ----------
-    source : PlantSource
-        Of the plant, imported already.
     """
     unused = set(unused_columns(study, source))
     tasks: dict[str, FitTask] = {}

@@ -28,11 +28,6 @@ def not_told(units: pd.DataFrame) -> dict[str, int]:
     over the units that give a deviation. The deviation counts what the entry may owe to directions
     that are not told (`GainCovariance.entries`), so that one told only with others is data too
     where it is told well enough.
-
-    Parameters
-    ----------
-    units : DataFrame
-        Table "units" of `cohort_tables`.
     """
     kept = only_told(units)
     return {
@@ -61,15 +56,7 @@ def only_told(units: pd.DataFrame) -> pd.DataFrame:
 
 
 def not_told_sentences(counts: Mapping[str, int], of: int) -> list[str]:
-    """What is left out for it, in one sentence; none where nothing is.
-
-    Parameters
-    ----------
-    counts : mapping of str to int
-        Of `not_told`, of those that are compared.
-    of : int
-        Number of units.
-    """
+    """What is left out for it, in one sentence; none where nothing is."""
     if not counts:
         return []
     each = "; ".join(f"the {measure_words(name)} of {count}" for name, count in counts.items())

@@ -22,25 +22,7 @@ _COUNTS = ("replicates",)
 def unit_digest(
     files: Sequence[str], plant: str, arguments: Mapping[str, Any], configuration: Configuration
 ) -> str:
-    """Of the whole content of recordings, of plant, settings and versions.
-
-    Parameters
-    ----------
-    files : sequence of str
-        Recordings, one a trial. Their names count too: a name may tell a label, and its ending the
-        format.
-    plant : str
-        Import path, imported already, or file.
-    arguments : mapping
-        Of the plant.
-    configuration : Configuration
-        Signals and settings.
-
-    Raises
-    ------
-    DataError
-        When a recording cannot be read.
-    """
+    """Of the whole content of recordings, of plant, settings and versions."""
     return digest(
         [(Path(name).name, content_digest(Path(name))) for name in files],
         source_digest(plant, arguments),
@@ -53,20 +35,7 @@ def unit_digest(
 
 
 def require_same_inputs(here: str, wanted: str) -> None:
-    """Refuse to work where the files, the plant or the versions are not those of the client.
-
-    Parameters
-    ----------
-    here : str
-        `unit_digest` as the worker finds it.
-    wanted : str
-        As the client found it.
-
-    Raises
-    ------
-    DataError
-        When they differ.
-    """
+    """Refuse to work where the files, the plant or the versions are not those of the client."""
     if here != wanted:
         raise DataError(
             "worker",

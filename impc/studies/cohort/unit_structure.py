@@ -30,19 +30,6 @@ def unit_structure(
 
     Logarithms of prices with ends of 95 %; minus infinity, for a price that is or may be zero,
     becomes null when it is written.
-
-    Parameters
-    ----------
-    problem : Problem
-        As it was posed.
-    fitted : Estimate
-        Of weights of any kind.
-    settings : FitSettings
-
-    Raises
-    ------
-    InputError, WeightsError
-        When the structure does not suit the plant.
     """
     if settings.structure is None:
         return None

@@ -57,26 +57,13 @@ _SHOWN = 600
 
 @dataclass(frozen=True)
 class FitTask:
-    """All that a worker needs of a unit.
+    """All that a worker needs of a unit."""
 
-    Attributes
-    ----------
-    files : tuple of str
-        Paths of the recordings.
-    plant : str
-        Its import path or file.
-    arguments : dict
-        Of the plant.
-    configuration : Configuration
-    digest : str
-        Of all of these and of the files' content.
-    """
-
-    files: tuple[str, ...]
-    plant: str
-    arguments: dict[str, Any] = field(hash=False)
+    files: tuple[str, ...]  # Paths of the recordings
+    plant: str  # Its import path or file
+    arguments: dict[str, Any] = field(hash=False)  # Of the plant
     configuration: Configuration = field(hash=False)
-    digest: str = ""
+    digest: str = ""  # Of all of these and of the files' content
 
 
 def fit_unit(task: FitTask) -> dict[str, Any]:
@@ -117,13 +104,7 @@ def replicate_unit(task: FitTask, fit: dict[str, Any], index: int) -> dict[str, 
 
 @functools.lru_cache(maxsize=4)
 def unit_problem(task: FitTask) -> tuple[Problem, FitSettings]:
-    """The recordings of a unit as an inverse problem, read once for all that is done with it.
-
-    Raises
-    ------
-    ImpcError
-        When a recording, the plant or the settings cannot be used, or are not those of the `task`.
-    """
+    """The recordings of a unit as an inverse problem, read once for all that is done with it."""
     settings = fit_settings(task.configuration.fit)
     source = plant_source(task.plant, task.arguments)
     # A worker on another machine, or one that has run for days, may have other files and code.

@@ -39,21 +39,11 @@ _ENVIRONMENT = {
 
 @dataclass(frozen=True)
 class Done:
-    """What became of a task.
+    """What became of a task."""
 
-    Attributes
-    ----------
-    key : hashable
-        Its name.
-    value : object
-        What it returned.
-    fault : str
-        Why it returned nothing; empty when it did.
-    """
-
-    key: Hashable
-    value: Any
-    fault: str = ""
+    key: Hashable  # Its name
+    value: Any  # What it returned
+    fault: str = ""  # Why it returned nothing; empty when it did
 
 
 class Workers(Protocol):
@@ -89,13 +79,7 @@ class _Worker:
 
 
 class LocalWorkers:
-    """Processes on this machine, see `Workers`.
-
-    Parameters
-    ----------
-    count : int
-        How many.
-    """
+    """Processes on this machine, see `Workers`."""
 
     def __init__(self, count: int) -> None:
         self._waiting: deque[_Task] = deque()
@@ -108,17 +92,7 @@ class LocalWorkers:
         return len(self._workers)
 
     def submit(self, key: Hashable, work: Callable[..., Any], *given: Any) -> None:
-        """As `Workers.submit`: ``work(*given)`` under a `key`.
-
-        Parameters
-        ----------
-        key : hashable
-            Its name.
-        work : callable
-            Of an importable module.
-        *given : object
-            Its arguments.
-        """
+        """As `Workers.submit`: ``work(*given)`` under a `key`."""
         self._waiting.append(_Task(key, work, given))
         self._give_out()
 
@@ -181,13 +155,7 @@ class LocalWorkers:
 
 @contextmanager
 def local_workers(count: int | None) -> Iterator[LocalWorkers]:
-    """Workers while the block lasts; as many as there are processors by default.
-
-    Parameters
-    ----------
-    count : int or None
-        How many.
-    """
+    """Workers while the block lasts; as many as there are processors by default."""
     found = LocalWorkers(count or os.cpu_count() or 1)
     try:
         yield found

@@ -46,21 +46,7 @@ def compare_recordings(
 ) -> tuple[MethodFit, ...]:
     """Run every method on all trials, then on all but each one.
 
-    Parameters
-    ----------
-    problem : Problem
-        Of `fit_problem`.
-    settle : float
-        Seconds at the start of a left-out trial that find its start and do not count.
-    remember : callable
-        (stage, compute) -> the estimate; stages are named "all/METHOD" and "without K/METHOD".
-    held_out : bool
-        Whether each trial is predicted from the others.
-
-    Raises
-    ------
-    WeightsError, SolverError
-        When no regulator can be simulated on all trials.
+    `remember` (stage, compute).
     """
     count, names = len(problem.recordings), compared_methods()
     ground = NaturalUnits(problem, _within("all", remember))

@@ -86,75 +86,33 @@ LOST = (
 
 @dataclass(frozen=True)
 class MethodResult(Frozen):
-    """What one method makes of the recording.
+    """What one method makes of the recording."""
 
-    Attributes
-    ----------
-    name : str
-        One of the seven, as in the first column of the table.
-    weights : Weights or None
-        Scaled to R[0, 0] = 1; None for a gain without weights.
-    K : Array or None
-        Gain (m, n); None when the method has no answer.
-    simulation : Simulation or None
-        The recording as the method explains it.
-    state_misfit : float or None
-        2-norm over all states and steps.
-    max_abs_u : float or None
-        Largest magnitude of an input.
-    bound_kept : bool or None
-        Whether every input is inside the bound, to 1e-9.
-    residual : float or None
-        (3.10), against the true weights.
-    seconds : float
-        Time of this method alone in s, given what it starts from.
-    simulations : int
-        Closed loops simulated, with derivatives, on the way; 0 for methods that need none.
-    feasible : bool or None
-        For the LMI.
-    """
-
-    name: str
-    weights: Weights | None
-    K: Array | None
-    simulation: Simulation | None
-    state_misfit: float | None
-    max_abs_u: float | None
-    bound_kept: bool | None
-    residual: float | None
-    seconds: float
+    name: str  # One of the seven, as in the first column of the table
+    weights: Weights | None  # Scaled to R[0, 0] = 1; None for a gain without weights
+    K: Array | None  # Gain (m, n); None when the method has no answer
+    simulation: Simulation | None  # The recording as the method explains it
+    state_misfit: float | None  # 2-norm over all states and steps
+    max_abs_u: float | None  # Largest magnitude of an input
+    bound_kept: bool | None  # Whether every input is inside the bound, to 1e-9
+    residual: float | None  # (3.10), against the true weights
+    seconds: float  # Time of this method alone in s, given what it starts from
+    # Closed loops simulated, with derivatives, on the way; 0 for methods that need none
     simulations: int
-    feasible: bool | None
+    feasible: bool | None  # For the LMI
 
 
 @dataclass(frozen=True)
 class CaseResult(Frozen):
-    """One initial state: the truth, the methods in the order of the table, and what was determined.
+    """One initial state: the truth, the methods of the table, and what was determined."""
 
-    Attributes
-    ----------
-    name : str
-        One of `CASES`.
-    x0 : Array
-        Initial state (n,).
-    controller : Controller
-        The true one, with its terminal set.
-    truth : Simulation
-        The recording.
-    branch : str
-        Branch of Table 3.1 that was taken: ``"LMI"`` or ``"gradient"``.
-    methods : tuple of MethodResult
-    identifiability : Identifiability
-        At the weights of the direct inverse MPC.
-    """
-
-    name: str
-    x0: Array
-    controller: Controller
-    truth: Simulation
-    branch: str
+    name: str  # One of `CASES`
+    x0: Array  # Initial state (n,)
+    controller: Controller  # The true one, with its terminal set
+    truth: Simulation  # The recording
+    branch: str  # Branch of Table 3.1 that was taken: ``"LMI"`` or ``"gradient"``
     methods: tuple[MethodResult, ...]
-    identifiability: Identifiability
+    identifiability: Identifiability  # At the weights of the direct inverse MPC
 
     def method(self, name: str) -> MethodResult:
         """The result of a method by its name."""
@@ -173,24 +131,7 @@ def run_case(
     solver: str = COMPILED,
     progress: Callable[[str], None] = lambda _: None,
 ) -> CaseResult:
-    """Simulate the true controller from a case's initial state and run every method on it.
-
-    Parameters
-    ----------
-    plant : Plant
-        Two states, one input.
-    name : str
-        ``"A"``, ``"B"`` or ``"C"``.
-    solver : str
-        Of the quadratic programs, see `Controller`.
-    progress : callable, optional
-        Called with the name of each method when it is done.
-
-    Raises
-    ------
-    ImpcError
-        When a method fails.
-    """
+    """Simulate the true controller from a case's initial state and run every method on it."""
     bounds = Bounds(plant, u_min=-BOUND, u_max=BOUND)
     truth_weights = true_weights(plant)
     controller = Controller(plant, truth_weights, bounds, HORIZON, solver=solver)

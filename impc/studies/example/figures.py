@@ -44,13 +44,7 @@ _PATHS = (Mark(BLUE, "", "--"), Mark(INK, "", "-"), Mark(VERMILLION, "", "-."))
 
 
 def example_figures(case: CaseResult) -> dict[str, bytes]:
-    """Draw all figures of a case.
-
-    Returns
-    -------
-    dict of str to bytes
-        PNG and PDF by file name: ``figure-3.2-case-A.png`` and so on.
-    """
+    """Draw all figures of a case."""
     with journal_style():
         figures = {f"figure-{number}": _fit(case, method) for number, method, _ in FIGURES}
         figures |= {"terminal-set": _terminal_set(case), "comparison": _comparison(case)}

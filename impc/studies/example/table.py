@@ -33,18 +33,10 @@ __all__ = [
 
 @dataclass(frozen=True)
 class MethodText:
-    """A method in words.
+    """A method in words."""
 
-    Attributes
-    ----------
-    label : str
-        For tables.
-    sentence : str
-        For readers who do not know it.
-    """
-
-    label: str
-    sentence: str
+    label: str  # For tables
+    sentence: str  # For readers who do not know it
 
 
 #: The true controller and the methods in words, by their names.
@@ -60,30 +52,17 @@ _NONE = "-"
 
 @dataclass(frozen=True)
 class Row:
-    """One line of the table, every cell as text.
+    """One line of the table, every cell as text."""
 
-    Attributes
-    ----------
-    name : str
-        Of the method: the key in result.json.
-    weights, gain : str
-        Entries; a dash or "infeasible" where there are none.
-    misfit, largest, kept : str
-        2-norm of the state misfit, largest magnitude of the input, whether the bound is kept.
-    residual : str
-        (3.10).
-    seconds : str
-        Time of the method, s.
-    """
-
-    name: str
-    weights: str
+    name: str  # Of the method: the key in result.json
+    weights: str  # Entries; a dash or "infeasible" where there are none
     gain: str
+    # 2-norm of the state misfit, largest magnitude of the input, whether the bound is kept
     misfit: str
     largest: str
     kept: str
-    residual: str
-    seconds: str
+    residual: str  # (3.10)
+    seconds: str  # Time of the method, s
 
     @property
     def cells(self) -> tuple[str, ...]:

@@ -36,11 +36,6 @@ def fit_observer(
     """The person of [fit.observer], and where steps of an unknown perturbation begin (d,).
 
     Levels stand at places to begin from; the search finds others by the residuals.
-
-    Raises
-    ------
-    InputError, PlantError
-        When a sensed signal is not known, or an unknown perturbation has nobody to estimate it.
     """
     asked = settings.observer
     if asked is None:
@@ -61,14 +56,7 @@ def fit_observer(
 
 
 def fit_structures(plant: Plant, settings: FitSettings) -> tuple[Structure, ...]:
-    """Structures of the weights that the settings name, that of [fit.structure] first.
-
-    Raises
-    ------
-    InputError, WeightsError
-        When a feature cannot be read, nothing prices a mode that does not decay, or two structures
-        have one name.
-    """
+    """Structures of the weights that the settings name, that of [fit.structure] first."""
     first = [] if settings.structure is None else [settings.structure]
     found: list[Structure] = []
     for item in (*first, *settings.structures):
@@ -89,13 +77,7 @@ def moving_body(
 
 
 def fit_bounds(plant: Plant, settings: FitSettings, recordings: Sequence[Recording]) -> Bounds:
-    """Bounds of the controller: inputs as set, states as set or from the data (3.22).
-
-    Raises
-    ------
-    InputError, BoundsError
-        When a state is unknown or its bound cannot be taken from the data.
-    """
+    """Bounds of the controller: inputs as set, states as set or from the data (3.22)."""
     x_max = np.full(plant.n, np.inf)
     for name, value in settings.bounded_states.items():
         if name not in plant.states:

@@ -65,14 +65,7 @@ def fit_figures(result: FitResult) -> dict[str, bytes]:
 
 
 def trajectory_figure(result: FitResult, index: int) -> Figure:
-    """Outputs, command and disturbance of a trial, recorded and simulated.
-
-    Parameters
-    ----------
-    result : FitResult
-    index : int
-        Of the trial.
-    """
+    """Outputs, command and disturbance of a trial, recorded and simulated."""
     plant = result.fitted.problem.plant
     trial, run = result.given.recordings[index], result.inverse_mpc.runs[index]
     time = np.arange(trial.samples) * plant.dt

@@ -41,23 +41,12 @@ class FitMemory(Cache):
     """The cache of `impc fit` and `impc compare`; its methods are what these two keep.
 
     `files`, `digest`, `done` and `stages` are as in `Cache`.
-
-    Attributes
-    ----------
-    problem : Problem
-        As it was posed.
     """
 
-    problem: Problem = field(kw_only=True)
+    problem: Problem = field(kw_only=True)  # As it was posed
 
     def estimate(self, name: str, compute: Callable[[], Estimate]) -> Estimate:
-        """The estimate of the stage `name`, as `compute` makes it.
-
-        Raises
-        ------
-        OutputError
-            When the file cannot be written.
-        """
+        """The estimate of the stage `name`, as `compute` makes it."""
 
         def decode(kept: dict[str, Any]) -> Estimate:
             return decode_estimate(_seen(self.problem, name, METHODS[kept["method"]]), kept)
@@ -65,36 +54,13 @@ class FitMemory(Cache):
         return self.get(name, compute, Codec(encode_estimate, decode))
 
     def replicate(self, name: str, compute: Callable[[], Replicate]) -> Replicate:
-        """The bootstrap replicate of the stage `name`, as `compute` makes it.
-
-        Raises
-        ------
-        OutputError
-            When the file cannot be written.
-        """
+        """The bootstrap replicate of the stage `name`, as `compute` makes it."""
         return self.get(name, compute, by_fields(Replicate))
 
     def person(
         self, name: str, posed: Problem, observer: Observer, compute: Callable[[], PersonModel]
     ) -> PersonModel:
-        """The person who senses with noise of the stage `name`, as `compute` makes it.
-
-        Parameters
-        ----------
-        name : str
-            What the model is called.
-        posed : Problem
-            Of that model.
-        observer : Observer
-            As it was asked for.
-        compute : callable
-            Without arguments.
-
-        Raises
-        ------
-        OutputError
-            When the file cannot be written.
-        """
+        """The person who senses with noise of the stage `name`, as `compute` makes it."""
 
         def encode(model: PersonModel) -> dict[str, Any]:
             fit = None if model.fit is None else encode_person(model.fit)
@@ -110,19 +76,7 @@ class FitMemory(Cache):
 def open_memory(
     folder: Path, problem: Problem, settings: FitSettings, command: str = "fit", made_of: str = ""
 ) -> FitMemory:
-    """The memory of a command in a folder, empty when there is none for this very problem.
-
-    Parameters
-    ----------
-    folder : Path
-        Where the command writes.
-    problem : Problem
-    settings : FitSettings
-    command : str
-        "fit" or "compare".
-    made_of : str
-        Digest of the files that the problem was made of (`Inputs.digest`).
-    """
+    """The memory of a command in a folder, empty when there is none for this very problem."""
     known = digest(_content(problem), settings, made_of, versions())
     return FitMemory(Kept(folder / f"{command}-in-progress"), known, problem=problem)
 

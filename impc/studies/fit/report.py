@@ -108,14 +108,7 @@ def fit_report(
 ) -> Report:
     """Page, result.json, tables and figures.
 
-    Parameters
-    ----------
-    result : FitResult
-    provenance : Provenance
-    truth : Array, optional
-        Gain (m, n) of a simulated subject: the page then compares with it.
-    missing : str
-        What was not given, of `missing`.
+    `truth` (m, n).
     """
     told = () if truth is None else (Note("Truth.", truth_sentence(result, truth)),)
     subject = str(result.given.recordings[0].label.subject) or "a subject"

@@ -43,21 +43,12 @@ LITTLE = 50.0
 
 @dataclass(frozen=True)
 class FittedParameter:
-    """A physical parameter of the plant that was fitted with the gain.
+    """A physical parameter of the plant that was fitted with the gain."""
 
-    Attributes
-    ----------
-    name : str
-        An argument of the plant's function.
-    nominal, value : float
-        In its unit.
-    deviation : float
-        Standard deviation of the value, in its unit; infinite when nothing determines it.
-    """
-
-    name: str
-    nominal: float
+    name: str  # An argument of the plant's function
+    nominal: float  # In its unit
     value: float
+    # Standard deviation of the value, in its unit; infinite when nothing determines it
     deviation: float
 
     @property
@@ -71,67 +62,37 @@ class FittedParameter:
 
 @dataclass(frozen=True)
 class FitResult:
-    """Result of `fit_recordings`.
-
-    Attributes
-    ----------
-    settings : FitSettings
-    given : Problem
-        The problem as it was posed: nominal plant, trials at rest.
-    fitted : Estimate
-        Weights and their gain; `fitted.problem` holds the initial states and the plant found.
-    estimate : GainEstimate
-        The gain that the recordings tell, and how far: what is printed with intervals.
-    parameters : tuple of FittedParameter
-    intent : Intent
-    identifiability : Identifiability
-        Directions of the weights that the recordings determine, and how many they leave.
-    certainty : Certainty
-        Intervals, the set of weights with this gain, and what else was asked for.
-    trials : tuple of TrialAgreement
-        Of inverse MPC, one a trial.
-    held_out : tuple of HeldOut
-        One a trial; empty for a single trial or when not asked for.
-    methods : tuple of MethodFit
-        Those of `impc.inverse.methods` that a fit asks for; the last is inverse MPC.
-    diagnostics : ResidualDiagnostics
-        What the residuals say against the fit.
-    terminal_set_difference : float
-        Largest change of a scaled output when the terminal set is added (or taken away); NaN when
-        the loop with it does not reach the end.
-    seconds : float
-        Time of the whole fit, s.
-    weights_test : WeightsTest
-        Whether any weights explain the gain.
-    other_limit : OtherLimit or None
-        The fit with the limit of the command free, where the recordings contradict the given one.
-    failures : dict of str to str
-        Stages that failed, and why; what they would have found is missing.
-    structures : tuple of StructureFit
-        Those that were asked for, that of [fit.structure] first.
-    person : PersonReport or None
-        Of [fit.observer]; None where none was asked for.
-    """
+    """Result of `fit_recordings`."""
 
     settings: FitSettings
-    given: Problem
+    given: Problem  # The problem as it was posed: nominal plant, trials at rest
+    # Weights and their gain; `fitted.problem` holds the initial states and the plant found
     fitted: Estimate
+    # The gain that the recordings tell, and how far: what is printed with intervals
     estimate: GainEstimate
     parameters: tuple[FittedParameter, ...]
     intent: Intent
+    # Directions of the weights that the recordings determine, and how many they leave
     identifiability: Identifiability
+    # Intervals, the set of weights with this gain, and what else was asked for
     certainty: Certainty
-    trials: tuple[TrialAgreement, ...]
-    held_out: tuple[HeldOut, ...]
+    trials: tuple[TrialAgreement, ...]  # Of inverse MPC, one a trial
+    held_out: tuple[HeldOut, ...]  # One a trial; empty for a single trial or when not asked for
+    # Those of `impc.inverse.methods` that a fit asks for; the last is inverse MPC
     methods: tuple[MethodFit, ...]
-    diagnostics: ResidualDiagnostics
+    diagnostics: ResidualDiagnostics  # What the residuals say against the fit
+    # Largest change of a scaled output when the terminal set is added (or taken away); NaN when the
+    # loop with it does not reach the end
     terminal_set_difference: float
-    seconds: float
-    weights_test: WeightsTest
+    seconds: float  # Time of the whole fit, s
+    weights_test: WeightsTest  # Whether any weights explain the gain
+    # The fit with the limit of the command free, where the recordings contradict the given one
     other_limit: OtherLimit | None = None
+    # Stages that failed, and why; what they would have found is missing
     failures: Mapping[str, str] = field(default_factory=dict)
+    # Those that were asked for, that of [fit.structure] first
     structures: tuple[StructureFit, ...] = ()
-    person: PersonReport | None = None
+    person: PersonReport | None = None  # Of [fit.observer]; None where none was asked for
 
     @property
     def usable(self) -> bool:

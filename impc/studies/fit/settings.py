@@ -61,46 +61,28 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class StructureSettings:
-    """What may be costed, by name (`impc.model.structure`).
+    """What may be costed, by name (`impc.model.structure`)."""
 
-    Attributes
-    ----------
-    Q, R : str or list of str
-        "diagonal", "full", for Q "outputs", or features with a price each.
-    over : list of str or None
-        Features that "diagonal" or "full" is over; all states by default.
-    name : str or None
-        In tables and sentences.
-    """
-
+    # "diagonal", "full", for Q "outputs", or features with a price each
     Q: str | list[str] = "diagonal"
     R: str | list[str] = "diagonal"
+    # Features that "diagonal" or "full" is over; all states by default
     over: list[str] | None = None
-    name: str | None = None
+    name: str | None = None  # In tables and sentences
 
 
 @dataclass(frozen=True)
 class ObserverSettings:
-    """How a person senses, and which noise is in the loop (`impc.model.observer`).
+    """How a person senses, and which noise is in the loop (`impc.model.observer`)."""
 
-    Attributes
-    ----------
-    sensed : list of str
-        Combinations of states and outputs; none for a person who sees every state.
-    motor, share, process : bool
-        Whether there is such noise; its size is searched.
-    known : bool
-        Whether the person knows the perturbation.
-    profiles : bool
-        Whether intervals of the gain and of levels that are weakly told follow the likelihood:
-        ten minutes and more on the seat.
-    """
-
+    # Combinations of states and outputs; none for a person who sees every state
     sensed: list[str] = field(default_factory=list)
-    motor: bool = True
+    motor: bool = True  # Whether there is such noise; its size is searched
     share: bool = False
     process: bool = False
-    known: bool = True
+    known: bool = True  # Whether the person knows the perturbation
+    # Whether intervals of the gain and of levels that are weakly told follow the likelihood: ten
+    # minutes and more on the seat
     profiles: bool = False
 
 
@@ -204,21 +186,7 @@ class FitSettings:
 
 
 def require_used(settings: FitSettings, used: Collection[str], command: str) -> None:
-    """Refuse what is set and not used, so that nothing is left out without a word.
-
-    Parameters
-    ----------
-    settings : FitSettings
-    used : collection of str
-        Of the settings that only some commands use, those that this one does.
-    command : str
-        Its name.
-
-    Raises
-    ------
-    InputError
-        When one of the others differs from its default.
-    """
+    """Refuse what is set and not used, so that nothing is left out without a word."""
     usual = FitSettings()
     for name in _OF_SOME:
         if name not in used and getattr(settings, name) != getattr(usual, name):
@@ -230,13 +198,7 @@ def require_used(settings: FitSettings, used: Collection[str], command: str) -> 
 
 
 def read_settings(name: str, kind: type[T], table: Mapping[str, Any]) -> T:
-    """The `table` of a file that is called `name`, as a dataclass of this `kind`.
-
-    Raises
-    ------
-    InputError
-        When a key is unknown or a value is of the wrong kind.
-    """
+    """The `table` of a file that is called `name`, as a dataclass of this `kind`."""
     known = [item.name for item in fields(kind)]  # type: ignore[arg-type]
     unknown = [key for key in table if key not in known]
     if unknown:
@@ -248,13 +210,7 @@ def read_settings(name: str, kind: type[T], table: Mapping[str, Any]) -> T:
 
 
 def fit_settings(table: Mapping[str, Any]) -> FitSettings:
-    """Read the [fit] table of a configuration.
-
-    Raises
-    ------
-    InputError
-        When a key is unknown or a value is of the wrong kind or out of range.
-    """
+    """Read the [fit] table of a configuration."""
     for name, value in table.items():
         if value == FILL_IN:
             raise InputError(

@@ -76,25 +76,15 @@ _UNUSABLE = "the controller explains less than half of a recorded signal."
 
 @dataclass(frozen=True)
 class FitProgress:
-    """What a caller wants to hear of a fit, and what it remembers of an earlier one.
+    """What a caller wants to hear of a fit, and what it remembers of an earlier one."""
 
-    Attributes
-    ----------
-    done : callable
-        Told the name of each stage when it is done.
-    estimate : callable
-        (name of stage, compute) -> the estimate, from memory when it is there
-        (`impc.studies.fit.memory`). By default every one is computed.
-    replicate : callable
-        (name of stage, compute) -> a bootstrap replicate, in the same way.
-    person : callable
-        (name of stage, problem, person, compute) -> a person who senses with noise, in the same
-        way.
-    """
-
-    done: Callable[[str], None] = lambda _: None
+    done: Callable[[str], None] = lambda _: None  # Told the name of each stage when it is done
+    # (name of stage, compute) -> the estimate, from memory when it is there
+    # (`impc.studies.fit.memory`). By default every one is computed.
     estimate: Remember = afresh
+    # (name of stage, compute) -> a bootstrap replicate, in the same way
     replicate: Callable[[str, Callable[[], Replicate]], Replicate] = lambda _, compute: compute()
+    # (name of stage, problem, person, compute) -> a person who senses with noise, in the same way
     person: RememberPerson = afresh_person
 
 
@@ -466,11 +456,6 @@ def state_sizes(runs: tuple[Simulation, ...]) -> Array:
     """Root-mean-square of each state (n,); states that never move count as the least that does.
 
     Of simulated `runs`.
-
-    Raises
-    ------
-    SolverError
-        When no state moves.
     """
     sizes = np.sqrt(np.mean(np.concatenate([run.x for run in runs]) ** 2, axis=0))
     moving = sizes[sizes > 0]

@@ -28,18 +28,7 @@ __all__ = ["read_truth", "truth_sentence", "truth_table"]
 def read_truth(recordings: Iterable[Path], plant: Plant) -> Array | None:
     """The gain of the truth.json that lies beside recordings.
 
-    Parameters
-    ----------
-    recordings : iterable of Path
-        The files.
-    plant : Plant
-        Whose gain it has to be.
-
-    Returns
-    -------
-    Array or None
-        (m, n); None where there is no such file, they lie in several folders, or it is of another
-        plant.
+    Returns (m, n).
     """
     folders = {path.absolute().parent for path in recordings}
     path = folders.pop() / "truth.json" if len(folders) == 1 else None

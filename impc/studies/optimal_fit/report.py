@@ -60,13 +60,7 @@ _TOLD = (
 
 
 def optimal_report(fit: OptimalFit, provenance: Provenance) -> Report:
-    """Page, result.json, parameters.csv, combinations.csv, trajectories.csv and figures.
-
-    Parameters
-    ----------
-    fit : OptimalFit
-    provenance : Provenance
-    """
+    """Page, result.json, parameters.csv, combinations.csv, trajectories.csv and figures."""
     told: list[Block] = [_TOLD, _combinations(fit), _VALUES]
     return Report(
         f"impc fit: {provenance.plant_name}",

@@ -32,29 +32,15 @@ _EXACT = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class OptimalFit(Frozen):
-    """An estimate, and where its recordings come from.
-
-    Attributes
-    ----------
-    estimate : OptimalControlEstimate
-    trials : tuple of str
-        A name for each recording.
-    findings : tuple of tuple of str
-        What the checks of each let pass.
-    dt : float or None
-        Sample time, s; None where nobody says it.
-    known : mapping of str to (float, str)
-        Parameters that were not searched: value and unit.
-    settings : mapping
-        As the user gave them.
-    """
+    """An estimate, and where its recordings come from."""
 
     estimate: OptimalControlEstimate
-    trials: tuple[str, ...]
-    findings: tuple[tuple[str, ...], ...]
-    dt: float | None = None
+    trials: tuple[str, ...]  # A name for each recording
+    findings: tuple[tuple[str, ...], ...]  # What the checks of each let pass
+    dt: float | None = None  # Sample time, s; None where nobody says it
+    # Parameters that were not searched: value and unit
     known: Mapping[str, tuple[float, str]] = field(default_factory=dict)
-    settings: Mapping[str, Any] = field(default_factory=dict)
+    settings: Mapping[str, Any] = field(default_factory=dict)  # As the user gave them
 
     @property
     def status(self) -> Status:
@@ -75,18 +61,10 @@ class OptimalFit(Frozen):
 
 @dataclass(frozen=True)
 class Reached:
-    """How often a constraint is at its limit.
+    """How often a constraint is at its limit."""
 
-    Attributes
-    ----------
-    name : str
-        Of the constraint.
-    samples, of : int
-        Those at which one of its rows is at its limit, and all.
-    """
-
-    name: str
-    samples: int
+    name: str  # Of the constraint
+    samples: int  # Those at which one of its rows is at its limit, and all
     of: int
 
 

@@ -27,65 +27,33 @@ _MOST = {"evaluations": 100_000, "starts": 1000}
 
 @dataclass(frozen=True)
 class ParameterSettings:
-    """A parameter of the problem: where its search begins, or its value.
+    """A parameter of the problem: where its search begins, or its value."""
 
-    Attributes
-    ----------
-    start : float or None
-        First value of a search.
-    known : float or None
-        Its value, when it is not searched.
-    unit : str
-        Of the number; that of the problem where it is empty.
-    """
-
-    start: float | None = None
-    known: float | None = None
-    unit: str = ""
+    start: float | None = None  # First value of a search
+    known: float | None = None  # Its value, when it is not searched
+    unit: str = ""  # Of the number; that of the problem where it is empty
 
 
 @dataclass(frozen=True)
 class OptimalFitSettings:
-    """What a user may set of the fit of an optimal control problem.
+    """What a user may set of the fit of an optimal control problem."""
 
-    Attributes
-    ----------
-    parameters : dict of str to ParameterSettings
-        Every parameter of the problem by its name.
-    recorded : "loop" or "plan"
-        Whether a recording is of a controller that plans anew at every sample, or is one plan.
-    horizon : int or None
-        In samples, in place of the problem's.
-    x0 : dict of str to float
-        Initial values of states, in SI units, in place of what was recorded.
-    unknown_start : bool
-        Whether initial states are searched, from what was recorded of them and from `x0`.
-    solver : str
-        One of `impc.control.nlp_solvers.SOLVERS`.
-    evaluations : int
-        After how many a search is stopped.
-    starts : int
-        From how many starts, where the first explains little or has no plan.
-    """
-
+    # Every parameter of the problem by its name
     parameters: dict[str, ParameterSettings] = field(default_factory=dict)
+    # Whether a recording is of a controller that plans anew at every sample, or is one plan
     recorded: Literal["loop", "plan"] = "loop"
-    horizon: int | None = None
+    horizon: int | None = None  # In samples, in place of the problem's
+    # Initial values of states, in SI units, in place of what was recorded
     x0: dict[str, float] = field(default_factory=dict)
+    # Whether initial states are searched, from what was recorded of them and from `x0`
     unknown_start: bool = True
-    solver: str = "ipopt"
-    evaluations: int = 200
-    starts: int = 5
+    solver: str = "ipopt"  # One of `impc.control.nlp_solvers.SOLVERS`
+    evaluations: int = 200  # After how many a search is stopped
+    starts: int = 5  # From how many starts, where the first explains little or has no plan
 
 
 def optimal_fit_settings(table: Mapping[str, Any]) -> OptimalFitSettings:
-    """Read the [fit] table of a configuration.
-
-    Raises
-    ------
-    InputError
-        When a key is unknown or a value is of the wrong kind or out of range.
-    """
+    """Read the [fit] table of a configuration."""
     _require_filled_in("[fit]", table)
     given = table.get("parameters", {})
     known = [item.name for item in fields(ParameterSettings)]
@@ -121,13 +89,7 @@ def _require_filled_in(place: str, table: Mapping[str, Any]) -> None:
 def posed(
     problem: OptimalControlProblem, settings: OptimalFitSettings
 ) -> tuple[OptimalControlProblem, dict[str, float], dict[str, float]]:
-    """The problem as it is fitted, where the search begins, and what is known; by name.
-
-    Raises
-    ------
-    InputError
-        When a parameter is missing or unknown, or its value or unit cannot be.
-    """
+    """The problem as it is fitted, where the search begins, and what is known; by name."""
     units = dict(zip(problem.parameter_names, problem.units, strict=True))
     for name in settings.parameters:
         if name not in units:
@@ -170,15 +132,7 @@ def _factor(name: str, written: str, expected: str) -> float:
 def recorded(
     problem: OptimalControlProblem, trial: OptimalTrial, settings: OptimalFitSettings
 ) -> OptimalRecording:
-    """A file as a recording of the problem.
-
-    Raises
-    ------
-    InputError
-        When the initial value of a state is neither recorded nor given, or is of no state.
-    DataError
-        When the recording is too short, or not as long as a plan.
-    """
+    """A file as a recording of the problem."""
     for name in settings.x0:
         if name not in problem.state_names:
             known = ", ".join(problem.state_names)

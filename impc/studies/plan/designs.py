@@ -52,98 +52,49 @@ _CALM = 0.5
 
 @dataclass(frozen=True)
 class Person(Frozen):
-    """The presumed person, and how they would be recorded.
-
-    Attributes
-    ----------
-    controller : Controller
-    structure : Structure
-        Of the weights.
-    prices : Array
-        Its unknowns (count,), logarithms.
-    deviation : Array
-        Of the noise in the recorder (p,), in the outputs' units.
-    root : float
-        Its correlation from one sample to the next.
-    stops : Array
-        Largest magnitude of each output (p,), infinite where there is no stop.
-    family : PlantFamily or None
-        With the physical parameters that a fit would have to find too.
-    """
+    """The presumed person, and how they would be recorded."""
 
     controller: Controller
-    structure: Structure
-    prices: Array
-    deviation: Array
-    root: float
-    stops: Array
+    structure: Structure  # Of the weights
+    prices: Array  # Its unknowns (count,), logarithms
+    deviation: Array  # Of the noise in the recorder (p,), in the outputs' units
+    root: float  # Its correlation from one sample to the next
+    stops: Array  # Largest magnitude of each output (p,), infinite where there is no stop
+    # With the physical parameters that a fit would have to find too
     family: PlantFamily | None = None
 
 
 @dataclass(frozen=True)
 class Design:
-    """One experiment.
+    """One experiment."""
 
-    Attributes
-    ----------
-    amplitude : float
-        Of the perturbation, in the disturbance's unit; a factor for one from a file.
-    dwell : float
-        For how long each value is kept, s; NaN for one from a file.
-    """
-
-    amplitude: float
-    dwell: float
+    amplitude: float  # Of the perturbation, in the disturbance's unit; a factor for one from a file
+    dwell: float  # For how long each value is kept, s; NaN for one from a file
 
 
 @dataclass(frozen=True)
 class _Trial(Frozen):
-    """A simulated trial that does not end in a fall.
+    """A simulated trial that does not end in a fall."""
 
-    Attributes
-    ----------
-    push : Array
-        Disturbance (samples, d).
-    outputs : Array
-        Without noise (samples, p).
-    inputs : Array
-        (samples, m).
-    """
-
-    push: Array
-    outputs: Array
-    inputs: Array
+    push: Array  # Disturbance (samples, d)
+    outputs: Array  # Without noise (samples, p)
+    inputs: Array  # (samples, m)
 
 
 @dataclass(frozen=True)
 class Outcome(Frozen):
-    """What an experiment would give.
-
-    Attributes
-    ----------
-    design : Design
-    falls : float
-        Share of the trials that end in a fall.
-    at_limit : float
-        Share of the samples at which an input stands on a bound, in trials without a fall.
-    peaks : Array
-        Largest magnitude of each output in these (p,).
-    vaf : Array
-        What a fit without an error would explain of each output, % (p,).
-    problem : Problem or None
-        The recordings, without noise, of so many trials as a person does; None where too few
-        trials end without a fall.
-    expected : Expectation or None
-        What they would tell.
-    """
+    """What an experiment would give."""
 
     design: Design
-    falls: float
+    falls: float  # Share of the trials that end in a fall
+    # Share of the samples at which an input stands on a bound, in trials without a fall
     at_limit: float
-    peaks: Array
-    vaf: Array
+    peaks: Array  # Largest magnitude of each output in these (p,)
+    vaf: Array  # What a fit without an error would explain of each output, % (p,)
+    # The recordings, without noise, of so many trials as a person does; None where too few trials
+    # end without a fall
     problem: Problem | None
-    expected: Expectation | None
+    expected: Expectation | None  # What they would tell
 
 
 def designs(amplitudes: Sequence[float], dwells: Sequence[float]) -> tuple[Design, ...]:
@@ -156,16 +107,7 @@ def try_design(
 ) -> Outcome:
     """Simulate one experiment, and tell what its recordings would.
 
-    Parameters
-    ----------
-    person : Person
-    design : Design
-    perturbation : callable
-        (amplitude, dwell, number of the draw) -> disturbance (samples, d).
-    trials : int
-        Of the person.
-    draws : int
-        Trials that are simulated, at least so many as are recorded.
+    `perturbation` (samples, d).
     """
     plant, limits = person.controller.plant, person.controller.bounds
     numbers = range(max(draws, trials))
@@ -231,19 +173,7 @@ def _expected(person: Person, problem: Problem) -> Expectation:
 
 
 def best_of(outcomes: Sequence[Outcome], falls: float) -> tuple[Outcome, Outcome]:
-    """The A-optimal experiment and the D-optimal one.
-
-    Parameters
-    ----------
-    outcomes : sequence of Outcome
-    falls : float
-        Largest share of the trials that may end in a fall.
-
-    Raises
-    ------
-    SolverError
-        When the person falls too often in every one of them.
-    """
+    """The A-optimal experiment and the D-optimal one."""
     held = [item for item in outcomes if item.expected is not None and item.falls <= falls]
     if not held:
         least = min(item.falls for item in outcomes)

@@ -51,76 +51,43 @@ _NUMBER = re.compile(r"\s*([0-9.eE+-]+)\s*(.*\S)\s*")
 
 @dataclass(frozen=True)
 class PlanSettings:
-    """The presumed person, the experiments to choose from, and what is asked of them.
+    """The presumed person, the experiments to choose from, and what is asked of them."""
 
-    Attributes
-    ----------
-    prices : dict of str to float
-        Presumed price of each feature of the structure, with the first input's at one; without
-        [fit.structure] its keys are the features.
-    noise : dict of str to float or str
-        Standard deviation of the noise in the recorder, for each output: in the plant's unit, or
-        with one, as in "0.1 deg".
-    correlation : float
-        Time in s over which this noise falls to 1/e of its correlation; 0 for white noise.
-    stops : dict of str to float or str
-        Largest magnitude of outputs beyond which a person falls, written as `noise` is; by default
-        the limits of [signals].
-    perturbed : list of str
-        Inputs of the plant that perturb the person; by default those that [signals] names.
-    amplitude : list of float
-        Of the perturbation, in the disturbance's unit; with `files` a factor.
-    dwell : list of float
-        For how long the ternary perturbation keeps each value, s.
-    duration : float
-        Of a trial, s.
-    trials : int
-        Of a person.
-    files : list of str
-        Recordings of perturbations in the place of the ternary one, beside the configuration.
-    draws : int
-        Trials that are simulated of each experiment to see how often the person falls.
-    falls : float
-        Largest share of them that may end in a fall, %.
-    groups : list of int
-        Persons in each of two groups that are to be told apart.
-    difference : float
-        By which a price differs between the groups, %.
-    between : float
-        Standard deviation of the logarithm of a price within a group, %.
-    fits : int
-        Fits of simulated recordings of the best experiment, to compare with; 0 for none.
-    seed : int
-        All that is drawn follows from it.
-    """
-
+    # Presumed price of each feature of the structure, with the first input's at one; without
+    # [fit.structure] its keys are the features
     prices: dict[str, float]
+    # Standard deviation of the noise in the recorder, for each output: in the plant's unit, or with
+    # one, as in "0.1 deg"
     noise: dict[str, float | str]
+    # Time in s over which this noise falls to 1/e of its correlation; 0 for white noise
     correlation: float = 0.0
+    # Largest magnitude of outputs beyond which a person falls, written as `noise` is; by default
+    # the limits of [signals]
     stops: dict[str, float | str] = field(default_factory=dict)
+    # Inputs of the plant that perturb the person; by default those that [signals] names
     perturbed: list[str] = field(default_factory=list)
+    # Of the perturbation, in the disturbance's unit; with `files` a factor
     amplitude: list[float] = field(default_factory=lambda: [2.5, 5.0, 10.0])
+    # For how long the ternary perturbation keeps each value, s
     dwell: list[float] = field(default_factory=lambda: [0.125, 0.25, 0.5])
-    duration: float = 30.0
-    trials: int = 3
+    duration: float = 30.0  # Of a trial, s
+    trials: int = 3  # Of a person
+    # Recordings of perturbations in the place of the ternary one, beside the configuration
     files: list[str] = field(default_factory=list)
+    # Trials that are simulated of each experiment to see how often the person falls
     draws: int = 20
-    falls: float = 5.0
+    falls: float = 5.0  # Largest share of them that may end in a fall, %
+    # Persons in each of two groups that are to be told apart
     groups: list[int] = field(default_factory=lambda: [10, 20])
-    difference: float = 50.0
-    between: float = 30.0
+    difference: float = 50.0  # By which a price differs between the groups, %
+    between: float = 30.0  # Standard deviation of the logarithm of a price within a group, %
+    # Fits of simulated recordings of the best experiment, to compare with; 0 for none
     fits: int = 0
-    seed: int = 0
+    seed: int = 0  # All that is drawn follows from it
 
 
 def plan_settings(table: Mapping[str, Any]) -> PlanSettings:
-    """Read the [plan] table of a configuration.
-
-    Raises
-    ------
-    InputError
-        When a key is unknown or a value is of the wrong kind or out of range.
-    """
+    """Read the [plan] table of a configuration."""
     settings = read_settings("plan", PlanSettings, table)
     for name, (least, most) in _RANGES.items():
         value = getattr(settings, name)
@@ -139,14 +106,7 @@ def plan_settings(table: Mapping[str, Any]) -> PlanSettings:
 def presumed_prices(
     plant: Plant, settings: PlanSettings, fit: FitSettings
 ) -> tuple[Structure, Array]:
-    """The structure of the presumed person, and its unknowns (count,).
-
-    Raises
-    ------
-    InputError, WeightsError
-        When a price is missing, unknown or not positive, or the structure is not one of a price
-        for each feature.
-    """
+    """The structure of the presumed person, and its unknowns (count,)."""
     given = settings.prices
     item = fit.structure
     if item is None:
@@ -168,13 +128,7 @@ def presumed_prices(
 
 
 def noise_deviations(plant: Plant, settings: PlanSettings) -> Array:
-    """Standard deviation of the noise of each output (p,), in the plant's units.
-
-    Raises
-    ------
-    InputError
-        When an output is missing or unknown, or its noise is not positive or of another kind.
-    """
+    """Standard deviation of the noise of each output (p,), in the plant's units."""
     found = _of_outputs(plant, "noise", settings.noise)
     for name in plant.outputs:
         if name not in found:
@@ -185,13 +139,7 @@ def noise_deviations(plant: Plant, settings: PlanSettings) -> Array:
 def mechanical_stops(
     plant: Plant, settings: PlanSettings, signals: Mapping[str, SignalTable]
 ) -> Array:
-    """Largest magnitude of each output (p,), in the plant's units; infinite without a stop.
-
-    Raises
-    ------
-    InputError
-        When an output is unknown, or its stop is not positive or of another kind.
-    """
+    """Largest magnitude of each output (p,), in the plant's units; infinite without a stop."""
     told = {
         name: entry.limit * si_unit(entry.unit).factor
         for name, entry in signals.items()

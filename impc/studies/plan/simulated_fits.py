@@ -38,21 +38,11 @@ _MIDDLE = (15.866, 84.134)
 
 @dataclass(frozen=True)
 class SimulatedFits(Frozen):
-    """What so many fits found.
+    """What so many fits found."""
 
-    Attributes
-    ----------
-    prices : Array
-        Unknowns of the structure (fits, count); minus infinity for a price of zero.
-    gains : Array
-        Gain without a structure, as it is printed with intervals (fits, m, n).
-    failed : int
-        Fits that ended without an answer.
-    """
-
-    prices: Array
-    gains: Array
-    failed: int
+    prices: Array  # Unknowns of the structure (fits, count); minus infinity for a price of zero
+    gains: Array  # Gain without a structure, as it is printed with intervals (fits, m, n)
+    failed: int  # Fits that ended without an answer
 
     def inside(self, expected: Expectation) -> Array:
         """Share of the fits whose unknowns lie in the expected intervals (count,)."""
@@ -74,20 +64,7 @@ def simulated_fits(
     seed: int,
     done: Callable[[str], None] = lambda _: None,
 ) -> SimulatedFits:
-    """Fit recordings of one experiment with fresh noise, again and again.
-
-    Parameters
-    ----------
-    person : Person
-    problem : Problem
-        Its recordings without noise (`designs.Outcome.problem`).
-    count : int
-        Of the fits.
-    seed : int
-        Of the noise.
-    done : callable
-        Told of each fit that has ended.
-    """
+    """Fit recordings of one experiment with fresh noise, again and again."""
     prices, gains, failed = [], [], 0
     truth = np.array(person.prices)
     for number in range(count):

@@ -41,53 +41,26 @@ _A_FIT = 40
 
 @dataclass(frozen=True)
 class GroupPower(Frozen):
-    """Whether two groups can be told apart by one price.
+    """Whether two groups can be told apart by one price."""
 
-    Attributes
-    ----------
-    feature : str
-        Whose price.
-    deviation : float
-        Of the logarithm of an estimate within a group: of persons and of the estimate.
-    powers : Array
-        How often a t-test at 5 % sees the difference, for each size of group (g,).
-    needed : float
-        Persons in each group for 80 %; infinite beyond a million.
-    """
-
-    feature: str
+    feature: str  # Whose price
+    # Of the logarithm of an estimate within a group: of persons and of the estimate
     deviation: float
-    powers: Array
-    needed: float
+    powers: Array  # How often a t-test at 5 % sees the difference, for each size of group (g,)
+    needed: float  # Persons in each group for 80 %; infinite beyond a million
 
 
 @dataclass(frozen=True)
 class Plan(Frozen):
-    """What experiments would tell of a presumed person.
-
-    Attributes
-    ----------
-    person : Person
-    settings : PlanSettings
-    outcomes : tuple of Outcome
-        One an experiment, in the order of `designs`.
-    best : Outcome
-        With the least mean variance of the logarithms of prices (A-optimal).
-    sharpest : Outcome
-        With the least determinant of their covariance (D-optimal).
-    groups : tuple of GroupPower
-        For the best one, one a price.
-    simulated : SimulatedFits or None
-        Of the best one.
-    """
+    """What experiments would tell of a presumed person."""
 
     person: Person
     settings: PlanSettings
-    outcomes: tuple[Outcome, ...]
-    best: Outcome
-    sharpest: Outcome
-    groups: tuple[GroupPower, ...]
-    simulated: SimulatedFits | None
+    outcomes: tuple[Outcome, ...]  # One an experiment, in the order of `designs`
+    best: Outcome  # With the least mean variance of the logarithms of prices (A-optimal)
+    sharpest: Outcome  # With the least determinant of their covariance (D-optimal)
+    groups: tuple[GroupPower, ...]  # For the best one, one a price
+    simulated: SimulatedFits | None  # Of the best one
 
 
 def _grid(settings: PlanSettings) -> tuple[Design, ...]:
@@ -107,19 +80,7 @@ def make_plan(
 ) -> Plan:
     """Try every experiment on the person.
 
-    Parameters
-    ----------
-    person : Person
-    settings : PlanSettings
-    perturbation : callable
-        (amplitude, dwell, number of the draw) -> disturbance (samples, d).
-    done : callable
-        Told the name of each step when it is done.
-
-    Raises
-    ------
-    SolverError
-        When the person falls too often in every experiment.
+    `perturbation` (samples, d).
     """
     outcomes = []
     for design in _grid(settings):

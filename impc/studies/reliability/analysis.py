@@ -39,20 +39,11 @@ _FORM: Form = "A,k"
 
 @dataclass(frozen=True)
 class Trials:
-    """Recordings of a study.
+    """Recordings of a study."""
 
-    Attributes
-    ----------
-    outputs : tuple of str
-        Names, in the order of the recordings' columns.
-    rate : float
-        Samples per second.
-    cells : mapping
-        (subject, visit, condition) -> the trials analysed, in order.
-    """
-
-    outputs: tuple[str, ...]
-    rate: float
+    outputs: tuple[str, ...]  # Names, in the order of the recordings' columns
+    rate: float  # Samples per second
+    # (subject, visit, condition) -> the trials analysed, in order
     cells: Mapping[tuple[str, str, str], tuple[Recording, ...]]
 
     def labels(self, index: int) -> tuple[str, ...]:
@@ -62,99 +53,53 @@ class Trials:
 
 @dataclass(frozen=True)
 class MeasureResult:
-    """One measure of one output in one condition.
+    """One measure of one output in one condition."""
 
-    Attributes
-    ----------
-    measure, output, condition : str
-        Of which, by name; the measure is one of `MEASURES`.
-    scores : Array
-        (subjects, visits), NaN where a cell is missing, in the output's unit (squared for energy).
-    icc : Icc or None
-        (A,k), between visits, with the generalised interval.
-    error : MeasurementError or None
-        Of the score of one visit, with the minimal detectable change (95 %), in the score's unit.
-    anova : Anova or None
-    pairs : tuple of PairedTest
-    trend : Trend or None
-        Learning: change from visit to visit.
-    components : tuple of VarianceComponent
-        Of subjects, visits and trials; empty when trials are too few.
-    notes : tuple of str
-        Why something is missing.
-    """
-
-    measure: str
+    measure: str  # Of which, by name; the measure is one of `MEASURES`
     output: str
     condition: str
+    # (subjects, visits), NaN where a cell is missing, in the output's unit (squared for energy)
     scores: Array
-    icc: Icc | None
+    icc: Icc | None  # (A,k), between visits, with the generalised interval
+    # Of the score of one visit, with the minimal detectable change (95 %), in the score's unit
     error: MeasurementError | None
     anova: Anova | None
     pairs: tuple[PairedTest, ...]
-    trend: Trend | None
+    trend: Trend | None  # Learning: change from visit to visit
+    # Of subjects, visits and trials; empty when trials are too few
     components: tuple[VarianceComponent, ...]
-    notes: tuple[str, ...]
+    notes: tuple[str, ...]  # Why something is missing
 
 
 @dataclass(frozen=True)
 class CmcResult:
-    """Coefficients of multiple correlation of one output in one condition, by subject.
+    """Coefficients of multiple correlation of one output in one condition, by subject."""
 
-    Attributes
-    ----------
-    output, condition : str
-        Of which, by name.
-    within, between : Array
-        (subjects,), NaN where there is none.
-    undefined : int
-        How many are the root of a negative number.
-    """
-
-    output: str
+    output: str  # Of which, by name
     condition: str
-    within: Array
+    within: Array  # (subjects,), NaN where there is none
     between: Array
-    undefined: int
+    undefined: int  # How many are the root of a negative number
 
 
 @dataclass(frozen=True)
 class Reliability:
-    """Everything that is found of a study.
+    """Everything that is found of a study."""
 
-    Attributes
-    ----------
-    subjects, visits, conditions, outputs : tuple of str
-        Names, in the order of the study.
-    band : Passband
-        Of the input.
-    measures : tuple of MeasureResult
-    cmc : tuple of CmcResult
-    responses : mapping
-        (subject, visit, condition) -> transfer function, average over trials.
-    notes : tuple of str
-        On the study as a whole.
-    """
-
-    subjects: tuple[str, ...]
+    subjects: tuple[str, ...]  # Names, in the order of the study
     visits: tuple[str, ...]
     conditions: tuple[str, ...]
     outputs: tuple[str, ...]
-    band: Passband
+    band: Passband  # Of the input
     measures: tuple[MeasureResult, ...]
     cmc: tuple[CmcResult, ...]
+    # (subject, visit, condition) -> transfer function, average over trials
     responses: Mapping[tuple[str, str, str], TransferFunction]
-    notes: tuple[str, ...]
+    notes: tuple[str, ...]  # On the study as a whole
 
 
 def analyse(trials: Trials) -> Reliability:
-    """Analyse a study.
-
-    Raises
-    ------
-    DataError
-        When there is no trial, or the input is constant.
-    """
+    """Analyse a study."""
     if not trials.cells:
         raise DataError("study", "has no trial", "check where it looks for recordings")
     subjects, visits, conditions = (trials.labels(index) for index in range(3))

@@ -28,82 +28,40 @@ __all__ = ["Anova", "PairedTest", "Trend", "learning_trend", "paired_tests", "vi
 
 @dataclass(frozen=True)
 class Anova:
-    """F test of a difference between visits.
+    """F test of a difference between visits."""
 
-    Attributes
-    ----------
-    F : float
-        Mean square of visits over that of visits by subjects.
-    freedom : tuple of float
-        Of numerator and denominator, uncorrected.
-    p : float
-        Uncorrected.
-    epsilon : float
-        Greenhouse and Geisser's, between 1 / (k - 1) and 1.
-    p_corrected : float
-        With both degrees of freedom times epsilon.
-    subjects, left_out : int
-        With all visits, and without.
-    """
-
-    F: float
-    freedom: tuple[float, float]
-    p: float
-    epsilon: float
-    p_corrected: float
-    subjects: int
+    F: float  # Mean square of visits over that of visits by subjects
+    freedom: tuple[float, float]  # Of numerator and denominator, uncorrected
+    p: float  # Uncorrected
+    epsilon: float  # Greenhouse and Geisser's, between 1 / (k - 1) and 1
+    p_corrected: float  # With both degrees of freedom times epsilon
+    subjects: int  # With all visits, and without
     left_out: int
 
 
 @dataclass(frozen=True)
 class PairedTest:
-    """Paired t between two visits.
+    """Paired t between two visits."""
 
-    Attributes
-    ----------
-    first, second : str
-        The visits.
-    difference : float
-        Mean of second minus first, in the score's unit.
-    p, p_holm : float
-        Without and with Holm's correction over all pairs.
-    """
-
-    first: str
+    first: str  # The visits
     second: str
-    difference: float
-    p: float
+    difference: float  # Mean of second minus first, in the score's unit
+    p: float  # Without and with Holm's correction over all pairs
     p_holm: float
 
 
 @dataclass(frozen=True)
 class Trend:
-    """Slope over visits.
+    """Slope over visits."""
 
-    Attributes
-    ----------
-    slope : float
-        Mean of the subjects' least-squares slopes, in the score's unit a visit.
-    low, high : float
-        Ends of its interval.
-    p : float
-        Of Student's t that the mean slope is zero.
-    """
-
-    slope: float
-    low: float
+    slope: float  # Mean of the subjects' least-squares slopes, in the score's unit a visit
+    low: float  # Ends of its interval
     high: float
-    p: float
+    p: float  # Of Student's t that the mean slope is zero
 
 
 def visit_anova(scores: Array) -> Anova:
-    """Test of visits; scores (subjects, visits), NaN where missing.
-
-    Raises
-    ------
-    DataError
-        When fewer than two subjects or visits are complete, or nothing varies.
-    """
+    """Test of visits; scores (subjects, visits), NaN where missing."""
     kept, left_out = _complete(scores)
     n, k = kept.shape
     long = pd.DataFrame(
@@ -126,17 +84,7 @@ def visit_anova(scores: Array) -> Anova:
 def paired_tests(scores: Array, visits: Sequence[str]) -> tuple[PairedTest, ...]:
     """Every pair of visits; subjects who lack one of the two are left out of that pair.
 
-    Parameters
-    ----------
-    scores : Array
-        (subjects, visits), NaN where missing.
-    visits : sequence of str
-        Names of the columns.
-
-    Raises
-    ------
-    DataError
-        When a pair has fewer than two subjects.
+    `scores` (subjects, visits).
     """
     rows = []
     for i, j in itertools.combinations(range(len(visits)), 2):
@@ -156,11 +104,6 @@ def learning_trend(scores: Array, level: float = 0.95) -> Trend:
     """Whether scores rise or fall from visit to visit; scores (subjects, visits).
 
     `level` is that of the interval, between 0 and 1.
-
-    Raises
-    ------
-    DataError
-        As `visit_anova`.
     """
     kept, _ = _complete(scores)
     visit = np.arange(kept.shape[1]) - (kept.shape[1] - 1) / 2

@@ -24,13 +24,7 @@ __all__ = ["cmc_between", "cmc_within"]
 
 
 def cmc_within(curves: ComplexArray) -> float:
-    """Within visits; curves (visits, trials, frequencies).
-
-    Raises
-    ------
-    DataError
-        When a visit has fewer than two trials, or there are fewer than two frequencies.
-    """
+    """Within visits; curves (visits, trials, frequencies)."""
     M, N, T = _shape(curves, trials=2)
     own = np.sum(np.abs(curves - curves.mean(axis=1, keepdims=True)) ** 2)
     all_of_visit = np.sum(np.abs(curves - curves.mean(axis=(1, 2), keepdims=True)) ** 2)
@@ -38,13 +32,7 @@ def cmc_within(curves: ComplexArray) -> float:
 
 
 def cmc_between(curves: ComplexArray) -> float:
-    """Between visits; curves (visits, trials, frequencies).
-
-    Raises
-    ------
-    DataError
-        When there are fewer than two visits or frequencies.
-    """
+    """Between visits; curves (visits, trials, frequencies)."""
     M, N, T = _shape(curves, visits=2)
     own = np.sum(np.abs(curves - curves.mean(axis=(0, 1), keepdims=True)) ** 2)
     everything = np.sum(np.abs(curves - curves.mean()) ** 2)

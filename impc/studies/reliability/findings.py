@@ -27,21 +27,11 @@ QUOTED = {
 
 @dataclass(frozen=True)
 class Finding:
-    """A statement of the dissertation, and what this study says of it.
+    """A statement of the dissertation, and what this study says of it."""
 
-    Attributes
-    ----------
-    statement : str
-        Of the dissertation, chapter 2.
-    found : bool
-        Whether it holds here.
-    numbers : str
-        Those of this study.
-    """
-
-    statement: str
-    found: bool
-    numbers: str
+    statement: str  # Of the dissertation, chapter 2
+    found: bool  # Whether it holds here
+    numbers: str  # Those of this study
 
 
 def findings(result: Reliability) -> tuple[Finding, ...]:

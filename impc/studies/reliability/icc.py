@@ -71,96 +71,48 @@ _DRAWS = 20_000
 
 
 class MeanSquares(NamedTuple):
-    """Mean squares of the two-way layout, and its size.
+    """Mean squares of the two-way layout, and its size."""
 
-    Attributes
-    ----------
-    subjects, occasions, error, within : float
-        MSR, MSC, MSE and MSW, in the score's unit squared.
-    n, k : int
-        Number of subjects and of occasions.
-    """
-
-    subjects: float
+    subjects: float  # MSR, MSC, MSE and MSW, in the score's unit squared
     occasions: float
     error: float
     within: float
-    n: int
+    n: int  # Number of subjects and of occasions
     k: int
 
 
 @dataclass(frozen=True)
 class Icc:
-    """One intraclass correlation.
+    """One intraclass correlation."""
 
-    Attributes
-    ----------
-    form : str
-        One of `FORMS`.
-    value, low, high : float
-        Estimate and ends of the interval; NaN when all scores are equal, or the denominator is
-        not positive. An estimate of 1 has the interval 1 to 1.
-    level : float
-        Of the interval.
-    subjects, occasions : int
-        How many there were of each.
-    left_out : int
-        Subjects that lacked a score on some occasion.
-    """
-
-    form: Form
+    form: Form  # One of `FORMS`
+    # Estimate and ends of the interval; NaN when all scores are equal, or the denominator is not
+    # positive. An estimate of 1 has the interval 1 to 1.
     value: float
     low: float
     high: float
-    level: float
-    subjects: int
+    level: float  # Of the interval
+    subjects: int  # How many there were of each
     occasions: int
-    left_out: int
+    left_out: int  # Subjects that lacked a score on some occasion
 
 
 @dataclass(frozen=True)
 class MeasurementError:
-    """Error of one measurement of one subject.
+    """Error of one measurement of one subject."""
 
-    Attributes
-    ----------
-    sem : float
-        Standard error of measurement, in the scores' unit.
-    freedom : float
-        Satterthwaite's degrees of freedom of its square; NaN when it is zero.
-    mdc : float
-        Minimal detectable change: what the difference of two measurements exceeds by error alone
-        in 1 - level of all subjects, in the scores' unit.
-    level : float
-        Of the MDC.
-    """
-
-    sem: float
-    freedom: float
+    sem: float  # Standard error of measurement, in the scores' unit
+    freedom: float  # Satterthwaite's degrees of freedom of its square; NaN when it is zero
+    # Minimal detectable change: what the difference of two measurements exceeds by error alone in 1
+    # - level of all subjects, in the scores' unit
     mdc: float
-    level: float
+    level: float  # Of the MDC
 
 
 def icc(scores: ArrayLike, form: Form = "A,k", level: float = 0.95, method: Method = "F") -> Icc:
     """Intraclass correlation of scores.
 
-    Parameters
-    ----------
-    scores : array_like
-        (subjects, occasions); NaN where there is none. Subjects with a missing score are left out.
-    form : str
-        One of `FORMS`. Chapter 5 uses (A,k); so does chapter 2 here.
-    level : float
-        Of the interval, between 0 and 1.
-    method : str
-        "F", or "generalised" for (A,1) and (A,k).
-
-    Raises
-    ------
-    InputError
-        When the form is unknown or has no such interval, or the level is out of range.
-    DataError
-        When fewer than two subjects or two occasions are complete.
+    `scores` (subjects, occasions).
     """
     if form not in FORMS:
         raise InputError(f"ICC form {form!r}", "is not known", f"known: {', '.join(FORMS)}")
@@ -196,19 +148,7 @@ def mean_squares(scores: Array) -> MeanSquares:
 def measurement_error(scores: ArrayLike, level: float = 0.95) -> MeasurementError:
     """Error of one measurement, and the change that it hides.
 
-    Parameters
-    ----------
-    scores : array_like
-        (subjects, occasions); subjects with a missing score (NaN) are left out.
-    level : float
-        Of the MDC, between 0 and 1.
-
-    Raises
-    ------
-    InputError
-        When the level is out of range.
-    DataError
-        When there are fewer than two complete subjects or two occasions.
+    `scores` (subjects, occasions).
     """
     if not 0 < level < 1:
         raise InputError("level", f"got {level}", "give a share between 0 and 1")

@@ -33,18 +33,11 @@ _NEIGHBOURS = 7
 
 @dataclass(frozen=True)
 class Passband:
-    """Range of frequencies.
+    """Range of frequencies."""
 
-    Attributes
-    ----------
-    low, high : float
-        Hz, both inside.
-    excited : IntArray
-        Indices (f,) of the excited frequencies inside, on the grid of the input's periodogram.
-    """
-
-    low: float
+    low: float  # Hz, both inside
     high: float
+    # Indices (f,) of the excited frequencies inside, on the grid of the input's periodogram
     excited: IntArray
 
 
@@ -56,19 +49,7 @@ def rms(outputs: Array) -> Array:
 def passband(signal: Array, rate: float, share: float = _SHARE) -> Passband:
     """Largest contiguous range of excited frequencies with power above a share of the peak.
 
-    Parameters
-    ----------
-    signal : Array
-        Input of one trial (samples,): a whole number of periods.
-    rate : float
-        Samples per second.
-    share : float
-        Of the peak.
-
-    Raises
-    ------
-    DataError
-        When the input is constant, so that nothing is excited.
+    `signal` (samples,); `rate` in second.
     """
     frequency, power = scipy.signal.periodogram(signal, rate, detrend=False)
     power[0] = 0.0
@@ -90,19 +71,7 @@ def passband(signal: Array, rate: float, share: float = _SHARE) -> Passband:
 def band_energy(outputs: Array, rate: float, low: float, high: float) -> Array:
     """Mean bandpass signal energy (2.1) of each output (p,), in its unit squared.
 
-    Parameters
-    ----------
-    outputs : Array
-        (samples, p).
-    rate : float
-        Samples per second.
-    low, high : float
-        Passband, Hz, both inside.
-
-    Raises
-    ------
-    DataError
-        When no frequency of the trial lies in the band.
+    `outputs` (samples, p); `rate` in second.
     """
     frequency, power = scipy.signal.periodogram(outputs, rate, detrend=False, axis=0)
     step = float(frequency[1] - frequency[0])

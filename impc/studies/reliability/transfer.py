@@ -31,21 +31,11 @@ ComplexArray = np.ndarray[tuple[int, ...], np.dtype[np.complex128]]
 
 @dataclass(frozen=True)
 class TransferFunction:
-    """Estimate at a few frequencies.
+    """Estimate at a few frequencies."""
 
-    Attributes
-    ----------
-    frequency : Array
-        Hz (f,).
-    response : ComplexArray
-        Output over input (f, p).
-    coherence : Array
-        (f, p); 1 for a single trial, which cannot tell.
-    """
-
-    frequency: Array
-    response: ComplexArray
-    coherence: Array
+    frequency: Array  # Hz (f,)
+    response: ComplexArray  # Output over input (f, p)
+    coherence: Array  # (f, p); 1 for a single trial, which cannot tell
 
 
 def transfer_function(
@@ -53,21 +43,7 @@ def transfer_function(
 ) -> TransferFunction:
     """Estimate from one or several trials of the same length.
 
-    Parameters
-    ----------
-    inputs : sequence of Array
-        (samples,) of each trial, a whole number of periods.
-    outputs : sequence of Array
-        (samples, p) of each trial.
-    rate : float
-        Samples per second.
-    band : Passband
-        Of the input; its excited frequencies are those of these trials.
-
-    Raises
-    ------
-    DataError
-        When there is no trial, or trials differ in length.
+    `inputs` (samples,); `outputs` (samples, p); `rate` in second.
     """
     if not inputs:
         raise DataError("transfer function", "has no trial", "give one or more")

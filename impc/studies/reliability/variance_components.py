@@ -30,18 +30,10 @@ __all__ = ["VarianceComponent", "variance_components"]
 
 @dataclass(frozen=True)
 class VarianceComponent:
-    """One component.
+    """One component."""
 
-    Attributes
-    ----------
-    name : str
-        "subject", "visit" or "trial".
-    value, low, high : float
-        Estimate and ends of the interval, in the score's unit squared.
-    """
-
-    name: str
-    value: float
+    name: str  # "subject", "visit" or "trial"
+    value: float  # Estimate and ends of the interval, in the score's unit squared
     low: float
     high: float
 
@@ -49,17 +41,7 @@ class VarianceComponent:
 def variance_components(scores: Array, level: float = 0.95) -> tuple[VarianceComponent, ...]:
     """Components of subjects, visits and trials.
 
-    Parameters
-    ----------
-    scores : Array
-        (subjects, visits, trials), complete.
-    level : float
-        Of each interval.
-
-    Raises
-    ------
-    DataError
-        When a cell is missing, or there are fewer than two of any.
+    `scores` (subjects, visits, trials).
     """
     table = np.asarray(scores, dtype=np.float64)
     if table.ndim != 3 or min(table.shape) < 2:

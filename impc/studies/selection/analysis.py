@@ -33,57 +33,28 @@ __all__ = ["StudySelection", "select_study"]
 
 @dataclass(frozen=True)
 class StudySelection:
-    """The study.
+    """The study."""
 
-    Attributes
-    ----------
-    nominal : mapping
-        Subject (and visit) -> all parameters fitted, information, feasible subsets.
-    worst_case : tuple of Selection
-        (5.5): the variance holds for every subject and visit; a sweep.
-    intersection : tuple of tuple of int
-        Subsets that are among the largest of every subject at the bound (chapter 4).
-    free : tuple of int
-        The subset that is refitted: the best of the worst case at the bound, or at the first bound
-        of the sweep that has one; failing that the most frequent of the subjects'.
-    chosen : mapping
-        Subject -> refit of that subset, intervals, LASSO.
-    lasso : tuple of int
-        What the LASSO selects most often.
-    doubts : Doubts
-        Of the first subject.
-    seconds : mapping
-        "fim", "lasso" and, when it was asked for, "nelder_mead": time in s, mean over subjects.
-    """
-
+    # Subject (and visit) -> all parameters fitted, information, feasible subsets
     nominal: Mapping[str, Nominal]
+    # (5.5): the variance holds for every subject and visit; a sweep
     worst_case: tuple[Selection, ...]
+    # Subsets that are among the largest of every subject at the bound (chapter 4)
     intersection: tuple[tuple[int, ...], ...]
+    # The subset that is refitted: the best of the worst case at the bound, or at the first bound of
+    # the sweep that has one; failing that the most frequent of the subjects'
     free: tuple[int, ...]
-    chosen: Mapping[str, Chosen]
-    lasso: tuple[int, ...]
-    doubts: Doubts
+    chosen: Mapping[str, Chosen]  # Subject -> refit of that subset, intervals, LASSO
+    lasso: tuple[int, ...]  # What the LASSO selects most often
+    doubts: Doubts  # Of the first subject
+    # "fim", "lasso" and, when it was asked for, "nelder_mead": time in s, mean over subjects
     seconds: Mapping[str, float]
 
 
 def select_study(
     recorded: Mapping[str, Sequence[Trial]], settings: SelectSettings, run: Runner
 ) -> StudySelection:
-    """Select sensitive parameters.
-
-    Parameters
-    ----------
-    recorded : mapping
-        Subject (and visit) -> trials.
-    settings : SelectSettings
-    run : Runner
-        Has the model, and does the work of each subject.
-
-    Raises
-    ------
-    DataError
-        When there is no subject, or no subset is feasible.
-    """
+    """Select sensitive parameters."""
     if not recorded:
         raise DataError("study", "has no subject", "check where it looks for recordings")
     trials = {name: tuple(item) for name, item in recorded.items()}

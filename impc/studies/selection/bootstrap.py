@@ -32,26 +32,14 @@ _THREADS = 2
 
 @dataclass(frozen=True)
 class BootstrapIntervals(Frozen):
-    """Percentiles of the replicates.
+    """Percentiles of the replicates."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        Free parameters.
-    value, low, high : Array
-        (free,), in their units.
-    level : float
-        Share of the replicates inside.
-    drawn : Array
-        (replicates, free).
-    """
-
-    names: tuple[str, ...]
-    value: Array
+    names: tuple[str, ...]  # Free parameters
+    value: Array  # (free,), in their units
     low: Array
     high: Array
-    level: float
-    drawn: Array
+    level: float  # Share of the replicates inside
+    drawn: Array  # (replicates, free)
 
     @property
     def width(self) -> Array:
@@ -79,28 +67,7 @@ def bootstrap_subset(
     level: float = 0.95,
     progress: Callable[[], None] = lambda: None,
 ) -> BootstrapIntervals:
-    """Intervals of the free parameters of a fit.
-
-    Parameters
-    ----------
-    fit : Estimate
-        Where every replicate begins.
-    replicates : int
-        How many are fitted.
-    seed : int
-        All numbers drawn follow from it.
-    draw : Draw
-        `draw_single` or `impc.assess.resampling.block_residuals`.
-    level : float
-        Of the intervals, between 0 and 1.
-    progress : callable
-        Called when a replicate is done.
-
-    Raises
-    ------
-    DataError
-        As `estimate`.
-    """
+    """Intervals of the free parameters of a fit."""
     theta = np.array(fit.theta)
     left = residuals(model, theta, trials)
     clean = [np.asarray(model.simulate(theta, item.input)) for item in trials]

@@ -42,30 +42,14 @@ def select_evaluations(settings: SelectSettings, subjects: int) -> int:
 
 
 def key_evaluations(settings: SelectSettings, most: int = 20) -> int:
-    """Of the model with its derivative, for one subject and visit of `impc key-parameters`.
-
-    Parameters
-    ----------
-    settings : SelectSettings
-    most : int
-        Subsets that are fitted alone.
-    """
+    """Of the model with its derivative, for one subject and visit of `impc key-parameters`."""
     return _FIT * (settings.starts + most)
 
 
 def selection_effort(
     model: ParametricModel, recorded: Iterable[Sequence[Trial]], evaluations: int
 ) -> Effort:
-    """What one subject takes, on average; the model is called three times.
-
-    Parameters
-    ----------
-    model : ParametricModel
-    recorded : iterable of sequences of Trial
-        Trials of each subject.
-    evaluations : int
-        Of the model with its derivative over all trials of a subject.
-    """
+    """What one subject takes, on average; the model is called three times."""
     subjects = [tuple(trials) for trials in recorded]
     samples = [sum(len(trial.input) for trial in trials) for trials in subjects]
     first = subjects[0][0]

@@ -29,40 +29,18 @@ _TOLERANCE = 1e-10
 
 @dataclass(frozen=True)
 class Estimate(Frozen):
-    """A fit.
+    """A fit."""
 
-    Attributes
-    ----------
-    theta : Array
-        All parameters (k,), in their units.
-    free : tuple of int
-        Which of them were fitted.
-    misfit : float
-        Sum of squares.
-    vaf : Array
-        (4.4) over all trials (p,), %.
-    evaluations : int
-        Of the residual.
-    at_bound : tuple of int
-        Free parameters that end on a bound.
-    """
-
-    theta: Array
-    free: tuple[int, ...]
-    misfit: float
-    vaf: Array
-    evaluations: int
-    at_bound: tuple[int, ...]
+    theta: Array  # All parameters (k,), in their units
+    free: tuple[int, ...]  # Which of them were fitted
+    misfit: float  # Sum of squares
+    vaf: Array  # (4.4) over all trials (p,), %
+    evaluations: int  # Of the residual
+    at_bound: tuple[int, ...]  # Free parameters that end on a bound
 
 
 def free_indices(model: ParametricModel, names: Sequence[str]) -> tuple[int, ...]:
-    """Indices of parameters by their `names`.
-
-    Raises
-    ------
-    InputError
-        When there is no such parameter.
-    """
+    """Indices of parameters by their `names`."""
     for name in names:
         if name not in model.names:
             raise InputError(f"parameter {name}", "is not one", f"known: {', '.join(model.names)}")
@@ -79,21 +57,7 @@ def estimate(
 ) -> Estimate:
     """Fit the free parameters to all trials at once.
 
-    Parameters
-    ----------
-    model : ParametricModel
-    trials : sequence of Trial
-    free : sequence of int
-        Indices of the parameters that are fitted.
-    start : Array
-        All parameters (k,), in their units; the others keep these values.
-    max_evaluations : int
-        Of the residual, at most.
-
-    Raises
-    ------
-    DataError
-        When there is no trial, or the model does not give finite outputs at the start.
+    `start` (k,).
     """
     if not trials:
         raise DataError("trials", "there are none", "give at least one")
@@ -139,17 +103,6 @@ def multi_start(
     """Fits from the typical values and from points drawn about them, the best first.
 
     Points at which the model is not finite are drawn again.
-
-    Parameters
-    ----------
-    free : sequence of int
-        Indices of the parameters that are fitted.
-    starts : int
-        How many fits.
-    seed : int
-        All numbers drawn follow from it.
-    spread : float
-        Deviation of the draws, in normalised units.
     """
     rng = np.random.default_rng(seed)
     typical = normalised(model, np.asarray(model.typical))

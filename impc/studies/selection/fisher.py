@@ -39,50 +39,26 @@ _UNSEEN = 1.0
 
 @dataclass(frozen=True)
 class Information(Frozen):
-    """Information of all trials together.
+    """Information of all trials together."""
 
-    Attributes
-    ----------
-    F : Array
-        (k, k), in normalised units.
-    singular_values : Array
-        Of the stacked sensitivity over sigma (k,), largest first.
-    directions : Array
-        Right singular vectors, one a row (k, k), in normalised units.
-    relative : Array
-        The same for sensitivities with respect to the logarithms of the parameters, singular
-        value and direction side by side (k, 1 + k). A direction there is a scaling.
-    variance : float
-        sigma^2 of the residual.
-    rank : int
-        Of the relative sensitivities: singular values above 1e-6 of the largest.
-    """
-
-    F: Array
-    singular_values: Array
-    directions: Array
+    F: Array  # (k, k), in normalised units
+    singular_values: Array  # Of the stacked sensitivity over sigma (k,), largest first
+    directions: Array  # Right singular vectors, one a row (k, k), in normalised units
+    # The same for sensitivities with respect to the logarithms of the parameters, singular value
+    # and direction side by side (k, 1 + k). A direction there is a scaling.
     relative: Array
-    variance: float
-    rank: int
+    variance: float  # sigma^2 of the residual
+    rank: int  # Of the relative sensitivities: singular values above 1e-6 of the largest
 
 
 @dataclass(frozen=True)
 class NullDirection:
-    """A combination of parameters that the outputs do not see.
+    """A combination of parameters that the outputs do not see."""
 
-    Attributes
-    ----------
-    singular_value : float
-        Relative to the largest.
-    shares : dict
-        Parameter -> its part in the direction of relative changes, largest first.
-    sentence : str
-        The same in words.
-    """
-
-    singular_value: float
+    singular_value: float  # Relative to the largest
+    # Parameter -> its part in the direction of relative changes, largest first
     shares: dict[str, float]
-    sentence: str
+    sentence: str  # The same in words
 
 
 def fisher_information(
@@ -90,15 +66,7 @@ def fisher_information(
 ) -> Information:
     """Information at a point.
 
-    Parameters
-    ----------
-    model : ParametricModel
-    theta : Array
-        (k,).
-    trials : sequence of Trial
-        Their inputs count; their outputs only where the variance is not given.
-    variance : float, optional
-        sigma^2; by default that of the residuals, over N - k.
+    `theta` (k,).
     """
     rows, squares = [], 0.0
     for trial in trials:

@@ -43,83 +43,42 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Candidate:
-    """A sensitive subset and how it does in the other filters.
+    """A sensitive subset and how it does in the other filters."""
 
-    Attributes
-    ----------
-    subset : tuple of int
-        Indices of its parameters.
-    variance : float
-        Largest, over subjects and visits, in normalised units.
-    vaf : float
-        Mean over subjects and visits, %.
-    reliability : float
-        Least ICC(A,k) of its parameters; NaN where none is defined.
-    diversity : int
-        Number of pathways.
-    kept : bool
-        Whether it passes goodness of fit and reliability.
-    """
-
-    subset: tuple[int, ...]
-    variance: float
-    vaf: float
-    reliability: float
-    diversity: int
-    kept: bool
+    subset: tuple[int, ...]  # Indices of its parameters
+    variance: float  # Largest, over subjects and visits, in normalised units
+    vaf: float  # Mean over subjects and visits, %
+    reliability: float  # Least ICC(A,k) of its parameters; NaN where none is defined
+    diversity: int  # Number of pathways
+    kept: bool  # Whether it passes goodness of fit and reliability
 
 
 @dataclass(frozen=True)
 class KeyParameters(Frozen):
-    """Outcome of the filters.
+    """Outcome of the filters."""
 
-    Attributes
-    ----------
-    selection : Selection
-        Subsets of the first filter.
-    sweep : tuple of Selection
-        The first filter at other bounds.
-    candidates : tuple of Candidate
-        All of them, best first: kept before not, then diversity, then reliability.
-    chosen : tuple of int
-        The first kept one; empty when none is kept.
-    nominal : Array
-        Estimates with all parameters free (parameters, subjects, visits), in physical units.
-    estimates : Array
-        Those of the chosen subset alone (chosen, subjects, visits), in physical units.
-    """
-
-    selection: Selection
-    sweep: tuple[Selection, ...]
+    selection: Selection  # Subsets of the first filter
+    sweep: tuple[Selection, ...]  # The first filter at other bounds
+    # All of them, best first: kept before not, then diversity, then reliability
     candidates: tuple[Candidate, ...]
-    chosen: tuple[int, ...]
+    chosen: tuple[int, ...]  # The first kept one; empty when none is kept
+    # Estimates with all parameters free (parameters, subjects, visits), in physical units
     nominal: Array
+    # Those of the chosen subset alone (chosen, subjects, visits), in physical units
     estimates: Array
 
 
 @dataclass(frozen=True)
 class Refits:
-    """Fits of several subsets to one subject and visit.
+    """Fits of several subsets to one subject and visit."""
 
-    Attributes
-    ----------
-    fits : tuple of Estimate
-        One a subset, in their order.
-    """
-
-    fits: tuple[Estimate, ...]
+    fits: tuple[Estimate, ...]  # One a subset, in their order
 
 
 def refit_subsets(
     model: ParametricModel, trials: Sequence[Trial], subsets: tuple[tuple[int, ...], ...]
 ) -> Refits:
-    """Fit each of the `subsets` alone, the other parameters at their typical values.
-
-    Raises
-    ------
-    DataError
-        As `estimate`.
-    """
+    """Fit each of the `subsets` alone, the other parameters at their typical values."""
     typical = np.array(model.typical)
     return Refits(tuple(estimate(model, trials, subset, typical) for subset in subsets))
 
@@ -137,20 +96,7 @@ def key_parameters(
 ) -> KeyParameters:
     """Choose key parameters of a study of several subjects and visits.
 
-    Parameters
-    ----------
-    model : ParametricModel
-        Its typical values are where fixed parameters stay.
-    recorded : mapping
-        (subject, visit) -> trials.
-    settings : SelectSettings
-        Of the nominal fits, at which the information is taken.
-    run : Runner
-        Does the work of each subject and visit.
-    bound, least_vaf, least_reliability
-        v, VAF in %, rho: chapter 5 has .35, 69 % and .75.
-    most : int
-        How many subsets of the first filter go on, those of least variance.
+    `recorded` (subject, visit).
     """
     trials = {" visit ".join(filter(None, key)): tuple(item) for key, item in recorded.items()}
     nominal = run(fit_nominal, Nominal, {name: (trials[name], settings) for name in trials})

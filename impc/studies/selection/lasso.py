@@ -37,30 +37,14 @@ _ROUNDING = 1e-12  # of the steepest slope, in the test of optimality
 
 @dataclass(frozen=True)
 class Lasso(Frozen):
-    """A selection.
+    """A selection."""
 
-    Attributes
-    ----------
-    weight : float
-        lambda.
-    t : Array
-        Normalised parameters (k,).
-    selected : tuple of int
-        Those away from their typical values.
-    refit : Estimate or None
-        Of the selected ones; None when none is.
-    objective : float
-        (C.5) at t.
-    solves : int
-        Problems (C.5) that were solved.
-    """
-
-    weight: float
-    t: Array
-    selected: tuple[int, ...]
-    refit: Estimate | None
-    objective: float
-    solves: int
+    weight: float  # lambda
+    t: Array  # Normalised parameters (k,)
+    selected: tuple[int, ...]  # Those away from their typical values
+    refit: Estimate | None  # Of the selected ones; None when none is
+    objective: float  # (C.5) at t
+    solves: int  # Problems (C.5) that were solved
 
 
 def proximal_lasso(
@@ -68,12 +52,7 @@ def proximal_lasso(
 ) -> tuple[Array, float]:
     """Solve (C.5): normalised parameters (k,) and the objective.
 
-    Parameters
-    ----------
-    weight : float
-        lambda.
-    start : Array, optional
-        Normalised parameters (k,); the typical values by default.
+    `start` (k,).
     """
     typical = normalised(model, np.asarray(model.typical))
     t = typical.copy() if start is None else np.clip(start, -1, 1)

@@ -31,35 +31,20 @@ __all__ = ["Discrete", "discretised", "kronecker_sensitivity", "linear_functions
 
 
 class Discrete(NamedTuple):
-    """Sampled matrices and their derivatives, the parameter's axis first.
+    """Sampled matrices and their derivatives, the parameter's axis first."""
 
-    Attributes
-    ----------
-    A, B, C : Array
-        (n, n), (n, d) and (p, n).
-    dA, dB, dC : Array
-        (k, n, n), (k, n, d) and (k, p, n).
-    """
-
-    A: Array
-    B: Array
-    C: Array
-    dA: Array
-    dB: Array
-    dC: Array
+    A: Array  # (n, n)
+    B: Array  # (n, d)
+    C: Array  # (p, n)
+    dA: Array  # (k, n, n)
+    dB: Array  # (k, n, d)
+    dC: Array  # (k, p, n)
 
 
 def discretised(matrices: ca.Function, theta: Array, dt: float) -> Discrete:
     """Sample a model at one point.
 
-    Parameters
-    ----------
-    matrices : casadi.Function
-        theta (k) -> A (n, n), B (n, d), C (p, n), continuous.
-    theta : Array
-        (k,).
-    dt : float
-        Sample time, s.
+    `theta` (k,); `dt` in s.
     """
     A, B, C = (item.full() for item in matrices(theta))
     symbol = ca.SX.sym("theta", len(theta))
@@ -77,12 +62,7 @@ def linear_functions(
 ]:
     """Simulation and Jacobian of a `ParametricModel` from rest.
 
-    Parameters
-    ----------
-    matrices : casadi.Function
-        theta (k) -> A (n, n), B (n, d), C (p, n), continuous.
-    dt : float
-        Sample time, s.
+    `dt` in s.
     """
     symbol = ca.SX.sym("theta", matrices.size1_in(0))
     parts = matrices(symbol)
@@ -116,10 +96,7 @@ def linear_functions(
 def kronecker_sensitivity(found: Discrete, given: Array) -> Array:
     """(A.3) with Kronecker products: derivative of the outputs (samples, p, k); slow.
 
-    Parameters
-    ----------
-    given : Array
-        Input (samples, d).
+    `given` (samples, d).
     """
     k, n, d = len(found.dA), found.A.shape[0], found.B.shape[1]
     dA, dB, dC = (np.hstack(list(item)) for item in (found.dA, found.dB, found.dC))

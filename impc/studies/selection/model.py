@@ -28,46 +28,26 @@ _STEP = 1e-4
 
 @dataclass(frozen=True)
 class Trial(Frozen):
-    """One recording, in the units of the model's signals.
+    """One recording, in the units of the model's signals."""
 
-    Attributes
-    ----------
-    input : Array
-        (samples, d).
-    outputs : Array
-        (samples, p).
-    """
-
-    input: Array
-    outputs: Array
+    input: Array  # (samples, d)
+    outputs: Array  # (samples, p)
 
 
 @dataclass(frozen=True)
 class ParametricModel(Frozen):
-    """The model and what is known of its parameters.
+    """The model and what is known of its parameters."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        (k,).
-    low, high, typical : Array
-        Bounds and typical values (k,), in the parameters' units.
-    pathways, units, meanings : tuple of str
-        What each belongs to, its unit, and what it is in words (k,).
-    simulate : callable
-        (theta (k,), input (samples, d)) -> outputs (samples, p).
-    jacobian : callable or None
-        (theta, input, free) -> (outputs, their derivative (samples, p, f) with respect to the f
-        parameters whose indices are `free`).
-    """
-
-    names: tuple[str, ...]
-    low: Array
+    names: tuple[str, ...]  # (k,)
+    low: Array  # Bounds and typical values (k,), in the parameters' units
     high: Array
     typical: Array
-    pathways: tuple[str, ...]
+    pathways: tuple[str, ...]  # What each belongs to, its unit, and what it is in words (k,)
     units: tuple[str, ...]
+    # (theta (k,), input (samples, d)) -> outputs (samples, p)
     simulate: Callable[[Array, Array], Array]
+    # (theta, input, free) -> (outputs, their derivative (samples, p, f) with respect to the f
+    # parameters whose indices are `free`)
     jacobian: Callable[[Array, Array, IntArray], tuple[Array, Array]] | None = None
     meanings: tuple[str, ...] = ()
 
@@ -107,24 +87,7 @@ def parametric_model(
 ) -> ParametricModel:
     """Check and freeze a model.
 
-    Parameters
-    ----------
-    names : sequence of str
-        Of the k parameters.
-    low, high, typical : sequence of float
-        Bounds and typical values (k,), in their units.
-    simulate : callable
-        (theta (k,), input (samples, d)) -> outputs (samples, p).
-    pathways, units, meanings : sequence of str, optional
-        Of each parameter; empty by default.
-    jacobian : callable, optional
-        (theta, input, free) -> outputs and their derivative (samples, p, f) with respect to the f
-        parameters whose indices are `free`, in their units.
-
-    Raises
-    ------
-    InputError
-        When lengths differ, a range is empty, or a typical value lies outside of it.
+    `low, high, typical` (k,).
     """
     count = len(names)
     for name, values in (("low", low), ("high", high), ("typical", typical)):
@@ -161,19 +124,7 @@ def sensitivity(
 ) -> tuple[Array, Array]:
     """Outputs of the model, and their derivative with respect to normalised parameters.
 
-    Parameters
-    ----------
-    theta : Array
-        (k,), in their units.
-    given : Array
-        Input (samples, d).
-    free : IntArray, optional
-        Indices (f,) of the parameters that are asked for; all by default.
-
-    Returns
-    -------
-    outputs, derivative : Array
-        (samples, p) and (samples, p, f).
+    `theta` (k,); `given` (samples, d); `free` (f,).
     """
     along = np.arange(model.size) if free is None else free
     if model.jacobian is not None:

@@ -38,37 +38,18 @@ _NEEDED = ("names", "low", "high", "typical", "inputs", "outputs", "rate")
 
 @dataclass(frozen=True)
 class ModelSource:
-    """A model, and how its signals are called in a recording.
+    """A model, and how its signals are called in a recording."""
 
-    Attributes
-    ----------
-    name : str
-        Import path of the function.
-    arguments : mapping
-        What it was called with.
-    model : ParametricModel
-    inputs, outputs : tuple of str
-        Signals of a recording.
-    rate : float
-        Samples per second of the model.
-    """
-
-    name: str
-    arguments: Mapping[str, Any]
+    name: str  # Import path of the function
+    arguments: Mapping[str, Any]  # What it was called with
     model: ParametricModel
-    inputs: tuple[str, ...]
+    inputs: tuple[str, ...]  # Signals of a recording
     outputs: tuple[str, ...]
-    rate: float
+    rate: float  # Samples per second of the model
 
 
 def model_source(name: str, arguments: Mapping[str, Any]) -> ModelSource:
-    """Call the function of an import path `name`, ``module:function``, with arguments.
-
-    Raises
-    ------
-    InputError
-        When there is no such function, it refuses the arguments, or what it returns lacks a key.
-    """
+    """Call the function of an import path `name`, ``module:function``, with arguments."""
     make = import_function(name)
     try:
         with users_code(f"model {name}", TypeError, ValueError):
@@ -100,13 +81,7 @@ def model_source(name: str, arguments: Mapping[str, Any]) -> ModelSource:
 
 
 def read_trials(study: Study, source: ModelSource) -> dict[tuple[str, str], tuple[Trial, ...]]:
-    """Trials of every subject and visit, all conditions together.
-
-    Raises
-    ------
-    DataError, InputError
-        As `read_recordings`.
-    """
+    """Trials of every subject and visit, all conditions together."""
     # A plant of that many signals: the reader takes names and the rate from it.
     d, p = len(source.inputs), len(source.outputs)
     names: dict[str, Any] = {"inputs": ["nothing", *source.inputs], "outputs": source.outputs}

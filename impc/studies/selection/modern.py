@@ -53,21 +53,11 @@ _MOST = 200_000
 
 @dataclass(frozen=True)
 class FixedBias(Frozen):
-    """Shift of the free parameters (in normalised units) for one fixed parameter moved.
+    """Shift of the free parameters (in normalised units) for one fixed parameter moved."""
 
-    Attributes
-    ----------
-    name : str
-        The fixed parameter.
-    moved : float
-        By how much, in normalised units.
-    shift : Array
-        Of each free parameter (free,), in normalised units.
-    """
-
-    name: str
-    moved: float
-    shift: Array
+    name: str  # The fixed parameter
+    moved: float  # By how much, in normalised units
+    shift: Array  # Of each free parameter (free,), in normalised units
 
 
 def pivoted_order(found: Information) -> tuple[int, ...]:
@@ -116,12 +106,7 @@ def agreement(
 ) -> dict[str, Selection | tuple[int, ...]]:
     """Selections by every rule, and those of the information with other ranges and points.
 
-    Parameters
-    ----------
-    theta : Array
-        (k,), in their units.
-    bound : float
-        v, largest variance in normalised units.
+    `theta` (k,).
     """
     found = fisher_information(model, theta, trials)
     ours = largest_subsets([found.F], bound)
@@ -166,15 +151,6 @@ def profile_interval(
 
     The parameter is held, the other free ones are fitted again; residuals are taken as white. An
     end that is not met inside the parameter's range is infinite.
-
-    Parameters
-    ----------
-    fit : Estimate
-        Where the profile begins.
-    index : int
-        Of the parameter, one of `fit.free`.
-    level : float
-        Of the interval, between 0 and 1.
     """
     others = tuple(item for item in fit.free if item != index)
     samples = sum(item.outputs.size for item in trials)

@@ -55,17 +55,7 @@ def in_turn(model: ParametricModel) -> Runner:
 def on_workers(
     workers: Workers, source: ModelSource, kept: Kept, done: Callable[[str], None] = lambda _: None
 ) -> Runner:
-    """On workers; what is kept already is not done again.
-
-    Parameters
-    ----------
-    workers : Workers
-    source : ModelSource
-        Its import path must be known to the workers too.
-    kept : Kept
-    done : callable
-        Told each name when its work is done.
-    """
+    """On workers; what is kept already is not done again."""
 
     def run(
         work: Callable[..., T], kind: type[T], arguments: Mapping[str, tuple[Any, ...]]

@@ -17,49 +17,22 @@ __all__ = ["SelectSettings", "select_settings"]
 
 @dataclass(frozen=True)
 class SelectSettings:
-    """Settings of `impc select`.
+    """Settings of `impc select`."""
 
-    Attributes
-    ----------
-    bound : float
-        v, largest variance in normalised units, of the subset that is refitted.
-    bounds : list of float
-        Of the sweep.
-    least : int
-        n_min.
-    size : int
-        Parameters that the LASSO is to leave.
-    starts : int
-        Of the nominal fit.
-    replicates : int
-        Of the bootstrap.
-    draw : "single" or "block"
-        How the bootstrap draws residuals.
-    nelder_mead : bool
-        Whether Table C.1 is run too: slow.
-    seed : int
-        Of starts and replicates.
-    """
-
-    bound: float = 0.05
+    bound: float = 0.05  # v, largest variance in normalised units, of the subset that is refitted
+    # Of the sweep
     bounds: list[float] = field(default_factory=lambda: [0.05 + 0.1 * k for k in range(10)])
-    least: int = 2
-    size: int = 5
-    starts: int = 3
-    replicates: int = 200
-    draw: str = "block"
-    nelder_mead: bool = False
-    seed: int = 0
+    least: int = 2  # n_min
+    size: int = 5  # Parameters that the LASSO is to leave
+    starts: int = 3  # Of the nominal fit
+    replicates: int = 200  # Of the bootstrap
+    draw: str = "block"  # How the bootstrap draws residuals
+    nelder_mead: bool = False  # Whether Table C.1 is run too: slow
+    seed: int = 0  # Of starts and replicates
 
 
 def select_settings(table: Mapping[str, Any]) -> SelectSettings:
-    """Read the [select] table.
-
-    Raises
-    ------
-    InputError
-        When a key is unknown or a value of the wrong kind.
-    """
+    """Read the [select] table."""
     found = read_settings("select", SelectSettings, table)
     _require_in_range(found)
     if found.draw not in ("single", "block"):

@@ -44,76 +44,38 @@ _DRAW = {"single": draw_single, "block": block_residuals}
 
 @dataclass(frozen=True)
 class Nominal:
-    """All parameters of one subject, and what the recordings tell of them.
+    """All parameters of one subject, and what the recordings tell of them."""
 
-    Attributes
-    ----------
-    fit : Estimate
-        All parameters fitted.
-    information : Information
-        At that estimate.
-    unseen : tuple of NullDirection
-    scalings : tuple of tuple of str
-        Parameters that may be scaled together unseen.
-    sweep : tuple of Selection
-    seconds : float
-        Time of information and sweep, s.
-    """
-
-    fit: Estimate
-    information: Information
+    fit: Estimate  # All parameters fitted
+    information: Information  # At that estimate
     unseen: tuple[NullDirection, ...]
-    scalings: tuple[tuple[str, ...], ...]
+    scalings: tuple[tuple[str, ...], ...]  # Parameters that may be scaled together unseen
     sweep: tuple[Selection, ...]
-    seconds: float
+    seconds: float  # Time of information and sweep, s
 
 
 @dataclass(frozen=True)
 class Chosen:
-    """The chosen parameters of one subject, and what the LASSO would have chosen.
+    """The chosen parameters of one subject, and what the LASSO would have chosen."""
 
-    Attributes
-    ----------
-    refit : Estimate
-        Others at typical values.
-    intervals : BootstrapIntervals
-    lasso : Lasso
-    nelder_mead : Lasso or None
-        Table C.1, when asked for.
-    seconds_lasso, seconds_nelder_mead : float
-        Time of each, s.
-    """
-
-    refit: Estimate
+    refit: Estimate  # Others at typical values
     intervals: BootstrapIntervals
     lasso: Lasso
-    nelder_mead: Lasso | None
-    seconds_lasso: float
+    nelder_mead: Lasso | None  # Table C.1, when asked for
+    seconds_lasso: float  # Time of each, s
     seconds_nelder_mead: float
 
 
 @dataclass(frozen=True)
 class Doubts:
-    """What a reviewer asks of the chosen parameters, in one subject.
+    """What a reviewer asks of the chosen parameters, in one subject."""
 
-    Attributes
-    ----------
-    agreement : dict
-        Rule -> its best subset.
-    collinearity : float
-        Brun's index of the chosen parameters.
-    bias : tuple of FixedBias
-    profile : tuple of (float, float)
-        Ends of the profile likelihood's 95 % interval of each chosen parameter.
-    bound : tuple of float
-        Half width of the Cramer-Rao 95 % interval of each, in its unit.
-    """
-
-    agreement: dict[str, tuple[int, ...]]
-    collinearity: float
+    agreement: dict[str, tuple[int, ...]]  # Rule -> its best subset
+    collinearity: float  # Brun's index of the chosen parameters
     bias: tuple[FixedBias, ...]
+    # Ends of the profile likelihood's 95 % interval of each chosen parameter
     profile: tuple[tuple[float, float], ...]
-    bound: tuple[float, ...]
+    bound: tuple[float, ...]  # Half width of the Cramer-Rao 95 % interval of each, in its unit
 
 
 def fit_nominal(

@@ -33,21 +33,12 @@ _MOST, _AT_ONCE = 1_000_000, 50_000
 
 @dataclass(frozen=True)
 class Selection:
-    """Feasible subsets of the largest size for one bound.
+    """Feasible subsets of the largest size for one bound."""
 
-    Attributes
-    ----------
-    bound : float
-        v.
-    subsets : tuple of tuple of int
-        Best first: least largest variance. Empty when none of n_min or more is feasible.
-    variances : tuple of float
-        Largest variance of each.
-    """
-
-    bound: float
+    bound: float  # v
+    # Best first: least largest variance. Empty when none of n_min or more is feasible.
     subsets: tuple[tuple[int, ...], ...]
-    variances: tuple[float, ...]
+    variances: tuple[float, ...]  # Largest variance of each
 
     @property
     def size(self) -> int:
@@ -82,20 +73,7 @@ def subset_variances(informations: Sequence[Array], subsets: Sequence[Sequence[i
 def largest_subsets(informations: Sequence[Array], bound: float, least: int = 2) -> Selection:
     """Largest feasible subsets.
 
-    Parameters
-    ----------
-    informations : sequence of Array
-        F (k, k) of each subject and visit: the variance must hold for all.
-    bound : float
-        v, largest variance in normalised units.
-    least : int
-        n_min.
-
-    Raises
-    ------
-    InputError
-        When there is no information, the bound is not positive, or so many subsets keep it that
-        they cannot all be looked at.
+    `informations` (k, k).
     """
     if not informations or not bound > 0:
         raise InputError("selection", "needs an information and a positive bound", "give both")
@@ -132,19 +110,7 @@ def _grown(known: Sequence[tuple[int, ...]], count: int) -> Iterator[tuple[int, 
 def exhaustive(informations: Sequence[Array], bound: float, least: int = 2) -> Selection:
     """`largest_subsets` by trying every subset: for checks, and up to twenty parameters.
 
-    Parameters
-    ----------
-    informations : sequence of Array
-        F of each subject and visit (k, k).
-    bound : float
-        v, largest variance in normalised units.
-    least : int
-        n_min.
-
-    Raises
-    ------
-    InputError
-        With more than twenty.
+    `informations` (k, k).
     """
     count = len(informations[0])
     if count > 20:
