@@ -5,7 +5,7 @@
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
-.PHONY: help env demo test long full check docs architecture reproduce wheel slow coverage structures followers plans default-subjects noisy-people nonlinear nonlinear-seat look search numerics bench fuzz lock clean
+.PHONY: help env demo test long full check docs architecture reproduce wheel slow coverage structures followers plans default-subjects noisy-people nonlinear nonlinear-seat look search numerics measure bench fuzz lock clean
 
 PYTHON ?= python3
 # Not to be set from outside: the environment is made with `venv --clear`.
@@ -14,10 +14,11 @@ PY := $(VENV)/bin/python
 PIP := $(PY) -m pip --disable-pip-version-check -qq
 UV := $(shell command -v uv 2>/dev/null || echo $(VENV)/bin/uv)
 
-# Three stamps, each written last, so that a half-made environment is never taken as complete.
+# Four stamps, each written last, so that a half-made environment is never taken as complete.
 LOCKED := $(VENV)/.stamp-locked
 PROJECT := $(VENV)/.stamp-project
 POLYTOPE := $(VENV)/.stamp-polytope
+COMPILED := $(VENV)/.stamp-compiled
 POLYTOPE_LOG := $(VENV)/polytope-install.log
 
 # Bytecode is kept whatever the environment says: without it each of the processes that tests start
@@ -60,6 +61,7 @@ help:
 	@echo 'make reproduce  write docs/reproduction: the dissertation, line by line (half an hour)'
 	@echo 'make wheel   build a wheel, install it in an empty environment, run impc example there'
 	@echo 'make look    every kind of page at the width of a desk and of a phone (needs chromium)'
+	@echo 'make measure  the sizes of the code base, of its tests and pages: a minute'
 	@echo 'make bench   the benchmarks:                     python -m experiments.benchmarks'
 	@echo 'make fuzz    160 000 mutated files, configurations and plants; FUZZ="--seed 1 --cases 1000"'
 	@echo 'make lock    compile both lock files again (needs uv); UPGRADE=--upgrade takes newer versions'
@@ -72,9 +74,9 @@ demo: env
 
 # A file of tests stays on one process, in the order of the folders: the longest are first. What all of
 # them share is compiled on one core while the checks run on the other.
-test: env
-	@OPENBLAS_NUM_THREADS=1 $(PY) -m tests.warm & warm=$$!; \
-	$(MAKE) --no-print-directory check; checked=$$?; wait $$warm && exit $$checked
+test: $(PROJECT) $(POLYTOPE)
+	@$(MAKE) --no-print-directory $(COMPILED) & compiled=$$!; \
+	$(MAKE) --no-print-directory check; checked=$$?; wait $$compiled && exit $$checked
 	$(PYTEST) -m "not long and not full and not slow"
 
 # Marks do not include each other: what is long but also full is full.
@@ -85,7 +87,7 @@ long: env
 full: env
 	$(PYTEST) -m full
 
-check: env
+check: $(PROJECT)
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
 	$(PY) -m mypy --strict impc plants experiments tests
@@ -179,6 +181,9 @@ nonlinear-seat: env
 	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.nonlinear_seat people
 	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.nonlinear_seat prices --amplitudes 5
 
+measure: env
+	$(PY) -m tests.measure
+
 bench: env
 	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(PY) -m experiments.benchmarks
 
@@ -186,7 +191,12 @@ bench: env
 fuzz: env
 	OPENBLAS_NUM_THREADS=1 $(PY) -m tests.fuzz $(FUZZ)
 
-env: $(PROJECT) $(POLYTOPE)
+env: $(PROJECT) $(POLYTOPE) $(COMPILED)
+
+$(COMPILED): $(wildcard impc/control/compiled_*.py) $(PROJECT)
+	@echo 'Compiling, once: some minutes.'
+	@OPENBLAS_NUM_THREADS=1 $(VENV)/bin/impc warm
+	@touch $@
 
 $(LOCKED): requirements.lock
 	@found=; for python in $(CANDIDATES); do \

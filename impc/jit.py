@@ -1,15 +1,18 @@
-"""numba's `njit`, wherever the package is installed.
+"""numba's `njit`, with compiled code kept where it stays true and safe.
 
-numba keeps compiled code in the folder of NUMBA_CACHE_DIR, else beside the module or in the user's
-cache folder, and refuses to compile at all where none can be written. There it is kept in a folder
-of the user's own among the temporary files, or compiled anew in every process. Compiled code is run
-as it is read: a folder that another user could have made or may write to is never used, nor one
-that a file of the working folder names (docs/speed.md).
+numba looks only into the file of a function for changes, not into those of the functions that it
+calls. Compiled code is therefore kept in a folder named by the digest of all compiled sources, in
+the folder of NUMBA_CACHE_DIR, else beside the package or in the user's cache folder; where none can
+be written, in a folder of the user's own among the temporary files, or nowhere. It is run as it is
+read: a folder that another user could have made or may write to is never used, nor one that a file
+of the working folder names (docs/speed.md).
 """
 
 from __future__ import annotations
 
 import contextlib
+import functools
+import hashlib
 import os
 import stat
 from pathlib import Path
@@ -20,7 +23,7 @@ from impc.settings_files import ignore_settings_files
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-__all__ = ["keep_caches", "njit"]
+__all__ = ["keep_caches", "njit", "say_when_compiling"]
 
 F = TypeVar("F", bound="Callable[..., Any]")
 
@@ -30,21 +33,65 @@ def njit(**options: Any) -> Callable[[F], F]:
     ignore_settings_files("numba")
     import numba  # noqa: PLC0415  # a quarter of a second, and `keep_caches` needs none
 
+    if _waiting:
+        _listen()
+
     def decorate(function: F) -> F:
         make: Any = numba.njit
         config: Any = numba.core.config
-        # Of the environment only: where numba was imported before impc, a file of the working
-        # folder may name another folder, from which numba would unpickle.
-        before, config.CACHE_DIR = config.CACHE_DIR, os.environ.get("NUMBA_CACHE_DIR", "")
+        before, config.CACHE_DIR = config.CACHE_DIR, _compiled()
         try:
-            found: F = make(**options)(function)
-        except RuntimeError:  # "no locator available for file ..."
-            found = make(**{**options, "cache": False})(function)
+            found: F = make(**{**options, "cache": bool(config.CACHE_DIR)})(function)
         finally:
             config.CACHE_DIR = before
         return found
 
     return decorate
+
+
+def say_when_compiling(say: Callable[[str], None]) -> None:
+    """Have `say` called with a line, once, when something is compiled that is not in the cache."""
+    _waiting[:] = [say]
+
+
+_waiting: list[Callable[[str], None]] = []
+
+
+def _listen() -> None:
+    """Tell whoever waits, once, when numba compiles."""
+    from numba.core import event  # noqa: PLC0415  # with numba, not before
+
+    class Once(event.Listener):
+        def on_start(self, _event: Any) -> None:
+            while _waiting:
+                _waiting.pop()("compiling, once: a minute or two (`impc warm` does it beforehand)")
+
+        def on_end(self, _event: Any) -> None:
+            """Nothing is told."""
+
+    register: Any = event.register
+    register("numba:compile", Once())
+
+
+@functools.cache
+def _compiled() -> str:
+    """The folder of what is compiled from the sources as they are; empty where there is none."""
+    base, package = _base(), Path(__file__).parent
+    if base is None:
+        return ""
+    digest = hashlib.sha256()
+    for path in sorted([Path(__file__), *package.rglob("compiled_*.py")]):
+        digest.update(path.read_bytes())
+    return str(base / f"compiled-{digest.hexdigest()[:16]}")
+
+
+def _base() -> Path | None:
+    """Where that folder is made: as the environment says, beside the package, or at home."""
+    named = os.environ.get("NUMBA_CACHE_DIR")
+    if named:
+        return Path(named)
+    places = (Path(__file__).parent / "__pycache__", _cache_home() / "impc")
+    return next((place for place in places if _writable(place)), None)
 
 
 def keep_caches() -> str:
@@ -53,13 +100,10 @@ def keep_caches() -> str:
     To be called before either is imported; processes that are begun later inherit it.
     """
     told = []
-    home = _cache_home()
-    if "NUMBA_CACHE_DIR" not in os.environ and not (
-        _writable(Path(__file__).parent / "control" / "__pycache__") or _writable(home / "numba")
-    ):
+    if _base() is None:
         told.append("NUMBA_CACHE_DIR")
     if "MPLCONFIGDIR" not in os.environ and not (
-        _writable(home / "matplotlib") and _writable(_config_home() / "matplotlib")
+        _writable(_cache_home() / "matplotlib") and _writable(_config_home() / "matplotlib")
     ):
         told.append("MPLCONFIGDIR")
     if not told:

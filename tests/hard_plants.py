@@ -18,7 +18,6 @@ from impc.control.closed_loop import PreparedLoop, prepare_loop, run_loop, simul
 from impc.control.compiled_dual import solve_dual
 from impc.control.constraint_rows import directions
 from impc.control.controller import Controller
-from impc.control.saturated import solve_saturated
 from impc.control.simulation import Scenario, Simulation, Status, scenario
 from impc.errors import SolverError
 from impc.model.bounds import Bounds, bound_rows
@@ -110,27 +109,22 @@ def prices(prepared: PreparedLoop, x: np.ndarray) -> np.ndarray:
     upper, lower = np.zeros((2, horizon, m))
     state = np.zeros((horizon, int(on.sum())))
     last = np.zeros(int(np.sum(rows.stage >= horizon)))
-    if not np.any(on) and not len(last):
-        sides = np.array(controller.bounds.u_min), np.array(controller.bounds.u_max)
-        plan = solve_saturated(prepared.matrices, np.array(controller.S), *sides, horizon, x)
-        upper, lower = np.maximum(plan.at, 0), np.maximum(-plan.at, 0)
-    else:
-        count, width = rows.M.shape
-        room, lam = min(count, width) + 1, np.zeros(count)
-        solve_dual(
-            rows.W, rows.gram, rows.b - rows.T @ x, rows.limit, 1e-13 * rows.b, lam,
-            np.empty(room, dtype=np.int64), np.empty((room, room)), np.empty((room, width)), 0,
-        )  # fmt: skip
-        for r in np.flatnonzero(lam > 0):
-            family, k = rows.family[r], rows.stage[r]
-            if k >= horizon:
-                last[r - (len(lam) - len(last))] = lam[r]
-            elif on[family]:
-                state[k, family - 2 * m] = lam[r]
-            elif family < m:
-                upper[k, family] = lam[r]
-            else:
-                lower[k, family - m] = lam[r]
+    count, width = rows.M.shape
+    room, lam = min(count, width) + 1, np.zeros(count)
+    solve_dual(
+        rows.W, rows.gram, rows.b - rows.T @ x, rows.limit, 1e-13 * rows.b, lam,
+        np.empty(room, dtype=np.int64), np.empty((room, room)), np.empty((room, width)), 0,
+    )  # fmt: skip
+    for r in np.flatnonzero(lam > 0):
+        family, k = rows.family[r], rows.stage[r]
+        if k >= horizon:
+            last[r - (len(lam) - len(last))] = lam[r]
+        elif on[family]:
+            state[k, family - 2 * m] = lam[r]
+        elif family < m:
+            upper[k, family] = lam[r]
+        else:
+            lower[k, family - m] = lam[r]
     return np.concatenate([part.ravel() for part in (upper, lower, state, last)])
 
 

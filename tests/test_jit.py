@@ -77,10 +77,10 @@ def test_nothing_is_said_or_set_where_caches_can_be_kept(
 
 def test_the_library_compiles_in_memory_without_a_place_for_caches(tmp_path: Path) -> None:
     shutil.copytree(ROOT / "impc", tmp_path / "impc", ignore=shutil.ignore_patterns("__pycache__"))
-    (tmp_path / "impc/control/__pycache__").write_text("a file, where numba would make a folder")
+    (tmp_path / "impc/__pycache__").write_text("a file, where numba would make a folder")
     code = (
-        "import impc.control.compiled_loop\n"
-        "loop = impc.control.compiled_loop\n"
+        "import impc.control.compiled_kernel\n"
+        "loop = impc.control.compiled_kernel\n"
         "print(type(loop.run._cache).__name__, loop.__file__)\n"
     )
     homeless = {"PYTHONPATH": str(tmp_path), "HOME": NOWHERE, "XDG_CACHE_HOME": NOWHERE}
@@ -89,4 +89,4 @@ def test_the_library_compiles_in_memory_without_a_place_for_caches(tmp_path: Pat
         words, env=os.environ | homeless, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
-    assert done.stdout.split() == ["NullCache", str(tmp_path / "impc/control/compiled_loop.py")]
+    assert done.stdout.split() == ["NullCache", str(tmp_path / "impc/control/compiled_kernel.py")]

@@ -49,8 +49,8 @@ ELSEWHERE = {
         studies/reliability/tables.py""",
     "control/test_body_steps.py": "control/compiled_body.py",
     "control/test_closed_loop.py": """
-        control/compiled_answer.py control/compiled_arrays.py control/compiled_dual.py
-        control/compiled_law.py control/compiled_loop.py control/constraint_rows.py""",
+        control/compiled_kernel.py control/compiled_kernel.py control/compiled_dual.py
+        control/compiled_kernel.py control/compiled_kernel.py control/constraint_rows.py""",
     "control/test_joint_likelihood.py": """
         control/compiled_clip.py control/compiled_covariance.py control/compiled_filter.py
         control/compiled_person.py control/compiled_room.py control/compiled_sample.py

@@ -8,9 +8,7 @@ Those of `drawn_particles` are drawn and weighed with
 which is that density where each command is replaced by a line, c + rho g and a variance beside, the
 best for what all outputs say of g (`compiled_clip`; posterior linearisation, García-Fernández et
 al. 2017; twisted particles, Guarniero, Johansen and Lee 2017). Whatever psi is the likelihood of
-the particles has no bias; it has the less noise the better psi is. numba's cache looks at this file
-only: a change of another one whose functions are called must change `COMPILED_WITH` below, which
-tests/control/test_joint_likelihood.py asks for.
+the particles has no bias; it has the less noise the better psi is.
 """
 
 from __future__ import annotations
@@ -25,10 +23,7 @@ from impc.arrays import Buffer
 from impc.control.compiled_clip import Clip, clipped
 from impc.jit import njit
 
-__all__ = ["COMPILED_WITH", "Twist", "twist"]
-
-#: First digits of the SHA-256 of each file whose functions are called.
-COMPILED_WITH = {"compiled_clip": "4b317b8d6c67db13"}
+__all__ = ["Twist", "twist"]
 
 
 class Twist(NamedTuple):

@@ -24,7 +24,6 @@ import scipy.linalg
 
 from impc.arrays import Array
 from impc.assess.bounded_weights import weights_set
-from impc.assess.compiled_regulator import doubled_gain
 from impc.assess.extreme_weights import linear_maxima, linear_ranges
 from impc.assess.intent_statements import price_direction
 from impc.checking import replace
@@ -59,6 +58,7 @@ _DECADE = np.log(10.0)
 _STEPS = 6
 # Share of P that the last doubling may add: the next would add its square.
 _ENOUGH = 1e-9
+_DOUBLINGS = 60
 # Of a drawn gain's programs: the range of 39 draws is itself a rough one, and a program takes four
 # fifths of the time of those for the fitted gain.
 _ROUGH = 1e-6
@@ -223,14 +223,26 @@ def _against(item: Statement, plant: Plant, sizes: Array) -> Array:
 
 
 def _gain(plant: Plant, Q: Array, R: Array) -> Array | None:
-    """K (m, n) to eight digits; None where doubling does not converge.
+    """K (m, n) to eight digits by doubling (Chu et al. 2004); None where it does not converge.
 
-    The sampler asks for three thousand gains, in a twentieth of the time of `solve_lqr`; those that
-    it returns are solved for to the last digit.
+    The sampler asks for three thousand gains, in less time than by `solve_lqr`; those that it
+    returns are solved for to the last digit.
     """
-    A, B = np.array(plant.A), np.array(plant.B)  # compiled code takes whole, writable arrays
-    converged, K = doubled_gain(A, B, np.array(Q), np.array(R), _ENOUGH)
-    return K if converged else None
+    A, B, P = plant.A, plant.B, Q
+    G = B @ np.linalg.solve(R, B.T)
+    n, unit = len(A), np.eye(len(A))
+    with np.errstate(over="ignore", invalid="ignore"):
+        for _ in range(_DOUBLINGS):
+            right = np.linalg.solve(unit + G @ P, np.hstack([A, G]))
+            ahead, beside = right[:, :n], right[:, n:]
+            more = A.T @ P @ ahead
+            A, G, P = A @ ahead, G + A @ beside @ A.T, P + more
+            size = np.max(np.abs(P))
+            if not np.isfinite(size):
+                return None
+            if np.max(np.abs(more)) <= _ENOUGH * size:
+                return np.asarray(np.linalg.solve(R + B.T @ P @ B, B.T @ P @ plant.A))
+    return None
 
 
 def _slice(

@@ -30,7 +30,6 @@ import numpy as np
 import scipy.signal
 
 from impc.arrays import Array, Frozen, frozen
-from impc.assess.compiled_colour import coloured_nearby
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -179,7 +178,11 @@ def _coloured(columns: Array, gammas: Array) -> Array:
     """sum_s Gamma_{t-s} columns_s for columns (samples, p, k), Gamma_{-l} = Gamma_l'."""
     if len(gammas) > _FEW_LAGS:
         return _convolved(columns, gammas)
-    return np.asarray(coloured_nearby(np.ascontiguousarray(columns), gammas))
+    result = gammas[0] @ columns
+    for lag in range(1, min(len(gammas), len(columns))):
+        result[lag:] += gammas[lag] @ columns[:-lag]
+        result[:-lag] += gammas[lag].T @ columns[lag:]
+    return np.asarray(result)
 
 
 def _convolved(columns: Array, gammas: Array) -> Array:

@@ -12,7 +12,7 @@ import click
 
 from impc.cli.ending import ended, interruptions, own_process
 from impc.cli.exit_status import ExitStatus
-from impc.jit import keep_caches
+from impc.jit import keep_caches, say_when_compiling
 from impc.settings_files import ignore_settings_files
 
 __all__ = ["main"]
@@ -29,6 +29,7 @@ _COMMANDS = {
     "reliability": "impc.cli.reliability",
     "select": "impc.cli.select",
     "simulate": "impc.cli.simulate",
+    "warm": "impc.cli.warm",
 }
 
 
@@ -65,6 +66,7 @@ class _Program(click.Group):
         with own_process():
             ignore_settings_files("matplotlib", "numba")
             note = keep_caches()
+            say_when_compiling(lambda text: click.echo(f"impc: {text}", err=True))
             status = ended(work)
             if note and status == ExitStatus.DONE and "numba" in sys.modules:
                 click.echo(f"impc: note: {note}", err=True)

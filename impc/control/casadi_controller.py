@@ -22,8 +22,7 @@ from impc.checking import checked
 from impc.control.body_steps import next_state
 from impc.control.constraint_rows import build_rows
 from impc.control.controller import Controller
-from impc.control.infeasibility import excluded_row
-from impc.control.named_solver import plugin, silent
+from impc.control.named_solver import excluded_row, plugin, silent
 from impc.control.simulation import Simulation, Status
 from impc.errors import InputError
 
@@ -147,7 +146,7 @@ def solve_mpc(mpc: MpcSolver, x: ArrayLike) -> MpcStep:
     status = _judge(excess[mpc.soft] / rows.b[mpc.soft], v)
     row = -1
     if not solved or violation > _EXCEEDED:
-        row = excluded_row(controller, rows, state)
+        row = excluded_row(rows, state)
         status = Status.INFEASIBLE if row >= 0 else Status.UNSOLVED
     plan, states = _unroll(controller, state, v)
     return MpcStep(plan[0], plan, states, status, violation, row)

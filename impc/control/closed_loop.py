@@ -27,20 +27,20 @@ import numpy as np
 from impc.arrays import Array
 from impc.checking import checked
 from impc.control.body_steps import body_tape, pushes
-from impc.control.compiled_arrays import LoopMatrices, workspace
-from impc.control.compiled_law import answer_with
-from impc.control.compiled_loop import run
+from impc.control.compiled_kernel import LoopMatrices, answer_with, run, workspace
 from impc.control.constraint_rows import RowDirections, build_rows, differentiate_rows, directions
-from impc.control.infeasibility import excluded_row, proves_infeasible
-from impc.control.named_solver import COMPILED, Program, active_set, build_program
-from impc.control.saturated import differentiate_plan, solve_saturated
+from impc.control.named_solver import (
+    COMPILED,
+    Program,
+    active_set,
+    build_program,
+    excluded_row,
+)
 from impc.control.simulation import Sensitivity, Simulation, Status
-from impc.model.bounds import bound_rows
 
 if TYPE_CHECKING:
     from impc.control.constraint_rows import Directions, Rows
     from impc.control.controller import Controller
-    from impc.control.saturated import Plan
     from impc.control.simulation import Scenario
 
 __all__ = [
@@ -50,6 +50,9 @@ __all__ = [
     "simulate",
     "simulate_and_differentiate",
 ]
+
+# Asked where the compiled method has no answer.
+_SECOND = "daqp"
 
 
 @dataclass(frozen=True)
@@ -140,7 +143,7 @@ def run_loop(
     status = np.full(steps, Status.NOT_REACHED, dtype=np.int8)
     x[0], dx[0] = given.x0, along.x0
     multipliers = np.zeros(len(prepared.rows.b))
-    program = prepared.program
+    program, asked = prepared.program, prepared.program is not None
     loop = (
         *(prepared.matrices, prepared.matrix_directions, prepared.rows, prepared.row_directions),
         body_tape(plant.body, n, n + m + given.disturbance.shape[1], moving=p > 0),
@@ -150,38 +153,19 @@ def run_loop(
     )
     written = (x, u, dx, du, status, multipliers)
     t, weakly_active = 0, 0
-    plan: Plan | None = None  # of the sample before, where the rows did not tell its input
     while True:
-        first = t
-        gain_only = program is not None or plan is not None
-        weak, failed_row = run(*loop, first, *written, gain_only, local)
+        weak, failed_row = run(*loop, t, *written, asked, local)
         weakly_active += weak
         t = int(np.count_nonzero(status <= Status.SOFTENED))
-        if t == steps or status[t] == Status.DIVERGED:
+        if t == steps or status[t] == Status.DIVERGED or not (asked or proved):
             break
-        if program is not None:
-            status[t], weak, failed_row = _ask_solver(prepared, program, x[t], dx[t], u[t], du[t])
-            weakly_active += weak
-            if status[t] > Status.SOFTENED:
-                break
-            continue
-        if not proved:
+        if program is None:  # a second opinion on a sample that the compiled method does not solve
+            program = build_program(_SECOND, prepared.rows)
+        status[t], weak, row = _ask_solver(prepared, program, x[t], dx[t], u[t], du[t])
+        weakly_active += weak
+        if status[t] > Status.SOFTENED:
+            failed_row = failed_row if row >= 0 and failed_row >= 0 else row
             break
-        asked = plan is None  # the rows, which did not tell
-        if asked and status[t] == Status.INFEASIBLE:
-            if proves_infeasible(prepared.controller, prepared.rows, multipliers, x[t]):
-                break
-            status[t], failed_row = Status.UNSOLVED, -1
-        if asked and not _only_inputs_are_bounded(prepared.controller):
-            break
-        plan = _saturated_plan(prepared, x[t], plan if t == first + 1 else None)
-        if plan.told:
-            u[t], status[t] = plan.u[0], Status.ACTIVE
-            du[t] = _differentiate_first_input(prepared, plan, dx[t])
-        elif asked:
-            break
-        else:
-            plan = None
     return Simulation(x, u, status, weakly_active, failed_row), Sensitivity(dx, du)
 
 
@@ -223,37 +207,8 @@ def _ask_solver(
         w = (v.reshape(-1, len(u)) @ np.linalg.cholesky(controller.S)).ravel()
         if status <= Status.SOFTENED and np.max(np.abs(w - found.w)) <= found.agrees:
             return Status(status), weak, -1
-    row = excluded_row(controller, rows, x)
+    row = excluded_row(rows, x)
     return Status.INFEASIBLE if row >= 0 else Status.UNSOLVED, False, row
-
-
-def _only_inputs_are_bounded(controller: Controller) -> bool:
-    return controller.terminal is None and not np.any(
-        bound_rows(controller.bounds, controller.plant).on_state
-    )
-
-
-def _saturated_plan(prepared: PreparedLoop, x: Array, last: Plan | None) -> Plan:
-    """Answer of the recursion over the stages, where that of the rows is not told."""
-    controller = prepared.controller
-    sides = np.array(controller.bounds.u_min), np.array(controller.bounds.u_max)
-    metric = np.array(controller.S)
-    return solve_saturated(prepared.matrices, metric, *sides, controller.horizon, x, last)
-
-
-def _differentiate_first_input(prepared: PreparedLoop, plan: Plan, dx: Array) -> Array:
-    controller, along = prepared.controller, prepared.along
-    if along.count == 0:
-        return np.zeros((controller.plant.m, 0))
-    rows = bound_rows(controller.bounds, controller.plant)
-    sides = np.zeros((3, controller.plant.m, along.count))  # at -1 the last one
-    for row, direction in zip(rows.F, along.bounds, strict=True):
-        j = int(np.flatnonzero(row)[0])
-        sides[int(row[j]), j] = row[j] * direction
-    held = sides[plan.at, np.arange(controller.plant.m)]
-    return differentiate_plan(
-        plan, prepared.matrices, prepared.matrix_directions, np.array(controller.S), held, dx
-    )
 
 
 def _writable(*matrices: Array) -> LoopMatrices:

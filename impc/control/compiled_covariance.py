@@ -8,9 +8,8 @@ With the gain g = P C'S^-1 of a sample of the outputs, L = F g, and P|t what is 
 as in `impc.model.kalman`: g makes P|t least, so that dP+ leaves dg alone. F, its command at its
 slope among it, is of the sample; k directions are the last axis of every derivative.
 
-The two products with G are most of what a likelihood costs (`compiled_products`). numba's cache
-does not look there: `COMPILED_WITH` must change with it, which
-tests/control/test_joint_likelihood.py asks for (docs/noisy-people.md).
+The two products with G are most of what a likelihood costs (`compiled_products`). See
+docs/noisy-people.md.
 """
 
 from __future__ import annotations
@@ -28,13 +27,7 @@ from impc.control.compiled_room import Moves, Room, Way
 from impc.control.joint_loop import JointLoop
 from impc.jit import njit
 
-__all__ = ["COMPILED_WITH", "advance", "variance_changes", "weigh"]
-
-#: First digits of the SHA-256 of each file whose functions are called.
-COMPILED_WITH = {
-    "compiled_products": "50101205237e0db3",
-    "compiled_room": "fa7fc135ea27d9fb",
-}
+__all__ = ["advance", "variance_changes", "weigh"]
 
 
 @njit(cache=True, inline="always")

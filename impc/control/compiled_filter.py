@@ -2,9 +2,7 @@
 
 The filter is that of `joint_likelihood` (docs/noisy-people.md), a sample of it that of
 `compiled_sample`. While no bound is near, what is recorded changes no covariance, so that trials
-share one: it is most of what a filter costs. numba's cache looks at this file only: a change of
-another one whose functions are called must change `COMPILED_WITH` below, which
-tests/control/test_joint_likelihood.py asks for.
+share one: it is most of what a filter costs.
 """
 
 from __future__ import annotations
@@ -14,11 +12,9 @@ from typing import NamedTuple
 import numpy as np
 
 from impc.arrays import Buffer
-from impc.borrowed import borrowed
-from impc.control.compiled_arrays import DIVERGED, LARGEST, SOFTENED, LoopMatrices
 from impc.control.compiled_clip import Clip
 from impc.control.compiled_covariance import advance, weigh
-from impc.control.compiled_law import law
+from impc.control.compiled_kernel import DIVERGED, LARGEST, SOFTENED, LoopMatrices, law
 from impc.control.compiled_room import Covariance, Room
 from impc.control.compiled_sample import (
     FilterResult,
@@ -33,19 +29,8 @@ from impc.control.constraint_rows import RowDirections, Rows
 from impc.control.joint_loop import JointLoop
 from impc.jit import njit
 
-__all__ = ["COMPILED_WITH", "Course", "FilterParts", "Steady", "run_filter"]
+__all__ = ["Course", "FilterParts", "Steady", "run_filter"]
 
-#: First digits of the SHA-256 of each file whose functions are called.
-COMPILED_WITH = {
-    "borrowed": "f9ef79e3bd6dacdb",
-    "compiled_arrays": "f9299fe715d0d2a3",
-    "compiled_clip": "4b317b8d6c67db13",
-    "compiled_covariance": "baae8087983d530c",
-    "compiled_law": "fb4d0617cbd31619",
-    "compiled_room": "fa7fc135ea27d9fb",
-    "compiled_sample": "cd74742718710aa3",
-    "compiled_slope": "1be8607182549482",
-}
 
 # The covariance is taken for the stationary one when no entry differs by more than this, of the
 # deviations of its row and column; nor its derivative by more than the second.
@@ -79,7 +64,7 @@ class Course(NamedTuple):
 class FilterParts(NamedTuple):
     """What is filtered with, along q directions of which the first k move covariances."""
 
-    # Of the controller's law, as in `compiled_loop.run`, along all q directions; unit (m,)
+    # Of the controller's law, as in `compiled_kernel.run`, along all q directions; unit (m,)
     loop: LoopMatrices
     dloop: LoopMatrices
     rows: Rows
@@ -113,9 +98,6 @@ def run_filter(
 
     `outputs` (rows, p); `disturbance` (rows, d); `z` (trials, z); `dz` (trials, z, q).
     """
-    # The caller keeps all of these while this runs.
-    parts, room, result, course = borrowed((parts, room, result, course))
-    outputs, disturbance, z, dz = borrowed((outputs, disturbance, z, dz))
     u, here, joint, djoint, lasting = room.u, room.here, parts.joint, parts.djoint, parts.lasting
     begin, reached, first, at = course.begin, course.reached, course.first, parts.at
     n = parts.loop.K.shape[1]

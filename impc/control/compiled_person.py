@@ -1,24 +1,16 @@
-"""Compiled code: a person who senses with noise, simulated (docs/noisy-people.md).
-
-numba's cache looks at this file only: a change of another one whose functions are called must
-change `COMPILED_WITH` below, which tests/control/test_joint_likelihood.py asks for.
-"""
+"""Compiled code: a person who senses with noise, simulated (docs/noisy-people.md)."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from impc.arrays import Buffer
-from impc.control.compiled_arrays import DIVERGED, LARGEST, SOFTENED, LoopMatrices, workspace
-from impc.control.compiled_law import law
+from impc.control.compiled_kernel import DIVERGED, LARGEST, SOFTENED, LoopMatrices, law, workspace
 from impc.control.constraint_rows import RowDirections, Rows
 from impc.control.joint_loop import JointLoop
 from impc.jit import njit
 
-__all__ = ["COMPILED_WITH", "run_person"]
-
-#: First digits of the SHA-256 of each file whose functions are called.
-COMPILED_WITH = {"compiled_arrays": "f9299fe715d0d2a3", "compiled_law": "fb4d0617cbd31619"}
+__all__ = ["run_person"]
 
 
 @njit(cache=True, nogil=True)

@@ -17,7 +17,6 @@ __all__ = [
     "add_both",
     "both_sides",
     "combine",
-    "dot",
     "invert",
     "noise_products",
     "turn",
@@ -179,12 +178,3 @@ def invert(S: Buffer, inverse: Buffer) -> float:
                 for c in range(p):
                     inverse[b, c] -= factor * inverse[a, c]
     return volume
-
-
-@njit(cache=True, inline="always")
-def dot(a: Buffer, b: Buffer) -> float:
-    """a'b, of two arrays of one length (k,)."""
-    total = 0.0
-    for i in range(len(a)):
-        total += a[i] * b[i]
-    return total

@@ -11,15 +11,12 @@ from typing import NamedTuple
 import numpy as np
 
 from impc.arrays import Buffer
-from impc.control.compiled_arrays import Workspace, workspace
+from impc.control.compiled_kernel import Workspace, workspace
 from impc.control.constraint_rows import Rows
 from impc.control.joint_loop import JointLoop
 from impc.jit import njit
 
-__all__ = ["COMPILED_WITH", "Covariance", "Moves", "Room", "Way", "filter_room"]
-
-#: First digits of the SHA-256 of each file whose functions are called.
-COMPILED_WITH = {"compiled_arrays": "f9299fe715d0d2a3"}
+__all__ = ["Covariance", "Moves", "Room", "Way", "filter_room"]
 
 
 class Covariance(NamedTuple):

@@ -2,9 +2,7 @@
 
 `update` takes the recorded outputs in, `expected_command`, `clip_command` and `share_noise` say
 what is expected of the command that follows and what noise comes with it, and `ahead` goes on to
-the next sample (`joint_likelihood`, docs/noisy-people.md). numba's cache looks at this file only:
-a change of another one whose functions are called must change `COMPILED_WITH` below, which
-tests/control/test_joint_likelihood.py asks for.
+the next sample (`joint_likelihood`, docs/noisy-people.md).
 """
 
 from __future__ import annotations
@@ -22,7 +20,6 @@ from impc.control.joint_loop import JointLoop
 from impc.jit import njit
 
 __all__ = [
-    "COMPILED_WITH",
     "FilterResult",
     "ahead",
     "clip_command",
@@ -31,13 +28,6 @@ __all__ = [
     "update",
 ]
 
-#: First digits of the SHA-256 of each file whose functions are called.
-COMPILED_WITH = {
-    "compiled_clip": "4b317b8d6c67db13",
-    "compiled_covariance": "baae8087983d530c",
-    "compiled_products": "50101205237e0db3",
-    "compiled_room": "fa7fc135ea27d9fb",
-}
 
 # A first state is forgotten when none of its directions moves an innovation by more than this, of
 # its deviation.

@@ -1,24 +1,16 @@
-"""Compiled code: the slope of the command with the state, at the active set of one sample.
-
-It calls the least-distance problem of `compiled_dual`, at which numba's cache does not look:
-`COMPILED_WITH` must change with it, which tests/control/test_joint_likelihood.py asks for
-(docs/noisy-people.md).
-"""
+"""Compiled code: slope of the command with the state at the active rows (docs/noisy-people.md)."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from impc.arrays import Buffer
-from impc.control.compiled_arrays import LoopMatrices, Workspace
 from impc.control.compiled_dual import substitute_all
+from impc.control.compiled_kernel import LoopMatrices, Workspace
 from impc.control.constraint_rows import RowDirections, Rows
 from impc.jit import njit
 
-__all__ = ["COMPILED_WITH", "slope_of_law"]
-
-#: First digits of the SHA-256 of each file whose functions are called.
-COMPILED_WITH = {"compiled_arrays": "f9299fe715d0d2a3", "compiled_dual": "c3376c1c32aa9492"}
+__all__ = ["slope_of_law"]
 
 
 @njit(cache=True, inline="always")

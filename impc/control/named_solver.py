@@ -43,6 +43,7 @@ __all__ = [
     "active_set",
     "build_program",
     "described",
+    "excluded_row",
     "plugin",
     "require_solver",
     "silent",
@@ -98,6 +99,9 @@ _SETTLED = 1e-7
 # differ from that of the equations by, relative to the larger of 1 and z. DAQP keeps rows to 1e-5
 # where a price of a million is paid. The answer of the equations is checked to 1e-9.
 _AGREES = 1e-4
+
+# Share of their bounds by which rows that no plan keeps are exceeded at least: HiGHS ends at 1e-7.
+_EXCEEDED = 1e-6
 
 _own = threading.local()  # a CasADi function is not to be evaluated in two threads at a time
 _printing = threading.Lock()
@@ -222,6 +226,8 @@ def active_set(program: Program, d: Array) -> ActiveSet | None:
 
     `d` (r,).
     """
+    if not (np.all(np.isfinite(program.A)) and np.all(np.isfinite(d))):
+        return None
     A, right, soft = program.A, d / program.b, program.soft
     found = _solve(program, program.hard, right, np.zeros(len(d)))
     if soft.any() and (found is None or np.any(found[1][soft] > program.price)):
@@ -236,6 +242,28 @@ def active_set(program: Program, d: Array) -> ActiveSet | None:
     pull = -z - A.T @ (program.price * given_up)
     tight = _independent(A, held, multipliers, pull)
     return ActiveSet(tight, given_up, program.unit * z, _AGREES * program.unit * size)
+
+
+def excluded_row(rows: Rows, x: Array) -> int:
+    """A hard row that no input sequence keeps beside the others, by linear programming; -1 if none.
+
+    The least share t of their bounds by which all rows are exceeded, T x + M v <= (1 + t) b, is
+    positive; the row is the one that weighs most in the dual. `x` (n,).
+    """
+    hard = np.isinf(rows.limit)
+    width, b = rows.M.shape[1], rows.b[hard]
+    if not (np.all(np.isfinite(rows.M)) and np.all(np.isfinite(x))):  # of a plant that runs away
+        return -1
+    answer: Any = scipy.optimize.linprog(
+        np.r_[np.zeros(width), 1.0],
+        A_ub=np.column_stack([rows.M[hard] / b[:, None], -np.ones(len(b))]),
+        b_ub=1 - rows.T[hard] @ x / b,
+        bounds=[*[(None, None)] * width, (-1.0, None)],
+        method="highs",
+    )
+    if answer.status != 0 or not answer.x[-1] > _EXCEEDED:
+        return -1
+    return int(np.flatnonzero(hard)[np.argmax(-answer.ineqlin.marginals)])
 
 
 def _solve_softened(program: Program, right: Array) -> _Answer | None:

@@ -15,7 +15,7 @@ import numpy as np
 
 from impc.arrays import Array, Frozen, as_numbers, finite_array, frozen
 from impc.checking import Value, checked
-from impc.control import compiled_arrays
+from impc.control import compiled_kernel
 from impc.control.constraint_rows import build_rows
 from impc.errors import DataError, InfeasibleError, SolverError
 from impc.model.bounds import bound_rows
@@ -43,9 +43,9 @@ class Status(IntEnum):
     """What happened at a sample.
 
     FREE: the gain keeps every bound. ACTIVE: a bound is active. SOFTENED: a soft bound was
-    exceeded. INFEASIBLE: it is proved that no input sequence keeps the bounds. UNSOLVED: which
-    input is the answer, or whether there is one, could not be told in double precision. DIVERGED:
-    the state left every reasonable range. NOT_REACHED: the simulation ended before.
+    exceeded. INFEASIBLE: no input sequence keeps the bounds. UNSOLVED: the input, or whether there
+    is one, cannot be determined in double precision. DIVERGED: the state left every reasonable
+    range. NOT_REACHED: the simulation ended before.
 
     Examples
     --------
@@ -54,12 +54,12 @@ class Status(IntEnum):
     'a bound is active'
     """
 
-    FREE = compiled_arrays.FREE
-    ACTIVE = compiled_arrays.ACTIVE
-    SOFTENED = compiled_arrays.SOFTENED
-    INFEASIBLE = compiled_arrays.INFEASIBLE
-    UNSOLVED = compiled_arrays.UNSOLVED
-    DIVERGED = compiled_arrays.DIVERGED
+    FREE = compiled_kernel.FREE
+    ACTIVE = compiled_kernel.ACTIVE
+    SOFTENED = compiled_kernel.SOFTENED
+    INFEASIBLE = compiled_kernel.INFEASIBLE
+    UNSOLVED = compiled_kernel.UNSOLVED
+    DIVERGED = compiled_kernel.DIVERGED
     NOT_REACHED = 6
 
     @property
@@ -73,7 +73,7 @@ _SENTENCES = {
     Status.ACTIVE: "a bound is active",
     Status.SOFTENED: "a soft bound was exceeded",
     Status.INFEASIBLE: "no input sequence keeps the bounds",
-    Status.UNSOLVED: "the input could not be told in double precision",
+    Status.UNSOLVED: "the input cannot be determined in double precision",
     Status.DIVERGED: "the state left every reasonable range",
     Status.NOT_REACHED: "the simulation ended before this sample",
 }

@@ -69,7 +69,7 @@ def test_a_solver_that_fails_proves_nothing(name: str) -> None:
     controller = Controller(plant, Weights(np.eye(3), 1), bounds, 60, terminal_set=False)
     run = simulate_mpc(build_mpc(controller, name), scenario(plant, np.ones(3), 2))
     assert run.status[0] == Status.UNSOLVED
-    with pytest.raises(SolverError, match="could not be told in double precision"):
+    with pytest.raises(SolverError, match="cannot be determined in double precision"):
         require_complete(controller, run)
 
 

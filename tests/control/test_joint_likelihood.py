@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import importlib
-import re
 from dataclasses import replace as replaced
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -31,29 +28,10 @@ from impc.model.bounds import Bounds
 from impc.model.observer import Observer, believed_filter
 from impc.model.plant import Plant
 from impc.model.recordings import Recording
-from tests.documents.blocks import ROOT
 from tests.support import extrapolated_slope
 
 if TYPE_CHECKING:
     from impc.arrays import Array
-
-
-_CALLED = re.compile(r"^from impc\.((?:\w+\.)?(?:compiled_\w+|borrowed)) import", re.MULTILINE)
-_COMPILED = {
-    str(path.relative_to(ROOT).with_suffix("")).replace("/", "."): _CALLED.findall(text)
-    for path in sorted([*(ROOT / "impc").rglob("*.py"), *(ROOT / "experiments").rglob("*.py")])
-    if "@njit" in (text := path.read_text(encoding="utf-8"))
-}
-
-
-@pytest.mark.parametrize("file", [file for file, called in _COMPILED.items() if called])
-def test_code_is_compiled_with_what_is_there(file: str) -> None:
-    """numba would go on running what is called as it was: write these digests into the file."""
-    found = {}
-    for name in _COMPILED[file]:
-        source = (ROOT / "impc" / f"{name.replace('.', '/')}.py").read_bytes()
-        found[name.split(".")[-1]] = hashlib.sha256(source).hexdigest()[:16]
-    assert found == importlib.import_module(file).COMPILED_WITH
 
 
 class Someone(NamedTuple):

@@ -128,7 +128,7 @@ def test_a_wrong_answer_is_not_believed(
 
     monkeypatch.setattr("impc.control.named_solver._function", early)
     assert active_set(build_program("daqp", rows), d) is None
-    with pytest.warns(UserWarning, match="could not be told"):
+    with pytest.warns(UserWarning, match="cannot be determined"):
         run = controller.simulate([1, 3], steps=3)
     assert run.status[0] == Status.UNSOLVED
 

@@ -99,7 +99,7 @@ def test_a_bound_is_at_work(name: str) -> None:
     ("name", "solver"),
     [(name, s) for name in PROBLEMS for s in TOLERANCES if (name, s) not in LEFT_OUT],
 )
-def test_a_program_at_every_sample_is_the_compiled_loop(name: str, solver: str) -> None:
+def test_a_program_at_every_sample_is_the_compiled_kernel(name: str, solver: str) -> None:
     one, tolerance = case(name), OTHER_TOLERANCE.get(name, TOLERANCES[solver])
     slow = simulate_mpc(build_mpc(one.controller, solver), one.drive)
     assert slow.complete, slow.status

@@ -255,6 +255,13 @@ def runaway(growth: float, **settings: float) -> None:
     require_complete(controller, simulate(controller, scenario(plant, x0=[5], steps=400)))
 
 
+def nothing_holds(_folder: Path) -> None:
+    """A gain of nothing, and a plant that grows."""
+    plant = cart(1.2)
+    law = Controller.from_gain(plant, [[0.0]], Bounds(plant), 5, terminal_set=False)
+    require_complete(law, simulate(law, scenario(plant, x0=[5], steps=400)))
+
+
 def draft_over_a_file(folder: Path) -> str:
     (folder / "a.csv").write_text("t,a\n0,1\n1,2\n")
     return command("inspect", str(folder / "a.csv"), "--out", str(folder / "a.csv"))
@@ -761,10 +768,10 @@ PROVOKED: dict[str, Callable[[Path], object]] = {
         cart(1.0), Weights(np.zeros((1, 1)), 1)
     ),
     "no input sequence keeps the bound ...": far_start,
-    "the input could not be told in double precision": lambda _: runaway(
+    "the input cannot be determined in double precision": lambda _: runaway(
         2.0, x_max=1.0, softening=50.0
     ),
-    "the state left every reasonable range": lambda _: runaway(1.1),
+    "the state left every reasonable range": nothing_holds,
     "exclude the origin for ...": lambda _: Bounds(cart(), u_min=1, u_max=2),
     "exists already; give another name, or remove it": draft_over_a_file,
     "... is a file; give another folder": file_for_a_folder,

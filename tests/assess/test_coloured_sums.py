@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from impc.assess.compiled_colour import coloured_nearby
+from impc.assess.long_run_covariance import _coloured
 
 
 @pytest.mark.parametrize(("samples", "lags"), [(9, 1), (9, 4), (3, 5)])
@@ -20,5 +20,5 @@ def test_sums_are_those_of_the_whole_covariance_matrix(samples: int, lags: int) 
         if abs(t - s) < lags:
             whole[t, :, s, :] = gammas[t - s] if t >= s else gammas[s - t].T
     np.testing.assert_allclose(
-        coloured_nearby(columns, gammas), np.tensordot(whole, columns, 2), atol=1e-13
+        _coloured(columns, gammas), np.tensordot(whole, columns, 2), atol=1e-13
     )

@@ -1,0 +1,20 @@
+"""`impc warm`: compile once what the other commands run."""
+
+from __future__ import annotations
+
+import click
+
+__all__ = ["command"]
+
+
+@click.command("warm")
+def command() -> None:
+    """Compile what the other commands run, once: some minutes, after which none compiles.
+
+    `make env` ends with it; after an installation by pip it is yours to call. Without it the first
+    command compiles what it needs and says so.
+    """
+    from impc.control.warm import compiled_parts  # noqa: PLC0415  # loads numba
+
+    for part in compiled_parts():
+        click.echo(f"compiled: {part}")
