@@ -70,7 +70,11 @@ def _room(name: str) -> str:
 
 def _page(name: str) -> str:
     module = importlib.import_module(name)
-    public = [item for item in getattr(module, "__all__", []) if _told(getattr(module, item))]
+    public = [
+        item
+        for item, thing in vars(module).items()
+        if not item.startswith("_") and _told(thing) and inspect.unwrap(thing).__module__ == name
+    ]
     names = (
         f"\n   .. autosummary::\n      :nosignatures:\n\n{_indented(public, 6)}\n" if public else ""
     )

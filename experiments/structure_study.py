@@ -24,8 +24,8 @@ import numpy as np
 import plants
 from experiments.printed_intervals import carts, with_noise
 from impc.assess.price_profiles import PriceProfiles
-from impc.assess.structure_test import structure_test
 from impc.assess.structured_weights import Tangent, price_covariance, tangent
+from impc.assess.structures import structure_test
 from impc.control.controller import Controller
 from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.structured_fit import fit_structure

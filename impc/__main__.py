@@ -14,7 +14,5 @@ if __name__ == "__main__" and not (
 
 from impc.cli.main import main
 
-__all__ = ["main"]
-
 if __name__ == "__main__":
     main()

@@ -13,22 +13,6 @@ from impc.errors import DataError, InputError
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-__all__ = [
-    "Array",
-    "BoolArray",
-    "Buffer",
-    "Frozen",
-    "IntArray",
-    "System",
-    "as_numbers",
-    "finite_array",
-    "frozen",
-    "percentiles",
-    "require_finite",
-    "symmetric_matrix",
-    "with_shape",
-]
-
 #: An array of float64, of the shape that each docstring gives.
 Array = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
 #: An array of int64.

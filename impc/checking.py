@@ -39,8 +39,6 @@ if TYPE_CHECKING:
     Kind = Callable[[str, Any], Any]
     Rule = str | float | tuple[float, float]
 
-__all__ = ["Value", "checked", "replace"]
-
 P = ParamSpec("P")
 R = TypeVar("R")
 _V = TypeVar("_V")

@@ -7,21 +7,6 @@ the command line, a report and a worker process can show them without parsing te
 
 from __future__ import annotations
 
-__all__ = [
-    "BoundsError",
-    "DataError",
-    "FallError",
-    "ImpcError",
-    "InfeasibleError",
-    "InputError",
-    "OutputError",
-    "PlantError",
-    "SolverError",
-    "WeightsError",
-    "brief",
-    "one_line",
-]
-
 # A line that is longer than this hides its remedy; names and values are cut in the middle.
 _LONGEST = 600
 _MANY_BITS = 128  # 39 digits

@@ -12,8 +12,6 @@ from typing import Any
 
 from impc.errors import ImpcError
 
-__all__ = ["EXTRAS", "installed", "optional"]
-
 #: Optional library, as it is imported -> the extra of pyproject.toml that brings it.
 EXTRAS = {
     "c3d": "c3d",

@@ -23,8 +23,6 @@ from impc.settings_files import ignore_settings_files
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-__all__ = ["keep_caches", "njit", "say_when_compiling"]
-
 F = TypeVar("F", bound="Callable[..., Any]")
 
 

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from importlib.machinery import ModuleSpec
     from types import ModuleType
 
-__all__ = ["IPOPT_ALONE", "ignore_settings_files"]
-
 #: Options with which IPOPT prints nothing and reads no file. ipopt.opt may have it write over any
 #: file, and load a library as its linear solver.
 IPOPT_ALONE: dict[str, Any] = {"print_level": 0, "sb": "yes", "option_file_name": ""}

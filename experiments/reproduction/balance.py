@@ -60,7 +60,7 @@ def _tables(result: dict[str, Any]) -> list[Entry]:
         Entry(
             "Table 2.2",
             "ICC between visits of the RMS: excellent.",
-            ("impc.studies.reliability.icc:icc", "impc.studies.reliability.tables"),
+            ("impc.studies.reliability.icc:icc", "impc.studies.reliability.report"),
             f"{rms[0]:.2f} to {rms[1]:.2f}. On the data of Shrout and Fleiss (1979): "
             f"{published[0]:.2f} and {published[1]:.2f} (.29 and .62 there).",
             kind(rms[0] >= _EXCELLENT),
@@ -69,7 +69,7 @@ def _tables(result: dict[str, Any]) -> list[Entry]:
         Entry(
             "Table 2.3",
             "ICC between visits of the bandpass energy: excellent.",
-            ("impc.studies.reliability.icc:icc", "impc.studies.reliability.tables"),
+            ("impc.studies.reliability.icc:icc", "impc.studies.reliability.report"),
             f"{band[0]:.2f} to {band[1]:.2f}.",
             kind(band[0] >= _EXCELLENT),
             _STUDY,
@@ -77,7 +77,10 @@ def _tables(result: dict[str, Any]) -> list[Entry]:
         Entry(
             "Table 2.4",
             "CMC of the transfer functions within and between visits.",
-            ("impc.studies.reliability.cmc:cmc_within", "impc.studies.reliability.cmc:cmc_between"),
+            (
+                "impc.studies.reliability.analysis:cmc_within",
+                "impc.studies.reliability.analysis:cmc_between",
+            ),
             f"Within {within[0]:.3f} to {within[1]:.3f}, between {between[0]:.3f} to"
             f" {between[1]:.3f}.",
             kind(min(within[0], between[0]) > _EXCELLENT),

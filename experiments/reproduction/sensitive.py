@@ -139,7 +139,7 @@ def _tables(
         Entry(
             "Figure 4.3",
             "Model-based bootstrap with 1000 replicates.",
-            ("impc.studies.selection.bootstrap:bootstrap_subset",),
+            ("impc.studies.selection.subject:bootstrap_subset",),
             "The same, with a block draw for coloured residuals; the number is a setting.",
             Verdict.REPRODUCED,
         ),
@@ -239,7 +239,7 @@ def _claims(
             "Claim, 4.2.4",
             "Bootstrap intervals, from the 2.5th to the 97.5th percentile.",
             (
-                "impc.studies.selection.bootstrap:bootstrap_subset",
+                "impc.studies.selection.subject:bootstrap_subset",
                 "impc.studies.selection.modern:profile_interval",
             ),
             "First subject: "

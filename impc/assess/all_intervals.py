@@ -39,8 +39,6 @@ if TYPE_CHECKING:
 #: (stage, compute, default) -> what it finds, or the default where it fails.
 Attempt = Callable[[str, Callable[[], Any], Any], Any]
 
-__all__ = ["Asked", "Attempt", "Certainty", "assess", "count_stages"]
-
 
 class Asked(Protocol):
     """What of all this is wanted: the part of a fit's settings that is read here."""

@@ -22,8 +22,6 @@ from impc.model.weights import condition_number
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-__all__ = ["ASSESSMENTS", "Assessment", "assessed"]
-
 
 @dataclass(frozen=True)
 class Assessment:

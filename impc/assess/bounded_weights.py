@@ -33,8 +33,6 @@ if TYPE_CHECKING:
     from impc.inverse.equivalent_weights import EquivalentWeights
     from impc.inverse.solution_set import GainFibre
 
-__all__ = ["WeightsSet", "weights_set"]
-
 
 @dataclass(frozen=True)
 class WeightsSet(Frozen):

@@ -41,15 +41,6 @@ if TYPE_CHECKING:
     from impc.inverse.residuals import Evaluation
     from impc.inverse.trial_span import TrialSpan
 
-__all__ = [
-    "FOREIGN",
-    "TOLD",
-    "TWO_SIDED",
-    "GainCovariance",
-    "by_trial",
-    "gain_covariance",
-]
-
 #: A direction with a larger deviation, of the natural size of a gain, is not told: there the prior
 #: of a search and the curvature of the problem count beside the recordings.
 TOLD = 0.2

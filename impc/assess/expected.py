@@ -36,8 +36,6 @@ if TYPE_CHECKING:
     from impc.assess.structured_weights import Tangent
     from impc.inverse.problem import Problem
 
-__all__ = ["Expectation", "expected_intervals"]
-
 # A root nearer to one is a drift, not noise.
 _LARGEST_ROOT = 0.999
 # Of all outputs: a limit that moves them by less is never met.

@@ -34,17 +34,6 @@ if TYPE_CHECKING:
     from impc.inverse.semidefinite import SemidefiniteSolution
     from impc.model.weights import Weights
 
-__all__ = [
-    "End",
-    "Range",
-    "entry_ranges",
-    "extreme_eigenvalue",
-    "linear_maxima",
-    "linear_ranges",
-    "nearest_diagonal",
-    "trace_range",
-]
-
 # Relative gap of the programs, and share of the way by which their points may be drawn too far.
 _GAP, _CLOSE = 1e-10, 1e-11
 

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from impc.inverse.problem import Problem
     from impc.model.recordings import Recording
 
-__all__ = ["HeldOut", "left_out_vaf", "predict"]
-
 
 @dataclass(frozen=True)
 class HeldOut(Frozen):

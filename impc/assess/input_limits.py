@@ -40,15 +40,6 @@ if TYPE_CHECKING:
     from impc.inverse.gain_search import GainFit
     from impc.inverse.problem import Problem
 
-__all__ = [
-    "LimitEstimate",
-    "OtherLimit",
-    "at_another_limit",
-    "input_limit",
-    "on_limit",
-    "with_limit",
-]
-
 # The limit is searched to this share of itself.
 _RESOLUTION = 1e-4
 # Growth of the steps towards an end of the interval, and how exact the end is, of the last step.

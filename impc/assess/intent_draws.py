@@ -40,16 +40,6 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
     from impc.model.riccati import LqrSolution
 
-__all__ = [
-    "DRAWS",
-    "DrawnSet",
-    "PriceRange",
-    "drawn_gains",
-    "prices_over_gains",
-    "set_of_gain",
-    "with_confidence",
-]
-
 #: Draws whose range is an interval of 95 %.
 DRAWS = 39
 # Of the logarithm of weights that nothing tells: a factor of ten.

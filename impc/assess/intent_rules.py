@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from impc.assess.bounded_weights import WeightsSet
     from impc.model.plant import Plant
 
-__all__ = ["Intent", "Reading", "dominant_sentence", "intent"]
-
 # Entries of a direction below this are not named in a sentence.
 _NAMED = 0.05
 

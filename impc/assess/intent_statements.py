@@ -31,14 +31,6 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
     from impc.model.weights import Weights
 
-__all__ = [
-    "Statement",
-    "order_statements",
-    "price_direction",
-    "sense_statements",
-    "widest_dominant_angle",
-]
-
 _FRANK_WOLFE = 12
 # A range that ends this near to zero, of its width, does not tell the sign.
 _TOUCHES = 1e-6

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from impc.assess.printed_gain import GainEstimate
     from impc.model.plant import Plant
 
-__all__ = ["LEVEL", "PARAMETER", "Interval", "covariance_intervals", "entry_names"]
-
 #: Of an interval, where none is asked for.
 LEVEL = 0.95
 #: Standard error of the logarithm of a parameter from which on it is not identified.

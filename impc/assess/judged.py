@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from impc.inverse.problem import Problem
     from impc.model.bounds import Bounds
 
-__all__ = ["MethodFit", "judge"]
-
 
 @dataclass(frozen=True)
 class MethodFit(Frozen):

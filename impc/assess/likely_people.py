@@ -21,8 +21,8 @@ import numpy as np
 
 from impc.arrays import Array, frozen
 from impc.assess.covariance import TWO_SIDED
-from impc.assess.held_person import held_person
 from impc.assess.person_covariance import person_covariance
+from impc.assess.person_profile import held_person
 from impc.checking import replace
 from impc.inverse.likelihood_fit import person_at
 from impc.inverse.likelihood_search import climb
@@ -33,14 +33,6 @@ if TYPE_CHECKING:
 
     from impc.assess.person_covariance import PersonCovariance
     from impc.inverse.likelihood_fit import PersonFit
-
-__all__ = [
-    "LikelyPerson",
-    "direction_intervals",
-    "entry_intervals",
-    "level_intervals",
-    "people_as_likely",
-]
 
 # Logarithm by which the noise of a sense that is all but exact is below what is expected, and
 # likelihoods of a search that begins there.

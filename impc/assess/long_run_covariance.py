@@ -38,8 +38,6 @@ if TYPE_CHECKING:
 
     Taken = tuple[Array, Array]
 
-__all__ = ["ResidualNoise", "residual_noise", "spread_of_sum", "white_noise"]
-
 # Andrews and Monahan: a root nearer to one is not told from one, and would be taken too seriously.
 _LARGEST_ROOT = 0.97
 # Samples before the first over which noise still has an effect: 0.97^250 is 5e-4.

@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from impc.assess.structured_weights import Tangent
     from impc.model.riccati import LqrSolution
 
-__all__ = ["NearFit"]
-
 # A price about its value in the fit: far wider than any interval that has an end.
 _SPREAD = 20.0
 _TRIES = 30

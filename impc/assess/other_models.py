@@ -31,14 +31,6 @@ if TYPE_CHECKING:
     from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
 
-__all__ = [
-    "Alternative",
-    "fit_alternatives",
-    "innovations_criterion",
-    "residuals_of",
-    "verdict",
-]
-
 _SAME, _RULED_OUT = 2.0, 10.0
 
 

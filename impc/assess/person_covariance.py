@@ -25,14 +25,6 @@ from impc.errors import InputError
 if TYPE_CHECKING:
     from impc.inverse.likelihood_fit import PersonFit
 
-__all__ = [
-    "KINDS",
-    "Confusion",
-    "PersonCovariance",
-    "confusion",
-    "person_covariance",
-]
-
 #: Ways to a covariance.
 KINDS = ("expected", "observed", "sandwich")
 # Of a coordinate, which none leaves by much more than one: the prior that is left.

@@ -39,16 +39,6 @@ if TYPE_CHECKING:
     from impc.inverse.problem import Problem
     from impc.model.observer import Observer
 
-__all__ = [
-    "PersonModel",
-    "PersonReport",
-    "RememberPerson",
-    "afresh_person",
-    "person_report",
-    "persons",
-    "prediction_errors",
-]
-
 # Samples ahead of which predictions are judged, as seconds; and how many starts in a trial at most.
 _AHEAD, _STARTS = (0.0, 0.1, 0.5), 100
 # Likelihoods with derivatives of the model that was asked for, and of those beside it, whose page

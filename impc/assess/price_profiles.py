@@ -30,8 +30,6 @@ from impc.errors import WeightsError
 if TYPE_CHECKING:
     from impc.assess.structured_weights import PriceCovariance, Tangent
 
-__all__ = ["PriceInterval", "PriceProfiles"]
-
 # Logarithms: beyond a factor of e^12 in price there is no end.
 _FARTHEST = 12.0
 # Of a deviation: how near to its end an interval ends.

@@ -36,8 +36,6 @@ if TYPE_CHECKING:
     from impc.inverse.problem import Problem
     from impc.inverse.residuals import Evaluation
 
-__all__ = ["GainEstimate", "ToldGain", "gain_estimate", "told_gain"]
-
 # On 60 random plants 51 searches ended after two rounds, 9 after three.
 _ROUNDS = 4
 _EVALUATIONS = 40

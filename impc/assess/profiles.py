@@ -37,8 +37,6 @@ if TYPE_CHECKING:
 
     from impc.assess.printed_gain import GainEstimate
 
-__all__ = ["Profile", "profile_likelihood"]
-
 # A prior this much wider than any gain that can be keeps free directions from wandering off.
 _WIDTH = 100.0
 # Steps, in deviations, of the walk that looks for the ends; where D is still low at the last one

@@ -34,19 +34,6 @@ if TYPE_CHECKING:
     from impc.assess.printed_gain import GainEstimate
     from impc.inverse.problem import Problem
 
-__all__ = [
-    "DRAWS",
-    "BootstrapModel",
-    "Draw",
-    "Replicate",
-    "block_length",
-    "block_residuals",
-    "bootstrap_intervals",
-    "bootstrap_model",
-    "model_residuals",
-    "replicate",
-]
-
 #: Draws residuals again: (residuals (samples, p) of each trial, generator) -> as many.
 Draw = Callable[[list[Array], np.random.Generator], list[Array]]
 

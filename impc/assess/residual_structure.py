@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from impc.inverse.problem import Problem
     from impc.inverse.residuals import Evaluation
 
-__all__ = ["ResidualStructure", "residual_structure"]
-
 _FAMILIES = ("linear", "nonlinear")
 # False alarms, both families together.
 _LEVEL = 0.05

@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from impc.inverse.likelihood_fit import PersonFit
     from impc.model.observer import Observer
 
-__all__ = ["SIMULATED", "runaways", "running_away"]
-
 #: Trials that are simulated.
 SIMULATED = 60
 

@@ -45,8 +45,6 @@ if TYPE_CHECKING:
 
     NoiseModel = Callable[[list[Array], TrialSpan], ResidualNoise]
 
-__all__ = ["TOLD_FACTOR", "PriceCovariance", "Tangent", "price_covariance", "tangent"]
-
 #: A combination of logarithms is told when its interval of 95 % ends within this factor.
 TOLD_FACTOR = 10.0
 # Of an unknown: a smaller share in a direction without a value is rounding's.

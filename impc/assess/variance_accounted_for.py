@@ -17,15 +17,6 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
     from impc.model.recordings import Recording
 
-__all__ = [
-    "TrialAgreement",
-    "agreement",
-    "centred_vaf",
-    "saturated_share",
-    "vaf",
-    "whiteness",
-]
-
 # One second of lags tells a rhythm that was missed; fewer than ten tell nothing.
 _LEAST_LAGS = 10
 

@@ -34,8 +34,6 @@ if TYPE_CHECKING:
     from impc.inverse.estimates import Estimate
     from impc.model.plant import Plant
 
-__all__ = ["ReturnDifference", "WeightsTest", "return_difference", "weights_test"]
-
 # Probability below which the true gain is said to have no weights.
 _LEVEL = 1e-3
 # How much more, of the misfit, weights have to leave where the model is contradicted.

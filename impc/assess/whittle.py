@@ -21,18 +21,6 @@ if TYPE_CHECKING:
 
     from impc.model.plant import Plant
 
-__all__ = [
-    "ORDER",
-    "Spectrum",
-    "loop_shapes",
-    "loops",
-    "misfit",
-    "outputs",
-    "root_of",
-    "size",
-    "spectrum",
-]
-
 Complex = np.ndarray[tuple[int, ...], np.dtype[np.complex128]]
 
 #: Of the autoregression of each output.

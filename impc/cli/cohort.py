@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from impc.checking import replace
-from impc.cli.exit_status import ExitStatus
+from impc.cli.ending import ExitStatus
 from impc.cli.options import code_options, out_option, scheduler_options, yes_option
 from impc.cli.plant import named_plant
 from impc.cli.progress import progress
@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from impc.studies.cohort.store import Store
     from impc.studies.cohort.study import Study
     from impc.studies.cohort.unit_task import FitTask
-
-__all__ = ["command"]
 
 # Of the settings that ask for more, those that a worker takes.
 _USED = ("replicates", "structure")

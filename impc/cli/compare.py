@@ -15,9 +15,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-__all__ = ["command"]
-
-
 @click.command("compare")
 @subject_arguments("What the columns mean, and settings, as for `impc fit`.")
 @out_option("compare", "report.html, result.json, tables and the figure")

@@ -10,8 +10,6 @@ import click
 if TYPE_CHECKING:
     from impc.studies.effort import Effort
 
-__all__ = ["FEWER", "FEWER_STARTS", "require_consent"]
-
 # What is begun without a question: two hours, and what a machine of 8 GB has to spare.
 _SECONDS, _GIGABYTES = 7200.0, 4.0
 

@@ -1,6 +1,8 @@
 """How every command ends: one line on stderr for whatever goes wrong, and a status that tells what.
 
 What nobody has foreseen is a defect: its line names the place in the code and a log for the report.
+
+The exit statuses of the `impc` command (docs/troubleshooting.md has the table).
 """
 
 from __future__ import annotations
@@ -11,26 +13,17 @@ import os
 import signal
 import sys
 import warnings
+from enum import IntEnum
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from impc.cli.exit_status import ExitStatus
 from impc.errors import ImpcError, one_line
 from impc.files.writing import NO_ROOM
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from types import FrameType, TracebackType
-
-__all__ = [
-    "InterruptionError",
-    "StrayError",
-    "UnreadError",
-    "ended",
-    "interruptions",
-    "own_process",
-]
 
 
 class InterruptionError(Exception):
@@ -208,3 +201,14 @@ def _quiet(heard: list[str]) -> Iterator[None]:
             yield
     finally:
         logging.getLogger().removeHandler(handler)
+
+
+class ExitStatus(IntEnum):
+    """What a script may ask of a command that has ended."""
+
+    DONE = 0
+    PARTIAL = 1
+    BAD_INPUT = 2
+    DEFECT = 70
+    INTERRUPTED = 130
+    UNREAD = 141

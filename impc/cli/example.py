@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
     from impc.studies.example.cases import CaseResult
 
-__all__ = ["command"]
-
 # The library knows no plant: the example's is named by its import path, ``module:function``.
 _EXAMPLE_PLANT = "plants:yalmip_example"
 

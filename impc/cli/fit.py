@@ -15,8 +15,6 @@ if TYPE_CHECKING:
 
     from impc.studies.fit.result import FitResult
 
-__all__ = ["command"]
-
 
 @click.command("fit")
 @subject_arguments("What the columns mean, and settings; `impc inspect FILE` writes one.")

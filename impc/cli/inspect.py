@@ -12,8 +12,6 @@ from impc.cli.plant import KNOWN, find_plant
 if TYPE_CHECKING:
     from impc.files.table import Table
 
-__all__ = ["command"]
-
 
 @click.command("inspect")
 @click.argument("file", type=click.Path(path_type=Path))

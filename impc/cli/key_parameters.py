@@ -7,15 +7,12 @@ from typing import TYPE_CHECKING
 
 import click
 
-from impc.cli.numbers import Number
-from impc.cli.options import code_options, out_option, scheduler_options, yes_option
+from impc.cli.options import Number, code_options, out_option, scheduler_options, yes_option
 from impc.cli.output import print_files
 from impc.cli.select import kept_results, read_model_study, study_runner
 
 if TYPE_CHECKING:
     from impc.studies.cohort.cluster import Cluster
-
-__all__ = ["command"]
 
 
 @click.command("key-parameters")

@@ -10,12 +10,9 @@ from typing import Any
 
 import click
 
-from impc.cli.ending import ended, interruptions, own_process
-from impc.cli.exit_status import ExitStatus
+from impc.cli.ending import ExitStatus, ended, interruptions, own_process
 from impc.jit import keep_caches, say_when_compiling
 from impc.settings_files import ignore_settings_files
-
-__all__ = ["main"]
 
 # One module a command, loaded when it is asked for: name -> module, which holds it as `command`.
 _COMMANDS = {

@@ -32,8 +32,6 @@ if TYPE_CHECKING:
 
     from impc.files.configuration import Configuration
 
-__all__ = ["fit_optimal"]
-
 
 def fit_optimal(
     files: Sequence[Path], plant_name: str, config: Path, out: Path, solver: str | None

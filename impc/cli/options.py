@@ -1,30 +1,28 @@
-"""Options that several commands have alike."""
+"""Options that several commands have alike.
+
+Numbers as options: click lets nan and infinity through every range.
+"""
 
 from __future__ import annotations
 
 import functools
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import click
 
-from impc.cli.numbers import LARGEST_SEED
 from impc.cli.plant import KNOWN
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-__all__ = [
-    "code_options",
-    "out_option",
-    "scheduler_options",
-    "seed_option",
-    "solver_option",
-    "subject_arguments",
-    "yes_option",
-]
+    from click import Context, Parameter
 
 F = TypeVar("F", bound="Callable[..., Any]")
+
+#: Numbers drawn for trial k of a seed follow from 100 seed + k, which has to be one of 64 bits.
+LARGEST_SEED = 10**15
 
 #: --seed of everything that is simulated.
 seed_option = click.option(
@@ -145,3 +143,16 @@ def code_options(kind: str) -> Callable[[F], F]:
         help=f"Run the code that the study names as its {kind}.",
     )
     return lambda command: name(allow(command))
+
+
+class Number(click.FloatRange):
+    """A number between two others; `nan` and `inf` are none."""
+
+    name = "number"
+
+    def convert(self, value: Any, param: Parameter | None, ctx: Context | None) -> float:
+        """The number that `value` says; click gives `param` and `ctx` for its message."""
+        found = float(super().convert(value, param, ctx))
+        if not math.isfinite(found):
+            self.fail(f"{value} is no number to compute with.", param, ctx)
+        return found

@@ -13,8 +13,6 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-__all__ = ["print_files", "print_next"]
-
 
 def print_files(out: Path, written: Sequence[Path]) -> None:
     """Name the files `written` to the folder `out`, one line for each name with its endings."""

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from impc.studies.plan.designs import Person, Perturbation
     from impc.studies.plan.settings import PlanSettings
 
-__all__ = ["command"]
-
 _FEWER = "lower fits, draws, amplitude or dwell in [plan]"
 
 

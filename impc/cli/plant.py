@@ -12,8 +12,6 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
     from impc.studies.cohort.study import Study
 
-__all__ = ["KNOWN", "find_plant", "load_plant", "named_plant"]
-
 #: Short names of plants, by their import paths: the library itself knows no plant.
 KNOWN = {"seated-balance": "plants:seated_balance_for", "cursor": "plants:cursor_plant"}
 

@@ -17,8 +17,6 @@ from tqdm import tqdm
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-__all__ = ["progress"]
-
 # Seconds between two lines, and from the start to the first: what is quick says nothing.
 _PAUSE = 10.0
 # The clock of a bar goes on while a step takes long, in seconds.

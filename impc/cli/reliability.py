@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from impc.studies.cohort.study import Unit
     from impc.studies.reliability.analysis import Trials
 
-__all__ = ["command"]
-
 
 @click.command("reliability")
 @click.argument("study_file", metavar="STUDY", type=click.Path(path_type=Path))

@@ -17,20 +17,6 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
     from impc.model.weights import Weights
 
-__all__ = [
-    "HORIZON",
-    "PLANT",
-    "SIGNALS",
-    "STEP",
-    "TORQUE",
-    "between_samples",
-    "numbered",
-    "random_person",
-    "seat_controller",
-    "seat_table",
-    "seat_weights",
-]
-
 #: Import paths of the linear plant, and of a step of the nonlinear one.
 PLANT, STEP = "plants:seated_balance_for", "plants:seated_balance_step_for"
 #: Import path of the torque on the seat.

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from impc.studies.selection.model_source import ModelSource
     from impc.studies.selection.queue import Runner
 
-__all__ = ["command", "kept_results", "read_model_study", "study_runner"]
-
 
 @click.command("select")
 @click.argument("study_file", metavar="STUDY", type=click.Path(path_type=Path))

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from impc.cli.numbers import Number
-from impc.cli.options import out_option, seed_option
+from impc.cli.options import Number, out_option, seed_option
 from impc.cli.output import print_files, print_next
 from impc.cli.seat import (
     HORIZON,
@@ -32,8 +31,6 @@ if TYPE_CHECKING:
     from impc.control.controller import Controller
     from impc.model.observer import Observer
     from impc.studies.simulated_people import SubjectTrial
-
-__all__ = ["command"]
 
 _ENDINGS = {
     "csv": ".csv",

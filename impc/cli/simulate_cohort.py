@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from impc.cli.numbers import Number
-from impc.cli.options import out_option, seed_option
+from impc.cli.options import Number, out_option, seed_option
 from impc.cli.output import print_next
 from impc.cli.seat import (
     HORIZON,
@@ -24,8 +23,6 @@ from impc.cli.seat import (
 
 if TYPE_CHECKING:
     import numpy as np
-
-__all__ = ["cohort"]
 
 _RATE = 100.0
 # Steps of the body between two samples: a single one of 10 ms errs in the states of the delay.

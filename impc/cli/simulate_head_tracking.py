@@ -8,12 +8,9 @@ from typing import Any
 
 import click
 
-from impc.cli.numbers import Number
-from impc.cli.options import out_option, seed_option
+from impc.cli.options import Number, out_option, seed_option
 from impc.cli.output import print_next
 from impc.cli.seat import numbered
-
-__all__ = ["head_tracking"]
 
 _MODEL, _STEPS = "plants:head_neck_model", "plants:step_reference"
 _RATE = 60.0

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.model.plant import Plant
 
-__all__ = ["reliability_study"]
-
 _RATE = 100.0
 # 242 steps of 0.12 s: one whole period of the register, so that its lines are lines.
 _DWELL, _DURATION = 0.12, 242 * 0.12

@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from impc.inverse.problem import Problem
     from impc.studies.fit.settings import FitSettings
 
-__all__ = ["Subject", "read_subject"]
-
 
 @dataclass(frozen=True)
 class Subject:

@@ -1,24 +1,36 @@
 """One sample of whatever moves, a plant's body or its matrices; slopes along a trajectory.
 
 docs/nonlinear.md has the equations.
+
+Machine code of a body: its list of operations, translated once for all samples.
+
+LLVM, which numba brings, makes it: a function of (constants, given, found) that reads and writes
+where they point to. The operations stand one behind the other without a branch, and none is taken
+together with another, so that every processor gives the same numbers. Parameters are among the
+constants, so that bodies which differ by them alone share their code (docs/nonlinear.md, "A body
+that is not linear").
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import functools
+import threading
+from typing import TYPE_CHECKING, Any
 
+import llvmlite.binding as llvm
 import numpy as np
+from llvmlite import ir
 
 from impc.arrays import Array
 from impc.control.compiled_body import BodyTape, move_along, states_along
-from impc.control.native_body import address
+from impc.model.body import OPERATIONS
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from impc.control.constraint_rows import Directions
     from impc.model.body import Body
     from impc.model.plant import Plant
-
-__all__ = ["body_tape", "next_state", "pushes", "slopes_along"]
 
 
 def body_tape(body: Body | None, n: int, given: int, *, moving: bool) -> BodyTape:
@@ -80,3 +92,120 @@ def slopes_along(plant: Plant, x: Array, u: Array, d: Array) -> tuple[Array, Arr
 
 def _matrices(plant: Plant) -> tuple[Array, Array, Array]:
     return plant.A, plant.B, plant.E
+
+
+_NUMBER, _PLACE = ir.DoubleType(), ir.IntType(64)
+_ZERO, _ONE, _MINUS = (_NUMBER(value) for value in (0.0, 1.0, -1.0))
+# Of LLVM, which takes a sine and a cosine of one number together, and of the C library, by name.
+_CALLED = {
+    **{"SIN": "llvm.sin", "COS": "llvm.cos", "SQRT": "llvm.sqrt", "FABS": "llvm.fabs"},
+    **{"EXP": "exp", "LOG": "log", "POW": "pow", "CONSTPOW": "pow"},
+    **{"TAN": "tan", "TANH": "tanh", "SINH": "sinh"},
+    **{"COSH": "cosh", "ASIN": "asin", "ACOS": "acos", "ATAN": "atan", "ATAN2": "atan2"},
+    **{"FMIN": "fmin", "FMAX": "fmax", "HYPOT": "hypot", "LOG1P": "log1p", "EXPM1": "expm1"},
+}
+_OF_TWO = {"POW", "CONSTPOW", "ATAN2", "FMIN", "FMAX", "HYPOT"}
+# Of instructions, from a builder and two operands.
+_WRITTEN: dict[str, Callable[[Any, Any, Any], Any]] = {
+    "MUL": lambda to, a, b: to.fmul(a, b),
+    "ADD": lambda to, a, b: to.fadd(a, b),
+    "SUB": lambda to, a, b: to.fsub(a, b),
+    "DIV": lambda to, a, b: to.fdiv(a, b),
+    "NEG": lambda to, a, _: to.fneg(a),
+    "SQ": lambda to, a, _: to.fmul(a, a),
+    "TWICE": lambda to, a, _: to.fadd(a, a),
+    "INV": lambda to, a, _: to.fdiv(_ONE, a),
+    "ASSIGN": lambda _, a, __: a,
+    "SIGN": lambda to, a, _: to.select(
+        to.fcmp_ordered(">", a, _ZERO), _ONE, to.select(to.fcmp_ordered("<", a, _ZERO), _MINUS, a)
+    ),
+    "LT": lambda to, a, b: to.uitofp(to.fcmp_ordered("<", a, b), _NUMBER),
+    "LE": lambda to, a, b: to.uitofp(to.fcmp_ordered("<=", a, b), _NUMBER),
+    "EQ": lambda to, a, b: to.uitofp(to.fcmp_ordered("==", a, b), _NUMBER),
+    "NE": lambda to, a, b: to.uitofp(to.fcmp_unordered("!=", a, b), _NUMBER),
+    "NOT": lambda to, a, _: to.uitofp(to.fcmp_ordered("==", a, _ZERO), _NUMBER),
+    "AND": lambda to, a, b: to.uitofp(to.and_(_true(to, a), _true(to, b)), _NUMBER),
+    "OR": lambda to, a, b: to.uitofp(to.or_(_true(to, a), _true(to, b)), _NUMBER),
+    "IF_ELSE_ZERO": lambda to, a, b: to.select(_true(to, a), b, _ZERO),
+}
+_one_at_a_time = threading.Lock()
+
+
+def address(body: Body, states: int, *, moving: bool) -> int:
+    """Where the machine code of a body begins; it stays there as long as the process."""
+    with _one_at_a_time:
+        place, _ = _translated(body.code.tobytes(), len(body.constants), None if moving else states)
+    return place
+
+
+def _of_states(code: list[list[int]], states: int) -> list[list[int]]:
+    """The operations that the next states need."""
+    needed: set[int] = set()
+    kept = []
+    for line in code[::-1]:
+        operation, to, a, b = line
+        if OPERATIONS[operation] == "OUTPUT":
+            wanted = to < states
+        else:
+            wanted = to in needed
+            needed.discard(to)
+        if wanted:
+            needed |= {a, b}
+            kept.append(line)
+    return kept[::-1]
+
+
+@functools.cache
+def _translated(code: bytes, constants: int, states: int | None) -> tuple[int, Any]:
+    """The address of a function of `states` alone, if any, and what keeps it there."""
+    lines: list[list[int]] = np.frombuffer(code, dtype=np.int64).reshape(-1, 4).tolist()
+    if states is not None:
+        lines = _of_states(lines, states)
+    module = ir.Module()
+    pointer = _NUMBER.as_pointer()
+    kind = ir.FunctionType(ir.VoidType(), [pointer] * 3)
+    function = ir.Function(module, kind, "body")
+    builder = ir.IRBuilder(function.append_basic_block())
+    held, given, found = function.args
+    slots: dict[int, Any] = {}
+
+    def read(slot: int) -> Any:
+        if slot not in slots:  # what is computed is written before it is read
+            source, place = (held, slot) if slot < constants else (given, slot - constants)
+            slots[slot] = builder.load(builder.gep(source, [_PLACE(place)]))
+        return slots[slot]
+
+    for operation, to, a, b in lines:
+        name = OPERATIONS[operation]
+        if name == "OUTPUT":
+            builder.store(read(a), builder.gep(found, [_PLACE(to)]))
+        elif name in _WRITTEN:
+            slots[to] = _WRITTEN[name](builder, read(a), read(b))
+        else:
+            operands = [read(a), read(b)] if name in _OF_TWO else [read(a)]
+            slots[to] = builder.call(_library(module, _CALLED[name], len(operands)), operands)
+    builder.ret_void()
+    return _compiled(str(module))
+
+
+def _compiled(text: str) -> tuple[int, Any]:
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    parsed = llvm.parse_assembly(text)
+    machine = llvm.Target.from_default_triple().create_target_machine(opt=2, jit=True)
+    engine = llvm.create_mcjit_compiler(parsed, machine)
+    engine.finalize_object()
+    return int(engine.get_function_address("body")), engine
+
+
+def _library(module: Any, name: str, operands: int) -> Any:
+    """A function of LLVM or of the C library, declared once."""
+    if name.startswith("llvm."):
+        return module.declare_intrinsic(name, [_NUMBER])
+    if name in module.globals:
+        return module.globals[name]
+    return ir.Function(module, ir.FunctionType(_NUMBER, [_NUMBER] * operands), name)
+
+
+def _true(builder: Any, a: Any) -> Any:
+    return builder.fcmp_unordered("!=", a, _ZERO)

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
     from impc.arrays import Array
 
-__all__ = ["Linear", "Map", "Matrix", "Signature", "differentiable"]
-
 _Kind = Literal["value", "forward", "reverse"]
 # CasADi's graphs do not keep alive what they call in Python: a function that is made stays.
 _alive: list[Any] = []

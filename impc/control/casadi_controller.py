@@ -32,16 +32,6 @@ if TYPE_CHECKING:
     from impc.control.constraint_rows import Rows
     from impc.control.simulation import Scenario
 
-__all__ = [
-    "SOLVERS",
-    "MpcSolver",
-    "MpcStep",
-    "build_mpc",
-    "mpc_function",
-    "simulate_mpc",
-    "solve_mpc",
-]
-
 # Slacks enter the cost linearly, so the Hessian is singular, which DAQP does not take; its proximal
 # iterations called feasible programs infeasible. Its slacks get a quadratic cost of this share of
 # their price instead: a relative excess s changes the price by 1e-8 s.

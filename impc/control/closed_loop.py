@@ -43,14 +43,6 @@ if TYPE_CHECKING:
     from impc.control.controller import Controller
     from impc.control.simulation import Scenario
 
-__all__ = [
-    "PreparedLoop",
-    "prepare_loop",
-    "run_loop",
-    "simulate",
-    "simulate_and_differentiate",
-]
-
 # Asked where the compiled method has no answer.
 _SECOND = "daqp"
 

@@ -19,8 +19,6 @@ from impc.jit import njit
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-__all__ = ["BodyTape", "move_along", "move_body", "states_along"]
-
 
 class BodyTape(NamedTuple):
     """The operations of a `Body` as machine code, with what it reads and writes."""

@@ -12,8 +12,6 @@ import numpy as np
 
 from impc.jit import njit
 
-__all__ = ["Clip", "Clipped", "clipped"]
-
 # A bound that is so many deviations away is not met: a normal number is there once in 1e13.
 _FAR, _EXACT = 7.5, 1e-12
 

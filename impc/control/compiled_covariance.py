@@ -27,8 +27,6 @@ from impc.control.compiled_room import Moves, Room, Way
 from impc.control.joint_loop import JointLoop
 from impc.jit import njit
 
-__all__ = ["advance", "variance_changes", "weigh"]
-
 
 @njit(cache=True, inline="always")
 def weigh(joint: JointLoop, djoint: JointLoop, room: Room) -> None:

@@ -24,19 +24,6 @@ import numpy as np
 from impc.arrays import Buffer
 from impc.jit import njit
 
-__all__ = [
-    "CONVERGED",
-    "DEPENDENT",
-    "INCONSISTENT",
-    "UNFINISHED",
-    "accept_row",
-    "append_row",
-    "refine",
-    "solve_dual",
-    "substitute",
-    "substitute_all",
-]
-
 #: What `solve_dual` says first: an answer, rows that exclude each other, none within its steps.
 CONVERGED, INCONSISTENT, UNFINISHED = 0, 1, 2
 #: A row is dependent on the active ones when less than this share of its length is new. The part is

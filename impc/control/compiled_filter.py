@@ -29,9 +29,6 @@ from impc.control.constraint_rows import RowDirections, Rows
 from impc.control.joint_loop import JointLoop
 from impc.jit import njit
 
-__all__ = ["Course", "FilterParts", "Steady", "run_filter"]
-
-
 # The covariance is taken for the stationary one when no entry differs by more than this, of the
 # deviations of its row and column; nor its derivative by more than the second.
 _STEADY, _STEADY_SLOPE = 1e-10, 1e-8

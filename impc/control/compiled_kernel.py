@@ -32,23 +32,6 @@ from impc.jit import njit
 if TYPE_CHECKING:
     from impc.control.constraint_rows import RowDirections, Rows
 
-__all__ = [
-    "ACTIVE",
-    "DIVERGED",
-    "FREE",
-    "INFEASIBLE",
-    "LARGEST",
-    "SOFTENED",
-    "UNSOLVED",
-    "LoopMatrices",
-    "Workspace",
-    "answer_with",
-    "dot",
-    "law",
-    "run",
-    "workspace",
-]
-
 #: Of `closed_loop.Status`, by which what is compiled says how a sample ended.
 FREE, ACTIVE, SOFTENED, INFEASIBLE, UNSOLVED, DIVERGED = 0, 1, 2, 3, 4, 5
 #: No entry of plant and estimate together goes beyond this: neither a state nor what is expected.

@@ -13,15 +13,6 @@ import numpy as np
 from impc.arrays import Buffer
 from impc.jit import njit
 
-__all__ = [
-    "add_both",
-    "both_sides",
-    "combine",
-    "invert",
-    "noise_products",
-    "turn",
-]
-
 
 @njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 def combine(weights: Buffer, rows: Buffer, step: int, result: Buffer) -> None:

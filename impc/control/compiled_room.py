@@ -16,8 +16,6 @@ from impc.control.constraint_rows import Rows
 from impc.control.joint_loop import JointLoop
 from impc.jit import njit
 
-__all__ = ["Covariance", "Moves", "Room", "Way", "filter_room"]
-
 
 class Covariance(NamedTuple):
     """Covariance of z before a sample of the outputs is known, and what that sample does to it."""

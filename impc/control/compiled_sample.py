@@ -19,16 +19,6 @@ from impc.control.compiled_room import Room
 from impc.control.joint_loop import JointLoop
 from impc.jit import njit
 
-__all__ = [
-    "FilterResult",
-    "ahead",
-    "clip_command",
-    "expected_command",
-    "share_noise",
-    "update",
-]
-
-
 # A first state is forgotten when none of its directions moves an innovation by more than this, of
 # its deviation.
 _FORGOTTEN = 1e-9

@@ -10,8 +10,6 @@ from impc.control.compiled_kernel import LoopMatrices, Workspace
 from impc.control.constraint_rows import RowDirections, Rows
 from impc.jit import njit
 
-__all__ = ["slope_of_law"]
-
 
 @njit(cache=True, inline="always")
 def slope_of_law(

@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from impc.model.body import Body
     from impc.model.bounds import BoundRows
 
-__all__ = ["Directions", "RowDirections", "Rows", "build_rows", "differentiate_rows", "directions"]
-
 
 class Rows(NamedTuple):
     """T x + M v <= b, and what the solver needs of it.

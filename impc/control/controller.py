@@ -36,8 +36,6 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
     from impc.model.weights import Weights
 
-__all__ = ["LONGEST_HORIZON", "Controller"]
-
 #: Samples; the rows of a horizon take memory in its square, 0.4 GB of these for two bounds.
 LONGEST_HORIZON = 5000
 

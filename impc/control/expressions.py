@@ -19,16 +19,6 @@ if TYPE_CHECKING:
 
     from impc.arrays import Array
 
-__all__ = [
-    "function_of",
-    "names_of",
-    "require_influence",
-    "scalar",
-    "stacked",
-    "symbols_of",
-    "with_values",
-]
-
 
 _COMPARISONS = (ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE, ca.OP_NOT, ca.OP_AND, ca.OP_OR)
 

@@ -25,8 +25,6 @@ from impc.errors import SolverError
 if TYPE_CHECKING:
     from impc.arrays import Array, BoolArray, IntArray
 
-__all__ = ["needed_rows", "redundant_rows", "seen_directions", "supports", "with_mirror"]
-
 # A direction that the normalised rows see less than this, relative to the best seen one, counts
 # as unbounded: rounding (2e-16) would move the set along it by more than 1e-6 of its size.
 _UNSEEN = 1e-10

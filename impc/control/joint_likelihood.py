@@ -52,8 +52,6 @@ if TYPE_CHECKING:
     from impc.model.observer import Observer
     from impc.model.recordings import Recording
 
-__all__ = ["Likelihood", "NoiseDirections", "PreparedFilter", "joint_likelihoods", "prepare_filter"]
-
 # How a sample ends at which there is no likelihood.
 _FAILED = (Status.INFEASIBLE, Status.UNSOLVED, Status.DIVERGED)
 

@@ -31,8 +31,6 @@ if TYPE_CHECKING:
     from impc.model.observer import Observer
     from impc.model.plant import Plant
 
-__all__ = ["JointLoop", "PlantMoves", "joint_directions", "joint_loop"]
-
 
 class JointLoop(NamedTuple):
     """The system, or its derivatives along k directions, which are then a last axis.

@@ -44,8 +44,6 @@ if TYPE_CHECKING:
     from impc.control.terminal_set import TerminalSet
     from impc.model.riccati import LqrSolution
 
-__all__ = ["closed_loop_function"]
-
 
 @checked(steps=(1, 10_000_000))
 def closed_loop_function(

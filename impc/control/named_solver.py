@@ -35,20 +35,6 @@ if TYPE_CHECKING:
 
     from impc.control.constraint_rows import Rows
 
-__all__ = [
-    "COMPILED",
-    "SOLVERS",
-    "ActiveSet",
-    "Program",
-    "active_set",
-    "build_program",
-    "described",
-    "excluded_row",
-    "plugin",
-    "require_solver",
-    "silent",
-]
-
 #: The package's own method, see `compiled_dual`.
 COMPILED = "compiled"
 _IPOPT: dict[str, Any] = {

@@ -22,8 +22,6 @@ from impc.settings_files import IPOPT_ALONE
 if TYPE_CHECKING:
     from impc.control.optimal_control import OptimalControlProblem
 
-__all__ = ["SOLVERS", "require_solver", "start_of", "worst_row"]
-
 #: Names of the solvers: interior points, sequential quadratic programs, structured interior points.
 SOLVERS = ("ipopt", "sqpmethod", "fatrop")
 _SILENT: dict[str, Any] = {"print_time": False, "error_on_fail": False}

@@ -2,6 +2,8 @@
 
 The system is that of `joint_loop`: commands follow from the estimate, with every bound active
 (docs/noisy-people.md).
+
+Compiled code: a person who senses with noise, simulated (docs/noisy-people.md).
 """
 
 from __future__ import annotations
@@ -11,13 +13,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from impc.arrays import Array, Frozen, finite_array, frozen
+from impc.arrays import Array, Buffer, Frozen, finite_array, frozen
 from impc.checking import checked
 from impc.control.closed_loop import prepare_loop
-from impc.control.compiled_person import run_person
-from impc.control.constraint_rows import directions
-from impc.control.joint_loop import joint_loop
+from impc.control.compiled_kernel import DIVERGED, LARGEST, SOFTENED, LoopMatrices, law, workspace
+from impc.control.constraint_rows import RowDirections, Rows, directions
+from impc.control.joint_loop import JointLoop, joint_loop
 from impc.control.simulation import Status, scenario
+from impc.jit import njit
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -26,8 +29,6 @@ if TYPE_CHECKING:
     from impc.control.controller import Controller
     from impc.control.joint_loop import JointLoop
     from impc.model.observer import Observer
-
-__all__ = ["PersonTrial", "run_joint", "simulate_person"]
 
 
 @dataclass(frozen=True)
@@ -122,3 +123,41 @@ def _root(covariance: Array) -> Array:
     """
     values, vectors = np.linalg.eigh(covariance)
     return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T)
+
+
+@njit(cache=True, nogil=True)
+def run_person(
+    loop: LoopMatrices,
+    dloop: LoopMatrices,
+    rows: Rows,
+    drows: RowDirections,
+    unit: Buffer,
+    joint: JointLoop,
+    at: int,
+    disturbance: Buffer,
+    noise: Buffer,
+    shared: Buffer,
+    z: Buffer,
+    u: Buffer,
+    status: Buffer,
+) -> int:
+    """Simulate from z[0] with noise that has been drawn, without derivatives.
+
+    `loop, dloop, rows, drows, unit, joint, at` (m,); `disturbance` (samples, d); `noise`
+    (samples, z); `shared` (samples, m); `z` (samples + 1, z); `u` (samples, m); `status`
+    (samples,).
+    """
+    n = loop.K.shape[1]
+    work = workspace(rows, u.shape[1], 0)
+    lam, dx, du = np.zeros(len(rows.b)), np.zeros((n, 0)), np.zeros((u.shape[1], 0))
+    for t in range(len(u)):
+        x = z[t, at : at + n]
+        status[t], _, _ = law(loop, dloop, rows, drows, unit, work, x, dx, lam, False, u[t], du)
+        if status[t] > SOFTENED:
+            return t
+        z[t + 1] = joint.F @ z[t] + joint.B @ u[t] + joint.E @ disturbance[t] + noise[t]
+        z[t + 1] += joint.G @ (joint.share * u[t] * shared[t])
+        if not np.max(np.abs(z[t + 1])) < LARGEST:
+            status[t] = DIVERGED
+            return t
+    return len(u)

@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
     from impc.model.weights import Weights
 
-__all__ = ["NonlinearMpc", "build_nonlinear_mpc", "simulate_nonlinear"]
-
 _OPTIONS: dict[str, Any] = {
     "expand": True,  # the functions of all samples in one list: half the time
     "print_time": False,

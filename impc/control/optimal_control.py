@@ -39,8 +39,6 @@ if TYPE_CHECKING:
     from impc.control.plan import Plan
     from impc.control.receding_horizon import ClosedLoop
 
-__all__ = ["OptimalControlProblem"]
-
 _LONGEST = 10_000  # stages: the program has as many as it has unknowns times states
 
 

@@ -16,8 +16,6 @@ from impc.errors import DataError
 if TYPE_CHECKING:
     from impc.control.optimal_control import OptimalControlProblem
 
-__all__ = ["OptimalRecording", "optimal_recording"]
-
 
 @dataclass(frozen=True, eq=False)
 class OptimalRecording(Frozen):

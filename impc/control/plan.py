@@ -34,8 +34,6 @@ if TYPE_CHECKING:
     from impc.control.optimal_control import OptimalControlProblem
     from impc.control.relaxed_conditions import Conditions, System
 
-__all__ = ["Plan", "moved", "nearby_plan", "solve_plan", "solved_plan"]
-
 # Of the conditions, relative to the largest multiplier (gradient) or as they are (dynamics, rows).
 # Newton's method ends at 1e-13 to 1e-15 on the four systems of docs/nonlinear.md.
 _TOLERANCE = 1e-10

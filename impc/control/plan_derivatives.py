@@ -29,8 +29,6 @@ from impc.control.relaxed_conditions import (
 if TYPE_CHECKING:
     from impc.control.plan import Plan
 
-__all__ = ["PlanDerivatives", "dependent_rows", "differentiate_plan", "weakly_active_rows"]
-
 # Multiplier over slack: at mu = 1e-10 an active row with a multiplier of one has 1e10, an inactive
 # one with a slack of one 1e-10.
 _WEAK = (1e-3, 1e3)

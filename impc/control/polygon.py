@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.control.terminal_set import TerminalSet
 
-__all__ = ["as_pytope", "polygon"]
-
 
 def polygon(terminal: TerminalSet) -> Array:
     """Corners (v, 2) of a bounded set of two states, counter-clockwise, in the units of x."""

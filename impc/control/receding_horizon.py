@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from impc.control.optimal_control import OptimalControlProblem
     from impc.control.plan_derivatives import PlanDerivatives
 
-__all__ = ["ClosedLoop", "closed_loop_from", "shifted", "simulate_receding"]
-
 
 @dataclass(frozen=True, eq=False)
 class ClosedLoop(Frozen):

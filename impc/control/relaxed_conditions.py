@@ -30,19 +30,6 @@ from impc.arrays import Array, BoolArray, Frozen, IntArray
 if TYPE_CHECKING:
     from impc.control.optimal_control import OptimalControlProblem
 
-__all__ = [
-    "Conditions",
-    "Point",
-    "Residuals",
-    "System",
-    "conditions",
-    "parameter_sides",
-    "residuals",
-    "solve_conditions",
-    "system",
-    "wanted_rows",
-]
-
 
 @dataclass(frozen=True, eq=False)
 class Point(Frozen):

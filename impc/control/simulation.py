@@ -28,16 +28,6 @@ if TYPE_CHECKING:
     from impc.control.controller import Controller
     from impc.model.plant import Plant
 
-__all__ = [
-    "Scenario",
-    "Sensitivity",
-    "Simulation",
-    "Status",
-    "excluded_bound",
-    "require_complete",
-    "scenario",
-]
-
 
 class Status(IntEnum):
     """What happened at a sample.

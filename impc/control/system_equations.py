@@ -24,8 +24,6 @@ from impc.errors import InputError, one_line
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-__all__ = ["is_system", "system_equations"]
-
 # Of the largest entry: between what the function says of numbers and what the expression does.
 _AGREE = 1e-10
 _REMEDY = "write it with operators and numpy's functions, without if, float and math"

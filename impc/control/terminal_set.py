@@ -44,14 +44,6 @@ if TYPE_CHECKING:
     from impc.model.bounds import Bounds
     from impc.model.plant import Plant
 
-__all__ = [
-    "TerminalSet",
-    "contains",
-    "invariance_violation",
-    "maximal_invariant_set",
-    "maximality_violation",
-]
-
 
 @dataclass(frozen=True)
 class TerminalSet(Value):

@@ -28,8 +28,6 @@ from impc.model.recordings import Recording
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-__all__ = ["compiled_parts"]
-
 _LIMIT, _STEPS = 0.8, 40
 
 

@@ -22,8 +22,6 @@ import scipy.linalg
 if TYPE_CHECKING:
     from impc.arrays import Array
 
-__all__ = ["misaligned"]
-
 _RATE = 20.0  # samples per second: sway has little above 5 Hz, and differences raise noise
 _ORDER = 1.0  # s, of the autoregression
 _LONGEST = 3.0  # s, of the lags that are looked at

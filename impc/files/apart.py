@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 
     from impc.arrays import Array
 
-__all__ = ["cells_apart", "match_apart", "matrices_apart", "read_apart"]
-
 # Seconds of computing that a file may take: measured, 1.5 s for 100 MB of HDF5 and 6 s for a C3D
 # of 10 MB (60 000 frames), which is the slowest.
 _SECONDS, _SECONDS_A_MEGABYTE = 10, 2

@@ -12,8 +12,6 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-__all__ = ["EMPTY", "HEAD", "NUMBER", "WORD", "Block", "first_block"]
-
 #: Kinds of a cell.
 EMPTY, NUMBER, WORD = 0, 1, 2
 #: Rows among which the first row of numbers must be.

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.files.table import Table
 
-__all__ = ["encode_c3d", "read_c3d"]
-
 
 def read_c3d(path: Path, largest: int) -> Table:
     """Read the analog channels of the file at `path`, with their units and rate.

@@ -19,19 +19,6 @@ if TYPE_CHECKING:
     from impc.arrays import Array, BoolArray
     from impc.files.units import Unit
 
-__all__ = [
-    "FELL",
-    "Channel",
-    "beyond_the_stop",
-    "clipped",
-    "constant",
-    "degrees_for_radians",
-    "missing",
-    "stretches",
-    "too_few",
-    "unit_of_the_file",
-]
-
 #: How the message of a fall begins.
 FELL = "the subject fell"
 # Share of samples that rest on an extreme value: above the first a finding, above the second no

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from impc.files.configuration import RecordingTable
     from impc.files.table import Table
 
-__all__ = ["Clock", "column_of", "counts_days", "on_even_instants", "read_clock"]
-
 # An interval this many periods long has lost a sample.
 _GAP = 1.5
 # Deviation from an even clock, in periods, from which it is a finding and values are interpolated.

@@ -26,15 +26,6 @@ from impc.files.units import si_unit
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-__all__ = [
-    "FILL_IN",
-    "Configuration",
-    "RecordingTable",
-    "ReportTable",
-    "SignalTable",
-    "read_configuration",
-]
-
 #: What `impc inspect` writes where nothing tells; it has to be filled in.
 FILL_IN = "?"
 

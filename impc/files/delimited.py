@@ -31,8 +31,6 @@ if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.files.table import Table
 
-__all__ = ["encode_delimited", "is_number", "read_delimited", "text_cell"]
-
 _DELIMITERS = {".csv": ",;\t", ".lvm": "\t,;", ".txt": "\t;, "}
 _TABS = "\t", "\t "  # .tsv; files of OpenSim, which blanks may divide too
 _NAMES = {",": "commas", ";": "semicolons", "\t": "tabs", " ": "blanks", "|": "bars", ":": "colons"}

@@ -33,8 +33,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from types import ModuleType
 
-__all__ = ["content_digest", "digest", "source_digest", "versions"]
-
 # What computes: another version of any of them may give other digits.
 _PACKAGES = ("casadi", "clarabel", "control", "cvxpy", "numba", "numpy", "scipy")
 _PLANT_FILES = (".mat", ".npz", ".json")

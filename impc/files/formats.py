@@ -26,15 +26,6 @@ if TYPE_CHECKING:
 
     from impc.files.table import Table
 
-__all__ = [
-    "FORMATS",
-    "Format",
-    "encode_table",
-    "read_table",
-    "write_matlab73",
-    "write_table",
-]
-
 
 @dataclass(frozen=True)
 class Format:

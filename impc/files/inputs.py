@@ -12,9 +12,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-__all__ = ["Inputs", "Recorded", "gather_inputs", "study_inputs"]
-
-
 @dataclass(frozen=True)
 class Inputs:
     """SHA-256 of what went into a result."""

@@ -13,8 +13,8 @@ import numpy as np
 
 from impc.errors import InputError
 from impc.files.clock import counts_days
-from impc.files.columns import in_columns
 from impc.files.configuration import FILL_IN
+from impc.files.headings import in_columns
 from impc.files.plant_sources import OWN
 from impc.files.units import guessed_unit, si_unit
 
@@ -23,8 +23,6 @@ if TYPE_CHECKING:
 
     from impc.arrays import Array
     from impc.files.table import Table
-
-__all__ = ["Wanted", "clock_column", "draft_configuration", "open_places", "summary"]
 
 _CLOCKS = ("time", "t", "zeit", "temps", "tiempo", "timestamp", "clock", "seconds", "sec")
 # Units of a clock that tells none, and how many make a second: the first in which the steps are

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.files.table import Table
 
-__all__ = ["HDF5_SIGNATURE", "matlab73_bytes", "read_matlab73"]
-
 #: First bytes of an HDF5 file.
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _USER_BLOCK = 512

@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.files.checks import Channel
 
-__all__ = ["comparable_rates", "few_gaps", "period_of_a_recording", "size", "times_of_a_recording"]
-
 # In SI units. Fourth powers of both are still numbers, and nothing measured comes near.
 _LARGEST, _SMALLEST = 1e50, 1e-50
 _LONGEST = 1e12  # s on a clock: 30 000 years; 1.7e9 is a count from 1970

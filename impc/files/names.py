@@ -10,8 +10,6 @@ from impc.errors import DataError, ImpcError, brief
 if TYPE_CHECKING:
     from pathlib import Path
 
-__all__ = ["LARGEST", "damaged", "require_ordinary"]
-
 #: Bytes of a file, and of its arrays in memory: an hour of 16 channels at 2 kHz.
 LARGEST = 1_000_000_000
 

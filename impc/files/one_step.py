@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
     from impc.arrays import Array, IntArray
 
-__all__ = ["departures", "rows_later"]
-
 _LAGS, _ROW_LAGS = 6, 8  # for offset and drift, and for rows
 _KNOWN = 3  # effects that the plant alone decides: no controller reacts before
 _REACH = 4  # rows by which lags are tried; the outermost are no answer

@@ -40,8 +40,6 @@ if TYPE_CHECKING:
     from impc.files.table import Table
     from impc.model.recordings import Label
 
-__all__ = ["OptimalTrial", "read_optimal_trials"]
-
 
 @dataclass(frozen=True, eq=False)
 class OptimalTrial(Frozen):

@@ -33,17 +33,6 @@ if TYPE_CHECKING:
 
     from impc.arrays import Array
 
-__all__ = [
-    "OWN",
-    "PlantSource",
-    "import_function",
-    "made_by",
-    "make_plant",
-    "plant_family_of",
-    "plant_source",
-    "users_code",
-]
-
 #: Arguments of a plant that are measured of every subject.
 OWN = ("mass", "height")
 

@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.files.table import Table
 
-__all__ = ["READERS", "main"]
-
 #: Module, function and library of each format that is read here.
 READERS = {
     "matlab": ("impc.files.matlab", "read_matlab", "scipy.io"),

@@ -35,19 +35,6 @@ if TYPE_CHECKING:
     from impc.files.units import Unit
     from impc.model.plant import Plant
 
-__all__ = [
-    "channel_of",
-    "disturbances_of",
-    "label_of",
-    "read_recordings",
-    "read_unit",
-    "recording_of",
-    "require_distinct",
-    "require_filled_in",
-    "require_kind",
-    "told_unit",
-]
-
 # Shares of half the range above which an offset and a drift are findings.
 _OFFSET, _DRIFT = 0.12, 0.25
 # Samples for each state of the plant below which nothing can be fitted.

@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 
     from impc.arrays import Array
 
-__all__ = ["held_means", "instants", "resampled_samples", "same_rate", "shifted"]
-
 # Attenuation in dB of what would alias, and the largest ripple below: 10^(-70/20) = 3e-4.
 _ATTENUATION = 70.0
 # What is kept ends here, as a part of the lower of the two Nyquist frequencies; what is removed

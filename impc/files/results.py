@@ -16,8 +16,6 @@ from impc.checking import checked
 from impc.errors import DataError
 from impc.files.writing import require_ordinary
 
-__all__ = ["SCHEMA", "MethodRecord", "ResultFile", "read_result"]
-
 #: Of the files that are written now. Before the first one that has a number there were others.
 SCHEMA = 2
 

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
-__all__ = ["SAVED", "read_matrices", "state_space"]
-
 #: Endings of the files that hold a plant.
 SAVED = (".mat", ".npz", ".json")
 

@@ -23,8 +23,6 @@ from impc.files.writing import remove_empty, require_ordinary, write_whole
 if TYPE_CHECKING:
     from pathlib import Path
 
-__all__ = ["Kept"]
-
 _UNSAFE = re.compile(r"[^A-Za-z0-9+._/-]")
 
 

@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.files.table import Table
 
-__all__ = ["read_cells", "read_spreadsheet"]
-
 _DAY = 86_400.0
 _TIMES = (datetime.datetime, datetime.date, datetime.time, datetime.timedelta)
 

@@ -17,8 +17,6 @@ if TYPE_CHECKING:
 
     from impc.arrays import Array
 
-__all__ = ["Table", "make_table"]
-
 _LONGEST = 160  # characters of a name, a unit or a reason: they stand in messages and in TOML
 
 

@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.files.table import Table
 
-__all__ = ["encode_tdms", "read_tdms"]
-
 # Kinds of scales that nptdms applies.
 _SCALES = (
     *("Linear", "Polynomial", "Table", "Add", "Subtract", "AdvancedAPI"),

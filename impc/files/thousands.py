@@ -10,8 +10,6 @@ from impc.errors import DataError
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
-__all__ = ["require_no_thousands"]
-
 
 def require_no_thousands(
     source: str, names: Mapping[int, str], rows: Iterable[tuple[int, Sequence[str]]], sign: str

@@ -12,8 +12,6 @@ from typing import Any
 from impc.checking import checked
 from impc.errors import InputError, brief
 
-__all__ = ["USUAL", "Unit", "as_pint_says", "guessed_unit", "is_unit", "si_unit"]
-
 # pint would take Nm for "number metre" and a.u. for "year times atomic mass unit".
 _TORQUE = re.compile(r"(?<![A-Za-z])([kmM]?)N[ ·.\-⋅]?([cm]?)m(?![A-Za-z0-9])")
 _DEGREES = str.maketrans("º˚", "°°")  # the marks of ordinals and of rings, typed for degrees

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from importlib.machinery import ModuleSpec
 
-__all__ = ["OURS", "consented_name", "is_installed", "module_file", "require_users_function"]
-
 #: This package's own modules; they are known by their version.
 OURS = ("impc", "plants")
 _DATA = (".mat", ".npz", ".json")

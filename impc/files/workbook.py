@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
     from impc.files.table import Table
 
-__all__ = ["MOST_ROWS", "encode_workbook", "workbook_bytes"]
-
 #: Rows of a sheet; Excel opens no more.
 MOST_ROWS = 1_048_576
 _LONGEST_NAME = 31  # characters of a sheet's

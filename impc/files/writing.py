@@ -11,16 +11,6 @@ from impc.errors import OutputError
 if TYPE_CHECKING:
     from pathlib import Path
 
-__all__ = [
-    "IN_ITS_PLACE",
-    "NO_ROOM",
-    "flush_folder",
-    "remove_empty",
-    "require_ordinary",
-    "unwritable",
-    "write_whole",
-]
-
 #: What to do about a file that cannot be written, where room would not help.
 IN_ITS_PLACE = "move what is in its place, or give another folder"
 #: Numbers of errors that room on the disk, or a larger quota or limit, would mend.

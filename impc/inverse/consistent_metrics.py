@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from impc.inverse.problem import Problem
     from impc.model.plant import Plant
 
-__all__ = ["MetricFamily", "fitted_metric", "metric_family", "unidentified_metrics"]
-
 # Condition number from which eigenvectors determine no metric, and share of an imaginary part.
 _DEFECTIVE, _REAL = 1e8, 1e-4
 # Grid of each d, in decades, and the most of it that is simulated; starts of a search among these.

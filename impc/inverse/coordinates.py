@@ -35,16 +35,6 @@ if TYPE_CHECKING:
     from impc.inverse.problem import Problem
     from impc.inverse.residuals import Evaluation
 
-__all__ = [
-    "PARAMETER_UNIT",
-    "Compressed",
-    "Coordinates",
-    "Point",
-    "descend",
-    "metric_directions",
-    "start_unit",
-]
-
 #: A parameter's coordinate counts thirds of itself.
 PARAMETER_UNIT = 1 / 3
 _START_FLOOR = 1e-8

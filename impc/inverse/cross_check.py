@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.inverse.estimates import Estimate
 
-__all__ = ["cross_checked"]
-
 # Misfits that differ by less, of themselves, are the same.
 _SAME = 1e-3
 # Methods that search all weights.

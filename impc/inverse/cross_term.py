@@ -26,8 +26,6 @@ if TYPE_CHECKING:
 
     from impc.model.plant import Plant
 
-__all__ = ["CrossTerm", "inverse_lqr_cross_term", "lifted"]
-
 
 @dataclass(frozen=True)
 class CrossTerm(Frozen):

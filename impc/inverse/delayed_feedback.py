@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from impc.inverse.problem import Problem
     from impc.model.plant import Plant
 
-__all__ = ["PreliminaryGain", "preliminary_gain"]
-
 _SCALES = np.geomspace(1.0, 1e-3, 25)
 # Nats and evaluations at which the search ends.
 _FINE, _EVALUATIONS = 0.01, 60

@@ -40,19 +40,6 @@ if TYPE_CHECKING:
     from impc.inverse.problem import Problem
     from impc.model.riccati import LqrSolution
 
-__all__ = [
-    "CONDITION_WEIGHT",
-    "DirectFit",
-    "Inference",
-    "ReducedFit",
-    "Start",
-    "infer_weights",
-    "inverse_mpc",
-    "inverse_mpc_reduced",
-    "output_penalty_weights",
-    "starting_point",
-]
-
 # c of (3.5) to (3.7) is lost. Small enough that the exact fit wins in the 2-norm (docs/theory.md).
 #: Weight of the condition number in (3.6) and (3.16), against 1 for a misfit of a typical output.
 CONDITION_WEIGHT = 1e-4

@@ -27,17 +27,6 @@ from impc.inverse.solution_set import GainFibre, pair_blocks, split_blocks
 from impc.model.riccati import solve_lqr
 from impc.model.weights import Weights, condition_number, normalised
 
-__all__ = [
-    "SLACK",
-    "EquivalentWeights",
-    "WeightsMargin",
-    "analytic_centre",
-    "inverse_factor",
-    "least_condition_weights",
-    "other_weights",
-    "weights_margin",
-]
-
 # Least eigenvalue, of a mean of 1, from which weights are said to exist: Clarabel errs by 1e-10.
 _MARGIN = 1e-9
 #: By how much, relatively, the condition number of a convention may exceed the least: with less

@@ -28,19 +28,6 @@ if TYPE_CHECKING:
     from impc.control.simulation import Simulation
     from impc.inverse.problem import Problem
 
-__all__ = [
-    "DETERMINED",
-    "ROUNDING",
-    "Estimate",
-    "Goodness",
-    "Status",
-    "decode_estimate",
-    "determined",
-    "encode_estimate",
-    "gain_rank",
-    "goodness",
-]
-
 
 class Status(Enum):
     """How a method ended; each has a sentence."""

@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from impc.inverse.problem import Problem
     from impc.model.weights import Weights
 
-__all__ = ["WeightsBehind", "weights_behind", "weights_misfit"]
-
 
 @dataclass(frozen=True)
 class WeightsBehind:

@@ -38,8 +38,6 @@ if TYPE_CHECKING:
     from impc.inverse.problem import Problem
     from impc.model.riccati import LqrSolution
 
-__all__ = ["FEW", "GainFit", "fit_gain", "refine_gain"]
-
 #: Numbers recorded up to which a search may be made many times.
 FEW = 2000
 # Few numbers are searched until three agree on the least misfit, to this share of it; longer

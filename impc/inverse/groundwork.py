@@ -49,8 +49,6 @@ if TYPE_CHECKING:
     from impc.inverse.problem import Problem
     from impc.model.plant import Plant
 
-__all__ = ["Found", "Groundwork", "NaturalUnits", "PlantUnits", "Remember", "afresh", "regulator"]
-
 # Share by which weights may miss the recordings by more than the gain that they were found for.
 _AS_GOOD = 1e-3
 

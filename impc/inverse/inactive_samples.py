@@ -24,8 +24,6 @@ from impc.inverse.problem import recorded_states
 if TYPE_CHECKING:
     from impc.inverse.problem import Problem
 
-__all__ = ["pair_of_inactive_samples"]
-
 # A command this near to its bound counts as at it, and of the commands: what exact samples leave.
 _AT_BOUND, _EXACT = 1e-6, 1e-8
 # Of the states: what the plant cannot do, and below which a sample says nothing.

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 
     from impc.inverse.problem import Problem
 
-__all__ = ["with_fitted_starts"]
-
 _EVALUATIONS = 20
 # The first round also counts as noise what saturation keeps from being linear; a second, which does
 # not, is worth its simulations where that was more than a share of it.

@@ -28,12 +28,6 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
     from impc.model.riccati import LqrSolution
 
-__all__ = [
-    "InverseLqr",
-    "inverse_lqr_gradient",
-    "inverse_lqr_lmi",
-]
-
 
 @dataclass(frozen=True)
 class InverseLqr(Frozen):

@@ -25,8 +25,6 @@ import scipy.linalg
 
 from impc.arrays import Array
 
-__all__ = ["Model", "Prior", "Rows", "Stop", "minimise", "triangular_rows"]
-
 _BLOCK = 4096
 # Damping at the start, its least value, and how it changes after a poor and after a good step.
 _DAMPING, _LEAST, _UP, _DOWN = 1e-3, 1e-12, 6.0, 0.2

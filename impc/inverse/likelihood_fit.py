@@ -39,8 +39,6 @@ if TYPE_CHECKING:
     from impc.inverse.problem import Problem
     from impc.model.observer import Observer
 
-__all__ = ["PersonFit", "fit_person", "person_at"]
-
 # Likelihoods for all but the gain, or the prices, at first: while levels are far off the gain that
 # explains most is on the border of those that stabilise, and three searches of 21 ended there.
 _FIRST = 10

@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.inverse.person_prior import Place, Prior
 
-__all__ = ["boxed_step", "climb"]
-
 # A search ends when a step promises less, nats: a hundredth of a deviation along any direction
 # without a prior, a tenth with it, for the slope that scores do not have is known no better.
 _SETTLED, _ENOUGH = 1e-4, 5e-3

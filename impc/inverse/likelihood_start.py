@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from impc.inverse.coordinates import Point
     from impc.model.observer import Observer
 
-__all__ = ["Asked", "gain_space", "likeliest_start", "prices_at", "prior_about"]
-
 # Of the residual, shares that a search begins with: inside the loop, of the senses, the recorder's.
 # The likeliest is taken. On a seat whose recorder has a thirtieth of the residual the search had
 # not ended after 40 steps (docs/noisy-people.md).

@@ -33,8 +33,6 @@ if TYPE_CHECKING:
 
     from impc.inverse.problem import Problem
 
-__all__ = ["METHODS", "Method", "estimate", "estimate_all", "estimate_of", "method_named"]
-
 
 @dataclass(frozen=True)
 class Method:

@@ -41,15 +41,6 @@ if TYPE_CHECKING:
     from impc.inverse.solution_set import GainFibre
     from impc.model.riccati import LqrSolution
 
-__all__ = [
-    "CONDITION_SHARE",
-    "WORST_START",
-    "best_conditioned",
-    "in_natural_units",
-    "in_plant_units",
-    "inverse_mpc_natural",
-]
-
 #: What the condition number of the start counts, in squared standard deviations of one sample's
 #: noise. It decides along directions that noise leaves open, and moves no other by as much as its
 #: own deviation; counted against all samples together (1e-3 of the squared misfit) it moved the

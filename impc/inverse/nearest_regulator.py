@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
     from impc.model.riccati import LqrSolution
 
-__all__ = ["AUXILIARY_CONDITION_WEIGHT", "auxiliary_weights", "definite", "weights_near"]
-
 #: Weight of the condition number in (3.7), against 1 for a distance as large as the gain in
 #: `infer_weights`.
 AUXILIARY_CONDITION_WEIGHT = 1e-3

@@ -54,8 +54,6 @@ if TYPE_CHECKING:
     from impc.model.riccati import LqrSolution
     from impc.model.weights import Weights
 
-__all__ = ["fit_controller", "free_gain", "noise_of"]
-
 # Weights that leave more than the free gain by what noise does in one of a hundred recordings are
 # looked for again.
 _RARE = 0.01

@@ -33,8 +33,6 @@ if TYPE_CHECKING:
     from impc.control.optimal_recordings import OptimalRecording
     from impc.inverse.optimal_control_residuals import Evaluation, Residuals
 
-__all__ = ["MU_STEPS", "OptimalControlEstimate", "fit_optimal_control"]
-
 #: The falling sequence of mu, over the mean cost of a recorded stage where that is below one.
 MU_STEPS = (1e-1, 1e-2, 1e-4, 1e-10)
 _MOST_STARTS = 1000

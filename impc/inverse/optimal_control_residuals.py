@@ -24,17 +24,6 @@ if TYPE_CHECKING:
     from impc.control.optimal_control import OptimalControlProblem
     from impc.control.optimal_recordings import OptimalRecording
 
-__all__ = [
-    "EXPLAINED",
-    "Evaluation",
-    "Residuals",
-    "assembled",
-    "begin",
-    "evaluate",
-    "first_plan",
-    "residuals_of",
-]
-
 #: Share of the squares of recordings above which plans are taken to be of another kind: a cart-pole
 #: that does not swing up leaves 0.8 of them, noise of 16 dB leaves 0.025.
 EXPLAINED = 0.03

@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from impc.control.optimal_recordings import OptimalRecording
     from impc.inverse.optimal_control_residuals import Residuals
 
-__all__ = ["Count", "along_mu", "guided"]
-
 _LONGEST_STEP = 0.7  # in a logarithm: a factor of two
 _SMALL_STEP = 1e-9
 _LEAST_DAMPING, _MOST_DAMPING = 1e-14, 1e6

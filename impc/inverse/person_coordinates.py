@@ -34,8 +34,6 @@ if TYPE_CHECKING:
     from impc.inverse.coordinates import Coordinates, Point
     from impc.model.observer import Observer
 
-__all__ = ["Person", "PersonCoordinates", "Told"]
-
 # Largest logarithm, either way, of a level whose square double precision can still multiply.
 _SQUARED = 300.0
 

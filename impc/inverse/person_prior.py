@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.inverse.person_coordinates import PersonCoordinates, Told
 
-__all__ = ["TOLD", "Place", "Prior"]
-
 #: A number of the gain is told by itself when its deviation is below this, of a coordinate.
 TOLD = 0.25
 

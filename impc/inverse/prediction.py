@@ -31,8 +31,6 @@ from impc.inverse.problem import scenarios
 if TYPE_CHECKING:
     from impc.inverse.problem import Problem
 
-__all__ = ["Correction", "command_sizes", "correction"]
-
 # Noise that reaches every mode, of that of the commands: for modes that B misses. The larger ones
 # are for plants whose Riccati equation is beyond double precision with less.
 _EVERYWHERE = (1e-9, 1e-6, 1e-3)

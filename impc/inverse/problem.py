@@ -37,20 +37,6 @@ if TYPE_CHECKING:
     from impc.model.recordings import Recording
     from impc.model.structure import Structure
 
-__all__ = [
-    "EXPLAINED",
-    "Problem",
-    "controller_for",
-    "follows_plant",
-    "misfit",
-    "recorded_size",
-    "recorded_states",
-    "scenarios",
-    "simulated",
-    "typical_output",
-    "with_or_without_set",
-]
-
 #: Misfit, of the recorded outputs, up to which they are explained.
 EXPLAINED = 1e-9
 # Of the states: noise that a laboratory would call none is above, rounding in files is below.

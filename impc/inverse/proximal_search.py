@@ -38,8 +38,6 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
     from impc.model.riccati import LqrSolution
 
-__all__ = ["ConditionedFit", "Objective", "Residual", "conditioned_fit", "weight_jacobian"]
-
 
 _STATIONARY = 1e-5
 # In units of the current weights: a step of 1 can double one direction or make it singular.

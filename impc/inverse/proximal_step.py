@@ -26,8 +26,6 @@ from impc.inverse.semidefinite import matrix_inequality, norm_bound, solve_semid
 if TYPE_CHECKING:
     from impc.inverse.semidefinite import Cone
 
-__all__ = ["StepProgram", "block_basis", "solve_step"]
-
 
 @dataclass(frozen=True)
 class StepProgram(Frozen):

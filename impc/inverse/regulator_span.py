@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
     from impc.model.structure import Structure
 
-__all__ = ["kept_to", "regulators_alone"]
-
 # Sizes of the weights on natural states, of natural commands' one: gains from a third of a natural
 # one to eight on the seat.
 _SIZES = (1e-2, 1.0, 1e2)

@@ -38,19 +38,6 @@ if TYPE_CHECKING:
 
     StartResidual = Callable[[Array], tuple[Array, Array]]
 
-__all__ = [
-    "Evaluation",
-    "evaluate",
-    "keeps_hard",
-    "misfit_or_reason",
-    "residual_only",
-    "residual_or_reason",
-    "scaled_changes",
-    "start_residual",
-    "unusable",
-    "verify_hard",
-]
-
 # What a sample that a trial controller does not reach counts for, in root-mean-square outputs.
 _NOT_REACHED = 1e3
 

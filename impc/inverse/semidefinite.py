@@ -24,15 +24,6 @@ from impc.errors import SolverError
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-__all__ = [
-    "Cone",
-    "SemidefiniteSolution",
-    "matrix_inequality",
-    "norm_bound",
-    "solve_each",
-    "solve_semidefinite",
-]
-
 
 @dataclass(frozen=True)
 class Cone:

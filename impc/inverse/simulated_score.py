@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from impc.inverse.problem import Problem
     from impc.model.recordings import Recording
 
-__all__ = ["SimulatedScore", "left_behind", "simulated_score"]
-
 # Times the largest recorded output: who falls from a seat at .16 rad is at 1.6 rad soon after.
 _FAR = 10.0
 # Jumps are asked of one set in so many: they scatter a third as much as scores, and take twice as

@@ -37,16 +37,6 @@ if TYPE_CHECKING:
 
     from impc.model.plant import Plant
 
-__all__ = [
-    "RANK",
-    "GainFibre",
-    "floored_covariance",
-    "gain_fibre",
-    "natural_coordinates",
-    "pair_blocks",
-    "split_blocks",
-]
-
 #: Singular values of the gain condition below this, of the largest, are zero: exact gains leave
 #: 1e-15 there (a singular A, or a metric given with its own gain), the seat's smallest is 4e-3.
 RANK = 1e-10

@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from impc.inverse.problem import Problem
     from impc.model.riccati import LqrSolution
 
-__all__ = ["balanced_regulator", "drawn_start", "regulators", "state_sizes"]
-
 # Cost weights of states that no output sees, of the others'.
 _UNSEEN = 1e-8
 # Costs of the command, of that of the balanced regulator.

@@ -37,14 +37,6 @@ if TYPE_CHECKING:
     from impc.inverse.problem import Problem
     from impc.model.structure import Structure
 
-__all__ = [
-    "bryson_prices",
-    "feature_sizes",
-    "fit_structure",
-    "fit_structured",
-    "structured_estimate",
-]
-
 # Decades of the price of the command, as in `bryson_weights`.
 _EFFORTS = np.log(10.0) * np.arange(-6, 7, 2)
 # Logarithm of a price: a factor of 150 about Bryson's, where the nearest gain leaves it free.

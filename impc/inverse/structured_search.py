@@ -37,8 +37,6 @@ if TYPE_CHECKING:
     from impc.inverse.residuals import Evaluation
     from impc.model.structure import Structure
 
-__all__ = ["PriceCoordinates", "StructuredEnd", "regulator_slopes", "search_from"]
-
 # Logarithm of a price: a factor of 150 about the start, while the basin is looked for.
 _SPREAD = 5.0
 # A combination with a larger deviation keeps that prior to the end.

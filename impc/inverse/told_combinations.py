@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 
     from impc.control.optimal_control import OptimalControlProblem
 
-__all__ = ["Combination", "Combinations", "combinations"]
-
 # Relative to the largest singular value. On the four systems of docs/nonlinear.md the weakest told
 # direction has 3e-4 and the strongest untold one, of a bound that nothing touches, 5e-11.
 _NOTHING = 1e-8

@@ -16,8 +16,6 @@ from impc.arrays import Array
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-__all__ = ["TrialSpan", "trial_span"]
-
 # A column that the others explain to that of its length adds nothing but rounding.
 _ROUNDING = 1e-10
 

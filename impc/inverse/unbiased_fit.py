@@ -40,8 +40,6 @@ if TYPE_CHECKING:
     from impc.inverse.likelihood_fit import PersonFit
     from impc.inverse.simulated_score import SimulatedScore
 
-__all__ = ["TiltedPrior", "Unbiased", "unbiased"]
-
 # Sets of trials for the mean: they add a thirtieth to the variance of the gain.
 _SETS = 32
 # Deviations within which a mean is as it was found.

@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.inverse.person_prior import Place, Prior
 
-__all__ = ["jumps", "learned_slope", "unseen_slope"]
-
 # Step of the differences along a level, of its logarithm; square of one that teaches half.
 _DIFFERENCE, _DAMPING = 0.1, 0.1
 # A direction of the gain that is hardly told has no longer step, of a coordinate.

@@ -22,8 +22,6 @@ from impc.errors import PlantError
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-__all__ = ["OPERATIONS", "Body", "read_body"]
-
 #: Names of the operations in CasADi, without ``OP_``; a list of operations has their places.
 OPERATIONS = (
     *("OUTPUT", "MUL", "ADD", "SUB", "DIV", "NEG", "SQ", "TWICE", "SIN", "COS", "TAN", "SQRT"),

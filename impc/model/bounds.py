@@ -23,8 +23,6 @@ if TYPE_CHECKING:
 
     from impc.model.plant import Plant
 
-__all__ = ["BoundRows", "Bounds", "bound_rows"]
-
 
 @dataclass(frozen=True, init=False)
 class Bounds(Value):

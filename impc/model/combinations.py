@@ -16,8 +16,6 @@ from impc.errors import InputError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-__all__ = ["linear_combination"]
-
 # Of the largest factor of a feature: its square is a number still, and its norm none too small.
 _SIZES = 1e-50, 1e50
 _NUMBER = re.compile(r"(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")

@@ -23,8 +23,6 @@ from impc.arrays import Array
 from impc.errors import SolverError
 from impc.model.riccati import is_stable, lyapunov_series
 
-__all__ = ["FilterChanges", "StationaryFilter", "filter_changes", "stationary_filter"]
-
 # Doublings: 2^40 samples are beyond any filter that is stable in double precision.
 _DOUBLINGS = 40
 _SETTLED = 1e-16

@@ -36,8 +36,6 @@ if TYPE_CHECKING:
     from impc.model.kalman import StationaryFilter
     from impc.model.plant import Plant
 
-__all__ = ["LEVELS", "Observer", "believed_filter", "believed_matrices"]
-
 #: The levels of noise, in the order in which they are searched.
 LEVELS = ("motor", "share", "process", "sensory", "walk")
 

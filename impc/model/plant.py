@@ -27,8 +27,6 @@ from impc.model.signal_units import UNKNOWN
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-__all__ = ["Plant", "change_coordinates"]
-
 
 @dataclass(frozen=True, init=False)
 class Plant(Value):

@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from impc.model.body import Body
     from impc.model.plant import Plant
 
-__all__ = ["PlantDifferential", "PlantFamily", "plant_at", "plant_differential"]
-
 _STEP = 1e-3
 # Difference of the two central differences, relative to the derivative: h^2 for a smooth plant.
 _ROUGH = 1e-3

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 
     from impc.model.plant import Plant
 
-__all__ = ["Label", "Recording"]
-
 
 @dataclass(frozen=True)
 class Label(Value):

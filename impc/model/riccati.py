@@ -27,18 +27,6 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
     from impc.model.weights import Weights
 
-__all__ = [
-    "Gradients",
-    "LqrSolution",
-    "gain_gradients",
-    "is_stable",
-    "lyapunov_series",
-    "metric_gradients",
-    "regulator_changes",
-    "solve_lqr",
-    "stabilises",
-]
-
 
 @dataclass(frozen=True)
 class LqrSolution(Frozen):

@@ -11,8 +11,6 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from impc.model.plant import Plant
 
-__all__ = ["UNKNOWN", "gain_unit", "price_unit"]
-
 #: What is written where a plant does not say in which unit a signal is.
 UNKNOWN = "SI"
 

@@ -28,8 +28,6 @@ if TYPE_CHECKING:
 
     from impc.model.plant import Plant
 
-__all__ = ["Structure"]
-
 _WORDS = ("diagonal", "full", "outputs")
 # Features whose prices differ by less than this, of their own size, make the same weights.
 _SAME = 1e-9

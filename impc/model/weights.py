@@ -21,15 +21,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike
 
-__all__ = [
-    "Weights",
-    "cholesky_parameters",
-    "condition_number",
-    "normalised",
-    "weight_error",
-    "weights_from_parameters",
-]
-
 
 @dataclass(frozen=True, init=False)
 class Weights(Value):

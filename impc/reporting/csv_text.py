@@ -19,8 +19,6 @@ from impc.files.delimited import text_cell
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-__all__ = ["csv_bytes"]
-
 _NUMBER = r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?"
 # What the project writes itself: no value; a number, with a unit, with an interval.
 _HARMLESS = re.compile(

@@ -2,41 +2,37 @@
 
 Text is escaped when the page is made. Where a sentence holds a piece of code or a link it is a
 `markupsafe.Markup`, whose `format` escapes what is put into it.
+
+The tables of a result as one MATLAB file: a struct a table, a field a column (docs/results.md).
+
+Names follow MATLAB's rules: letters, digits and underscores, a letter first, 63 characters at most.
+Columns of numbers are column vectors, all others cell arrays of text.
 """
 
 from __future__ import annotations
 
 import base64
+import io
 import json
+import math
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from impc.files.columns import in_columns
+import numpy as np
+import scipy.io
+
+from impc.files.headings import in_columns
 from impc.files.results import SCHEMA
 from impc.files.workbook import MOST_ROWS, workbook_bytes
 from impc.reporting.csv_text import csv_bytes
 from impc.reporting.glossary import Glossary, used_words
-from impc.reporting.matlab_tables import matlab_tables
 from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import plain, render_template
 
-__all__ = [
-    "Block",
-    "Chart",
-    "Details",
-    "Heading",
-    "Lines",
-    "Note",
-    "Picture",
-    "Report",
-    "Section",
-    "Terms",
-    "TextTable",
-    "Verdict",
-    "json_bytes",
-    "table_of",
-]
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
 
 T = TypeVar("T")
 
@@ -201,3 +197,42 @@ class Report:
 def json_bytes(content: Mapping[str, Any]) -> bytes:
     """The `content` of result.json, UTF-8; what is not a number is null."""
     return (json.dumps(plain(content), indent=1, allow_nan=False) + "\n").encode()
+
+
+_LONGEST = 63
+
+
+def matlab_tables(tables: Mapping[str, TextTable]) -> bytes:
+    """The bytes of a .mat file of version 5."""
+    content = {}
+    for name, table in zip(_names(list(tables)), tables.values(), strict=True):
+        columns = list(zip(*table.rows, strict=True)) or [()] * len(table.heads)
+        fields = zip(_names(table.heads), columns, strict=True)
+        content[name] = {field: _column(values) for field, values in fields}
+    stream = io.BytesIO()
+    save: Any = scipy.io.savemat  # its stubs know paths only
+    save(stream, content, long_field_names=True, oned_as="column")
+    return stream.getvalue()
+
+
+def _names(given: Sequence[str]) -> list[str]:
+    """Names that MATLAB takes; what becomes the same is told apart by a number."""
+    found: list[str] = []
+    for text in given:
+        name = re.sub(r"\W", "_", text, flags=re.ASCII)
+        name = (name if re.match("[A-Za-z]", name) else f"x{name}")[:_LONGEST]
+        count = 1
+        while name in found:
+            count += 1
+            name = f"{name[: _LONGEST - 4]}_{count}"
+        found.append(name)
+    return found
+
+
+def _column(values: Sequence[Any]) -> Any:
+    numbers = [math.nan if value is None else value for value in values]
+    if all(isinstance(value, int | float) for value in numbers):
+        return np.array(numbers, dtype=np.float64)[:, None]
+    cells = np.empty((len(numbers), 1), dtype=object)
+    cells[:, 0] = [str(value) for value in values]
+    return cells

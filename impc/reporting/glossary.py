@@ -8,8 +8,6 @@ from html import unescape
 
 from markupsafe import Markup, escape
 
-__all__ = ["WORDS", "Glossary", "used_words"]
-
 #: Word -> what it means. A word is found in any case of its first letter, and in the plural.
 WORDS: dict[str, str] = {
     "A-optimal": "Of experiments: with the least mean variance of the logarithms of the prices.",

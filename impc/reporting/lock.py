@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-__all__ = ["LOCK", "locked"]
-
 #: Name of the lock in a folder.
 LOCK = ".impc-lock"
 

@@ -12,8 +12,6 @@ import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-__all__ = ["number", "plain", "render_template"]
-
 
 def render_template(name: str, **values: Any) -> str:
     """Render a template of this package; all `values` that enter it are escaped.

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 
     from impc.model.plant import Plant
 
-__all__ = ["angles_in", "axis_label", "shown_angle", "shown_as", "shown_unit"]
-
 _DEGREES = {"rad": "deg", "rad/s": "deg/s", "rad/s^2": "deg/s^2"}
 # Of plants that say no units, angles are told by their names.
 _ANGLES = ("theta", "angle", "yaw", "pitch", "roll")

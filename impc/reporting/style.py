@@ -25,23 +25,6 @@ if TYPE_CHECKING:
 
     from matplotlib.ticker import Formatter
 
-__all__ = [
-    "BLUE",
-    "DOUBLE_COLUMN",
-    "FORBIDDEN",
-    "GREEN",
-    "INK",
-    "SET_FILL",
-    "SINGLE_COLUMN",
-    "STATE_MARKS",
-    "VERMILLION",
-    "Mark",
-    "drawn",
-    "journal_style",
-    "new_figure",
-    "render",
-]
-
 # Their lightness (46, 56, 60 of 100) is too near to tell them apart in grey, hence the markers
 # and line styles beside them.
 #: Colours of Okabe and Ito (2008).

@@ -26,8 +26,6 @@ from impc.reporting.lock import locked
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
 
-__all__ = ["owned", "require_writable", "write_files"]
-
 _REMEDY = "give another folder"
 _LIST, _NOTICE = ".impc", "INCOMPLETE.txt"
 _STAGING = ".impc-"  # how the name of the folder begins from which files are moved

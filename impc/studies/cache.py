@@ -21,8 +21,6 @@ from impc.files.sealed import Kept
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-__all__ = ["Cache", "Codec", "by_fields"]
-
 T = TypeVar("T")
 
 

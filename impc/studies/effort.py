@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from impc.inverse.problem import Problem
     from impc.studies.fit.settings import FitSettings
 
-__all__ = ["SECONDS_A_SAMPLE", "Effort", "fit_effort"]
-
 #: Seconds for each sample, state and sample of the horizon.
 SECONDS_A_SAMPLE = 5.4e-3 / (3000 * 10 * 20)
 # For each number of the derivatives of the rows, which are built again for each simulation.

@@ -25,15 +25,6 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
     from impc.model.weights import Weights
 
-__all__ = [
-    "column_terms",
-    "methods_data",
-    "methods_numbers",
-    "methods_table",
-    "until_its_end",
-    "weight_entries",
-]
-
 
 @dataclass(frozen=True)
 class _Column(Frozen):

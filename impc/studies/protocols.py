@@ -20,8 +20,6 @@ from impc.errors import InputError, SolverError
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-__all__ = ["CriticalStiffness", "TorqueAmplitude", "critical_stiffness", "torque_amplitude"]
-
 
 @dataclass(frozen=True)
 class CriticalStiffness:

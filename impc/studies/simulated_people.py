@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from impc.control.controller import Controller
     from impc.model.plant import Plant
 
-__all__ = ["SubjectTrial", "simulate_subject"]
-
 
 @dataclass(frozen=True)
 class SubjectTrial(Frozen):

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
     from impc.studies.cohort.workers import Workers
 
-__all__ = ["Cluster", "connected"]
-
 _PATIENCE = "10s"
 
 

@@ -21,7 +21,7 @@ import numpy as np
 import scipy.stats
 from statsmodels.regression.mixed_linear_model import MixedLM
 
-from impc.assess.several_tests import holm
+from impc.assess.identified_directions import holm
 from impc.checking import replace
 from impc.errors import DataError, one_line
 from impc.studies.cohort.told import only_told
@@ -33,8 +33,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from impc.arrays import Array
-
-__all__ = ["Comparison", "compare_cohort", "measures_of"]
 
 _FEWEST = 3
 _PRICE = "log_price."

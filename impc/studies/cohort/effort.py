@@ -15,8 +15,6 @@ if TYPE_CHECKING:
 
     from impc.studies.cohort.unit_task import FitTask
 
-__all__ = ["study_effort"]
-
 
 def study_effort(tasks: Mapping[str, FitTask]) -> tuple[Effort, float]:
     """What the first unit that can be read takes, and as how many such units all `tasks` count.

@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from impc.studies.cohort.study import Study, Unit
     from impc.studies.cohort.workers import Done, Workers
 
-__all__ = ["Failures", "run_study", "work_left"]
-
 # Tasks given out for each thread of the cluster: one that runs, and two that wait for it.
 _AHEAD = 3
 _FIT = -1

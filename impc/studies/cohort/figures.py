@@ -9,7 +9,7 @@ import numpy as np
 
 from impc.model.signal_units import UNKNOWN
 from impc.reporting.style import DOUBLE_COLUMN, INK, STATE_MARKS, VERMILLION, new_figure
-from impc.studies.cohort.words import measure_words
+from impc.studies.cohort.told import measure_words
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-__all__ = ["group_figure", "subject_figure"]
 
 _COLUMNS = 3
 _SOFT = "#8C8C8C"

@@ -1,4 +1,7 @@
-"""Tables, page and figures of a cohort, made from its folder."""
+"""Tables, page and figures of a cohort, made from its folder.
+
+What the columns of units.csv are, in words: for the pages of a cohort (docs/cohorts.md).
+"""
 
 from __future__ import annotations
 
@@ -28,8 +31,7 @@ from impc.studies.cohort.figures import group_figure
 from impc.studies.cohort.study import safe_name
 from impc.studies.cohort.subject_page import kept_words, or_nan, subject_files
 from impc.studies.cohort.tables import cohort_tables, table_bytes
-from impc.studies.cohort.told import not_told, not_told_sentences, only_told
-from impc.studies.cohort.words import measure_words
+from impc.studies.cohort.told import measure_words, not_told, not_told_sentences, only_told
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -38,8 +40,6 @@ if TYPE_CHECKING:
     from impc.studies.cohort.engine import Failures
     from impc.studies.cohort.store import Store
     from impc.studies.cohort.study import Study, Unit
-
-__all__ = ["write_report"]
 
 _QUESTIONS = {
     "group": ("Between groups", "Hedges' g"),

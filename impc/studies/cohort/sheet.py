@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-__all__ = ["Sheet", "column_values", "read_sheet"]
-
 # 100 000 participants of 100 characters are 10 MB.
 _LARGEST = 100_000_000
 _POINT = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")

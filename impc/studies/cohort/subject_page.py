@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from impc.studies.cohort.store import Store
     from impc.studies.cohort.study import Unit
 
-__all__ = ["kept_words", "or_nan", "subject_files"]
-
 
 def subject_files(
     subject: str, units: list[Unit], store: Store, failures: Failures

@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from impc.studies.cohort.store import Store
     from impc.studies.cohort.study import Study, Unit
 
-__all__ = ["cohort_tables", "table_bytes"]
-
 _CENTRE = "analytic centre (no units)"
 _LEVEL = 0.95
 

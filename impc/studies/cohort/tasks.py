@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from impc.files.plant_sources import PlantSource
     from impc.studies.cohort.study import Study, Unit
 
-__all__ = ["study_tasks", "unused_columns"]
-
 # Threads that read recordings for their digests: hashing lets others run.
 _THREADS = 4
 

@@ -13,8 +13,6 @@ if TYPE_CHECKING:
 
     from impc.files.configuration import Configuration
 
-__all__ = ["require_same_inputs", "unit_digest"]
-
 # They say how many replicates there are, not what any of them is.
 _COUNTS = ("replicates",)
 

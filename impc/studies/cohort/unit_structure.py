@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from impc.inverse.problem import Problem
     from impc.studies.fit.settings import FitSettings
 
-__all__ = ["structure_row", "unit_structure"]
-
 
 def unit_structure(
     problem: Problem, fitted: Estimate, settings: FitSettings

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from multiprocessing.connection import Connection
     from multiprocessing.process import BaseProcess
 
-__all__ = ["Done", "LocalWorkers", "Workers", "local_workers"]
-
 # A task that has lost so many workers is taken for the cause.
 _DEATHS = 4
 # One thread a worker, for every library of linear algebra; and no module from the current folder

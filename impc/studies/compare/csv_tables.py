@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from impc.assess.judged import MethodFit
     from impc.inverse.problem import Problem
 
-__all__ = ["compare_tables"]
-
 
 def compare_tables(problem: Problem, compared: Sequence[MethodFit]) -> dict[str, TextTable]:
     """The tables by name."""

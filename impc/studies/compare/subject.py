@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from impc.inverse.groundwork import Remember
     from impc.inverse.problem import Problem
 
-__all__ = ["compare_recordings", "compared_methods", "stages"]
-
 # Needs states to be named; what is compared in its two parts; and what needs a structure, which has
 # a table of its own in `impc fit`.
 _LEFT_OUT = ("preliminary", "inverse_lqr", "structured")

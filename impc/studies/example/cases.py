@@ -34,20 +34,6 @@ if TYPE_CHECKING:
     from impc.assess.judged import MethodFit
     from impc.model.plant import Plant
 
-__all__ = [
-    "BOUND",
-    "CASES",
-    "EXAMPLE",
-    "HORIZON",
-    "LOST",
-    "SETTINGS",
-    "STEPS",
-    "CaseResult",
-    "MethodResult",
-    "run_case",
-    "true_weights",
-]
-
 _T = TypeVar("_T")
 
 #: Initial states by name.

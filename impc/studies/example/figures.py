@@ -31,8 +31,6 @@ if TYPE_CHECKING:
     from impc.control.simulation import Simulation
     from impc.studies.example.cases import CaseResult
 
-__all__ = ["FIGURES", "example_figures"]
-
 #: Figure of the dissertation, the method it shows, and that method in words.
 FIGURES = (
     ("3.2", "feedback_gain", "feedback gain"),

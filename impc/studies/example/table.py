@@ -18,18 +18,6 @@ if TYPE_CHECKING:
     from impc.model.weights import Weights
     from impc.studies.example.cases import CaseResult, MethodResult
 
-__all__ = [
-    "COLUMNS",
-    "METHODS",
-    "MethodText",
-    "Row",
-    "compact_weights",
-    "determined_sentences",
-    "methods_table",
-    "significant",
-    "table_rows",
-]
-
 
 @dataclass(frozen=True)
 class MethodText:

@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from impc.model.recordings import Recording
     from impc.studies.fit.settings import FitSettings
 
-__all__ = ["fit_bounds", "fit_observer", "fit_structures", "moving_body"]
-
 # A recorded angle is differentiated over this time, by a parabola: noise of 1 % of the largest
 # angle at 100 Hz then gives a rate of a few per cent of the largest.
 _RATE_WINDOW = 0.15

@@ -23,8 +23,6 @@ from impc.studies.methods_table import methods_numbers, until_its_end, weight_en
 if TYPE_CHECKING:
     from impc.studies.fit.result import FitResult
 
-__all__ = ["fit_tables"]
-
 
 def fit_tables(result: FitResult) -> dict[str, TextTable]:
     """The tables by name."""

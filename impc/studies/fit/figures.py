@@ -34,8 +34,6 @@ if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.studies.fit.result import FitResult
 
-__all__ = ["fit_figures", "trajectory_figure"]
-
 _SOFT = "#8C8C8C"
 _LAGS = 1.0  # s of the autocorrelation
 _WINDOW = 10.0  # s of the comparison

@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from impc.assess.intervals import Interval
     from impc.studies.fit.result import FitResult
 
-__all__ = ["gain_figure", "shown_statements", "statements_figure"]
-
 _WIDTH = 4.2  # inches: 8 points are 9 pixels at the width of a phone
 _SOFT = "#8C8C8C"
 # Beside what the recordings tell; intervals of what they do not tell have no size.

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
     from impc.studies.fit.result import FitResult
 
-__all__ = ["person_data", "person_section", "person_sentences", "preferred"]
-
 # A level whose interval of 95 % ends beyond a factor of ten is not told.
 _TOLD = np.log(10)
 # Gain and noise that go together by more than this are hardly told apart.

@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from impc.inverse.problem import Problem
     from impc.studies.fit.settings import FitSettings
 
-__all__ = ["LITTLE", "MOST_TRIALS", "FitResult", "FittedParameter", "shown_trials", "trial_name"]
-
 #: Trials that are drawn one by one: 500 made a page of 51 MB and took 6.3 GB.
 MOST_TRIALS = 24
 

@@ -52,8 +52,6 @@ if TYPE_CHECKING:
     from impc.reporting.provenance import Provenance
     from impc.studies.fit.result import FitResult
 
-__all__ = ["fit_data"]
-
 
 def fit_data(result: FitResult, provenance: Provenance) -> dict[str, Any]:
     """Content of result.json."""

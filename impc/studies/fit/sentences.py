@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from impc.studies.fit.result import FitResult
     from impc.studies.fit.settings import FitSettings
 
-__all__ = ["bounded", "direction_name", "limited", "missing", "remarks"]
-
 # Parts of a direction below this are not named.
 _NAMED = 0.15
 

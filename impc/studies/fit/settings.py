@@ -17,16 +17,6 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
 
 
-__all__ = [
-    "BESIDE",
-    "FitSettings",
-    "ObserverSettings",
-    "StructureSettings",
-    "fit_settings",
-    "read_settings",
-    "require_used",
-]
-
 # Percentiles of 95 % lie between replicates only from 20 on.
 _FEWEST = 20
 # Least and most of each number. The most is far beyond any use: it keeps sizes and seconds numbers.

@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from impc.assess.structures import Ratio, StructureFit
     from impc.studies.fit.result import FitResult
 
-__all__ = ["ends", "factor_of", "probability", "structure_sentences"]
-
 # A test that refuses a departure less often than this has not looked.
 _BLIND = 0.1
 # docs/structures.md, What was measured.

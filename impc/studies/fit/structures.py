@@ -24,12 +24,6 @@ if TYPE_CHECKING:
     from impc.assess.structures import StructureFit
     from impc.studies.fit.result import FitResult
 
-__all__ = [
-    "price_figure",
-    "structure_data",
-    "structure_section",
-]
-
 _WIDTH = 4.2  # inches, so that its words can be read on a phone
 # Parts of a combination below this are not named.
 _NAMED = 0.15

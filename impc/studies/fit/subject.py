@@ -68,8 +68,6 @@ if TYPE_CHECKING:
     from impc.model.recordings import Recording
     from impc.model.riccati import LqrSolution
 
-__all__ = ["FitProgress", "fit_problem", "fit_recordings", "stages", "state_sizes"]
-
 _THREADS = 2
 _UNUSABLE = "the controller explains less than half of a recorded signal."
 

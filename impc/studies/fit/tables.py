@@ -20,19 +20,6 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
     from impc.studies.fit.result import FitResult
 
-__all__ = [
-    "alternatives_table",
-    "eigenvalues_table",
-    "entries_table",
-    "intervals_table",
-    "limit_sentences",
-    "number_name",
-    "number_units",
-    "prices_table",
-    "set_sentences",
-    "statements_table",
-]
-
 _METHODS = {
     "sandwich": "colour of the residuals",
     "cramer-rao": "as if they were white",

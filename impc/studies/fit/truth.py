@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
     from impc.studies.fit.result import FitResult
 
-__all__ = ["read_truth", "truth_sentence", "truth_table"]
-
 
 def read_truth(recordings: Iterable[Path], plant: Plant) -> Array | None:
     """The gain of the truth.json that lies beside recordings.

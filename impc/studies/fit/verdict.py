@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
     from impc.studies.fit.result import FitResult
 
-__all__ = ["abstract", "other_limit_sentence", "verdict"]
-
 
 def verdict(result: FitResult) -> str:
     """The one sentence that says what may be made of the fit; what forbids most comes first."""

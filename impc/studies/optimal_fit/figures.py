@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 
     from impc.studies.optimal_fit.result import OptimalFit
 
-__all__ = ["interval_rows", "optimal_figures"]
-
 _SOFT = "#8C8C8C"
 _ONE_COLUMN = 6  # signals above each other; more stand in two columns
 # Factors beyond which an interval is drawn with an arrow.

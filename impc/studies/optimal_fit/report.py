@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from impc.reporting.provenance import Provenance
     from impc.studies.optimal_fit.result import OptimalFit
 
-__all__ = ["METHOD", "optimal_report", "parameters_table"]
-
 #: Under which name its numbers stand among the methods of result.json.
 METHOD = "nonlinear_inverse_mpc"
 _LEVEL = 0.95

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from impc.control.optimal_control import OptimalControlProblem
     from impc.inverse.optimal_control_fit import OptimalControlEstimate
 
-__all__ = ["MOST_TRIALS", "OptimalFit", "Reached", "limits_of", "reached", "row_name", "signal_vaf"]
-
 #: Recordings that are drawn, the first ones.
 MOST_TRIALS = 6
 # Of the largest value that a row has: nearer to zero it is at its limit. An active row with a

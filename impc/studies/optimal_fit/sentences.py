@@ -14,8 +14,6 @@ from impc.studies.optimal_fit.result import reached, signal_vaf
 if TYPE_CHECKING:
     from impc.studies.optimal_fit.result import OptimalFit
 
-__all__ = ["abstract", "verdict"]
-
 # % of a signal below which a fit explains less than it leaves.
 _LITTLE = 50.0
 

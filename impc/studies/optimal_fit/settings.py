@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from impc.control.optimal_recordings import OptimalRecording
     from impc.files.optimal_reading import OptimalTrial
 
-__all__ = ["OptimalFitSettings", "ParameterSettings", "optimal_fit_settings", "posed", "recorded"]
-
 
 _MOST = {"evaluations": 100_000, "starts": 1000}
 

@@ -32,17 +32,6 @@ if TYPE_CHECKING:
     from impc.model.structure import Structure
 
 
-__all__ = [
-    "Design",
-    "Outcome",
-    "Person",
-    "Perturbation",
-    "best_of",
-    "designs",
-    "try_design",
-]
-
-
 #: (amplitude, dwell, number of the draw) -> disturbance (samples, d).
 Perturbation = Callable[[float, float, int], Array]
 

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from impc.studies.plan.designs import Outcome
     from impc.studies.plan.study import Plan
 
-__all__ = ["experiments_figure", "prices_figure"]
-
 _LINES = ((BLUE, "o", "-"), (VERMILLION, "s", "--"), (GREEN, "^", ":"), (INK, "D", "-."))
 # Beyond this factor a price is not told, whatever its interval.
 _LARGEST = 100.0

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from impc.studies.plan.designs import Design, Outcome
     from impc.studies.plan.study import Plan
 
-__all__ = ["design_name", "plan_sentences", "told_as"]
-
 # Wider than this, from end to end of an interval, a price is not called told.
 _WIDE = math.log(100)
 # Nearer to one on both sides, an interval is told in percent.

@@ -22,14 +22,6 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
     from impc.studies.fit.settings import FitSettings
 
-__all__ = [
-    "PlanSettings",
-    "mechanical_stops",
-    "noise_deviations",
-    "plan_settings",
-    "presumed_prices",
-]
-
 # Least and most of each number; the most is far beyond any use.
 _RANGES: dict[str, tuple[float, float]] = {
     "amplitude": (1e-100, 1e100),

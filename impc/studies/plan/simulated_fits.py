@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from impc.inverse.problem import Problem
     from impc.studies.plan.designs import Person
 
-__all__ = ["SimulatedFits", "recorded_noise", "simulated_fits", "spread"]
-
 # Correlation left of the noise before the first sample: 1e-6.
 _FORGOTTEN = 14.0
 # Of a normal distribution, one deviation to each side.

@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from impc.studies.plan.designs import Person, Perturbation
     from impc.studies.plan.settings import PlanSettings
 
-__all__ = ["GroupPower", "Plan", "make_plan", "plan_effort", "steps_of"]
-
 _SIZE, _POWER = 0.05, 0.8
 # Persons in a group: a t-test needs two, and nobody measures more.
 _SMALLEST, _LARGEST = 2.0, 1e6

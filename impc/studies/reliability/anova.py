@@ -17,13 +17,11 @@ import scipy.stats
 from statsmodels.stats.anova import AnovaRM
 
 from impc.arrays import Array
-from impc.assess.several_tests import holm
+from impc.assess.identified_directions import holm
 from impc.errors import DataError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-
-__all__ = ["Anova", "PairedTest", "Trend", "learning_trend", "paired_tests", "visit_anova"]
 
 
 @dataclass(frozen=True)

@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 
     from impc.studies.reliability.analysis import Reliability, Trials
 
-__all__ = ["reliability_figures"]
-
 _LINES = ((BLUE, "-"), (VERMILLION, "--"), (GREEN, ":"), (INK, "-."))
 
 

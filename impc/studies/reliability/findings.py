@@ -15,8 +15,6 @@ from impc.studies.reliability.verdict import band_of
 if TYPE_CHECKING:
     from impc.studies.reliability.analysis import Reliability
 
-__all__ = ["QUOTED", "Finding", "findings"]
-
 #: p-values of tables 2.5 (RMS) and 2.6 (energy) that survive in the text, lower and upper body.
 #: They are the dissertation's, of its own thirty subjects, and are never compared with as truth.
 QUOTED = {

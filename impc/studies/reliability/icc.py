@@ -47,18 +47,6 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
 _ALIKE = 1e-24  # of mean squares: round-off of means
-__all__ = [
-    "FORMS",
-    "Form",
-    "Icc",
-    "MeanSquares",
-    "MeasurementError",
-    "Method",
-    "icc",
-    "mean_squares",
-    "measurement_error",
-]
-
 #: One of `FORMS`, for annotations.
 Form = Literal["1", "k", "C,1", "C,k", "A,1", "A,k"]
 #: Names of the forms, as above.

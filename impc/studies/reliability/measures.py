@@ -21,8 +21,6 @@ import scipy.signal
 from impc.arrays import Array, IntArray
 from impc.errors import DataError
 
-__all__ = ["Passband", "band_energy", "passband", "rms"]
-
 _SHARE = 0.03
 # Power below this share of the peak is none: rounding, and what a window leaks.
 _NOTHING = 1e-6

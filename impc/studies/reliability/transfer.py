@@ -23,8 +23,6 @@ if TYPE_CHECKING:
 
     from impc.studies.reliability.measures import Passband
 
-__all__ = ["ComplexArray", "TransferFunction", "transfer_function"]
-
 #: An array of complex numbers.
 ComplexArray = np.ndarray[tuple[int, ...], np.dtype[np.complex128]]
 

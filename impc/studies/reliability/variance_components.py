@@ -25,8 +25,6 @@ import scipy.stats
 from impc.arrays import Array
 from impc.errors import DataError
 
-__all__ = ["VarianceComponent", "variance_components"]
-
 
 @dataclass(frozen=True)
 class VarianceComponent:

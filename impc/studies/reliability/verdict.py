@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 
     from impc.studies.reliability.analysis import MeasureResult, Reliability
 
-__all__ = ["answer", "band_of", "interval_band", "shown_score"]
-
 _BANDS = ((0.40, "poor"), (0.60, "fair"), (0.75, "good"), (np.inf, "excellent"))
 
 

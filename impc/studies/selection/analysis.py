@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from impc.studies.selection.settings import SelectSettings
     from impc.studies.selection.subsets import Selection
 
-__all__ = ["StudySelection", "select_study"]
-
 
 @dataclass(frozen=True)
 class StudySelection:

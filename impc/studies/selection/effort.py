@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from impc.studies.selection.model import ParametricModel, Trial
     from impc.studies.selection.settings import SelectSettings
 
-__all__ = ["key_evaluations", "select_evaluations", "selection_effort"]
-
 # Evaluations with derivatives of a fit from a start far off, of one from its neighbourhood, of a
 # LASSO with its refit, of Table C.1 (of the outputs alone: a few thousand a solve), and of a
 # profile, which fits again at each of its points. Counted on the drug: 7, 5, 74 and 180; on the

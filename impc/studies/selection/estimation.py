@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 
     from impc.studies.selection.model import ParametricModel, Trial
 
-__all__ = ["Estimate", "estimate", "free_indices", "multi_start", "pooled_vaf", "residuals"]
-
 _TOLERANCE = 1e-10
 
 

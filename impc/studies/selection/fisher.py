@@ -22,15 +22,6 @@ if TYPE_CHECKING:
 
     from impc.studies.selection.model import ParametricModel, Trial
 
-__all__ = [
-    "Information",
-    "NullDirection",
-    "common_scaling",
-    "fisher_information",
-    "null_directions",
-    "unseen_scalings",
-]
-
 # Singular values of the sensitivity below this, of the largest, are rounding or as good as that.
 _RANK = 1e-6
 _NAMED = 0.1

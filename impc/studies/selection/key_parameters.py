@@ -31,15 +31,6 @@ if TYPE_CHECKING:
     from impc.studies.selection.settings import SelectSettings
     from impc.studies.selection.subsets import Selection
 
-__all__ = [
-    "Candidate",
-    "KeyParameters",
-    "Refits",
-    "between_visits",
-    "key_parameters",
-    "refit_subsets",
-]
-
 
 @dataclass(frozen=True)
 class Candidate:

@@ -31,8 +31,6 @@ if TYPE_CHECKING:
     from impc.studies.selection.key_parameters import KeyParameters
     from impc.studies.selection.model import ParametricModel
 
-__all__ = ["key_report"]
-
 
 def key_report(
     model: ParametricModel, found: KeyParameters, command: str, inputs: Inputs

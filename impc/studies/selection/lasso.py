@@ -28,8 +28,6 @@ if TYPE_CHECKING:
 
     from impc.studies.selection.model import ParametricModel, Trial
 
-__all__ = ["Lasso", "lasso_of_size", "proximal_lasso", "table_c1"]
-
 _THRESHOLD, _FIRST = 0.005, 0.13
 _CHANGES, _ROUNDS, _HALVINGS = 500, 60, 30
 _ROUNDING = 1e-12  # of the steepest slope, in the test of optimality

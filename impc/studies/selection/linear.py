@@ -27,8 +27,6 @@ from impc.jit import njit
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-__all__ = ["Discrete", "discretised", "kronecker_sensitivity", "linear_functions"]
-
 
 class Discrete(NamedTuple):
     """Sampled matrices and their derivatives, the parameter's axis first."""

@@ -21,8 +21,6 @@ from impc.errors import InputError
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-__all__ = ["ParametricModel", "Trial", "normalised", "parametric_model", "physical", "sensitivity"]
-
 _STEP = 1e-4
 
 

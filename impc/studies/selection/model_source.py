@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 
     from impc.studies.cohort.study import Study
 
-__all__ = ["ModelSource", "model_source", "read_trials"]
-
 _NEEDED = ("names", "low", "high", "typical", "inputs", "outputs", "rate")
 
 

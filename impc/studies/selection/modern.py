@@ -35,18 +35,6 @@ if TYPE_CHECKING:
     from impc.studies.selection.model import ParametricModel, Trial
     from impc.studies.selection.subsets import Selection
 
-__all__ = [
-    "FixedBias",
-    "agreement",
-    "best_collinear",
-    "collinearity",
-    "fixed_bias",
-    "pivoted_order",
-    "profile_interval",
-    "subset_by_svd",
-    "with_doubled_ranges",
-]
-
 # Subsets whose collinearity is looked at.
 _MOST = 200_000
 

@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from impc.studies.selection.model import ParametricModel
     from impc.studies.selection.model_source import ModelSource
 
-__all__ = ["Runner", "in_turn", "on_workers"]
-
 T = TypeVar("T")
 
 

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from impc.studies.selection.analysis import StudySelection
     from impc.studies.selection.model import ParametricModel
 
-__all__ = ["command_section", "names_of", "selection_report", "selection_table"]
-
 
 def selection_report(
     model: ParametricModel, found: StudySelection, command: str, inputs: Inputs

@@ -12,8 +12,6 @@ from impc.studies.fit.settings import read_settings
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-__all__ = ["SelectSettings", "select_settings"]
-
 
 @dataclass(frozen=True)
 class SelectSettings:

@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 
     from impc.arrays import Array
 
-__all__ = ["Selection", "exhaustive", "largest_subsets", "subset_variances", "sweep"]
-
 _EPS = float(np.finfo(np.float64).eps)
 # Subsets of one size that are looked at, and at a time: a minute, and 0.1 GB for ten parameters.
 _MOST, _AT_ONCE = 1_000_000, 50_000
