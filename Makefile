@@ -5,7 +5,7 @@
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
-.PHONY: help env demo test long full check docs architecture reproduce wheel slow coverage structures followers plans default-subjects noisy-people nonlinear nonlinear-seat look search numerics measure bench fuzz lock clean
+.PHONY: help env demo test full check docs architecture reproduce wheel slow coverage structures followers plans default-subjects noisy-people nonlinear nonlinear-seat look search numerics measure bench fuzz lock clean
 
 PYTHON ?= python3
 # Not to be set from outside: the environment is made with `venv --clear`.
@@ -42,9 +42,8 @@ endif
 
 help:
 	@echo 'make demo    set up .venv and run the example:   impc example'
-	@echo 'make test    set up .venv, then check and pytest: all that matters, about five minutes'
-	@echo 'make long    documents that run, experiments, whole studies, mutated files: three minutes more'
-	@echo 'make full    the site, and studies in full size: five minutes more, before a merge'
+	@echo 'make test    set up .venv, then check and pytest: all that matters, about ten minutes'
+	@echo 'make full    the site, pages that run, experiments, studies in full size: half an hour, before a merge'
 	@echo 'make check   ruff check, ruff format --check, mypy --strict'
 	@echo 'make slow    hundreds of recordings, fits and subjects: an hour'
 	@echo 'make coverage  how often printed intervals hold the truth: the table of docs/fitting.md'
@@ -73,17 +72,12 @@ demo: env
 	$(VENV)/bin/impc example
 
 # A file of tests stays on one process, in the order of the folders: the longest are first. What all of
-# them share is compiled on one core while the checks run on the other.
+# them share is compiled meanwhile.
 test: $(PROJECT) $(POLYTOPE)
 	@$(MAKE) --no-print-directory $(COMPILED) & compiled=$$!; \
-	$(MAKE) --no-print-directory check; checked=$$?; wait $$compiled && exit $$checked
-	$(PYTEST) -m "not long and not full and not slow"
+	$(MAKE) --no-print-directory check && $(PYTEST) -m "not full and not slow"; tested=$$?; \
+	wait $$compiled && exit $$tested
 
-# Marks do not include each other: what is long but also full is full.
-long: env
-	$(PYTEST) -m "long and not full and not slow"
-
-# The site on one process, the studies on the other.
 full: env
 	$(PYTEST) -m full
 

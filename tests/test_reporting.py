@@ -40,8 +40,7 @@ from impc.reporting.style import journal_style
 from impc.reporting.writer import require_writable, write_files
 from impc.studies.example.cases import CASES, SETTINGS, CaseResult, run_case
 from impc.studies.example.figures import example_figures
-from impc.studies.example.report import example_report
-from impc.studies.example.result import example_data
+from impc.studies.example.report import example_data, example_report
 from impc.studies.example.table import (
     METHODS,
     determined_sentences,

@@ -193,6 +193,7 @@ def sprung(folder: Path, opened: set[str]) -> set[str]:
     return traps | {name.name for name in folder.glob("sprung")}
 
 
+@pytest.mark.full
 def test_nothing_of_the_folder_is_opened(runs: tuple[Path, Path, list[str]]) -> None:
     _, trapped, lines = runs
     assert f"{trapped}/sub-1.mat" in lines
@@ -200,6 +201,7 @@ def test_nothing_of_the_folder_is_opened(runs: tuple[Path, Path, list[str]]) -> 
     assert sprung(trapped, set(lines)) == set()
 
 
+@pytest.mark.full
 def test_results_are_those_of_the_folder_without(runs: tuple[Path, Path, list[str]]) -> None:
     plain, trapped, _ = runs
     pictures = [file.relative_to(plain) for file in plain.rglob("*.png")]

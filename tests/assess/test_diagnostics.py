@@ -13,8 +13,13 @@ from experiments.benchmarks.workloads import seat
 from experiments.coverage import cart, noisy_trial
 from experiments.residual_study import diagnosed
 from impc.arrays import Array
-from impc.assess.diagnostics import ResidualDiagnostics, residual_diagnostics, residual_warnings
-from impc.assess.loop_noise import LoopNoise, loop_noise
+from impc.assess.diagnostics import (
+    LoopNoise,
+    ResidualDiagnostics,
+    loop_noise,
+    residual_diagnostics,
+    residual_warnings,
+)
 from impc.assess.residual_structure import ResidualStructure, residual_structure
 from impc.checking import replace
 from impc.inverse.noisy_fit import fit_controller

@@ -10,8 +10,8 @@ import pytest
 from experiments.benchmarks.workloads import example, seat
 from impc.arrays import Array
 from impc.assess.bounded_weights import WeightsSet, weights_set
-from impc.assess.eigenvalue_ranges import eigenvalue_ranges
 from impc.assess.extreme_weights import entry_ranges, extreme_eigenvalue, nearest_diagonal
+from impc.assess.weights_ranges import eigenvalue_ranges
 from impc.inverse.solution_set import gain_fibre
 from impc.model.plant import Plant
 from impc.model.riccati import solve_lqr

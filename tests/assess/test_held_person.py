@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from impc.assess.held_person import held_person
+from impc.assess.person_profile import held_person
 from impc.inverse.likelihood_fit import PersonFit, fit_person
 from impc.inverse.methods import estimate
 from impc.model.observer import Observer
@@ -19,6 +19,7 @@ def fitted() -> PersonFit:
     return fit_person(estimate(posed(person, 0.01, 3.0)), person)
 
 
+@pytest.mark.full
 def test_all_else_is_at_its_best(fitted: PersonFit) -> None:
     """Against a search without derivatives, along a combination of gain and motor noise."""
     prior, unseen = fitted.prior, np.array(fitted.unseen)

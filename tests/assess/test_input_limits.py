@@ -37,7 +37,8 @@ def gentle_trial() -> Recording:
     return Recording(controller.plant, clean + 0.2 * np.std(clean) * noise, push)
 
 
-@pytest.mark.parametrize("assumed", [pytest.param(None, marks=pytest.mark.full), 1.4])
+@pytest.mark.full
+@pytest.mark.parametrize("assumed", [None, 1.4])
 def test_a_limit_that_is_met_is_found(assumed: float | None) -> None:
     """Seed 3: within 2 %, the truth inside the interval, whatever was assumed before."""
     found = input_limit(fitted_cart(noisy_trial(SEED, 0.0), assumed))

@@ -31,6 +31,7 @@ def test_errors_ahead_are_those_that_the_filter_expects(fitted: PersonFit) -> No
     assert errors[0] < errors[1] < errors[2]
 
 
+@pytest.mark.full
 def test_without_limit_and_perturbation_there_are_three_models() -> None:
     person = Observer(cart(), ["x"], motor=0.15, sensory=0.02)
     found = estimate(posed(person, 0.01, np.inf, trials=1))

@@ -58,7 +58,7 @@ def width(found: tuple[Interval, ...]) -> Array:
     return np.array([item.high - item.low for item in found])
 
 
-@pytest.mark.long
+@pytest.mark.full
 @pytest.mark.parametrize(
     "fitted",
     [0.9, pytest.param(0.0, marks=pytest.mark.full)],

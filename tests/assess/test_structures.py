@@ -14,8 +14,8 @@ from experiments.printed_intervals import carts, with_noise
 from experiments.structure_study import cart_person, seat_person
 from impc.assess.near_fit import NearFit
 from impc.assess.price_profiles import PriceProfiles
-from impc.assess.structure_test import structure_test
 from impc.assess.structured_weights import Tangent, price_covariance, tangent
+from impc.assess.structures import structure_test
 from impc.checking import replace
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
@@ -112,6 +112,7 @@ def test_an_interval_ends_where_the_misfit_has_grown() -> None:
         assert grown == pytest.approx(3.84 * wider**2, rel=0.05)
 
 
+@pytest.mark.full
 def test_an_interval_ends_where_the_recordings_say_and_not_where_a_line_does() -> None:
     """One trial of a subject whose prices are told to a factor of ten: far from linear.
 

@@ -102,7 +102,7 @@ def workers_of(process: psutil.Process) -> list[psutil.Process]:
 @pytest.mark.parametrize(
     "kills",
     [
-        pytest.param((1, 1), marks=pytest.mark.long),
+        pytest.param((1, 1), marks=pytest.mark.full),
         pytest.param((3, 2), marks=pytest.mark.full),
     ],
 )
@@ -255,7 +255,7 @@ def test_two_runs_into_one_folder_are_refused(study: Path, tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("subjects", "damaged"),
     [
-        pytest.param(5, (1, 3, 4), marks=pytest.mark.long),
+        pytest.param(5, (1, 3, 4), marks=pytest.mark.full),
         pytest.param(30, (4, 11, 29), marks=pytest.mark.slow),
     ],
 )

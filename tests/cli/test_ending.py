@@ -19,8 +19,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 import impc.studies.example.cases
-from impc.cli.ending import ended
-from impc.cli.exit_status import ExitStatus
+from impc.cli.ending import ExitStatus, ended
 from impc.cli.main import main
 from impc.errors import ImpcError, brief, one_line
 
@@ -152,6 +151,7 @@ def command(
     )  # fmt: skip
 
 
+@pytest.mark.full
 def test_modules_beside_recordings_replace_nothing(tmp_path: Path) -> None:
     """Neither the package's plants nor what is installed, nor what is not: slycot is not."""
     for name in ("numpy", "json", "plants", "control", "click", "scipy", "casadi", "slycot"):

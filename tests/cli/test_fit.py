@@ -113,6 +113,7 @@ def test_a_person_who_senses_with_noise_is_simulated_and_asked_for(tmp_path: Pat
     assert json.loads((tmp_path / "truth.json").read_text())["settings"]["observer"] is True
 
 
+@pytest.mark.full
 def test_result_json_is_the_fit(fitted: tuple[Result, Path], subject: Path, quick: Path) -> None:
     """Against a fit of the same files without command and report."""
     found = json.loads((fitted[1] / "result.json").read_text())
@@ -223,6 +224,7 @@ def test_the_command_prints_the_table(fitted: tuple[Result, Path]) -> None:
     assert "degrees: so far it is not the subject's" in printed
 
 
+@pytest.mark.full
 def test_a_plant_and_a_file_of_ones_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A semicolon file with decimal commas; a plant beside it; names to stumble over."""
     monkeypatch.chdir(tmp_path)

@@ -29,8 +29,6 @@ if TYPE_CHECKING:
 
     from impc.control.optimal_control import OptimalControlProblem
 
-pytestmark = pytest.mark.long
-
 MODULE = '''
 """A point with drag that is pushed to the origin; its force is limited."""
 

@@ -20,7 +20,7 @@ from impc.studies.reliability.findings import QUOTED
 from impc.studies.reliability.icc import icc
 from impc.studies.reliability.verdict import band_of
 
-pytestmark = pytest.mark.long
+pytestmark = pytest.mark.full
 
 
 def run(*arguments: str) -> Result:

@@ -145,7 +145,7 @@ def test_parameters_move_the_body_as_differences_say() -> None:
         assert np.allclose(found.dparameters[:, index], slope, atol=1e-6 * np.max(np.abs(slope)))
 
 
-@pytest.mark.parametrize("limit", [0.7, 1e3])
+@pytest.mark.parametrize("limit", [0.7, pytest.param(1e3, marks=pytest.mark.full)])
 def test_a_linear_body_is_the_linear_plant(limit: float) -> None:
     """Trajectory and derivatives, and what a fit finds; saturated and not."""
     plant = pendulum().linear()

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from impc.control.body_steps import body_tape, next_state
+from impc.control.body_steps import address, body_tape, next_state
 from impc.control.compiled_body import states_along
-from impc.control.native_body import address
 from tests.control.hanging_body import pendulum
 
 

@@ -35,7 +35,7 @@ def test_on_a_linear_plant_it_is_the_linear_controller(x0: list[float]) -> None:
     np.testing.assert_allclose(found.u, expected.u, atol=2e-6)
 
 
-@pytest.mark.long
+@pytest.mark.full
 def test_on_the_seat_they_part_as_the_square_of_the_angle() -> None:
     """Twice the torque, four times the share of the angle, to a fifth; a second each."""
     small, double = compare_at(1.0, 1.0), compare_at(2.0, 1.0)

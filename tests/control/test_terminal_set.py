@@ -240,6 +240,7 @@ def test_inside_stays_inside_and_outside_leaves(case: Case, seed: int) -> None:
             assert worst_excess(terminal, 1.001 * edge, 300) > 5e-4
 
 
+@pytest.mark.full
 @few
 @given(cases())
 def test_rows_are_the_needed_ones_of_a_long_horizon(case: Case) -> None:

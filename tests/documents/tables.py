@@ -40,7 +40,6 @@ NOT_RUN = {
     ("docs/start.md", ". .venv/bin/activate"): _ENVIRONMENT,
     ("docs/contributing.md", "make check"): _WHOLE,
     ("docs/contributing.md", "make test"): _WHOLE,
-    ("docs/contributing.md", "make long"): _WHOLE,
     ("docs/contributing.md", "make full"): _WHOLE,
     ("docs/contributing.md", "make slow"): _WHOLE,
     ("docs/contributing.md", "make fuzz"): _WHOLE,

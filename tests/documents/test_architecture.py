@@ -105,15 +105,6 @@ def test_a_name_is_imported_from_the_module_that_defines_it() -> None:
     assert strays == []
 
 
-@pytest.mark.parametrize("module", sorted(name for name in GRAPH if room(name) != "door"))
-def test_what_a_module_exports_is_its_own(module: str) -> None:
-    path = ROOT / "impc" / module.replace(".", "/")
-    text = (path / "__init__.py" if path.is_dir() else path.with_suffix(".py")).read_text("utf-8")
-    found = re.search(r"^__all__ = (\[.*?\])", text, flags=re.MULTILINE | re.DOTALL)
-    if found is not None:
-        assert set(ast.literal_eval(found[1])) <= defined(module)
-
-
 def test_no_public_name_hides_a_module() -> None:
     """Neither one directly in impc/ nor the one that it is defined in."""
     hidden = {module.split(".")[0] for module in GRAPH}

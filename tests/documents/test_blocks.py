@@ -25,8 +25,6 @@ from tests.documents.tables import NOT_RUN, PREPARED, SMALLER
 if TYPE_CHECKING:
     from tests.documents.blocks import Block
 
-pytestmark = pytest.mark.long
-
 _SILENT = {"text", "bibtex", "matlab"}
 _NUMBER = re.compile(r"[-+]?\d+(\.\d*)?(e[-+]?\d+)?")
 
@@ -37,7 +35,14 @@ def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.usefixtures("blank_figures")
-@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page)])
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(page, marks=[] if page == "README.md" else pytest.mark.full)
+        for page in PAGES
+        if blocks(page)
+    ],
+)
 def test_the_blocks_run(page: str, kept: Path, tmp_path: Path) -> None:
     names: dict[str, object] = {"__name__": "page"}
     with working_in(tmp_path):

@@ -92,15 +92,12 @@ def public_names() -> Iterator[tuple[str, Any]]:
             if inspect.isfunction(method) and not (default or member.startswith("_")):
                 yield f"{place}.{member}", method
     for module in modules():
-        for name in module.__all__:
-            if isinstance(value := getattr(module, name), click.Command):
-                yield f"{module.__name__}:{name}", value
+        if isinstance(value := getattr(module, "command", None), click.Command):
+            yield f"{module.__name__}:command", value
 
 
 NAMES = dict(public_names())
-CLASSES = {
-    name for each in modules() for name in each.__all__ if inspect.isclass(getattr(each, name))
-}
+CLASSES = {name for each in modules() for name, one in vars(each).items() if inspect.isclass(one)}
 
 
 def faults(key: str, value: Any) -> list[str]:
@@ -220,10 +217,6 @@ def source_faults(module: ModuleType, text: str) -> Iterator[str]:
         there = (ROOT / page).read_text(encoding="utf-8") if (ROOT / page).exists() else ""
         if not re.search(rf"^## {section}\." if section else ".", there, re.MULTILINE):
             yield f"{page} {section}: does not exist"
-
-
-def test_every_module_names_what_is_public() -> None:
-    assert [module.__name__ for module in modules() if not getattr(module, "__all__", None)] == []
 
 
 @pytest.mark.parametrize("key", NAMES)

@@ -61,11 +61,9 @@ from impc.model.structure import Structure
 from impc.model.weights import Weights
 from impc.reporting.writer import owned, require_writable, write_files
 from impc.studies.cohort import cluster
-from impc.studies.cohort.finding import find_by_pattern
-from impc.studies.cohort.names import checked_name
 from impc.studies.cohort.sheet import Sheet, column_values, read_sheet
 from impc.studies.cohort.store import Store, open_store
-from impc.studies.cohort.study import read_study
+from impc.studies.cohort.study import checked_name, find_by_pattern, read_study
 from impc.studies.effort import Effort
 from impc.studies.fit.asked import fit_structures
 from impc.studies.fit.settings import FitSettings, fit_settings, require_used
@@ -82,8 +80,6 @@ from tests.files.test_one_step import balanced, fallen, read, stick
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
-
-pytestmark = pytest.mark.long
 
 PAGE = PAGES["docs/troubleshooting.md"].read_text(encoding="utf-8")
 MESSAGES = re.findall(r"\*\*`([^`]+)`\*\*", PAGE)

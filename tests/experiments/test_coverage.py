@@ -7,7 +7,7 @@ import pytest
 
 from experiments.coverage import covered
 
-pytestmark = pytest.mark.long
+pytestmark = pytest.mark.full
 
 
 def shares(count: int, root: float) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:

@@ -22,7 +22,7 @@ from impc.model.structure import Structure
 from tests.experiments.recordings import recorded
 from tests.support import nelder_mead
 
-pytestmark = pytest.mark.long
+pytestmark = pytest.mark.full
 
 DELAY, LAG, OFFSET, PRICE = 8, 0.03, 3.0, 20.0
 #: And how near logarithms are found, some four of their deviations, whatever noise is drawn: that

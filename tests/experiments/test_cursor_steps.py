@@ -8,7 +8,7 @@ import scipy.stats
 
 from experiments.cursor_steps import Expected, fit_steps, step_nats
 
-pytestmark = pytest.mark.long
+pytestmark = pytest.mark.full
 
 NUMBERS = np.array([-0.1, -0.3, 1.2, np.log(4.0)])
 

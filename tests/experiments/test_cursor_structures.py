@@ -9,7 +9,7 @@ from experiments.cursor_data import data_file, read_conditions
 from experiments.cursor_structures import STRUCTURES, structure_rows
 from tests.experiments.recordings import recorded
 
-pytestmark = pytest.mark.long
+pytestmark = pytest.mark.full
 
 
 @pytest.mark.slow

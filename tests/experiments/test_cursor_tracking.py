@@ -14,7 +14,7 @@ from experiments.cursor_tracking import left_out_vaf
 from impc.errors import DataError
 from tests.experiments.recordings import recorded
 
-pytestmark = pytest.mark.long
+pytestmark = pytest.mark.full
 
 #: Leave-one-trial-out VAF of a delayed second-order feedback, from the sharpest target on.
 REFERENCE = (86.7, 82.7, 84.3, 80.1, 57.8, 48.4)

@@ -8,7 +8,7 @@ import pytest
 
 from experiments.default_subjects import fitted_subject, simulated_files
 
-pytestmark = pytest.mark.long
+pytestmark = pytest.mark.full
 
 
 def test_the_truth_of_a_short_default_subject_is_found(tmp_path: Path) -> None:

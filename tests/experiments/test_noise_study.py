@@ -12,7 +12,7 @@ from experiments.benchmarks.workloads import seat
 from experiments.noise_study import Cell, Outcome, study_cell
 from impc.studies.compare.subject import compared_methods
 
-pytestmark = pytest.mark.long
+pytestmark = pytest.mark.full
 
 
 def test_a_cell_with_saturation(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,7 +15,7 @@ from impc.inverse.likelihood_fit import fit_person
 from impc.inverse.methods import estimate
 from impc.model.structure import Structure
 
-pytestmark = pytest.mark.long
+pytestmark = pytest.mark.full
 
 
 def scored(seed: int, limit: float) -> Score:

@@ -14,7 +14,7 @@ from impc.control.simulation import scenario
 from impc.model.riccati import solve_lqr
 from plants import seated_balance_for, ternary_torque
 
-pytestmark = pytest.mark.long
+pytestmark = pytest.mark.full
 
 
 def test_the_first_torque_from_a_tilt_is_that_of_the_optimality_conditions() -> None:

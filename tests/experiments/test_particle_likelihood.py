@@ -12,7 +12,7 @@ from experiments.particles.likelihood import particle_likelihood
 from impc.arrays import Array
 from tests.control.test_joint_likelihood import Someone, likelihood, particles, push, recorded
 
-pytestmark = pytest.mark.long
+pytestmark = pytest.mark.full
 
 PEOPLE = [
     Someone(limit=0.8, horizon=1, sensory=(0.1, 0.2)),

@@ -8,7 +8,7 @@ import pytest
 from experiments.peer_benchmark import LOOPS, coverage, demonstration, fit_from
 from experiments.peer_systems import SYSTEMS
 
-pytestmark = pytest.mark.long
+pytestmark = pytest.mark.full
 
 
 def test_a_start_a_third_off_ends_at_what_is_told() -> None:

@@ -8,7 +8,7 @@ import pytest
 from experiments.plan_study import cart, compare, seat
 from impc.studies.plan.designs import try_design
 
-pytestmark = pytest.mark.long
+pytestmark = pytest.mark.full
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from experiments.reproduction.entry import Chapter, Entry, Verdict
 from experiments.reproduction.example import controller_entries
 from experiments.reproduction.page import figure_name, page
 
-pytestmark = pytest.mark.long
+pytestmark = pytest.mark.full
 
 FOLDER = Path(__file__).parents[2] / "docs" / "reproduction"
 PAGE = (FOLDER / "index.md").read_text(encoding="utf-8")

@@ -7,7 +7,7 @@ import pytest
 
 from experiments.structure_study import cart_person, score
 
-pytestmark = pytest.mark.long
+pytestmark = pytest.mark.full
 
 
 def test_a_subject_is_scored_against_its_truth() -> None:

@@ -16,7 +16,7 @@ import scipy.sparse
 from impc.errors import DataError, InputError
 from impc.files.apart import matrices_apart
 from impc.files.formats import read_table
-from impc.files.matlab_tags import look_at_tags
+from impc.files.matlab import look_at_tags
 from tests.files.samples import mat5_array, mat5_element, mat5_file, pushed_seat, save_mat
 
 if TYPE_CHECKING:

@@ -12,8 +12,6 @@ from tests.fuzz.targets import TARGETS, Fuzzer
 if TYPE_CHECKING:
     from pathlib import Path
 
-pytestmark = pytest.mark.long
-
 # Cases of each target, about two seconds.
 _CASES = {".csv": 120, ".tsv": 60, ".txt": 60, ".mat": 400, ".tdms": 300, ".c3d": 150,
           ".xlsx": 120}  # fmt: skip

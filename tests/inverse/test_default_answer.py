@@ -86,12 +86,12 @@ def test_exact_recordings_of_one_input(wanted: int) -> None:
 
 
 @pytest.mark.parametrize("inputs", [2, 3])
-@pytest.mark.parametrize("wanted", [5, pytest.param(100, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("wanted", [3, pytest.param(100, marks=pytest.mark.slow)])
 def test_exact_recordings_of_several_inputs(inputs: int, wanted: int) -> None:
     assert score(posed(lambda seed: random_problem(seed, inputs), wanted))[0] <= wanted // 100
 
 
-@pytest.mark.parametrize("wanted", [8, pytest.param(67, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("wanted", [3, pytest.param(67, marks=pytest.mark.slow)])
 def test_half_of_the_outputs_from_an_unknown_state(wanted: int) -> None:
     wrong, silent = score(posed(lambda seed: random_problem(seed, half=True), wanted))
     assert wrong <= wanted // 10
@@ -119,6 +119,7 @@ def test_a_command_always_at_its_bound_identifies_nothing() -> None:
     assert any("identify 0 of the 2 directions" in doubt for doubt in found.doubts)
 
 
+@pytest.mark.full
 def test_the_rank_is_that_of_the_derivative() -> None:
     """Of 12 outputs of one trial with two inputs, against singular values of differences."""
     known = next(posed(lambda seed: random_problem(seed, 2, half=True, samples=12), 1))
@@ -171,6 +172,7 @@ def test_two_motors_of_one_joint() -> None:
         assert np.allclose(found.stage_weights.R, np.eye(2), atol=1e-4)
 
 
+@pytest.mark.full
 def test_a_start_that_is_not_the_first_sample_is_searched() -> None:
     """With noise on the first output the start is free by default, and known where it is exact."""
     plant = impc.Plant(control.ss([[1.1, 0.2], [0, 0.9]], [[0], [1]], [[1, 0]], 0, 1))

@@ -158,6 +158,7 @@ def test_output_penalty_reaches_what_a_derivative_free_search_reaches(
     assert objective(found.weights) <= search + 1e-8
 
 
+@pytest.mark.full
 def test_direct_form_tends_to_the_reduced_one_with_noise(
     example_plant: Plant, example_bounds: Bounds
 ) -> None:
@@ -298,6 +299,7 @@ def test_starting_point_alone_is_table_3_1_without_its_last_line(
     assert start.weights is start.auxiliary.weights
 
 
+@pytest.mark.full
 def test_a_recording_that_breaks_a_state_bound_is_fitted_softly_and_said_so(
     example_plant: Plant,
 ) -> None:

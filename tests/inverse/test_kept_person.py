@@ -11,12 +11,12 @@ from numpy.testing import assert_array_equal
 from impc.assess.person_covariance import person_covariance
 from impc.checking import replace
 from impc.inverse.estimates import Estimate
-from impc.inverse.kept_person import decode_person, encode_person
 from impc.inverse.likelihood_fit import fit_person
 from impc.inverse.methods import estimate
 from impc.inverse.structured_fit import fit_structured
 from impc.model.observer import Observer
 from impc.model.structure import Structure
+from impc.studies.fit.memory import decode_person, encode_person
 from tests.inverse.test_likelihood_fit import cart, posed
 from tests.inverse.test_regulator_span import late_body, late_problem
 

@@ -194,6 +194,7 @@ def test_a_gain_that_cannot_be_the_persons_is_left_behind(
     assert np.all(np.abs(np.array(found.K) - fitted.K) < 0.1 * deviations)
 
 
+@pytest.mark.full
 def test_prices_of_a_structure_are_searched() -> None:
     person = Observer(cart(), ["x"], motor=0.15, sensory=0.02)
     given = posed(person, 0.01, 0.9)

@@ -203,6 +203,7 @@ def test_moved_changes_starts_and_plant() -> None:
     assert not np.array_equal(there.plant.A, problem.plant.A)
 
 
+@pytest.mark.full
 def test_standard_deviations_of_a_linear_model_are_those_of_theory() -> None:
     """White noise, no bound: the sandwich is sigma^2 (J'J)^-1 of the full problem."""
     subject_noise = 1e-6

@@ -50,6 +50,7 @@ def test_a_demonstration_gives_back_what_it_tells(name: str) -> None:
         assert one.value == pytest.approx(expected, rel=1e-5)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("limit", [0.6, 50.0], ids=["saturated", "not saturated"])
 def test_a_linear_loop_has_the_weights_of_the_linear_route(limit: float) -> None:
     """Two states, one input: the gain's two numbers are what the diagonal of Q says."""
@@ -104,6 +105,7 @@ def test_several_recordings_of_both_kinds_with_missing_samples_and_disturbances(
     assert found.combinations.untold == ()
 
 
+@pytest.mark.full
 def test_an_unknown_initial_state_is_found_with_the_parameters() -> None:
     problem = point()
     loop = problem.closed_loop(TRUTH, [1.0, 0.5], 25)
@@ -115,6 +117,7 @@ def test_an_unknown_initial_state_is_found_with_the_parameters() -> None:
     assert found.theta["drag"] == pytest.approx(0.3, rel=1e-6)
 
 
+@pytest.mark.full
 def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
     """Thirty noisy plans, three parameters each: 95 % of ninety, within three deviations."""
     problem = point()

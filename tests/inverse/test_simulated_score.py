@@ -18,6 +18,8 @@ from impc.model.recordings import Recording
 from tests.inverse.noisy_cart import person, problem
 from tests.inverse.test_likelihood_fit import cart
 
+pytestmark = pytest.mark.full
+
 
 def fitted(limit: float) -> PersonFit:
     return fit_person(estimate(problem(limit)), person())
@@ -41,7 +43,6 @@ def test_it_is_zero_where_the_likelihood_is_exact(free: PersonFit) -> None:
     assert np.all((np.diag(spread) > 0.3) & (np.diag(spread) < 2.5))
 
 
-@pytest.mark.long
 def test_it_is_not_on_a_seat_at_its_limit_with_loud_senses() -> None:
     """At the truth, in deviations of three trials: more than one, and fresh draws say the same."""
     who = subject("seat", 1, "sensory", 70.0, 9.0)

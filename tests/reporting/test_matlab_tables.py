@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 import scipy.io
 
-from impc.reporting.document import TextTable
-from impc.reporting.matlab_tables import matlab_tables
+from impc.reporting.document import TextTable, matlab_tables
 
 
 def read(tables: dict[str, TextTable]) -> dict[str, Any]:

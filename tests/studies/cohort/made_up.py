@@ -10,8 +10,7 @@ import numpy as np
 from impc.assess.assessments import ASSESSMENTS
 from impc.files.configuration import Configuration, RecordingTable
 from impc.model.plant import Plant
-from impc.studies.cohort.finding import KEYS
-from impc.studies.cohort.study import Study, Unit
+from impc.studies.cohort.study import KEYS, Study, Unit
 from impc.studies.cohort.unit_task import FitTask
 from impc.studies.cohort.workers import Done
 

@@ -77,6 +77,7 @@ def test_a_gain_about_zero_is_told_where_all_are_told_as_well() -> None:
     assert not_told(units) == {}
 
 
+@pytest.mark.full
 def test_the_page_says_how_many_are_left_out(tmp_path: Path) -> None:
     study = made_up_study(8)
     digests = {name: task.digest for name, task in tasks_of(study).items()}

@@ -23,7 +23,7 @@ from impc.studies.cohort.unit_structure import structure_row
 from impc.studies.cohort.unit_task import fit_unit
 from tests.studies.cohort.carts import write_study
 
-pytestmark = pytest.mark.long
+pytestmark = pytest.mark.full
 
 STRUCTURE = '[fit.structure]\nQ = ["x[0]", "x[1]"]\n'
 

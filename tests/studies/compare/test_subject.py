@@ -37,7 +37,7 @@ from impc.studies.fit.subject import fit_problem
 from plants import yalmip_example
 from tests.support import easier_seat
 
-pytestmark = pytest.mark.long
+pytestmark = pytest.mark.full
 
 SETTINGS = FitSettings(horizon=10, u_max=1.0)
 

@@ -40,6 +40,7 @@ def data(result: FitResult) -> dict[str, Any]:
     return fit_data(result, Provenance())
 
 
+@pytest.mark.full
 def test_less_than_half_explained_gives_no_interval_and_no_statement() -> None:
     """Noise of three times the motion."""
     result = fitted(noise=0.15)

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from impc.arrays import frozen
-from impc.assess.diagnostics import ResidualDiagnostics
+from impc.assess.diagnostics import LoopNoise, ResidualDiagnostics
 from impc.assess.likely_people import entry_intervals, people_as_likely
-from impc.assess.loop_noise import LoopNoise
 from impc.checking import replace
 from impc.control.controller import Controller
 from impc.control.noisy_person import simulate_person
@@ -32,7 +31,7 @@ from impc.studies.fit.truth import truth_sentence
 from impc.studies.fit.verdict import verdict
 from tests.inverse.test_likelihood_fit import cart
 
-pytestmark = pytest.mark.long
+pytestmark = pytest.mark.full
 
 TABLE: dict[str, Any] = {
     "horizon": 5,

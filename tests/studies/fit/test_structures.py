@@ -51,7 +51,7 @@ def fitted(cross: float) -> FitResult:
     return fit_recordings(fit_problem(plant, trials, settings), settings)
 
 
-@pytest.mark.long
+@pytest.mark.full
 def test_statements_within_a_structure_that_holds() -> None:
     result = fitted(0.0)
     lines = structure_sentences(result)
@@ -70,6 +70,7 @@ def test_statements_within_a_structure_that_holds() -> None:
     assert sum(held) >= 4  # of 95 % each
 
 
+@pytest.mark.full
 def test_a_price_of_zero_makes_the_intervals_less_sure() -> None:
     result = fitted(0.0)
     found = result.structures[0]
@@ -82,7 +83,7 @@ def test_a_price_of_zero_makes_the_intervals_less_sure() -> None:
     assert any(line.startswith("Where the best price is zero") for line in lines)
 
 
-@pytest.mark.long
+@pytest.mark.full
 def test_a_refusal_may_be_the_fault_of_the_model() -> None:
     result = fitted(0.5)
     assert not any("not be the structure's fault" in line for line in structure_sentences(result))
@@ -95,6 +96,7 @@ def test_a_refusal_may_be_the_fault_of_the_model() -> None:
     assert not any("not be the structure's fault" in line for line in structure_sentences(whole))
 
 
+@pytest.mark.full
 def test_a_structure_that_does_not_hold_is_refused_first() -> None:
     result = fitted(0.5)
     assert result.structures[0].refused
@@ -104,6 +106,7 @@ def test_a_structure_that_does_not_hold_is_refused_first() -> None:
     assert verdict(result) == first
 
 
+@pytest.mark.full
 def test_the_section_has_every_structure() -> None:
     result = fitted(0.0)
     section = structure_section(result)

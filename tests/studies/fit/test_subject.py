@@ -272,6 +272,7 @@ def test_a_release_without_disturbance_is_fitted() -> None:
     np.testing.assert_allclose(fitted.problem.recordings[1].x0, [-0.2, 0.3], atol=1e-7)
 
 
+@pytest.mark.full
 def test_a_recording_in_which_nothing_moves_is_left_unexplained() -> None:
     plant = cart()
     rng = np.random.default_rng(SEED)

@@ -22,6 +22,7 @@ def ends() -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
     return np.array([[found[name].low, found[name].high] for name in names])
 
 
+@pytest.mark.full
 def test_inside_and_outside_are_counted_and_the_farthest_is_named() -> None:
     result, (place, speed) = fitted(1.0), ends()
     middle = np.array([[np.mean(place), np.mean(speed)]])

@@ -9,8 +9,7 @@ import control
 import numpy as np
 import pytest
 
-from impc.assess.diagnostics import ResidualDiagnostics
-from impc.assess.loop_noise import LoopNoise
+from impc.assess.diagnostics import LoopNoise, ResidualDiagnostics
 from impc.assess.residual_structure import ResidualStructure
 from impc.checking import replace
 from impc.control.controller import Controller
@@ -20,14 +19,13 @@ from impc.model.plant import Plant
 from impc.model.recordings import Recording
 from impc.model.weights import Weights
 from impc.reporting.shown_units import angles_in
-from impc.studies.charts import methods_chart, weights_chart
+from impc.studies.charts import methods_chart, signal_words, weights_chart
 from impc.studies.fit.figures import trajectory_figure
 from impc.studies.fit.interval_figures import gain_figure, shown_statements, statements_figure
 from impc.studies.fit.sentences import missing
 from impc.studies.fit.settings import FitSettings
 from impc.studies.fit.subject import fit_problem, fit_recordings, stages
 from impc.studies.fit.verdict import abstract, verdict
-from impc.studies.signal_words import signal_words
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -94,6 +92,7 @@ def test_noise_in_the_loop_and_another_body_are_said_first() -> None:
     assert "is not that of the model" in verdict(other)
 
 
+@pytest.mark.full
 def test_no_limit_and_a_limit_that_is_not_reached() -> None:
     clear = ResidualDiagnostics(None, None)
     assert "No limit of the command or of a state was given" in verdict(

@@ -151,6 +151,7 @@ def test_retests_exceed_the_mdc_of_a_large_study_in_one_of_twenty(occasion: floa
     assert 0.04 <= exceeded(2000, 50, occasion, 1, 5) <= 0.06
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("subjects", "visits", "occasion"), [(30, 3, 0.0), (30, 3, 0.3), (30, 2, 0.3), (12, 2, 0.0)]
 )
@@ -174,6 +175,7 @@ def test_the_error_is_that_of_a_single_score() -> None:
         measurement_error(scores, 1.0)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("form", ["A,1", "A,k"])
 def test_generalised_intervals_cover_where_visits_differ_much(form: Form) -> None:
     """700 studies of 30 subjects on 2 visits, visits as different as 0.7 of subjects; seed 8.

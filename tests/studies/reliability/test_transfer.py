@@ -9,7 +9,7 @@ import scipy.signal
 import plants
 from impc.arrays import Array
 from impc.errors import DataError
-from impc.studies.reliability.cmc import cmc_between, cmc_within
+from impc.studies.reliability.analysis import cmc_between, cmc_within
 from impc.studies.reliability.measures import band_energy, passband, rms
 from impc.studies.reliability.transfer import transfer_function
 

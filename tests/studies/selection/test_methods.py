@@ -11,7 +11,6 @@ from click.testing import CliRunner, Result
 
 from impc.assess.resampling import block_residuals
 from impc.cli.main import main
-from impc.studies.selection.bootstrap import bootstrap_subset, draw_single
 from impc.studies.selection.estimation import estimate, free_indices
 from impc.studies.selection.fisher import fisher_information
 from impc.studies.selection.key_parameters import key_parameters
@@ -19,6 +18,7 @@ from impc.studies.selection.lasso import proximal_lasso, table_c1
 from impc.studies.selection.model import ParametricModel, Trial, normalised, parametric_model
 from impc.studies.selection.queue import in_turn
 from impc.studies.selection.settings import SelectSettings
+from impc.studies.selection.subject import bootstrap_subset, draw_single
 from tests.studies.selection.dosing import blood_model
 from tests.studies.selection.heads import head_model
 
@@ -126,7 +126,7 @@ def test_widths_of_table_4_3() -> None:
     assert sum(inside) >= 4
 
 
-@pytest.mark.long
+@pytest.mark.full
 def test_head_tracking_from_files_to_files(tmp_path: Path) -> None:
     made = run("simulate", "head-tracking", "--out", str(tmp_path), "--subjects", "1",
                "--trials", "1", "--duration", "8")  # fmt: skip
@@ -185,7 +185,7 @@ replicates = 40
     return folder / "study.toml"
 
 
-@pytest.mark.long
+@pytest.mark.full
 def test_a_model_from_another_field(tmp_path: Path) -> None:
     study = blood_study(tmp_path, 5, 2)
     done = run("select", str(study), *MINE, "--out", str(tmp_path / "select"), "--workers", "1")
