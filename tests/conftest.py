@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from typing import TYPE_CHECKING, Any
 
 import control
@@ -29,17 +28,6 @@ settings.register_profile(
     "impc", derandomize=SEARCH == 1, deadline=None, database=None, print_blob=True
 )
 settings.load_profile("impc")
-
-# Tests of subjects who sense with noise are the last: their filter takes two minutes to compile,
-# which `make test` does meanwhile.
-_FILTER = re.compile(
-    "person|people|likel|runaway|score|unbiased|unseen|span|memory|public|messages"
-)
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Bring the tests into the order in which they run."""
-    items.sort(key=lambda item: bool(_FILTER.search(item.path.name)))
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -65,7 +65,14 @@ def test_a_name_loads_its_module_and_not_the_others() -> None:
     assert found.isdisjoint({"casadi", "numba", "impc.inverse.problem", "matplotlib"})
 
 
-@pytest.mark.parametrize("name", impc.__all__)
+@pytest.mark.parametrize(
+    "name",
+    [
+        # Its filter takes two minutes to compile.
+        pytest.param(name, marks=pytest.mark.full if name == "fit_person" else [])
+        for name in impc.__all__
+    ],
+)
 def test_the_example_of_the_name_runs(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -12,6 +12,8 @@ from impc.inverse.methods import estimate
 from impc.model.observer import Observer
 from tests.inverse.test_likelihood_fit import cart, posed
 
+pytestmark = pytest.mark.full
+
 
 @pytest.fixture(scope="module")
 def fitted() -> PersonFit:
@@ -19,7 +21,6 @@ def fitted() -> PersonFit:
     return fit_person(estimate(posed(person, 0.01, 3.0)), person)
 
 
-@pytest.mark.full
 def test_all_else_is_at_its_best(fitted: PersonFit) -> None:
     """Against a search without derivatives, along a combination of gain and motor noise."""
     prior, unseen = fitted.prior, np.array(fitted.unseen)

@@ -20,6 +20,8 @@ from impc.inverse.methods import estimate
 from impc.model.observer import Observer
 from tests.inverse.test_likelihood_fit import cart, posed
 
+pytestmark = pytest.mark.full
+
 
 @pytest.fixture(scope="module")
 def fitted() -> PersonFit:
@@ -103,7 +105,6 @@ def test_who_sees_every_state_has_one_hill() -> None:
     np.testing.assert_allclose(wider, (low, high), rtol=0.1)
 
 
-@pytest.mark.full
 def test_where_a_hill_is_flat_an_interval_reaches_as_far_as_the_profile() -> None:
     """Of the direction of the gain that is least told, with noisy senses at a limit."""
     person = Observer(cart(), ["x", "v"], motor=0.05, sensory=[0.3, 0.6])

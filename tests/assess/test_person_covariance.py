@@ -14,6 +14,8 @@ from impc.inverse.methods import estimate
 from impc.model.observer import Observer
 from tests.inverse.test_likelihood_fit import cart, posed
 
+pytestmark = pytest.mark.full
+
 
 @pytest.fixture(scope="module")
 def fitted() -> PersonFit:
@@ -60,7 +62,6 @@ def test_an_unknown_kind_is_refused(fitted: PersonFit) -> None:
         person_covariance(fitted, "robust")
 
 
-@pytest.mark.full
 def test_a_direction_that_nothing_tells_leaves_the_others_as_they_are() -> None:
     """Two inputs and no limit: the metric of the inputs moves no command, nor any likelihood.
 

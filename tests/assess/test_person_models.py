@@ -14,6 +14,8 @@ from impc.model.structure import Structure
 from tests.inverse.test_likelihood_fit import cart, posed
 from tests.inverse.test_regulator_span import late_body, late_problem
 
+pytestmark = pytest.mark.full
+
 
 @pytest.fixture(scope="module")
 def fitted() -> PersonFit:
@@ -31,7 +33,6 @@ def test_errors_ahead_are_those_that_the_filter_expects(fitted: PersonFit) -> No
     assert errors[0] < errors[1] < errors[2]
 
 
-@pytest.mark.full
 def test_without_limit_and_perturbation_there_are_three_models() -> None:
     person = Observer(cart(), ["x"], motor=0.15, sensory=0.02)
     found = estimate(posed(person, 0.01, np.inf, trials=1))
@@ -58,7 +59,6 @@ def test_who_cannot_estimate_has_a_reason() -> None:
     assert report.covariance is None
 
 
-@pytest.mark.full
 def test_a_structure_is_set_beside_any_gain() -> None:
     """Behind a delay: the same recordings, with fewer numbers and hardly less likelihood."""
     problem = late_problem(structure=Structure(late_body(), ["p", "v"]))

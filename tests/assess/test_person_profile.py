@@ -25,6 +25,8 @@ from impc.inverse.unseen_slope import unseen_slope
 from impc.model.observer import Observer
 from tests.inverse.test_likelihood_fit import cart, posed
 
+pytestmark = pytest.mark.full
+
 
 @pytest.fixture(scope="module")
 def fitted() -> PersonFit:
@@ -107,7 +109,6 @@ def test_a_level_that_may_be_none_is_told_on_one_side() -> None:
     assert 1e-4 < high < 10.0  # metres: closed above, whatever is not expected of it
 
 
-@pytest.mark.full
 @pytest.mark.parametrize("seed", [0, 3])
 def test_a_sense_that_is_hardly_told_leaves_the_motor_noise_its_own(seed: int) -> None:
     """Without a prior of levels a sense slides to none here, and the motor noise takes its part."""

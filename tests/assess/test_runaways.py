@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import control
 import numpy as np
+import pytest
 
 import impc
 from impc.assess.runaways import SIMULATED, runaways, running_away
 from impc.checking import replace
 from impc.control.noisy_person import simulate_person
 from impc.inverse.likelihood_fit import PersonFit
+
+pytestmark = pytest.mark.full
 
 SAMPLES, POLE, LIMIT, MOTOR = 1200, 1.04, 0.5, 1.1
 

@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
     from impc.control.optimal_control import OptimalControlProblem
 
+pytestmark = pytest.mark.full
+
 MODULE = '''
 """A point with drag that is pushed to the origin; its force is limited."""
 

@@ -33,6 +33,8 @@ from tests.support import extrapolated_slope
 if TYPE_CHECKING:
     from impc.arrays import Array
 
+pytestmark = pytest.mark.full
+
 
 class Someone(NamedTuple):
     """A person on a cart, by numbers that can be moved."""

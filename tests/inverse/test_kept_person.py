@@ -20,6 +20,8 @@ from impc.studies.fit.memory import decode_person, encode_person
 from tests.inverse.test_likelihood_fit import cart, posed
 from tests.inverse.test_regulator_span import late_body, late_problem
 
+pytestmark = pytest.mark.full
+
 
 def any_gain() -> tuple[Estimate, Observer]:
     person = Observer(cart(), ["x"], motor=0.15, sensory=0.02)
@@ -39,7 +41,6 @@ def prices() -> tuple[Estimate, Observer]:
     return fit_structured(problem, structure, estimate(problem)), person
 
 
-@pytest.mark.full
 @pytest.mark.parametrize("make", [any_gain, gain_of_a_structure, prices])
 def test_it_is_the_one_that_was_fitted(make: object) -> None:
     assert callable(make)

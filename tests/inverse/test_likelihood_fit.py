@@ -31,6 +31,8 @@ from impc.model.structure import Structure
 from impc.model.weights import Weights
 from tests.support import extrapolated_slope
 
+pytestmark = pytest.mark.full
+
 
 def cart() -> Plant:
     system = control.ss(
@@ -194,7 +196,6 @@ def test_a_gain_that_cannot_be_the_persons_is_left_behind(
     assert np.all(np.abs(np.array(found.K) - fitted.K) < 0.1 * deviations)
 
 
-@pytest.mark.full
 def test_prices_of_a_structure_are_searched() -> None:
     person = Observer(cart(), ["x"], motor=0.15, sensory=0.02)
     given = posed(person, 0.01, 0.9)

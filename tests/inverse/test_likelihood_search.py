@@ -18,6 +18,8 @@ from impc.model.observer import Observer
 from impc.model.weights import Weights
 from tests.inverse.test_likelihood_fit import cart, posed
 
+pytestmark = pytest.mark.full
+
 
 def sliding_person() -> PersonFit:
     """Someone whose senses err so little that these levels are not told."""
@@ -99,7 +101,6 @@ def test_initial_states_are_as_any_other_state(sliding: PersonFit) -> None:
     assert away == pytest.approx(x0 @ np.linalg.solve(unit @ unit.T + driven, x0) / 2)
 
 
-@pytest.mark.full
 def test_what_levels_lose_is_that_of_the_gain_integrated_out() -> None:
     """Against a grid over the gain, at the levels that were found and at twice the motor noise."""
     person = Observer(cart(), ["x"], motor=0.4, sensory=0.05)

@@ -15,13 +15,14 @@ from impc.inverse.unbiased_fit import TiltedPrior, unbiased
 from tests.inverse.noisy_cart import person, problem
 from tests.support import extrapolated_slope
 
+pytestmark = pytest.mark.full
+
 
 @pytest.fixture(scope="module")
 def met() -> PersonFit:
     return fit_person(estimate(problem(0.7)), person())
 
 
-@pytest.mark.full
 def test_where_it_ends_the_score_is_what_it_is_on_average(met: PersonFit) -> None:
     """Along the gain, with the slope of the prior; fresh draws, within a third of a deviation."""
     found, reason = unbiased(met)
@@ -35,7 +36,6 @@ def test_where_it_ends_the_score_is_what_it_is_on_average(met: PersonFit) -> Non
     np.testing.assert_array_equal(unbiased(met).fit.theta, theta)
 
 
-@pytest.mark.full
 def test_the_tilted_likelihood_is_level_where_it_ends(met: PersonFit) -> None:
     """What makes others as likely is measured from there; within a third of a deviation."""
     found = unbiased(met).fit
@@ -47,7 +47,6 @@ def test_the_tilted_likelihood_is_level_where_it_ends(met: PersonFit) -> None:
     assert found.theta is not met.theta
 
 
-@pytest.mark.full
 def test_a_mean_that_is_not_found_leaves_the_fit_and_says_why(
     met: PersonFit, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -60,7 +59,6 @@ def test_a_mean_that_is_not_found_leaves_the_fit_and_says_why(
     assert "runs away in every simulated trial" in reason
 
 
-@pytest.mark.full
 @pytest.mark.parametrize("deviations", [1.5, 12.0, 400.0])
 def test_no_farther_than_the_likelihood_is_a_parabola(
     met: PersonFit, monkeypatch: pytest.MonkeyPatch, deviations: float
@@ -93,7 +91,6 @@ def test_no_farther_than_the_likelihood_is_a_parabola(
         assert reason.endswith("the likelihood is no parabola")
 
 
-@pytest.mark.full
 def test_the_tilt_of_a_prior_has_the_slope_that_it_says(met: PersonFit) -> None:
     theta, prior = np.array(met.theta), met.prior
     rng = np.random.default_rng(1)
@@ -113,7 +110,6 @@ def test_the_tilt_of_a_prior_has_the_slope_that_it_says(met: PersonFit) -> None:
     assert exact == pytest.approx(extrapolated_slope(moved, 1e-3)[0], rel=1e-6)
 
 
-@pytest.mark.full
 def test_along_directions_that_are_not_told_nothing_moves(
     met: PersonFit, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -132,7 +128,6 @@ def test_along_directions_that_are_not_told_nothing_moves(
     assert reason == ""
 
 
-@pytest.mark.full
 def test_where_no_bound_is_met_nothing_changes() -> None:
     fit = fit_person(estimate(problem(50.0)), person())
     found, reason = unbiased(fit)

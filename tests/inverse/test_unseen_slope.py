@@ -26,6 +26,8 @@ from tests.inverse.test_likelihood_search import sliding_person
 if TYPE_CHECKING:
     from impc.arrays import Array
 
+pytestmark = pytest.mark.full
+
 
 @pytest.fixture(scope="module")
 def sliding() -> PersonFit:
@@ -66,7 +68,6 @@ def heights(fit: PersonFit, offsets: Array, step: Array) -> list[float]:
     return [fit.space.value(place) + fit.prior.value(place) for place in places]
 
 
-@pytest.mark.full
 def test_the_slope_of_what_levels_lose_follows_the_ridge(sliding: PersonFit) -> None:
     """Against searches of all else with a level a little lower and higher."""
     prior, theta = sliding.prior, np.array(sliding.theta)
@@ -84,7 +85,6 @@ def test_the_slope_of_what_levels_lose_follows_the_ridge(sliding: PersonFit) -> 
         assert found[index] == pytest.approx((lost[0] - lost[1]) / (2 * step), abs=0.1)
 
 
-@pytest.mark.full
 def test_jumps_have_a_slope_that_no_score_has(jumping: PersonFit) -> None:
     """Against a cubic through sixty values of the likelihood within a deviation and a half."""
     prior = jumping.prior
@@ -101,7 +101,6 @@ def test_jumps_have_a_slope_that_no_score_has(jumping: PersonFit) -> None:
     assert np.max(np.abs(two)) > 0.2
 
 
-@pytest.mark.full
 def test_without_a_bound_scores_have_all_of_the_gain() -> None:
     person = Observer(cart(), ["x"], motor=0.4, sensory=0.05)
     free = fit_person(estimate(posed(person, 0.01, 30.0)), person)
@@ -110,7 +109,6 @@ def test_without_a_bound_scores_have_all_of_the_gain() -> None:
     )
 
 
-@pytest.mark.full
 def test_what_levels_lose_is_learned_and_jumps_are_not(jumping: PersonFit) -> None:
     """After a long step along one level the slope along it is what was lost over the length."""
     prior, theta, own = jumping.prior, np.array(jumping.theta), jumping.space.own
@@ -123,7 +121,6 @@ def test_what_levels_lose_is_learned_and_jumps_are_not(jumping: PersonFit) -> No
     np.testing.assert_array_equal(np.delete(learned, own), np.delete(slope, own))
 
 
-@pytest.mark.full
 def test_the_search_for_somebody_at_a_limit_ends_where_the_likelihood_is_highest() -> None:
     """Of parabolas through many values along each direction of the gain, jumps and all."""
     who = subject("seat", 3, "sensory", 90.0, 6.0)

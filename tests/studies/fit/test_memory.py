@@ -16,8 +16,9 @@ from impc.studies.fit.memory import open_memory
 from impc.studies.fit.settings import FitSettings
 from tests.inverse.test_likelihood_fit import cart, posed
 
+pytestmark = pytest.mark.full
 
-@pytest.mark.full
+
 def test_persons_of_an_interrupted_fit_are_not_fitted_again(tmp_path: Path) -> None:
     person = Observer(cart(), ["x"], motor=0.15, sensory=0.02)
     problem, settings = posed(person, 0.01, 0.9), FitSettings(horizon=5, u_max=0.9)
