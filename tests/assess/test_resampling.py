@@ -75,6 +75,7 @@ def test_bootstrap_agrees_with_the_sandwich(fitted: Estimate) -> None:
         assert np.all(np.abs(np.log(ratio)) < np.log(1.5)), ratio
 
 
+@pytest.mark.full
 def test_profile_agrees_with_the_sandwich(fitted: Estimate) -> None:
     """Nearly quadratic, so nearly the same ends."""
     estimate = gain_estimate(fitted)
@@ -95,6 +96,7 @@ def test_plain_intervals_are_narrower_with_coloured_noise() -> None:
     assert np.all(sandwich > 2 * plain)
 
 
+@pytest.mark.full
 def test_profile_against_brute_force(fitted: Estimate) -> None:
     """D at one value against a dense search over the only other entry, initial state refitted."""
     problem = replace(fitted.problem, unknown_start=False)

@@ -55,6 +55,7 @@ def _with_gain_entry(work: Workload, index: int, change: float) -> np.ndarray:
     return np.array(simulate(moved, work.drives[0]).x)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("limit", [70.0, 6.0, pytest.param(4.5, marks=pytest.mark.full)])
 def test_the_whole_fit_reaches_the_true_gain(limit: float) -> None:
     work = seat(limit=limit)

@@ -225,6 +225,7 @@ def cases(draw: st.DrawFn) -> Case:
 few = draws(25)
 
 
+@pytest.mark.full
 @few
 @given(cases(), st.integers(0, 2**32 - 1))
 def test_inside_stays_inside_and_outside_leaves(case: Case, seed: int) -> None:

@@ -39,7 +39,7 @@ def clean_problem(limit: float, trials: int = 2) -> tuple[Workload, Problem]:
 
 
 # At 4.5 Nm, where clipped LQR falls, a search takes ten times as long.
-LIMITS = [70.0, 6.0, pytest.param(4.5, marks=pytest.mark.full)]
+LIMITS = [6.0, *(pytest.param(one, marks=pytest.mark.full) for one in (70.0, 4.5))]
 
 
 @pytest.fixture(scope="module", params=LIMITS, ids="{}Nm".format)

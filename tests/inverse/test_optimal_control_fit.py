@@ -171,6 +171,7 @@ def test_an_infeasible_start_names_the_constraint_and_the_sample() -> None:
         fit_optimal_control(arm.problem, [recording], arm.truth | {"max_q": 2.3})
 
 
+@pytest.mark.full
 def test_another_start_is_tried_where_the_first_has_no_plan() -> None:
     """The angle's first limit is below where the arm begins to be stopped; the second is not."""
     arm = SYSTEMS["robot arm"]()

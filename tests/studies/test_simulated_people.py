@@ -55,6 +55,7 @@ def test_who_hardly_errs_moves_as_who_sees_all() -> None:
     np.testing.assert_allclose(found.states, plain.states, atol=1e-6)
 
 
+@pytest.mark.full
 def test_noise_of_a_person_is_that_of_the_linear_loop() -> None:
     """The linear plant at 100 Hz and at 1000 Hz: the same spread of the angles, to its error."""
     work = seat(1, 30.0, 70.0)

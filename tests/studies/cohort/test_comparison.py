@@ -89,6 +89,7 @@ def cohort_p(seed: int, difference: float, subjects: int = 10) -> float:
     return found.p
 
 
+@pytest.mark.full
 def test_a_planted_difference_is_found() -> None:
     assert cohort_p(0, 3.0) < 0.01
 

@@ -162,6 +162,7 @@ def small() -> tuple[Problem, FitSettings]:
     return fit_problem(cart(), cart_trials(3, 0.2), settings), settings
 
 
+@pytest.mark.full
 def test_a_plant_of_ones_own_with_one_output(small: tuple[Problem, FitSettings]) -> None:
     heard: list[str] = []
     result = fit_recordings(*small, FitProgress(heard.append))

@@ -41,6 +41,7 @@ def test_inside_and_outside_are_counted_and_the_farthest_is_named() -> None:
     assert [row[-1] for row in rows] == ["outside", "inside"]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("content", "found"),
     [
