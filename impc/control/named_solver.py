@@ -280,13 +280,16 @@ def _solve(
     with silent():
         answer = function(h=H, g=g, a=rows, lba=-np.inf, uba=right, lbx=least, ubx=np.inf)
     found, multipliers = answer["x"].full().ravel(), answer["lam_a"].full().ravel()
+    if not (np.all(np.isfinite(found)) and np.all(np.isfinite(multipliers))):
+        return None
     z, excess = found[:width], np.zeros(count)
     if len(found) > width:
         excess[soft] = found[width:]
     size = max(1.0, float(np.abs(z).max()))
     most = max(1.0, float(np.abs(multipliers).max()))
-    kept = (A @ z - right - excess).max() <= _AGREES * size
-    stationary = np.abs(z + A.T @ multipliers).max() <= _AGREES * max(size, most)
+    with np.errstate(over="ignore", invalid="ignore"):  # of a plant that runs away: then it is none
+        kept = (A @ z - right - excess).max() <= _AGREES * size
+        stationary = np.abs(z + A.T @ multipliers).max() <= _AGREES * max(size, most)
     signed = multipliers.min() >= -_AGREES * most
     return (z, multipliers, excess, size) if kept and stationary and signed else None
 
