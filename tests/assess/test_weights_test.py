@@ -36,7 +36,10 @@ def noisy_problem(seed: int, K: np.ndarray | None = None) -> Problem:
     return Problem(plant, bounds, 3, (impc.Recording(plant, noisy, push),))
 
 
-@pytest.mark.parametrize("wanted", [4, pytest.param(200, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "wanted",
+    [4, pytest.param(12, marks=pytest.mark.full), pytest.param(200, marks=pytest.mark.slow)],
+)
 def test_an_optimal_regulator_has_weights(wanted: int) -> None:
     assert [seed for seed in range(wanted) if compared(noisy_problem(seed)).rejected] == []
 
