@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import click
 
+from impc.jit import say_when_compiling
+
 
 @click.command("warm")
 def command() -> None:
@@ -12,6 +14,7 @@ def command() -> None:
     `make env` ends with it; after an installation by pip it is yours to call. Without it the first
     command compiles what it needs and says so.
     """
+    say_when_compiling(lambda _: None)  # nobody has to be told here
     from impc.control.warm import compiled_parts  # noqa: PLC0415  # loads numba
 
     for part in compiled_parts():

@@ -12,6 +12,8 @@ many prices of the command; from the few ends that differ the recordings themsel
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
 import functools
 import time
 from dataclasses import dataclass
@@ -76,7 +78,7 @@ def fit_structure(
             "none of its regulators can be simulated on the recordings",
             "price other features",
         )
-    return StructuredEnd(**{**vars(best), "evaluations": spent})
+    return dataclasses.replace(best, evaluations=spent)
 
 
 def fit_structured(problem: Problem, structure: Structure, near: Estimate) -> Estimate:
@@ -86,8 +88,12 @@ def fit_structured(problem: Problem, structure: Structure, near: Estimate) -> Es
     end = fit_structure(posed, structure, np.array(near.gain), np.array(near.metric))
     given = np.array(problem.logarithms)
     if np.any(np.abs(near.problem.logarithms - given) > _RUNAWAY):
-        again = search_from(problem.at(np.array(end.problem.starts), given), structure, end.prices)
-        end = min(end, again, key=lambda one: one.misfit)
+        there = problem.at(np.array(end.problem.starts), given)
+        with contextlib.suppress(WeightsError):  # a price of zero may leave no regulator there
+            again = search_from(there, structure, end.prices)
+            spent = end.evaluations + again.evaluations
+            best = min(end, again, key=lambda one: one.misfit)
+            end = dataclasses.replace(best, evaluations=spent)
     return structured_estimate(posed, structure, end, time.perf_counter() - started)
 
 
