@@ -137,6 +137,7 @@ def test_one_line_says_how_to_get_it(call: str, message: str, tmp_path: Path) ->
     assert done.stdout == message + "\n", done.stderr
 
 
+@pytest.mark.full
 def test_a_subject_is_simulated_in_the_formats_that_are_there(tmp_path: Path) -> None:
     done = plain(
         "from impc.cli.main import main\n"

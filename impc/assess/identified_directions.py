@@ -4,8 +4,6 @@ The closed loop depends on (Q, R) through K and the scale-free S only, so the de
 outputs with respect to the weights has at most n m + m (m + 1)/2 - 1 directions, whatever was
 recorded (n m + m - 1 when A is invertible: docs/theory.md). The rest of the weights was chosen by
 the condition number.
-
-Several tests at once: the correction of their p-values by Holm (1979).
 """
 
 from __future__ import annotations
@@ -136,17 +134,3 @@ def _explain(problem: Problem, found: EquivalentWeights) -> OtherWeights:
     solution = solve_lqr(problem.plant, found.weights)
     left = misfit(problem, simulated(problem, solution.K, solution.S))
     return OtherWeights(found.weights, condition_number(found.weights), left)
-
-
-def holm(p: Array) -> Array:
-    """Return the p-values of several tests, each as if it were one of all that could be made.
-
-    statsmodels has the same, and collects the garbage of the whole process at every call.
-
-    `p` (k,); returns (k,).
-    """
-    order = np.argsort(p)[: np.count_nonzero(np.isfinite(p))]
-    corrected = np.full(len(p), np.nan)
-    grown = np.maximum.accumulate(p[order] * np.arange(len(order), 0, -1))
-    corrected[order] = np.minimum(grown, 1.0)
-    return corrected

@@ -173,7 +173,7 @@ class _Search:
 
     def __init__(self, fitted: Estimate, control: int) -> None:
         self.fitted, self.control = fitted, control
-        self.samples = sum(fitted.problem.trial_sizes)
+        self.samples = fitted.problem.recorded_numbers
         self.tried: dict[float, GainFit | None] = {}
 
     def fit(self, limit: float) -> GainFit:

@@ -97,7 +97,7 @@ class _Search:
         )
         self.unit = np.zeros_like(direction)
         self.unit[own] = direction[own] / float(direction[own] @ direction[own])
-        self.samples = sum(problem.trial_sizes)
+        self.samples = problem.recorded_numbers
         misfit = float(np.linalg.norm(self.space.at(self.space.start).residual))
         self.noise = max(misfit, 1e-12) / np.sqrt(self.samples)
         self.pull = self.noise / _WIDTH

@@ -3,10 +3,8 @@
 Every number is over all weights with the gain whose condition number, in the units of the plant, is
 at most a multiple of the least (`weights_set`; docs/equivalent-weights.md, section 5).
 
-How far each eigenvalue of Q can go over all weights with a gain (`weights_set`).
-
-The largest eigenvalue is a convex function of Q and the least a concave one, so that two ends are
-programs and proved:
+Among them is how far each eigenvalue of Q can go. The largest is a convex function of Q and the
+least a concave one, so that two ends are programs and proved:
 
     min over members of lambda_max(Q),        max over members of lambda_min(Q).
 

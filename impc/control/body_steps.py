@@ -2,13 +2,11 @@
 
 docs/nonlinear.md has the equations.
 
-Machine code of a body: its list of operations, translated once for all samples.
-
-LLVM, which numba brings, makes it: a function of (constants, given, found) that reads and writes
-where they point to. The operations stand one behind the other without a branch, and none is taken
-together with another, so that every processor gives the same numbers. Parameters are among the
-constants, so that bodies which differ by them alone share their code (docs/nonlinear.md, "A body
-that is not linear").
+A body's list of operations is machine code, translated once for all samples by LLVM, which numba
+brings: a function of (constants, given, found) that reads and writes where they point to. The
+operations stand one behind the other without a branch, and none is taken together with another, so
+that every processor gives the same numbers. Parameters are among the constants, so that bodies
+which differ by them alone share their code (docs/nonlinear.md, "A body that is not linear").
 """
 
 from __future__ import annotations

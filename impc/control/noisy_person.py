@@ -1,9 +1,7 @@
 """A trial of a person who senses with noise, under the constrained controller.
 
 The system is that of `joint_loop`: commands follow from the estimate, with every bound active
-(docs/noisy-people.md).
-
-Compiled code: a person who senses with noise, simulated (docs/noisy-people.md).
+(docs/noisy-people.md). Samples run in compiled code.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""Names and units of columns from what stands above them: ``angle (deg)``, or a row of units.
-
-Rows of text as columns of a fixed width, for a terminal.
-"""
+"""Names and units of columns from what stands above them: ``angle (deg)``, or a row of units."""
 
 from __future__ import annotations
 
@@ -146,18 +143,3 @@ def _padded(row: Sequence[str], width: int) -> list[str]:
 
 def _bare(item: str) -> str:
     return item.strip("()[] ")
-
-
-def in_columns(rows: Sequence[Sequence[str]], left: int = 1) -> str:
-    """The `rows`, a line each: the first `left` columns flush left, the others flush right.
-
-    pandas would set all of them flush right, names of methods too, or want a formatter a column.
-    """
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return "\n".join(
-        "  ".join(
-            cell.ljust(width) if place < left else cell.rjust(width)
-            for place, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in rows
-    )

@@ -13,8 +13,8 @@ import numpy as np
 
 from impc.errors import InputError
 from impc.files.clock import counts_days
+from impc.files.columns import in_columns
 from impc.files.configuration import FILL_IN
-from impc.files.headings import in_columns
 from impc.files.plant_sources import OWN
 from impc.files.units import guessed_unit, si_unit
 

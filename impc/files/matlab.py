@@ -1,12 +1,10 @@
 """MATLAB .mat files up to version 7 (called v5 after their header), by scipy.
 
-A flipped bit can end the process in scipy's reader. So all tags are looked at first
-(`impc.files.matlab`), and files are read in a process of their own (`impc.files.apart`).
+A flipped bit can end the process in scipy's reader. So all tags are looked at first, and files are
+read in a process of their own (`impc.files.apart`).
 
 Vectors are columns by their name, the columns of a matrix are `name_1`, `name_2` and so on, numeric
 fields of a struct are `s.field`. The longer side of a matrix is taken as time.
-
-The tags of a MATLAB .mat file of version 5 to 7, looked at before scipy reads it.
 
 A file is a header of 128 bytes and a sequence of elements: a tag of 8 bytes (type, length), then as
 many bytes. An array is an element of elements. scipy's reader looks types up in a table without

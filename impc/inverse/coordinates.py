@@ -283,7 +283,7 @@ class _Along:
         self.columns = np.eye(len(z) - self.last + self.first) if along is None else along
         self.shape = (space.trials, space.n) if self.last > self.first else (1, 0)
         self.begin = self.apart(z)
-        self.count = sum(space.problem.trial_sizes)
+        self.count = space.problem.recorded_numbers
         self.here = z
 
     def apart(self, z: Array) -> tuple[Array, Array]:

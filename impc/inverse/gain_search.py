@@ -86,7 +86,7 @@ class GainFit(Frozen):
 @checked
 def fit_gain(problem: Problem) -> GainFit:
     """Fit K, and S for several inputs, with initial states and parameters that are not known."""
-    count = sum(problem.trial_sizes)
+    count = problem.recorded_numbers
     few, wanted = count <= FEW, _SURE if count <= _HANDFUL else _AGREE
     found: list[GainFit] = []
     exact = pair_of_inactive_samples(problem)
@@ -217,7 +217,7 @@ def _predictions(problem: Problem, begin: LqrSolution, ratio: float) -> Coordina
 
 
 def _stop(problem: Problem, share: float, evaluations: int) -> Stop:
-    count = sum(problem.trial_sizes)
+    count = problem.recorded_numbers
     return Stop(share * count, (_ROUNDING * recorded_size(problem)) ** 2, evaluations)
 
 

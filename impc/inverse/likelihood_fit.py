@@ -58,8 +58,8 @@ _FAR = 4.0
 class PersonFit(Frozen):
     """A person behind recordings, at the largest likelihood."""
 
-    K: Array  # Gain (m, n) and metric (m, m)
-    S: Array
+    K: Array  # Gain (m, n)
+    S: Array  # Metric (m, m)
     problem: Problem  # At the initial states, as the person takes them, and the parameters
     observer: Observer  # At the levels found; a level of zero was not searched
     recorder: Array  # Standard deviations of the recorder's noise (p,), in the outputs' units

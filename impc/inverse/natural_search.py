@@ -78,7 +78,7 @@ def inverse_mpc_natural(
     residual = _residual(problem, T, G, noise)
     fits = np.linalg.norm(residual(solve_lqr(natural, best)).values) <= _FITS
     begin = best if fits else _away_from_the_edge(best, worst_start)
-    samples = sum(problem.trial_sizes)
+    samples = problem.recorded_numbers
     reference, evaluations, found = condition_number(best), 0, None
     for _ in range(_ROUNDS):
         objective = Objective(residual, 1.0, condition_share / samples / reference, squared=True)

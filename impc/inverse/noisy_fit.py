@@ -90,7 +90,7 @@ def _set_may_matter(found: Estimate) -> bool:
     far longer: many samples have to speak for it at the controller found.
     """
     posed = replace(found.problem, terminal_set=True)
-    if sum(posed.trial_sizes) > FEW:
+    if posed.recorded_numbers > FEW:
         left, reason = misfit_or_reason(posed, found.gain, found.metric)
         return not reason and left < found.misfit
     try:
@@ -161,7 +161,7 @@ def _unlikely(free: GainFit) -> float:
     plant, problem = free.problem.plant, free.problem
     unknowns = plant.m * plant.n + plant.m * (plant.m + 1) // 2 - 1 + len(problem.logarithms)
     unknowns += plant.n * len(problem.recordings) if problem.unknown_start else 0
-    samples = sum(problem.trial_sizes)
+    samples = problem.recorded_numbers
     return float(np.exp(scipy.special.chdtri(unknowns, _RARE) / (2 * samples)))
 
 
@@ -201,7 +201,7 @@ def _nearest(free: GainFit, regulator: LqrSolution) -> Weights:
     target = np.asarray(np.linalg.solve(G, free.K @ T))
     own = gain_fibre(natural, np.linalg.solve(G, regulator.K @ T), G.T @ regulator.S @ G)
     begin = best_conditioned(own, in_natural_units(regulator.weights, T, G))
-    samples = sum(problem.trial_sizes)
+    samples = problem.recorded_numbers
     share = CONDITION_SHARE / samples / condition_number(begin)
     return in_plant_units(weights_near(natural, form, target, begin, share).weights, T, G)
 

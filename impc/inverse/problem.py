@@ -209,6 +209,11 @@ class Problem(Value):
         """How many numbers were recorded in each trial."""
         return [trial.outputs.size for trial in self.recordings]
 
+    @property
+    def recorded_numbers(self) -> int:
+        """How many numbers were recorded in all trials."""
+        return sum(self.trial_sizes)
+
 
 def _root_mean_square(recordings: Sequence[Recording]) -> Array:
     outputs = np.concatenate([trial.outputs for trial in recordings])
@@ -304,7 +309,7 @@ def with_or_without_set(
 
 def typical_output(problem: Problem) -> float:
     """Root-mean-square of all recorded outputs over their scales: 1 at the default scales."""
-    return recorded_size(problem) / float(np.sqrt(sum(problem.trial_sizes))) or 1.0
+    return recorded_size(problem) / float(np.sqrt(problem.recorded_numbers)) or 1.0
 
 
 def simulated(problem: Problem, gain: Array, metric: Array) -> list[Simulation]:

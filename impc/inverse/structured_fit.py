@@ -144,7 +144,7 @@ class _Target:
         self.space = Coordinates(problem, gain, metric)
         start = self.space.start
         seen = self.space.without_nuisance(start)
-        samples = sum(problem.trial_sizes)
+        samples = problem.recorded_numbers
         self.noise = float(np.linalg.norm(self.space.at(start).residual)) / np.sqrt(samples)
         # Of the gain alone: the metric shows only where commands stand at their limits.
         count = len(self.space.gains)

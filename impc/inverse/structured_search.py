@@ -207,7 +207,7 @@ class _Place:
 def _polished(place: _Place, spent: int, settled: bool) -> StructuredEnd:
     """Without the prior along what the recordings tell of the prices, with one about here."""
     space, z = place.space()
-    noise = _misfit(space, z) / np.sqrt(_samples(space.problem))
+    noise = _misfit(space, z) / np.sqrt(space.problem.recorded_numbers)
     rows, deviations = space.deviations(z, noise)
     beside = len(space.problem.logarithms)
     along = scipy.linalg.block_diag(rows.T, np.eye(beside))
@@ -279,7 +279,7 @@ def _seen_from(end: StructuredEnd, place: _Place, index: int) -> float:
 
 def _without_pull(end: StructuredEnd, structure: Structure, budget: int) -> StructuredEnd:
     """The same where the prior, begun anew about the end, has nothing more to hold back."""
-    samples = _samples(end.problem)
+    samples = end.problem.recorded_numbers
     for _ in range(_ROUNDS):
         if end.evaluations >= budget:
             break
@@ -299,7 +299,7 @@ def _widest(place: _Place, misfit: float, tried: set[int]) -> int | None:
     space, z = place.space()
     if structure.coupled or np.count_nonzero(space.moving[: len(structure.labels)]) < 2:
         return None
-    rows, along = space.deviations(z, misfit / np.sqrt(_samples(space.problem)))
+    rows, along = space.deviations(z, misfit / np.sqrt(space.problem.recorded_numbers))
     own = np.full(structure.count, -np.inf)
     own[space.moving] = np.sqrt((rows**2).T @ np.minimum(along, _ENDLESS) ** 2)
     own[len(structure.labels) :] = -np.inf
@@ -310,7 +310,3 @@ def _widest(place: _Place, misfit: float, tried: set[int]) -> int | None:
 
 def _misfit(space: PriceCoordinates, z: Array) -> float:
     return float(np.linalg.norm(space.at(z).residual))
-
-
-def _samples(problem: Problem) -> int:
-    return sum(problem.trial_sizes)

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 import scipy.io
 
-from impc.files.headings import in_columns
+from impc.files.columns import in_columns
 from impc.files.results import SCHEMA
 from impc.files.workbook import MOST_ROWS, workbook_bytes
 from impc.reporting.csv_text import csv_bytes

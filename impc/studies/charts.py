@@ -10,8 +10,6 @@ A chart is a dictionary that `impc/reporting/page.js` reads:
     prices, mixed         names of these numbers
 
 Long trials are drawn with every k-th sample (docs/results.md).
-
-What a plant and its signals are, in words: for the end of every page (docs/units.md).
 """
 
 from __future__ import annotations
@@ -48,7 +46,6 @@ if TYPE_CHECKING:
     from impc.assess.intent_rules import Intent
     from impc.assess.judged import MethodFit
     from impc.inverse.problem import Problem
-    from impc.model.plant import Plant
 
 # Samples that are drawn of a trial. Of the weights' chart, which has a curve a position: how many
 # are simulated, and each how many-th is drawn.
@@ -208,23 +205,3 @@ def _panels(
 def _short(values: Array) -> list[float | None]:
     """Five digits: a screen has four."""
     return [float(f"{one:.5g}") if np.isfinite(one) else None for one in values]
-
-
-def signal_words(plant: Plant) -> tuple[tuple[str, str], ...]:
-    """Each signal of a `plant` that has words, with them and its unit."""
-    names = dict.fromkeys((*plant.outputs, *plant.states, *plant.controls, *plant.disturbances))
-    return tuple(
-        (name, f"{words[0].upper()}{words[1:]}, in {plant.unit(name)}.")
-        for name in names
-        if (words := plant.word(name))
-    )
-
-
-def body_sentence(plant: Plant) -> str:
-    """Which body every simulation of a page moved, that of a `plant` or its matrices."""
-    if plant.body is None:
-        return "What moves is the linear plant, by which the controller predicts too."
-    return (
-        "What moves are the plant's own equations, which are not linear; the controller predicts "
-        "by their linearisation at rest."
-    )

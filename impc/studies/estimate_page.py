@@ -34,10 +34,11 @@ from impc.reporting.rendering import number
 from impc.reporting.shown_units import axis_label, shown_unit
 from impc.reporting.style import BLUE, DOUBLE_COLUMN, INK, drawn, journal_style, new_figure
 from impc.reporting.writer import owned, write_files
-from impc.studies.charts import body_sentence, methods_chart, signal_words
+from impc.studies.charts import methods_chart
 from impc.studies.methods_table import column_terms, methods_data, methods_table
 from impc.studies.optimal_fit.report import optimal_report
 from impc.studies.optimal_fit.result import OptimalFit
+from impc.studies.signal_words import body_sentence, signal_words
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

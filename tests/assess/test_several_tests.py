@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from statsmodels.stats.multitest import multipletests
 
-from impc.assess.identified_directions import holm
+from impc.assess.several_tests import holm
 
 SEED = 5
 

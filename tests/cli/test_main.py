@@ -108,7 +108,10 @@ def test_bad_arguments_get_one_line(arguments: tuple[str, ...], names: str) -> N
     assert names in result.stderr
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize(
+    "solver",
+    [pytest.param(one, marks=pytest.mark.full) if one != "daqp" else one for one in SOLVERS],
+)
 def test_any_solver_finds_the_weights_of_the_example(solver: str, example_plant: Plant) -> None:
     """Case A, whose recording stands at the bound for three samples."""
     found = run_case(example_plant, "A", solver=solver)

@@ -44,6 +44,7 @@ def drive(plant: Plant) -> Scenario:
     return scenario(plant, START, disturbance=PUSH)
 
 
+@pytest.mark.full
 def test_every_operation_is_casadis_and_its_slopes_are_differences() -> None:
     """Each where it is smooth, at 50 points, in a body that adds them up; 2e-8 was found."""
     x, w = ca.SX.sym("x", 2), ca.SX.sym("w", 2)

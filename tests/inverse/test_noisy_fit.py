@@ -173,6 +173,7 @@ def test_every_column_of_the_search_equals_differences() -> None:
         )
 
 
+@pytest.mark.full
 def test_physical_parameters_are_found_with_the_gain() -> None:
     problem, work = seat_family()
     fitted = fit_controller(problem)

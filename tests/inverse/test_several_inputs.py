@@ -112,7 +112,7 @@ def test_reported_weights_reproduce_the_recording(path: str, m: int) -> None:
         pytest.param(2, 2, marks=pytest.mark.slow),
         pytest.param(2, 8, marks=pytest.mark.slow),
         pytest.param(3, 1, marks=pytest.mark.full),
-        (2, 96),
+        pytest.param(2, 96, marks=pytest.mark.full),
         (3, 70),
     ],
 )

@@ -21,7 +21,7 @@ import numpy as np
 import scipy.stats
 from statsmodels.regression.mixed_linear_model import MixedLM
 
-from impc.assess.identified_directions import holm
+from impc.assess.several_tests import holm
 from impc.checking import replace
 from impc.errors import DataError, one_line
 from impc.studies.cohort.told import only_told

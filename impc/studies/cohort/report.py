@@ -31,7 +31,8 @@ from impc.studies.cohort.figures import group_figure
 from impc.studies.cohort.study import safe_name
 from impc.studies.cohort.subject_page import kept_words, or_nan, subject_files
 from impc.studies.cohort.tables import cohort_tables, table_bytes
-from impc.studies.cohort.told import measure_words, not_told, not_told_sentences, only_told
+from impc.studies.cohort.told import not_told, not_told_sentences, only_told
+from impc.studies.cohort.words import measure_words
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -6,21 +6,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from impc.studies.cohort.words import measure_words
+
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     import pandas as pd
 
-_WORDS = {
-    "K": "gain of {1} to {0}",
-    "K_of_weights": "gain of the weights, {1} to {0}",
-    "vaf": "VAF of {0}",
-    "held_out_vaf": "VAF of {0}, left out",
-    "price": "price of {0}",
-    "centre_price": "price of {0}, analytic centre",
-    "largest_input": "largest {0}",
-    "log_price": "logarithm of the price of {0}",
-}
 
 # A deviation may be so many times the usual size of an entry. Small entries that are well told
 # stay: those of a gain whose truth is zero have a median size of 0.67 of their deviation. It is
@@ -71,9 +63,3 @@ def not_told_sentences(counts: Mapping[str, int], of: int) -> list[str]:
         "A gain whose standard deviation is more than twice its usual size is not told, and not "
         f"compared: of {of} units {each}."
     ]
-
-
-def measure_words(name: str) -> str:
-    """A column by its `name` in words: "K.command.theta1" is "gain of theta1 to command"."""
-    kind, *rest = name.split(".", 2 if name.startswith("K") else 1)
-    return _WORDS[kind].format(*rest) if kind in _WORDS and rest else name.replace("_", " ")

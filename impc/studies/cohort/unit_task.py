@@ -33,12 +33,12 @@ from impc.inverse.noisy_fit import fit_controller
 from impc.model.signal_units import price_unit
 from impc.reporting.rendering import plain
 from impc.reporting.shown_units import angles_in, shown_unit
-from impc.studies.charts import signal_words
 from impc.studies.cohort.unit_digest import require_same_inputs, unit_digest
 from impc.studies.cohort.unit_structure import unit_structure
 from impc.studies.fit.settings import fit_settings
 from impc.studies.fit.subject import fit_problem, state_sizes
 from impc.studies.fit.tables import number_units
+from impc.studies.signal_words import signal_words
 
 if TYPE_CHECKING:
     from impc.arrays import Array

@@ -23,9 +23,10 @@ from impc.reporting.document import (
 from impc.reporting.rendering import number
 from impc.reporting.shown_units import axis_label
 from impc.reporting.style import BLUE, DOUBLE_COLUMN, INK, drawn, journal_style, new_figure
-from impc.studies.charts import body_sentence, chart_figure, methods_chart, signal_words
+from impc.studies.charts import chart_figure, methods_chart
 from impc.studies.compare.csv_tables import compare_tables
 from impc.studies.methods_table import column_terms, methods_data, methods_table
+from impc.studies.signal_words import body_sentence, signal_words
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -26,7 +26,7 @@ from impc.reporting.document import (
     table_of,
 )
 from impc.reporting.rendering import number
-from impc.studies.charts import body_sentence, methods_chart, signal_words, weights_chart
+from impc.studies.charts import methods_chart, weights_chart
 from impc.studies.fit.csv_tables import fit_tables
 from impc.studies.fit.figures import fit_figures
 from impc.studies.fit.interval_figures import shown_statements
@@ -48,6 +48,7 @@ from impc.studies.fit.tables import (
 from impc.studies.fit.truth import truth_sentence, truth_table
 from impc.studies.fit.verdict import abstract, other_limit_sentence, verdict
 from impc.studies.methods_table import column_terms, methods_table
+from impc.studies.signal_words import body_sentence, signal_words
 
 if TYPE_CHECKING:
     from impc.arrays import Array

@@ -16,11 +16,11 @@ from impc.reporting.document import Lines, Picture, Report, Section, Terms, Text
 from impc.reporting.rendering import number
 from impc.reporting.shown_units import shown_unit
 from impc.reporting.style import drawn, journal_style
-from impc.studies.charts import signal_words
 from impc.studies.fit.tables import number_name
 from impc.studies.plan.figures import experiments_figure, prices_figure
 from impc.studies.plan.sentences import design_name, plan_sentences, told_as
 from impc.studies.plan.simulated_fits import spread
+from impc.studies.signal_words import signal_words
 
 if TYPE_CHECKING:
     from impc.reporting.provenance import Provenance

@@ -17,7 +17,7 @@ import scipy.stats
 from statsmodels.stats.anova import AnovaRM
 
 from impc.arrays import Array
-from impc.assess.identified_directions import holm
+from impc.assess.several_tests import holm
 from impc.errors import DataError
 
 if TYPE_CHECKING:
