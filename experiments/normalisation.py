@@ -14,12 +14,12 @@ from functools import cache
 import numpy as np
 
 import plants
+from experiments.protocols import critical_stiffness, torque_amplitude
 from impc.arrays import Array
 from impc.control.controller import Controller
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.weights import Weights
-from impc.studies.protocols import critical_stiffness, torque_amplitude
 from impc.studies.simulated_people import simulate_subject
 
 __all__ = ["subject_balances", "subject_peak"]

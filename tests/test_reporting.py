@@ -13,40 +13,38 @@ from typing import Any
 
 import matplotlib as mpl
 import numpy as np
+import pandas as pd
 import pytest
 from markupsafe import Markup
 
 from impc.checking import replace
 from impc.errors import OutputError
+from impc.inverse.methods import METHODS
 from impc.model.plant import Plant
 from impc.model.riccati import solve_lqr
 from impc.model.weights import Weights
 from impc.reporting.document import (
-    Chart,
     Details,
     Heading,
     Lines,
     Note,
-    Picture,
     Report,
     Section,
     Terms,
-    TextTable,
     Verdict,
     json_bytes,
 )
+from impc.reporting.finding import Chart, Finding, Picture, Severity
 from impc.reporting.provenance import Provenance
 from impc.reporting.style import journal_style
 from impc.reporting.writer import require_writable, write_files
-from impc.studies.example.cases import CASES, SETTINGS, CaseResult, run_case
+from impc.studies.example.cases import CASES, EXAMPLE, SETTINGS, CaseResult, run_case
 from impc.studies.example.figures import example_figures
-from impc.studies.example.report import example_data, example_report
-from impc.studies.example.table import (
-    METHODS,
-    determined_sentences,
-    methods_table,
-    significant,
-    table_rows,
+from impc.studies.example.report import (
+    example_data,
+    example_report,
+    methods_finding,
+    others_finding,
 )
 from plants import yalmip_example
 
@@ -84,28 +82,25 @@ def snapshot(folder: Path) -> dict[str, bytes]:
 
 
 def test_the_table_has_the_truth_and_every_method_in_order(case_a: CaseResult) -> None:
-    rows = table_rows(case_a)
-    assert [row.name for row in rows] == list(METHODS)
-    assert rows[0].weights == rows[-1].weights == "1.000 0.000 1.000 / 1"
-    by_name = {row.name: row for row in rows}
-    assert by_name["inverse_lqr_lmi"].weights == "infeasible"
-    assert by_name["feedback_gain"].kept == "no"
-    assert by_name["inverse_mpc"].kept == "yes"
-    assert "-0.000" not in methods_table(case_a).text()
+    finding = methods_finding(case_a)
+    assert finding.table is not None
+    table = finding.table.set_index("method")
+    assert list(table.index) == ["truth", *EXAMPLE]
+    np.testing.assert_allclose(table.loc["truth", ["Q11", "Q12", "Q22"]].astype(float), [1, 0, 1])
+    last = table.loc["inverse_mpc_reduced", ["Q11", "Q12", "Q22"]].astype(float)
+    np.testing.assert_allclose(last, [1, 0, 1], atol=1e-9)
+    kept = dict(table["kept"])
+    assert (kept["inverse_lqr_lmi"], kept["feedback_gain"], kept["inverse_mpc"]) == (
+        "infeasible", "no", "yes"
+    )  # fmt: skip
 
 
 def test_sentences_say_what_was_determined_and_what_was_chosen(case_a: CaseResult) -> None:
-    first, *others = determined_sentences(case_a.identifiability)
+    finding = others_finding(case_a)
+    (first,) = finding.sentences
     assert "determined 2 of the 3 free directions" in first
     assert "condition number chose 1" in first
-    assert len(others) == 2
-
-
-@pytest.mark.parametrize(
-    ("value", "text"), [(10.0, "10"), (9.99999999999, "10"), (0.23329, "0.233"), (2e-16, "2e-16")]
-)
-def test_significant(value: float, text: str) -> None:
-    assert significant(value) == text
+    assert len(finding.rows) == 2
 
 
 # result.json
@@ -194,9 +189,9 @@ def test_the_page_needs_nothing_else(page: str) -> None:
 def test_the_page_says_what_a_reader_must_know(page: str, case_a: CaseResult) -> None:
     assert "are lost" in page
     assert "determined 2 of the 3 free directions" in page
-    for row in table_rows(case_a):
-        assert f"<code>{row.name}</code>" in page
-        assert METHODS[row.name].label in page
+    for name in EXAMPLE:
+        assert f'<th scope="row">{name}</th>' in page
+        assert METHODS[name].label[1:] in page
     assert "casadi" in page
     assert "condition weight" in page
 
@@ -232,7 +227,13 @@ def every_block() -> Report:
         *lines,
         Lines(lines),
         Terms([(EVIL, lines)]),
-        TextTable(EVIL, (EVIL, "=1"), [(EVIL, "2"), ("=1+1", EVIL)]),
+        Finding(
+            "numbers",
+            pd.DataFrame([(EVIL, 0.1), ("=1+1", EVIL)], columns=["=a", "p_b"]),
+            EVIL,
+            [EVIL],
+            severity=Severity.RED,
+        ),
         Picture(EVIL, EVIL, EVIL),
         Chart(Picture(EVIL, EVIL, EVIL), {EVIL: f"</script>{EVIL}"}),
         Heading(EVIL),
@@ -243,7 +244,6 @@ def every_block() -> Report:
     return Report(
         EVIL, EVIL, blocks, [Section(EVIL, blocks, contents="In short"), Section("2", ())],
         figures={f"{EVIL}.png": b"png"},
-        tables={"numbers": TextTable("", ("=a", "b"), [("-x", 0.1)])},
         data={"a": np.array([1.0, np.nan])},
     )  # fmt: skip
 
@@ -294,20 +294,25 @@ def test_the_page_ends_with_the_words_that_it_uses() -> None:
 
 def test_a_report_is_its_files() -> None:
     files = every_block().files()
-    assert list(files) == ["report.html", "result.json", "numbers.csv", "tables.mat", "tables.xlsx",
+    assert list(files) == ["report.html", "result.json", "numbers.csv", "tables.xlsx",
                            f"{EVIL}.png"]  # fmt: skip
     found = json.loads(files["result.json"])
-    assert list(found) == ["schema", *every_block().provenance.data(), "a"]
+    assert list(found) == ["schema", *every_block().provenance.data(), "a", "findings"]
     assert found["a"] == [1.0, None]
-    assert files["numbers.csv"] == b"'=a,b\n'-x,0.1\n"
+    assert found["findings"]["numbers"] == {
+        "severity": "red", "sentences": [EVIL], "table": {"=a": [EVIL, "=1+1"], "p_b": [0.1, EVIL]}
+    }  # fmt: skip
+    assert b"\n'=1+1," in files["numbers.csv"]
 
 
 def test_columns_for_a_terminal() -> None:
-    table = TextTable("", ("method", "VAF", ""), [("a", "1.00", "falls"), ("longer", "-10.00", "")])
-    assert table.text().splitlines() == [
-        "method     VAF",
-        "a         1.00  falls",
-        "longer  -10.00",
+    table = pd.DataFrame(
+        [("a", 1.0, "falls"), ("longer", -10.0, "")], columns=["method", "VAF", "n"]
+    )
+    assert Finding("a", table).text().splitlines() == [
+        "method  VAF      n",
+        "a         1  falls",
+        "longer  -10",
     ]
 
 

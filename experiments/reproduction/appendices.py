@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 import plants
+from experiments.kronecker import kronecker_sensitivity
 from experiments.reproduction.entry import Entry, Verdict, agrees
 from experiments.selection_claims import FIM_SUBSET, mean_subject
 from impc.checking import replace
 from impc.studies.selection.estimation import estimate, free_indices
 from impc.studies.selection.fisher import fisher_information
 from impc.studies.selection.lasso import lasso_of_size
-from impc.studies.selection.linear import discretised, kronecker_sensitivity
+from impc.studies.selection.linear import discretised
 from impc.studies.selection.model import Trial, normalised, sensitivity
 from impc.studies.selection.subsets import exhaustive, largest_subsets
 
@@ -64,7 +65,7 @@ def _information(
         Entry(
             "(A.3)",
             "The gradient as a recursion with Kronecker products.",
-            ("impc.studies.selection.linear:kronecker_sensitivity",),
+            ("experiments.kronecker:kronecker_sensitivity",),
             f"Against the exact derivative: {kronecker:.0e}.",
             agrees(kronecker < 1e-8),
         ),

@@ -5,8 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 
 from experiments.reproduction.entry import Entry, Verdict, agrees, drawing, kind
+from experiments.reproduction.evidence import table
 from impc.studies.reliability.icc import icc
 from impc.studies.reliability.measures import band_energy
 from plants.ternary import ternary_sequence
@@ -37,8 +39,9 @@ def balance_entries(evidence: Evidence) -> list[Entry]:
 def _tables(result: dict[str, Any]) -> list[Entry]:
     energy = _sine_energy()
     published = [icc(_JUDGED, form).value for form in ("A,1", "A,k")]
-    rms, band = _range(result["icc"], "rms"), _range(result["icc"], "energy")
-    within, between = _range(result["cmc"], "within"), _range(result["cmc"], "between")
+    rms, band = (_range(table(result, f"icc-{name}")["icc"]) for name in ("rms", "energy"))
+    correlations = table(result, "cmc")
+    within, between = (_range(correlations[f"{name}_visits"]) for name in ("within", "between"))
     return [
         Entry(
             "(2.1)",
@@ -157,9 +160,9 @@ def _claims(result: dict[str, Any]) -> list[Entry]:
             else "Nothing in the simulated study makes it so: the same noise acts on both bodies,"
             " and a visit changes the subject by less than its trials differ. " + _STUDY,
         )
-        for item in result["findings"]
+        for item in result["dissertation"]
     ]
-    least = min(group["p"] for measure in result["anova"].values() for group in measure.values())
+    least = min(table(result, f"visits-{name}")["p"].min() for name in ("rms", "energy"))
     learnt = Entry(
         "Claim, 2.3",
         "Learning: RMS fell over visits with eyes open and with vibration, energy with vibration.",
@@ -174,7 +177,7 @@ def _claims(result: dict[str, Any]) -> list[Entry]:
     protocol = Entry(
         "Claim, 2.2.2",
         "Normalisation: twice the critical stiffness, and the greatest torque that is survived.",
-        ("impc.studies.protocols", "experiments.normalisation"),
+        ("experiments.protocols", "experiments.normalisation"),
         "`python -m experiments.normalisation` runs both on the simulated subject.",
         Verdict.IN_KIND,
         "Whether the last success or the first failure is the critical stiffness is not told; here"
@@ -192,12 +195,10 @@ def _claims(result: dict[str, Any]) -> list[Entry]:
 
 
 def _p_values(result: dict[str, Any], item: str, measure: str, quoted: str) -> Entry:
+    p = table(result, f"visits-{measure}").set_index(["output", "condition"])["p"]
     found = "; ".join(
         f"{condition} "
-        + " and ".join(
-            f"{result['anova'][f'{measure}.{output}'][condition]['p']:.2f}"
-            for output in ("theta1", "theta2")
-        )
+        + " and ".join(f"{p[output, condition]:.2f}" for output in ("theta1", "theta2"))
         for condition in ("EO", "EC", "VIB")
     )
     return Entry(
@@ -218,17 +219,5 @@ def _sine_energy() -> float:
     return float(band_energy(sine, 100.0, 0.5, 1.5)[0])
 
 
-def _range(table: dict[str, Any], name: str) -> tuple[float, float]:
-    values = [
-        item["value"] if isinstance(item, dict) else item
-        for key, group in _leaves(table, name)
-        for item in group.values()
-    ]
-    return min(values), max(values)
-
-
-def _leaves(table: dict[str, Any], name: str) -> list[tuple[str, dict[str, Any]]]:
-    """ICC: measure.output -> condition; CMC: within/between -> output -> condition."""
-    if name in table:
-        return list(table[name].items())
-    return [(key, group) for key, group in table.items() if key.startswith(f"{name}.")]
+def _range(values: pd.Series[Any]) -> tuple[float, float]:
+    return float(values.min()), float(values.max())

@@ -15,6 +15,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
+
 from experiments.selection_claims import bootstrap_widths, reduced_widths
 from impc.reporting.writer import write_files
 
@@ -64,6 +66,11 @@ def gather(folder: Path) -> Evidence:
         for name, line in commands.items()
     }
     return Evidence(**results, claims=_claims(folder / "claims.json"), folder=folder)
+
+
+def table(result: dict[str, Any], name: str) -> pd.DataFrame:
+    """The table of a finding of a `result`."""
+    return pd.DataFrame(result["findings"][name]["table"])
 
 
 def _claims(path: Path) -> dict[str, Any]:

@@ -8,6 +8,7 @@ import numpy as np
 
 import plants
 from experiments.reproduction.entry import Entry, Verdict, agrees, kind
+from experiments.reproduction.evidence import table
 from experiments.selection_claims import mean_subject
 from impc.studies.selection.fisher import fisher_information
 from impc.studies.selection.modern import with_doubled_ranges
@@ -31,8 +32,8 @@ def key_entries(evidence: Evidence) -> list[Entry]:
 
 
 def _key_equations(yaw: dict[str, Any]) -> list[Entry]:
-    least = min(item["icc"] for item in yaw["candidates"])
-    worst = max(item["variance"] for item in yaw["candidates"])
+    candidates = table(yaw, "candidates")
+    least, worst = candidates["least_icc"].min(), candidates["largest_variance"].max()
     return [
         Entry(
             "(5.1)",
@@ -138,7 +139,8 @@ def _key_tables(yaw: dict[str, Any], pitch: dict[str, Any]) -> list[Entry]:
 def _key_claims(yaw: dict[str, Any], pitch: dict[str, Any]) -> list[Entry]:
     both = {"Yaw": yaw, "Pitch": pitch}
     kept = {
-        name: [item for item in axis["candidates"] if item["kept"]] for name, axis in both.items()
+        name: table(axis, "candidates").query("kept").to_dict("records")
+        for name, axis in both.items()
     }
     shares = {name: _pathways(axis) for name, axis in both.items()}
     doubled = _doubled()
@@ -156,7 +158,7 @@ def _key_claims(yaw: dict[str, Any], pitch: dict[str, Any]) -> list[Entry]:
             "Feasible at ICC of .75: one in yaw (diversity 2), three in pitch (3, 2, 2).",
             ("impc.studies.selection.key_parameters:key_parameters",),
             "; ".join(
-                f"{name}: {len(items)} (diversity {', '.join(str(i['diversity']) for i in items)})"
+                f"{name}: {len(items)} (diversity {', '.join(str(i['pathways']) for i in items)})"
                 for name, items in kept.items()
             )
             + ".",
@@ -169,12 +171,12 @@ def _key_claims(yaw: dict[str, Any], pitch: dict[str, Any]) -> list[Entry]:
             "Mean VAF above 69 %.",
             ("impc.studies.selection.key_parameters:key_parameters",),
             "; ".join(
-                f"{name}: {min(i['vaf'] for i in items):.1f} to"
-                f" {max(i['vaf'] for i in items):.1f} %"
+                f"{name}: {min(i['mean_vaf_percent'] for i in items):.1f} to"
+                f" {max(i['mean_vaf_percent'] for i in items):.1f} %"
                 for name, items in kept.items()
             )
             + ".",
-            kind(all(item["vaf"] > 69 for items in kept.values() for item in items)),
+            kind(all(item["mean_vaf_percent"] > 69 for items in kept.values() for item in items)),
             _FORTY,
         ),
         Entry(
@@ -183,11 +185,11 @@ def _key_claims(yaw: dict[str, Any], pitch: dict[str, Any]) -> list[Entry]:
             ("impc.studies.selection.key_report:key_report",),
             "; ".join(
                 f"{name}: least ICC {_least(axis, 'chosen'):.2f} of the chosen,"
-                f" {_least(axis, 'nominal'):.2f} of all twelve"
+                f" {_least(axis, 'all'):.2f} of all twelve"
                 for name, axis in both.items()
             )
             + ".",
-            kind(all(_least(axis, "chosen") > _least(axis, "nominal") for axis in both.values())),
+            kind(all(_least(axis, "chosen") > _least(axis, "all") for axis in both.values())),
             _FORTY,
         ),
         Entry(
@@ -219,8 +221,8 @@ def _doubled() -> float:
 
 def _estimates(item: str, axis: str, result: dict[str, Any], quoted: str) -> Entry:
     told = "; ".join(
-        f"{name} {entry['value']:.2f} [{entry['low']:.2f}, {entry['high']:.2f}]"
-        for name, entry in result["icc"]["chosen"].items()
+        f"{row.parameter} {row.icc:.2f} [{row.icc_low:.2f}, {row.icc_high:.2f}]"
+        for row in table(result, "estimates").query("free == 'chosen'").itertuples()
     )
     return Entry(
         item,
@@ -233,8 +235,7 @@ def _estimates(item: str, axis: str, result: dict[str, Any], quoted: str) -> Ent
 
 
 def _least(axis: dict[str, Any], which: str) -> float:
-    values = [item["value"] for item in axis["icc"][which].values()]
-    return min(float(value) for value in values if value is not None)
+    return float(table(axis, "estimates").query("free == @which")["icc"].min())
 
 
 def _counts(axis: dict[str, Any]) -> str:

@@ -8,6 +8,7 @@ import numpy as np
 
 import plants
 from experiments.reproduction.entry import Entry, Verdict, agrees, kind
+from experiments.reproduction.evidence import table
 from experiments.selection_claims import FIM_SUBSET, mean_subject, nominal_information
 from impc.studies.selection.estimation import estimate, free_indices, pooled_vaf
 from impc.studies.selection.model import normalised, physical
@@ -87,7 +88,7 @@ def _tables(
     first = ", ".join(
         model.names[index] for index in largest_subsets([information.F], 0.05).subsets[0]
     )
-    sizes = [item["size"] for item in select["sweep"]]
+    sizes = list(table(select, "sweep")["size_all_at_once"])
     return [
         Entry(
             "Table 4.1",
@@ -180,7 +181,7 @@ def _claims(
     place = selection.subsets.index(free_indices(model, FIM_SUBSET)) + 1
     ratio = select["seconds"]["lasso"] / select["seconds"]["fim"]
     fim, lasso, common = select["selected"]["fim"], select["selected"]["lasso"], select["common"]
-    vafs, first = _mean_vafs(select), next(iter(select["intervals"].values()))
+    vafs, doubt = _mean_vafs(select), table(select, "doubt")
     return [
         Entry(
             "Claim, 4.3",
@@ -244,13 +245,13 @@ def _claims(
             ),
             "First subject: "
             + "; ".join(
-                f"{name} {item['low']:.3g} to {item['high']:.3g}" for name, item in first.items()
+                f"{row.parameter} {row.bootstrap_low:.3g} to {row.bootstrap_high:.3g}"
+                for row in doubt.itertuples()
             )
             + ". By profile likelihood: "
             + "; ".join(
-                f"{name} {ends[0]:.3g} to {ends[1]:.3g}"
-                for name, ends in select["profile"].items()
-                if None not in ends
+                f"{row.parameter} {row.profile_low:.3g} to {row.profile_high:.3g}"
+                for row in doubt.dropna().itertuples()
             )
             + ".",
             Verdict.REPRODUCED,

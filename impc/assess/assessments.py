@@ -28,20 +28,14 @@ class Assessment:
     """One function of a method's estimate and its simulation of all trials (docs/results.md)."""
 
     name: str  # In result.json and in the heads of CSV files
-    label: str  # Head of its column; `{}` stands for the signal's name and `{unit}` for its unit
     sentence: str  # For readers who do not know it
     # Plant -> names of what it has a number for, (k,): outputs, inputs, or `whole` for one number
     # of the method
     signals: Callable[[Plant], tuple[str, ...]]
     find: Callable[[MethodFit], Array]  # MethodFit -> the numbers (k,); NaN where there is none
-    digits: int = 3  # That are shown
-
-    def heads(self, plant: Plant) -> list[str]:
-        """Heads of its columns in a table for readers."""
-        return [self.label.format(name, unit=plant.unit(name)) for name in self.signals(plant)]
 
     def keys(self, plant: Plant) -> list[str]:
-        """Heads of its columns in a table for programs."""
+        """Heads of its columns in a table."""
         return [f"{self.name}_{name}".rstrip("_") for name in self.signals(plant)]
 
 
@@ -71,45 +65,37 @@ ASSESSMENTS: dict[str, Assessment] = {
     for item in (
         Assessment(
             "vaf",
-            "VAF {} %",
-            "Variance accounted for (3.24), over all trials.",
+            "Variance accounted for (3.24), over all trials, %.",
             lambda plant: plant.outputs,
             lambda fit: fit.vaf,
-            digits=5,
         ),
         Assessment(
             "held_out_vaf",
-            "left out {} %",
             "VAF of each trial predicted from the others, after the time that serves to find where "
-            "it starts; the mean over trials.",
+            "it starts; the mean over trials, %.",
             lambda plant: plant.outputs,
             _held_out,
-            digits=5,
         ),
         Assessment(
             "largest_input",
-            "largest {} ({unit})",
-            "Largest magnitude of the input.",
+            "Largest magnitude of the input, in its unit.",
             lambda plant: plant.controls,
             lambda fit: fit.largest_input,
         ),
         Assessment(
             "beyond_bound",
-            "beyond bound %",
-            "Share of the samples at which an input bound is exceeded.",
+            "Share of the samples at which an input bound is exceeded, %.",
             whole,
             lambda fit: np.array([np.nan if fit.estimate.K is None else 100 * fit.exceeded]),
         ),
         Assessment(
             "first_fall",
-            "falls, s",
-            "Time at which the first of the trials leaves every reasonable range.",
+            "Time at which the first of the trials leaves every reasonable range, s.",
             whole,
             _first_fall,
         ),
         Assessment(
             "condition_number",
-            "condition number",
             "Largest over smallest eigenvalue of blkdiag(Q, R), in the units of the plant.",
             whole,
             _condition,

@@ -43,7 +43,7 @@ def command(
     from impc.studies.effort import fit_effort  # noqa: PLC0415
     from impc.studies.fit.memory import open_memory  # noqa: PLC0415
     from impc.studies.fit.settings import require_used  # noqa: PLC0415
-    from impc.studies.methods_table import methods_table  # noqa: PLC0415
+    from impc.studies.methods_table import methods_finding  # noqa: PLC0415
 
     require_writable(out)
     subject = read_subject("compare", files, plant_name, config, solver)
@@ -60,5 +60,5 @@ def command(
         content = compare_report(problem, compared, subject.provenance).files()
     written = write_files(out, content)
     memory.forget()
-    click.echo(methods_table(compared).text())
+    click.echo(methods_finding(compared).text())
     print_files(out, written)

@@ -56,22 +56,18 @@ def command(case: str, out: Path, solver: str | None) -> None:
 
 
 def _run(plant: Plant, names: Sequence[str], solver: str) -> list[CaseResult]:
-    from impc.studies.example.cases import run_case  # noqa: PLC0415
-    from impc.studies.example.table import METHODS  # noqa: PLC0415
+    from impc.studies.example.cases import EXAMPLE, run_case  # noqa: PLC0415
 
-    total = len(names) * (len(METHODS) - 1)  # the truth is no method
-    with progress(total, "method") as step:
+    with progress(len(names) * len(EXAMPLE), "method") as step:
         return [run_case(plant, name, solver=solver, progress=step) for name in names]
 
 
 def _print_case(result: CaseResult) -> None:
-    from impc.studies.example.table import (  # noqa: PLC0415
-        determined_sentences,
-        methods_table,
-    )
+    from impc.studies.example.report import methods_finding, others_finding  # noqa: PLC0415
 
     start = ", ".join(f"{value:g}" for value in result.x0)
     click.echo(f"\nCase {result.name}: start at ({start}), {result.branch} branch of Table 3.1\n")
-    click.echo(methods_table(result).text() + "\n")
-    for line in determined_sentences(result.identifiability):
-        click.echo(line)
+    click.echo(methods_finding(result).text() + "\n")
+    others = others_finding(result)
+    click.echo(f"{others.sentences[0]} {others.caption}")
+    click.echo(others.text())

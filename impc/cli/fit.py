@@ -43,13 +43,13 @@ def command(
     from impc.studies.effort import fit_effort  # noqa: PLC0415
     from impc.studies.fit.memory import open_memory  # noqa: PLC0415
     from impc.studies.fit.report import fit_report  # noqa: PLC0415
-    from impc.studies.fit.sentences import missing  # noqa: PLC0415
     from impc.studies.fit.subject import (  # noqa: PLC0415
         FitProgress,
         fit_recordings,
         stages,
     )
     from impc.studies.fit.truth import read_truth, truth_sentence  # noqa: PLC0415
+    from impc.studies.fit.verdict import missing  # noqa: PLC0415
 
     require_writable(out)
     if fit_optimal(files, plant_name, config, out, solver):
@@ -83,13 +83,13 @@ def _print(result: FitResult) -> None:
     from impc.studies.fit.person import person_sentences  # noqa: PLC0415
     from impc.studies.fit.structure_words import structure_sentences  # noqa: PLC0415
     from impc.studies.fit.verdict import verdict  # noqa: PLC0415
-    from impc.studies.methods_table import methods_table  # noqa: PLC0415
+    from impc.studies.methods_table import methods_finding  # noqa: PLC0415
 
     told = (*structure_sentences(result), *person_sentences(result), *result.warnings)
     for line in dict.fromkeys((verdict(result), *told)):
         click.echo(line)
     plant = result.fitted.problem.plant
-    click.echo(methods_table(result.methods).text())
+    click.echo(methods_finding(result.methods).text())
     if result.held_out:
         for index, name in enumerate(plant.outputs):
             each = ", ".join(f"{item.vaf[index]:.2f}" for item in result.held_out)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
@@ -16,8 +16,11 @@ from impc.checking import checked
 from impc.errors import DataError
 from impc.files.writing import require_ordinary
 
+if TYPE_CHECKING:
+    import pandas as pd
+
 #: Of the files that are written now. Before the first one that has a number there were others.
-SCHEMA = 2
+SCHEMA = 3
 
 Matrix = list[list[float]]
 
@@ -52,6 +55,34 @@ class ResultFile(msgspec.Struct, frozen=True):
     # Of `impc fit`, `impc compare` and `impc.report`; empty for the other commands
     methods: dict[str, MethodRecord] = {}
     content: dict[str, Any] = {}  # All of the file, as JSON has it
+
+    def table(self, name: str) -> pd.DataFrame:
+        """The table of a finding of the page, by its `name`, which is also that of its CSV file.
+
+        Parameters
+        ----------
+        name : str
+            Such as "gain", of `impc fit`.
+
+        Returns
+        -------
+        pandas.DataFrame
+            Numbers in the units of the plant; NaN where there is none.
+
+        Raises
+        ------
+        DataError
+            When the result has no such table.
+        """
+        import pandas as pd  # noqa: PLC0415  # a third of a second
+
+        found = self.content.get("findings", {})
+        known = [key for key, item in found.items() if "table" in item]
+        if name not in known:
+            raise DataError(
+                "result", f"has no table {name!r}", f"choose from {', '.join(known) or 'none'}"
+            )
+        return pd.DataFrame(found[name]["table"])
 
 
 @checked

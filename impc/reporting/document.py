@@ -2,37 +2,25 @@
 
 Text is escaped when the page is made. Where a sentence holds a piece of code or a link it is a
 `markupsafe.Markup`, whose `format` escapes what is put into it.
-
-The tables of a result as one MATLAB file: a struct a table, a field a column (docs/results.md).
-
-Names follow MATLAB's rules: letters, digits and underscores, a letter first, 63 characters at most.
-Columns of numbers are column vectors, all others cell arrays of text.
 """
 
 from __future__ import annotations
 
 import base64
-import io
 import json
-import math
-import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
-import numpy as np
-import scipy.io
+import pandas as pd
 
 from impc.files.columns import in_columns
 from impc.files.results import SCHEMA
-from impc.files.workbook import MOST_ROWS, workbook_bytes
-from impc.reporting.csv_text import csv_bytes
+from impc.reporting.finding import MOST_CELLS, Chart, Finding, csv_bytes, workbook_bytes
+from impc.reporting.finding import Picture as Picture  # noqa: PLC0414
 from impc.reporting.glossary import Glossary, used_words
 from impc.reporting.provenance import Provenance
-from impc.reporting.rendering import plain, render_template
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+from impc.reporting.rendering import plain, render_page
 
 T = TypeVar("T")
 
@@ -45,10 +33,6 @@ class TextTable:
     heads: Sequence[str]  # One a column
     rows: Sequence[Sequence[Any]]  # Their first cell is a head of its own
 
-    def csv(self) -> bytes:
-        """As a file for spreadsheets, without the caption."""
-        return csv_bytes(self.heads, self.rows)
-
     def text(self) -> str:
         """In columns of a fixed width for a terminal, without the caption."""
         return in_columns([self.heads, *self.rows])
@@ -60,24 +44,6 @@ def table_of(
     """A table with a row for each of the `items`."""
     rows = [tuple(cell(item) for cell in columns.values()) for item in items]
     return TextTable(caption, tuple(columns), rows)
-
-
-@dataclass(frozen=True)
-class Picture:
-    """A figure of the report."""
-
-    name: str  # Of its PNG among the report's figures, without the ending
-    alternative: str  # In place of the picture for those who do not see it
-    caption: str  # Below it
-    narrow: bool = False  # Whether its words can be read at the width of a phone
-
-
-@dataclass(frozen=True)
-class Chart:
-    """A figure whose curves the page's script lets a reader move, zoom and switch on and off."""
-
-    picture: Picture  # What is seen without scripts, in print, and before a reader asks for more
-    data: Mapping[str, Any]  # The curves, as `impc.studies.charts` makes them
 
 
 @dataclass(frozen=True)
@@ -125,7 +91,9 @@ class Details:
 
 
 #: What a section is made of; a str is a paragraph.
-Block = str | TextTable | Picture | Chart | Lines | Terms | Heading | Note | Verdict | Details
+Block = (
+    str | Finding | TextTable | Picture | Chart | Lines | Terms | Heading | Note | Verdict | Details
+)
 
 
 @dataclass(frozen=True)
@@ -148,91 +116,63 @@ class Report:
     opening: Sequence[Block]  # Before the first section
     sections: Sequence[Section]
     figures: Mapping[str, bytes] = field(default_factory=dict)  # By the name of the file
-    # Written as CSV under these names, and together as tables.xlsx and tables.mat
+    # Written as CSV under these names, and together as tables.xlsx
     tables: Mapping[str, TextTable] = field(default_factory=dict)
-    # Content of result.json, beside what every one has (docs/results.md)
+    beside: Sequence[Finding] = ()  # Whose tables are written as files and stand on no page
+    # Content of result.json beside the findings and what every one has (docs/results.md)
     data: Mapping[str, Any] = field(default_factory=dict)
     provenance: Provenance = field(default_factory=Provenance)  # Where the result comes from
     # What the page is about, signals and parameters: with these its glossary begins
     words: Sequence[tuple[str, str]] = ()
-    template: str = "page.html"  # page.html, or one that extends it, by its path in this package
-    # What such a template names beside the report
-    values: Mapping[str, Any] = field(default_factory=dict)
 
     def page(self) -> str:
         """The page as one HTML text that needs no other file; it ends with its glossary."""
-        bare = render_template(self.template, report=self, glossary=Glossary(), **self.values)
+        bare = render_page(report=self, glossary=Glossary())
         found = Glossary((*self.words, *used_words(bare)))
-        return render_template(self.template, report=self, glossary=found, **self.values)
+        return render_page(report=self, glossary=found)
 
     def source(self, name: str) -> str:
         """The picture `name` as the address of an <img> that needs no other file."""
         return "data:image/png;base64," + base64.b64encode(self.figures[f"{name}.png"]).decode()
 
-    def _together(self) -> dict[str, bytes]:
-        """All tables in one file; a sheet of Excel holds so many rows and no more."""
-        if not self.tables:
-            return {}
-        sheets = {
-            name: (table.heads, table.rows)
+    def findings(self) -> list[Finding]:
+        """Those of the page, in the order in which they stand there."""
+        blocks = [*self.opening, *(item for section in self.sections for item in section.blocks)]
+        return _findings(blocks)
+
+    def _tables(self) -> dict[str, pd.DataFrame]:
+        found = [*self.findings(), *self.beside]
+        old = {
+            name: pd.DataFrame(list(table.rows), columns=list(table.heads))
             for name, table in self.tables.items()
-            if len(table.rows) < MOST_ROWS
         }
-        return {
-            "tables.mat": matlab_tables(self.tables),
-            **({"tables.xlsx": workbook_bytes(sheets)} if sheets else {}),
-        }
+        return {item.name: item.table for item in found if item.table is not None} | old
 
     def files(self) -> dict[str, bytes]:
         """Page, result.json, tables and figures by name."""
+        tables = self._tables()
+        sheets = {name: one for name, one in tables.items() if one.size <= MOST_CELLS}
+        found = {item.name: item.data() for item in self.findings()}
+        own = {"schema": SCHEMA, **self.provenance.data(), **self.data}
         return {
             "report.html": self.page().encode(),
-            "result.json": json_bytes({"schema": SCHEMA, **self.provenance.data(), **self.data}),
-            **{f"{name}.csv": table.csv() for name, table in self.tables.items()},
-            **self._together(),
+            "result.json": json_bytes({**own, "findings": found} if found else own),
+            **{f"{name}.csv": csv_bytes(table) for name, table in tables.items()},
+            **({"tables.xlsx": workbook_bytes(sheets)} if sheets else {}),
             **self.figures,
         }
+
+
+def _findings(blocks: Sequence[Block]) -> list[Finding]:
+    found: list[Finding] = []
+    for item in blocks:
+        if isinstance(item, Finding):
+            found.append(item)
+        elif isinstance(item, Details):
+            found += _findings(item.blocks)
+    return found
 
 
 def json_bytes(content: Mapping[str, Any]) -> bytes:
     """The `content` of result.json, UTF-8; what is not a number is null."""
     return (json.dumps(plain(content), indent=1, allow_nan=False) + "\n").encode()
-
-
-_LONGEST = 63
-
-
-def matlab_tables(tables: Mapping[str, TextTable]) -> bytes:
-    """The bytes of a .mat file of version 5."""
-    content = {}
-    for name, table in zip(_names(list(tables)), tables.values(), strict=True):
-        columns = list(zip(*table.rows, strict=True)) or [()] * len(table.heads)
-        fields = zip(_names(table.heads), columns, strict=True)
-        content[name] = {field: _column(values) for field, values in fields}
-    stream = io.BytesIO()
-    save: Any = scipy.io.savemat  # its stubs know paths only
-    save(stream, content, long_field_names=True, oned_as="column")
-    return stream.getvalue()
-
-
-def _names(given: Sequence[str]) -> list[str]:
-    """Names that MATLAB takes; what becomes the same is told apart by a number."""
-    found: list[str] = []
-    for text in given:
-        name = re.sub(r"\W", "_", text, flags=re.ASCII)
-        name = (name if re.match("[A-Za-z]", name) else f"x{name}")[:_LONGEST]
-        count = 1
-        while name in found:
-            count += 1
-            name = f"{name[: _LONGEST - 4]}_{count}"
-        found.append(name)
-    return found
-
-
-def _column(values: Sequence[Any]) -> Any:
-    numbers = [math.nan if value is None else value for value in values]
-    if all(isinstance(value, int | float) for value in numbers):
-        return np.array(numbers, dtype=np.float64)[:, None]
-    cells = np.empty((len(numbers), 1), dtype=object)
-    cells[:, 0] = [str(value) for value in values]
-    return cells

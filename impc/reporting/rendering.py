@@ -13,21 +13,16 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 
-def render_template(name: str, **values: Any) -> str:
-    """Render a template of this package; all `values` that enter it are escaped.
-
-    Templates of this folder go by their name, others by their path, such as
-    "studies/example/example_page.html".
-    """
-    here = Path(__file__).parent
+def render_page(**values: Any) -> str:
+    """Render page.html; all `values` that enter it are escaped."""
     environment = Environment(
-        loader=FileSystemLoader([here, here.parent]),
+        loader=FileSystemLoader(Path(__file__).parent),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    return _encodable(environment.get_template(name).render(script=_script(), **values))
+    return _encodable(environment.get_template("page.html").render(script=_script(), **values))
 
 
 @functools.cache

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pandas as pd
 from markupsafe import Markup
 
 from impc.assess.judged import judge
@@ -19,37 +20,25 @@ from impc.errors import InputError
 from impc.inverse.estimates import Estimate
 from impc.inverse.methods import METHODS
 from impc.inverse.optimal_control_fit import OptimalControlEstimate
-from impc.reporting.document import (
-    Block,
-    Chart,
-    Lines,
-    Picture,
-    Report,
-    Section,
-    TextTable,
-    Verdict,
-)
+from impc.model.signal_units import gain_unit
+from impc.reporting.document import Block, Lines, Report, Section, Verdict
+from impc.reporting.finding import Chart, Finding, Picture
 from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import number
-from impc.reporting.shown_units import axis_label, shown_unit
-from impc.reporting.style import BLUE, DOUBLE_COLUMN, INK, drawn, journal_style, new_figure
+from impc.reporting.style import drawn, journal_style
 from impc.reporting.writer import owned, write_files
-from impc.studies.charts import methods_chart
-from impc.studies.methods_table import column_terms, methods_data, methods_table
+from impc.studies.charts import chart_figure, methods_chart
+from impc.studies.methods_table import column_terms, methods_data, methods_finding, weight_entries
 from impc.studies.optimal_fit.report import optimal_report
 from impc.studies.optimal_fit.result import OptimalFit
 from impc.studies.signal_words import body_sentence, signal_words
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from impc.assess.judged import MethodFit
 
 _CALLER = "of the program that called impc.report"
 # Trials that are drawn, the first ones.
 _DRAWN = 6
-# Of the largest entry of a matrix: below it stands the rounding of a search.
-_ROUNDING = 1e-12
 
 
 @checked
@@ -111,21 +100,19 @@ def _document(fit: MethodFit) -> Report:
     provenance = Provenance(_CALLER)
     with journal_style():
         shown = range(min(len(fit.runs), _DRAWN))
-        figures = drawn({f"trial-{index + 1}": _trajectories(fit, index) for index in shown})
+        charts = [methods_chart(estimate.problem, [fit], index) for index in shown]
+        figures = drawn({f"trial-{k + 1}": chart_figure(one, 2) for k, one in enumerate(charts)})
     pictures = [
         Picture(
             f"trial-{index + 1}",
             f"Outputs and inputs of trial {index + 1}: recorded, and as {method.label} has them",
-            f"Trial {index + 1}. Grey: recorded. Blue: simulated. Dotted: bounds.",
+            f"Trial {index + 1}. Grey: recorded. In colour: simulated. Dotted: bounds.",
         )
         for index in shown
     ]
     shown_blocks: list[Block] = list(pictures)
     if pictures:
-        shown_blocks[0] = Chart(pictures[0], methods_chart(estimate.problem, [fit], 0))
-    tables = {"gain": _gain(estimate), "vaf": _vaf(fit)}
-    if estimate.weights is not None:
-        tables["weights"] = _weights(estimate)
+        shown_blocks[0] = Chart(pictures[0], charts[0])
     return Report(
         f"impc: {method.label}",
         f"Estimate: {method.label}",
@@ -133,12 +120,10 @@ def _document(fit: MethodFit) -> Report:
         [
             Section(
                 "1. Recorded and simulated",
-                (methods_table([fit]), column_terms(), tables["vaf"], *shown_blocks),
+                (methods_finding([fit]), column_terms(), _vaf(fit), *shown_blocks),
                 together=True,
             ),
-            Section(
-                "2. Controller", [tables[name] for name in ("gain", "weights") if name in tables]
-            ),
+            Section("2. Controller", [_gain(estimate), *_weights(estimate)]),
             Section(
                 "3. Versions",
                 (
@@ -149,7 +134,6 @@ def _document(fit: MethodFit) -> Report:
             ),
         ],
         figures=figures,
-        tables=tables,
         data={
             "methods": methods_data([fit]),
             "states": estimate.problem.plant.states,
@@ -190,59 +174,32 @@ def _findings(fit: MethodFit) -> list[str]:
     return lines
 
 
-def _gain(estimate: Estimate) -> TextTable:
+def _gain(estimate: Estimate) -> Finding:
     plant = estimate.problem.plant
     rows = [
-        (name, *(number(float(value), 6) for value in row))
-        for name, row in zip(plant.controls, estimate.gain, strict=True)
+        (control, state, gain_unit(plant, control, state), float(value))
+        for control, row in zip(plant.controls, estimate.gain, strict=True)
+        for state, value in zip(plant.states, row, strict=True)
     ]
-    return TextTable("Gain K of u = -Kx, in SI units.", ("input", *plant.states), rows)
+    table = pd.DataFrame(rows, columns=["input", "state", "unit", "value"])
+    return Finding("gain", table, "Gain K of u = -Kx.", digits=6)
 
 
-def _weights(estimate: Estimate) -> TextTable:
-    plant, weights = estimate.problem.plant, estimate.stage_weights
-    rows = [
-        (f"{which} {name}", *(number(float(value), 6) for value in row))
-        for which, names, matrix in (
-            ("Q", plant.states, weights.Q),
-            ("R", plant.controls, weights.R),
-        )
-        for name, row in zip(names, matrix, strict=True)
-    ]
-    rows = [row + ("",) * (plant.n + 1 - len(row)) for row in rows]
-    heads = ("", *(str(index + 1) for index in range(max(plant.n, plant.m))))
-    return TextTable("Weights, scaled to R[0, 0] = 1.", heads, [row[: len(heads)] for row in rows])
+def _weights(estimate: Estimate) -> list[Finding]:
+    if estimate.weights is None:
+        return []
+    entries = weight_entries(estimate.problem.plant, estimate.stage_weights)
+    table = pd.DataFrame(entries, columns=["matrix", "first", "second", "unit", "value"])
+    return [Finding("weights", table, "Weights, scaled to R = 1 of the first input.", digits=6)]
 
 
-def _vaf(fit: MethodFit) -> TextTable:
+def _vaf(fit: MethodFit) -> Finding:
     outputs = fit.estimate.problem.plant.outputs
-    rows = [("all", *(number(float(value), 5) for value in fit.vaf))]
-    for index, values in enumerate(fit.trial_vaf):
-        rows.append((str(index + 1), *(number(float(value), 5) for value in values)))
-    return TextTable(
-        "Variance accounted for (3.24), %.", ("trial", *(f"VAF {name} %" for name in outputs)), rows
-    )
-
-
-def _trajectories(fit: MethodFit, index: int) -> Figure:
-    problem, run = fit.estimate.problem, fit.runs[index]
-    plant, trial = problem.plant, problem.recordings[index]
-    time = np.arange(trial.samples) * plant.dt
-    count = len(plant.outputs) + plant.m
-    figure = new_figure(DOUBLE_COLUMN, 0.5 + 1.2 * count)
-    axes = figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0]
-    simulated = run.x @ plant.C.T
-    for place, name in enumerate(plant.outputs):
-        factor, unit = shown_unit(plant, name)
-        axes[place].plot(time, factor * trial.outputs[:, place], color="#BBBBBB", linewidth=3.5)
-        axes[place].plot(time, factor * simulated[:, place], color=BLUE, linewidth=1.0)
-        axes[place].set_ylabel(f"{name} ({unit})")
-    for place, name in enumerate(plant.controls):
-        ax = axes[len(plant.outputs) + place]
-        ax.plot(time[:-1], run.u[:, place], color=BLUE, linewidth=1.0)
-        for limit in (problem.bounds.u_min[place], problem.bounds.u_max[place]):
-            if np.isfinite(limit):
-                ax.axhline(float(limit), color=INK, linestyle=":", linewidth=1.0)
-        ax.set_ylabel(axis_label(plant, name))
-    axes[-1].set_xlabel("time (s)")
-    return figure
+    trials = [("all", fit.vaf), *((str(k + 1), vaf) for k, vaf in enumerate(fit.trial_vaf))]
+    rows = [
+        (trial, name, float(value))
+        for trial, values in trials
+        for name, value in zip(outputs, values, strict=True)
+    ]
+    table = pd.DataFrame(rows, columns=["trial", "output", "vaf_percent"])
+    return Finding("vaf", table, "Variance accounted for (3.24).", digits=5)

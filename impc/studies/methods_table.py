@@ -1,60 +1,45 @@
-"""Methods beside each other: one table for readers, one for programs, and result.json.
+"""Methods beside each other: a table, and result.json.
 
 The columns are those of `impc.assess.assessments`, whichever command asks (docs/results.md).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 
-from impc.arrays import Array, Frozen
 from impc.assess.assessments import ASSESSMENTS, assessed
 from impc.inverse.methods import METHODS
 from impc.model.signal_units import price_unit
-from impc.reporting.document import Terms, TextTable
-from impc.reporting.rendering import number
+from impc.reporting.document import Terms
+from impc.reporting.finding import Finding
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from impc.arrays import Array
     from impc.assess.judged import MethodFit
     from impc.control.simulation import Simulation
     from impc.model.plant import Plant
     from impc.model.weights import Weights
 
 
-@dataclass(frozen=True)
-class _Column(Frozen):
-    label: str
-    key: str
-    values: Array
-    digits: int
-
-
-def methods_table(fits: Sequence[MethodFit]) -> TextTable:
-    """What methods reach on the same recordings, for readers; no column without a number."""
-    columns = [column for column in _columns(fits) if not np.all(np.isnan(column.values))]
-    noted = any(fit.estimate.reason for fit in fits)
-    rows = []
-    for row, fit in enumerate(fits):
-        cells = [number(float(column.values[row]), column.digits) for column in columns]
-        note = [fit.estimate.reason] * noted
-        rows.append((METHODS[fit.name].label, *cells, f"{fit.estimate.seconds:.2f}", *note))
-    heads = ["method", *(column.label for column in columns), "seconds", *(["note"] * noted)]
-    return TextTable("Every method on the same recordings, all trials at once.", heads, rows)
-
-
-def methods_numbers(fits: Sequence[MethodFit]) -> TextTable:
-    """The same with every digit, for programs."""
-    columns, rows = _columns(fits), []
-    for row, fit in enumerate(fits):
-        cells = [float(column.values[row]) for column in columns]
-        rows.append((fit.name, *cells, fit.estimate.seconds, fit.estimate.reason))
-    heads = ["method", *(column.key for column in columns), "seconds", "reason"]
-    return TextTable("", heads, rows)
+def methods_finding(fits: Sequence[MethodFit]) -> Finding:
+    """What methods reach on the same recordings; no column without a number."""
+    plant, rows = fits[0].estimate.problem.plant, []
+    for fit in fits:
+        row: dict[str, Any] = {"method": METHODS[fit.name].label}
+        for item in ASSESSMENTS.values():
+            row |= dict(zip(item.keys(plant), map(float, item.find(fit)), strict=True))
+        ended = {"seconds": fit.estimate.seconds, "name": fit.name, "note": fit.estimate.reason}
+        rows.append(row | ended)
+    table = pd.DataFrame(rows).dropna(axis="columns", how="all")
+    if not any(table["note"]):
+        table = table.drop(columns="note")
+    caption = "Every method on the same recordings, all trials at once."
+    return Finding("methods", table, caption)
 
 
 def methods_data(fits: Sequence[MethodFit]) -> dict[str, Any]:
@@ -64,25 +49,7 @@ def methods_data(fits: Sequence[MethodFit]) -> dict[str, Any]:
 
 def column_terms() -> Terms:
     """What each column says, in a sentence."""
-    heads = [
-        item.label.format("", unit="").replace("()", "").strip() for item in ASSESSMENTS.values()
-    ]
-    sentences = [(item.sentence,) for item in ASSESSMENTS.values()]
-    return Terms(list(zip(heads, sentences, strict=True)))
-
-
-def _columns(fits: Sequence[MethodFit]) -> list[_Column]:
-    plant = fits[0].estimate.problem.plant
-    return [
-        _Column(label, key, values, item.digits)
-        for item in ASSESSMENTS.values()
-        for label, key, values in zip(
-            item.heads(plant),
-            item.keys(plant),
-            np.array([item.find(fit) for fit in fits]).T,
-            strict=True,
-        )
-    ]
+    return Terms([(key.replace("_", " "), (item.sentence,)) for key, item in ASSESSMENTS.items()])
 
 
 def _data(fit: MethodFit) -> dict[str, Any]:

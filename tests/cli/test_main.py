@@ -16,8 +16,8 @@ from impc.cli.main import main
 from impc.control.named_solver import SOLVERS
 from impc.errors import SolverError
 from impc.model.plant import Plant
-from impc.studies.example.cases import run_case
-from impc.studies.example.table import METHODS, determined_sentences
+from impc.studies.example.cases import EXAMPLE, run_case
+from impc.studies.example.report import others_finding
 
 ROOT = Path(__file__).parents[2]
 
@@ -53,10 +53,10 @@ def test_example_prints_the_table_and_what_was_determined(
     printed = case_b[0].stdout
     assert "are lost" in printed
     assert "LMI branch" in printed
-    for name in METHODS:
+    for name in ("truth", *EXAMPLE):
         assert f"\n{name} " in printed
-    found = run_case(example_plant, "B").identifiability
-    assert determined_sentences(found)[0].split("(Sing")[0] in printed
+    found = others_finding(run_case(example_plant, "B"))
+    assert found.sentences[0].split("(Sing")[0] in printed
 
 
 def test_result_json_is_the_run(case_b: tuple[Result, Path], example_plant: Plant) -> None:

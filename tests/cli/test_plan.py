@@ -69,10 +69,11 @@ def test_the_page_the_table_and_the_numbers_say_the_same(folder: Path) -> None:
     page = (folder / "out" / "report.html").read_text(encoding="utf-8")
     assert table["amplitude"].tolist() == [2, 4]
     assert found["best"] == {"amplitude": 4, "dwell": 0.25}
-    for row, one in zip(found["experiments"], table.to_dict("records"), strict=True):
-        assert row["theta1 deviation"] == pytest.approx(one["theta1 deviation"])
-    # Twice the torque in a body that nothing stops: half the deviation.
-    assert table["theta1 deviation"][1] == pytest.approx(table["theta1 deviation"][0] / 2, rel=1e-6)
+    errors = table["theta1_standard_error"]
+    kept = found["findings"]["experiments"]["table"]["theta1_standard_error"]
+    assert kept == pytest.approx(list(errors))
+    # Twice the torque in a body that nothing stops: half the standard error.
+    assert errors[1] == pytest.approx(errors[0] / 2, rel=1e-6)
     text = html.unescape(re.sub("<[^>]*>", "", page))  # words link to what they mean
     for sentence in found["sentences"]:
         assert sentence in text
@@ -85,11 +86,11 @@ def test_an_interval_without_an_upper_end_is_infinite_not_a_large_number(tmp_pat
     done = planned(tmp_path, PLAN.replace("0.05 deg", "100000 deg").replace("[2, 4]", "[2]"))
     assert done.exit_code == 0, done.output
     assert "says next to nothing of theta1" in done.output
-    (found,) = json.loads((tmp_path / "out" / "result.json").read_text("utf-8"))["experiments"]
+    found = json.loads((tmp_path / "out" / "result.json").read_text("utf-8"))["findings"]
     (row,) = pd.read_csv(tmp_path / "out" / "experiments.csv").to_dict("records")
-    assert found["theta1 high"] is None
-    assert row["theta1 low"] == 0
-    assert row["theta1 high"] == np.inf
+    assert found["experiments"]["table"]["theta1_high"] == [None]
+    assert row["theta1_low"] == 0
+    assert row["theta1_high"] == np.inf
 
 
 def test_a_perturbation_from_a_file_is_scaled(folder: Path) -> None:
@@ -106,8 +107,9 @@ def test_a_perturbation_from_a_file_is_scaled(folder: Path) -> None:
     assert done.exit_code == 0, done.output
     assert "the recorded perturbation times 2" in done.output
     found = json.loads((folder / "file" / "result.json").read_text(encoding="utf-8"))
-    assert [row["amplitude"] for row in found["experiments"]] == [1, 2]
-    assert found["experiments"][0]["dwell"] is None
+    table = found["findings"]["experiments"]["table"]
+    assert table["amplitude"] == [1, 2]
+    assert table["dwell"] == [None, None]
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ import shutil
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from click.testing import CliRunner, Result
 
@@ -65,17 +66,17 @@ def test_icc_is_that_of_the_recordings(study: Path, analysed: tuple[Result, Path
             scores = [np.sqrt(np.mean(item.outputs[:, 0] ** 2)) for item in trials]
             table[int(unit.subject) - 1, int(unit.visit) - 1] = np.mean(scores)
     expected = icc(table, "A,k", method="generalised")
-    told = found["icc"]["rms.theta1"]["EC"]
-    assert told["form"] == "A,k"
-    for key in ("value", "low", "high"):
-        assert told[key] == pytest.approx(getattr(expected, key))
+    shown = pd.DataFrame(found["findings"]["icc-rms"]["table"])
+    told = shown.query("output == 'theta1' and condition == 'EC'").iloc[0]
+    for key, name in (("icc", "value"), ("low", "low"), ("high", "high")):
+        assert told[key] == pytest.approx(getattr(expected, name))
     # The error of a single visit, not of the mean over visits that ICC(A,k) is of.
     complete = table[np.all(np.isfinite(table), axis=1)]
-    within = np.sqrt(np.mean(np.var(complete, axis=1, ddof=1)))
+    within = np.rad2deg(1) * np.sqrt(np.mean(np.var(complete, axis=1, ddof=1)))
     assert told["sem"] == pytest.approx(within)
     assert told["mdc"] > 1.96 * np.sqrt(2) * within
-    assert set(found["cmc"]) == {"within", "between"}
-    assert 0 <= found["anova"]["rms.theta1"]["EO"]["p"] <= 1
+    assert {"within_visits", "between_visits"} <= set(found["findings"]["cmc"]["table"])
+    assert all(0 <= p <= 1 for p in found["findings"]["visits-rms"]["table"]["p"])
 
 
 @pytest.mark.usefixtures("blank_figures")
@@ -167,7 +168,8 @@ def test_a_condition_without_trials(study: Path, tmp_path: Path) -> None:
     done = run("reliability", str(folder / "study.toml"), "--out", str(tmp_path / "o"))
     assert done.exit_code == 0, done.stderr
     found = json.loads((tmp_path / "o" / "result.json").read_text())
-    assert set(found["icc"]["rms.theta1"]) == {"EO", "EC"}
+    shown = pd.DataFrame(found["findings"]["icc-rms"]["table"])
+    assert set(shown.dropna(subset=["icc"])["condition"]) == {"EO", "EC"}
 
 
 def test_an_empty_passband_is_one_line(study: Path, tmp_path: Path) -> None:

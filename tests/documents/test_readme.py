@@ -6,7 +6,7 @@ import pytest
 
 from impc.model.plant import Plant
 from impc.studies.example.cases import run_case
-from impc.studies.example.table import methods_table
+from impc.studies.example.report import methods_finding
 from tests.documents.blocks import PAGES, blocks
 
 README = PAGES["README.md"].read_text(encoding="utf-8")
@@ -30,7 +30,7 @@ def test_the_first_lines_are_the_two_commands() -> None:
 def test_the_table_is_what_comes_out(example_plant: Plant) -> None:
     texts = (block.text for block in blocks("README.md") if block.language == "text")
     shown = next(text for text in texts if "feedback_gain" in text)
-    found = methods_table(run_case(example_plant, "A")).text()
+    found = methods_finding(run_case(example_plant, "A")).text()
     shown_rows, found_rows = shown.splitlines(), found.splitlines()
     assert len(shown_rows) == len(found_rows)
     assert shown_rows[0].split() == found_rows[0].split()

@@ -144,8 +144,11 @@ def _plan(folder: Path) -> Numbers:
     (folder / "plan.toml").write_text(PLAN, encoding="utf-8")
     found = _typed(folder, "plan", str(folder / "plan.toml"), "--plant", "seated-balance")
     table = pd.read_csv(folder / "out/experiments.csv")
-    deviations = [name for name in map(str, table.columns) if name.endswith("deviation")]
-    return {"best": found["best"], **{name: _exact(table[name]) for name in deviations}}
+    ending = "_standard_error"
+    errors = [name for name in map(str, table.columns) if name.endswith(ending)]
+    return {"best": found["best"]} | {
+        f"{name.removesuffix(ending)} deviation": _exact(table[name]) for name in errors
+    }
 
 
 def _reliability(folder: Path) -> Numbers:
@@ -154,23 +157,24 @@ def _reliability(folder: Path) -> Numbers:
         "--trials", "2",
     ])  # fmt: skip
     assert made.exit_code == 0, made.output
-    found = _typed(folder, "reliability", str(folder / "study.toml"))
-    numbers = {"anova": ("F", "p"), "icc": ("value", "low", "high", "sem")}
-    return {
-        f"{table} {measure}": _exact([[one[key] for key in keys] for one in conditions.values()])
-        for table, keys in numbers.items()
-        for measure, conditions in found[table].items()
-    }
+    _typed(folder, "reliability", str(folder / "study.toml"))
+    found: Numbers = {}
+    for measure, unit in (("rms", np.deg2rad(1)), ("energy", np.deg2rad(1) ** 2)):
+        scores = pd.read_csv(folder / f"out/icc-{measure}.csv")
+        scores["sem"] *= unit
+        visits = pd.read_csv(folder / f"out/visits-{measure}.csv")
+        for output, rows in visits.groupby("output"):
+            found[f"anova {measure}.{output}"] = _exact(rows[["F", "p"]])
+        for output, rows in scores.groupby("output"):
+            found[f"icc {measure}.{output}"] = _exact(rows[["icc", "low", "high", "sem"]])
+    return found
 
 
 def _selection(folder: Path) -> Numbers:
     study = blood_study(folder, 3, 1)
     found = _typed(folder, "select", str(study), *MINE, "--workers", "1")
-    intervals = [
-        [one[end] for end in ("value", "low", "high")]
-        for subject in found["intervals"].values()
-        for one in subject.values()
-    ]
+    table = pd.read_csv(folder / "out/intervals.csv")
+    intervals = table.sort_values("subject", kind="stable")[["value", "low", "high"]].to_numpy()
     widths = np.ptp(intervals, axis=1, keepdims=True)
     return {
         "selected": found["selected"],

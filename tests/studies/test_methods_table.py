@@ -21,13 +21,13 @@ from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.weights import Weights
 from impc.reporting.document import json_bytes
+from impc.reporting.finding import csv_bytes
 from impc.studies.fit.settings import FitSettings
 from impc.studies.fit.subject import fit_problem
 from impc.studies.methods_table import (
     column_terms,
     methods_data,
-    methods_numbers,
-    methods_table,
+    methods_finding,
     until_its_end,
 )
 
@@ -42,25 +42,26 @@ def fits() -> list[MethodFit]:
 
 
 def test_the_three_say_the_same(fits: list[MethodFit]) -> None:
-    table = methods_table(fits)
-    numbers = list(csv.DictReader(io.StringIO(methods_numbers(fits).csv().decode())))
+    finding = methods_finding(fits)
+    assert finding.table is not None
+    numbers = list(csv.DictReader(io.StringIO(csv_bytes(finding.table).decode())))
     data = json.loads(json_bytes(methods_data(fits)))
-    assert list(data) == ["feedback_gain", "inverse_kkt"] == [row["method"] for row in numbers]
+    assert list(data) == ["feedback_gain", "inverse_kkt"] == [row["name"] for row in numbers]
     output = fits[0].estimate.problem.plant.outputs[0]
     share = data["feedback_gain"]["vaf"][output]
     assert float(numbers[0][f"vaf_{output}"]) == share
-    assert table.rows[0][1] == f"{share:.5g}"
-    assert table.rows[0][0] == METHODS["feedback_gain"].label
+    assert finding.rows[0][1] == f"{share:.4g}"
+    assert finding.rows[0][0] == METHODS["feedback_gain"].label
     assert (numbers[1][f"vaf_{output}"], data["inverse_kkt"]["vaf"]) == ("", {output: None})
-    assert table.rows[1][-1] == numbers[1]["reason"] == "it was not tried"
+    assert finding.rows[1][-1] == numbers[1]["note"] == "it was not tried"
 
 
 def test_columns_without_a_number_are_not_shown(fits: list[MethodFit]) -> None:
     output = fits[0].estimate.problem.plant.outputs[0]
-    assert f"left out {output} %" not in methods_table(fits).heads
+    assert f"held out vaf {output}" not in methods_finding(fits).heads
     left = [replace(fits[0], held_out=np.array([[50.0], [60.0]]))]
-    table = methods_table(left)
-    assert table.rows[0][table.heads.index(f"left out {output} %")] == "55"
+    table = methods_finding(left)
+    assert table.rows[0][table.heads.index(f"held out vaf {output}")] == "55"
     assert "note" not in table.heads
 
 
@@ -68,12 +69,12 @@ def test_an_assessment_more_is_a_column_more(
     fits: list[MethodFit], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     count = Assessment(
-        "trials", "trials", "That were simulated.", lambda _: ("",),
+        "trials", "That were simulated.", lambda _: ("",),
         lambda fit: np.array([float(len(fit.runs)) if fit.runs else np.nan]),
     )  # fmt: skip
     monkeypatch.setitem(ASSESSMENTS, "trials", count)
-    assert methods_table(fits).rows[0][methods_table(fits).heads.index("trials")] == "1"
-    assert methods_numbers(fits).heads[-3] == "trials"
+    found = methods_finding(fits)
+    assert found.rows[0][found.heads.index("trials")] == "1"
     assert methods_data(fits)["feedback_gain"]["trials"] == 1
     assert ("trials", ("That were simulated.",)) in column_terms().terms
 

@@ -1,7 +1,4 @@
-"""Tables, page and figures of a cohort, made from its folder.
-
-What the columns of units.csv are, in words: for the pages of a cohort (docs/cohorts.md).
-"""
+"""Tables, page and figures of a cohort, made from its folder."""
 
 from __future__ import annotations
 
@@ -13,24 +10,16 @@ from markupsafe import Markup
 
 from impc.errors import DataError
 from impc.files.checks import FELL
-from impc.reporting.document import (
-    Block,
-    Lines,
-    Picture,
-    Report,
-    Section,
-    TextTable,
-    Verdict,
-)
+from impc.reporting.document import Block, Lines, Report, Section, Verdict
+from impc.reporting.finding import Finding, Picture, table_of
 from impc.reporting.provenance import Provenance
-from impc.reporting.rendering import number
 from impc.reporting.style import drawn, journal_style
 from impc.reporting.writer import write_files
 from impc.studies.cohort.comparison import compare_cohort, measures_of
 from impc.studies.cohort.figures import group_figure
 from impc.studies.cohort.study import safe_name
-from impc.studies.cohort.subject_page import kept_words, or_nan, subject_files
-from impc.studies.cohort.tables import cohort_tables, table_bytes
+from impc.studies.cohort.subject_page import kept_words, subject_files
+from impc.studies.cohort.tables import cohort_tables
 from impc.studies.cohort.told import not_told, not_told_sentences, only_told
 from impc.studies.cohort.words import measure_words
 
@@ -43,11 +32,11 @@ if TYPE_CHECKING:
     from impc.studies.cohort.study import Study, Unit
 
 _QUESTIONS = {
-    "group": ("Between groups", "Hedges' g"),
-    "visit": ("Between visits", "d_z"),
-    "change": ("Do groups change differently from visit to visit?", "Hedges' g"),
-    "mixed": ("Between groups, over all visits: mixed model of the prices", ""),
-    "reliability": ("Reliability between visits, ICC(A,1)", ""),
+    "group": "between groups",
+    "visit": "between visits",
+    "change": "change from visit to visit",
+    "mixed": "between groups, over all visits (mixed model of the prices)",
+    "reliability": "reliability between visits",
 }
 _WITHIN = "those of the structure, compared in their logarithms"
 _CENTRE = (
@@ -70,7 +59,6 @@ def write_report(study: Study, store: Store, failures: Failures, command: str) -
         compared = compare_cohort(units)
     except DataError:
         compared = ()
-    rows = [item.__dict__ for item in compared]
     subjects: dict[str, list[Unit]] = {}
     for unit in study.units:
         subjects.setdefault(unit.subject, []).append(unit)
@@ -110,12 +98,10 @@ def write_report(study: Study, store: Store, failures: Failures, command: str) -
             "failed_replicates": failures.replicates,
             "digests": store.digests,
             "not_told": left_out,
-            "comparisons": rows,
         },
+        beside=[Finding(name, table) for name, table in tables.items()],
     )
-    tables["comparisons"] = pd.DataFrame(rows)
-    numbers = {f"{name}.csv": table_bytes(table) for name, table in tables.items()}
-    write_files(store.folder, numbers | report.files())
+    write_files(store.folder, report.files())
 
 
 def _comparisons(
@@ -128,7 +114,7 @@ def _comparisons(
     ]
     if "groups.png" in figures:
         blocks.append(_GROUPS)
-    return blocks + _comparison_tables(compared)
+    return [*blocks, *([_comparison(compared)] if compared else [])]
 
 
 def _subjects(subjects: dict[str, list[Unit]], units: pd.DataFrame) -> list[Block]:
@@ -136,38 +122,33 @@ def _subjects(subjects: dict[str, list[Unit]], units: pd.DataFrame) -> list[Bloc
         Markup('<a href="subjects/sub-{}.html">{}</a>').format(safe_name(name), name)
         for name in subjects
     ]
-    table = _unit_table(units)
-    return [
-        Markup(", ").join(links),
-        *(() if table is None else (table,)),
-        *_structure_table(units),
-    ]
+    return [Markup(", ").join(links), *_unit_findings(units)]
 
 
-def _structure_table(units: pd.DataFrame) -> list[TextTable]:
-    """Prices of every unit within the structure, and whether it holds there."""
-    priced = [name for name in units.columns if name.startswith("log_price.")]
-    if not priced:
+def _unit_findings(units: pd.DataFrame) -> list[Finding]:
+    """How much of every unit is explained; its prices within the structure, where one is asked."""
+    if not len(units):
         return []
-    rows = []
-    for _, row in units.iterrows():
-        cells = []
-        for name in priced:
-            low, high = (_price(row[name.replace("log_price", f"log_price_{end}")])
-                         for end in ("low", "high"))  # fmt: skip
-            cells.append(f"{_price(row[name])} ({low} to {high})")
-        word = "refused" if row["structure_refused"] else "holds"
-        rows.append((str(row["unit"]), str(row["group"]), word, *cells))
-    heads = ("unit", "group", "structure", *(name.removeprefix("log_price.") for name in priced))
-    caption = (
-        "Prices within the structure, with one for the first command, and their intervals of 95 %; "
-        "it holds where the recordings do not refuse it."
+    shown = [name for name in units.columns if name.startswith(("vaf.", "held_out_vaf."))]
+    explained = units[["unit", "group", *shown]].assign(
+        at_the_bound_percent=100 * units["saturated"]
     )
-    return [TextTable(caption, heads, rows)]
-
-
-def _price(logarithm: float) -> str:
-    return "0" if np.isnan(logarithm) else number(float(np.exp(logarithm)), 3)
+    found = [Finding("agreement", explained, "Every unit. units.csv has all numbers.")]
+    priced = [name for name in units.columns if name.startswith("log_price.")]
+    if priced:
+        word = np.where(units["structure_refused"], "refused", "holds")
+        prices = units[["unit", "group"]].assign(structure=word)
+        for name in priced:
+            label = name.removeprefix("log_price.")
+            for end in ("", "_low", "_high"):
+                logarithm = units[name.replace("log_price", f"log_price{end}")].astype(float)
+                prices[f"{label}{end}"] = np.exp(logarithm.fillna(-np.inf))
+        caption = (
+            "Prices within the structure, with one for the first command, and their intervals of "
+            "95 %; it holds where the recordings do not refuse it."
+        )
+        found.append(Finding("prices", prices, caption, digits=3))
+    return found
 
 
 def _run(command: str) -> list[Block]:
@@ -302,46 +283,26 @@ def _most_telling(compared: tuple[Comparison, ...], units: pd.DataFrame) -> list
     return [name for name in dict.fromkeys(names) if units[name].notna().any()][:6]
 
 
-def _comparison_tables(compared: tuple[Comparison, ...]) -> list[TextTable]:
-    tables = []
-    for question, (title, effect) in _QUESTIONS.items():
-        rows = [_comparison_row(item) for item in compared if item.question == question]
-        if not rows:
-            continue
-        estimate = "ICC" if question == "reliability" else "difference"
-        heads = ("measure", "condition", "compared", "n", estimate, "95 %", effect or "effect")
-        tables.append(TextTable(title, (*heads, "p", "p, Holm"), rows))
-    return tables
-
-
-def _comparison_row(item: Comparison) -> tuple[str, ...]:
-    interval = f"{number(item.low)} to {number(item.high)}" if np.isfinite(item.low) else "-"
-    pair = f"{item.second} - {item.first}" if item.first else ""
-    return (
-        measure_words(item.measure),
-        item.condition,
-        item.note or pair,
-        str(item.n),
-        number(item.estimate),
-        interval,
-        number(item.effect, 2),
-        number(item.p, 2),
-        number(item.p_holm, 2),
+def _comparison(compared: tuple[Comparison, ...]) -> Finding:
+    table = table_of(
+        compared,
+        {
+            "question": lambda item: _QUESTIONS[item.question],
+            "measure": lambda item: measure_words(item.measure),
+            "condition": lambda item: item.condition,
+            "compared": lambda item: f"{item.second} - {item.first}" if item.first else "",
+            "n": lambda item: item.n,
+            "estimate": lambda item: item.estimate,
+            "low": lambda item: item.low,
+            "high": lambda item: item.high,
+            "effect": lambda item: item.effect,
+            "p": lambda item: item.p,
+            "p_holm": lambda item: item.p_holm,
+            "note": lambda item: item.note,
+        },
     )
-
-
-def _unit_table(units: pd.DataFrame) -> TextTable | None:
-    if not len(units):
-        return None
-    shown = [name for name in units.columns if name.startswith(("vaf.", "held_out_vaf."))]
-    rows = tuple(
-        (
-            str(row["unit"]),
-            str(row["group"]),
-            *(number(or_nan(row[name]), 4) for name in shown),
-            f"{100 * row['saturated']:.1f}",
-        )
-        for _, row in units.iterrows()
+    caption = (
+        "Difference of means, or ICC(A,1) of the reliability, with its interval of 95 %; effect: "
+        "Hedges' g between groups and of changes, d_z between visits."
     )
-    heads = ("unit", "group", *(f"{measure_words(name)} %" for name in shown), "at the bound %")
-    return TextTable("Every unit. units.csv has all numbers.", heads, rows)
+    return Finding("comparisons", table, caption, digits=3)

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from markupsafe import Markup
 
-from impc.reporting.document import Block, Picture, Report, Section, TextTable, Verdict
-from impc.reporting.rendering import number
+from impc.reporting.document import Block, Report, Section, Verdict
+from impc.reporting.finding import Finding, Picture, table_of
 from impc.reporting.style import drawn, journal_style
 from impc.studies.cohort.figures import subject_figure
 from impc.studies.cohort.study import safe_name
@@ -87,48 +87,49 @@ def _unit_blocks(unit: Unit, fit: dict[str, Any], failures: Failures) -> list[Bl
         )
     return [
         *blocks,
-        _fit_table(fit),
-        _gain_table(fit),
+        _explained(unit, fit),
+        _gain(unit, fit),
         *(line for trial in fit["findings"] for line in trial),
     ]
 
 
-def _fit_table(fit: dict[str, Any]) -> TextTable:
-    rows = tuple(
-        (name, number(or_nan(fit["vaf"][name]), 5), number(or_nan(fit["held_out_vaf"][name]), 5))
-        for name in fit["outputs"]
+def _explained(unit: Unit, fit: dict[str, Any]) -> Finding:
+    table = table_of(
+        fit["outputs"],
+        {
+            "output": str,
+            "vaf_percent": lambda name: or_nan(fit["vaf"][name]),
+            "left_out_vaf_percent": lambda name: or_nan(fit["held_out_vaf"][name]),
+        },
     )
-    return TextTable(
-        f"Variance accounted for, {fit['trials']} trials; the command stands at its bound for "
-        f"{100 * fit['saturated']:.1f} % of the time.",
-        ("output", "VAF %", "left out %"),
-        rows,
-    )
-
-
-def _gain_table(fit: dict[str, Any]) -> TextTable:
-    reported = next(iter(fit["readings"].values()))
-    rows = []
-    for i, control in enumerate(fit["controls"]):
-        for j, state in enumerate(fit["states"]):
-            rows.append(
-                (
-                    f"{control} from {state}",
-                    number(fit["K"][i][j], 4),
-                    number(or_nan(fit["K_deviation"][i][j]), 2)
-                    if fit["K_told"][i][j]
-                    else "not told",
-                    number(fit["K_of_weights"][i][j], 4),
-                    number(reported["Q"][j][j]) if i == 0 else "",
-                )
-            )
     caption = (
-        "Gain with standard deviations (not told: the recordings tell this entry only together "
-        "with others), beside the gain of the reported weights; and prices of the weights of least "
+        f"Variance accounted for, {fit['trials']} trials; the command is at its bound for "
+        f"{100 * fit['saturated']:.1f} % of the time."
+    )
+    return Finding(f"{unit.name}-agreement", table, caption, digits=5)
+
+
+def _gain(unit: Unit, fit: dict[str, Any]) -> Finding:
+    reported = next(iter(fit["readings"].values()))
+    entries = [(i, j) for i in range(len(fit["controls"])) for j in range(len(fit["states"]))]
+    table = table_of(
+        entries,
+        {
+            "entry": lambda at: f"{fit['controls'][at[0]]} from {fit['states'][at[1]]}",
+            "gain": lambda at: float(fit["K"][at[0]][at[1]]),
+            "standard_error": lambda at: (
+                or_nan(fit["K_deviation"][at[0]][at[1]]) if fit["K_told"][at[0]][at[1]] else np.nan
+            ),
+            "gain_of_the_weights": lambda at: float(fit["K_of_weights"][at[0]][at[1]]),
+            "price_of_the_state": lambda at: float(reported["Q"][at[1]][at[1]]),
+        },
+    )
+    caption = (
+        "Gain with standard errors (none: the recordings identify this entry only together with "
+        "others), beside the gain of the reported weights; and prices of the weights of least "
         "condition number: a choice among all weights with the latter gain."
     )
-    heads = ("entry", "gain", "deviation", "gain of the weights", "price of the state")
-    return TextTable(caption, heads, rows)
+    return Finding(f"{unit.name}-gain", table, caption)
 
 
 def or_nan(value: float | None) -> float:

@@ -19,7 +19,6 @@ import pandas as pd
 
 from impc.arrays import percentiles
 from impc.assess.assessments import ASSESSMENTS
-from impc.reporting.csv_text import csv_bytes
 from impc.studies.cohort.unit_structure import structure_row
 
 if TYPE_CHECKING:
@@ -54,11 +53,6 @@ def cohort_tables(study: Study, store: Store) -> dict[str, pd.DataFrame]:
         "replicates": pd.DataFrame(replicates),
         "intervals": pd.DataFrame(intervals),
     }
-
-
-def table_bytes(table: pd.DataFrame) -> bytes:
-    """A table as CSV, numbers to the last digit, no cell a formula."""
-    return csv_bytes(list(table.columns), table.itertuples(index=False, name=None))
 
 
 def _labels(unit: Unit) -> dict[str, Any]:

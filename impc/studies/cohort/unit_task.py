@@ -35,9 +35,9 @@ from impc.reporting.rendering import plain
 from impc.reporting.shown_units import angles_in, shown_unit
 from impc.studies.cohort.unit_digest import require_same_inputs, unit_digest
 from impc.studies.cohort.unit_structure import unit_structure
+from impc.studies.fit.gain_findings import number_units
 from impc.studies.fit.settings import fit_settings
 from impc.studies.fit.subject import fit_problem, state_sizes
-from impc.studies.fit.tables import number_units
 from impc.studies.signal_words import signal_words
 
 if TYPE_CHECKING:

@@ -5,27 +5,25 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 from markupsafe import Markup
 
 from impc.assess.assessments import ASSESSMENTS
 from impc.control.named_solver import described
 from impc.inverse.methods import METHODS
-from impc.reporting.document import (
-    Chart,
-    Lines,
-    Picture,
-    Report,
-    Section,
-    Terms,
-    TextTable,
-    Verdict,
-)
-from impc.reporting.rendering import number
+from impc.model.signal_units import gain_unit
+from impc.reporting.document import Lines, Report, Section, Terms, Verdict
+from impc.reporting.finding import Chart, Finding, Picture
 from impc.reporting.shown_units import axis_label
 from impc.reporting.style import BLUE, DOUBLE_COLUMN, INK, drawn, journal_style, new_figure
 from impc.studies.charts import chart_figure, methods_chart
-from impc.studies.compare.csv_tables import compare_tables
-from impc.studies.methods_table import column_terms, methods_data, methods_table
+from impc.studies.methods_table import (
+    column_terms,
+    methods_data,
+    methods_finding,
+    until_its_end,
+    weight_entries,
+)
 from impc.studies.signal_words import body_sentence, signal_words
 
 if TYPE_CHECKING:
@@ -78,7 +76,7 @@ def compare_report(
     sections = [
         Section(
             "1. All methods on the same recordings",
-            (_PICTURE, methods_table(compared), Chart(_TRAJECTORIES, curves)),
+            (_PICTURE, methods_finding(compared), Chart(_TRAJECTORIES, curves)),
             "Methods",
             together=True,
         ),
@@ -112,7 +110,7 @@ def compare_report(
         (Verdict(_verdict(compared)), Lines(_findings(compared))),
         sections,
         figures=figures,
-        tables=compare_tables(problem, compared),
+        beside=[_gain(problem, compared), _trajectories(problem, compared)],
         data=_data(problem, compared),
         provenance=provenance,
         words=signal_words(problem.plant),
@@ -165,28 +163,45 @@ def _score(item: MethodFit) -> Array:
     return item.vaf if np.any(np.isnan(outside)) else outside
 
 
-def _weights(problem: Problem, compared: Sequence[MethodFit]) -> TextTable:
+def _gain(problem: Problem, compared: Sequence[MethodFit]) -> Finding:
     plant = problem.plant
-    rows = []
-    for item in compared:
-        given = item.estimate.weights
-        if given is None:
-            continue
-        eigenvalues = np.linalg.eigvalsh(given.block)
-        rows.append(
-            (
-                METHODS[item.name].label,
-                *(number(float(value)) for value in np.diag(given.Q)),
-                number(float(eigenvalues[-1] / eigenvalues[0])),
-            )
-        )
-    heads = ("method", *(f"Q {name}" for name in plant.states), "condition number")
-    return TextTable(
-        "Diagonal of Q in plant units at R[0, 0] = 1, and kappa(blkdiag(Q, R)). result.json has "
-        "all entries.",
-        heads,
-        rows,
-    )
+    rows = [
+        (f"K.{control}.{state}", gain_unit(plant, control, state), item.name, float(K[i, j]))
+        for item in compared
+        if (K := item.estimate.K) is not None
+        for i, control in enumerate(plant.controls)
+        for j, state in enumerate(plant.states)
+    ]
+    return Finding("gain", pd.DataFrame(rows, columns=["number", "unit", "method", "value"]))
+
+
+def _weights(problem: Problem, compared: Sequence[MethodFit]) -> Finding:
+    rows = [
+        (*entry[:-1], item.name, entry[-1])
+        for item in compared
+        if item.estimate.weights is not None
+        for entry in weight_entries(problem.plant, item.estimate.weights)
+    ]
+    heads = ["matrix", "first", "second", "unit", "method", "value"]
+    caption = "Entries of Q and R, at R = 1 of the first command."
+    return Finding("weights", pd.DataFrame(rows, columns=heads), caption)
+
+
+def _trajectories(problem: Problem, compared: Sequence[MethodFit]) -> Finding:
+    """Every trial; a method that falls has no numbers from there on."""
+    plant, blocks = problem.plant, []
+    shown = [item for item in compared if item.runs]
+    for index, trial in enumerate(problem.recordings):
+        steps = trial.samples
+        parts = [np.full((steps, 1), index + 1.0), plant.dt * np.arange(steps)[:, None]]
+        parts += [np.asarray(trial.outputs), np.asarray(trial.disturbance)]
+        for item in shown:
+            parts += until_its_end(plant, item.runs[index])
+        blocks.append(np.hstack(parts))
+    heads = ["trial", "time", *(f"{name}_recorded" for name in plant.outputs), *plant.disturbances]
+    for item in shown:
+        heads += [f"{name}_{item.name}" for name in (*plant.outputs, *plant.controls)]
+    return Finding("trajectories", pd.DataFrame(np.vstack(blocks), columns=heads))
 
 
 def _figure(problem: Problem, compared: Sequence[MethodFit]) -> Figure:

@@ -13,7 +13,7 @@ import numpy as np
 from impc.assess.intervals import entry_names
 from impc.model.signal_units import UNKNOWN
 from impc.reporting.style import BLUE, INK, VERMILLION, new_figure
-from impc.studies.fit.tables import number_name
+from impc.studies.fit.gain_findings import number_name
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -9,9 +9,9 @@ import numpy as np
 
 from impc.assess.intervals import entry_names
 from impc.files.names import LARGEST
-from impc.reporting.document import TextTable
+from impc.reporting.finding import Finding, table_of
 from impc.reporting.rendering import number
-from impc.studies.fit.tables import number_name
+from impc.studies.fit.gain_findings import number_name
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -76,20 +76,22 @@ def _of_person(result: FitResult, truth: Array) -> str:
     )
 
 
-def truth_table(result: FitResult, truth: Array) -> TextTable:
+def truth_finding(result: FitResult, truth: Array) -> Finding:
     """Every entry of the gain of a `result` with its interval beside the `truth` (m, n)."""
-    rows = [
-        (
-            number_name(result.given.plant, item.name),
-            number(np.nan if item.value is None else item.value, 4),
-            f"{number(item.low, 4)} to {number(item.high, 4)}",
-            number(value, 4),
-            "inside" if _inside(item, value) else "outside",
-        )
-        for item, value in _pairs(result, truth)
-    ]
+    table = table_of(
+        _pairs(result, truth),
+        {
+            "number": lambda pair: number_name(result.given.plant, pair[0].name),
+            "estimate": lambda pair: np.nan if pair[0].value is None else float(pair[0].value),
+            "low": lambda pair: float(pair[0].low),
+            "high": lambda pair: float(pair[0].high),
+            "truth": lambda pair: float(pair[1]),
+            "inside": lambda pair: _inside(*pair),
+        },
+    )
     caption = "The truth that lies beside the recordings (truth.json), and what the fit says of it."
-    return TextTable(caption, ("number", "estimate", "interval", "truth", ""), rows)
+    said = [truth_sentence(result, truth)]
+    return Finding("truth", table, caption, said, folded="The true gain, entry by entry")
 
 
 def _pairs(result: FitResult, truth: Array) -> list[tuple[Interval, float]]:

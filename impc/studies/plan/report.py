@@ -9,22 +9,23 @@ import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 from markupsafe import Markup
 
 from impc.model.signal_units import gain_unit
-from impc.reporting.document import Lines, Picture, Report, Section, Terms, TextTable, Verdict
+from impc.reporting.document import Lines, Report, Section, Terms, Verdict
+from impc.reporting.finding import Finding, Picture, table_of
 from impc.reporting.rendering import number
 from impc.reporting.shown_units import shown_unit
 from impc.reporting.style import drawn, journal_style
-from impc.studies.fit.tables import number_name
+from impc.studies.fit.gain_findings import number_name
 from impc.studies.plan.figures import experiments_figure, prices_figure
-from impc.studies.plan.sentences import design_name, plan_sentences, told_as
+from impc.studies.plan.sentences import plan_sentences
 from impc.studies.plan.simulated_fits import spread
 from impc.studies.signal_words import signal_words
 
 if TYPE_CHECKING:
     from impc.reporting.provenance import Provenance
-    from impc.studies.plan.designs import Outcome
     from impc.studies.plan.study import Plan
 
 _PICTURES = (
@@ -63,106 +64,100 @@ def plan_report(plan: Plan, provenance: Provenance) -> Report:
         (Verdict(first), Lines(rest)),
         sections,
         figures=figures,
-        tables={"experiments": _numbers(plan)},
         data=_data(plan),
         provenance=provenance,
         words=signal_words(plan.person.controller.plant),
     )
 
 
-def _experiments(plan: Plan) -> TextTable:
-    names = plan.person.structure.unknowns
-    rows = []
+def _experiments(plan: Plan) -> Finding:
+    """Every experiment and what it would tell, as factors of the presumed prices (95 %)."""
+    rows: list[dict[str, Any]] = []
     for item in plan.outcomes:
-        mark = "A-optimal" if item is plan.best else ""
-        mark += (", " if mark else "") + "D-optimal" if item is plan.sharpest else ""
-        told = ["-"] * len(names)
-        if item.expected is not None:
-            told = [told_as(one) for one in item.expected.intervals]
-        share = "-" if math.isnan(item.at_limit) else f"{100 * item.at_limit:.1f}"
-        rows.append((design_name(plan, item.design), f"{100 * item.falls:.0f}", share, *told, mark))
-    heads = ("experiment", "falls (%)", "at the limit (%)", *(f"price of {x}" for x in names), "")
-    return TextTable("Expected intervals of 95 %, as factors of the presumed price.", heads, rows)
+        best = [word for word, one in (("A-optimal", plan.best), ("D-optimal", plan.sharpest))
+                if item is one]  # fmt: skip
+        row = {
+            "amplitude": float(item.design.amplitude),
+            "dwell": float(item.design.dwell),
+            "falls_percent": 100 * float(item.falls),
+            "at_the_limit_percent": 100 * float(item.at_limit),
+        }
+        for index, name in enumerate(plan.person.structure.unknowns):
+            interval = None if item.expected is None else item.expected.intervals[index]
+            for end in ("low", "high"):
+                away = np.nan if interval is None else getattr(interval, end) - interval.value
+                row[f"{name}_{end}"] = float(np.exp(away))
+            expected = item.expected
+            error = np.nan if expected is None else float(expected.deviations[index])
+            row[f"{name}_standard_error"] = error
+        rows.append({**row, "best": ", ".join(best)})
+    caption = (
+        "Expected intervals of 95 %, as factors of the presumed price, and standard errors of its "
+        "logarithm; dwell in s."
+    )
+    return Finding("experiments", pd.DataFrame(rows), caption, digits=3)
 
 
-def _best(plan: Plan) -> tuple[TextTable, ...]:
-    expected = plan.best.expected
+def _best(plan: Plan) -> list[Finding]:
+    expected, person = plan.best.expected, plan.person
     if expected is None:
-        return ()
-    plant, truth = plan.person.controller.plant, np.array(plan.person.controller.K)
-    gains = [
-        (
-            number_name(plant, f"K.{control}.{state}"),
-            number(truth[i, j]),
-            number(1.96 * expected.gain.entries[i, j]),
-            "yes" if expected.gain.told_entries[i, j] else "only with others",
-            gain_unit(plant, control, state),
-        )
-        for i, control in enumerate(plant.controls)
-        for j, state in enumerate(plant.states)
-    ]
-    heads = ("gain", "presumed", "half an interval of 95 %", "told", "unit")
+        return []
+    plant, truth, fits = person.controller.plant, np.array(person.controller.K), plan.simulated
+    scatter = None if fits is None or len(fits.prices) == 0 else spread(fits.prices)
+    prices = table_of(
+        range(len(person.structure.unknowns)),
+        {
+            "price_of": lambda k: person.structure.unknowns[k],
+            "presumed": lambda k: math.exp(float(person.prices[k])),
+            "low": lambda k: math.exp(expected.intervals[k].low),
+            "high": lambda k: math.exp(expected.intervals[k].high),
+            "standard_error_of_the_logarithm": lambda k: float(expected.deviations[k]),
+            "in_simulated_fits": lambda k: np.nan if scatter is None else float(scatter[k]),
+        },
+    )
+    gains = table_of(
+        [(i, j) for i in range(plant.m) for j in range(plant.n)],
+        {
+            "gain": lambda at: number_name(
+                plant, f"K.{plant.controls[at[0]]}.{plant.states[at[1]]}"
+            ),
+            "unit": lambda at: gain_unit(plant, plant.controls[at[0]], plant.states[at[1]]),
+            "presumed": lambda at: float(truth[at]),
+            "half_an_interval": lambda at: 1.96 * float(expected.gain.entries[at]),
+            "identified": lambda at: bool(expected.gain.told_entries[at]),
+        },
+    )
     along = int(np.count_nonzero(expected.gain.told))
     caption = (
-        f"Gains fitted without a structure: {along} of {truth.size} directions would be told to a "
-        "fifth of their natural size."
+        f"Gains fitted without a structure: {along} of {truth.size} directions would be identified "
+        "to a fifth of their natural size. Half an interval is that of 95 %."
     )
-    return _price_table(plan), TextTable(caption, heads, gains)
-
-
-def _price_table(plan: Plan) -> TextTable:
-    person, expected, fits = plan.person, plan.best.expected, plan.simulated
-    scatter = None if fits is None or len(fits.prices) == 0 else spread(fits.prices)
-    rows = []
-    for index, name in enumerate(person.structure.unknowns):
-        value = math.exp(float(person.prices[index]))
-        if expected is None:
-            continue
-        item = expected.intervals[index]
-        rows.append(
-            (
-                name,
-                number(value),
-                number(math.exp(item.low)) if np.isfinite(item.low) else "0",
-                number(math.exp(item.high)),
-                number(float(expected.deviations[index]), 2),
-                "-" if scatter is None else number(float(scatter[index]), 2),
-            )
-        )
-    heads = (
-        "price of",
-        "presumed",
-        "interval from",
-        "to",
-        "deviation of its logarithm",
-        "in simulated fits",
-    )
-    return TextTable("Prices, with one for the first command.", heads, rows)
-
-
-def _groups(plan: Plan) -> TextTable:
-    settings = plan.settings
-    rows = [
-        (
-            item.feature,
-            number(item.deviation, 2),
-            *(f"{100 * power:.0f}" for power in item.powers),
-            "-" if math.isinf(item.needed) else f"{item.needed:.0f}",
-        )
-        for item in plan.groups
+    return [
+        Finding("prices", prices, "Prices, with one for the first command, 95 %.", digits=3),
+        Finding("gain", gains, caption, digits=3),
     ]
-    heads = (
-        "price of",
-        "deviation within a group",
-        *(f"power with {size} a group (%)" for size in settings.groups),
-        "persons a group for 80 %",
+
+
+def _groups(plan: Plan) -> Finding:
+    settings = plan.settings
+    powers = {
+        f"power_with_{size}_a_group_percent": (lambda item, k=k: 100 * float(item.powers[k]))
+        for k, size in enumerate(settings.groups)
+    }
+    table = table_of(
+        plan.groups,
+        {
+            "price_of": lambda item: item.feature,
+            "standard_deviation_within_a_group": lambda item: float(item.deviation),
+            **powers,
+            "persons_a_group_for_80_percent": lambda item: float(item.needed),
+        },
     )
-    return TextTable(
+    caption = (
         f"Two groups whose price differs by {settings.difference:g} %, t-test of the logarithms at "
-        f"5 %; persons within a group differ by {settings.between:g} %.",
-        heads,
-        rows,
+        f"5 %; persons within a group differ by {settings.between:g} %."
     )
+    return Finding("groups", table, caption, digits=3)
 
 
 def _presumed(plan: Plan) -> tuple[Terms, ...]:
@@ -193,34 +188,10 @@ def _presumed(plan: Plan) -> tuple[Terms, ...]:
     )
 
 
-def _row(plan: Plan, item: Outcome) -> dict[str, Any]:
-    names = plan.person.structure.unknowns
-    row: dict[str, Any] = {
-        "amplitude": item.design.amplitude,
-        "dwell": item.design.dwell,
-        "falls": item.falls,
-        "at_limit": item.at_limit,
-    }
-    for index, name in enumerate(names):
-        told = None if item.expected is None else item.expected.intervals[index]
-        row[f"{name} low"] = np.nan if told is None else math.exp(told.low)
-        row[f"{name} high"] = np.nan if told is None else math.exp(told.high)
-        row[f"{name} deviation"] = (
-            np.nan if item.expected is None else float(item.expected.deviations[index])
-        )
-    return row
-
-
-def _numbers(plan: Plan) -> TextTable:
-    rows = [_row(plan, item) for item in plan.outcomes]
-    return TextTable("", tuple(rows[0]), [tuple(row.values()) for row in rows])
-
-
 def _data(plan: Plan) -> dict[str, Any]:
     person, expected, fits = plan.person, plan.best.expected, plan.simulated
     names = person.structure.unknowns
     found: dict[str, Any] = {
-        "experiments": [_row(plan, item) for item in plan.outcomes],
         "best": {"amplitude": plan.best.design.amplitude, "dwell": plan.best.design.dwell},
         "sharpest": {
             "amplitude": plan.sharpest.design.amplitude,
@@ -229,15 +200,6 @@ def _data(plan: Plan) -> dict[str, Any]:
         "structure": person.structure.name,
         "presumed": dict(zip(names, np.exp(person.prices), strict=True)),
         "gain": {"presumed": person.controller.K},
-        "groups": [
-            {
-                "price": item.feature,
-                "deviation": item.deviation,
-                "power": dict(zip(map(str, plan.settings.groups), item.powers, strict=True)),
-                "needed": item.needed,
-            }
-            for item in plan.groups
-        ],
         "sentences": plan_sentences(plan),
         "simulated": None,
     }

@@ -1,6 +1,6 @@
 """The report of a reliability study: page, tables as CSV, result.json, figures.
 
-Tables of a reliability study: counterparts of tables 2.2 to 2.6, for page and CSV alike.
+Its tables are counterparts of tables 2.2 to 2.6.
 """
 
 from __future__ import annotations
@@ -9,17 +9,20 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 from markupsafe import Markup
 
-from impc.reporting.document import Lines, Picture, Report, Section, TextTable, Verdict
+from impc.reporting.document import Lines, Report, Section, Verdict
+from impc.reporting.finding import Finding, Picture
 from impc.reporting.provenance import Provenance
-from impc.reporting.rendering import number
 from impc.studies.reliability.analysis import MEASURES
 from impc.studies.reliability.figures import reliability_figures
 from impc.studies.reliability.findings import QUOTED, findings
 from impc.studies.reliability.verdict import answer, interval_band, shown_score
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from impc.arrays import Array
     from impc.files.inputs import Inputs
     from impc.studies.reliability.analysis import MeasureResult, Reliability, Trials
@@ -63,7 +66,7 @@ _VISITS = Picture(
 
 def reliability_report(trials: Trials, result: Reliability, command: str, inputs: Inputs) -> Report:
     """Page, result.json, tables and figures; they name the `command` and its `inputs`."""
-    tables = reliability_tables(result)
+    tables = reliability_findings(result)
     found = [
         Markup("<strong>{}:</strong> {} ({})").format(
             "Found" if item.found else "Not found", item.statement, item.numbers
@@ -77,6 +80,7 @@ def reliability_report(trials: Trials, result: Reliability, command: str, inputs
     )
     # One visit has no reliability: a table of dashes says less than the sentence above it.
     shown = _TABLES if len(result.visits) > 1 else {"1. The visit": ("visits-rms", "visits-energy")}
+    shown_names = [name for names in shown.values() for name in names]
     sections = [
         *(
             Section(title, [*([] if number else [_VISITS]), *(tables[name] for name in names)])
@@ -93,7 +97,7 @@ def reliability_report(trials: Trials, result: Reliability, command: str, inputs
         (Verdict(said[0]), *((Lines(said[1:]),) if said[1:] else ()), summary, *result.notes),
         sections,
         figures=reliability_figures(trials, result),
-        tables=tables,
+        beside=[one for name, one in tables.items() if name not in shown_names],
         data=_data(result),
         provenance=Provenance(command=command, inputs=inputs),
         words=[(name, "A condition of this study.") for name in result.conditions],
@@ -101,190 +105,143 @@ def reliability_report(trials: Trials, result: Reliability, command: str, inputs
 
 
 def _data(result: Reliability) -> dict[str, Any]:
-    found: dict[str, dict[str, Any]] = {"icc": {}, "anova": {}, "components": {}}
-    for item in result.measures:
-        name = f"{item.measure}.{item.output}"
-        if item.icc is not None:
-            told = {key: getattr(item.icc, key) for key in ("value", "low", "high", "form")}
-            told |= {"subjects": item.icc.subjects, "interval": "generalised"}
-            if item.error is not None:
-                told |= {key: getattr(item.error, key) for key in ("sem", "mdc", "freedom")}
-            found["icc"].setdefault(name, {})[item.condition] = told
-        if item.anova is not None:
-            test = asdict(item.anova)
-            test["pairs"] = [asdict(pair) for pair in item.pairs]
-            test["trend"] = None if item.trend is None else asdict(item.trend)
-            found["anova"].setdefault(name, {})[item.condition] = test
-        parts = {part.name: asdict(part) for part in item.components}
-        found["components"].setdefault(name, {})[item.condition] = parts
-    cmc: dict[str, dict[str, dict[str, float]]] = {"within": {}, "between": {}}
-    for curve in result.cmc:
-        for kind, values in (("within", curve.within), ("between", curve.between)):
-            cmc[kind].setdefault(curve.output, {})[curve.condition] = _mean(values)
     return {
-        **found,
-        "cmc": cmc,
         "passband": {"low": result.band.low, "high": result.band.high},
-        "findings": [asdict(item) for item in findings(result)],
+        "dissertation": [asdict(item) for item in findings(result)],
         "notes": result.notes,
     }
-
-
-def _mean(values: Array) -> float:
-    return float(np.nanmean(values)) if np.any(np.isfinite(values)) else float("nan")
 
 
 _NUMBERS = {"rms": "2.2", "energy": "2.3"}
 _VISIT_TABLES = {"rms": "2.5", "energy": "2.6"}
 
 
-def reliability_tables(result: Reliability) -> dict[str, TextTable]:
-    """All tables by the name of their file."""
-    tables = {}
+def reliability_findings(result: Reliability) -> dict[str, Finding]:
+    """All findings by name."""
+    found = [_correlations(result), _pairs(result), _quoted()]
     for measure in MEASURES:
-        tables[f"icc-{measure}"] = _icc_table(result, measure)
-        tables[f"visits-{measure}"] = _visit_table(result, measure)
-        tables[f"components-{measure}"] = _component_table(result, measure)
-    tables["cmc"] = _cmc_table(result)
-    tables["pairs"] = _pair_table(result)
-    tables["dissertation"] = _quoted_table()
-    return tables
+        own = [item for item in result.measures if item.measure == measure]
+        found += [_icc(own, measure), _visits(own, measure, result), _components(own, measure)]
+    return {item.name: item for item in found}
 
 
-def _of(result: Reliability, measure: str) -> list[MeasureResult]:
-    return [item for item in result.measures if item.measure == measure]
-
-
-def _icc_table(result: Reliability, measure: str) -> TextTable:
+def _icc(own: Sequence[MeasureResult], measure: str) -> Finding:
     rows = []
-    for item in _of(result, measure):
+    for item in own:
         factor, unit = shown_score(item)
         found, error = item.icc, item.error
-        if found is None or error is None:
-            rows.append((item.condition, item.output, "-", "-", "-", "-", "; ".join(item.notes)))
-            continue
-        rows.append(
-            (
-                item.condition,
-                item.output,
-                f"{found.value:.2f} ({found.low:.2f}, {found.high:.2f})".replace("nan", "-"),
-                interval_band(found.low, found.high),
-                f"{factor * error.sem:.3g} {unit}",
-                f"{factor * error.mdc:.3g} {unit}",
-                "; ".join((f"{found.subjects} subjects", *item.notes)),
-            )
-        )
+        row: dict[str, Any] = {"condition": item.condition, "output": item.output}
+        if found is not None and error is not None:
+            row |= {
+                "icc": found.value,
+                "low": found.low,
+                "high": found.high,
+                "reliability": interval_band(found.low, found.high),
+                "sem": factor * error.sem,
+                "mdc": factor * error.mdc,
+                "unit": unit,
+                "subjects": found.subjects,
+            }
+        rows.append(row | {"notes": "; ".join(item.notes)})
     caption = (
         f"Counterpart of table {_NUMBERS[measure]}: between-visit reliability of "
         f"{MEASURES[measure]}, ICC(A,k) of the mean over visits with its generalised 95 % "
-        "interval, which allows for few visits that differ; standard error of measurement and "
-        "minimal detectable change (95 %) of the score of a single visit. The word is that of the "
-        "whole interval."
+        "interval, which allows for few visits that differ; standard error of measurement (SEM) "
+        "and minimal detectable change (MDC, 95 %) of the score of a single visit. The word is "
+        "that of the whole interval."
     )
-    heads = ("condition", "output", "ICC(A,k)", "reliability", "SEM", "MDC", "notes")
-    return TextTable(caption, heads, rows)
+    return Finding(f"icc-{measure}", pd.DataFrame(rows), caption, digits=3)
 
 
-def _visit_table(result: Reliability, measure: str) -> TextTable:
+def _visits(own: Sequence[MeasureResult], measure: str, result: Reliability) -> Finding:
     rows = []
-    for item in _of(result, measure):
+    for item in own:
         factor, unit = shown_score(item)
-        scores = factor * item.scores
-        cells = []
-        for column in scores.T:
-            known = column[np.isfinite(column)]
-            spread = f" ± {np.std(known, ddof=1):.3g}" if len(known) > 1 else ""
-            cells.append(f"{np.mean(known):.3g}{spread}" if len(known) else "-")
-        test, trend = item.anova, item.trend
-        rows.append(
-            (
-                item.condition,
-                f"{item.output} ({unit})",
-                *cells,
-                "-" if test is None else number(test.p, 2),
-                "-" if test is None else number(test.p_corrected, 2),
-                "-"
-                if trend is None
-                else f"{factor * trend.slope:+.2g} ({factor * trend.low:+.2g}, "
-                f"{factor * trend.high:+.2g})",
-                "-" if trend is None else number(trend.p, 2),
-            )
-        )
+        row: dict[str, Any] = {"condition": item.condition, "output": item.output, "unit": unit}
+        for visit, column in zip(result.visits, (factor * item.scores).T, strict=True):
+            row[f"mean_visit_{visit}"], row[f"sd_visit_{visit}"] = _mean_sd(column)
+        if item.anova is not None:
+            row |= {"F": item.anova.F, "p": item.anova.p}
+            row |= {"p_greenhouse_geisser": item.anova.p_corrected}
+        if item.trend is not None:
+            row |= {
+                "change_per_visit": factor * item.trend.slope,
+                "change_low": factor * item.trend.low,
+                "change_high": factor * item.trend.high,
+                "p_change": item.trend.p,
+            }
+        rows.append(row)
     caption = (
         f"Counterpart of table {_VISIT_TABLES[measure]}: {MEASURES[measure]} across visits, mean "
-        "± SD of the subjects; repeated-measures analysis of variance, uncorrected and after "
-        "Greenhouse and Geisser; change from visit to visit."
+        "and SD of the subjects; repeated-measures analysis of variance, uncorrected and after "
+        "Greenhouse and Geisser; change from visit to visit with its 95 % interval."
     )
-    visits = tuple(f"visit {name}" for name in result.visits)
-    heads = ("condition", "output", *visits, "p", "p (G-G)", "change per visit", "p (change)")
-    return TextTable(caption, heads, rows)
+    return Finding(f"visits-{measure}", pd.DataFrame(rows), caption, digits=3)
 
 
-def _component_table(result: Reliability, measure: str) -> TextTable:
-    rows = []
-    for item in _of(result, measure):
-        factor, unit = shown_score(item)
-        cells = {
-            part.name: f"{factor**2 * part.value:.3g} ({factor**2 * part.low:.3g}, "
-            f"{factor**2 * part.high:.3g})"
-            for part in item.components
+def _components(own: Sequence[MeasureResult], measure: str) -> Finding:
+    rows = [
+        {
+            "condition": item.condition,
+            "output": item.output,
+            "unit": f"({shown_score(item)[1]})²",
+            "variance_of": f"{part.name}s",
+            **{
+                name: shown_score(item)[0] ** 2 * float(getattr(part, name))
+                for name in ("value", "low", "high")
+            },
         }
-        names = ("subject", "visit", "trial")
-        rows.append(
-            (item.condition, f"{item.output} ({unit})²", *(cells.get(key, "-") for key in names))
-        )
+        for item in own
+        for part in item.components
+    ]
     caption = f"Variance of subjects, visits and trials behind {MEASURES[measure]}, 95 % intervals."
-    return TextTable(caption, ("condition", "output", "subjects", "visits", "trials"), rows)
+    return Finding(f"components-{measure}", pd.DataFrame(rows), caption, digits=3)
 
 
-def _cmc_table(result: Reliability) -> TextTable:
+def _correlations(result: Reliability) -> Finding:
     rows = []
     for item in result.cmc:
-        cells = []
-        for values in (item.within, item.between):
-            known = values[np.isfinite(values)]
-            spread = f" ± {np.std(known, ddof=1):.3f}" if len(known) > 1 else ""
-            cells.append(f"{np.mean(known):.3f}{spread}" if len(known) else "-")
-        note = f"{item.undefined} undefined" if item.undefined else ""
-        rows.append((item.condition, item.output, *cells, note))
+        (within, sd_within), (between, sd_between) = map(_mean_sd, (item.within, item.between))
+        rows.append(
+            (item.condition, item.output, within, sd_within, between, sd_between, item.undefined)
+        )
+    heads = ["condition", "output", "within_visits", "sd_within", "between_visits", "sd_between",
+             "undefined"]  # fmt: skip
     caption = (
         "Counterpart of table 2.4: coefficient of multiple correlation of the transfer functions "
-        "from perturbation to angle, mean ± SD over subjects."
+        "from perturbation to angle, mean and SD over subjects."
     )
-    return TextTable(caption, ("condition", "output", "within visits", "between visits", ""), rows)
+    return Finding("cmc", pd.DataFrame(rows, columns=heads), caption, digits=3)
 
 
-def _pair_table(result: Reliability) -> TextTable:
+def _pairs(result: Reliability) -> Finding:
     rows = []
     for item in result.measures:
         factor, unit = shown_score(item)
         for pair in item.pairs:
-            rows.append(
-                (
-                    item.condition,
-                    item.output,
-                    MEASURES[item.measure],
-                    f"{pair.second} - {pair.first}",
-                    f"{factor * pair.difference:+.3g} {unit}",
-                    number(pair.p, 2),
-                    number(pair.p_holm, 2),
-                )
-            )
-    heads = ("condition", "output", "measure", "visits", "difference", "p", "p (Holm)")
-    return TextTable("Paired t between visits, without and with Holm's correction.", heads, rows)
+            rows.append((item.condition, item.output, MEASURES[item.measure],
+                         f"{pair.second} - {pair.first}", factor * float(pair.difference), unit,
+                         float(pair.p), float(pair.p_holm)))  # fmt: skip
+    heads = ["condition", "output", "measure", "visits", "difference", "unit", "p", "p_holm"]
+    caption = "Paired t between visits, without and with Holm's correction."
+    return Finding("pairs", pd.DataFrame(rows, columns=heads), caption, digits=3)
 
 
-def _quoted_table() -> TextTable:
-    rows = []
-    for measure, conditions in QUOTED.items():
-        for condition, (lower, upper) in conditions.items():
-            rows.append(
-                (_VISIT_TABLES[measure], MEASURES[measure], condition, f"{lower}", f"{upper}")
-            )
+def _quoted() -> Finding:
+    rows = [
+        (_VISIT_TABLES[measure], MEASURES[measure], condition, lower, upper)
+        for measure, conditions in QUOTED.items()
+        for condition, (lower, upper) in conditions.items()
+    ]
+    heads = ["table", "measure", "condition", "p_lower_body", "p_upper_body"]
     caption = (
         "Quoted from the dissertation, of its own subjects and not of these: the p-values of its "
         "tables 2.5 and 2.6 that survive."
     )
-    return TextTable(
-        caption, ("table", "measure", "condition", "p lower body", "p upper body"), rows
-    )
+    return Finding("dissertation", pd.DataFrame(rows, columns=heads), caption)
+
+
+def _mean_sd(values: Array) -> tuple[float, float]:
+    known = values[np.isfinite(values)]
+    mean = float(np.mean(known)) if len(known) else np.nan
+    return mean, float(np.std(known, ddof=1)) if len(known) > 1 else np.nan

@@ -5,18 +5,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 
-from impc.reporting.document import (
-    Details,
-    Lines,
-    Picture,
-    Report,
-    Section,
-    TextTable,
-    Verdict,
-)
+from impc.reporting.document import Details, Lines, Report, Section, Verdict
+from impc.reporting.finding import Finding, Picture, table_of
 from impc.reporting.provenance import Provenance
-from impc.reporting.rendering import number
 from impc.reporting.style import BLUE, DOUBLE_COLUMN, INK, drawn, journal_style, new_figure
 from impc.studies.selection.key_parameters import between_visits
 from impc.studies.selection.report import command_section, names_of
@@ -36,7 +29,6 @@ def key_report(
     model: ParametricModel, found: KeyParameters, command: str, inputs: Inputs
 ) -> Report:
     """Page, result.json, table and figure of `impc key-parameters`, with `command` and `inputs`."""
-    candidates = _candidate_table(model, found)
     chosen = names_of(model, found.chosen) if found.chosen else "none: no subset passes all filters"
     findings = [
         f"{len(found.selection.subsets)} subsets of {found.selection.size} parameters are "
@@ -55,46 +47,43 @@ def key_report(
         "Key parameters",
         (Verdict(f"Key parameters: {chosen}."), Lines(findings)),
         [
-            Section("1. Estimates", (_estimate_table(model, found),), "Estimates", together=True),
+            Section("1. Estimates", (_estimates(model, found),), "Estimates", together=True),
             Section(
                 "2. Subsets and filters",
                 (
                     Picture("solution-space", caption, caption),
-                    Details("Every subset", (candidates, _sweep_table(model, found))),
+                    Details("Every subset", (_candidates(model, found), _sweep(model, found))),
                 ),
                 "Subsets",
             ),
             command_section(command),
         ],
         figures=figures,
-        tables={"candidates": candidates},
         data=_data(model, found),
         provenance=Provenance(command=command, inputs=inputs),
         words=model.words,
     )
 
 
-def _candidate_table(model: ParametricModel, found: KeyParameters) -> TextTable:
-    rows = [
-        (
-            names_of(model, item.subset),
-            number(item.variance),
-            number(item.vaf, 4),
-            number(item.reliability, 2),
-            str(item.diversity),
-            "kept" if item.kept else "",
-        )
-        for item in found.candidates
-    ]
-    heads = ("subset", "largest variance", "mean VAF %", "least ICC(A,k)", "pathways", "")
-    return TextTable("Subsets and the filters that they pass, best first.", heads, rows)
+def _candidates(model: ParametricModel, found: KeyParameters) -> Finding:
+    table = table_of(
+        found.candidates,
+        {
+            "subset": lambda item: names_of(model, item.subset),
+            "largest_variance": lambda item: float(item.variance),
+            "mean_vaf_percent": lambda item: float(item.vaf),
+            "least_icc": lambda item: float(item.reliability),
+            "pathways": lambda item: item.diversity,
+            "kept": lambda item: item.kept,
+        },
+    )
+    return Finding("candidates", table, "Subsets and the filters that they pass, best first.")
 
 
 def _data(model: ParametricModel, found: KeyParameters) -> dict[str, Any]:
     def names(subset: Sequence[int]) -> list[str]:
         return [model.names[index] for index in subset]
 
-    estimates = zip(names(found.chosen), map(_icc, found.estimates), strict=True)
     return {
         "chosen": names(found.chosen),
         "size": found.selection.size,
@@ -103,63 +92,44 @@ def _data(model: ParametricModel, found: KeyParameters) -> dict[str, Any]:
             {"bound": item.bound, "size": item.size, "subsets": [names(s) for s in item.subsets]}
             for item in found.sweep
         ],
-        "icc": {
-            "nominal": dict(zip(model.names, map(_icc, found.nominal), strict=True)),
-            "chosen": dict(estimates),
-        },
-        "candidates": [
-            {
-                "names": names(item.subset),
-                "variance": item.variance,
-                "vaf": item.vaf,
-                "icc": item.reliability,
-                "diversity": item.diversity,
-                "kept": item.kept,
-            }
-            for item in found.candidates
-        ],
     }
 
 
 def _icc(values: Array) -> dict[str, float]:
     """With its 95 % interval; NaN where there is none."""
     told = between_visits(values)
-    return {key: getattr(told, key, np.nan) for key in ("value", "low", "high")}
+    return {key: float(getattr(told, key, np.nan)) for key in ("value", "low", "high")}
 
 
-def _estimate_table(model: ParametricModel, found: KeyParameters) -> TextTable:
-    """Counterpart of tables 5.3 and 5.4: mean ± SD over subjects, physical units."""
+def _estimates(model: ParametricModel, found: KeyParameters) -> Finding:
+    """Counterpart of tables 5.3 and 5.4: mean and SD over subjects, physical units."""
     places = {index: place for place, index in enumerate(found.chosen)}
-    visits = [f"visit {number + 1}" for number in range(found.nominal.shape[2])]
-    rows = []
+    rows: list[dict[str, Any]] = []
     for index, name in enumerate(model.names):
-        own = found.estimates[places[index]] if index in places else None
-        rows.append(
-            (
-                name,
-                model.units[index],
-                _mean_sd(found.nominal[index]),
-                _with_interval(found.nominal[index]),
-                *(["fixed"] * len(visits) if own is None else map(_mean_sd, own.T)),
-                "" if own is None else _with_interval(own),
-            )
-        )
-    heads = ("parameter", "unit", "all free", "ICC, all free", *visits, "ICC")
-    title = "Estimates, mean ± SD over subjects; ICC(A,k) between visits with its 95 % interval."
-    return TextTable(title, heads, rows)
+        fits = [("all", found.nominal[index])]
+        if index in places:
+            fits.append(("chosen", found.estimates[places[index]]))
+        for free, values in fits:
+            row: dict[str, Any] = {"parameter": name, "unit": model.units[index], "free": free}
+            row["mean"], row["sd"] = _mean_sd(values)
+            if free == "chosen":
+                for visit, own in enumerate(values.T, start=1):
+                    row[f"mean_visit_{visit}"], row[f"sd_visit_{visit}"] = _mean_sd(own)
+            icc = {"icc": "value", "icc_low": "low", "icc_high": "high"}
+            rows.append(row | {key: _icc(values)[end] for key, end in icc.items()})
+    caption = (
+        "Estimates, mean and SD over subjects, with all parameters free and with the chosen ones; "
+        "ICC(A,k) between visits with its 95 % interval."
+    )
+    return Finding("estimates", pd.DataFrame(rows), caption, digits=3)
 
 
-def _mean_sd(values: Array) -> str:
-    spread = number(float(np.nanstd(values, ddof=1))) if values.size > 1 else "-"
-    return f"{number(float(np.nanmean(values)))} ± {spread}"
+def _mean_sd(values: Array) -> tuple[float, float]:
+    spread = float(np.nanstd(values, ddof=1)) if values.size > 1 else np.nan
+    return float(np.nanmean(values)), spread
 
 
-def _with_interval(values: Array) -> str:
-    value, low, high = _icc(values).values()
-    return "-" if np.isnan(value) else f"{value:.2f} [{low:.2f}, {high:.2f}]"
-
-
-def _sweep_table(model: ParametricModel, found: KeyParameters) -> TextTable:
+def _sweep(model: ParametricModel, found: KeyParameters) -> Finding:
     """How the first filter depends on its bound, and which parameters its subsets have."""
     rows = []
     for item in found.sweep:
@@ -167,9 +137,10 @@ def _sweep_table(model: ParametricModel, found: KeyParameters) -> TextTable:
         counts = ", ".join(
             f"{name} {count}" for name, count in zip(model.names, inside, strict=True) if count
         )
-        rows.append((f"{item.bound:.2f}", str(item.size), str(len(item.subsets)), counts or "-"))
-    heads = ("variance bound", "size", "subsets", "in how many of them")
-    return TextTable("The first filter, for every subject and visit at once (5.5).", heads, rows)
+        rows.append((item.bound, item.size, len(item.subsets), counts))
+    heads = ["variance_bound", "size", "subsets", "in_how_many_of_them"]
+    caption = "The first filter, for every subject and visit at once (5.5)."
+    return Finding("sweep", pd.DataFrame(rows, columns=heads), caption)
 
 
 def _solution_figure(model: ParametricModel, found: KeyParameters) -> Figure:

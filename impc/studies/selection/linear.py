@@ -8,9 +8,6 @@ is exact, however fast a pole is. Derivatives of the exponential are Fréchet de
 of A and B, which CasADi gives; with X_i = dx / dtheta_i
 
     X_i+ = Ad X_i + (dAd/dtheta_i) x + (dBd/dtheta_i) r.
-
-`kronecker_sensitivity` is the same recursion as the dissertation writes it, (A.3): one row of
-blocks, and Kronecker products. It serves as a check.
 """
 
 from __future__ import annotations
@@ -89,23 +86,6 @@ def linear_functions(
         return np.asarray(outputs), np.asarray(on_state + on_output)
 
     return simulate, jacobian
-
-
-def kronecker_sensitivity(found: Discrete, given: Array) -> Array:
-    """(A.3) with Kronecker products: derivative of the outputs (samples, p, k); slow.
-
-    `given` (samples, d).
-    """
-    k, n, d = len(found.dA), found.A.shape[0], found.B.shape[1]
-    dA, dB, dC = (np.hstack(list(item)) for item in (found.dA, found.dB, found.dC))
-    x, X = np.zeros((n, 1)), np.zeros((n, k))
-    eye = np.eye(k)
-    rows = np.empty((len(given), found.C.shape[0], k))
-    for sample, r in enumerate(np.asarray(given).reshape(len(given), d, 1)):
-        rows[sample] = dC @ np.kron(eye, x) + found.C @ X
-        X = dA @ np.kron(eye, x) + found.A @ X + dB @ np.kron(eye, r)
-        x = found.A @ x + found.B @ r
-    return rows
 
 
 def _sampled(parts: Any, derivatives: list[Array], dt: float) -> Discrete:

@@ -6,11 +6,12 @@ from collections import Counter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 from markupsafe import Markup
 
-from impc.reporting.document import Lines, Picture, Report, Section, TextTable, Verdict
+from impc.reporting.document import Lines, Report, Section, Verdict
+from impc.reporting.finding import Finding, Picture, table_of
 from impc.reporting.provenance import Provenance
-from impc.reporting.rendering import number
 from impc.reporting.style import BLUE, DOUBLE_COLUMN, INK, drawn, journal_style, new_figure
 
 if TYPE_CHECKING:
@@ -27,15 +28,6 @@ def selection_report(
     model: ParametricModel, found: StudySelection, command: str, inputs: Inputs
 ) -> Report:
     """Page, result.json, tables and figure of `impc select`; they name `command` and `inputs`."""
-    tables = {
-        "identifiability": _rank_table(model, found),
-        "sweep": _sweep_table(model, found),
-        "intervals": _interval_table(model, found),
-        "methods": selection_table(model, found),
-        "agreement": _agreement_table(model, found),
-        "bias": _bias_table(model, found),
-        "doubt": _three_intervals(model, found),
-    }
     caption = (
         "Widths of the 95 % bootstrap intervals of the chosen parameters, relative to their "
         "ranges: a point a subject, a bar at the mean."
@@ -48,18 +40,25 @@ def selection_report(
         "Sensitive parameters",
         (Verdict(_verdict(model, found)), Lines(_findings(model, found))),
         [
-            Section("1. Estimates", (picture, tables["intervals"], tables["doubt"]), "Estimates"),
-            Section("2. Methods of selection", (tables["methods"], tables["agreement"]), "Methods"),
+            Section(
+                "1. Estimates",
+                (picture, _intervals(model, found), _three_intervals(model, found)),
+                "Estimates",
+            ),
+            Section(
+                "2. Methods of selection",
+                (method_finding(model, found), _agreement(model, found)),
+                "Methods",
+            ),
             Section(
                 "3. Subsets, directions and bias",
-                [tables[name] for name in ("sweep", "identifiability", "bias")],
+                (_sweep(model, found), _ranks(model, found), _bias(model, found)),
                 "Subsets",
                 folded=True,
             ),
             command_section(command),
         ],
         figures=figures,
-        tables=tables,
         data=_data(model, found),
         provenance=Provenance(command=command, inputs=inputs),
         words=model.words,
@@ -78,7 +77,7 @@ def _verdict(model: ParametricModel, found: StudySelection) -> str:
     )
 
 
-def selection_table(model: ParametricModel, found: StudySelection) -> TextTable:
+def method_finding(model: ParametricModel, found: StudySelection) -> Finding:
     """What each method selects, and what it costs."""
     vaf = np.mean([np.mean(item.refit.vaf) for item in found.chosen.values()])
     full = np.mean([np.mean(item.fit.vaf) for item in found.nominal.values()])
@@ -87,27 +86,18 @@ def selection_table(model: ParametricModel, found: StudySelection) -> TextTable:
         "nelder_mead": [item.nelder_mead for item in found.chosen.values() if item.nelder_mead],
     }
     rows = [
-        ("all parameters", str(model.size), number(float(full), 4), "", ""),
-        (
-            "information (FIM)", names_of(model, found.free), number(float(vaf), 4),
-            f"{found.seconds['fim']:.3g}", "",
-        ),
-    ]  # fmt: skip
+        ("all parameters", f"all {model.size}", float(full), np.nan),
+        ("information (FIM)", names_of(model, found.free), float(vaf), found.seconds["fim"]),
+    ]
     for label, key in (("LASSO, proximal", "lasso"), ("LASSO, Table C.1", "nelder_mead")):
-        known = [item for item in fits[key] if item.refit is not None]
-        if not known:
-            continue
-        share = np.mean([np.mean(item.refit.vaf) for item in known if item.refit is not None])
-        chosen = Counter(item.selected for item in known).most_common(1)[0][0]
-        rows.append(
-            (
-                label, names_of(model, chosen), number(float(share), 4),
-                f"{found.seconds[key]:.3g}",
-                f"{found.seconds[key] / found.seconds['fim']:.3g}",
-            )
-        )  # fmt: skip
-    heads = ("method", "selected", "mean VAF %", "seconds a subject", "over FIM")
-    return TextTable("Methods of selection.", heads, rows)
+        shares = [np.mean(item.refit.vaf) for item in fits[key] if item.refit is not None]
+        if shares:
+            known = (item.selected for item in fits[key] if item.refit is not None)
+            chosen = Counter(known).most_common(1)[0][0]
+            rows.append((label, names_of(model, chosen), float(np.mean(shares)),
+                         found.seconds[key]))  # fmt: skip
+    heads = ["method", "selected", "mean_vaf_percent", "seconds_a_subject"]
+    return Finding("methods", pd.DataFrame(rows, columns=heads), "Methods of selection.")
 
 
 def _findings(model: ParametricModel, found: StudySelection) -> list[str]:
@@ -125,104 +115,96 @@ def _findings(model: ParametricModel, found: StudySelection) -> list[str]:
     return lines
 
 
-def _rank_table(model: ParametricModel, found: StudySelection) -> TextTable:
-    rows = tuple(
-        (
-            name,
-            str(item.information.rank),
-            number(float(np.mean(item.fit.vaf)), 4),
-            ", ".join(model.names[index] for index in item.fit.at_bound) or "-",
-            "; ".join(direction.sentence for direction in item.unseen) or "-",
-        )
-        for name, item in found.nominal.items()
+def _ranks(model: ParametricModel, found: StudySelection) -> Finding:
+    table = table_of(
+        found.nominal.items(),
+        {
+            "subject": lambda pair: pair[0],
+            "rank": lambda pair: pair[1].information.rank,
+            "vaf_percent": lambda pair: float(np.mean(pair[1].fit.vaf)),
+            "at_a_bound": lambda pair: names_of(model, pair[1].fit.at_bound),
+            "directions_that_are_not_seen": lambda pair: "; ".join(
+                direction.sentence for direction in pair[1].unseen
+            ),
+        },
     )
-    heads = ("subject", "rank", "VAF %", "at a bound", "directions that are not seen")
-    return TextTable("Identifiability, before any selection.", heads, rows)
+    return Finding("identifiability", table, "Identifiability, before any selection.")
 
 
-def _sweep_table(model: ParametricModel, found: StudySelection) -> TextTable:
+def _sweep(model: ParametricModel, found: StudySelection) -> Finding:
     rows = []
     for index, selection in enumerate(found.worst_case):
         sizes = [item.sweep[index].size for item in found.nominal.values()]
-        rows.append(
-            (
-                f"{selection.bound:.2f}",
-                f"{min(sizes)} to {max(sizes)}",
-                str(selection.size),
-                str(len(selection.subsets)),
-                names_of(model, selection.subsets[0]) if selection.subsets else "-",
-            )
+        best = names_of(model, selection.subsets[0]) if selection.subsets else ""
+        rows.append((selection.bound, min(sizes), max(sizes), selection.size,
+                     len(selection.subsets), best))  # fmt: skip
+    heads = ["variance_bound", "least_size_of_a_subject", "largest_size_of_a_subject",
+             "size_all_at_once", "subsets", "best"]  # fmt: skip
+    return Finding("sweep", pd.DataFrame(rows, columns=heads), "Largest feasible subsets (5.5).")
+
+
+def _intervals(model: ParametricModel, found: StudySelection) -> Finding:
+    rows = [
+        (
+            subject,
+            name,
+            model.units[index],
+            *(float(ends[place]) for ends in (item.intervals.value, item.intervals.low,
+                                              item.intervals.high)),
+            50 * float(item.intervals.width[place]) / float(model.gain[index]),
         )
-    heads = ("variance bound", "size, each subject", "size, all at once (5.5)", "subsets", "best")
-    return TextTable("Largest feasible subsets.", heads, rows)
+        for place, (index, name) in enumerate((k, model.names[k]) for k in found.free)
+        for subject, item in found.chosen.items()
+    ]  # fmt: skip
+    heads = ["subject", "parameter", "unit", "value", "low", "high", "width_percent_of_the_range"]
+    caption = "The chosen parameters of each subject, with 95 % bootstrap intervals."
+    return Finding("intervals", pd.DataFrame(rows, columns=heads), caption)
 
 
-def _interval_table(model: ParametricModel, found: StudySelection) -> TextTable:
-    rows = []
-    for place, index in enumerate(found.free):
-        values = np.array([item.refit.theta[index] for item in found.chosen.values()])
-        widths = np.array([item.intervals.width[place] for item in found.chosen.values()])
-        rows.append(
-            (
-                model.names[index], model.units[index],
-                f"{values.mean():.4g}{_spread(values)}",
-                f"{widths.mean():.3g}{_spread(widths)}",
-                f"{100 * widths.mean() / (2 * model.gain[index]):.1f}",
-            )
-        )  # fmt: skip
-    heads = ("parameter", "unit", "estimate", "width of the interval", "% of its range")
-    return TextTable("Chosen parameters, mean ± SD over subjects.", heads, rows)
-
-
-def _three_intervals(model: ParametricModel, found: StudySelection) -> TextTable:
+def _three_intervals(model: ParametricModel, found: StudySelection) -> Finding:
     """First subject: percentiles, profile likelihood and the Cramer-Rao bound."""
     first = next(iter(found.chosen.values()))
     rows = []
     for place, index in enumerate(found.free):
-        value, half = first.refit.theta[index], found.doubts.bound[place]
-        ends = (
-            (first.intervals.low[place], first.intervals.high[place]),
-            found.doubts.profile[place],
-            (value - half, value + half),
-        )
-        cells = (f"{low:.4g} to {high:.4g}" for low, high in ends)
-        rows.append((model.names[index], model.units[index], f"{value:.4g}", *cells))
-    heads = ("parameter", "unit", "estimate", "bootstrap", "profile likelihood", "Cramér-Rao bound")
+        value, half = float(first.refit.theta[index]), float(found.doubts.bound[place])
+        bootstrap = (float(first.intervals.low[place]), float(first.intervals.high[place]))
+        rows.append((model.names[index], model.units[index], value, *bootstrap,
+                     *found.doubts.profile[place], value - half, value + half))  # fmt: skip
+    ends = [f"{method}_{end}" for method in ("bootstrap", "profile", "cramer_rao")
+            for end in ("low", "high")]  # fmt: skip
     caption = (
-        "95 % intervals in the first subject. The last two take the residuals for white; an "
-        "infinite end is not met inside the parameter's range."
+        "95 % intervals in the first subject: bootstrap, profile likelihood and Cramér-Rao bound. "
+        "The last two take the residuals for white; an infinite end is not met inside the "
+        "parameter's range."
     )
-    return TextTable(caption, heads, rows)
+    table = pd.DataFrame(rows, columns=["parameter", "unit", "value", *ends])
+    return Finding("doubt", table, caption)
 
 
-def _finite(ends: tuple[float, float]) -> list[float | None]:
-    """JSON has no infinity."""
-    return [value if np.isfinite(value) else None for value in ends]
-
-
-def _agreement_table(model: ParametricModel, found: StudySelection) -> TextTable:
-    rows = []
-    for rule, subset in found.doubts.agreement.items():
-        shared = len(set(subset) & set(found.free))
-        rows.append((rule, names_of(model, subset) or "-", f"{shared} of {len(found.free)}"))
+def _agreement(model: ParametricModel, found: StudySelection) -> Finding:
+    table = table_of(
+        found.doubts.agreement.items(),
+        {
+            "rule": lambda pair: pair[0],
+            "subset": lambda pair: names_of(model, pair[1]),
+            "shared_with_the_chosen": lambda pair: len(set(pair[1]) & set(found.free)),
+        },
+    )
     caption = (
         f"What other rules select in the first subject. The chosen subset's collinearity is "
         f"{found.doubts.collinearity:.3g}; 10 to 20 is the usual limit."
     )
-    return TextTable(caption, ("rule", "subset", "shared with the chosen"), rows)
+    return Finding("agreement", table, caption)
 
 
-def _bias_table(model: ParametricModel, found: StudySelection) -> TextTable:
-    rows = tuple(
-        (item.name, f"{item.moved:+.2f}", *(f"{value:+.3f}" for value in item.shift))
-        for item in found.doubts.bias
-    )
-    heads = ("fixed parameter", "moved by", *(model.names[index] for index in found.free))
+def _bias(model: ParametricModel, found: StudySelection) -> Finding:
+    rows = [(item.name, item.moved, *item.shift) for item in found.doubts.bias]
+    heads = ["fixed_parameter", "moved_by", *(model.names[index] for index in found.free)]
     caption = (
         "Bias from fixing, first subject: shift of the chosen parameters when a fixed one is "
         "elsewhere; all in halves of their ranges."
     )
-    return TextTable(caption, heads, rows)
+    return Finding("bias", pd.DataFrame(rows, columns=heads), caption, digits=3)
 
 
 def _interval_figure(model: ParametricModel, found: StudySelection) -> Figure:
@@ -244,16 +226,6 @@ def _data(model: ParametricModel, found: StudySelection) -> dict[str, Any]:
     def names(subset: Sequence[int]) -> list[str]:
         return [model.names[index] for index in subset]
 
-    intervals = {
-        subject: {
-            name: {"value": value, "low": low, "high": high}
-            for name, value, low, high in zip(
-                item.intervals.names, item.intervals.value, item.intervals.low, item.intervals.high,
-                strict=True,
-            )
-        }
-        for subject, item in found.chosen.items()
-    }  # fmt: skip
     return {
         "selected": {
             "fim": names(found.free),
@@ -266,8 +238,6 @@ def _data(model: ParametricModel, found: StudySelection) -> dict[str, Any]:
         },
         "common": names(sorted(set(found.free) & set(found.lasso))),
         "intersection": [names(subset) for subset in found.intersection],
-        "intervals": intervals,
-        "profile": dict(zip(names(found.free), map(_finite, found.doubts.profile), strict=True)),
         "vaf": {
             "nominal": {key: item.fit.vaf for key, item in found.nominal.items()},
             "fim": {key: item.refit.vaf for key, item in found.chosen.items()},
@@ -276,15 +246,13 @@ def _data(model: ParametricModel, found: StudySelection) -> dict[str, Any]:
                 for key, item in found.chosen.items()
             },
         },
-        "seconds": found.seconds,
-        "rank": {key: item.information.rank for key, item in found.nominal.items()},
         "unseen_scalings": {key: item.scalings for key, item in found.nominal.items()},
         "unseen": {
             key: [direction.shares for direction in item.unseen]
             for key, item in found.nominal.items()
         },
-        "sweep": [
-            {"bound": item.bound, "size": item.size, "subsets": [names(s) for s in item.subsets]}
+        "subsets": [
+            {"bound": item.bound, "subsets": [names(subset) for subset in item.subsets]}
             for item in found.worst_case
         ],
     }
@@ -293,8 +261,3 @@ def _data(model: ParametricModel, found: StudySelection) -> dict[str, Any]:
 def names_of(model: ParametricModel, subset: Sequence[int]) -> str:
     """Names of a subset, with commas."""
     return ", ".join(model.names[index] for index in subset)
-
-
-def _spread(values: np.ndarray[Any, np.dtype[np.float64]]) -> str:
-    """The deviation behind a mean; nothing for one subject."""
-    return f" ± {np.std(values, ddof=1):.2g}" if len(values) > 1 else ""

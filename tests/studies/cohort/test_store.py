@@ -12,11 +12,12 @@ import pandas as pd
 import pytest
 
 from impc.errors import ImpcError, InputError, OutputError
+from impc.reporting.finding import csv_bytes
 from impc.studies.cohort import engine
 from impc.studies.cohort.engine import Failures, run_study, work_left
 from impc.studies.cohort.report import write_report
 from impc.studies.cohort.store import Store, open_store
-from impc.studies.cohort.tables import cohort_tables, table_bytes
+from impc.studies.cohort.tables import cohort_tables
 from tests.studies.cohort.made_up import Here, fit_of, made_up_study, replicate_of, tasks_of
 
 REPLICATES = 3
@@ -36,7 +37,7 @@ def filled(folder: Path) -> Store:
 
 
 def tables(store: Store) -> dict[str, bytes]:
-    return {name: table_bytes(table) for name, table in cohort_tables(STUDY, store).items()}
+    return {name: csv_bytes(table) for name, table in cohort_tables(STUDY, store).items()}
 
 
 def test_tables_hold_what_was_kept(tmp_path: Path) -> None:
@@ -218,5 +219,5 @@ def test_formulas_are_no_cells() -> None:
     table = pd.DataFrame(
         {"unit": ["=HYPERLINK(1)", "@SUM(1)", "-2", "sub-1"], "=K": [-1.5, 2, 3, 4]}
     )
-    text = table_bytes(table).decode()
+    text = csv_bytes(table).decode()
     assert text == "unit,'=K\n'=HYPERLINK(1),-1.5\n'@SUM(1),2.0\n-2,3.0\nsub-1,4.0\n"

@@ -178,7 +178,7 @@ def test_the_command(tmp_path: Path) -> None:
     assert done.exit_code == 0, done.stderr
     names = {path.name for path in out.iterdir()}
     pictures = {"comparison.png", "comparison.pdf", "trajectories.png", "trajectories.pdf"}
-    tables = {"gain.csv", "weights.csv", "methods.csv", "trajectories.csv", "tables.mat",
+    tables = {"gain.csv", "weights.csv", "methods.csv", "trajectories.csv",
               "tables.xlsx"}  # fmt: skip
     assert names == {"report.html", "result.json", ".impc", *tables, *pictures}
     found = json.loads((out / "result.json").read_text())["methods"]
@@ -186,7 +186,7 @@ def test_the_command(tmp_path: Path) -> None:
     with (out / "methods.csv").open() as stream:
         rows = list(csv.DictReader(stream))
     for row in rows:
-        told = found[row["method"]]["vaf"]["theta1"]
+        told = found[row["name"]]["vaf"]["theta1"]
         assert row["vaf_theta1"] == ("" if told is None else repr(told))
     gain, weights, sway = (pd.read_csv(out / f"{name}.csv")
                            for name in ("gain", "weights", "trajectories"))  # fmt: skip

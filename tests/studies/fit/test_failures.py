@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from functools import cache
 from typing import Any
 
@@ -13,10 +14,9 @@ from experiments.search_problems import stick
 from impc.errors import SolverError
 from impc.reporting.provenance import Provenance
 from impc.studies.fit import subject
+from impc.studies.fit.report import fit_report
 from impc.studies.fit.result import FitResult
-from impc.studies.fit.schema import fit_data
-from impc.studies.fit.sentences import remarks
-from impc.studies.fit.verdict import abstract, verdict
+from impc.studies.fit.verdict import abstract, remarks, verdict
 
 
 @cache
@@ -37,7 +37,8 @@ def fitted(angle: float = -25.0, rate: float = -7.0, noise: float = 3e-4) -> Fit
 
 
 def data(result: FitResult) -> dict[str, Any]:
-    return fit_data(result, Provenance())
+    found: dict[str, Any] = json.loads(fit_report(result, Provenance()).files()["result.json"])
+    return found
 
 
 @pytest.mark.full
@@ -47,9 +48,7 @@ def test_less_than_half_explained_gives_no_interval_and_no_statement() -> None:
     found = data(result)
     assert np.max(result.inverse_mpc.vaf) < 50
     assert found["usable"] is False
-    assert found["intervals"] == {}
-    assert found["all_intervals"] == []
-    assert found["weights_set"] is None
+    assert not {"gain", "directions", "prices"} & set(found["findings"])
     assert verdict(result).startswith("The fitted controller explains less than half of angle")
     assert not any("cost is" in sentence for sentence in (*abstract(result), *remarks(result)))
     assert data(fitted())["usable"] is True
@@ -60,7 +59,7 @@ def test_no_weights_is_said_before_any_weights() -> None:
     result = fitted(-60.0, -4.0)
     assert result.weights_test.rejected
     assert verdict(result).startswith("No cost weights explain this gain")
-    assert data(result)["weights_set"] is None
+    assert "prices" not in data(result)["findings"]
     assert not any("dominant cost" in sentence for sentence in abstract(result))
     assert not fitted().weights_test.rejected
 

@@ -16,6 +16,7 @@ from impc.errors import InputError
 from impc.inverse.noisy_fit import fit_controller
 from impc.model.bounds import Bounds
 from impc.model.weights import Weights
+from impc.reporting.document import Report
 from impc.studies.fit.asked import fit_structures
 from impc.studies.fit.result import FitResult
 from impc.studies.fit.settings import FitSettings, fit_settings
@@ -110,14 +111,13 @@ def test_a_structure_that_does_not_hold_is_refused_first() -> None:
 def test_the_section_has_every_structure() -> None:
     result = fitted(0.0)
     section = structure_section(result)
-    tables = [block for block in section.blocks if hasattr(block, "rows")]
-    side_by_side = tables[-1].rows
+    found = {item.name: item for item in Report("", "", (), [section]).findings()}
+    side_by_side = found["structures"].rows
     assert [row[0] for row in side_by_side] == ["weights of any kind", "one by one", "positions"]
     assert side_by_side[2][-1] == "refuse it"  # no price on speeds
     kept = structure_data(result)
     assert [item["name"] for item in kept] == ["one by one", "positions"]
-    assert kept[0]["rank"] == 5
-    assert len(kept[0]["prices"]) == 5
+    assert len(found["structure_prices"].rows) == 5
     json.dumps([item["refused"] for item in kept])
 
 

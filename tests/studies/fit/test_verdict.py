@@ -22,10 +22,9 @@ from impc.reporting.shown_units import angles_in
 from impc.studies.charts import methods_chart, weights_chart
 from impc.studies.fit.figures import trajectory_figure
 from impc.studies.fit.interval_figures import gain_figure, shown_statements, statements_figure
-from impc.studies.fit.sentences import missing
 from impc.studies.fit.settings import FitSettings
 from impc.studies.fit.subject import fit_problem, fit_recordings, stages
-from impc.studies.fit.verdict import abstract, verdict
+from impc.studies.fit.verdict import abstract, missing, verdict
 from impc.studies.signal_words import signal_words
 
 if TYPE_CHECKING:

@@ -11,6 +11,7 @@ import pytest
 
 import impc.studies.selection.subsets
 import plants
+from experiments.kronecker import kronecker_sensitivity
 from impc.errors import DataError, InputError
 from impc.studies.selection.estimation import estimate, free_indices, multi_start
 from impc.studies.selection.fisher import (
@@ -19,7 +20,7 @@ from impc.studies.selection.fisher import (
     null_directions,
     unseen_scalings,
 )
-from impc.studies.selection.linear import discretised, kronecker_sensitivity
+from impc.studies.selection.linear import discretised
 from impc.studies.selection.model import normalised, parametric_model, physical, sensitivity
 from impc.studies.selection.modern import (
     best_collinear,

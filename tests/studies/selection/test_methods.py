@@ -137,7 +137,7 @@ def test_head_tracking_from_files_to_files(tmp_path: Path) -> None:
     assert done.exit_code == 0, done.stderr
     found = json.loads((tmp_path / "out" / "result.json").read_text())
     assert set(found["selected"]) == {"fim", "lasso", "nelder_mead"}
-    assert {"common", "intervals", "vaf", "seconds", "rank"} <= set(found)
+    assert {"common", "vaf", "seconds", "findings"} <= set(found)
     (scalings,) = found["unseen_scalings"].values()
     assert ["Kvis", "Kvcr", "Kccr", "B", "K"] in scalings
     page = (tmp_path / "out" / "report.html").read_text()
@@ -197,7 +197,7 @@ def test_a_model_from_another_field(tmp_path: Path) -> None:
     assert done.exit_code == 0, done.stderr
     found = json.loads((tmp_path / "key" / "result.json").read_text())
     assert found["chosen"] == ["ka", "ke", "V"]
-    assert found["candidates"][0]["diversity"] == 3
+    assert found["findings"]["candidates"]["table"]["pathways"][0] == 3
 
 
 def test_faults_are_one_line(tmp_path: Path) -> None:

@@ -6,8 +6,8 @@ import math
 
 import pytest
 
+from experiments.protocols import critical_stiffness, torque_amplitude
 from impc.errors import InputError, SolverError
-from impc.studies.protocols import critical_stiffness, torque_amplitude
 
 
 @pytest.mark.parametrize("threshold", [40.0, 61.3, 117.5, 249.0])

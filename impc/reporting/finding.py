@@ -1,0 +1,159 @@
+"""A finding: what one assessment says, as one value.
+
+Page, CSV, workbook and result.json are made from the list of findings (`impc.reporting.document`):
+a new assessment is one function that returns a `Finding`, and one line in the sections of a page.
+"""
+
+from __future__ import annotations
+
+import enum
+import io
+import math
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+import pandas as pd
+
+from impc.errors import one_line
+from impc.files.columns import in_columns
+from impc.files.delimited import text_cell
+from impc.reporting.rendering import number
+
+T = TypeVar("T")
+
+
+class Severity(enum.Enum):
+    """How far a finding forbids statements about the person."""
+
+    GREEN = "green"  # Nothing speaks against it
+    AMBER = "amber"  # Some statements must not be made
+    RED = "red"  # Nothing may be said about the person's control
+    NOTE = "note"  # For information
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A figure of the report."""
+
+    name: str  # Of its PNG among the report's figures, without the ending
+    alternative: str  # In place of the picture for those who do not see it
+    caption: str  # Below it
+    narrow: bool = False  # Whether its words can be read at the width of a phone
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A figure whose curves the page's script lets a reader move, zoom and switch on and off."""
+
+    picture: Picture  # What is seen without scripts, in print, and before a reader asks for more
+    data: Mapping[str, Any]  # The curves, as `impc.studies.charts` makes them
+
+
+@dataclass(frozen=True, eq=False)
+class Finding:
+    """Name, table, sentences and figure of one assessment, and how severe it is.
+
+    Heads of the table are words joined by `_`, which R and MATLAB take for names, and numbers are
+    numbers in the units of the plant. `p` and heads that begin with `p_` are of probabilities.
+    """
+
+    name: str  # Key in result.json, name of the CSV file and of the sheet
+    table: pd.DataFrame | None = None
+    caption: str = ""  # Above the table
+    sentences: Sequence[str] = ()  # Before the figure
+    figure: Picture | Chart | None = None
+    severity: Severity = Severity.NOTE
+    folded: str = ""  # What the table is called where a reader has to unfold it on the page
+    digits: int = 4  # Of its numbers on the page
+
+    @property
+    def heads(self) -> list[str]:
+        """Heads of the table for readers."""
+        names: Sequence[str] = () if self.table is None else list(self.table.columns)
+        return [str(name).replace("percent", "%").replace("_", " ") for name in names]
+
+    @property
+    def rows(self) -> list[list[str]]:
+        """Cells of the table for readers."""
+        if self.table is None:
+            return []
+        columns = [
+            [_shown(name, value, self.digits) for value in self.table[name]]
+            for name in self.table.columns
+        ]
+        return [list(row) for row in zip(*columns, strict=True)]
+
+    def text(self) -> str:
+        """The table in columns of a fixed width, for a terminal."""
+        return in_columns([self.heads, *self.rows])
+
+    def data(self) -> dict[str, Any]:
+        """For result.json."""
+        table = {} if self.table is None else {"table": self.table.to_dict("list")}
+        return {"severity": self.severity.value, "sentences": list(self.sentences), **table}
+
+
+def table_of(items: Iterable[T], columns: Mapping[str, Callable[[T], Any]]) -> pd.DataFrame:
+    """A table with a row for each of the `items`; every column has its name and its function."""
+    found = list(items)
+    return pd.DataFrame(
+        {name: pd.Series([cell(item) for item in found], dtype=None if found else object)
+         for name, cell in columns.items()}
+    )  # fmt: skip
+
+
+def csv_bytes(table: pd.DataFrame) -> bytes:
+    """A table as CSV in UTF-8 that a spreadsheet may open: none of its texts is a formula."""
+    stream = io.StringIO()
+    as_data(table).to_csv(stream, index=False, lineterminator="\n")
+    return stream.getvalue().encode()
+
+
+def workbook_bytes(tables: Mapping[str, pd.DataFrame]) -> bytes:
+    """Tables as sheets of one workbook (.xlsx)."""
+    stream = io.BytesIO()
+    with pd.ExcelWriter(stream, engine="openpyxl") as writer:
+        for name, table in tables.items():
+            as_data(table).to_excel(writer, sheet_name=name[:_LONGEST_NAME], index=False)
+    return stream.getvalue()
+
+
+#: Cells of a table that is in the workbook too; a larger one, some seconds to write, is CSV alone.
+MOST_CELLS = 200_000
+_LONGEST_NAME = 31  # characters of a sheet's
+_ANY_LENGTH = 32_767  # characters of a cell
+_NUMBER = re.compile(r"[+-]?\d+(\.\d*)?")
+
+
+def as_data(table: pd.DataFrame) -> pd.DataFrame:
+    """A table whose texts no spreadsheet takes for formulas; truth values are yes and no.
+
+    A spreadsheet runs what begins with = + - or @, and names come from files of others: such a text
+    gets an apostrophe, which spreadsheets know as the mark of text.
+    """
+    safe = table.map(_safe)
+    safe.columns = pd.Index([_safe(name) for name in table.columns])
+    return safe
+
+
+def _safe(value: Any) -> Any:
+    if isinstance(value, bool | np.bool_):
+        return "yes" if value else "no"
+    if not isinstance(value, str):
+        return value
+    return one_line(value if _NUMBER.fullmatch(value) else text_cell(value), _ANY_LENGTH)
+
+
+def _shown(column: str, value: Any, digits: int) -> str:
+    if value is None or (isinstance(value, float) and math.isnan(value)):
+        return "-"
+    if isinstance(value, bool | np.bool_):
+        return "yes" if value else "no"
+    if not isinstance(value, float | np.floating):
+        return str(value)
+    if re.match(r"p(_|$)", column):
+        return "< 0.001" if value < 1e-3 else number(float(value), 2)
+    return number(float(value), digits)

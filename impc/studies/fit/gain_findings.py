@@ -1,0 +1,184 @@
+"""What a fit says of the gain: its entries, directions, physical parameters, limit and horizon."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pandas as pd
+
+from impc.assess.covariance import TOLD
+from impc.assess.intervals import entry_names
+from impc.assess.other_models import verdict
+from impc.model.signal_units import UNKNOWN, gain_unit
+from impc.reporting.finding import Finding, Picture, Severity, table_of
+from impc.studies.fit.verdict import direction_name, other_limit_sentence
+
+if TYPE_CHECKING:
+    from impc.model.plant import Plant
+    from impc.studies.fit.result import FitResult
+
+_FIGURE = Picture(
+    "gain",
+    "Every entry of the gain with its interval, one row a state",
+    "Entries of the gain, each as the command that it gives at the state's typical size, with 95 % "
+    "intervals. Grey: not identified by itself. An arrow: the interval goes on.",
+    narrow=True,
+)
+# Columns of intervals by other methods than that of low and high.
+_OTHER = {"cramer-rao": "white", "block": "block", "model": "model", "profile": "profile"}
+
+
+def gain_finding(result: FitResult) -> Finding:
+    """Every number with its intervals, beside the gain of the weights."""
+    certainty, plant = result.certainty, result.fitted.problem.plant
+    of_weights = dict(zip(entry_names(plant), np.ravel(result.fitted.gain), strict=True))
+    found = {(item.name, item.method): item for item in certainty.intervals}
+    units, rows = number_units(plant), []
+    for name in dict.fromkeys(item.name for item in certainty.intervals):
+        item = next(one for (number, _), one in found.items() if number == name)
+        row = {
+            "number": number_name(plant, name),
+            "unit": units.get(name, UNKNOWN),
+            "value": np.nan if item.value is None else float(item.value),
+            "low": float(item.low),
+            "high": float(item.high),
+            "identified": item.told,
+            "excludes_zero": item.excludes_zero,
+        }
+        for method, column in _OTHER.items():
+            other = found.get((name, method))
+            if any(key == method for _, key in found):
+                row[f"{column}_low"] = np.nan if other is None else float(other.low)
+                row[f"{column}_high"] = np.nan if other is None else float(other.high)
+        rows.append(row | {"gain_of_the_weights": float(of_weights.get(name, np.nan))})
+    level = 100 * certainty.intervals[0].level if rows else 95
+    return Finding(
+        "gain",
+        pd.DataFrame(rows),
+        f"Intervals of {level:.0f} %. Low and high allow for autocorrelated residuals, as those of "
+        "people are; those that take them for white are too narrow then. An entry that is not "
+        "identified takes part in directions that hardly show in the recordings: values within its "
+        "interval cannot be distinguished, and the table of directions says which combinations "
+        "can. The gain of the reported weights follows from a rule that chose them, so it has no "
+        "interval; outside the estimate's interval these weights do not quite behave as recorded.",
+        figure=_FIGURE,
+        folded="Every number with its intervals",
+    )
+
+
+def direction_finding(result: FitResult) -> Finding:
+    """Combinations of entries that the recordings determine, best first."""
+    plant, covariance = result.fitted.problem.plant, result.estimate.covariance
+    names = tuple(
+        state if plant.m == 1 else f"{state} to {control}"
+        for control in plant.controls
+        for state in plant.states
+    )
+    back = np.kron(np.array(covariance.G), np.linalg.inv(covariance.T).T)
+    moved = (covariance.directions @ back.T) * np.tile(np.array(result.intent.sizes), plant.m)
+    values, deviations = covariance.singular_values, covariance.deviations
+    table = table_of(
+        range(len(values)),
+        {
+            "direction": lambda k: direction_name(moved[k] / np.linalg.norm(moved[k]), names),
+            "relative_singular_value": lambda k: float(values[k] / values[0]),
+            "standard_error": lambda k: float(deviations[k]),
+            "identified": lambda k: bool(deviations[k] < TOLD),
+        },
+    )
+    return Finding(
+        "directions",
+        table,
+        "Directions of the gain, best determined first, as commands at typical states. The "
+        "standard error is relative to the natural size of a gain: 1 means practically unknown. "
+        f"Above {TOLD:g} a direction is not identified, and the estimate stays near that of the "
+        "weights.",
+        folded="Combinations of entries: directions of the gain",
+        digits=2,
+    )
+
+
+def parameter_findings(result: FitResult) -> list[Finding]:
+    """Physical parameters that were fitted with the gain, where there are any."""
+    if not result.parameters:
+        return []
+    table = table_of(
+        result.parameters,
+        {
+            "parameter": lambda item: item.name,
+            "nominal": lambda item: float(item.nominal),
+            "fitted": lambda item: float(item.value),
+            "standard_error": lambda item: float(item.deviation),
+            "identified": lambda item: item.determined,
+        },
+    )
+    caption = (
+        "Physical parameters fitted with the gain, in SI units. One that is not identified, to a "
+        "factor of e at 95 %, stays near its nominal value whatever the true one is."
+    )
+    return [Finding("parameters", table, caption)]
+
+
+def limit_findings(result: FitResult) -> list[Finding]:
+    """What the recordings say of the limit of the command and of the horizon, where asked."""
+    found = []
+    if result.certainty.limits:
+        limits = result.certainty.limits
+        table = table_of(
+            zip(result.given.plant.controls, limits, strict=True),
+            {
+                "input": lambda pair: pair[0],
+                "limit": lambda pair: np.nan if pair[1].value is None else float(pair[1].value),
+                "low": lambda pair: float(pair[1].low),
+                "high": lambda pair: float(pair[1].high),
+                "distance_of_no_limit": lambda pair: float(pair[1].against_none),
+                "threshold": lambda pair: float(pair[1].quantile),
+            },
+        )
+        said = [f"{item.reason[0].upper()}{item.reason[1:]}." for item in limits]
+        found.append(Finding("limits", table, "Limits of the command as unknowns, 95 %.", said))
+    if result.other_limit is not None:
+        contradicted = result.other_limit.contradicted
+        level = Severity.RED if contradicted else Severity.NOTE
+        said = [other_limit_sentence(result)]
+        found.append(Finding("other_limit", sentences=said, severity=level))
+    if result.certainty.alternatives:
+        first = result.certainty.alternatives[0]
+        table = table_of(
+            result.certainty.alternatives,
+            {
+                "fit": lambda item: item.name,
+                "horizon": lambda item: int(item.horizon),
+                "aic_above_the_least": lambda item: float(item.aic),
+                "left_out_vaf": lambda item: float(item.held_out),
+                "the_recordings_say": lambda item: "" if item is first else verdict(first, item),
+            },
+        )
+        caption = (
+            "The same recordings with other horizons and without limit. AIC is above the least, "
+            "for the innovations of the residuals; VAF (%) is of trials left out."
+        )
+        found.append(Finding("alternatives", table, caption))
+    return found
+
+
+def number_name(plant: Plant, name: str) -> str:
+    """What a reader calls a number of a fit by its `name`, such as K.command.theta1."""
+    kind, _, rest = name.partition(".")
+    if name not in number_units(plant):
+        return name
+    if kind == "u_max":
+        return f"limit of {rest}"
+    control = next(one for one in plant.controls if rest.startswith(f"{one}."))
+    state = rest.removeprefix(f"{control}.")
+    return f"gain of {state}" if plant.m == 1 else f"gain of {state} to {control}"
+
+
+def number_units(plant: Plant) -> dict[str, str]:
+    """Units of the numbers of a fit by their names: K.<control>.<state>, u_max.<control>."""
+    return {
+        f"K.{control}.{state}": gain_unit(plant, control, state)
+        for control in plant.controls
+        for state in plant.states
+    } | {f"u_max.{control}": plant.unit(control) for control in plant.controls}

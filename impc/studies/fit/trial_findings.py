@@ -1,0 +1,105 @@
+"""What a fit says of each trial: agreement, residuals, checks of the recording, curves."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pandas as pd
+
+from impc.reporting.finding import Finding, Picture, Severity
+from impc.studies.fit.result import shown_trials, trial_name
+from impc.studies.methods_table import until_its_end
+
+if TYPE_CHECKING:
+    from impc.studies.fit.result import FitResult
+
+
+def agreement_finding(result: FitResult) -> Finding:
+    """How much of each output of each trial is explained."""
+    outputs, rows = result.fitted.problem.plant.outputs, []
+    for index, trial in enumerate(result.trials):
+        held = result.held_out[index].vaf if result.held_out else [np.nan] * len(outputs)
+        for column, name in enumerate(outputs):
+            rows.append(
+                {
+                    "trial": trial_name(result, index),
+                    "output": name,
+                    "vaf_percent": float(trial.vaf[column]),
+                    "left_out_vaf_percent": float(held[column]),
+                    "p_white_residual": float(trial.whiteness[column]),
+                    "at_the_bound_percent": 100 * float(trial.saturated),
+                }
+            )
+    return Finding(
+        "agreement",
+        pd.DataFrame(rows),
+        "Variance accounted for (VAF). Left out: predicted from the other trials, after the time "
+        "that serves to find where the trial starts. P-value of Ljung and Box's test that the "
+        "residual is white; a small one says that something regular is left.",
+        digits=5,
+    )
+
+
+def residual_findings(result: FitResult) -> list[Finding]:
+    """Tests that speak against the model; their warnings have to be read before any number."""
+    found, rows = result.diagnostics, []
+    if found.loop is not None:
+        rows.append(("noise inside the loop", found.loop.statistic, found.loop.threshold,
+                     np.nan, float(np.max(found.loop.shares)), found.loop.found))  # fmt: skip
+    if found.structure is not None:
+        least = min(found.structure.p_linear, found.structure.p_nonlinear)
+        rows.append(("error of the model", np.nan, np.nan, least, found.structure.share,
+                     found.structure.found))  # fmt: skip
+    if not rows:
+        return []
+    heads = ["test", "statistic", "threshold", "p", "share_of_the_residual", "found"]
+    return [
+        Finding(
+            "residual_tests",
+            pd.DataFrame(rows, columns=heads),
+            "What the residuals say against the model.",
+            result.warnings,
+            severity=Severity.AMBER if result.warnings else Severity.GREEN,
+            folded="Tests of the residuals",
+        )
+    ]
+
+
+RESIDUALS = Picture(
+    "residuals",
+    "Residuals over time and their autocorrelation",
+    "Residuals of every trial, one below the other, and their autocorrelation.",
+)
+
+
+def check_finding(result: FitResult) -> Finding:
+    """What the checks of the recordings found."""
+    rows = [
+        (trial_name(result, index), line)
+        for index, trial in enumerate(result.given.recordings)
+        for line in trial.findings or ("Nothing found.",)
+    ]
+    return Finding("checks", pd.DataFrame(rows, columns=["trial", "found"]))
+
+
+def trajectory_finding(result: FitResult) -> Finding:
+    """A row a sample of the trials that the page draws: recorded and simulated."""
+    plant, blocks = result.given.plant, []
+    for index in shown_trials(result):
+        trial, run = result.given.recordings[index], result.inverse_mpc.runs[index]
+        number = np.full((trial.samples, 1), index + 1.0)
+        time = plant.dt * np.arange(trial.samples)[:, None]
+        simulated, commands = until_its_end(plant, run)
+        blocks.append(
+            np.hstack([number, time, trial.outputs, simulated, commands, trial.disturbance])
+        )
+    heads = [
+        "trial",
+        "time",
+        *(f"{name}_recorded" for name in plant.outputs),
+        *(f"{name}_simulated" for name in plant.outputs),
+        *(f"{name}_simulated" for name in plant.controls),
+        *plant.disturbances,
+    ]
+    return Finding("trajectories", pd.DataFrame(np.vstack(blocks), columns=heads))
