@@ -32,7 +32,7 @@ FILES = (
     "tests/test_exact_mpc.py",
     "tests/inverse/test_noisy_fit.py",
     "tests/control/test_hard_plants.py",
-    "tests/inverse/test_stationarity.py",
+    "tests/experiments/test_inverse_kkt.py",
     "tests/inverse/test_inverse_lqr.py",
     "tests/inverse/test_direct_and_reduced.py",
     "tests/model/test_riccati.py",

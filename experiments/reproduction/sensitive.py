@@ -238,19 +238,10 @@ def _claims(
         Entry(
             "Claim, 4.2.4",
             "Bootstrap intervals, from the 2.5th to the 97.5th percentile.",
-            (
-                "impc.studies.selection.subject:bootstrap_subset",
-                "impc.studies.selection.modern:profile_interval",
-            ),
+            ("impc.studies.selection.subject:bootstrap_subset",),
             "First subject: "
             + "; ".join(
                 f"{name} {item['low']:.3g} to {item['high']:.3g}" for name, item in first.items()
-            )
-            + ". By profile likelihood: "
-            + "; ".join(
-                f"{name} {ends[0]:.3g} to {ends[1]:.3g}"
-                for name, ends in select["profile"].items()
-                if None not in ends
             )
             + ".",
             Verdict.REPRODUCED,

@@ -37,7 +37,9 @@ def fits() -> list[MethodFit]:
     settings = FitSettings(horizon=10, u_max=1.0)
     problem = fit_problem(cart(), [noisy_trial(21, 0.0)], settings)
     gain = judge(estimate(problem, "feedback_gain"), problem.bounds)
-    none = replace(gain.estimate, method="inverse_kkt", K=None, S=None, reason="it was not tried")
+    none = replace(
+        gain.estimate, method="inverse_lqr_lmi", K=None, S=None, reason="it was not tried"
+    )
     return [gain, judge(none, problem.bounds)]
 
 
@@ -45,13 +47,13 @@ def test_the_three_say_the_same(fits: list[MethodFit]) -> None:
     table = methods_table(fits)
     numbers = list(csv.DictReader(io.StringIO(methods_numbers(fits).csv().decode())))
     data = json.loads(json_bytes(methods_data(fits)))
-    assert list(data) == ["feedback_gain", "inverse_kkt"] == [row["method"] for row in numbers]
+    assert list(data) == ["feedback_gain", "inverse_lqr_lmi"] == [row["method"] for row in numbers]
     output = fits[0].estimate.problem.plant.outputs[0]
     share = data["feedback_gain"]["vaf"][output]
     assert float(numbers[0][f"vaf_{output}"]) == share
     assert table.rows[0][1] == f"{share:.5g}"
     assert table.rows[0][0] == METHODS["feedback_gain"].label
-    assert (numbers[1][f"vaf_{output}"], data["inverse_kkt"]["vaf"]) == ("", {output: None})
+    assert (numbers[1][f"vaf_{output}"], data["inverse_lqr_lmi"]["vaf"]) == ("", {output: None})
     assert table.rows[1][-1] == numbers[1]["reason"] == "it was not tried"
 
 

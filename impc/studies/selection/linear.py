@@ -8,9 +8,6 @@ is exact, however fast a pole is. Derivatives of the exponential are Fréchet de
 of A and B, which CasADi gives; with X_i = dx / dtheta_i
 
     X_i+ = Ad X_i + (dAd/dtheta_i) x + (dBd/dtheta_i) r.
-
-`kronecker_sensitivity` is the same recursion as the dissertation writes it, (A.3): one row of
-blocks, and Kronecker products. It serves as a check.
 """
 
 from __future__ import annotations
@@ -37,20 +34,6 @@ class Discrete(NamedTuple):
     dA: Array  # (k, n, n)
     dB: Array  # (k, n, d)
     dC: Array  # (k, p, n)
-
-
-def discretised(matrices: ca.Function, theta: Array, dt: float) -> Discrete:
-    """Sample a model at one point.
-
-    `theta` (k,); `dt` in s.
-    """
-    A, B, C = (item.full() for item in matrices(theta))
-    symbol = ca.SX.sym("theta", len(theta))
-    parts = matrices(symbol)
-    derivative = ca.Function(
-        "derivative", [symbol], [ca.jacobian(ca.vec(part), symbol) for part in parts]
-    )
-    return _sampled((A, B, C), [item.full() for item in derivative(theta)], dt)
 
 
 def linear_functions(
@@ -81,7 +64,7 @@ def linear_functions(
 
     def jacobian(theta: Array, given: Array, free: IntArray) -> tuple[Array, Array]:
         continuous = [item.full() for item in matrices(theta)]
-        found = _sampled(continuous, [item.full()[:, free] for item in derivative(theta)], dt)
+        found = sampled(continuous, [item.full()[:, free] for item in derivative(theta)], dt)
         x, X = _with_derivatives(found.A, found.B, found.dA, found.dB, np.ascontiguousarray(given))
         outputs = x @ found.C.T
         on_state = np.einsum("pn,skn->spk", found.C, X)
@@ -91,24 +74,8 @@ def linear_functions(
     return simulate, jacobian
 
 
-def kronecker_sensitivity(found: Discrete, given: Array) -> Array:
-    """(A.3) with Kronecker products: derivative of the outputs (samples, p, k); slow.
-
-    `given` (samples, d).
-    """
-    k, n, d = len(found.dA), found.A.shape[0], found.B.shape[1]
-    dA, dB, dC = (np.hstack(list(item)) for item in (found.dA, found.dB, found.dC))
-    x, X = np.zeros((n, 1)), np.zeros((n, k))
-    eye = np.eye(k)
-    rows = np.empty((len(given), found.C.shape[0], k))
-    for sample, r in enumerate(np.asarray(given).reshape(len(given), d, 1)):
-        rows[sample] = dC @ np.kron(eye, x) + found.C @ X
-        X = dA @ np.kron(eye, x) + found.A @ X + dB @ np.kron(eye, r)
-        x = found.A @ x + found.B @ r
-    return rows
-
-
-def _sampled(parts: Any, derivatives: list[Array], dt: float) -> Discrete:
+def sampled(parts: Any, derivatives: list[Array], dt: float) -> Discrete:
+    """Continuous A, B, C and their derivatives, a column a parameter, sampled at `dt`, s."""
     A, B, C = parts
     n, d = B.shape
     k = derivatives[0].shape[1]

@@ -32,9 +32,6 @@ def selection_report(
         "sweep": _sweep_table(model, found),
         "intervals": _interval_table(model, found),
         "methods": selection_table(model, found),
-        "agreement": _agreement_table(model, found),
-        "bias": _bias_table(model, found),
-        "doubt": _three_intervals(model, found),
     }
     caption = (
         "Widths of the 95 % bootstrap intervals of the chosen parameters, relative to their "
@@ -48,11 +45,11 @@ def selection_report(
         "Sensitive parameters",
         (Verdict(_verdict(model, found)), Lines(_findings(model, found))),
         [
-            Section("1. Estimates", (picture, tables["intervals"], tables["doubt"]), "Estimates"),
-            Section("2. Methods of selection", (tables["methods"], tables["agreement"]), "Methods"),
+            Section("1. Estimates", (picture, tables["intervals"]), "Estimates"),
+            Section("2. Methods of selection", (tables["methods"],), "Methods"),
             Section(
-                "3. Subsets, directions and bias",
-                [tables[name] for name in ("sweep", "identifiability", "bias")],
+                "3. Subsets and directions",
+                [tables[name] for name in ("sweep", "identifiability")],
                 "Subsets",
                 folded=True,
             ),
@@ -174,57 +171,6 @@ def _interval_table(model: ParametricModel, found: StudySelection) -> TextTable:
     return TextTable("Chosen parameters, mean ± SD over subjects.", heads, rows)
 
 
-def _three_intervals(model: ParametricModel, found: StudySelection) -> TextTable:
-    """First subject: percentiles, profile likelihood and the Cramer-Rao bound."""
-    first = next(iter(found.chosen.values()))
-    rows = []
-    for place, index in enumerate(found.free):
-        value, half = first.refit.theta[index], found.doubts.bound[place]
-        ends = (
-            (first.intervals.low[place], first.intervals.high[place]),
-            found.doubts.profile[place],
-            (value - half, value + half),
-        )
-        cells = (f"{low:.4g} to {high:.4g}" for low, high in ends)
-        rows.append((model.names[index], model.units[index], f"{value:.4g}", *cells))
-    heads = ("parameter", "unit", "estimate", "bootstrap", "profile likelihood", "Cramér-Rao bound")
-    caption = (
-        "95 % intervals in the first subject. The last two take the residuals for white; an "
-        "infinite end is not met inside the parameter's range."
-    )
-    return TextTable(caption, heads, rows)
-
-
-def _finite(ends: tuple[float, float]) -> list[float | None]:
-    """JSON has no infinity."""
-    return [value if np.isfinite(value) else None for value in ends]
-
-
-def _agreement_table(model: ParametricModel, found: StudySelection) -> TextTable:
-    rows = []
-    for rule, subset in found.doubts.agreement.items():
-        shared = len(set(subset) & set(found.free))
-        rows.append((rule, names_of(model, subset) or "-", f"{shared} of {len(found.free)}"))
-    caption = (
-        f"What other rules select in the first subject. The chosen subset's collinearity is "
-        f"{found.doubts.collinearity:.3g}; 10 to 20 is the usual limit."
-    )
-    return TextTable(caption, ("rule", "subset", "shared with the chosen"), rows)
-
-
-def _bias_table(model: ParametricModel, found: StudySelection) -> TextTable:
-    rows = tuple(
-        (item.name, f"{item.moved:+.2f}", *(f"{value:+.3f}" for value in item.shift))
-        for item in found.doubts.bias
-    )
-    heads = ("fixed parameter", "moved by", *(model.names[index] for index in found.free))
-    caption = (
-        "Bias from fixing, first subject: shift of the chosen parameters when a fixed one is "
-        "elsewhere; all in halves of their ranges."
-    )
-    return TextTable(caption, heads, rows)
-
-
 def _interval_figure(model: ParametricModel, found: StudySelection) -> Figure:
     figure = new_figure(DOUBLE_COLUMN, 2.4)
     ax = figure.subplots()
@@ -267,7 +213,6 @@ def _data(model: ParametricModel, found: StudySelection) -> dict[str, Any]:
         "common": names(sorted(set(found.free) & set(found.lasso))),
         "intersection": [names(subset) for subset in found.intersection],
         "intervals": intervals,
-        "profile": dict(zip(names(found.free), map(_finite, found.doubts.profile), strict=True)),
         "vaf": {
             "nominal": {key: item.fit.vaf for key, item in found.nominal.items()},
             "fim": {key: item.refit.vaf for key, item in found.chosen.items()},
