@@ -27,7 +27,6 @@ FILES = (
     "tests/studies/selection/test_methods.py",
     "tests/assess/test_variance_accounted_for.py",
     "tests/control/test_closed_loop.py",
-    "tests/assess/test_eigenvalue_ranges.py",
     "tests/inverse/test_equivalent_weights.py",
     "tests/test_exact_mpc.py",
     "tests/inverse/test_noisy_fit.py",

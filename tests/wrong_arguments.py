@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 import scipy.sparse
 
-from impc.assess import bounded_weights, expected, extreme_weights
+from impc.assess import bounded_weights, expected
 from impc.assess import identified_directions as identifiability
 from impc.assess import variance_accounted_for as agreement
 from impc.checking import replace
@@ -296,12 +296,9 @@ def calls() -> list[Call]:
             {"fibre": v["fibre"], "count": 2, "condition_ratio": 10.0},
         ),
         (bounded_weights.weights_set, {"fibre": v["fibre"], "ratio": 10.0}),
-        (extreme_weights.linear_ranges, {"found": v["set"], "directions": np.eye(4)[None]}),
-        (extreme_weights.linear_maxima, {"found": v["set"], "directions": np.eye(4)[None]}),
-        (extreme_weights.entry_ranges, {"found": v["set"], "states": [0]}),
-        (extreme_weights.trace_range, {"found": v["set"], "scaling": size}),
-        (extreme_weights.nearest_diagonal, {"found": v["set"], "scaling": size}),
-        (extreme_weights.extreme_eigenvalue, {"found": v["set"], "largest": True}),
+        (bounded_weights.linear_ranges, {"found": v["set"], "directions": np.eye(4)[None]}),
+        (bounded_weights.linear_maxima, {"found": v["set"], "directions": np.eye(4)[None]}),
+        (bounded_weights.entry_ranges, {"found": v["set"], "states": [0]}),
         (inverse_lqr.inverse_lqr_lmi, about),
         (
             inverse_lqr.inverse_lqr_gradient,

@@ -23,8 +23,7 @@ import numpy as np
 import scipy.linalg
 
 from impc.arrays import Array
-from impc.assess.bounded_weights import weights_set
-from impc.assess.extreme_weights import linear_maxima, linear_ranges
+from impc.assess.bounded_weights import linear_maxima, linear_ranges, weights_set
 from impc.assess.intent_statements import price_direction
 from impc.checking import replace
 from impc.errors import SolverError, WeightsError

@@ -37,7 +37,6 @@ from impc.studies.fit.sentences import direction_name, remarks
 from impc.studies.fit.structures import structure_section
 from impc.studies.fit.tables import (
     alternatives_table,
-    eigenvalues_table,
     entries_table,
     intervals_table,
     limit_sentences,
@@ -215,8 +214,7 @@ def _weights(result: FitResult) -> list[Block]:
     blocks: list[Block] = [_readings(result), *missing, moved]
     if summary is not None:
         blocks += set_sentences(summary)
-        ranges = (entries_table(summary), eigenvalues_table(summary))
-        blocks.append(Details("Ranges of entries and eigenvalues of Q", ranges))
+        blocks.append(Details("Ranges of entries of Q", (entries_table(summary),)))
     Q, P = result.intent.reported.weights.Q, result.reported_P
     matrices = (
         _matrix("Q, the prices of the states, at R = 1", Q, plant.states),

@@ -162,25 +162,6 @@ def entries_table(summary: WeightsSummary) -> TextTable:
     )
 
 
-def eigenvalues_table(summary: WeightsSummary) -> TextTable:
-    """Ranges of eigenvalues of Q."""
-    count = len(summary.eigenvalues)
-    return table_of(
-        "Range of the eigenvalues of Q over the set, largest first. Ends that are not proved are "
-        "values that some member has; others may go farther.",
-        list(enumerate(summary.eigenvalues))[::-1],
-        {
-            "eigenvalue": lambda item: str(count - item[0]),
-            "least": lambda item: _end(item[1].low, item[1].low_proved),
-            "most": lambda item: _end(item[1].high, item[1].high_proved),
-        },
-    )
-
-
-def _end(value: float, proved: bool) -> str:
-    return number(value) + (" (proved)" if proved else "")
-
-
 def limit_sentences(certainty: Certainty) -> tuple[str, ...]:
     """What the recordings say of the input limit."""
     return tuple(
