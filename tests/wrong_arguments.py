@@ -30,8 +30,8 @@ from impc.control import (
 )
 from impc.files import configuration, formats, reading, table, units
 from impc.files import plant_sources as plant_source
-from impc.inverse import cross_term, equivalent_weights, inverse_lqr, optimal_control_fit, residuals
 from impc.inverse import direct_and_reduced as inverse_mpc
+from impc.inverse import equivalent_weights, inverse_lqr, optimal_control_fit, residuals
 from impc.inverse import gain_search as gain
 from impc.inverse import noisy_fit as fitted_controller
 from impc.inverse import problem as inverse_problem
@@ -244,7 +244,7 @@ def calls() -> list[Call]:
                 "near": v["terminal"],
             },
         ),
-        (terminal_set.contains, {"terminal": v["terminal"], "x": size, "tolerance": 1e-9}),
+        (terminal_set.contains, {"terminal": v["terminal"], "x": size}),
         (terminal_set.invariance_violation, {"terminal": v["terminal"]}),
         (terminal_set.maximality_violation, {"terminal": v["terminal"]}),
         (
@@ -302,10 +302,10 @@ def calls() -> list[Call]:
         (inverse_lqr.inverse_lqr_lmi, about),
         (
             inverse_lqr.inverse_lqr_gradient,
-            {**about, "start": v["weights"], "max_evaluations": 3, "floor": 1e-9},
+            {**about, "start": v["weights"], "max_evaluations": 3},
         ),
-        (cross_term.inverse_lqr_cross_term, about),
-        (inverse_mpc.infer_weights, {**problem, "condition_weight": 0.0}),
+        (inverse_lqr.inverse_lqr_cross_term, about),
+        (inverse_mpc.infer_weights, problem),
         (inverse_mpc.starting_point, problem),
         (
             inverse_mpc.inverse_mpc,
@@ -317,7 +317,7 @@ def calls() -> list[Call]:
                 "max_iterations": 2,
             },
         ),
-        (inverse_mpc.inverse_mpc_reduced, {**problem, "condition_weight": 0.0}),
+        (inverse_mpc.inverse_mpc_reduced, problem),
         (residuals.verify_hard, {**problem, "weights": v["weights"]}),
         (gain.fit_gain, problem),
         (fitted_controller.fit_controller, {**problem, "start": v["weights"]}),

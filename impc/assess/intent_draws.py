@@ -84,13 +84,12 @@ def drawn_gains(
     gain: Array,
     covariance: GainCovariance,
     count: int = DRAWS,
-    seed: int = 0,
 ) -> tuple[LqrSolution, ...]:
     """Regulators whose gains the recordings allow.
 
     `gain` (m, n).
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     n = plant.n
     factor: Array = np.asarray(np.linalg.cholesky(weights.block), dtype=np.float64)
     centre = solve_lqr(plant, weights)

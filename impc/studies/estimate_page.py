@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from markupsafe import Markup
 
-from impc.assess.judged import judge
+from impc.assess.assessments import judge
 from impc.checking import checked
 from impc.control.named_solver import described
 from impc.errors import InputError
@@ -43,7 +43,7 @@ from impc.studies.signal_words import body_sentence, signal_words
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from impc.assess.judged import MethodFit
+    from impc.assess.assessments import MethodFit
 
 _CALLER = "of the program that called impc.report"
 # Trials that are drawn, the first ones.

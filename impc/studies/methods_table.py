@@ -20,7 +20,7 @@ from impc.reporting.rendering import number
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from impc.assess.judged import MethodFit
+    from impc.assess.assessments import MethodFit
     from impc.control.simulation import Simulation
     from impc.model.plant import Plant
     from impc.model.weights import Weights

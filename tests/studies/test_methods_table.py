@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from experiments.coverage import cart, noisy_trial
-from impc.assess.assessments import ASSESSMENTS, Assessment
-from impc.assess.judged import MethodFit, judge
+from impc.assess.assessments import ASSESSMENTS, Assessment, MethodFit, judge
 from impc.checking import replace
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller

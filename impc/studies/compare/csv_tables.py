@@ -20,7 +20,7 @@ from impc.studies.methods_table import methods_numbers, until_its_end, weight_en
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from impc.assess.judged import MethodFit
+    from impc.assess.assessments import MethodFit
     from impc.inverse.problem import Problem
 
 

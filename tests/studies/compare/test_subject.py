@@ -15,7 +15,7 @@ from click.testing import CliRunner
 
 from experiments.coverage import cart, noisy_trial, true_controller
 from impc.arrays import Array
-from impc.assess.judged import MethodFit, judge
+from impc.assess.assessments import MethodFit, judge
 from impc.checking import replace
 from impc.cli.main import main
 from impc.control.controller import Controller
