@@ -22,13 +22,12 @@ from tqdm import tqdm
 from experiments.cursor_data import Condition, data_file, read_conditions
 from experiments.cursor_tracking import condition_problem
 from impc.assess.covariance import gain_covariance
-from impc.assess.held_out import left_out_vaf
 from impc.assess.long_run_covariance import residual_noise
 from impc.assess.other_models import residuals_of
 from impc.assess.price_profiles import PriceProfiles
 from impc.assess.structured_weights import tangent
 from impc.assess.structures import StructureFit, assess_structure, criterion_of
-from impc.assess.variance_accounted_for import vaf
+from impc.assess.variance_accounted_for import left_out_vaf, vaf
 from impc.control.closed_loop import simulate
 from impc.errors import SolverError, WeightsError
 from impc.inverse.noisy_fit import fit_controller

@@ -29,9 +29,8 @@ from experiments.cursor_ceiling import fit_step_response, follow
 from experiments.cursor_data import RATE, Condition, data_file, read_conditions
 from experiments.cursor_figure import cursor_figure
 from impc.arrays import Array, frozen
-from impc.assess.bounded_weights import weights_set
+from impc.assess.bounded_weights import linear_ranges, weights_set
 from impc.assess.covariance import gain_covariance
-from impc.assess.extreme_weights import linear_ranges
 from impc.assess.input_limits import with_limit
 from impc.assess.variance_accounted_for import centred_vaf
 from impc.checking import replace

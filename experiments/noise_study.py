@@ -1,10 +1,10 @@
-"""Where each method breaks: eight methods over noise levels and saturation shares.
+"""Where each method breaks: nine methods over noise levels and saturation shares.
 
 The linear seat under a torque limit, one trial of 30 s with white noise on the angles. For each
 limit (70, 6 and 4.5 Nm: the subject saturates never, for an eighth and for a third of the time),
-noise level and seed every method of `impc compare` is fitted; then its controller simulates another
-trial, and is compared with the truth without noise. A cell that is done is kept in the folder: the
-same command, after an interruption, goes on from there.
+noise level and seed every method of `impc compare`, and inverse KKT, is fitted; then its controller
+simulates another trial, and is compared with the truth without noise. A cell that is done is kept
+in the folder: the same command, after an interruption, goes on from there.
 
     python -m experiments.noise_study --out results/noise-study
 """
@@ -23,11 +23,12 @@ import numpy as np
 from tqdm import tqdm
 
 from experiments.benchmarks.workloads import seat
+from experiments.inverse_kkt import INVERSE_KKT
 from impc.assess.variance_accounted_for import vaf
 from impc.checking import replace
 from impc.control.closed_loop import simulate
 from impc.inverse.groundwork import NaturalUnits
-from impc.inverse.methods import METHODS, estimate_all
+from impc.inverse.methods import METHODS
 from impc.inverse.problem import controller_for
 from impc.inverse.solution_set import natural_coordinates
 from impc.model.recordings import Recording
@@ -55,7 +56,10 @@ if TYPE_CHECKING:
     from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
 
-__all__ = ["Cell", "Outcome", "study_cell"]
+__all__ = ["COMPARED", "Cell", "Outcome", "study_cell"]
+
+#: The methods by name: those of `impc compare`, and a peer.
+COMPARED = {name: METHODS[name] for name in compared_methods()} | {"inverse_kkt": INVERSE_KKT}
 
 _LIMITS = (70.0, 6.0, 4.5)
 _CEILINGS = (99.99, 99.0, 90.0, 70.0, 50.0)
@@ -122,9 +126,10 @@ def study_cell(cell: Cell) -> dict[str, Outcome]:
     problem = fit_problem(plant, [trial], FitSettings(u_max=cell.limit))
     truth = np.array(work.controller.K)
     judged = replace(work.problem, recordings=(unseen,))
+    ground = NaturalUnits(problem)
     return {
-        name: _judge(estimate, judged, work.drives[1], truth)
-        for name, estimate in estimate_all(NaturalUnits(problem), compared_methods()).items()
+        name: _judge(method.estimate(ground), judged, work.drives[1], truth)
+        for name, method in COMPARED.items()
     }
 
 
@@ -135,7 +140,7 @@ def _judge(estimate: Estimate, unseen: Problem, drive: Scenario, truth: Array) -
     T, _ = natural_coordinates(plant, truth)
     error = float(np.linalg.norm((K - truth) @ T) / np.linalg.norm(truth @ T))
     run = simulate(
-        controller_for(METHODS[estimate.method].sees(unseen), K, np.array(estimate.S)), drive
+        controller_for(COMPARED[estimate.method].sees(unseen), K, np.array(estimate.S)), drive
     )
     share = None
     if run.complete:
@@ -192,13 +197,13 @@ def _table(found: dict[str, dict[str, Outcome]], seeds: int) -> str:
             f"\nlimit {limit:g} Nm: VAF % of an unseen trial without noise (error of the gain)",
             f"{'noise leaves':<38}" + "".join(f"{ceiling:>15.2f} %" for ceiling in _CEILINGS),
         ]
-        for name in compared_methods():
+        for name, method in COMPARED.items():
             cells = []
             for ceiling in _CEILINGS:
                 share, error, count = _median(found, limit, ceiling, seeds, name)
                 text = f"{share:.2f} ({error:.2g})" if count else "none"
                 cells.append(f"{text:>17}")
-            lines.append(f"{METHODS[name].label:<38}{''.join(cells)}")
+            lines.append(f"{method.label:<38}{''.join(cells)}")
     return "\n".join(lines)
 
 
@@ -207,7 +212,7 @@ def _figure(found: dict[str, dict[str, Outcome]], seeds: int) -> Figure:
     axes = figure.subplots(1, len(_LIMITS), sharey=True)
     noise = [100 - ceiling for ceiling in _CEILINGS]
     for position, (ax, limit) in enumerate(zip(axes, _LIMITS, strict=True)):
-        for name in compared_methods():
+        for name, method in COMPARED.items():
             color, marker, line = _MARKS[name]
             missed = [100 - _median(found, limit, ceiling, seeds, name)[0] for ceiling in _CEILINGS]
             ax.loglog(
@@ -217,7 +222,7 @@ def _figure(found: dict[str, dict[str, Outcome]], seeds: int) -> Figure:
                 marker=marker,
                 linestyle=line,
                 markerfacecolor="white",
-                label=METHODS[name].label,
+                label=method.label,
             )
         ax.set_title(f"({'ABC'[position]}) limit {limit:g} Nm", loc="left")
         ax.set_xlabel("noise (% of the variance)")

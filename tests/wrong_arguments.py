@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 import scipy.sparse
 
-from impc.assess import bounded_weights, expected, extreme_weights
+from impc.assess import bounded_weights, expected
 from impc.assess import identified_directions as identifiability
 from impc.assess import variance_accounted_for as agreement
 from impc.checking import replace
@@ -30,8 +30,8 @@ from impc.control import (
 )
 from impc.files import configuration, formats, reading, table, units
 from impc.files import plant_sources as plant_source
-from impc.inverse import cross_term, equivalent_weights, inverse_lqr, optimal_control_fit, residuals
 from impc.inverse import direct_and_reduced as inverse_mpc
+from impc.inverse import equivalent_weights, inverse_lqr, optimal_control_fit, residuals
 from impc.inverse import gain_search as gain
 from impc.inverse import noisy_fit as fitted_controller
 from impc.inverse import problem as inverse_problem
@@ -244,7 +244,7 @@ def calls() -> list[Call]:
                 "near": v["terminal"],
             },
         ),
-        (terminal_set.contains, {"terminal": v["terminal"], "x": size, "tolerance": 1e-9}),
+        (terminal_set.contains, {"terminal": v["terminal"], "x": size}),
         (terminal_set.invariance_violation, {"terminal": v["terminal"]}),
         (terminal_set.maximality_violation, {"terminal": v["terminal"]}),
         (
@@ -296,19 +296,16 @@ def calls() -> list[Call]:
             {"fibre": v["fibre"], "count": 2, "condition_ratio": 10.0},
         ),
         (bounded_weights.weights_set, {"fibre": v["fibre"], "ratio": 10.0}),
-        (extreme_weights.linear_ranges, {"found": v["set"], "directions": np.eye(4)[None]}),
-        (extreme_weights.linear_maxima, {"found": v["set"], "directions": np.eye(4)[None]}),
-        (extreme_weights.entry_ranges, {"found": v["set"], "states": [0]}),
-        (extreme_weights.trace_range, {"found": v["set"], "scaling": size}),
-        (extreme_weights.nearest_diagonal, {"found": v["set"], "scaling": size}),
-        (extreme_weights.extreme_eigenvalue, {"found": v["set"], "largest": True}),
+        (bounded_weights.linear_ranges, {"found": v["set"], "directions": np.eye(4)[None]}),
+        (bounded_weights.linear_maxima, {"found": v["set"], "directions": np.eye(4)[None]}),
+        (bounded_weights.entry_ranges, {"found": v["set"], "states": [0]}),
         (inverse_lqr.inverse_lqr_lmi, about),
         (
             inverse_lqr.inverse_lqr_gradient,
-            {**about, "start": v["weights"], "max_evaluations": 3, "floor": 1e-9},
+            {**about, "start": v["weights"], "max_evaluations": 3},
         ),
-        (cross_term.inverse_lqr_cross_term, about),
-        (inverse_mpc.infer_weights, {**problem, "condition_weight": 0.0}),
+        (inverse_lqr.inverse_lqr_cross_term, about),
+        (inverse_mpc.infer_weights, problem),
         (inverse_mpc.starting_point, problem),
         (
             inverse_mpc.inverse_mpc,
@@ -320,7 +317,7 @@ def calls() -> list[Call]:
                 "max_iterations": 2,
             },
         ),
-        (inverse_mpc.inverse_mpc_reduced, {**problem, "condition_weight": 0.0}),
+        (inverse_mpc.inverse_mpc_reduced, problem),
         (residuals.verify_hard, {**problem, "weights": v["weights"]}),
         (gain.fit_gain, problem),
         (fitted_controller.fit_controller, {**problem, "start": v["weights"]}),

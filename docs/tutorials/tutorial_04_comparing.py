@@ -2,7 +2,7 @@
 Comparing inverse MPC with inverse LQR
 ======================================
 
-Eight methods on the same recordings: a free gain, five kinds of inverse LQR and inverse KKT, and
+Eight methods on the same recordings: a free gain, five kinds of inverse LQR, and two of
 inverse MPC. They are those of the stick (:doc:`tutorial_03_own_plant`), whose holder is at the
 limit for a tenth of the time or more.
 """

@@ -5,17 +5,17 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING
 
+import casadi as ca
 import numpy as np
 
 import plants
-from experiments.kronecker import kronecker_sensitivity
 from experiments.reproduction.entry import Entry, Verdict, agrees
 from experiments.selection_claims import FIM_SUBSET, mean_subject
 from impc.checking import replace
 from impc.studies.selection.estimation import estimate, free_indices
 from impc.studies.selection.fisher import fisher_information
 from impc.studies.selection.lasso import lasso_of_size
-from impc.studies.selection.linear import discretised
+from impc.studies.selection.linear import Discrete, sampled
 from impc.studies.selection.model import Trial, normalised, sensitivity
 from impc.studies.selection.subsets import exhaustive, largest_subsets
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from impc.studies.selection.fisher import Information
     from impc.studies.selection.model import ParametricModel
 
-__all__ = ["appendix_entries"]
+__all__ = ["appendix_entries", "discretised", "kronecker_sensitivity"]
 
 _DRAWS = 200
 
@@ -34,6 +34,37 @@ def appendix_entries() -> list[Entry]:
     subject = mean_subject()
     information = fisher_information(*subject)
     return [*_information(*subject, information), *_lasso(*subject), *_selection(information)]
+
+
+def discretised(matrices: ca.Function, theta: Array, dt: float) -> Discrete:
+    """Sample a model at one point.
+
+    `theta` (k,); `dt` in s.
+    """
+    A, B, C = (item.full() for item in matrices(theta))
+    symbol = ca.SX.sym("theta", len(theta))
+    parts = matrices(symbol)
+    derivative = ca.Function(
+        "derivative", [symbol], [ca.jacobian(ca.vec(part), symbol) for part in parts]
+    )
+    return sampled((A, B, C), [item.full() for item in derivative(theta)], dt)
+
+
+def kronecker_sensitivity(found: Discrete, given: Array) -> Array:
+    """(A.3) with Kronecker products: derivative of the outputs (samples, p, k); slow.
+
+    `given` (samples, d).
+    """
+    k, n, d = len(found.dA), found.A.shape[0], found.B.shape[1]
+    dA, dB, dC = (np.hstack(list(item)) for item in (found.dA, found.dB, found.dC))
+    x, X = np.zeros((n, 1)), np.zeros((n, k))
+    eye = np.eye(k)
+    rows = np.empty((len(given), found.C.shape[0], k))
+    for sample, r in enumerate(np.asarray(given).reshape(len(given), d, 1)):
+        rows[sample] = dC @ np.kron(eye, x) + found.C @ X
+        X = dA @ np.kron(eye, x) + found.A @ X + dB @ np.kron(eye, r)
+        x = found.A @ x + found.B @ r
+    return rows
 
 
 def _information(
@@ -51,7 +82,7 @@ def _information(
         Entry(
             "(A.1)",
             "Discrete state space with white measurement noise.",
-            ("impc.studies.selection.linear:discretised",),
+            ("impc.studies.selection.linear:sampled",),
             f"{linear.A.shape[0]} states, sampled exactly; {len(outputs)} samples a trial.",
             Verdict.REPRODUCED,
         ),
@@ -65,7 +96,7 @@ def _information(
         Entry(
             "(A.3)",
             "The gradient as a recursion with Kronecker products.",
-            ("experiments.kronecker:kronecker_sensitivity",),
+            ("experiments.reproduction.appendices:kronecker_sensitivity",),
             f"Against the exact derivative: {kronecker:.0e}.",
             agrees(kronecker < 1e-8),
         ),

@@ -181,7 +181,7 @@ def _claims(
     place = selection.subsets.index(free_indices(model, FIM_SUBSET)) + 1
     ratio = select["seconds"]["lasso"] / select["seconds"]["fim"]
     fim, lasso, common = select["selected"]["fim"], select["selected"]["lasso"], select["common"]
-    vafs, doubt = _mean_vafs(select), table(select, "doubt")
+    vafs, found = _mean_vafs(select), table(select, "intervals")
     return [
         Entry(
             "Claim, 4.3",
@@ -239,19 +239,11 @@ def _claims(
         Entry(
             "Claim, 4.2.4",
             "Bootstrap intervals, from the 2.5th to the 97.5th percentile.",
-            (
-                "impc.studies.selection.subject:bootstrap_subset",
-                "impc.studies.selection.modern:profile_interval",
-            ),
+            ("impc.studies.selection.subject:bootstrap_subset",),
             "First subject: "
             + "; ".join(
-                f"{row.parameter} {row.bootstrap_low:.3g} to {row.bootstrap_high:.3g}"
-                for row in doubt.itertuples()
-            )
-            + ". By profile likelihood: "
-            + "; ".join(
-                f"{row.parameter} {row.profile_low:.3g} to {row.profile_high:.3g}"
-                for row in doubt.dropna().itertuples()
+                f"{row.parameter} {row.low:.3g} to {row.high:.3g}"
+                for row in found[found["subject"] == found["subject"][0]].itertuples()
             )
             + ".",
             Verdict.REPRODUCED,

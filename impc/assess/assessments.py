@@ -4,6 +4,9 @@
 into result.json under `methods.<method>.<assessment>` (docs/results.md). What takes a fit of its
 own (intervals, other horizons) is asked for in the settings of a fit, and stands in
 `impc.assess.all_intervals`.
+
+Their measures are those of docs/comparing.md: VAF (3.24), largest input, share of samples beyond a
+bound.
 """
 
 from __future__ import annotations
@@ -14,13 +17,109 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.arrays import Array
-from impc.assess.judged import MethodFit
+from impc.arrays import Array, Frozen, frozen
+from impc.assess.variance_accounted_for import vaf
+from impc.control.simulation import Simulation
+from impc.inverse.problem import simulated
 from impc.model.plant import Plant
 from impc.model.weights import condition_number
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+
+    from impc.inverse.estimates import Estimate
+    from impc.inverse.problem import Problem
+    from impc.model.bounds import Bounds
+
+
+@dataclass(frozen=True)
+class MethodFit(Frozen):
+    """One method on all recordings."""
+
+    estimate: Estimate  # What it found; its problem has the bounds that the method knows
+    bounds: Bounds  # Those of the subject
+    runs: tuple[Simulation, ...]  # One a trial; empty without a gain
+    vaf: Array  # (3.24) over all trials, % (p,); NaN when a simulation does not reach the end
+    trial_vaf: Array  # (trials, p), the same for each
+    # (trials, p), VAF of each trial predicted from the others; NaN where there is no gain or the
+    # simulation ends early; (0, p) where none was left out, as `judge` has it
+    held_out: Array
+    largest_input: Array  # Largest magnitude of each input (m,)
+    # Share of the samples that were reached at which an input bound is exceeded, by more than 1e-6
+    # of it
+    exceeded: float
+    # For each trial the time in s at which the loop left every reasonable range
+    fell: tuple[float | None, ...]
+
+    @property
+    def name(self) -> str:
+        """Of the method."""
+        return self.estimate.method
+
+    @property
+    def keeps_bounds(self) -> bool:
+        """Whether there is a gain and it never exceeds an input bound."""
+        return self.estimate.K is not None and self.exceeded == 0
+
+    @property
+    def commands(self) -> Array:
+        """Those of all samples that were reached (samples, m), in the units of the inputs."""
+        none = np.empty((0, self.estimate.problem.plant.m))
+        return np.concatenate([none, *(run.applied for run in self.runs)])
+
+
+def judge(estimate: Estimate, bounds: Bounds) -> MethodFit:
+    """Simulate all recordings with what a method found."""
+    problem = estimate.problem
+    if estimate.K is None:
+        return _without_gain(estimate, bounds)
+    runs = tuple(simulated(problem, estimate.gain, estimate.metric))
+    commands = np.concatenate([run.applied for run in runs])
+    beyond = (commands > bounds.u_max + 1e-6 * np.abs(bounds.u_max)) | (
+        commands < bounds.u_min - 1e-6 * np.abs(bounds.u_min)
+    )
+    return MethodFit(
+        estimate,
+        bounds,
+        runs,
+        frozen(_pooled_vaf(problem, runs)),
+        frozen([_trial_vaf(problem, index, run) for index, run in enumerate(runs)]),
+        frozen(np.empty((0, len(problem.plant.outputs)))),
+        frozen(np.max(np.abs(commands), axis=0, initial=0.0)),
+        float(np.count_nonzero(np.any(beyond, axis=1)) / max(len(commands), 1)),
+        tuple(None if run.complete else run.reached * problem.plant.dt for run in runs),
+    )
+
+
+def _without_gain(estimate: Estimate, bounds: Bounds) -> MethodFit:
+    plant, count = estimate.problem.plant, len(estimate.problem.recordings)
+    p = len(plant.outputs)
+    return MethodFit(
+        estimate,
+        bounds,
+        (),
+        frozen(np.full(p, np.nan)),
+        frozen(np.full((count, p), np.nan)),
+        frozen(np.empty((0, p))),
+        frozen(np.full(plant.m, np.nan)),
+        0.0,
+        (None,) * count,
+    )
+
+
+def _trial_vaf(problem: Problem, index: int, run: Simulation) -> Array:
+    trial = problem.recordings[index]
+    if not run.complete:
+        return np.full(len(problem.plant.outputs), np.nan)
+    return vaf(trial.outputs, run.x @ problem.plant.C.T)
+
+
+def _pooled_vaf(problem: Problem, runs: tuple[Simulation, ...]) -> Array:
+    if not all(run.complete for run in runs):
+        return np.full(len(problem.plant.outputs), np.nan)
+    recorded = np.concatenate([trial.outputs for trial in problem.recordings])
+    simulated = np.concatenate([run.x @ problem.plant.C.T for run in runs])
+    return vaf(recorded, simulated)
 
 
 @dataclass(frozen=True)

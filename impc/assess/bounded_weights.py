@@ -3,8 +3,11 @@
     { X = blkdiag(Q, R) : X in the fibre of the gain,  trace R = m,  kappa(X) <= limit }
 
 is convex: kappa(X) <= limit says that some t has  t I <= X <= limit t I.  Nothing that the
-recordings say of the weights can be finer than this set (docs/equivalent-weights.md, section 2);
-what holds for all of it is found by programs over it (`impc.assess.extreme_weights`).
+recordings say of the weights can be finer than this set (docs/equivalent-weights.md, section 2).
+A linear function of the weights (an entry, a difference of two prices) has a range over the set
+that two semidefinite programs find, so that a statement such as "the price of x_1 is above that of
+x_2" holds for every member, or for none, or for some. Each end has a member that is there, and a
+proof that none is beyond.
 
 They are written as seen from the analytic centre LL' of the fibre, L^-1 X L^-T, in which
 tr(L^-1 X L^-T) is the same for every X of one scale: all members lie within n + m of it, which
@@ -15,23 +18,32 @@ farther: what the programs then returned was 1.4e-3 from the optimum and called 
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.linalg
+import scipy.optimize
 
 from impc.arrays import Array, Frozen
 from impc.checking import checked
 from impc.errors import InputError, SolverError, WeightsError
 from impc.inverse.equivalent_weights import analytic_centre, inverse_factor, least_condition_weights
-from impc.inverse.semidefinite import Cone, matrix_inequality
-from impc.inverse.solution_set import pair_blocks
+from impc.inverse.semidefinite import Cone, matrix_inequality, solve_each
+from impc.inverse.solution_set import pair_blocks, split_blocks
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
     from impc.inverse.equivalent_weights import EquivalentWeights
+    from impc.inverse.semidefinite import SemidefiniteSolution
     from impc.inverse.solution_set import GainFibre
+    from impc.model.weights import Weights
+
+# Relative gap of the programs, and share of the way by which their points may be drawn too far.
+_GAP, _CLOSE = 1e-10, 1e-11
 
 
 @dataclass(frozen=True)
@@ -114,3 +126,142 @@ def _largest_trace(fibre: GainFibre, inverse: Array, raw: Array) -> float:
             "analytic centre", f"is off by {error:.2g} of a trace", "scale the states and inputs"
         )
     return alpha * m * float(np.linalg.norm(fibre.G, 2)) ** 2 / (1 - error)
+
+
+@dataclass(frozen=True)
+class End:
+    """The member at which a program ends, its value, and what no member goes beyond."""
+
+    value: float  # Of the function at the member
+    weights: Weights  # The member, at trace R = m
+    prove: Callable[[], float]  # Computes `bound`
+
+    @cached_property
+    def bound(self) -> float:
+        """What no member goes beyond, from the dual program."""
+        return self.prove()
+
+
+@dataclass(frozen=True)
+class Range:
+    """Least and largest value of a linear function over the set, each with a member that has it."""
+
+    least: End
+    most: End
+
+    @property
+    def low(self) -> float:
+        """The least value."""
+        return self.least.value
+
+    @property
+    def high(self) -> float:
+        """The largest value."""
+        return self.most.value
+
+
+@checked(directions="* n+m n+m")
+def linear_ranges(
+    found: WeightsSet, directions: Array, *, tolerance: float = _GAP
+) -> tuple[Range, ...]:
+    """Range over the set of each trace(direction blkdiag(Q, R)).
+
+    `directions` (k, n + m, n + m).
+    """
+    ends = _minima(found, np.concatenate([directions, -directions]), tolerance)
+    half = len(directions)
+    return tuple(
+        Range(low, _negative(high)) for low, high in zip(ends[:half], ends[half:], strict=True)
+    )
+
+
+@checked(directions="* n+m n+m")
+def linear_maxima(
+    found: WeightsSet, directions: Array, *, tolerance: float = _GAP
+) -> tuple[End, ...]:
+    """Largest value over the set of each trace(direction blkdiag(Q, R)).
+
+    `directions` (k, n + m, n + m) and `tolerance` as in `linear_ranges`.
+    """
+    return tuple(_negative(end) for end in _minima(found, -directions, tolerance))
+
+
+@checked
+def entry_ranges(
+    found: WeightsSet, states: Sequence[int] | None = None
+) -> dict[tuple[int, int], Range]:
+    """Range of every entry Q_ij, i >= j, of the given states (indices), of all by default."""
+    size = len(found.first)
+    chosen = sorted(range(found.fibre.plant.n) if states is None else states)
+    pairs = [(i, j) for position, i in enumerate(chosen) for j in chosen[: position + 1]]
+    directions = np.zeros((len(pairs), size, size))
+    for direction, (i, j) in zip(directions, pairs, strict=True):
+        direction[i, j] = direction[j, i] = 1.0 if i == j else 0.5
+    return dict(zip(pairs, linear_ranges(found, directions), strict=True))
+
+
+def _minima(found: WeightsSet, directions: Array, tolerance: float) -> list[End]:
+    """Ends of least trace(direction X), of directions (k, n + m, n + m)."""
+    ends = [_same_for_all(found, direction) for direction in directions]
+    slopes = np.tensordot(directions, found.level, ([1, 2], [1, 2]))
+    scales = np.linalg.norm(slopes, axis=1)
+    told = np.flatnonzero(scales)
+    if len(told) == 0:  # or there is but one member
+        return ends
+    objectives = np.pad(slopes[told] / scales[told, None], ((0, 0), (0, 1)))
+    each = solve_each(
+        objectives,
+        found.cones,
+        reach=np.full(len(found.level) + 1, found.reach),
+        tolerance=tolerance,
+    )
+    for index, solved in zip(told, each, strict=True):
+        X = _member(found, solved.y)
+        ends[index] = End(
+            float(np.sum(directions[index] * X)),
+            split_blocks(X, found.fibre.plant.n),
+            functools.partial(_bound, ends[index].value, float(scales[index]), solved),
+        )
+    return ends
+
+
+def _negative(end: End) -> End:
+    return End(-end.value, end.weights, lambda: -end.bound)
+
+
+def _same_for_all(found: WeightsSet, direction: Array) -> End:
+    constant = float(np.sum(direction * found.first))
+    return End(constant, found.least.weights, lambda: constant)
+
+
+def _bound(constant: float, scale: float, solved: SemidefiniteSolution) -> float:
+    return constant + scale * solved.bound
+
+
+def _member(found: WeightsSet, y: Array) -> Array:
+    """The point of a program, drawn towards the centre until it is a member beyond doubt.
+
+    A program's error, 1e-8 of the largest weight, can outweigh the least eigenvalue.
+    """
+    X = found.first + np.tensordot(y[: len(found.level)], found.level, 1)
+    X = (X + X.T) / 2
+    n = found.fibre.plant.n
+    centre = found.least.weights.block
+    centre = centre * ((len(centre) - n) / np.trace(centre[n:, n:]))
+
+    def at(share: float) -> Array:
+        return np.asarray(centre + share * (X - centre))
+
+    def room(share: float) -> float:
+        """What the limit leaves, as `condition_number` sees it: concave along the segment."""
+        values = np.linalg.eigvalsh(at(share))
+        return found.limit * float(values[0]) - float(values[-1])
+
+    if room(1.0) >= 0:
+        return at(1.0)
+    if room(0.0) <= 0:  # no other is a member
+        return at(0.0)
+    share, back = float(scipy.optimize.brentq(room, 0.0, 1.0, xtol=_CLOSE)), _CLOSE
+    while room(share) < 0:
+        share, back = max(0.0, share - back), 2 * back
+    return at(share)

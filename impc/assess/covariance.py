@@ -30,16 +30,16 @@ from impc.arrays import Array, BoolArray, Frozen, frozen
 from impc.assess.long_run_covariance import ResidualNoise, residual_noise, spread_of_sum
 from impc.inverse.coordinates import metric_directions
 from impc.inverse.estimates import DETERMINED, determined
+from impc.inverse.least_squares import trial_span
 from impc.inverse.residuals import evaluate, residual_only, residual_or_reason
 from impc.inverse.solution_set import natural_coordinates
-from impc.inverse.trial_span import trial_span
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from impc.inverse.least_squares import TrialSpan
     from impc.inverse.problem import Problem
     from impc.inverse.residuals import Evaluation
-    from impc.inverse.trial_span import TrialSpan
 
 #: A direction with a larger deviation, of the natural size of a gain, is not told: there the prior
 #: of a search and the curvature of the problem count beside the recordings.

@@ -80,7 +80,6 @@ def expected_intervals(
     deviation: ArrayLike,
     *,
     root: float = 0.0,
-    level: float = LEVEL,
 ) -> Expectation:
     """Intervals that a fit of such recordings would have.
 
@@ -94,8 +93,6 @@ def expected_intervals(
         Standard deviation of the noise in the recorder, in the outputs' units, one or (p,).
     root : float
         Of first-order noise: its correlation from one sample to the next, 0 for white.
-    level : float
-        Of the intervals.
 
     Raises
     ------
@@ -136,21 +133,21 @@ def expected_intervals(
     K, S = np.array(at.solution.K), np.array(at.solution.S)
     return Expectation(
         found,
-        _intervals(at, found, level),
+        _intervals(at, found),
         gain_covariance(scaled, K, S, lambda _trials, _lost: coloured, curvature=True),
         frozen(_limits(at, coloured)),
     )
 
 
-def _intervals(at: Tangent, found: PriceCovariance, level: float) -> tuple[PriceInterval, ...]:
+def _intervals(at: Tangent, found: PriceCovariance) -> tuple[PriceInterval, ...]:
     rows = np.eye(at.structure.count)
     if not at.structure.coupled:
         profiles = PriceProfiles(at, found)
-        return tuple(profiles.interval(row, level) for row in rows)
-    ends = -scipy.special.ndtri((1 - level) / 2) * np.asarray(found.each)
+        return tuple(profiles.interval(row) for row in rows)
+    ends = -scipy.special.ndtri((1 - LEVEL) / 2) * np.asarray(found.each)
     values = np.asarray(found.values)
     return tuple(
-        PriceInterval(float(value), float(value - end), float(value + end), level)
+        PriceInterval(float(value), float(value - end), float(value + end), LEVEL)
         for value, end in zip(values, ends, strict=True)
     )
 

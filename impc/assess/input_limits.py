@@ -22,6 +22,7 @@ import scipy.special
 
 from impc.arrays import Array, Frozen, frozen
 from impc.assess.covariance import by_trial
+from impc.assess.intervals import LEVEL
 from impc.assess.long_run_covariance import residual_noise, spread_of_sum, white_noise
 from impc.checking import replace
 from impc.control.closed_loop import simulate_and_differentiate
@@ -103,7 +104,7 @@ def with_limit(problem: Problem, limit: float, control: int = 0) -> Problem:
     return replace(problem, bounds=changed)
 
 
-def input_limit(fitted: Estimate, control: int = 0, *, level: float = 0.95) -> LimitEstimate:
+def input_limit(fitted: Estimate, control: int = 0) -> LimitEstimate:
     """Fit the symmetric limit of one input; the others keep theirs."""
     if not 0 <= control < fitted.problem.plant.m:
         raise InputError("control", f"got {control}", f"there are {fitted.problem.plant.m} inputs")
@@ -112,7 +113,7 @@ def input_limit(fitted: Estimate, control: int = 0, *, level: float = 0.95) -> L
     top = max(_typical_peak(search.fitted, control), search.limit_of(best))
     noise = best.misfit**2 / search.samples
     factor = _colour_factor(best, search.limit_of(best), control)
-    quantile = float(scipy.special.chdtri(1, 1 - level))
+    quantile = float(scipy.special.chdtri(1, 1 - LEVEL))
     unit = noise * factor
 
     def distance(limit: float) -> float:
@@ -139,7 +140,7 @@ def input_limit(fitted: Estimate, control: int = 0, *, level: float = 0.95) -> L
         value if determined else None,
         low,
         float(high),
-        level,
+        LEVEL,
         none,
         quantile,
         reason,

@@ -23,8 +23,7 @@ import numpy as np
 import scipy.linalg
 
 from impc.arrays import Array
-from impc.assess.bounded_weights import weights_set
-from impc.assess.extreme_weights import linear_maxima, linear_ranges
+from impc.assess.bounded_weights import linear_maxima, linear_ranges, weights_set
 from impc.assess.intent_statements import price_direction
 from impc.checking import replace
 from impc.errors import SolverError, WeightsError
@@ -85,13 +84,12 @@ def drawn_gains(
     gain: Array,
     covariance: GainCovariance,
     count: int = DRAWS,
-    seed: int = 0,
 ) -> tuple[LqrSolution, ...]:
     """Regulators whose gains the recordings allow.
 
     `gain` (m, n).
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     n = plant.n
     factor: Array = np.asarray(np.linalg.cholesky(weights.block), dtype=np.float64)
     centre = solve_lqr(plant, weights)

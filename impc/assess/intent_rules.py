@@ -8,25 +8,21 @@ between their directions says how much of v was chosen by the rule and not by th
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from impc.arrays import Array, Frozen, frozen
-from impc.assess.bounded_weights import weights_set
-from impc.assess.extreme_weights import nearest_diagonal, trace_range
+from impc.assess.bounded_weights import linear_maxima, weights_set
 from impc.errors import SolverError, WeightsError
 from impc.inverse.equivalent_weights import analytic_centre, least_condition_weights
 from impc.inverse.solution_set import gain_fibre
-from impc.model.plant import change_coordinates
 from impc.model.weights import Weights, condition_number, normalised
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from impc.assess.bounded_weights import WeightsSet
     from impc.model.plant import Plant
 
 # Entries of a direction below this are not named in a sentence.
@@ -87,7 +83,7 @@ def intent(plant: Plant, gain: Array, metrics: Array, sizes: Array, fallback: We
         except (WeightsError, SolverError) as error:
             missing.append(f"{rule}: {error}")
             continue
-        readings.extend(_reading(rule, item, readings) for item in found)
+        readings.append(_reading(rule, found, readings))
     if not readings or (missing and missing[0].startswith(_PLANT_UNITS)):
         first = _reading("the weights that the fit ended with", fallback, [])
         readings = [first, *(_reading(item.rule, item.weights, [first]) for item in readings)]
@@ -126,35 +122,19 @@ _PLANT_UNITS = "least condition number, plant units (the dissertation's)"
 
 def _rules(
     plant: Plant, gain: Array, metrics: Array, sizes: Array
-) -> list[tuple[str, Callable[[], list[Weights]]]]:
+) -> list[tuple[str, Callable[[], Weights]]]:
     fibre = gain_fibre(plant, gain, metrics)
 
-    @functools.cache
-    def members() -> WeightsSet:
-        """Up to ten times the least condition number: the infimum of a trace is not attained."""
-        return weights_set(fibre)
-
-    def in_units(T: Array) -> list[Weights]:
-        scaled = gain_fibre(change_coordinates(plant, T), gain @ T, metrics)
-        found = least_condition_weights(scaled).weights
-        back = np.linalg.inv(T)
-        return [normalised(Weights(back.T @ found.Q @ back, found.R))]
+    def of_least_trace() -> Weights:
+        """Up to ten times the least condition number: the infimum is not attained."""
+        squares = np.diag(np.append(np.asarray(sizes) ** 2, np.zeros(plant.m)))
+        return linear_maxima(weights_set(fibre), -squares[None])[0].weights
 
     return [
-        (_PLANT_UNITS, lambda: [least_condition_weights(fibre).weights]),
-        ("least condition number, states over their size", lambda: in_units(np.diag(sizes))),
-        ("least condition number, natural coordinates", lambda: in_units(np.array(fibre.T))),
-        ("analytic centre (no units)", lambda: [analytic_centre(fibre).weights]),
-        (
-            "least trace, states over their size",
-            lambda: [trace_range(members(), sizes).least.weights],
-        ),
-        ("nearest to diagonal, states over their size", lambda: [_diagonal(members(), sizes)]),
+        (_PLANT_UNITS, lambda: least_condition_weights(fibre).weights),
+        ("analytic centre (no units)", lambda: analytic_centre(fibre).weights),
+        ("least trace, states over their size", of_least_trace),
     ]
-
-
-def _diagonal(found: WeightsSet, sizes: Array) -> Weights:
-    return nearest_diagonal(found, sizes).weights
 
 
 def _reading(rule: str, weights: Weights, before: list[Reading]) -> Reading:

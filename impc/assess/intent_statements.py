@@ -21,13 +21,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.arrays import Array
-from impc.assess.extreme_weights import linear_maxima, linear_ranges
+from impc.assess.bounded_weights import linear_maxima, linear_ranges
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from impc.assess.bounded_weights import WeightsSet
-    from impc.assess.extreme_weights import Range
+    from impc.assess.bounded_weights import Range, WeightsSet
     from impc.model.plant import Plant
     from impc.model.weights import Weights
 

@@ -58,13 +58,13 @@ def entry_names(plant: Plant) -> tuple[str, ...]:
 
 
 def covariance_intervals(
-    estimate: GainEstimate, covariance: GainCovariance, method: str, level: float = LEVEL
+    estimate: GainEstimate, covariance: GainCovariance, method: str
 ) -> tuple[Interval, ...]:
     """Normal intervals of the entries of K and of the parameters."""
-    z = float(scipy.special.ndtri(0.5 + level / 2))
+    z = float(scipy.special.ndtri(0.5 + LEVEL / 2))
     names = entry_names(estimate.problem.plant)
     found = [
-        Interval(name, method, level, float(value), float(value - half), float(value + half), told)
+        Interval(name, method, LEVEL, float(value), float(value - half), float(value + half), told)
         for name, value, half, told in zip(
             names,
             np.ravel(estimate.K),
@@ -80,7 +80,7 @@ def covariance_intervals(
         ):
             low, high = _around(value, z * float(deviation))
             told = bool(deviation < PARAMETER)
-            found.append(Interval(name, method, level, float(value), low, high, told))
+            found.append(Interval(name, method, LEVEL, float(value), low, high, told))
     return tuple(found)
 
 

@@ -34,7 +34,7 @@ from impc.arrays import Array, Frozen, frozen
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from impc.inverse.trial_span import TrialSpan
+    from impc.inverse.least_squares import TrialSpan
 
     Taken = tuple[Array, Array]
 

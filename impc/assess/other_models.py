@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.assess.held_out import left_out_vaf
 from impc.assess.long_run_covariance import residual_noise
+from impc.assess.variance_accounted_for import left_out_vaf
 from impc.checking import replace
 from impc.errors import SolverError, WeightsError
 from impc.inverse.noisy_fit import fit_controller

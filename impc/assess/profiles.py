@@ -56,17 +56,17 @@ class Profile(Frozen):
     distances: Array
 
 
-def profile_likelihood(estimate: GainEstimate, name: str, level: float = LEVEL) -> Profile:
+def profile_likelihood(estimate: GainEstimate, name: str) -> Profile:
     """Profile an entry of K (name K.<control>.<state>) or a parameter fitted with it."""
     require_numbers(estimate, [name])
     search = _Search(estimate, name)
-    quantile = float(scipy.special.chdtri(1, 1 - level))
+    quantile = float(scipy.special.chdtri(1, 1 - LEVEL))
     ends = search.ends(quantile)
     tried = sorted(search.tried)
     low, high = (search.number(offset) for offset in ends)
     best = search.number(search.best_offset())
     return Profile(
-        Interval(name, "profile", level, best, low, high),
+        Interval(name, "profile", LEVEL, best, low, high),
         frozen([search.number(offset) for offset in tried]),
         frozen([search.distance(offset) for offset in tried]),
     )

@@ -28,18 +28,18 @@ from impc.assess.long_run_covariance import (
 )
 from impc.inverse.coordinates import metric_directions
 from impc.inverse.estimates import DETERMINED
+from impc.inverse.least_squares import trial_span
 from impc.inverse.residuals import evaluate
 from impc.inverse.solution_set import natural_coordinates
 from impc.inverse.structured_search import regulator_slopes
-from impc.inverse.trial_span import trial_span
 from impc.model.riccati import solve_lqr
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from impc.inverse.least_squares import TrialSpan
     from impc.inverse.problem import Problem
     from impc.inverse.residuals import Evaluation
-    from impc.inverse.trial_span import TrialSpan
     from impc.model.riccati import LqrSolution
     from impc.model.structure import Structure
 

@@ -30,14 +30,12 @@ import scipy.stats
 
 from impc.arrays import Array, Frozen, frozen
 from impc.assess.covariance import TOLD, by_trial
-from impc.assess.held_out import left_out_vaf
 from impc.assess.intervals import LEVEL
 from impc.assess.long_run_covariance import residual_noise, spread_of_sum
-from impc.assess.near_fit import NearFit
 from impc.assess.other_models import innovations_criterion, residuals_of
-from impc.assess.price_profiles import PriceInterval, PriceProfiles
+from impc.assess.price_profiles import NearFit, PriceInterval, PriceProfiles
 from impc.assess.structured_weights import PriceCovariance, price_covariance, tangent
-from impc.assess.variance_accounted_for import vaf
+from impc.assess.variance_accounted_for import left_out_vaf, vaf
 from impc.control.closed_loop import simulate
 from impc.inverse.problem import EXPLAINED, recorded_size, scenarios
 from impc.inverse.structured_fit import feature_sizes, structured_estimate

@@ -28,7 +28,7 @@ def command(
     solver: str | None,
     yes: bool,
 ) -> None:
-    """Compare feedback gain, inverse LQR, inverse KKT and inverse MPC, one file a trial.
+    """Compare feedback gain, inverse LQR and inverse MPC, one file a trial.
 
     Each method is fitted to all trials and to all but each one. What is done when you interrupt it
     is kept in the folder: the same command goes on from there.

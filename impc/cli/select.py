@@ -48,9 +48,8 @@ def command(
     study, source, recorded, inputs = read_model_study(study_file, model_name, allowed)
     settings = select_settings(study.configuration.select)
     named = {" visit ".join(part for part in key if part): item for key, item in recorded.items()}
-    evaluations = select_evaluations(settings, len(named))
-    effort = selection_effort(source.model, named.values(), evaluations)
-    with study_runner(source, out, cluster, 2 * len(named) + 1) as (run, threads):
+    effort = selection_effort(source.model, named.values(), select_evaluations(settings))
+    with study_runner(source, out, cluster, 2 * len(named)) as (run, threads):
         require_consent(effort.shared(len(named), threads), yes, FEWER_STARTS)
         found = select_study(named, settings, run)
     line = f"impc select {study_file.name} --model {source.name}"

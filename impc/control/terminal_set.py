@@ -178,15 +178,11 @@ def maximal_invariant_set(
     )
 
 
-@checked(tolerance=0)
-def contains(terminal: TerminalSet, x: ArrayLike, tolerance: float | None = None) -> bool:
-    """Whether the state x (n,) is in the set, within a fraction of each bound.
-
-    The tolerance is the set's own unless given. Raises DataError when x has another shape.
-    """
+@checked
+def contains(terminal: TerminalSet, x: ArrayLike) -> bool:
+    """Whether the state x (n,) is in the set, within its tolerance of each bound."""
     state = finite_array("x", x, (terminal.H.shape[1],))
-    allowed = terminal.tolerance if tolerance is None else tolerance
-    return bool(np.all(terminal.H @ state <= terminal.h * (1 + allowed)))
+    return bool(np.all(terminal.H @ state <= terminal.h * (1 + terminal.tolerance)))
 
 
 @checked

@@ -106,15 +106,13 @@ class Inference:
     fit: DirectFit  # Line 9
 
 
-@checked(condition_weight=0)
-def infer_weights(problem: Problem, *, condition_weight: float | None = None) -> Inference:
+@checked
+def infer_weights(problem: Problem) -> Inference:
     """Table 3.1: from recordings to the weights of the constrained controller behind them.
 
     Parameters
     ----------
     problem : Problem
-    condition_weight : float, optional
-        Of the direct form, see `inverse_mpc`.
 
     Raises
     ------
@@ -134,7 +132,7 @@ def infer_weights(problem: Problem, *, condition_weight: float | None = None) ->
     (True, True)
     """
     start = starting_point(problem)
-    return Inference(start, inverse_mpc(problem, start.weights, condition_weight=condition_weight))
+    return Inference(start, inverse_mpc(problem, start.weights))
 
 
 @checked
@@ -252,8 +250,8 @@ def _explaining(problem: Problem, found: DirectFit, weight: float) -> DirectFit:
     )
 
 
-@checked(condition_weight=0)
-def inverse_mpc_reduced(problem: Problem, *, condition_weight: float | None = None) -> ReducedFit:
+@checked
+def inverse_mpc_reduced(problem: Problem) -> ReducedFit:
     """Reduced inverse MPC: fit the gain through the constrained controller, then one program.
 
     When the gain does not explain the recordings, or no weights have it, a search that stays among
@@ -262,8 +260,6 @@ def inverse_mpc_reduced(problem: Problem, *, condition_weight: float | None = No
     Parameters
     ----------
     problem : Problem
-    condition_weight : float, optional
-        Of the direct form, see `inverse_mpc`.
 
     Raises
     ------
@@ -282,14 +278,10 @@ def inverse_mpc_reduced(problem: Problem, *, condition_weight: float | None = No
     >>> found.explained, bool(abs(found.gain.K - truth.K).max() < 1e-6)
     (True, True)
     """
-
-    def fit(problem: Problem) -> ReducedFit:
-        return _reduced(problem, condition_weight)
-
-    return with_or_without_set(problem, fit, lambda found: found.explained)
+    return with_or_without_set(problem, _reduced, lambda found: found.explained)
 
 
-def _reduced(problem: Problem, condition_weight: float | None) -> ReducedFit:
+def _reduced(problem: Problem) -> ReducedFit:
     first = weights_behind(fit_gain(problem))
     if first.explained:
         return _with_gain(problem, first)
@@ -297,7 +289,6 @@ def _reduced(problem: Problem, condition_weight: float | None) -> ReducedFit:
         direct = inverse_mpc(
             problem,
             _most_promising(problem),
-            condition_weight=condition_weight,
             max_iterations=_DETOUR,
             explain=False,
         )

@@ -17,10 +17,10 @@ from impc.checking import replace
 from impc.control.controller import Controller
 from impc.control.simulation import Status as SampleStatus
 from impc.errors import SolverError, WeightsError
+from impc.inverse.least_squares import trial_span
 from impc.inverse.problem import controller_for, misfit, recorded_size, simulated
 from impc.inverse.residuals import evaluate
 from impc.inverse.solution_set import natural_coordinates
-from impc.inverse.trial_span import trial_span
 from impc.model.riccati import stabilises
 from impc.model.weights import Weights
 

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.arrays import Array, BoolArray
-from impc.inverse.consistent_metrics import fitted_metric, metric_family
+from impc.inverse.explaining_weights import fitted_metric, metric_family
 from impc.inverse.prediction import command_sizes
 from impc.inverse.problem import recorded_states
 

@@ -13,17 +13,24 @@ each step d_1 is bent by the second derivative of the residual along it (Transtr
 "geodesic acceleration"), for one more evaluation without derivatives:
 
     d_2 = -1/2 (J'J + damping)^-1 J' r'',     r'' = 2/h ((r(z + h d_1) - r(z))/h - J d_1)
+
+`TrialSpan` is what initial states, trial by trial, and other columns can explain of a residual.
+Side by side these columns would take the square of the number of trials: 8 GB for 500 of 500
+samples (docs/speed.md).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import scipy.linalg
 
 from impc.arrays import Array
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
 _BLOCK = 4096
 # Damping at the start, its least value, and how it changes after a poor and after a good step.
@@ -239,3 +246,55 @@ def triangular_rows(columns: list[Array]) -> Array:
         _, upper = scipy.linalg.qr(np.vstack([triangle, block]), mode="raw", check_finite=False)
         triangle = np.asarray(upper, dtype=np.float64)
     return triangle
+
+
+# A column that the others explain to that of its length adds nothing but rounding.
+_ROUNDING = 1e-10
+
+
+@dataclass(frozen=True)
+class TrialSpan:
+    """An orthonormal basis."""
+
+    own: tuple[Array, ...]  # Of each trial (rows, k), k at most n; zero in the rows of the others
+    shared: Array  # Of the rest (r, c), orthogonal to those
+
+    def without(self, columns: Array) -> Array:
+        """What the basis does not explain of `columns` (r, k), of that shape."""
+        left = _without(self.own, columns)
+        return np.asarray(left - self.shared @ (self.shared.T @ left))
+
+    def plus(self, columns: Array) -> TrialSpan:
+        """With orthonormal `columns` (r, k) that are orthogonal to this basis."""
+        return TrialSpan(self.own, np.hstack([self.shared, columns]))
+
+
+def trial_span(own: Array, sizes: Sequence[int], shared: Array) -> TrialSpan:
+    """Span of columns, each in its own scale, to 1e-10.
+
+    `own` (r, n); `shared` (r, c).
+    """
+    parts = np.split(own, np.cumsum(sizes)[:-1])
+    bases = tuple(_basis(_of_length_one(part)) for part in parts)
+    return TrialSpan(bases, _basis(_without(bases, _of_length_one(shared))))
+
+
+def _of_length_one(columns: Array) -> Array:
+    size = np.linalg.norm(columns, axis=0)
+    return np.asarray(columns[:, size > 0] / size[size > 0])
+
+
+def _basis(columns: Array) -> Array:
+    if columns.size == 0:
+        return np.zeros((len(columns), 0))
+    left, values, _ = np.linalg.svd(columns, full_matrices=False)
+    return np.asarray(left[:, values > _ROUNDING])
+
+
+def _without(bases: Sequence[Array], columns: Array) -> Array:
+    left, row = np.array(columns), 0
+    for basis in bases:
+        mine = slice(row, row + len(basis))
+        row = mine.stop
+        left[mine] -= basis @ (basis.T @ left[mine])
+    return left

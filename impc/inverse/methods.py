@@ -23,7 +23,6 @@ from impc.inverse.estimates import Estimate, Goodness, Status, goodness
 from impc.inverse.gain_search import GainFit
 from impc.inverse.groundwork import Found, Groundwork, NaturalUnits, PlantUnits, regulator
 from impc.inverse.problem import EXPLAINED, recorded_size
-from impc.inverse.stationarity import inverse_kkt
 from impc.inverse.structured_fit import fit_structured
 from impc.model.bounds import Bounds
 from impc.model.weights import normalised
@@ -198,14 +197,6 @@ _TABLE = (
         lambda ground: ground.output(),
     ),
     Method(
-        "inverse_kkt",
-        "inverse KKT",
-        "Weights that make the smoothed states and commands look like optimal plans. No "
-        "simulation; what disturbs the subject is taken for planned.",
-        _as_posed,
-        lambda ground: regulator(ground, inverse_kkt(ground.known, ground.starting_gain)),
-    ),
-    Method(
         "clipped_lqr",
         "LQR of inverse MPC, clipped",
         "The regulator of inverse MPC, its command cut off at the bounds.",
@@ -244,6 +235,10 @@ METHODS: dict[str, Method] = {method.name: method for method in _TABLE}
 @checked
 def method_named(name: str) -> Method:
     """Return the method of the registry that is called `name`."""
+    if name == "inverse_kkt":
+        raise InputError(
+            "method", "inverse_kkt was removed", "take it out; experiments/inverse_kkt.py has it"
+        )
     if name not in METHODS:
         raise InputError("method", f"got {name!r}", f"choose one of {', '.join(METHODS)}")
     return METHODS[name]

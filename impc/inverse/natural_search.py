@@ -48,6 +48,7 @@ if TYPE_CHECKING:
 CONDITION_SHARE = 1.0
 # Rounds with another reference, and by how much the condition number has to grow for one more.
 _ROUNDS, _WORSE = 3, 1.05
+_ITERATIONS = 40
 # A step that promises less than this, of the objective, is below what the noise decides.
 _TOLERANCE = 1e-5
 #: Condition number, in natural coordinates, of the weights that a search begins with. Prices of a
@@ -63,10 +64,6 @@ def inverse_mpc_natural(
     problem: Problem,
     start: Weights,
     noise: float,
-    *,
-    worst_start: float = WORST_START,
-    condition_share: float = CONDITION_SHARE,
-    max_iterations: int = 40,
 ) -> ConditionedFit:
     """Direct inverse MPC in natural coordinates, at given initial states and plant."""
     plant = problem.plant
@@ -77,13 +74,13 @@ def inverse_mpc_natural(
     best = best_conditioned(fibre, in_natural_units(start, T, G))
     residual = _residual(problem, T, G, noise)
     fits = np.linalg.norm(residual(solve_lqr(natural, best)).values) <= _FITS
-    begin = best if fits else _away_from_the_edge(best, worst_start)
+    begin = best if fits else _away_from_the_edge(best)
     samples = problem.recorded_numbers
     reference, evaluations, found = condition_number(best), 0, None
     for _ in range(_ROUNDS):
-        objective = Objective(residual, 1.0, condition_share / samples / reference, squared=True)
+        objective = Objective(residual, 1.0, CONDITION_SHARE / samples / reference, squared=True)
         found = conditioned_fit(
-            natural, objective, begin, max_iterations=max_iterations, tolerance=_TOLERANCE
+            natural, objective, begin, max_iterations=_ITERATIONS, tolerance=_TOLERANCE
         )
         evaluations += found.evaluations
         if found.condition <= _WORSE * reference:
@@ -97,7 +94,7 @@ def inverse_mpc_natural(
         solution=solve_lqr(plant, weights),
         misfit=found.misfit * noise,
         evaluations=evaluations,
-        converged=found.iterations < max_iterations,
+        converged=found.iterations < _ITERATIONS,
     )
 
 
@@ -125,11 +122,11 @@ def best_conditioned(fibre: GainFibre, member: Weights) -> Weights:
         return member
 
 
-def _away_from_the_edge(weights: Weights, worst: float) -> Weights:
-    """The weights, if need be with a price on every direction, at most `worst` apart."""
-    if condition_number(weights) <= worst:
+def _away_from_the_edge(weights: Weights) -> Weights:
+    """The weights, if need be with a price on every direction, at most `WORST_START` apart."""
+    if condition_number(weights) <= WORST_START:
         return weights
-    floor = float(np.linalg.eigvalsh(weights.block)[-1]) / worst
+    floor = float(np.linalg.eigvalsh(weights.block)[-1]) / WORST_START
     n, size = len(weights.Q), len(weights.block)
     return split_blocks(weights.block + floor * np.eye(size), n)
 

@@ -21,11 +21,10 @@ import scipy.special
 from impc.arrays import Array, frozen
 from impc.checking import checked, replace
 from impc.errors import InputError, SolverError, WeightsError
-from impc.inverse.consistent_metrics import metric_family, unidentified_metrics
 from impc.inverse.coordinates import Coordinates
 from impc.inverse.equivalent_weights import least_condition_weights
 from impc.inverse.estimates import Estimate, Status, goodness
-from impc.inverse.explaining_weights import weights_behind
+from impc.inverse.explaining_weights import metric_family, unidentified_metrics, weights_behind
 from impc.inverse.gain_search import FEW, GainFit, fit_gain, refine_gain
 from impc.inverse.initial_states import with_fitted_starts
 from impc.inverse.inverse_lqr import inverse_lqr_gradient

@@ -82,9 +82,7 @@ class GainFibre(Frozen):
 
 
 @checked(gain="m n")
-def gain_fibre(
-    plant: Plant, gain: ArrayLike, metric: ArrayLike | None = None, rank: float = RANK
-) -> GainFibre:
+def gain_fibre(plant: Plant, gain: ArrayLike, metric: ArrayLike | None = None) -> GainFibre:
     """Compute the space of the weights that have a given gain.
 
     Parameters
@@ -98,9 +96,6 @@ def gain_fibre(
         it. Where the recordings tell less of it, a basis (k, m, m) of the metrics that they leave
         (`GainFit.metrics`): only pairs whose R + B'PB is in its span. With a single input it says
         nothing.
-    rank : float
-        Singular values of the conditions below this, of the largest, count as zero. More than the
-        1e-10 of exact gains gives the weights whose gain and metric come near given ones.
 
     Raises
     ------
@@ -134,7 +129,7 @@ def gain_fibre(
     if metric is not None:
         conditions = _add_metric(conditions, R + B.T @ P @ B if plant.discrete else R, G, metric)
     _, singular, directions = np.linalg.svd(conditions.T)
-    count = int(np.count_nonzero(singular > rank * singular[0]))
+    count = int(np.count_nonzero(singular > RANK * singular[0]))
     members = directions[count:]
     return GainFibre(
         plant,

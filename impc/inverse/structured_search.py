@@ -49,6 +49,7 @@ _EXACT = 1e-9
 # A price whose logarithm has a deviation beyond this is tried at zero.
 _NEARLY_ZERO = 2.0
 _EVALUATIONS = 60
+_MOST = 120
 # Nats at which a search ends, and of rounding, of the recorded outputs.
 _FINE, _ROUNDING = 1e-3, 1e-13
 _ENDLESS = 1e6
@@ -170,9 +171,7 @@ class StructuredEnd:
     settled: bool  # Whether it ended by itself
 
 
-def search_from(
-    problem: Problem, structure: Structure, prices: Array, *, max_evaluations: int = 120
-) -> StructuredEnd:
+def search_from(problem: Problem, structure: Structure, prices: Array) -> StructuredEnd:
     """One search from given unknowns.
 
     `prices` (count,).
@@ -180,13 +179,13 @@ def search_from(
     space = PriceCoordinates(problem, structure, prices)
     beside = len(problem.logarithms)
     shared = np.concatenate([np.full(int(space.ends[0]), 1 / _SPREAD), np.ones(beside)])
-    stop = _stop(space, max_evaluations)
+    stop = _stop(space, _MOST)
     z, spent, settled = descend(space, space.start, stop, shared=shared, own=1.0)
     here = _Place(problem, structure, space.unknowns(z), space.unpack(z).problem)
-    end = _with_zeros(_polished(here, spent, settled), here, max_evaluations)
+    end = _with_zeros(_polished(here, spent, settled), here, _MOST)
     if end.misfit <= _EXACT * recorded_size(problem):
         return end
-    return _without_pull(_without_zeros(end, here, max_evaluations), structure, max_evaluations)
+    return _without_pull(_without_zeros(end, here, _MOST), structure, _MOST)
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,6 @@ WORDS: dict[str, str] = {
     "from its own residuals.",
     "bound": "The most that the subject can do, as the settings give it: no command is larger.",
     "CMC": "Coefficient of multiple correlation: how alike whole curves are, 1 at most.",
-    "collinearity": "How nearly the effect of one parameter is a sum of those of others; above 10 "
-    "to 20 they cannot be told apart.",
     "coloured": "Of a residual: neighbouring samples resemble each other, as those of people do.",
     "condition number": "Largest over smallest eigenvalue of the weights: how unequally they price "
     "directions. It depends on units.",
@@ -50,8 +48,6 @@ WORDS: dict[str, str] = {
     "horizon": "How many samples the controller looks ahead.",
     "ICC": "Intraclass correlation: the share of the spread of measurements that is between "
     "people. 1: a second visit finds the same order of people.",
-    "inverse KKT": "Weights from the conditions of an optimum (Karush, Kuhn and Tucker), with no "
-    "simulation.",
     "inverse LQR": "Weights from recordings as if no bound were ever reached.",
     "inverse MPC": "Weights from recordings with the bounds: the controller that would have moved "
     "the same way inside them.",

@@ -43,8 +43,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from impc.arrays import Array
+    from impc.assess.assessments import MethodFit
     from impc.assess.intent_rules import Intent
-    from impc.assess.judged import MethodFit
     from impc.inverse.problem import Problem
 
 # Samples that are drawn of a trial. Of the weights' chart, which has a curve a position: how many

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 from markupsafe import Markup
 
-from impc.assess.judged import judge
+from impc.assess.assessments import judge
 from impc.checking import checked
 from impc.control.named_solver import described
 from impc.errors import InputError
@@ -34,7 +34,7 @@ from impc.studies.optimal_fit.result import OptimalFit
 from impc.studies.signal_words import body_sentence, signal_words
 
 if TYPE_CHECKING:
-    from impc.assess.judged import MethodFit
+    from impc.assess.assessments import MethodFit
 
 _CALLER = "of the program that called impc.report"
 # Trials that are drawn, the first ones.

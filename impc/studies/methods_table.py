@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from impc.arrays import Array
-    from impc.assess.judged import MethodFit
+    from impc.assess.assessments import MethodFit
     from impc.control.simulation import Simulation
     from impc.model.plant import Plant
     from impc.model.weights import Weights

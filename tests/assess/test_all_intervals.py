@@ -61,8 +61,6 @@ def test_the_set_of_weights_is_described(result: FitResult) -> None:
         i, j = (result.fitted.problem.plant.states.index(n) for n in (item.first, item.second))
         assert item.low <= Q[i, j] * (1 + 1e-6) + 1e-9
         assert Q[i, j] <= item.high + 1e-6 * abs(item.high)
-    for value, ends in zip(np.linalg.eigvalsh(Q), found.eigenvalues, strict=True):
-        assert ends.low * (1 - 1e-6) <= value <= ends.high * (1 + 1e-6)
     assert len(found.statements) == 2
 
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from experiments.coverage import cart, noisy_trial
-from impc.assess.assessments import ASSESSMENTS, assessed
-from impc.assess.judged import MethodFit, judge
+from impc.assess.assessments import ASSESSMENTS, MethodFit, assessed, judge
 from impc.checking import replace
 from impc.inverse.methods import estimate
 from impc.studies.fit.settings import FitSettings

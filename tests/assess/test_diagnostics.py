@@ -14,13 +14,13 @@ from experiments.coverage import cart, noisy_trial
 from experiments.residual_study import diagnosed
 from impc.arrays import Array
 from impc.assess.diagnostics import (
-    LoopNoise,
     ResidualDiagnostics,
-    loop_noise,
+    ResidualStructure,
     residual_diagnostics,
+    residual_structure,
     residual_warnings,
 )
-from impc.assess.residual_structure import ResidualStructure, residual_structure
+from impc.assess.loop_noise import LoopNoise, loop_noise
 from impc.checking import replace
 from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.residuals import evaluate

@@ -12,8 +12,7 @@ import scipy.optimize
 import plants
 from experiments.printed_intervals import carts, with_noise
 from experiments.structure_study import cart_person, seat_person
-from impc.assess.near_fit import NearFit
-from impc.assess.price_profiles import PriceProfiles
+from impc.assess.price_profiles import NearFit, PriceProfiles
 from impc.assess.structured_weights import Tangent, price_covariance, tangent
 from impc.assess.structures import structure_test
 from impc.checking import replace

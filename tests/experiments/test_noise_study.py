@@ -9,8 +9,7 @@ import pytest
 
 from experiments import noise_study
 from experiments.benchmarks.workloads import seat
-from experiments.noise_study import Cell, Outcome, study_cell
-from impc.studies.compare.subject import compared_methods
+from experiments.noise_study import COMPARED, Cell, Outcome, study_cell
 
 pytestmark = pytest.mark.full
 
@@ -24,7 +23,7 @@ def test_a_cell_with_saturation(monkeypatch: pytest.MonkeyPatch) -> None:
         noise_study, "seat", lambda trials, seconds, limit: seat(trials, seconds / 3, limit)
     )
     found = study_cell(Cell(4.5, 99.0, 0))
-    assert list(found) == list(compared_methods())
+    assert list(found) == list(COMPARED)
     ours = found["inverse_mpc"].vaf
     assert ours is not None
     assert ours > 99.9
@@ -43,7 +42,7 @@ def test_cells_that_are_done_are_not_done_again(
     cells = [Cell(6.0, 90.0, seed) for seed in range(2)]
     (tmp_path / "cells").mkdir()
     for cell in cells:
-        content = json.dumps(dict.fromkeys(compared_methods(), outcome))
+        content = json.dumps(dict.fromkeys(COMPARED, outcome))
         (tmp_path / "cells" / f"{cell.name}.json").write_text(content)
     monkeypatch.setattr(noise_study, "study_cell", None)
     found = noise_study._run(cells, tmp_path)

@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from impc.arrays import Array
-from impc.inverse.cross_term import inverse_lqr_cross_term
 from impc.inverse.inverse_lqr import (
     _FactorSpace,
+    inverse_lqr_cross_term,
     inverse_lqr_gradient,
     inverse_lqr_lmi,
 )

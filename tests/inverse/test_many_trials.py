@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-import impc.assess.residual_structure
+import impc.assess.diagnostics
 from experiments.coverage import cart
 from impc.assess.covariance import gain_covariance
-from impc.assess.residual_structure import residual_structure
+from impc.assess.diagnostics import residual_structure
 from impc.checking import replace
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
@@ -83,8 +83,8 @@ WORK: dict[str, Callable[[Problem], object]] = {
 @pytest.mark.parametrize("name", WORK)
 def test_memory_grows_as_the_trials_do(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Thrice the trials: 3 times the memory; nine times when each had columns beside all others."""
-    monkeypatch.setattr(impc.assess.residual_structure, "_LAGS", 2)
-    monkeypatch.setattr(impc.assess.residual_structure, "_SHIFTS", 3)
+    monkeypatch.setattr(impc.assess.diagnostics, "_LAGS", 2)
+    monkeypatch.setattr(impc.assess.diagnostics, "_SHIFTS", 3)
     few, many = (starts_unknown(count) for count in (60, 180))
     WORK[name](few)  # what is compiled and kept once does not count
     assert peak_of(lambda: WORK[name](many)) < 4.5 * peak_of(lambda: WORK[name](few))
@@ -93,8 +93,8 @@ def test_memory_grows_as_the_trials_do(name: str, monkeypatch: pytest.MonkeyPatc
 def test_of_very_many_samples_some_trials_are_tested(monkeypatch: pytest.MonkeyPatch) -> None:
     problem = starts_unknown(9)
     found = evaluate(problem, GAIN, np.eye(1))
-    monkeypatch.setattr(impc.assess.residual_structure, "_LAGS", 2)
-    monkeypatch.setattr(impc.assess.residual_structure, "_MOST", 200)
+    monkeypatch.setattr(impc.assess.diagnostics, "_LAGS", 2)
+    monkeypatch.setattr(impc.assess.diagnostics, "_MOST", 200)
     some = replace(problem, recordings=problem.recordings[::3])
     expected = residual_structure(some, GAIN, evaluate(some, GAIN, np.eye(1)))
     assert expected is not None

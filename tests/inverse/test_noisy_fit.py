@@ -8,8 +8,8 @@ import pytest
 import plants
 from experiments.benchmarks.workloads import Workload, seat
 from experiments.simulated_subjects import simulated_subject
+from impc.assess.assessments import judge
 from impc.assess.covariance import gain_covariance
-from impc.assess.judged import judge
 from impc.assess.printed_gain import gain_estimate
 from impc.checking import replace
 from impc.control.closed_loop import simulate

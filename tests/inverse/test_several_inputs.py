@@ -17,11 +17,10 @@ from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
 from impc.control.simulation import scenario
 from impc.errors import ImpcError
-from impc.inverse.consistent_metrics import metric_family
 from impc.inverse.coordinates import Coordinates
 from impc.inverse.direct_and_reduced import infer_weights, inverse_mpc_reduced
 from impc.inverse.equivalent_weights import least_condition_weights, other_weights
-from impc.inverse.explaining_weights import weights_behind
+from impc.inverse.explaining_weights import metric_family, weights_behind
 from impc.inverse.gain_search import fit_gain, refine_gain
 from impc.inverse.inactive_samples import pair_of_inactive_samples
 from impc.inverse.noisy_fit import fit_controller

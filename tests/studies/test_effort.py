@@ -154,7 +154,7 @@ def test_evaluations_of_a_selection_are_told_to_their_order_of_magnitude(which: 
     watched = replace(model, jacobian=counted)
     settings = SelectSettings(replicates=20, starts=2, least=1)
     select_study({"1": trials}, settings, in_turn(watched))
-    assert 1 / 10 < select_evaluations(settings, 1) / calls < 10
+    assert 1 / 10 < select_evaluations(settings) / calls < 10
     calls = 0
     cells = {("1", "1"): trials, ("1", "2"): trials}
     found = key_parameters(watched, cells, settings, in_turn(watched), bound=0.5)

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from experiments.coverage import cart, noisy_trial
-from impc.assess.assessments import ASSESSMENTS, Assessment
-from impc.assess.judged import MethodFit, judge
+from impc.assess.assessments import ASSESSMENTS, Assessment, MethodFit, judge
 from impc.checking import replace
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
@@ -37,7 +36,9 @@ def fits() -> list[MethodFit]:
     settings = FitSettings(horizon=10, u_max=1.0)
     problem = fit_problem(cart(), [noisy_trial(21, 0.0)], settings)
     gain = judge(estimate(problem, "feedback_gain"), problem.bounds)
-    none = replace(gain.estimate, method="inverse_kkt", K=None, S=None, reason="it was not tried")
+    none = replace(
+        gain.estimate, method="inverse_lqr_lmi", K=None, S=None, reason="it was not tried"
+    )
     return [gain, judge(none, problem.bounds)]
 
 
@@ -46,13 +47,13 @@ def test_the_three_say_the_same(fits: list[MethodFit]) -> None:
     assert finding.table is not None
     numbers = list(csv.DictReader(io.StringIO(csv_bytes(finding.table).decode())))
     data = json.loads(json_bytes(methods_data(fits)))
-    assert list(data) == ["feedback_gain", "inverse_kkt"] == [row["name"] for row in numbers]
+    assert list(data) == ["feedback_gain", "inverse_lqr_lmi"] == [row["name"] for row in numbers]
     output = fits[0].estimate.problem.plant.outputs[0]
     share = data["feedback_gain"]["vaf"][output]
     assert float(numbers[0][f"vaf_{output}"]) == share
     assert finding.rows[0][1] == f"{share:.4g}"
     assert finding.rows[0][0] == METHODS["feedback_gain"].label
-    assert (numbers[1][f"vaf_{output}"], data["inverse_kkt"]["vaf"]) == ("", {output: None})
+    assert (numbers[1][f"vaf_{output}"], data["inverse_lqr_lmi"]["vaf"]) == ("", {output: None})
     assert finding.rows[1][-1] == numbers[1]["note"] == "it was not tried"
 
 

@@ -18,13 +18,11 @@ import numpy as np
 import psutil
 
 from impc.arrays import frozen
-from impc.assess.assessments import assessed
-from impc.assess.held_out import predict
+from impc.assess.assessments import assessed, judge
 from impc.assess.intent_rules import intent
-from impc.assess.judged import judge
 from impc.assess.printed_gain import gain_estimate
 from impc.assess.resampling import DRAWS, bootstrap_model, replicate
-from impc.assess.variance_accounted_for import saturated_share
+from impc.assess.variance_accounted_for import predict, saturated_share
 from impc.checking import replace
 from impc.errors import ImpcError
 from impc.files.plant_sources import make_plant, plant_family_of, plant_source
@@ -42,7 +40,7 @@ from impc.studies.signal_words import signal_words
 
 if TYPE_CHECKING:
     from impc.arrays import Array
-    from impc.assess.judged import MethodFit
+    from impc.assess.assessments import MethodFit
     from impc.files.configuration import Configuration
     from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from impc.arrays import Array
-    from impc.assess.judged import MethodFit
+    from impc.assess.assessments import MethodFit
     from impc.inverse.problem import Problem
     from impc.reporting.provenance import Provenance
 

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.arrays import Array, frozen
-from impc.assess.held_out import left_out_vaf
-from impc.assess.judged import judge
+from impc.assess.assessments import judge
+from impc.assess.variance_accounted_for import left_out_vaf
 from impc.checking import replace
 from impc.errors import SolverError, WeightsError
 from impc.inverse.cross_check import cross_checked
@@ -19,7 +19,7 @@ from impc.inverse.groundwork import NaturalUnits, afresh
 from impc.inverse.methods import METHODS, estimate_all
 
 if TYPE_CHECKING:
-    from impc.assess.judged import MethodFit
+    from impc.assess.assessments import MethodFit
     from impc.inverse.estimates import Estimate
     from impc.inverse.groundwork import Remember
     from impc.inverse.problem import Problem

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from impc.arrays import Array, Frozen, frozen
+from impc.assess.assessments import judge
 from impc.assess.identified_directions import Identifiability, identifiability
-from impc.assess.judged import judge
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
 from impc.control.named_solver import COMPILED
@@ -31,7 +31,7 @@ from impc.model.weights import Weights, weight_error
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from impc.assess.judged import MethodFit
+    from impc.assess.assessments import MethodFit
     from impc.model.plant import Plant
 
 _T = TypeVar("_T")

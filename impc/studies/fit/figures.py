@@ -185,13 +185,13 @@ def _intent(result: FitResult) -> Figure:
     plant, readings = result.fitted.problem.plant, result.intent.readings
     figure = new_figure(DOUBLE_COLUMN, 2.9)
     left, right = figure.subplots(1, 2, width_ratios=[1, 2.2])
-    marks = ("o", "s", "D", "^", "v", "P")
+    marks = ("o", "s", "D")
     for index, reading in enumerate(readings):
         values = reading.eigenvalues[::-1]
         left.plot(
             np.arange(1, len(values) + 1),
             values,
-            marker=marks[index % 6],
+            marker=marks[index % 3],
             linewidth=0.7,
             color=_shade(index),
             markerfacecolor="white" if index else _shade(index),
@@ -205,7 +205,7 @@ def _intent(result: FitResult) -> Figure:
             color=_shade(index),
             edgecolor=INK,
             linewidth=0.4,
-            hatch=("", "//", "..", "xx", "--", "oo")[index % 6],
+            hatch=("", "//", "..")[index % 3],
             label=reading.rule,
         )
     left.set_yscale("log")

@@ -16,17 +16,16 @@ from impc.model.riccati import solve_lqr
 if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.assess.all_intervals import Certainty
+    from impc.assess.assessments import MethodFit
     from impc.assess.diagnostics import ResidualDiagnostics
-    from impc.assess.held_out import HeldOut
     from impc.assess.identified_directions import Identifiability
     from impc.assess.input_limits import OtherLimit
     from impc.assess.intent_rules import Intent
     from impc.assess.intervals import Interval
-    from impc.assess.judged import MethodFit
     from impc.assess.person_models import PersonReport
     from impc.assess.printed_gain import GainEstimate
     from impc.assess.structures import StructureFit
-    from impc.assess.variance_accounted_for import TrialAgreement
+    from impc.assess.variance_accounted_for import HeldOut, TrialAgreement
     from impc.assess.weights_test import WeightsTest
     from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem

@@ -19,20 +19,19 @@ from tqdm.auto import tqdm
 
 from impc.arrays import Array, frozen
 from impc.assess.all_intervals import assess, count_stages
+from impc.assess.assessments import judge
 from impc.assess.diagnostics import (
     ResidualDiagnostics,
     residual_diagnostics,
 )
-from impc.assess.held_out import predict
 from impc.assess.identified_directions import identifiability
 from impc.assess.input_limits import at_another_limit
 from impc.assess.intent_draws import drawn_gains
 from impc.assess.intent_rules import intent
-from impc.assess.judged import judge
 from impc.assess.person_models import afresh_person, person_report, persons
 from impc.assess.printed_gain import gain_estimate
 from impc.assess.structures import assess_structure, no_structure
-from impc.assess.variance_accounted_for import agreement
+from impc.assess.variance_accounted_for import agreement, predict
 from impc.assess.weights_ranges import weights_summary_or_reason
 from impc.assess.weights_test import weights_test
 from impc.checking import checked, replace
@@ -52,14 +51,13 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from impc.assess.all_intervals import Attempt, Certainty
-    from impc.assess.held_out import HeldOut
+    from impc.assess.assessments import MethodFit
     from impc.assess.input_limits import OtherLimit
-    from impc.assess.judged import MethodFit
     from impc.assess.person_models import PersonReport, RememberPerson
     from impc.assess.printed_gain import GainEstimate
     from impc.assess.resampling import Replicate
     from impc.assess.structures import StructureFit
-    from impc.assess.variance_accounted_for import TrialAgreement
+    from impc.assess.variance_accounted_for import HeldOut, TrialAgreement
     from impc.assess.weights_ranges import WeightsSummary
     from impc.control.simulation import Simulation
     from impc.model.bounds import Bounds

@@ -9,14 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.errors import DataError
-from impc.studies.selection.subject import (
-    Chosen,
-    Doubts,
-    Nominal,
-    fit_chosen,
-    fit_nominal,
-    raise_doubts,
-)
+from impc.studies.selection.subject import Chosen, Nominal, fit_chosen, fit_nominal
 from impc.studies.selection.subsets import largest_subsets, sweep
 
 if TYPE_CHECKING:
@@ -44,7 +37,6 @@ class StudySelection:
     free: tuple[int, ...]
     chosen: Mapping[str, Chosen]  # Subject -> refit of that subset, intervals, LASSO
     lasso: tuple[int, ...]  # What the LASSO selects most often
-    doubts: Doubts  # Of the first subject
     # "fim", "lasso" and, when it was asked for, "nelder_mead": time in s, mean over subjects
     seconds: Mapping[str, float]
 
@@ -61,8 +53,6 @@ def select_study(
     worst = sweep(informations, settings.bounds, settings.least)
     free = _free(informations, worst, nominal, settings)
     chosen = run(fit_chosen, Chosen, {name: (trials[name], settings, free) for name in trials})
-    first = next(iter(trials))
-    asked = {first: (trials[first], settings, nominal[first], chosen[first].refit)}
     seconds = {
         "fim": float(np.mean([item.seconds for item in nominal.values()])),
         "lasso": float(np.mean([item.seconds_lasso for item in chosen.values()])),
@@ -77,7 +67,6 @@ def select_study(
         free,
         chosen,
         Counter(item.lasso.selected for item in chosen.values()).most_common(1)[0][0],
-        run(raise_doubts, Doubts, asked)[first],
         seconds,
     )
 

@@ -21,22 +21,17 @@ if TYPE_CHECKING:
     from impc.studies.selection.settings import SelectSettings
 
 # Evaluations with derivatives of a fit from a start far off, of one from its neighbourhood, of a
-# LASSO with its refit, of Table C.1 (of the outputs alone: a few thousand a solve), and of a
-# profile, which fits again at each of its points. Counted on the drug: 7, 5, 74 and 180; on the
-# head, whose twelve parameters are hardly told: 200, 17, 23.
-_FIT, _REFIT, _LASSO, _TABLE, _PROFILE = 30, 9, 100, 4000, 180
+# LASSO with its refit, and of Table C.1 (of the outputs alone: a few thousand a solve). Counted
+# on the drug: 7, 5, 74; on the head, whose twelve parameters are hardly told: 200, 17, 23.
+_FIT, _REFIT, _LASSO, _TABLE = 30, 9, 100, 4000
 # Arrays of the size of the derivative that a fit holds, and fits at a time in a bootstrap.
 _COPIES, _THREADS = 6, 2
 
 
-def select_evaluations(settings: SelectSettings, subjects: int) -> int:
-    """Of the model with its derivative, for one of so many `subjects` of `impc select`.
-
-    Profiles are taken of the first subject only.
-    """
+def select_evaluations(settings: SelectSettings) -> int:
+    """Of the model with its derivative, for one subject of `impc select`."""
     table = _TABLE if settings.nelder_mead else 0
-    each = _FIT * settings.starts + _REFIT * settings.replicates + _LASSO + table
-    return each + _PROFILE * settings.size // subjects
+    return _FIT * settings.starts + _REFIT * settings.replicates + _LASSO + table
 
 
 def key_evaluations(settings: SelectSettings, most: int = 20) -> int:

@@ -36,20 +36,6 @@ class Discrete(NamedTuple):
     dC: Array  # (k, p, n)
 
 
-def discretised(matrices: ca.Function, theta: Array, dt: float) -> Discrete:
-    """Sample a model at one point.
-
-    `theta` (k,); `dt` in s.
-    """
-    A, B, C = (item.full() for item in matrices(theta))
-    symbol = ca.SX.sym("theta", len(theta))
-    parts = matrices(symbol)
-    derivative = ca.Function(
-        "derivative", [symbol], [ca.jacobian(ca.vec(part), symbol) for part in parts]
-    )
-    return _sampled((A, B, C), [item.full() for item in derivative(theta)], dt)
-
-
 def linear_functions(
     matrices: ca.Function, dt: float
 ) -> tuple[
@@ -78,7 +64,7 @@ def linear_functions(
 
     def jacobian(theta: Array, given: Array, free: IntArray) -> tuple[Array, Array]:
         continuous = [item.full() for item in matrices(theta)]
-        found = _sampled(continuous, [item.full()[:, free] for item in derivative(theta)], dt)
+        found = sampled(continuous, [item.full()[:, free] for item in derivative(theta)], dt)
         x, X = _with_derivatives(found.A, found.B, found.dA, found.dB, np.ascontiguousarray(given))
         outputs = x @ found.C.T
         on_state = np.einsum("pn,skn->spk", found.C, X)
@@ -88,7 +74,8 @@ def linear_functions(
     return simulate, jacobian
 
 
-def _sampled(parts: Any, derivatives: list[Array], dt: float) -> Discrete:
+def sampled(parts: Any, derivatives: list[Array], dt: float) -> Discrete:
+    """Continuous A, B, C and their derivatives, a column a parameter, sampled at `dt`, s."""
     A, B, C = parts
     n, d = B.shape
     k = derivatives[0].shape[1]

@@ -42,17 +42,17 @@ def selection_report(
         [
             Section(
                 "1. Estimates",
-                (picture, _intervals(model, found), _three_intervals(model, found)),
+                (picture, _intervals(model, found)),
                 "Estimates",
             ),
             Section(
                 "2. Methods of selection",
-                (method_finding(model, found), _agreement(model, found)),
+                (method_finding(model, found),),
                 "Methods",
             ),
             Section(
-                "3. Subsets, directions and bias",
-                (_sweep(model, found), _ranks(model, found), _bias(model, found)),
+                "3. Subsets and directions",
+                (_sweep(model, found), _ranks(model, found)),
                 "Subsets",
                 folded=True,
             ),
@@ -159,52 +159,6 @@ def _intervals(model: ParametricModel, found: StudySelection) -> Finding:
     heads = ["subject", "parameter", "unit", "value", "low", "high", "width_percent_of_the_range"]
     caption = "The chosen parameters of each subject, with 95 % bootstrap intervals."
     return Finding("intervals", pd.DataFrame(rows, columns=heads), caption)
-
-
-def _three_intervals(model: ParametricModel, found: StudySelection) -> Finding:
-    """First subject: percentiles, profile likelihood and the Cramer-Rao bound."""
-    first = next(iter(found.chosen.values()))
-    rows = []
-    for place, index in enumerate(found.free):
-        value, half = float(first.refit.theta[index]), float(found.doubts.bound[place])
-        bootstrap = (float(first.intervals.low[place]), float(first.intervals.high[place]))
-        rows.append((model.names[index], model.units[index], value, *bootstrap,
-                     *found.doubts.profile[place], value - half, value + half))  # fmt: skip
-    ends = [f"{method}_{end}" for method in ("bootstrap", "profile", "cramer_rao")
-            for end in ("low", "high")]  # fmt: skip
-    caption = (
-        "95 % intervals in the first subject: bootstrap, profile likelihood and Cramér-Rao bound. "
-        "The last two take the residuals for white; an infinite end is not met inside the "
-        "parameter's range."
-    )
-    table = pd.DataFrame(rows, columns=["parameter", "unit", "value", *ends])
-    return Finding("doubt", table, caption)
-
-
-def _agreement(model: ParametricModel, found: StudySelection) -> Finding:
-    table = table_of(
-        found.doubts.agreement.items(),
-        {
-            "rule": lambda pair: pair[0],
-            "subset": lambda pair: names_of(model, pair[1]),
-            "shared_with_the_chosen": lambda pair: len(set(pair[1]) & set(found.free)),
-        },
-    )
-    caption = (
-        f"What other rules select in the first subject. The chosen subset's collinearity is "
-        f"{found.doubts.collinearity:.3g}; 10 to 20 is the usual limit."
-    )
-    return Finding("agreement", table, caption)
-
-
-def _bias(model: ParametricModel, found: StudySelection) -> Finding:
-    rows = [(item.name, item.moved, *item.shift) for item in found.doubts.bias]
-    heads = ["fixed_parameter", "moved_by", *(model.names[index] for index in found.free)]
-    caption = (
-        "Bias from fixing, first subject: shift of the chosen parameters when a fixed one is "
-        "elsewhere; all in halves of their ranges."
-    )
-    return Finding("bias", pd.DataFrame(rows, columns=heads), caption, digits=3)
 
 
 def _interval_figure(model: ParametricModel, found: StudySelection) -> Figure:

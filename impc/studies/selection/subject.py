@@ -31,13 +31,6 @@ from impc.studies.selection.fisher import (
 )
 from impc.studies.selection.lasso import Lasso, lasso_of_size, table_c1
 from impc.studies.selection.model import Trial
-from impc.studies.selection.modern import (
-    FixedBias,
-    agreement,
-    collinearity,
-    fixed_bias,
-    profile_interval,
-)
 from impc.studies.selection.subsets import Selection, sweep
 
 if TYPE_CHECKING:
@@ -73,18 +66,6 @@ class Chosen:
     seconds_nelder_mead: float
 
 
-@dataclass(frozen=True)
-class Doubts:
-    """What a reviewer asks of the chosen parameters, in one subject."""
-
-    agreement: dict[str, tuple[int, ...]]  # Rule -> its best subset
-    collinearity: float  # Brun's index of the chosen parameters
-    bias: tuple[FixedBias, ...]
-    # Ends of the profile likelihood's 95 % interval of each chosen parameter
-    profile: tuple[tuple[float, float], ...]
-    bound: tuple[float, ...]  # Half width of the Cramer-Rao 95 % interval of each, in its unit
-
-
 def fit_nominal(
     model: ParametricModel, trials: Sequence[Trial], settings: SelectSettings
 ) -> Nominal:
@@ -116,32 +97,6 @@ def fit_chosen(
     nelder_mead = table_c1(model, trials, settings.size) if settings.nelder_mead else None
     ended = time.perf_counter()
     return Chosen(refit, intervals, lasso, nelder_mead, between - started, ended - between)
-
-
-def raise_doubts(
-    model: ParametricModel,
-    trials: Sequence[Trial],
-    settings: SelectSettings,
-    nominal: Nominal,
-    refit: Estimate,
-) -> Doubts:
-    """Other rules of selection, collinearity, bias from fixing, profile likelihood."""
-    chosen = list(refit.free)
-    rules = agreement(model, trials, np.array(nominal.fit.theta), settings.bound)
-    best = {
-        rule: (item.subsets[0] if item.subsets else ()) if isinstance(item, Selection) else item
-        for rule, item in rules.items()
-    }
-    local = fisher_information(model, np.array(refit.theta), trials)
-    covariance = np.linalg.pinv(np.asarray(local.F)[np.ix_(chosen, chosen)], hermitian=True)
-    half = 1.96 * np.sqrt(np.diag(covariance)) * model.gain[chosen]
-    return Doubts(
-        best,
-        collinearity(nominal.information, chosen),
-        fixed_bias(model, trials, refit),
-        tuple(profile_interval(model, trials, refit, index) for index in chosen),
-        tuple(float(item) for item in half),
-    )
 
 
 _THREADS = 2

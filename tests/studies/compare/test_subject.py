@@ -15,7 +15,7 @@ from click.testing import CliRunner
 
 from experiments.coverage import cart, noisy_trial, true_controller
 from impc.arrays import Array
-from impc.assess.judged import MethodFit, judge
+from impc.assess.assessments import MethodFit, judge
 from impc.checking import replace
 from impc.cli.main import main
 from impc.control.controller import Controller
@@ -204,7 +204,7 @@ def test_the_command(tmp_path: Path) -> None:
     assert share == pytest.approx(found["inverse_mpc"]["trial_vaf"][1][0])
     page = (out / "report.html").read_text()
     assert not re.search("https?:", page)
-    assert "inverse KKT" in page
+    assert "inverse LQR, LMI" in page
     assert "inverse MPC, direct (3.6)" in done.stdout
 
 

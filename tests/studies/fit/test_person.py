@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from impc.arrays import frozen
-from impc.assess.diagnostics import LoopNoise, ResidualDiagnostics
+from impc.assess.diagnostics import ResidualDiagnostics
 from impc.assess.likely_people import entry_intervals, people_as_likely
+from impc.assess.loop_noise import LoopNoise
 from impc.checking import replace
 from impc.control.controller import Controller
 from impc.control.noisy_person import simulate_person

@@ -128,6 +128,8 @@ def test_what_a_command_does_not_use_is_refused_by_name(
 
 
 def test_a_method_of_a_fit_is_one_of_the_registry() -> None:
-    assert fit_settings({"methods": ["inverse_kkt"]}).methods == ["inverse_kkt"]
+    assert fit_settings({"methods": ["clipped_lqr"]}).methods == ["clipped_lqr"]
     with pytest.raises(InputError, match="method: got 'inverse_mpc_direct'; choose one of"):
         fit_settings({"methods": ["inverse_mpc_direct"]})
+    with pytest.raises(InputError, match="method: inverse_kkt was removed; take it out"):
+        fit_settings({"methods": ["inverse_kkt"]})

@@ -9,8 +9,8 @@ import control
 import numpy as np
 import pytest
 
-from impc.assess.diagnostics import LoopNoise, ResidualDiagnostics
-from impc.assess.residual_structure import ResidualStructure
+from impc.assess.diagnostics import ResidualDiagnostics, ResidualStructure
+from impc.assess.loop_noise import LoopNoise
 from impc.checking import replace
 from impc.control.controller import Controller
 from impc.files.plant_sources import plant_source

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import itertools
 import tracemalloc
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import impc.studies.selection.subsets
 import plants
-from experiments.kronecker import kronecker_sensitivity
+from experiments.reproduction.appendices import discretised, kronecker_sensitivity
 from impc.errors import DataError, InputError
 from impc.studies.selection.estimation import estimate, free_indices, multi_start
 from impc.studies.selection.fisher import (
@@ -20,16 +19,7 @@ from impc.studies.selection.fisher import (
     null_directions,
     unseen_scalings,
 )
-from impc.studies.selection.linear import discretised
 from impc.studies.selection.model import normalised, parametric_model, physical, sensitivity
-from impc.studies.selection.modern import (
-    best_collinear,
-    collinearity,
-    fixed_bias,
-    pivoted_order,
-    profile_interval,
-    subset_by_svd,
-)
 from impc.studies.selection.subsets import exhaustive, largest_subsets, subset_variances
 from tests.studies.selection.heads import NAMES_FIM, head_model, head_trials
 
@@ -144,36 +134,6 @@ def test_estimates_find_the_truth() -> None:
     assert several[0].misfit == pytest.approx(found.misfit, rel=1e-6)
 
 
-def test_other_selectors() -> None:
-    assert len(set(pivoted_order(FOUND))) == 12
-    assert len(subset_by_svd(FOUND, 5)) == 5
-    free = free_indices(MODEL, NAMES_FIM)
-    gamma = collinearity(FOUND, free)
-    columns = np.concatenate([sensitivity(MODEL, NOMINAL, item.input)[1][:, 0] for item in TRIALS])[
-        :, list(free)
-    ]
-    scaled = columns / np.linalg.norm(columns, axis=0)
-    assert gamma == pytest.approx(1 / np.linalg.svd(scaled, compute_uv=False)[-1], rel=1e-6)
-    assert best_collinear(FOUND, 3)[1] <= collinearity(FOUND, free[:3])
-
-
-def test_profile_agrees_with_cramer_rao() -> None:
-    free = free_indices(MODEL, ("tau",))
-    found = estimate(MODEL, TRIALS, free, NOMINAL)
-    low, high = profile_interval(MODEL, TRIALS, found, free[0])
-    deviation = MODEL.gain[3] / np.sqrt(FOUND.F[3, 3])
-    assert (high - low) / 2 == pytest.approx(1.96 * deviation, rel=0.1)
-
-
-def test_bias_from_fixed_parameters() -> None:
-    """The inertia-like scaling: Kvcr fixed 10 % of its half range higher moves Kvis up with it."""
-    free = free_indices(MODEL, ("Kvis", "Kccr", "tau"))
-    fit = estimate(MODEL, TRIALS, free, NOMINAL)
-    told = {item.name: item for item in fixed_bias(MODEL, TRIALS, fit)}
-    assert set(told) == set(MODEL.names) - {"Kvis", "Kccr", "tau"}
-    assert np.sign(told["Kvcr"].shift[0]) == np.sign(told["Kvcr"].moved)
-
-
 def test_any_function_is_a_model() -> None:
     """Exponential decay by a plain function: the information of its closed form."""
     time = np.linspace(0, 4, 50)[:, None]
@@ -215,5 +175,3 @@ def test_subsets_beyond_number_are_refused_and_not_begun(monkeypatch: pytest.Mon
         tracemalloc.stop()
     few = np.diag([1.0] * 4 + [0.1] * 36)
     assert largest_subsets([few], 2.0).subsets == ((0, 1, 2, 3),)
-    found = SimpleNamespace(F=np.eye(40))
-    assert best_collinear(found, 10)[0] == ()  # type: ignore[arg-type]

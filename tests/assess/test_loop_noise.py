@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from impc.arrays import Array
-from impc.assess.whittle import (
+from impc.assess.loop_noise import (
     ORDER,
     Spectrum,
     loop_shapes,

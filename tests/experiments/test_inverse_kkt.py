@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from experiments.benchmarks.workloads import example, seat
+from experiments.inverse_kkt import Smoothed, smoothed_trials, stationarity_weights
 from impc.arrays import Array
 from impc.control.closed_loop import simulate
 from impc.errors import DataError
-from impc.inverse.stationarity import Smoothed, smoothed_trials, stationarity_weights
 from impc.model.riccati import solve_lqr
 from impc.model.weights import Weights
 from tests.support import random_plant, random_weights

@@ -1,4 +1,4 @@
-"""Weights from the stationarity of recorded trajectories: inverse KKT, a method of the literature.
+"""Weights from the stationarity of recorded trajectories: inverse KKT, a peer of the noise study.
 
 Each stretch of N samples of a trajectory (x_j, u_j) is taken for a plan that was optimal. With the
 adjoint lambda_j of the dynamics it satisfies
@@ -35,7 +35,10 @@ import scipy.linalg
 import scipy.optimize
 
 from impc.arrays import Array, BoolArray, Frozen, frozen
+from impc.checking import replace
 from impc.errors import DataError
+from impc.inverse.groundwork import regulator
+from impc.inverse.methods import Method
 from impc.inverse.proximal_step import block_basis
 from impc.inverse.semidefinite import matrix_inequality, norm_bound, solve_semidefinite
 from impc.inverse.solution_set import natural_coordinates, split_blocks
@@ -155,6 +158,17 @@ def _least_squares(triangle: Array, units: Array, n: int, G: Array) -> Array:
 _RATIOS = (-8.0, 8.0)
 # Variance of states and commands at the first sample, over that of the outputs.
 _DIFFUSE = 1e6
+
+#: The method for `Method.estimate`, as the noise study compares it with those of the registry.
+INVERSE_KKT = Method(
+    "inverse_kkt",
+    "inverse KKT",
+    "Weights that make the smoothed states and commands look like optimal plans.",
+    lambda problem: problem,
+    lambda ground: replace(
+        regulator(ground, inverse_kkt(ground.known, ground.starting_gain)), problem=ground.known
+    ),
+)
 
 
 @dataclass(frozen=True)
