@@ -403,7 +403,7 @@ def reader_that(ends: str) -> Callable[[Path], None]:
     def read(folder: Path) -> None:
         hdf5_mat(folder / "t.mat", {"x": np.arange(9.0)})
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(apart, "_current", [])
+            patch.setattr(apart, "_children", {})
             patch.setattr(apart, "_START", f"import os, signal; {ends}")
             read_table(folder / "t.mat")
 
