@@ -20,7 +20,6 @@ from impc.files.blocks import EMPTY, HEAD, NUMBER, WORD, Block, first_block
 from impc.files.headings import find_headings, written_heading
 from impc.files.names import LARGEST
 from impc.files.table import make_table
-from impc.files.thousands import require_no_thousands
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -108,7 +107,6 @@ class _Column:
     """What is found in a column: its numbers, and how often a word, the first with its row."""
 
     values: Array
-    signs: bool = False  # whether some of its numbers may have a decimal sign
     words: int = 0
     word: str = ""
     row: int = 0
@@ -316,7 +314,6 @@ def _columns(text: _Text, body: _Body) -> list[_Column]:
 def _take(column: _Column, piece: pd.Series[Any], start: int, decimal: str) -> None:
     """Take in the values of some rows, and count the words among them."""
     values = column.values[start : start + len(piece)]
-    column.signs |= piece.dtype.kind not in "iu"
     if piece.dtype.kind in "fiu":
         values[:] = piece
         return
@@ -340,7 +337,6 @@ def _table(text: _Text, body: _Body, columns: Sequence[_Column], above: Sequence
     heads = find_headings(text.source, rows, empty, named_rows=quoted or bool(columns[0].words))
     kept: dict[str, Array] = {}
     skipped: dict[str, str] = {}
-    floats: dict[int, str] = {}
     for place, (name, column) in enumerate(zip(heads.names, columns, strict=True)):
         known = name or f"column_{place + 1}"
         if empty[place]:
@@ -350,8 +346,6 @@ def _table(text: _Text, body: _Body, columns: Sequence[_Column], above: Sequence
         else:
             column.values.flags.writeable = False  # taken as they are
             kept[known] = column.values
-            floats |= {place: name} if column.signs else {}
-    _require_no_thousands(text, body, floats)
     notes = (*heads.notes, *([body.rest] if body.rest else []))
     return make_table(text.source, kept, heads.units, None, skipped, notes)
 
@@ -377,16 +371,3 @@ def _words(text: _Text, body: _Body, name: str, column: _Column) -> str:
         f"{column.word!r} in line {line}",
         "correct those rows or export the column as numbers, without thousands separators",
     )
-
-
-def _require_no_thousands(text: _Text, body: _Body, floats: dict[int, str]) -> None:
-    """Look for thousands where some of the numbers that are not whole have no decimal sign."""
-    sign = text.decimal.encode()
-    if text.content.count(sign) >= body.rows * len(floats):
-        return
-    rows = (
-        (number, text.fields(line))
-        for index, (number, line) in enumerate(text.lines())
-        if body.start <= index < body.start + body.rows
-    )
-    require_no_thousands(text.source, floats, rows, text.decimal)

@@ -20,7 +20,6 @@ from impc.files.blocks import EMPTY, HEAD, NUMBER, WORD, Block, first_block
 from impc.files.delimited import is_number
 from impc.files.headings import find_headings
 from impc.files.table import make_table
-from impc.files.thousands import require_no_thousands
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -185,9 +184,6 @@ def _column(
         )
         remedy = "correct those cells or save the column as numbers, without thousands separators"
         raise DataError(source, problem, remedy)
-    lines = ((corner[0] + row + 1, [cell]) for row, cell in enumerate(map(str, cells)))
-    if texts:
-        require_no_thousands(source, {0: name}, lines, mark)
     kinds = {_kind(cell) for cell in given}
     if len(kinds) > 1:
         problem = f"column {name!r} has {' and '.join(sorted(kinds))}"

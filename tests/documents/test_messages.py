@@ -370,11 +370,6 @@ def everything_recorded(_: Path) -> None:
     make_plant(source, source.make().input_labels)
 
 
-def thousands(folder: Path) -> None:
-    (folder / "t.csv").write_text("t;x\n0;999\n1;1.000\n")
-    read_table(folder / "t.csv")
-
-
 def workbook(*rows: Sequence[Any]) -> Callable[[Path], Table]:
     def read(folder: Path) -> Table:
         made = openpyxl.Workbook()
@@ -593,7 +588,6 @@ PROVOKED: dict[str, Callable[[Path], object]] = {
     "column '...' has text in ... of ... rows": damaged("text in a column"),
     "the file ends in the middle of a row": damaged("truncated csv"),
     "is a MATLAB table; save a struct of vectors": damaged("table object"),
-    "which may be a thousand": thousands,
     "is no ordinary file": a_pipe,
     "takes more than ... GB to read": reader_that("os.kill(os.getpid(), signal.SIGKILL)"),
     "takes longer than ... s to read": reader_that("os.kill(os.getpid(), signal.SIGXCPU)"),
