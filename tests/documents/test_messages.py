@@ -607,7 +607,7 @@ PROVOKED: dict[str, Callable[[Path], object]] = {
     "method: got ...; choose one of ...": lambda _: fit_settings({"methods": ["best"]}),
     "solver: got ...; choose one of ...": lambda _: fit_settings({"solver": "gurobi"}),
     "solver: ... is not part of the CasADi that is installed": without_daqp,
-    "[fit] ...: is not a setting; known: ...": lambda _: fit_settings({"horzon": 20}),
+    "[fit] ...: is not a setting; did you mean ...": lambda _: fit_settings({"horzon": 20}),
     "... has the symbol ...; which is neither a state, an input, a disturbance nor a parameter": (
         lambda _: own_problem(stage_cost=lambda x, u, p: p * x**2 + casadi.SX.sym("w") * u**2)
     ),
@@ -637,10 +637,10 @@ PROVOKED: dict[str, Callable[[Path], object]] = {
     "is an optimal control problem; impc fit takes one, this does not": lambda _: make_plant(
         PlantSource("mine:problem", own_problem, {}), ()
     ),
-    "[fit.structure] ...: is not a setting; known: ...": lambda _: fit_settings(
+    "[fit.structure] ...: is not a setting; see docs/fitting.md": lambda _: fit_settings(
         {"structure": {"q": "diagonal"}}
     ),
-    "[fit.observer] ...: is not a setting; known: ...": lambda _: fit_settings(
+    "[fit.observer] ...: is not a setting; see docs/fitting.md": lambda _: fit_settings(
         {"observer": {"senses": ["theta1"]}}
     ),
     "walk: is given, but every state is seen; say what is sensed": lambda _: Observer(
@@ -719,7 +719,7 @@ PROVOKED: dict[str, Callable[[Path], object]] = {
     "ends in ... (...); correct the function, or what it is given": lambda _: make_plant(
         PlantSource("mine:stick", lambda: sys.exit(0), {}), ()
     ),
-    "[fit] ...: got ...; give at least ..., at most ...": of_fit({"horizon": 2**63}),
+    "[fit] ...: got ...; give at most ...": of_fit({"horizon": 2**63}),
     "names ... twice; name each once": of_fit({"free": ["mass", "mass"]}),
     "is a ... that no result can keep": lambda _: find_plant("cursor", {"sample_time": 2**64}),
     "would need ... GB of memory, more than this machine has": large_request(0, 1e9),

@@ -207,7 +207,7 @@ def test_faults_are_one_line(tmp_path: Path) -> None:
         ('model = "tests.studies.selection.dosing:blood_model"', "", "study.model"),
         ("dosing:blood_model", "dosing:nothing", "nothing"),
         ("bound = 0.05", "bond = 0.05", "is not a setting"),
-        ("replicates = 40", "draw = 'x'", "single or block"),
+        ("replicates = 40", "draw = 'x'", "give single or block"),
         ("replicates = 40", "replicates = 0", "[select] replicates"),
         ("replicates = 40", "replicates = 1", "[select] replicates"),
         ("replicates = 40", "replicates = 9223372036854775807", "[select] replicates"),
