@@ -778,9 +778,6 @@ PROVOKED: dict[str, Callable[[Path], object]] = {
     "names code that would be run, ...": lambda folder: command(
         "cohort", str(own_plant(folder)), "--out", str(folder / "out")
     ),
-    "is no function of a module of yours": lambda folder: command(
-        "cohort", str(own_plant(folder)), "--plant", "os:system", "--out", str(folder / "out")
-    ),
     "has ... in it; use letters, digits, spaces and . + - _": lambda _: checked_name(
         "t.csv", "subject", "a/b"
     ),

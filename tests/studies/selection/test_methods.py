@@ -216,11 +216,6 @@ def test_faults_are_one_line(tmp_path: Path) -> None:
         ("replicates = 40", "bounds = []", "[select] bounds"),
         ("replicates = 40", "bounds = [nan]", "[select] bound"),
         ("bound = 0.05", "bound = -1.0", "[select] bound"),
-        (
-            "tests.studies.selection.dosing:blood_model",
-            "os:system",
-            "no function of a module of yours",
-        ),
     ):
         study.write_text(text.replace(old, new))
         done = run("select", str(study), "--allow-model", "--out", str(tmp_path / "out"))
