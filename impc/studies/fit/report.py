@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -34,6 +33,7 @@ from impc.studies.fit.person import person_section
 from impc.studies.fit.result import shown_trials, trial_name
 from impc.studies.fit.schema import fit_data
 from impc.studies.fit.sentences import direction_name, remarks
+from impc.studies.fit.settings import plain_settings
 from impc.studies.fit.structures import structure_section
 from impc.studies.fit.tables import (
     alternatives_table,
@@ -237,7 +237,7 @@ def _checks(result: FitResult) -> Terms:
 def _made(result: FitResult, provenance: Provenance) -> list[Block]:
     plant = result.fitted.problem.plant
     arguments = "; ".join(f"{key} = {value}" for key, value in provenance.plant_arguments.items())
-    settings = asdict(result.settings)
+    settings = plain_settings(result.settings)
     return [
         _terminal_set(result),
         Markup("<code>{}</code>").format(provenance.command),

@@ -44,6 +44,7 @@ import numpy as np
 
 from impc.assess.intent_rules import dominant_sentence
 from impc.studies.fit.person import person_data
+from impc.studies.fit.settings import plain_settings
 from impc.studies.fit.structures import structure_data
 from impc.studies.methods_table import methods_data
 
@@ -213,6 +214,6 @@ def _made(result: FitResult, provenance: Provenance) -> dict[str, Any]:
             "C": plant.C,
             "dt": plant.dt,
         },
-        "settings": asdict(result.settings),
+        "settings": plain_settings(result.settings),
         "seconds": result.seconds,
     }

@@ -165,6 +165,12 @@ class FitSettings:
         return self.observer is not None and self.observer.profiles
 
 
+def plain_settings(settings: FitSettings) -> dict[str, Any]:
+    """Settings as result.json has them; numbers of numpy as Python's."""
+    found: dict[str, Any] = msgspec.to_builtins(settings, enc_hook=lambda number: number.item())
+    return found
+
+
 def require_used(settings: FitSettings, used: Collection[str], command: str) -> None:
     """Refuse what is set and not used, so that nothing is left out without a word."""
     usual = FitSettings()
