@@ -127,15 +127,10 @@ def _writable(folder: Path) -> bool:
     """Whether files can be made in a folder, or it can be made; nothing is."""
     for place in (folder, *folder.parents):
         if place.is_dir():
-            return os.access(place, os.W_OK | os.X_OK) and not _is_kernels(place)
+            return os.access(place, os.W_OK | os.X_OK)
         if place.exists():
             return False
     return False
-
-
-def _is_kernels(place: Path) -> bool:
-    """/proc and /sys: no folder can be made there, though root may write."""
-    return place.parts[:2] in {("/", "proc"), ("/", "sys")}
 
 
 def _private_folder() -> Path | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import importlib
 import os
 import sys
@@ -57,9 +56,6 @@ class _Program(click.Group):
 
         if args or kwargs:  # called from Python
             sys.exit(ended(work))
-        # The libraries' million objects stay: looking through them for garbage with every 700 more
-        # took a fifth of the drawing, and a twentieth of `impc fit`.
-        gc.set_threshold(50_000)
         with own_process():
             ignore_settings_files("matplotlib", "numba")
             note = keep_caches()

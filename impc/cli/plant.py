@@ -51,11 +51,8 @@ def load_plant(path: str) -> Plant:
 
 def named_plant(study_file: Path, study: Study, given: str | None, allowed: bool) -> PlantSource:
     """The plant of a study, when the command line consents to it."""
-    from impc.files.user_code import consented_name, require_users_function  # noqa: PLC0415
+    from impc.files.user_code import consented_name  # noqa: PLC0415
 
     where = f"{study_file}: study.plant"
     name = consented_name(where, study.plant, given, allowed, "plant", tuple(KNOWN))
-    source = find_plant(name, study.configuration.plant)
-    if ":" in source.name:
-        require_users_function(where, source.make)
-    return source
+    return find_plant(name, study.configuration.plant)

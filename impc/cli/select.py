@@ -90,15 +90,13 @@ def read_model_study(
 ) -> tuple[Study, ModelSource, dict[tuple[str, str], tuple[Trial, ...]], Inputs]:
     """The study at `path`, its model, all recordings, and the digests of these."""
     from impc.files.inputs import study_inputs  # noqa: PLC0415
-    from impc.files.plant_sources import import_function  # noqa: PLC0415
     from impc.files.reading import require_distinct  # noqa: PLC0415
-    from impc.files.user_code import consented_name, require_users_function  # noqa: PLC0415
+    from impc.files.user_code import consented_name  # noqa: PLC0415
     from impc.studies.cohort.study import read_study  # noqa: PLC0415
     from impc.studies.selection.model_source import model_source, read_trials  # noqa: PLC0415
 
     study, where = read_study(path), f"{path}: study.model"
     name = consented_name(where, study.model, given, allowed, "model", ())
-    require_users_function(where, import_function(name))
     require_distinct([file for unit in study.units for file in unit.files])
     arguments: dict[str, Any] = dict(study.configuration.model)
     source = model_source(name, arguments)

@@ -1,54 +1,57 @@
 """Files read in a process of their own, with a limit on memory and time.
 
 HDF5 and scipy's reader of MATLAB 5 are compiled, and nptdms and c3d take what a header says: a
-damaged file can end their process, fill the memory, or never end. It is then a process of their own
-that ends, and the reason is one line. One such process serves a whole run; it starts with the first
-file, and is replaced when it ends. A process that served before and fails is no verdict on a file:
-that one is read again by a new one.
+damaged file can end their process, fill the memory, or never end. One process serves a whole run:
+it starts with the first file, by the one interpreter and none of the user's modules, and is
+replaced when a file ends it. Requests and answers are pickles in its pipes, and it ends when they
+close.
 """
 
 from __future__ import annotations
 
 import atexit
 import contextlib
-import json
+import faulthandler
+import math
 import os
+import pickle
+import re
 import signal
 import subprocess
 import sys
 import threading
-from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import numpy as np
-
-from impc.errors import DataError, InputError
+from impc.errors import DataError, ImpcError, InputError, brief
+from impc.files.names import damaged
 from impc.files.table import Table
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from impc.arrays import Array
-
+#: Module, function and library of each format that is read here.
+READERS = {
+    "matlab": ("impc.files.matlab", "read_matlab", "scipy.io"),
+    "matrices": ("impc.files.matlab", "read_matrices", "scipy.io"),
+    "matlab73": ("impc.files.matlab73", "read_matlab73", "h5py"),
+    "tdms": ("impc.files.tdms", "read_tdms", "nptdms"),
+    "c3d": ("impc.files.c3d_analog", "read_c3d", "c3d"),
+    "spreadsheet": ("impc.files.spreadsheet", "read_spreadsheet", "python_calamine"),
+    "cells": ("impc.files.spreadsheet", "read_cells", "python_calamine"),
+}
 # Seconds of computing that a file may take: measured, 1.5 s for 100 MB of HDF5 and 6 s for a C3D
 # of 10 MB (60 000 frames), which is the slowest.
 _SECONDS, _SECONDS_A_MEGABYTE = 10, 2
-# Bytes that reading may take beside what the process begins with (0.1 GB): a reader holds the
-# file's arrays up to three times.
+# Bytes that reading may take: a reader holds the file's arrays up to three times.
 _ROOM, _ROOM_A_BYTE = 800_000_000, 3
-# What aborts where it is given no more memory, as libraries in Rust do.
-_ABORTS = ("spreadsheet", "cells")
 # Where the system bounds no address space, the size is looked at this often, in seconds.
 _LOOK = 0.02
 _BOUNDED = sys.platform == "linux"
 # -P: never from the folder in which the command was typed. The package is the one that is running.
-# Status 1 is that of a time that ran out.
 _START = """
 import sys
 try:
     sys.path.insert(0, sys.argv[1]); import impc; del sys.path[0]
-    from impc.files.reader_process import main; main()
+    from impc.files.apart import serve; serve()
 except BaseException:
     sys.exit(3)
 """
@@ -57,6 +60,10 @@ _ENVIRONMENT = {
     "OMP_NUM_THREADS": "1",
     "HDF5_PLUGIN_PRELOAD": "::",  # a file may name a filter; none is loaded from a folder
 }
+_KILLED = getattr(signal, "SIGKILL", 9)
+_lock = threading.Lock()
+# By the process that started it: a fork has one of its own.
+_children: dict[int, subprocess.Popen[bytes]] = {}
 
 
 def read_apart(kind: str, path: Path, largest: int, sheet: str = "") -> Table:
@@ -64,20 +71,14 @@ def read_apart(kind: str, path: Path, largest: int, sheet: str = "") -> Table:
 
     Its arrays take `largest` bytes at most; `sheet` is that of a workbook, where one is asked for.
     """
-    source = str(path)
-    named = {"sheet": sheet} if sheet else {}
-    reply, columns = _asked(_request(kind, path, largest) | {"more": named})
-    if "refused" in reply:
-        raise DataError(*reply["refused"])
-    told = reply["table"]
-    return Table(
-        source,
-        dict(zip(told["names"], columns, strict=True)),
-        told["units"],
-        told["rate"],
-        told["skipped"],
-        tuple(told["notes"]),
-    )
+    given = (path.absolute(), largest, sheet) if sheet else (path.absolute(), largest)
+    found = _read(path, kind, *given)
+    if found.rate is not None and not 0 < found.rate < math.inf:
+        problem = f"says {found.rate:g} samples per second"
+        raise DataError(str(path), problem, "export it again with its rate")
+    for values in found.columns.values():
+        values.flags.writeable = False
+    return Table(str(path), found.columns, found.units, found.rate, found.skipped, found.notes)
 
 
 def matrices_apart(path: Path, largest: int) -> dict[str, Any]:
@@ -85,15 +86,11 @@ def matrices_apart(path: Path, largest: int) -> dict[str, Any]:
 
     Real arrays, (rows, columns) or more, of `largest` bytes at most, and lists of text.
     """
-    reply, arrays = _asked(_request("matrices", path, largest))
-    if "refused" in reply:
-        raise InputError(f"plant {path}", *reply["refused"][1:])
-    shapes: dict[str, list[int]] = reply["shapes"]
-    matrices = {
-        name: array.reshape(shape)
-        for (name, shape), array in zip(shapes.items(), arrays, strict=True)
-    }
-    return {**matrices, **reply["texts"]}
+    try:
+        found: dict[str, Any] = _read(path, "matrices", path.absolute(), largest)
+    except DataError as error:
+        raise InputError(f"plant {path}", error.problem, error.remedy) from None
+    return found
 
 
 def cells_apart(path: Path, largest: int) -> list[list[str]]:
@@ -101,11 +98,8 @@ def cells_apart(path: Path, largest: int) -> list[list[str]]:
 
     It may unpack to `largest` bytes.
     """
-    reply, _ = _asked(_request("cells", path, largest))
-    if "refused" in reply:
-        raise InputError(*reply["refused"])
-    rows: list[list[str]] = reply["texts"]["cells"]
-    return rows
+    found: dict[str, list[list[str]]] = _read(path, "cells", path.absolute(), largest)
+    return found["cells"]
 
 
 def match_apart(subject: str, pattern: str, text: str) -> dict[str, str | None] | None:
@@ -114,181 +108,163 @@ def match_apart(subject: str, pattern: str, text: str) -> dict[str, str | None] 
     Some patterns of users, such as ``(a+)+x``, take longer than anybody lives; `subject` is for the
     message.
     """
-    request = {
-        "do": "match",
-        "pattern": pattern,
-        "text": text,
-        "room": _ROOM,
-        "seconds": _SECONDS,
-        "path": "",
-        "source": "",
-    }
-    reply, _ = _asked(request)
-    if "refused" in reply:
+    try:
+        found: dict[str, str | None] | None = _asked(subject, "match", (pattern, text), 0)
+    except DataError:
         problem = f"cannot be matched with {text[:80]!r} in {_SECONDS} s"
-        raise InputError(subject, problem, "write no repetition within a repetition")
-    groups: dict[str, str | None] | None = reply["groups"]
-    return groups
+        raise InputError(subject, problem, "write no repetition within a repetition") from None
+    return found
 
 
-@dataclass
-class _Process:
-    """A process that reads; `served` says whether it has answered before."""
-
-    popen: subprocess.Popen[bytes]
-    owner: int = field(default_factory=os.getpid)
-    served: bool = False
-
-    def ask(self, request: dict[str, Any]) -> tuple[dict[str, Any], list[Array]]:
-        """Send a request and wait for its answer."""
-        assert self.popen.stdin is not None
-        with _watched(self.popen, request["room"]):
-            self.popen.stdin.write(json.dumps(request).encode("ascii") + b"\n")
-            self.popen.stdin.flush()
-            length = int.from_bytes(self._bytes(8), "little")
-            reply = json.loads(self._bytes(length))
-            columns = [self._column(length) for length in reply.get("lengths", ())]
-        self.served = True
-        return reply, columns
-
-    def _column(self, samples: int) -> Array:
-        return np.frombuffer(self._bytes(8 * samples), dtype=np.float64)  # read-only, as bytes are
-
-    def _bytes(self, size: int) -> bytes:
-        assert self.popen.stdout is not None
-        found = self.popen.stdout.read(size)
-        if len(found) < size:
-            raise EOFError
-        return found
-
-    def end(self) -> int:
-        """End it; what it ended with."""
-        if self.owner != os.getpid():  # a fork of whoever started it
-            return 0
-        if self.popen.poll() is None:
-            self.popen.kill()
-        with contextlib.suppress(OSError):
-            self.popen.communicate()
-        return self.popen.wait()
+def _read(path: Path, kind: str, *given: Any) -> Any:
+    """What the reader of a `kind` returns; messages name the file as it was given."""
+    try:
+        return _asked(str(path), kind, given, path.stat().st_size)
+    except ImpcError as error:
+        subject = error.subject.replace(str(path.absolute()), str(path), 1)
+        raise DataError(subject, brief(error.problem, 300), error.remedy) from None
 
 
-_lock = threading.Lock()
-_current: list[_Process] = []
-
-
-def _asked(request: dict[str, Any]) -> tuple[dict[str, Any], list[Array]]:
+def _asked(source: str, kind: str, given: tuple[Any, ...], size: int) -> Any:
     """The answer of the process that is there, or of a new one."""
+    room, seconds = _ROOM + _ROOM_A_BYTE * size, _SECONDS + _SECONDS_A_MEGABYTE * size // 1_000_000
+    done = threading.Event()
     with _lock:
-        while True:
-            try:
-                process = _running()
-            except OSError as error:
-                reason = error.strerror or type(error).__name__
-                problem = f"the process that reads it cannot be started ({reason})"
-                return _refusal(request, problem, f"check that {sys.executable} can run"), []
-            served = process.served
-            try:
-                reply, columns = process.ask(request)
-            except (EOFError, OSError):
-                reply = _refusal(request, *_why(_replaced(process), request))
-            except BaseException:  # interrupted: its answer would be taken for the next one's
-                _replaced(process)
-                raise
-            else:
-                if "memory" not in reply:
-                    return reply, columns
-                _replaced(process)
-                reply = _refusal(request, *_too_large(request))
-            if not served:
-                return reply, []
+        child = _running(source)
+        assert child.stdin is not None
+        assert child.stdout is not None
+        if not _BOUNDED:
+            threading.Thread(target=_watch, args=(child.pid, room, done), daemon=True).start()
+        try:
+            pickle.dump((kind, given, room, seconds), child.stdin)
+            child.stdin.flush()
+            found = pickle.load(child.stdout)
+        except (EOFError, OSError):
+            found = _why(source, kind, _ended(), room, seconds)
+        except BaseException:  # interrupted: its answer would be taken for the next one's
+            _ended()
+            raise
+        finally:
+            done.set()
+        if isinstance(found, MemoryError):
+            found = _why(source, kind, -_KILLED, room, seconds)
+            _ended()
+    if isinstance(found, Exception):
+        raise found
+    return found
 
 
-def _request(kind: str, path: Path, largest: int) -> dict[str, Any]:
-    size = path.stat().st_size
-    return {
-        "do": kind,
-        "path": str(path.absolute()),
-        "source": str(path),
-        "largest": largest,
-        "room": _ROOM + _ROOM_A_BYTE * size,
-        "seconds": _SECONDS + _SECONDS_A_MEGABYTE * size // 1_000_000,
-    }
+def _watch(pid: int, room: int, done: threading.Event) -> None:
+    """End a process that grows too large, where the system does not see to it."""
+    import psutil  # noqa: PLC0415  # not on Linux
+
+    with contextlib.suppress(psutil.Error):
+        process = psutil.Process(pid)
+        most = process.memory_info().rss + room
+        while not done.wait(_LOOK):
+            if process.memory_info().rss > most:
+                process.kill()
 
 
-def _refusal(request: dict[str, Any], problem: str, remedy: str) -> dict[str, Any]:
-    return {"refused": [request["source"], problem, remedy]}
-
-
-def _running() -> _Process:
-    """The process that is there, or a new one; OSError where none can be started."""
-    if _current and _current[0].owner != os.getpid():
-        _current.clear()
-    if not _current:
-        popen = subprocess.Popen(
+def _running(source: str) -> subprocess.Popen[bytes]:
+    """The process that is there, or a new one."""
+    child = _children.get(os.getpid())
+    if child is not None and child.poll() is None:
+        return child
+    _ended()
+    try:
+        _children[os.getpid()] = subprocess.Popen(
             [sys.executable, "-P", "-c", _START, str(Path(__file__).parents[2])],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             env={**os.environ, **_ENVIRONMENT},
         )
-        _current.append(_Process(popen))
-    return _current[0]
-
-
-def _replaced(process: _Process) -> int:
-    """End a process so that the next request starts another."""
-    _current.clear()
-    return process.end()
+    except OSError as error:
+        reason = error.strerror or type(error).__name__
+        problem = f"the process that reads it cannot be started ({reason})"
+        raise DataError(source, problem, f"check that {sys.executable} can run") from None
+    return _children[os.getpid()]
 
 
 @atexit.register
-def _end() -> None:
-    for process in _current:
-        process.end()
+def _ended() -> int:
+    """End the process that is there; what it ended with."""
+    child = _children.pop(os.getpid(), None)
+    if child is None:
+        return 0
+    child.kill()
+    with contextlib.suppress(OSError):
+        child.communicate()
+    return child.wait()
 
 
-def _why(status: int, request: dict[str, Any]) -> tuple[str, str]:
+def _why(source: str, kind: str, status: int, room: int, seconds: int) -> DataError:
     """Why a process ended, and what to do."""
     again = "copy or export it again"
-    if status == -getattr(signal, "SIGXCPU", 0) or status == 1:
-        return f"takes longer than {request['seconds']} s to read: it is damaged", again
-    aborted = status == -getattr(signal, "SIGABRT", 6) and request["do"] in _ABORTS
-    if aborted or status == -getattr(signal, "SIGKILL", 9):
-        return _too_large(request)
+    if status in (-getattr(signal, "SIGXCPU", 0), 1):  # 1: `faulthandler` ended it
+        return DataError(source, f"takes longer than {seconds} s to read: it is damaged", again)
+    # Libraries in Rust abort where they are given no more memory.
+    rust = READERS.get(kind, ("",))[-1] == "python_calamine"
+    if status == -_KILLED or (rust and status == -signal.SIGABRT):
+        problem = f"takes more than {room / 1e9:.1f} GB to read"
+        return DataError(source, problem, "save only the signals and seconds that are needed")
     name = signal.Signals(-status).name if status < 0 else f"status {status}"
-    return f"is damaged and ends the process that reads it ({name})", again
+    return DataError(source, f"is damaged and ends the process that reads it ({name})", again)
 
 
-def _too_large(request: dict[str, Any]) -> tuple[str, str]:
-    return (
-        f"takes more than {request['room'] / 1e9:.1f} GB to read",
-        "save only the signals and seconds that are needed",
-    )
+def serve() -> None:
+    """Answer requests until the input ends; in the process that reads."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # whoever asks is interrupted, and ends this
+    # What libraries print must not stand among the answers.
+    answers = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)
+    while True:
+        try:
+            kind, given, room, seconds = pickle.load(sys.stdin.buffer)
+        except EOFError:
+            return
+        for module in READERS.get(kind, ())[::2]:  # so that its limits are for the file alone
+            with contextlib.suppress(ImportError):  # the reader says so
+                import_module(module)
+        _limit(room, seconds)
+        found = _found(kind, given)
+        faulthandler.cancel_dump_traceback_later()
+        pickle.dump(found, answers, protocol=pickle.HIGHEST_PROTOCOL)
+        answers.flush()
 
 
-@contextlib.contextmanager
-def _watched(popen: subprocess.Popen[bytes], room: int) -> Iterator[None]:
-    """End a process that grows too large, where the system does not see to it."""
-    if _BOUNDED:
-        yield
+def _limit(room: int, seconds: int) -> None:
+    """No more than so much memory and so many seconds, whatever a library does.
+
+    Seconds are of computing, so that a busy machine changes no verdict; a file that makes its
+    library wait is ended by the clock after ten times as long.
+    """
+    faulthandler.dump_traceback_later(10 * seconds, exit=True)
+    if sys.platform == "win32":
         return
-    import psutil  # noqa: PLC0415
+    import resource  # noqa: PLC0415  # not on Windows
 
-    done = threading.Event()
+    used = sum(resource.getrusage(resource.RUSAGE_SELF)[:2])
+    limits = {resource.RLIMIT_CORE: 0, resource.RLIMIT_CPU: math.ceil(used) + seconds}
+    if _BOUNDED:
+        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
+        limits[resource.RLIMIT_AS] = pages * os.sysconf("SC_PAGE_SIZE") + room
+    for kind, most in limits.items():
+        hard = resource.getrlimit(kind)[1]
+        resource.setrlimit(kind, (most if hard < 0 else min(most, hard), hard))
 
-    def watch() -> None:
-        with contextlib.suppress(psutil.Error):
-            process = psutil.Process(popen.pid)
-            most = process.memory_info().rss + room
-            while not done.wait(_LOOK):
-                if process.memory_info().rss > most:
-                    popen.kill()
-                    return
 
-    thread = threading.Thread(target=watch, daemon=True)
-    thread.start()
+def _found(kind: str, given: tuple[Any, ...]) -> Any:
+    """What a reader returns, or the error that it raises."""
     try:
-        yield
-    finally:
-        done.set()
-        thread.join()
+        if kind == "match":
+            match = re.fullmatch(*given)
+            return None if match is None else match.groupdict()
+        module, function, _ = READERS[kind]
+        return getattr(import_module(module), function)(*given)
+    except (ImpcError, MemoryError) as error:
+        return error.with_traceback(None)
+    # The libraries meet damaged files with any exception: struct.error, KeyError, AssertionError.
+    except Exception as error:
+        return damaged(str(given[0]), error)

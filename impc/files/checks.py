@@ -36,6 +36,11 @@ _BALANCED = 0.05  # share of a trial before a fall
 # 11.5 deg that were recorded in rad and called deg.
 _TURN, _WIDE, _TINY = np.pi, 1.0, np.deg2rad(0.2)
 
+# In SI units. Fourth powers of both are still numbers, and nothing measured comes near.
+_LARGEST, _SMALLEST = 1e50, 1e-50
+# The plant's samples for one of the recording: milliseconds taken for seconds are 1000.
+_SLOWER = 50
+
 
 @dataclass(frozen=True)
 class Channel:
@@ -78,6 +83,31 @@ def unit_of_the_file(channel: Channel, told: Unit | None, overruled: bool) -> st
         f"is in {channel.unit.written!r} by the configuration and in {told.written!r} by the file",
         f"correct {key}.unit, or write {key}.overrule_unit = true if the file is wrong",
     )
+
+
+def measurable(channel: Channel) -> str:
+    """Values that no measurement has: infinite almost, or all but nothing."""
+    sizes = np.where(np.isfinite(channel.values), np.abs(channel.values), 0)
+    first = int(np.argmax(sizes))
+    factor = channel.unit.factor
+    if sizes[first] > _LARGEST / factor or 0 < sizes[first] < _SMALLEST / factor:
+        raise DataError(
+            channel.name,
+            f"is {channel.values[first]:.3g} {channel.unit.written} in {channel.at(first)}, which "
+            "is no measurement",
+            f"correct the column, or offset and unit in signals.{channel.signal}",
+        )
+    return ""
+
+
+def comparable_rates(subject: str, period: float, dt: float) -> None:
+    """Require that a recording is not much slower than the plant: its `period`, and `dt`, in s."""
+    if period > _SLOWER * dt:
+        raise DataError(
+            subject,
+            f"has a sample every {period:.4g} s, and the plant one every {dt:.4g} s",
+            "correct recording.time_unit or rate, or give the plant a longer dt",
+        )
 
 
 def missing(channel: Channel, fill_gaps: float) -> str:

@@ -10,7 +10,6 @@ import scipy.interpolate
 
 from impc.checking import replace
 from impc.errors import DataError, InputError
-from impc.files import measurable
 from impc.files.units import si_unit
 
 if TYPE_CHECKING:
@@ -24,6 +23,9 @@ _GAP = 1.5
 _JITTER = 0.01
 # Two statements of the rate that differ by more than this contradict each other.
 _RATE = 1e-3
+# What no recorder has: a clock beyond 30 000 years (1.7e9 s is a count from 1970), a period outside
+# of these, in s, and more even instants for each sample, where gaps may be filled.
+_LONGEST, _PERIODS, _GAPS = 1e12, (1e-9, 1e6), 10
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,7 @@ def read_clock(table: Table, recording: RecordingTable) -> Clock:
     """Read the clock, cut the recording, and check that its instants are even."""
     if recording.time is None:
         rate = _told_rate(table, recording)
-        measurable.period_of_a_recording(table.source, 1 / rate)
+        _require_period(table.source, 1 / rate)
         time = np.arange(table.samples) / rate
         rows = _cut(table.source, time, recording)
         steps = np.arange(rows.stop - rows.start)
@@ -66,7 +68,9 @@ def read_clock(table: Table, recording: RecordingTable) -> Clock:
         raise DataError(subject, f"has the unit {unit.written!r}", 'write time_unit = "s" or "ms"')
     _require_rising(subject, values)
     time = values * unit.factor
-    measurable.times_of_a_recording(subject, time)
+    if (furthest := float(max(abs(time[0]), abs(time[-1])))) > _LONGEST:
+        remedy = "correct the clock, or recording.time_unit"
+        raise DataError(subject, f"reaches {furthest:.3g} s", remedy)
     rows = _cut(table.source, time, recording)
     note = f"{subject}: read as day numbers of a spreadsheet" if days else ""
     return replace(_measured(subject, time[rows], rows, recording.fill_gaps), note=note)
@@ -199,8 +203,10 @@ def _measured(subject: str, time: Array, rows: slice, fill_gaps: float) -> Clock
     intervals = np.diff(time)
     usual = intervals[intervals < _GAP * np.median(intervals)]
     rough = float(np.mean(usual))
-    measurable.period_of_a_recording(subject, rough)
-    measurable.few_gaps(subject, time, rough)
+    _require_period(subject, rough)
+    if (instants := (time[-1] - time[0]) / rough) > _GAPS * len(time):
+        problem = f"has {len(time)} samples on {instants:.3g} even instants: the rest are gaps"
+        raise DataError(subject, problem, "cut with recording.start and stop")
     counts = np.rint(intervals / rough).astype(np.int64)
     if (counts == 0).any():
         first = int(np.argmax(counts == 0))
@@ -243,3 +249,13 @@ def _gaps(
             f"(now {fill_gaps:g} s)",
         )
     return [f"{subject}: {found}; filled by interpolation"]
+
+
+def _require_period(subject: str, period: float) -> None:
+    """Require that a recorder can have the `period`, in s."""
+    if not _PERIODS[0] <= period <= _PERIODS[1]:
+        raise DataError(
+            subject,
+            f"has a sample every {period:.3g} s",
+            f"correct the rate or the clock's unit: {_PERIODS[0]:g} to {_PERIODS[1]:g} s can be",
+        )

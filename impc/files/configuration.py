@@ -8,13 +8,13 @@ settings of the fit and of a plan, and not interpreted here.
 from __future__ import annotations
 
 import difflib
-import math
 import os
 import re
+import sys
 import tomllib
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args, get_type_hints
 
 import msgspec
 
@@ -24,7 +24,7 @@ from impc.files.names import require_ordinary
 from impc.files.units import si_unit
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Callable, Iterable, Mapping
 
 #: What `impc inspect` writes where nothing tells; it has to be filled in.
 FILL_IN = "?"
@@ -36,6 +36,12 @@ _LABELS = ("subject", "visit", "condition", "trial")
 _TABLES = ("recording", "signals", "plant", "fit", "plan", "report")
 _STUDY = ("study", "model", "select")
 
+_MOST = sys.float_info.max
+Finite = Annotated[float, msgspec.Meta(ge=-_MOST, le=_MOST)]
+Positive = Annotated[float, msgspec.Meta(gt=0, le=_MOST)]
+T = TypeVar("T")
+S = TypeVar("S", bound=msgspec.Struct)
+
 
 class RecordingTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The [recording] table."""
@@ -43,7 +49,7 @@ class RecordingTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     time: str | None = None  # Column with the clock
     time_unit: str | None = None  # Its unit; None takes the one that the file tells, or seconds
     # Samples per second, where there is no clock. Neither is needed for TDMS and C3D.
-    rate: float | None = None
+    rate: Positive | None = None
     subject: str = ""  # The label of the trial; empty where it is not said
     visit: str = ""
     condition: str = ""
@@ -52,10 +58,10 @@ class RecordingTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     # groups subject, visit, condition and trial give the label
     pattern: str | None = None
     # Seconds; the longest gap that may be filled by interpolation. 0 fills none.
-    fill_gaps: float = 0.0
+    fill_gaps: Annotated[float, msgspec.Meta(ge=0, le=_MOST)] = 0.0
     # Seconds on the file's clock, which begins at 0 where there is only a rate
-    start: float | None = None
-    stop: float | None = None
+    start: Finite | None = None
+    stop: Finite | None = None
     sheet: str = ""  # Of a workbook; empty for the first one with rows of numbers
 
 
@@ -65,12 +71,12 @@ class SignalTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     column: str  # Column of the file
     unit: str  # Its unit, as pint knows it
     # Mechanical stop in this unit: the largest magnitude after offset and sign
-    limit: float | None = None
-    offset: float = 0.0  # In this unit
+    limit: Positive | None = None
+    offset: Finite = 0.0  # In this unit
     sign: Literal[1, -1] = 1  # 1 or -1
     overrule_unit: bool = False  # Whether `unit` counts where the file gives another one
     # By how much the signal is moved later: a whole number of samples, or seconds with a point
-    shift: int | float = 0
+    shift: int | Finite = 0
     # Whether it is a command of the subject that was recorded, and not a disturbance
     command: bool = False
 
@@ -126,8 +132,7 @@ def read_configuration(path: Path | str, *more: str) -> Configuration:
     """
     source = str(path)
     content = _parsed(source, Path(path))
-    known = (*_TABLES, *more)
-    _require_known(source, "", content, known)
+    require_known(lambda key: f"{source}: {key}", content, (*_TABLES, *more), "is not known")
     tables = {name: content.get(name, {}) for name in (*_TABLES, *_STUDY)}
     for name, table in tables.items():
         if not isinstance(table, dict):
@@ -141,7 +146,8 @@ def read_configuration(path: Path | str, *more: str) -> Configuration:
     signals = {}
     for name, table in tables["signals"].items():
         signals[name] = _convert(source, f"signals.{brief(name, 80)}", table, SignalTable)
-        _check_signal(source, f"signals.{brief(name, 80)}", signals[name])
+        if signals[name].unit != FILL_IN:
+            _unit(source, f"signals.{brief(name, 80)}.unit", signals[name].unit)
     # A plan needs none: nothing is recorded yet.
     if not signals and not tables["plan"]:
         raise InputError(
@@ -150,9 +156,6 @@ def read_configuration(path: Path | str, *more: str) -> Configuration:
     plain: dict[str, Any] = {name: tables[name] for name in ("plant", "fit", "plan", *_STUDY)}
     report = _convert(source, "report", tables["report"], ReportTable)
     return Configuration(recording, signals, report=report, **plain)
-
-
-_Struct = TypeVar("_Struct", bound=msgspec.Struct)
 
 
 def _parsed(source: str, path: Path) -> dict[str, Any]:
@@ -185,27 +188,59 @@ def _deeper(value: Any, levels: int) -> bool:
     return levels < 0 or any(_deeper(item, levels - 1) for item in items)
 
 
-def _require_known(source: str, place: str, table: Mapping[str, Any], known: Iterable[str]) -> None:
+def require_known(
+    where: Callable[[str], str], table: Mapping[str, Any], known: Iterable[str], problem: str
+) -> None:
+    """Refuse a key that is not `known`; `where` makes the subject of a message from a path."""
     names = list(known)
     for key in table:
         if key not in names:
             near = difflib.get_close_matches(key, names, n=1, cutoff=0.5)
             remedy = f"did you mean {near[0]}?" if near else f"known: {', '.join(names)}"
-            where = f"{place}.{brief(key, 80)}" if place else brief(key, 80)
-            raise InputError(f"{source}: {where}", "is not known", remedy)
+            raise InputError(where(brief(key, 80)), problem, remedy)
 
 
-def _convert(source: str, place: str, table: Any, kind: type[_Struct]) -> _Struct:
-    if not isinstance(table, dict):
-        raise InputError(f"{source}: {place}", "is not a table", f"write [{place}]")
-    _require_known(source, place, table, kind.__struct_fields__)
+def converted(
+    where: Callable[[str], str], table: Mapping[str, Any], kind: type[T], see: str = "correct it"
+) -> T:
+    """The `table` as a `kind` of value, by msgspec; its messages in ours.
+
+    `where` makes the subject of a message from a path, and `see` is what to do about most faults.
+    """
     try:
         return msgspec.convert(table, kind)
     except msgspec.ValidationError as error:
-        message, _, where = str(error).partition(" - at `$.")
-        where = f"{place}.{where.rstrip('`')}" if where else place
-        problem = message.replace("Object missing required field", "lacks").replace("`", "'")
-        raise InputError(f"{source}: {where}", problem, "correct it") from None
+        said, _, path = str(error).partition(" - at `$")
+    path = path.rstrip("`").lstrip(".")
+    unknown = re.fullmatch("Object contains unknown field `(.*)`", said)
+    if unknown:
+        raise InputError(where(f"{path}.{unknown[1]}"), "is not a setting", see)
+    limit = re.fullmatch("Expected `(?:int|float)` ([<>]=?) (.*)", said)
+    if limit and "..." not in path:
+        found: Any = table
+        for part in re.findall(r"[^.\[\]]+", path):
+            found = found[int(part)] if isinstance(found, list) else found[part]
+        words = {">": "more than", ">=": "at least", "<": "less than", "<=": "at most"}
+        raise InputError(
+            where(path), f"got {brief(found)}", f"give {words[limit[1]]} {float(limit[2]):.6g}"
+        )
+    problem = said.replace("Object missing required field", "lacks").replace("`", "'")
+    problem = problem.replace("Expected 'array' of length >= 1", "is empty")
+    allowed = get_args(get_type_hints(kind).get(path)) if "enum" in said else ()
+    if allowed:
+        see = f"give {' or '.join(map(str, allowed))}"
+    raise InputError(where(path), problem, see)
+
+
+def _convert(source: str, place: str, table: Any, kind: type[S]) -> S:
+    if not isinstance(table, dict):
+        raise InputError(f"{source}: {place}", "is not a table", f"write [{place}]")
+
+    def where(path: str) -> str:
+        return f"{source}: {place}.{path}" if path else f"{source}: {place}"
+
+    require_known(where, table, kind.__struct_fields__, "is not known")
+    return converted(where, table, kind)
 
 
 def _check_recording(source: str, table: RecordingTable) -> None:
@@ -214,14 +249,6 @@ def _check_recording(source: str, table: RecordingTable) -> None:
 
     if table.time is not None and table.rate is not None:
         raise refuse("rate", "is given beside recording.time", "keep one of the two")
-    if table.rate is not None and not (math.isfinite(table.rate) and table.rate > 0):
-        raise refuse("rate", f"is {table.rate:g}", "give samples per second, above 0")
-    if not (math.isfinite(table.fill_gaps) and table.fill_gaps >= 0):
-        raise refuse("fill_gaps", f"is {table.fill_gaps:g}", "give seconds, 0 or more")
-    for key in ("start", "stop"):
-        value = getattr(table, key)
-        if value is not None and not math.isfinite(value):
-            raise refuse(key, f"is {value}", "give seconds")
     if table.start is not None and table.stop is not None and table.stop <= table.start:
         raise refuse("stop", f"is {table.stop:g} s, start {table.start:g} s", "give a later one")
     if table.time_unit is not None and _unit(source, "recording.time_unit", table.time_unit) != (
@@ -251,19 +278,6 @@ def _check_pattern(refuse: Any, table: RecordingTable, pattern: str) -> None:
     for name in groups:
         if getattr(table, name):
             raise refuse(name, "is given, and in recording.pattern too", "keep one of the two")
-
-
-def _check_signal(source: str, place: str, table: SignalTable) -> None:
-    if table.unit != FILL_IN:
-        _unit(source, f"{place}.unit", table.unit)
-    if not math.isfinite(table.offset):
-        raise InputError(f"{source}: {place}.offset", f"is {table.offset}", "give a number")
-    if not math.isfinite(table.shift):
-        raise InputError(f"{source}: {place}.shift", f"is {table.shift}", "give samples or seconds")
-    if table.limit is not None and not (math.isfinite(table.limit) and table.limit > 0):
-        raise InputError(
-            f"{source}: {place}.limit", f"is {table.limit:g}", "give a magnitude above 0"
-        )
 
 
 def _unit(source: str, place: str, written: str) -> str:

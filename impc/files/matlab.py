@@ -1,26 +1,17 @@
 """MATLAB .mat files up to version 7 (called v5 after their header), by scipy.
 
-A flipped bit can end the process in scipy's reader. So all tags are looked at first, and files are
-read in a process of their own (`impc.files.apart`).
+A flipped bit can end the process in scipy's reader: files are read in a process of their own
+(`impc.files.apart`).
 
 Vectors are columns by their name, the columns of a matrix are `name_1`, `name_2` and so on, numeric
 fields of a struct are `s.field`. The longer side of a matrix is taken as time.
-
-A file is a header of 128 bytes and a sequence of elements: a tag of 8 bytes (type, length), then as
-many bytes. An array is an element of elements. scipy's reader looks types up in a table without
-looking at its end, so that a flipped bit ends the process or takes what stands behind the table for
-a type; and it takes the memory that a length asks for. Nothing is read here but tags: whether the
-elements are those that scipy expects is not known, and some that are not end its process. They do
-it at the address zero, as the types that are let through are all in the table or empty in it.
 """
 
 from __future__ import annotations
 
 import io
 import re
-import struct
 import warnings
-import zlib
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -42,24 +33,23 @@ AS_STRUCT = 'save a struct of vectors: s = table2struct(T, "ToScalar", true)'
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,62}")
 
 
-def read_matlab(path: Path, largest: int) -> Table:
-    """Read the .mat file of version 5 to 7 at `path`; unpacked it takes `largest` bytes at most."""
+def read_matlab(path: Path, _largest: int) -> Table:
+    """Read the .mat file of version 5 to 7 at `path`; the process bounds what it unpacks to."""
     columns: dict[str, Array] = {}
     skipped: dict[str, str] = {}
-    for name, value in _variables(path, largest).items():
+    for name, value in _variables(path).items():
         _collect(name, value, columns, skipped, 0)
     return make_table(str(path), columns, None, None, skipped)
 
 
-def read_matrices(path: Path, largest: int) -> dict[str, Array | list[str | None]]:
+def read_matrices(path: Path, _largest: int) -> dict[str, Array | list[str | None]]:
     """Read the matrices and names of a saved plant from the .mat file of version 5 to 7 at `path`.
 
-    Real numbers in MATLAB's sizes, (rows, columns) or more, of `largest` bytes at most; of a text
+    Real numbers in MATLAB's sizes, (rows, columns) or more; of a text
     its rows, of a cell array its texts, None for what is no text.
     """
     found: dict[str, Array | list[str | None]] = {}
-    left = largest
-    for name, value in _variables(path, largest).items():
+    for name, value in _variables(path).items():
         if type(value) is np.ndarray and value.dtype.kind in "USO":
             found[name] = _names(value)
             continue
@@ -69,9 +59,6 @@ def read_matrices(path: Path, largest: int) -> dict[str, Array | list[str | None
             raise DataError(str(path), f"{name} {reason or 'is a struct'}", remedy)
         if value.dtype.kind not in "fiub":
             raise DataError(str(path), f"has a complex matrix {name}", "save real numbers")
-        left -= 8 * value.size
-        if left < 0:
-            raise too_large(path, largest - left)
         found[name] = np.asarray(value, dtype=np.float64)
     return found
 
@@ -123,12 +110,11 @@ def nested_columns(source: str, columns: Mapping[str, Array]) -> dict[str, Any]:
     return nested
 
 
-def _variables(path: Path, largest: int) -> dict[str, Any]:
-    """The variables of a file by name, as scipy has them, once their tags are found sound."""
+def _variables(path: Path) -> dict[str, Any]:
+    """The variables of a file by name, as scipy has them."""
     import scipy.io  # noqa: PLC0415  # in the process that reads only
     from scipy.io.matlab import MatlabOpaque, MatReadWarning  # noqa: PLC0415
 
-    look_at_tags(path, largest)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         # Two variables of one name, or a variable cut off: never a part of a file.
@@ -198,93 +184,3 @@ def _names(value: Any) -> list[str | None]:
 
 def _is_text(value: Any) -> bool:
     return isinstance(value, np.ndarray) and value.dtype.kind in "US"
-
-
-# Types of elements: numbers and text, arrays (of elements), and a variable packed by zlib.
-_PLAIN = {1, 2, 3, 4, 5, 6, 7, 9, 12, 13, 16, 17, 18}
-_MATRIX, _PACKED = 14, 15
-_FLAGS = (6, 8)  # type and length of the first element of an array: scipy takes them for granted
-_NESTED = 100  # arrays within one another: scipy's reader calls itself for each
-
-
-def look_at_tags(path: Path, largest: int) -> None:
-    """Require types that exist, lengths that are there, and `largest` bytes unpacked at the most.
-
-    The header of the file at `path` is not looked at.
-    """
-    content = memoryview(path.read_bytes())
-    order = "<" if bytes(content[126:128]) == b"IM" else ">"  # as scipy has it
-    left = largest
-    for kind, size, inside in _elements(content[128:], order, padded=False):
-        left -= size
-        if left < 0:
-            raise too_large(path, largest - left)
-        if kind == _PACKED:
-            unpacked = _unpacked(path, inside, order, left)
-            left -= len(unpacked)
-            for each, _, matrix in _elements(unpacked, order, padded=False):
-                _look_into(each, matrix, order, 0)
-        else:
-            _look_into(kind, inside, order, 0)
-
-
-def _unpacked(path: Path, packed: memoryview, order: str, most: int) -> memoryview:
-    """What zlib packed: as many bytes as the tag in front of it says, and no more than `most`."""
-    try:
-        tag = zlib.decompressobj().decompress(packed, 8).ljust(8, b"\0")
-        size = 8 + struct.unpack(f"{order}II", tag)[1]
-        if size > most:
-            raise too_large(path, size)
-        unpacker = zlib.decompressobj()
-        content = unpacker.decompress(packed, size)
-        surplus = unpacker.decompress(unpacker.unconsumed_tail, 1)  # reads the checksum
-    except zlib.error as error:
-        raise ValueError(str(error)) from None
-    if surplus or not unpacker.eof:
-        raise ValueError("a packed variable is not as long as it says")
-    return memoryview(content)
-
-
-def too_large(path: Path, size: int) -> DataError:
-    """The reason to raise for the file at `path`, whose variables take `size` bytes."""
-    return DataError(
-        str(path),
-        f"would take {size / 1e9:.1f} GB once it is unpacked",
-        "save only the signals that are needed",
-    )
-
-
-def _look_into(kind: int, content: memoryview, order: str, depth: int) -> None:
-    """The tags within an array, which is all that may stand here."""
-    if kind != _MATRIX:
-        raise ValueError(f"an element of type {kind} is out of place")
-    if depth > _NESTED:
-        raise ValueError(f"more than {_NESTED} arrays within one another")
-    if content and bytes(content[:8]) != struct.pack(f"{order}II", *_FLAGS):
-        raise ValueError("an array without flags")
-    for inner, _, inside in _elements(content, order):
-        if inner not in _PLAIN:
-            _look_into(inner, inside, order, depth + 1)
-
-
-def _elements(
-    content: memoryview, order: str, padded: bool = True
-) -> Iterator[tuple[int, int, memoryview]]:
-    """Type, length and bytes of each element that stands in `content`."""
-    tag = struct.Struct(f"{order}II")
-    at = 0
-    while at < len(content):
-        if at + 8 > len(content):
-            raise ValueError("the file ends in the middle of an array")
-        kind, size = tag.unpack_from(content, at)
-        begin = at + 8
-        if kind >> 16:  # up to four bytes stand in the tag itself
-            kind, size, begin = kind & 0xFFFF, kind >> 16, at + 4
-            at += 8
-            if size > 4 or kind not in _PLAIN:
-                raise ValueError(f"an element of type {kind} has {size} bytes in its tag")
-        else:
-            at = begin + size + (-size % 8 if padded else 0)
-        if begin + size > len(content):
-            raise ValueError(f"an element of type {kind} has fewer bytes than it says")
-        yield kind, size, content[begin : begin + size]

@@ -17,7 +17,7 @@ import numpy as np
 
 from impc.arrays import Array, Frozen, frozen
 from impc.errors import InputError
-from impc.files import checks, measurable
+from impc.files import checks
 from impc.files.clock import on_even_instants, read_clock
 from impc.files.formats import read_table
 from impc.files.reading import (
@@ -90,7 +90,7 @@ def _trial(
     entry = configuration.recording
     label, clock = label_of(table.source, entry), read_clock(table, entry)
     dt = clock.period if problem.dt is None else problem.dt
-    measurable.comparable_rates(table.source, clock.period, dt)
+    checks.comparable_rates(table.source, clock.period, dt)
     findings = list(clock.findings)
     columns: dict[str, Array] = {}
     for name in configuration.signals:
@@ -127,7 +127,7 @@ def _series(
     channel = channel_of(table, clock, name, entry)
     found = [
         checks.unit_of_the_file(channel, told_unit(table, channel.column), entry.overrule_unit),
-        measurable.size(channel),
+        checks.measurable(channel),
         "" if entry.limit is None else checks.beyond_the_stop(channel, entry.limit),
     ]
     dt = clock.period if problem.dt is None else problem.dt

@@ -12,7 +12,7 @@ import numpy as np
 
 from impc.checking import checked, replace
 from impc.errors import DataError, FallError, InputError
-from impc.files import checks, measurable
+from impc.files import checks
 from impc.files.alignment import misaligned
 from impc.files.apart import match_apart
 from impc.files.clock import column_of, on_even_instants, read_clock
@@ -128,7 +128,7 @@ def recording_of(table: Table, configuration: Configuration, plant: Plant) -> Re
     entry = configuration.recording
     label = label_of(table.source, entry)
     clock = read_clock(table, entry)
-    measurable.comparable_rates(table.source, clock.period, plant.dt)
+    checks.comparable_rates(table.source, clock.period, plant.dt)
     samples = resampled_samples(int(clock.steps[-1]) + 1, clock.period, plant.dt)
     checks.too_few(table.source, samples, _SAMPLES_A_STATE * plant.n)
     findings = [*(f"{table.source}: {note}" for note in table.notes), *clock.findings]
@@ -170,7 +170,7 @@ def disturbances_of(table: Table, configuration: Configuration, plant: Plant) ->
     """Perturbations of one table on the plant's clock (samples, d), in SI base units."""
     entry, columns = configuration.recording, []
     clock = read_clock(table, entry)
-    measurable.comparable_rates(table.source, clock.period, plant.dt)
+    checks.comparable_rates(table.source, clock.period, plant.dt)
     for name in plant.disturbances:
         if name not in configuration.signals:
             raise InputError(f"signals.{name}", "is missing", "name the column of the file")
@@ -352,7 +352,7 @@ def _checked(
     """Every check of one channel, those first whose fault would explain the others."""
     found = [
         checks.unit_of_the_file(channel, told_unit(table, channel.column), entry.overrule_unit),
-        measurable.size(channel),
+        checks.measurable(channel),
         checks.missing(channel, recorded.fill_gaps),
         checks.constant(channel),
         checks.degrees_for_radians(channel) if response else "",

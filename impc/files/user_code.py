@@ -2,24 +2,22 @@
 
 A study file that names a plant `module:function` asks for that module to be imported and that
 function to be called. Somebody else may have written the file: such a name needs the consent of
-whoever types the command, and must be a function of a module of the user's. The plants of this
-package, and saved matrices, need none (docs/security.md).
+whoever types the command. The plants of this package, and saved matrices, need none
+(docs/security.md).
 """
 
 from __future__ import annotations
 
 import importlib.machinery
 import importlib.util
-import inspect
 import sys
 import sysconfig
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from impc.errors import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
     from importlib.machinery import ModuleSpec
 
 #: This package's own modules; they are known by their version.
@@ -47,38 +45,7 @@ def consented_name(
             where, f"names code that would be run, {name!a}",
             f"look at it, then say --{option} {name}, or --allow-{option}",
         )  # fmt: skip
-    _require_users_module(where, module, name)
     return name
-
-
-def _require_users_module(where: str, module: str, name: str) -> None:
-    """Before anything is imported."""
-    if not all(part.isidentifier() for part in module.split(".")):
-        raise InputError(where, f"{module[:80]!a} is no module's name", "write module:function")
-    top = module.partition(".")[0]
-    if top in sys.stdlib_module_names or top in sys.builtin_module_names or top == "impc":
-        raise _not_yours(where, name)
-    file = module_file(top, Path())
-    if file is not None and is_installed(file):
-        raise _not_yours(where, name)
-
-
-def require_users_function(where: str, function: Callable[..., Any]) -> None:
-    """Refuse a `function` that is not of the user's or of this package's plants.
-
-    `where` is how messages call the place in the file.
-    """
-    module = getattr(function, "__module__", None) or ""
-    file = module_file(module, None)
-    ours = module.partition(".")[0] == "plants"
-    if not inspect.isfunction(function) or not (ours or (file and not is_installed(file))):
-        raise _not_yours(where, f"{module}:{getattr(function, '__name__', '?')}")
-
-
-def _not_yours(where: str, name: str) -> InputError:
-    return InputError(
-        where, f"{name} is no function of a module of yours", "write a function that calls it"
-    )
 
 
 def module_file(name: str, beside: Path | None) -> Path | None:

@@ -142,6 +142,11 @@ def asked_for(before: str, after: str, **units: str) -> Callable[[Path], None]:
     return read
 
 
+def thousands(folder: Path) -> None:
+    (folder / "t.csv").write_text("t;x\n0;999\n1;1.000\n")
+    read_table(folder / "t.csv")
+
+
 def old_result(folder: Path) -> None:
     (folder / "result.json").write_text('{"K": [[1.0]], "versions": {}}')
     read_result(folder)
@@ -385,11 +390,6 @@ def everything_recorded(_: Path) -> None:
     make_plant(source, source.make().input_labels)
 
 
-def thousands(folder: Path) -> None:
-    (folder / "t.csv").write_text("t;x\n0;999\n1;1.000\n")
-    read_table(folder / "t.csv")
-
-
 def workbook(*rows: Sequence[Any]) -> Callable[[Path], Table]:
     def read(folder: Path) -> Table:
         made = openpyxl.Workbook()
@@ -418,7 +418,7 @@ def reader_that(ends: str) -> Callable[[Path], None]:
     def read(folder: Path) -> None:
         hdf5_mat(folder / "t.mat", {"x": np.arange(9.0)})
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(apart, "_current", [])
+            patch.setattr(apart, "_children", {})
             patch.setattr(apart, "_START", f"import os, signal; {ends}")
             read_table(folder / "t.mat")
 
@@ -608,7 +608,6 @@ PROVOKED: dict[str, Callable[[Path], object]] = {
     "column '...' has text in ... of ... rows": damaged("text in a column"),
     "the file ends in the middle of a row": damaged("truncated csv"),
     "is a MATLAB table; save a struct of vectors": damaged("table object"),
-    "which may be a thousand": thousands,
     "is no ordinary file": a_pipe,
     "takes more than ... GB to read": reader_that("os.kill(os.getpid(), signal.SIGKILL)"),
     "takes longer than ... s to read": reader_that("os.kill(os.getpid(), signal.SIGXCPU)"),
@@ -628,7 +627,7 @@ PROVOKED: dict[str, Callable[[Path], object]] = {
     "method: got ...; choose one of ...": lambda _: fit_settings({"methods": ["best"]}),
     "solver: got ...; choose one of ...": lambda _: fit_settings({"solver": "gurobi"}),
     "solver: ... is not part of the CasADi that is installed": without_daqp,
-    "[fit] ...: is not a setting; known: ...": lambda _: fit_settings({"horzon": 20}),
+    "[fit] ...: is not a setting; did you mean ...": lambda _: fit_settings({"horzon": 20}),
     "... has the symbol ...; which is neither a state, an input, a disturbance nor a parameter": (
         lambda _: own_problem(stage_cost=lambda x, u, p: p * x**2 + casadi.SX.sym("w") * u**2)
     ),
@@ -658,10 +657,10 @@ PROVOKED: dict[str, Callable[[Path], object]] = {
     "is an optimal control problem; impc fit takes one, this does not": lambda _: make_plant(
         PlantSource("mine:problem", own_problem, {}), ()
     ),
-    "[fit.structure] ...: is not a setting; known: ...": lambda _: fit_settings(
+    "[fit.structure] ...: is not a setting; see docs/fitting.md": lambda _: fit_settings(
         {"structure": {"q": "diagonal"}}
     ),
-    "[fit.observer] ...: is not a setting; known: ...": lambda _: fit_settings(
+    "[fit.observer] ...: is not a setting; see docs/fitting.md": lambda _: fit_settings(
         {"observer": {"senses": ["theta1"]}}
     ),
     "walk: is given, but every state is seen; say what is sensed": lambda _: Observer(
@@ -740,7 +739,7 @@ PROVOKED: dict[str, Callable[[Path], object]] = {
     "ends in ... (...); correct the function, or what it is given": lambda _: make_plant(
         PlantSource("mine:stick", lambda: sys.exit(0), {}), ()
     ),
-    "[fit] ...: got ...; give at least ..., at most ...": of_fit({"horizon": 2**63}),
+    "[fit] ...: got ...; give at most ...": of_fit({"horizon": 2**63}),
     "names ... twice; name each once": of_fit({"free": ["mass", "mass"]}),
     "is a ... that no result can keep": lambda _: find_plant("cursor", {"sample_time": 2**64}),
     "would need ... GB of memory, more than this machine has": large_request(0, 1e9),
@@ -797,15 +796,13 @@ PROVOKED: dict[str, Callable[[Path], object]] = {
     "names code that would be run, ...": lambda folder: command(
         "cohort", str(own_plant(folder)), "--out", str(folder / "out")
     ),
-    "is no function of a module of yours": lambda folder: command(
-        "cohort", str(own_plant(folder)), "--plant", "os:system", "--out", str(folder / "out")
-    ),
     "has ... in it; use letters, digits, spaces and . + - _": lambda _: checked_name(
         "t.csv", "subject", "a/b"
     ),
     "row ... has ... cells, the head ...": lambda folder: sheet_of(
         folder, "subject,mass\n1,70,5\n"
     ),
+    "which may be a thousand": thousands,
     "which may be thousands; write it with a decimal point": lambda folder: column_values(
         sheet_of(folder, "subject;mass\n1;1,234\n"), "mass"
     ),

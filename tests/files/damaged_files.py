@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import struct
 import warnings
-import zlib
 from typing import TYPE_CHECKING
 
 import c3d
@@ -264,16 +262,6 @@ def _complex_signal(folder: Path) -> Made:
 def _three_dimensions(folder: Path) -> Made:
     save_mat(folder / "trial.mat", {"data": np.zeros((5, 6, 7))})
     return folder / "trial.mat", settings()
-
-
-@_damage("would take 4.0 GB")
-def _mat_that_unpacks_to_too_much(folder: Path) -> Made:
-    path = folder / "trial.mat"
-    save_mat(path, {"seat": np.arange(600.0)})
-    # The tag in front of a packed variable says how long it is once unpacked.
-    packed = zlib.compress(struct.pack("<II", 14, 4_000_000_000) + bytes(10_000))
-    path.write_bytes(path.read_bytes()[:128] + struct.pack("<II", 15, len(packed)) + packed)
-    return path, settings()
 
 
 @_damage("seat points elsewhere")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import random
 import subprocess
 import sys
@@ -16,37 +15,12 @@ import scipy.sparse
 from impc.errors import DataError, InputError
 from impc.files.apart import matrices_apart
 from impc.files.formats import read_table
-from impc.files.matlab import look_at_tags
-from tests.files.samples import mat5_array, mat5_element, mat5_file, pushed_seat, save_mat
+from tests.files.samples import pushed_seat, save_mat
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    pass
 
 LARGEST = 10**8
-
-
-def files_of_scipy() -> Iterator[Path]:
-    """Those of version 5 to 7 from the tests of scipy, most of them written by MATLAB."""
-    spec = importlib.util.find_spec("scipy.io.matlab")
-    assert spec is not None
-    assert spec.origin is not None
-    for path in sorted((Path(spec.origin).parent / "tests" / "data").glob("*.mat")):
-        if path.read_bytes().startswith(b"MATLAB 5"):
-            yield path
-
-
-def test_the_tags_of_files_that_matlab_wrote_are_sound() -> None:
-    paths = list(files_of_scipy())
-    if not paths:
-        pytest.skip("this scipy came without its tests")
-    refused = set()
-    for path in paths:
-        try:
-            look_at_tags(path, LARGEST)
-        except ValueError:
-            refused.add(path.name)
-    assert len(paths) > 60
-    assert refused == {"corrupted_zlib_checksum.mat", "corrupted_zlib_data.mat", "malformed1.mat"}
 
 
 @pytest.mark.parametrize("packed", [False, True])
@@ -80,7 +54,6 @@ def test_matrices_of_every_type_and_shape(tmp_path: Path, packed: bool) -> None:
         (np.eye(2) + 1j, "has a complex matrix x"),
         ({"y": 1.0}, "x is a struct"),
         (scipy.sparse.csc_array(np.eye(2)), "x is sparse"),
-        (np.zeros((600, 600), dtype=np.uint8), "would take 0.0 GB once it is unpacked"),
         ("a" * 1_000_001, "a text of more than 1000000 characters"),
     ],
 )
@@ -108,19 +81,6 @@ def test_the_other_byte_order(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_table(tmp_path / "x.mat").columns["x"], numbers)
 
 
-@pytest.mark.parametrize("kind", [*range(-1, 42), 200, 2**31])
-def test_each_type_of_element_is_read_or_refused(tmp_path: Path, kind: int) -> None:
-    # Where numbers stand; scipy's process ends for some of those that do not exist.
-    content = mat5_array(6, (2, 1), "x", mat5_element(kind % 2**32, bytes(16)))
-    (tmp_path / "x.mat").write_bytes(mat5_file(content))
-    if kind in (9, 12, 13):  # sixteen bytes are two numbers
-        assert read_table(tmp_path / "x.mat").samples == 2
-    else:
-        with pytest.raises(DataError, match="is damaged and cannot be read") as caught:
-            read_table(tmp_path / "x.mat")
-        assert "\n" not in str(caught.value)
-
-
 @pytest.mark.parametrize("packed", [False, True])
 def test_each_flipped_bit_ends_in_one_line_or_is_read(tmp_path: Path, packed: bool) -> None:
     path = tmp_path / "x.mat"
@@ -141,9 +101,6 @@ def test_each_flipped_bit_ends_in_one_line_or_is_read(tmp_path: Path, packed: bo
             problems.append(error.problem)
     assert len(problems) > 50
     assert all(problem.isprintable() for problem in problems)
-    # scipy looks for an imaginary part behind numbers that are said to be complex, and such.
-    ended = [problem for problem in problems if "ends the process" in problem]
-    assert len(ended) <= 3
 
 
 def test_the_process_that_asks_does_not_load_the_library(tmp_path: Path) -> None:

@@ -65,6 +65,7 @@ from impc.studies.fit.gain_findings import (
 )
 from impc.studies.fit.person import person_data, person_section
 from impc.studies.fit.result import shown_trials, trial_name
+from impc.studies.fit.settings import plain_settings
 from impc.studies.fit.structures import structure_data, structure_section
 from impc.studies.fit.trial_findings import (
     RESIDUALS,
@@ -199,7 +200,9 @@ def _trajectories(result: FitResult) -> list[Block]:
 def _made(result: FitResult, provenance: Provenance) -> list[Block]:
     plant = result.fitted.problem.plant
     arguments = "; ".join(f"{key} = {value}" for key, value in provenance.plant_arguments.items())
-    settings = "; ".join(f"{key} = {value}" for key, value in asdict(result.settings).items())
+    settings = "; ".join(
+        f"{key} = {value}" for key, value in plain_settings(result.settings).items()
+    )
     code = Markup("<code>{}</code>")
     moved = Markup("<code>{}</code>, sample time {} s, states {} <code>{}</code>").format(
         provenance.plant_name, plant.dt, ", ".join(plant.states), arguments
@@ -258,7 +261,7 @@ def fit_data(result: FitResult, provenance: Provenance) -> dict[str, Any]:
             "arguments": dict(provenance.plant_arguments),
             **{name: getattr(plant, name) for name in ("A", "B", "E", "C", "dt")},
         },
-        "settings": asdict(result.settings),
+        "settings": plain_settings(result.settings),
         "seconds": result.seconds,
     }
 

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import msgspec
 import numpy as np
+from msgspec import Meta
 
 from impc.control.named_solver import COMPILED, require_solver
-from impc.errors import InputError, brief
-from impc.files.configuration import FILL_IN
+from impc.errors import InputError
+from impc.files.configuration import FILL_IN, converted, require_known
 from impc.inverse.methods import method_named
 
 if TYPE_CHECKING:
@@ -19,16 +20,6 @@ if TYPE_CHECKING:
 
 # Percentiles of 95 % lie between replicates only from 20 on.
 _FEWEST = 20
-# Least and most of each number. The most is far beyond any use: it keeps sizes and seconds numbers.
-_RANGES: dict[str, tuple[float, float]] = {
-    "horizon": (1, 5000),
-    "margin": (1, 1000),
-    "settle": (0, 1e6),
-    "replicates": (0, 1_000_000),
-    "seed": (0, 2**63 - 1),
-}
-# A limit of an input is squared and divided by: beyond these the square is no number any more.
-_LIMITS = (1e-100, 1e100)
 # Settings that ask for assessments which not every command makes.
 _OF_SOME = (
     "feedback_states",
@@ -46,11 +37,11 @@ _PAGES = {"fit": "docs/fitting.md", "plan": "docs/planning.md", "select": "docs/
 #: Methods that a fit shows beside inverse MPC, which comes last (docs/fitting.md).
 BESIDE = ("feedback_gain", "inverse_lqr", "inverse_lqr_output", "clipped_lqr")
 
+Length = Annotated[int, Meta(ge=1, le=5000)]  # Of a horizon, in samples
 T = TypeVar("T")
 
 
-@dataclass(frozen=True)
-class StructureSettings:
+class StructureSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What may be costed, by name (`impc.model.structure`)."""
 
     # "diagonal", "full", for Q "outputs", or features with a price each
@@ -61,12 +52,11 @@ class StructureSettings:
     name: str | None = None  # In tables and sentences
 
 
-@dataclass(frozen=True)
-class ObserverSettings:
+class ObserverSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How a person senses, and which noise is in the loop (`impc.model.observer`)."""
 
     # Combinations of states and outputs; none for a person who sees every state
-    sensed: list[str] = field(default_factory=list)
+    sensed: list[str] = []
     motor: bool = True  # Whether there is such noise; its size is searched
     share: bool = False
     process: bool = False
@@ -146,22 +136,22 @@ class FitSettings:
     (10, 1.2)
     """
 
-    horizon: int = 20
+    horizon: Length = 20
     u_max: float | list[float] | None = None
     bounded_states: dict[str, float | str] = field(default_factory=dict)
-    margin: float = 1.2
+    margin: Annotated[float, Meta(ge=1, le=1000)] = 1.2
     terminal_set: bool | Literal["auto"] = "auto"
     free: list[str] = field(default_factory=list)
     feedback_states: list[str] = field(default_factory=list)
-    settle: float = 1.0
+    settle: Annotated[float, Meta(ge=0, le=1_000_000)] = 1.0
     held_out: bool = True
-    replicates: int = 0
+    replicates: Annotated[int, Meta(ge=0, le=1_000_000)] = 0
     bootstrap: Literal["block", "model"] = "block"
-    seed: int = 0
+    seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 0
     profiles: list[str] = field(default_factory=list)
     intent_draws: bool = True
     unknown_limit: bool = False
-    horizons: list[int] = field(default_factory=list)
+    horizons: list[Length] = field(default_factory=list)
     methods: list[str] = field(default_factory=lambda: list(BESIDE))
     structure: StructureSettings | None = None
     structures: list[StructureSettings] = field(default_factory=list)
@@ -173,6 +163,12 @@ class FitSettings:
     def person_profiles(self) -> bool:
         """Whether intervals of a person who senses with noise follow the likelihood."""
         return self.observer is not None and self.observer.profiles
+
+
+def plain_settings(settings: FitSettings) -> dict[str, Any]:
+    """Settings as result.json has them; numbers of numpy as Python's."""
+    found: dict[str, Any] = msgspec.to_builtins(settings, enc_hook=lambda number: number.item())
+    return found
 
 
 def require_used(settings: FitSettings, used: Collection[str], command: str) -> None:
@@ -189,14 +185,15 @@ def require_used(settings: FitSettings, used: Collection[str], command: str) -> 
 
 def read_settings(name: str, kind: type[T], table: Mapping[str, Any]) -> T:
     """The `table` of a file that is called `name`, as a dataclass of this `kind`."""
-    known = [item.name for item in fields(kind)]  # type: ignore[arg-type]
-    unknown = [key for key in table if key not in known]
-    if unknown:
-        raise InputError(f"[{name}] {unknown[0]}", "is not a setting", f"known: {', '.join(known)}")
-    try:
-        return msgspec.convert(dict(table), kind, strict=True)
-    except msgspec.ValidationError as error:
-        raise InputError(f"[{name}]", str(error), f"see {_PAGES[name]}") from None
+
+    def where(path: str) -> str:
+        """The path structure.over as [fit.structure] over."""
+        *tables, key = path.split(".")
+        return f"[{'.'.join((name, *tables))}] {key}".rstrip()
+
+    known = (item.name for item in fields(kind))  # type: ignore[arg-type]
+    require_known(where, table, known, "is not a setting")
+    return converted(where, table, kind, f"see {_PAGES[name]}")
 
 
 def fit_settings(table: Mapping[str, Any]) -> FitSettings:
@@ -206,34 +203,21 @@ def fit_settings(table: Mapping[str, Any]) -> FitSettings:
             raise InputError(
                 f"[fit] {name}", f"is still {FILL_IN!r}", "fill it in, or take the line out"
             )
-    _require_structures(table)
     settings = read_settings("fit", FitSettings, table)
-    for name, (least, most) in _RANGES.items():
-        _require_between(name, getattr(settings, name), least, most)
     if 0 < settings.replicates < _FEWEST:
         raise InputError(
             "[fit] replicates", f"got {settings.replicates}", f"give 0 or at least {_FEWEST}"
         )
-    for length in settings.horizons:
-        _require_between("horizons", length, *_RANGES["horizon"])
     limits = settings.u_max if isinstance(settings.u_max, list) else [settings.u_max]
-    for limit in limits:
-        if limit is not None and limit != np.inf:
-            _require_between("u_max", limit, *_LIMITS)
-    for name, bound in settings.bounded_states.items():
-        if not isinstance(bound, str) and bound != np.inf:
-            _require_between(f"bounded_states {name}", bound, *_LIMITS)
+    given: list[tuple[str, Any]] = [("u_max", limit) for limit in limits]
+    given += [(f"bounded_states {name}", item) for name, item in settings.bounded_states.items()]
+    for name, limit in given:  # it is squared and divided by
+        if isinstance(limit, float) and not (1e-100 <= limit <= 1e100 or limit == np.inf):
+            raise InputError(f"[fit] {name}", f"got {limit}", "give at least 1e-100, at most 1e100")
     _require_distinct(settings)
     for name in settings.methods:
         method_named(name)
     return replace(settings, solver=require_solver(settings.solver))
-
-
-def _require_between(name: str, value: float, least: float, most: float) -> None:
-    if not least <= value <= most:
-        raise InputError(
-            f"[fit] {name}", f"got {brief(value)}", f"give at least {least:.6g}, at most {most:.6g}"
-        )
 
 
 def _require_distinct(settings: FitSettings) -> None:
@@ -242,17 +226,3 @@ def _require_distinct(settings: FitSettings) -> None:
         twice = [item for index, item in enumerate(given) if item in given[:index]]
         if twice:
             raise InputError(f"[fit] {name}", f"names {twice[0]} twice", "name each once")
-
-
-def _require_structures(table: Mapping[str, Any]) -> None:
-    """Every key of the tables in the table is known: msgspec passes over those that are not."""
-    others = table.get("structures", [])
-    given = [table.get("structure"), *(others if isinstance(others, list) else [])]
-    asked = [("structure", StructureSettings, item) for item in given]
-    for name, kind, item in (*asked, ("observer", ObserverSettings, table.get("observer"))):
-        known = [each.name for each in fields(kind)]
-        for key in item if isinstance(item, dict) else ():
-            if key not in known:
-                raise InputError(
-                    f"[fit.{name}] {key}", "is not a setting", f"known: {', '.join(known)}"
-                )

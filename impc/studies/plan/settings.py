@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
+from msgspec import Meta
 
 from impc.errors import InputError, brief
 from impc.files.units import si_unit
@@ -22,21 +23,11 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
     from impc.studies.fit.settings import FitSettings
 
-# Least and most of each number; the most is far beyond any use.
-_RANGES: dict[str, tuple[float, float]] = {
-    "amplitude": (1e-100, 1e100),
-    "dwell": (1e-4, 1e4),
-    "duration": (0.1, 1e4),
-    "trials": (1, 100),
-    "draws": (1, 1000),
-    "falls": (0, 100),
-    "correlation": (0, 100),
-    "between": (0, 1000),
-    "groups": (2, 100_000),
-    "difference": (0.1, 1e4),
-    "fits": (0, 10_000),
-    "seed": (0, 2**31),
-}
+# The most is far beyond any use.
+Amplitude = Annotated[float, Meta(ge=1e-100, le=1e100)]
+Dwell = Annotated[float, Meta(ge=1e-4, le=1e4)]
+Persons = Annotated[int, Meta(ge=2, le=100_000)]
+Some = Meta(min_length=1)
 _FEWEST_FITS = 20
 _NUMBER = re.compile(r"\s*([0-9.eE+-]+)\s*(.*\S)\s*")
 
@@ -52,44 +43,41 @@ class PlanSettings:
     # one, as in "0.1 deg"
     noise: dict[str, float | str]
     # Time in s over which this noise falls to 1/e of its correlation; 0 for white noise
-    correlation: float = 0.0
+    correlation: Annotated[float, Meta(ge=0, le=100)] = 0.0
     # Largest magnitude of outputs beyond which a person falls, written as `noise` is; by default
     # the limits of [signals]
     stops: dict[str, float | str] = field(default_factory=dict)
     # Inputs of the plant that perturb the person; by default those that [signals] names
     perturbed: list[str] = field(default_factory=list)
     # Of the perturbation, in the disturbance's unit; with `files` a factor
-    amplitude: list[float] = field(default_factory=lambda: [2.5, 5.0, 10.0])
+    amplitude: Annotated[list[Amplitude], Some] = field(default_factory=lambda: [2.5, 5.0, 10.0])
     # For how long the ternary perturbation keeps each value, s
-    dwell: list[float] = field(default_factory=lambda: [0.125, 0.25, 0.5])
-    duration: float = 30.0  # Of a trial, s
-    trials: int = 3  # Of a person
+    dwell: Annotated[list[Dwell], Some] = field(default_factory=lambda: [0.125, 0.25, 0.5])
+    duration: Annotated[float, Meta(ge=0.1, le=1e4)] = 30.0  # Of a trial, s
+    trials: Annotated[int, Meta(ge=1, le=100)] = 3  # Of a person
     # Recordings of perturbations in the place of the ternary one, beside the configuration
     files: list[str] = field(default_factory=list)
     # Trials that are simulated of each experiment to see how often the person falls
-    draws: int = 20
-    falls: float = 5.0  # Largest share of them that may end in a fall, %
+    draws: Annotated[int, Meta(ge=1, le=1000)] = 20
+    falls: Annotated[float, Meta(ge=0, le=100)] = (
+        5.0  # Largest share of them that may end in a fall, %
+    )
     # Persons in each of two groups that are to be told apart
-    groups: list[int] = field(default_factory=lambda: [10, 20])
-    difference: float = 50.0  # By which a price differs between the groups, %
-    between: float = 30.0  # Standard deviation of the logarithm of a price within a group, %
+    groups: Annotated[list[Persons], Some] = field(default_factory=lambda: [10, 20])
+    difference: Annotated[float, Meta(ge=0.1, le=1e4)] = (
+        50.0  # By which a price differs between the groups, %
+    )
+    between: Annotated[float, Meta(ge=0, le=1000)] = (
+        30.0  # Standard deviation of the logarithm of a price within a group, %
+    )
     # Fits of simulated recordings of the best experiment, to compare with; 0 for none
-    fits: int = 0
-    seed: int = 0  # All that is drawn follows from it
+    fits: Annotated[int, Meta(ge=0, le=10_000)] = 0
+    seed: Annotated[int, Meta(ge=0, le=2**31)] = 0  # All that is drawn follows from it
 
 
 def plan_settings(table: Mapping[str, Any]) -> PlanSettings:
     """Read the [plan] table of a configuration."""
     settings = read_settings("plan", PlanSettings, table)
-    for name, (least, most) in _RANGES.items():
-        value = getattr(settings, name)
-        values = value if isinstance(value, list) else [value]
-        if not values:
-            raise InputError(f"[plan] {name}", "is empty", "give one number or more")
-        for item in values:
-            if not least <= item <= most:
-                remedy = f"give at least {least:.6g}, at most {most:.6g}"
-                raise InputError(f"[plan] {name}", f"got {brief(item)}", remedy)
     if 0 < settings.fits < _FEWEST_FITS:
         raise InputError("[plan] fits", f"got {settings.fits}", f"give 0 or {_FEWEST_FITS} or more")
     return settings

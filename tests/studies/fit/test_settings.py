@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,12 @@ from impc.errors import ImpcError, InputError
 from impc.model.plant import Plant
 from impc.model.recordings import Recording
 from impc.studies.fit.asked import fit_bounds
-from impc.studies.fit.settings import FitSettings, fit_settings, require_used
+from impc.studies.fit.settings import (
+    FitSettings,
+    fit_settings,
+    plain_settings,
+    require_used,
+)
 
 
 @pytest.fixture(scope="module")
@@ -60,6 +66,13 @@ def test_what_is_wrong_is_named(table: dict[str, Any], says: str) -> None:
     with pytest.raises(ImpcError, match=says) as caught:
         fit_settings(table)
     assert "\n" not in str(caught.value)
+
+
+def test_settings_with_a_structure_are_written_as_plain_values() -> None:
+    found = plain_settings(fit_settings({"u_max": [2], "structure": {"Q": ["x"]}, "observer": {}}))
+    assert json.loads(json.dumps(found)) == found
+    assert found["structure"] == {"Q": ["x"], "R": "diagonal", "over": None, "name": None}
+    assert found["observer"]["motor"] is True
 
 
 def test_bounds_from_the_data(seat: Plant) -> None:

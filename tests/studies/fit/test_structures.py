@@ -126,9 +126,9 @@ def test_settings_name_structures() -> None:
     found = fit_structures(carts(2), settings)
     assert [item.name for item in found] == ["one by one", "positions"]
     assert fit_structures(carts(2), FitSettings()) == ()
-    with pytest.raises(InputError, match=r"^\[fit.structure\] features: is not a setting"):
+    with pytest.raises(InputError, match=r"^\[fit.structures\[0\]\] features: is not a setting"):
         fit_settings({"structures": [{"features": ["x[0]"]}]})
-    with pytest.raises(InputError, match=r"^\[fit\]"):
+    with pytest.raises(InputError, match=r"^\[fit.structure\] Q: Expected"):
         fit_settings({"structure": {"Q": 3}})
     plain = fit_settings({**TABLE, "structure": None, "structures": []})
     problem = fitted(0.0).given

@@ -129,7 +129,7 @@ def test_spread_is_the_deviation_of_normal_numbers() -> None:
     ("table", "message"),
     [
         ({"prices": PRICES, "noise": {}, "amplitude": []}, "amplitude: is empty"),
-        ({"prices": PRICES, "noise": {}, "amplitude": [-1.0]}, "amplitude: got -1"),
+        ({"prices": PRICES, "noise": {}, "amplitude": [-1.0]}, "amplitude[0]: got -1"),
         ({"prices": PRICES, "noise": {}, "trials": 0}, "trials: got 0"),
         ({"prices": PRICES, "noise": {}, "fits": 3}, "fits: got 3"),
         ({"prices": PRICES, "noise": {}, "trails": 3}, "trails: is not a setting"),
