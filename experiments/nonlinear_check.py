@@ -18,12 +18,12 @@ import numpy as np
 from tqdm import tqdm
 
 from experiments.benchmarks.workloads import seat
+from experiments.nonlinear_mpc import build_nonlinear_mpc, simulate_nonlinear
 from impc.arrays import Array
 from impc.checking import replace
 from impc.control.casadi_controller import build_mpc, solve_mpc
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
-from impc.control.nonlinear_controller import build_nonlinear_mpc, simulate_nonlinear
 from impc.control.simulation import Scenario, scenario
 from impc.model.bounds import Bounds
 from plants.integration import runge_kutta_step

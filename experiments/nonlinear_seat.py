@@ -4,7 +4,7 @@
     python -m experiments.nonlinear_seat prices    prices, by the full equations and without
 
 The body that moves has its full equations throughout. A *full* person predicts with them too
-(`impc.control.nonlinear_controller`), a *linear* one with their slopes at rest. The torque limit
+(`experiments.nonlinear_mpc`), a *linear* one with their slopes at rest. The torque limit
 is 1.2 times the amplitude of the torque on the seat. docs/nonlinear-seat.md has the answers;
 `people` draws its figure.
 """
@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from tqdm import tqdm
 
+from experiments.nonlinear_mpc import build_nonlinear_mpc, simulate_nonlinear
 from experiments.nonlinear_seat_figure import seat_figure
 from experiments.seat_problem import DIRECTION, TRUTH, seat_problem
 from impc.assess.covariance import gain_covariance
@@ -26,23 +27,22 @@ from impc.assess.long_run_covariance import white_noise
 from impc.cli.seat import HORIZON, seat_controller, seat_weights
 from impc.control.casadi_controller import build_mpc, solve_mpc
 from impc.control.closed_loop import simulate
-from impc.control.nonlinear_controller import build_nonlinear_mpc, simulate_nonlinear
 from impc.control.simulation import require_complete, scenario
 from impc.inverse.methods import estimate
 from impc.inverse.noisy_fit import free_gain
-from impc.inverse.optimal_control_fit import fit_optimal_control
 from impc.inverse.problem import Problem, recorded_size
 from impc.model.bounds import Bounds
 from impc.model.recordings import Recording
 from impc.model.structure import Structure
+from impc.nonlinear.fit import fit_optimal_control
 from plants import seated_balance_for, ternary_torque
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from experiments.nonlinear_mpc import NonlinearMpc
     from impc.arrays import Array
     from impc.control.controller import Controller
-    from impc.control.nonlinear_controller import NonlinearMpc
     from impc.control.simulation import Scenario, Simulation
 
 __all__ = ["Amplitude", "Fitted", "compare_at", "first_torques", "fitted_person", "fitted_prices"]

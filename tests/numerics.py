@@ -38,7 +38,7 @@ FILES = (
     "tests/model/test_riccati.py",
     "tests/control/test_casadi_controller.py",
     "tests/control/test_solvers.py",
-    "tests/control/test_nonlinear_controller.py",
+    "tests/experiments/test_nonlinear_mpc.py",
     "tests/inverse/test_random_inverse.py",
     "tests/inverse/test_semidefinite.py",
     "tests/control/test_terminal_set.py",

@@ -22,16 +22,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
+from experiments.nonlinear_mpc import build_nonlinear_mpc, simulate_nonlinear
 from impc.control.casadi_controller import build_mpc, solve_mpc
 from impc.control.controller import Controller
-from impc.control.nonlinear_controller import build_nonlinear_mpc, simulate_nonlinear
 from impc.control.simulation import scenario
 from impc.errors import InfeasibleError
 from impc.files.formats import write_table
 from impc.files.table import make_table
 from impc.model.weights import Weights
-from tests.control.test_nonlinear_controller import linear_step
-from tests.control.test_optimal_control import TRUTH, made
+from tests.experiments.test_nonlinear_mpc import linear_step
+from tests.nonlinear.test_problem import TRUTH, made
 from tests.studies.cohort.carts import cart_plant, subject_trial
 
 if TYPE_CHECKING:

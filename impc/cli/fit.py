@@ -36,8 +36,8 @@ def command(
     """
     # Imported here: the libraries take seconds to load, and --help needs none.
     from impc.cli.consent import require_consent  # noqa: PLC0415
-    from impc.cli.optimal_subject import fit_optimal  # noqa: PLC0415
     from impc.cli.subject import read_subject  # noqa: PLC0415
+    from impc.extras import installed  # noqa: PLC0415
     from impc.reporting.shown_units import angles_in  # noqa: PLC0415
     from impc.reporting.writer import require_writable, write_files  # noqa: PLC0415
     from impc.studies.effort import fit_effort  # noqa: PLC0415
@@ -52,8 +52,11 @@ def command(
     from impc.studies.fit.truth import read_truth, truth_sentence  # noqa: PLC0415
 
     require_writable(out)
-    if fit_optimal(files, plant_name, config, out, solver):
-        return
+    if installed("impc.nonlinear"):
+        from impc.nonlinear.command import fit_optimal  # noqa: PLC0415
+
+        if fit_optimal(files, plant_name, config, out, solver):
+            return
     subject = read_subject("fit", files, plant_name, config, solver)
     problem, settings = subject.problem, subject.settings
     require_consent(fit_effort(problem, settings), yes)

@@ -34,11 +34,11 @@ from impc.model.signal_units import UNKNOWN
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from impc.control.optimal_control import OptimalControlProblem
     from impc.files.clock import Clock
     from impc.files.configuration import Configuration
     from impc.files.table import Table
     from impc.model.recordings import Label
+    from impc.nonlinear.problem import OptimalControlProblem
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.assess.covariance import TWO_SIDED
+from impc.nonlinear.result import MOST_TRIALS, limits_of
 from impc.reporting.shown_units import shown_as
 from impc.reporting.style import (
     BLUE,
@@ -23,13 +24,12 @@ from impc.reporting.style import (
     journal_style,
     new_figure,
 )
-from impc.studies.optimal_fit.result import MOST_TRIALS, limits_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from impc.studies.optimal_fit.result import OptimalFit
+    from impc.nonlinear.result import OptimalFit
 
 _SOFT = "#8C8C8C"
 _ONE_COLUMN = 6  # signals above each other; more stand in two columns

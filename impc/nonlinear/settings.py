@@ -6,18 +6,18 @@ import math
 from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any, Literal
 
-from impc.control.nlp_solvers import require_solver
 from impc.errors import InputError, brief
 from impc.files.configuration import FILL_IN
 from impc.files.units import si_unit
+from impc.nonlinear.solvers import require_solver
 from impc.studies.fit.settings import read_settings
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from impc.control.optimal_control import OptimalControlProblem
-    from impc.control.optimal_recordings import OptimalRecording
-    from impc.files.optimal_reading import OptimalTrial
+    from impc.nonlinear.problem import OptimalControlProblem
+    from impc.nonlinear.reading import OptimalTrial
+    from impc.nonlinear.recordings import OptimalRecording
 
 
 _MOST = {"evaluations": 100_000, "starts": 1000}
@@ -45,7 +45,7 @@ class OptimalFitSettings:
     x0: dict[str, float] = field(default_factory=dict)
     # Whether initial states are searched, from what was recorded of them and from `x0`
     unknown_start: bool = True
-    solver: str = "ipopt"  # One of `impc.control.nlp_solvers.SOLVERS`
+    solver: str = "ipopt"  # One of `impc.nonlinear.solvers.SOLVERS`
     evaluations: int = 200  # After how many a search is stopped
     starts: int = 5  # From how many starts, where the first explains little or has no plan
 

@@ -10,13 +10,13 @@ import pytest
 from experiments.peer_systems import SYSTEMS
 from experiments.seat_problem import DIRECTION, TRUTH, seat_problem
 from impc.arrays import Array
-from impc.control.optimal_control import OptimalControlProblem
-from impc.control.plan import Plan, nearby_plan
-from impc.control.plan_derivatives import differentiate_plan
-from impc.control.receding_horizon import ClosedLoop, closed_loop_from
 from impc.model.plant import Plant
 from impc.model.riccati import solve_lqr
 from impc.model.weights import Weights
+from impc.nonlinear.closed_loop import ClosedLoop, closed_loop_from
+from impc.nonlinear.derivatives import differentiate_plan
+from impc.nonlinear.plan import Plan, nearby_plan
+from impc.nonlinear.problem import OptimalControlProblem
 from plants import seated_balance_for
 from tests.support import extrapolated_slope
 

@@ -19,13 +19,13 @@ import numpy as np
 
 from impc.arrays import Array, Frozen
 from impc.checking import replace
-from impc.control.plan import Plan, nearby_plan, solve_plan
-from impc.control.plan_derivatives import differentiate_plan
 from impc.errors import SolverError
+from impc.nonlinear.derivatives import differentiate_plan
+from impc.nonlinear.plan import Plan, nearby_plan, solve_plan
 
 if TYPE_CHECKING:
-    from impc.control.optimal_control import OptimalControlProblem
-    from impc.control.plan_derivatives import PlanDerivatives
+    from impc.nonlinear.derivatives import PlanDerivatives
+    from impc.nonlinear.problem import OptimalControlProblem
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +76,7 @@ def simulate_receding(
 ) -> ClosedLoop:
     """Simulate from nothing, at theta (p,), from x0 (n,), disturbed by d of shape (steps, d).
 
-    `solver` and `mu` are those of `impc.control.plan.solve_plan`.
+    `solver` and `mu` are those of `impc.nonlinear.plan.solve_plan`.
     """
     first = solve_plan(problem, theta, x0, solver=solver, mu=mu)
     found = closed_loop_from(first, theta, x0, d, mu, solver)

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.studies.optimal_fit.result import reached, signal_vaf
+from impc.nonlinear.result import reached, signal_vaf
 
 if TYPE_CHECKING:
-    from impc.studies.optimal_fit.result import OptimalFit
+    from impc.nonlinear.result import OptimalFit
 
 # % of a signal below which a fit explains less than it leaves.
 _LITTLE = 50.0

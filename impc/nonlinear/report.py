@@ -11,6 +11,9 @@ import numpy as np
 from markupsafe import Markup
 
 from impc.assess.covariance import TWO_SIDED
+from impc.nonlinear.figures import interval_rows, optimal_figures
+from impc.nonlinear.result import MOST_TRIALS, reached, row_name, signal_vaf
+from impc.nonlinear.sentences import abstract, verdict
 from impc.reporting.document import (
     Block,
     Details,
@@ -23,14 +26,11 @@ from impc.reporting.document import (
     Verdict,
 )
 from impc.reporting.rendering import number
-from impc.studies.optimal_fit.figures import interval_rows, optimal_figures
-from impc.studies.optimal_fit.result import MOST_TRIALS, reached, row_name, signal_vaf
-from impc.studies.optimal_fit.sentences import abstract, verdict
 
 if TYPE_CHECKING:
-    from impc.inverse.told_combinations import Combination
+    from impc.nonlinear.combinations import Combination
+    from impc.nonlinear.result import OptimalFit
     from impc.reporting.provenance import Provenance
-    from impc.studies.optimal_fit.result import OptimalFit
 
 #: Under which name its numbers stand among the methods of result.json.
 METHOD = "nonlinear_inverse_mpc"

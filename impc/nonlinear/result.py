@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from impc.arrays import Array
-    from impc.control.optimal_control import OptimalControlProblem
-    from impc.inverse.optimal_control_fit import OptimalControlEstimate
+    from impc.nonlinear.fit import OptimalControlEstimate
+    from impc.nonlinear.problem import OptimalControlProblem
 
 #: Recordings that are drawn, the first ones.
 MOST_TRIALS = 6

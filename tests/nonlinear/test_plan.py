@@ -10,19 +10,19 @@ import pytest
 from experiments.peer_systems import SYSTEMS, PeerSystem
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
-from impc.control.nlp_solvers import SOLVERS
-from impc.control.optimal_control import OptimalControlProblem
-from impc.control.plan import Plan, nearby_plan
-from impc.control.plan_derivatives import (
-    dependent_rows,
-    differentiate_plan,
-    weakly_active_rows,
-)
 from impc.control.simulation import Status, scenario
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.weights import Weights
-from tests.control.linear_twin import linear_twin
+from impc.nonlinear.derivatives import (
+    dependent_rows,
+    differentiate_plan,
+    weakly_active_rows,
+)
+from impc.nonlinear.plan import Plan, nearby_plan
+from impc.nonlinear.problem import OptimalControlProblem
+from impc.nonlinear.solvers import SOLVERS
+from tests.nonlinear.linear_twin import linear_twin
 from tests.support import extrapolated_slope, random_plant, random_weights
 
 

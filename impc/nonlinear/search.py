@@ -14,9 +14,9 @@ import numpy as np
 
 from impc.arrays import Array, frozen
 from impc.checking import replace
-from impc.control.plan import Plan, solved_plan
-from impc.control.plan_derivatives import differentiate_plan
-from impc.inverse.optimal_control_residuals import (
+from impc.nonlinear.derivatives import differentiate_plan
+from impc.nonlinear.plan import Plan, solved_plan
+from impc.nonlinear.residuals import (
     Evaluation,
     assembled,
     evaluate,
@@ -26,8 +26,8 @@ from impc.inverse.optimal_control_residuals import (
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from impc.control.optimal_recordings import OptimalRecording
-    from impc.inverse.optimal_control_residuals import Residuals
+    from impc.nonlinear.recordings import OptimalRecording
+    from impc.nonlinear.residuals import Residuals
 
 _LONGEST_STEP = 0.7  # in a logarithm: a factor of two
 _SMALL_STEP = 1e-9
@@ -52,7 +52,7 @@ class Count:
     def evaluate(
         self, given: Residuals, unknowns: Array, mu: float, before: Evaluation
     ) -> Evaluation | None:
-        """`impc.inverse.optimal_control_residuals.evaluate` at unknowns (k,) and mu, counted."""
+        """`impc.nonlinear.residuals.evaluate` at unknowns (k,) and mu, counted."""
         self.done += 1
         return evaluate(given, unknowns, mu, before)
 

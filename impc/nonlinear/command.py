@@ -11,20 +11,20 @@ from impc.checking import replace
 from impc.cli.output import print_files
 from impc.cli.plant import find_plant
 from impc.cli.progress import progress
-from impc.control.nlp_solvers import require_solver
-from impc.control.optimal_control import OptimalControlProblem
 from impc.files.configuration import read_configuration
 from impc.files.inputs import gather_inputs
-from impc.files.optimal_reading import read_optimal_trials
 from impc.files.plant_sources import made_by
-from impc.inverse.optimal_control_fit import fit_optimal_control
+from impc.nonlinear.fit import fit_optimal_control
+from impc.nonlinear.problem import OptimalControlProblem
+from impc.nonlinear.reading import read_optimal_trials
+from impc.nonlinear.report import optimal_report
+from impc.nonlinear.result import OptimalFit
+from impc.nonlinear.sentences import abstract, verdict
+from impc.nonlinear.settings import optimal_fit_settings, posed, recorded
+from impc.nonlinear.solvers import require_solver
 from impc.reporting.provenance import Provenance
 from impc.reporting.shown_units import angles_in
 from impc.reporting.writer import write_files
-from impc.studies.optimal_fit.report import optimal_report
-from impc.studies.optimal_fit.result import OptimalFit
-from impc.studies.optimal_fit.sentences import abstract, verdict
-from impc.studies.optimal_fit.settings import optimal_fit_settings, posed, recorded
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.arrays import Array, Frozen
-from impc.control.relaxed_conditions import (
+from impc.nonlinear.conditions import (
     Point,
     conditions,
     parameter_sides,
@@ -27,7 +27,7 @@ from impc.control.relaxed_conditions import (
 )
 
 if TYPE_CHECKING:
-    from impc.control.plan import Plan
+    from impc.nonlinear.plan import Plan
 
 # Multiplier over slack: at mu = 1e-10 an active row with a multiplier of one has 1e10, an inactive
 # one with a slack of one 1e-10.

@@ -4,7 +4,7 @@
 
 A plan near another one (the next theta of a search, the next sample of a closed loop, the next mu)
 takes a few steps of Newton's method from it. Where there is none near, or where it does not end, a
-solver by name makes the start (`impc.control.nlp_solvers`). Either way the answer is what the same
+solver by name makes the start (`impc.nonlinear.solvers`). Either way the answer is what the same
 test of the conditions and of the second order says, so it does not depend on the solver.
 docs/nonlinear.md.
 """
@@ -18,8 +18,8 @@ import numpy as np
 
 from impc.arrays import Array, Frozen
 from impc.checking import replace
-from impc.control.nlp_solvers import require_solver, start_of, worst_row
-from impc.control.relaxed_conditions import (
+from impc.errors import InfeasibleError, InputError, SolverError
+from impc.nonlinear.conditions import (
     Point,
     Residuals,
     conditions,
@@ -28,11 +28,11 @@ from impc.control.relaxed_conditions import (
     system,
     wanted_rows,
 )
-from impc.errors import InfeasibleError, InputError, SolverError
+from impc.nonlinear.solvers import require_solver, start_of, worst_row
 
 if TYPE_CHECKING:
-    from impc.control.optimal_control import OptimalControlProblem
-    from impc.control.relaxed_conditions import Conditions, System
+    from impc.nonlinear.conditions import Conditions, System
+    from impc.nonlinear.problem import OptimalControlProblem
 
 # Of the conditions, relative to the largest multiplier (gradient) or as they are (dynamics, rows).
 # Newton's method ends at 1e-13 to 1e-15 on the four systems of docs/nonlinear.md.

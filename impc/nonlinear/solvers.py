@@ -1,4 +1,4 @@
-"""CasADi's solvers of nonlinear programs by name, as starts of `impc.control.plan`.
+"""CasADi's solvers of nonlinear programs by name, as starts of `impc.nonlinear.plan`.
 
 The program is written with x_0 as an unknown that one equation fixes, and in the order x, u stage
 by stage, which is the structure that fatrop looks for. A solver's own word on how it ended is not
@@ -15,12 +15,12 @@ import casadi as ca
 import numpy as np
 
 from impc.arrays import Array, BoolArray
-from impc.control.relaxed_conditions import Point, wanted_rows
 from impc.errors import InputError
+from impc.nonlinear.conditions import Point, wanted_rows
 from impc.settings_files import IPOPT_ALONE
 
 if TYPE_CHECKING:
-    from impc.control.optimal_control import OptimalControlProblem
+    from impc.nonlinear.problem import OptimalControlProblem
 
 #: Names of the solvers: interior points, sequential quadratic programs, structured interior points.
 SOLVERS = ("ipopt", "sqpmethod", "fatrop")

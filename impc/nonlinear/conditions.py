@@ -28,7 +28,7 @@ from scipy.linalg import lapack
 from impc.arrays import Array, BoolArray, Frozen, IntArray
 
 if TYPE_CHECKING:
-    from impc.control.optimal_control import OptimalControlProblem
+    from impc.nonlinear.problem import OptimalControlProblem
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,14 +15,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.arrays import Array, BoolArray, IntArray
-from impc.control.plan import Plan, nearby_plan, solve_plan, solved_plan
-from impc.control.plan_derivatives import PlanDerivatives, differentiate_plan
-from impc.control.receding_horizon import ClosedLoop, closed_loop_from
 from impc.errors import SolverError
+from impc.nonlinear.closed_loop import ClosedLoop, closed_loop_from
+from impc.nonlinear.derivatives import PlanDerivatives, differentiate_plan
+from impc.nonlinear.plan import Plan, nearby_plan, solve_plan, solved_plan
 
 if TYPE_CHECKING:
-    from impc.control.optimal_control import OptimalControlProblem
-    from impc.control.optimal_recordings import OptimalRecording
+    from impc.nonlinear.problem import OptimalControlProblem
+    from impc.nonlinear.recordings import OptimalRecording
 
 #: Share of the squares of recordings above which plans are taken to be of another kind: a cart-pole
 #: that does not swing up leaves 0.8 of them, noise of 16 dB leaves 0.025.
@@ -36,7 +36,7 @@ class Residuals:
 
     problem: OptimalControlProblem  # Whose parameters are searched
     recordings: tuple[OptimalRecording, ...]
-    solver: str  # One of `impc.control.nlp_solvers.SOLVERS`
+    solver: str  # One of `impc.nonlinear.solvers.SOLVERS`
     scales: Array  # Of states and inputs (n + m,)
     size: float  # Sum of squares of all that was measured, over the scales
 

@@ -12,14 +12,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from numbers import Real
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import casadi as ca
 import numpy as np
 
 from impc.arrays import Array, BoolArray, Frozen, finite_array
-from impc.checking import checked
-from impc.control.expressions import (
+from impc.checking import checked, register
+from impc.errors import InputError
+from impc.nonlinear.expressions import (
     function_of,
     names_of,
     require_influence,
@@ -28,16 +29,15 @@ from impc.control.expressions import (
     symbols_of,
     with_values,
 )
-from impc.control.optimal_recordings import optimal_recording
-from impc.control.system_equations import is_system, system_equations
-from impc.errors import InputError
+from impc.nonlinear.recordings import optimal_recording
+from impc.nonlinear.systems import is_system, system_equations
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
-    from impc.control.optimal_recordings import OptimalRecording
-    from impc.control.plan import Plan
-    from impc.control.receding_horizon import ClosedLoop
+    from impc.nonlinear.closed_loop import ClosedLoop
+    from impc.nonlinear.plan import Plan
+    from impc.nonlinear.recordings import OptimalRecording
 
 _LONGEST = 10_000  # stages: the program has as many as it has unknowns times states
 
@@ -54,7 +54,7 @@ class OptimalControlProblem(Frozen):
         Name of each unknown -> its scalar symbol in the expressions.
     next_state : casadi expression or control.NonlinearIOSystem
         f(x, u, d; theta) (n); of a system its own equations, with the symbols in the place of its
-        parameters of those names (`impc.control.system_equations`).
+        parameters of those names (`impc.nonlinear.systems`).
     stage_cost : casadi expression
         l(x, u; theta), a number; as a rule prices times features, one price a known number.
     horizon : int
@@ -123,6 +123,9 @@ class OptimalControlProblem(Frozen):
     >>> plan.x.shape, bool(plan.u.min() > -1.0 - 1e-9)
     ((21, 2), True)
     """
+
+    #: Why commands for linear plants refuse it.
+    no_plant: ClassVar = ("is an optimal control problem", "impc fit takes one, this does not")
 
     horizon: int
     state_names: tuple[str, ...]
@@ -292,7 +295,7 @@ class OptimalControlProblem(Frozen):
     def plan(
         self, theta: Mapping[str, float], x0: Any, *, solver: str = "ipopt", mu: float = 1e-10
     ) -> Plan:
-        """The optimal plan from a state, as `impc.control.plan.solve_plan`.
+        """The optimal plan from a state, as `impc.nonlinear.plan.solve_plan`.
 
         Parameters
         ----------
@@ -301,16 +304,16 @@ class OptimalControlProblem(Frozen):
         x0 : array_like
             (n,).
         solver : str
-            One of `impc.control.nlp_solvers.SOLVERS`.
+            One of `impc.nonlinear.solvers.SOLVERS`.
         mu : float
             Of the relaxed conditions lam g = -mu.
 
         Raises
         ------
         InfeasibleError, SolverError
-            As `impc.control.plan.solve_plan`.
+            As `impc.nonlinear.plan.solve_plan`.
         """
-        from impc.control.plan import solve_plan  # noqa: PLC0415 - it stands on this module
+        from impc.nonlinear.plan import solve_plan  # noqa: PLC0415 - it stands on this module
 
         return solve_plan(self, self.values(theta), self.start(x0), solver=solver, mu=mu)
 
@@ -341,9 +344,9 @@ class OptimalControlProblem(Frozen):
         InputError, DataError
             When `steps` or `d` are not such.
         InfeasibleError, SolverError
-            As `impc.control.receding_horizon.simulate_receding`.
+            As `impc.nonlinear.closed_loop.simulate_receding`.
         """
-        from impc.control.receding_horizon import simulate_receding  # noqa: PLC0415 - see plan
+        from impc.nonlinear.closed_loop import simulate_receding  # noqa: PLC0415 - see plan
 
         if isinstance(steps, bool) or not isinstance(steps, int | np.integer) or steps < 1:
             raise InputError("steps", f"got {steps!r:.40}", "give a whole number of samples")
@@ -362,7 +365,7 @@ class OptimalControlProblem(Frozen):
         x0: Any = None,
         unknown_start: bool | None = None,
     ) -> OptimalRecording:
-        """A recording that is one plan: `impc.control.optimal_recordings.optimal_recording`.
+        """A recording that is one plan: `impc.nonlinear.recordings.optimal_recording`.
 
         x (N + 1, n), u (N, m), d (N, d), x0 (n,); NaN is not measured. With
         `unknown_start` x0 is searched from what is given: by default where it is the first of x.
@@ -380,7 +383,7 @@ class OptimalControlProblem(Frozen):
         x0: Any = None,
         unknown_start: bool | None = None,
     ) -> OptimalRecording:
-        """A recording of the closed loop: `impc.control.optimal_recordings.optimal_recording`.
+        """A recording of the closed loop: `impc.nonlinear.recordings.optimal_recording`.
 
         x (steps + 1, n), u (steps, m), d (steps, d), x0 (n,); NaN is not measured. With
         `unknown_start` x0 is searched from what is given: by default where it is the first of x.
@@ -388,6 +391,11 @@ class OptimalControlProblem(Frozen):
         return optimal_recording(
             self, x, u, closed_loop=True, d=d, x0=x0, unknown_start=unknown_start
         )
+
+
+register(
+    __name__, "OptimalControlProblem", "make it with OptimalControlProblem(states, inputs, ...)"
+)
 
 
 def _require_horizon(horizon: Any) -> None:

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from experiments.nonlinear_check import compare_at
+from experiments.nonlinear_mpc import build_nonlinear_mpc, simulate_nonlinear
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
-from impc.control.nonlinear_controller import build_nonlinear_mpc, simulate_nonlinear
 from impc.control.simulation import scenario
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
