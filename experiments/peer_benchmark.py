@@ -22,7 +22,7 @@ from tqdm import tqdm
 from experiments.peer_systems import SYSTEMS
 from impc.errors import ImpcError
 from impc.nonlinear.fit import fit_optimal_control
-from impc.nonlinear.solvers import SOLVERS
+from impc.nonlinear.plan import SOLVERS
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

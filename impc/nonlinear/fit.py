@@ -22,16 +22,23 @@ from impc.arrays import Array, Frozen, IntArray
 from impc.checking import checked, replace
 from impc.errors import DataError, InfeasibleError, InputError, SolverError
 from impc.nonlinear.combinations import Combinations, combinations
-from impc.nonlinear.residuals import EXPLAINED, begin, first_plan, residuals_of
-from impc.nonlinear.search import Count, along_mu, guided
-from impc.nonlinear.solvers import require_solver
+from impc.nonlinear.plan import require_solver
+from impc.nonlinear.search import (
+    EXPLAINED,
+    Count,
+    along_mu,
+    begin,
+    first_plan,
+    guided,
+    residuals_of,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
     from impc.nonlinear.problem import OptimalControlProblem
     from impc.nonlinear.recordings import OptimalRecording
-    from impc.nonlinear.residuals import Evaluation, Residuals
+    from impc.nonlinear.search import Evaluation, Residuals
     from impc.reporting.document import Report
     from impc.reporting.provenance import Provenance
 
@@ -70,8 +77,7 @@ class OptimalControlEstimate(Frozen):
 
     def page(self, provenance: Provenance) -> Report:
         """Page, tables and figures, as `impc.report` writes them."""
-        from impc.nonlinear.report import optimal_report  # noqa: PLC0415 - it stands on this module
-        from impc.nonlinear.result import OptimalFit  # noqa: PLC0415
+        from impc.nonlinear.page import OptimalFit, optimal_report  # noqa: PLC0415 - it shows this
 
         names = tuple(f"recording {index + 1}" for index in range(len(self.recordings)))
         fit = OptimalFit(self, names, ((),) * len(names), self.problem.dt)
@@ -119,7 +125,7 @@ def fit_optimal_control(
     start : dict
         First value of each parameter by its name.
     solver : str
-        One of `impc.nonlinear.solvers.SOLVERS`.
+        One of `impc.nonlinear.plan.SOLVERS`.
     mu_steps : sequence of float, optional
         Falling, of the dimension of the cost; by default `MU_STEPS` times the mean cost of a
         recorded stage at the start, at most one, and at least 1e-10.
@@ -324,6 +330,6 @@ def _estimate(
     )
     return OptimalControlEstimate(
         problem, given.recordings, begun, named, loss, found.residual, found.jacobian, signals,
-        given.scales, told, tuple(given.split(found.unknowns)[1]), found.trajectories(), settled,
-        evaluations, seconds,
+        given.scales, told, tuple(given.split(found.unknowns)[1]),
+        tuple((run.x, run.u) for run in found.runs), settled, evaluations, seconds,
     )  # fmt: skip

@@ -10,6 +10,7 @@ docs/nonlinear.md has the derivation and an example.
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from numbers import Real
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -217,6 +218,11 @@ class OptimalControlProblem(Frozen):
         """Number of disturbances."""
         return len(self.disturbance_names)
 
+    def slopes(self, x: Array, u: Array, d: Array, theta: Array) -> tuple[Array, Array, Array]:
+        """f (n,), and its derivatives by (x, u) (n, n + m) and theta (n, p), at one sample."""
+        following, f_w, f_theta = _slopes(self)(x, u, d, theta)
+        return following.full().ravel(), f_w.full(), f_theta.full()
+
     def with_horizon(self, horizon: int) -> OptimalControlProblem:
         """The same problem over another `horizon` in samples.
 
@@ -304,7 +310,7 @@ class OptimalControlProblem(Frozen):
         x0 : array_like
             (n,).
         solver : str
-            One of `impc.nonlinear.solvers.SOLVERS`.
+            One of `impc.nonlinear.plan.SOLVERS`.
         mu : float
             Of the relaxed conditions lam g = -mu.
 
@@ -396,6 +402,16 @@ class OptimalControlProblem(Frozen):
 register(
     __name__, "OptimalControlProblem", "make it with OptimalControlProblem(states, inputs, ...)"
 )
+
+
+@functools.lru_cache(maxsize=16)
+def _slopes(problem: OptimalControlProblem) -> Any:
+    f = problem.functions[0]
+    kind: Any = ca.SX if f.is_a("SXFunction") else ca.MX
+    given = [kind.sym(letter, f.numel_in(index)) for index, letter in enumerate("xudt")]
+    following = f(*given)
+    by_x, by_u, _, by_theta = (ca.jacobian(following, item) for item in given)
+    return ca.Function("slopes", given, [following, ca.horzcat(by_x, by_u), by_theta])
 
 
 def _require_horizon(horizon: Any) -> None:

@@ -56,10 +56,15 @@ from impc.model.recordings import Label, Recording
 from impc.model.riccati import solve_lqr
 from impc.model.structure import Structure
 from impc.model.weights import Weights
+from impc.nonlinear.files import (
+    OptimalTrial,
+    optimal_fit_settings,
+    posed,
+    read_optimal_trials,
+    recorded,
+)
+from impc.nonlinear.plan import require_solver as require_nlp_solver
 from impc.nonlinear.problem import OptimalControlProblem
-from impc.nonlinear.reading import OptimalTrial, read_optimal_trials
-from impc.nonlinear.settings import optimal_fit_settings, posed, recorded
-from impc.nonlinear.solvers import require_solver as require_nlp_solver
 from impc.reporting.writer import owned, require_writable, write_files
 from impc.studies.cohort import cluster
 from impc.studies.cohort.sheet import Sheet, column_values, read_sheet

@@ -19,7 +19,7 @@ from click.testing import CliRunner, Result
 import impc
 from impc.cli.main import main
 from impc.files.results import read_result
-from impc.nonlinear import figures
+from impc.nonlinear import page as figures
 from impc.reporting import style
 from impc.reporting.style import journal_style
 from tests.labelled_axes import require_labels

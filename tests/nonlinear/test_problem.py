@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from impc.errors import DataError, ImpcError, InfeasibleError, InputError, SolverError
+from impc.nonlinear.plan import SOLVERS, require_solver
 from impc.nonlinear.problem import OptimalControlProblem
-from impc.nonlinear.solvers import SOLVERS, require_solver
 
 TRUTH = {"mass": 1.5, "price": 10.0, "limit": 1.0}
 
