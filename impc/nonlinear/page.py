@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from markupsafe import Markup
 
-from impc.arrays import Array, Frozen
+from impc.arrays import Frozen
 from impc.assess.covariance import TWO_SIDED
 from impc.inverse.estimates import Status
 from impc.reporting.document import (
@@ -44,7 +44,6 @@ if TYPE_CHECKING:
 
     from impc.nonlinear.combinations import Combination
     from impc.nonlinear.fit import OptimalControlEstimate
-    from impc.nonlinear.problem import OptimalControlProblem
     from impc.reporting.provenance import Provenance
 
 #: Recordings that are drawn, the first ones.
@@ -84,15 +83,6 @@ class OptimalFit(Frozen):
         return (*problem.state_names, *problem.input_names)
 
 
-@dataclass(frozen=True)
-class Reached:
-    """How often a constraint is at its limit."""
-
-    name: str  # Of the constraint
-    samples: int  # Those at which one of its rows is at its limit, and all
-    of: int
-
-
 def signal_vaf(estimate: OptimalControlEstimate) -> dict[str, float]:
     """(3.24) of each state and input over all recordings, %; NaN where nothing was measured."""
     problem = estimate.problem
@@ -112,34 +102,20 @@ def row_name(row: str) -> str:
     return row.rpartition("[")[0] if row.endswith("]") else row
 
 
-def reached(estimate: OptimalControlEstimate) -> tuple[Reached, ...]:
-    """How often each constraint of the path is at its limit, in the estimate's own runs."""
-    problem = estimate.problem
-    values = np.vstack(
-        [_constraint_values(problem, estimate, index) for index in range(len(estimate.runs))]
-    )
+def reached(estimate: OptimalControlEstimate) -> dict[str, tuple[int, int]]:
+    """At how many samples each constraint of the path is at its limit, in the estimate's runs."""
+    problem, theta, parts = estimate.problem, list(estimate.theta.values()), []
+    for one, (x, u) in zip(estimate.recordings, estimate.runs, strict=True):
+        repeated = np.repeat(np.array(theta)[:, None], len(u), axis=1)
+        parts.append(problem.functions[3].map(len(u))(x[:-1].T, u.T, one.d.T, repeated).full().T)
+    values = np.vstack(parts).reshape(-1, len(problem.rows))
     size = np.max(np.abs(values), axis=0, initial=0.0)
     at_limit = values > -_AT_LIMIT * np.where(size > 0, size, 1.0)
-    families = [row_name(row) for row in problem.rows]
-    return tuple(
-        Reached(
-            name,
-            int(np.count_nonzero(at_limit[:, [item == name for item in families]].any(axis=1))),
-            len(values),
-        )
-        for name in dict.fromkeys(families)
-    )
-
-
-def _constraint_values(
-    problem: OptimalControlProblem, estimate: OptimalControlEstimate, index: int
-) -> Array:
-    """Values of the constraints (steps, q) along a run."""
-    (x, u), d = estimate.runs[index], estimate.recordings[index].d
-    steps = len(u)
-    theta = np.repeat(np.array(list(estimate.theta.values()))[:, None], steps, axis=1)
-    values = problem.functions[3].map(steps)(x[:-1].T, u.T, d.T, theta)
-    return np.asarray(values.full().T).reshape(steps, len(problem.rows))
+    names = np.array([row_name(row) for row in problem.rows])
+    return {
+        name: (int(at_limit[:, names == name].any(axis=1).sum()), len(values))
+        for name in dict.fromkeys(map(str, names))
+    }
 
 
 # % of a signal below which a fit explains less than it leaves.
@@ -214,8 +190,8 @@ def _agreement(fit: OptimalFit) -> str:
 
 def _at_the_limit(fit: OptimalFit) -> list[str]:
     parts = [
-        f"{one.name} at {one.samples} of {one.of} samples" if one.samples else f"{one.name} never"
-        for one in reached(fit.estimate)
+        f"{name} at {samples} of {of} samples" if samples else f"{name} never"
+        for name, (samples, of) in reached(fit.estimate).items()
     ]
     return [f"Constraints at their limit: {', '.join(parts)}."] if parts else []
 
@@ -485,7 +461,7 @@ def _trajectories(fit: OptimalFit) -> list[Block]:
     limits = TextTable(
         "At how many samples each constraint is at its limit.",
         ("constraint", "at its limit", "samples"),
-        [(one.name, str(one.samples), str(one.of)) for one in reached(fit.estimate)],
+        [(name, *map(str, found)) for name, found in reached(fit.estimate).items()],
     )
     pictures = [
         Picture(
@@ -570,7 +546,7 @@ def _data(fit: OptimalFit, provenance: Provenance) -> dict[str, Any]:
             for kind, items in (("told", found.told), ("untold", found.untold))
         },
         "singular_values": found.singular_values,
-        "reached": {one.name: one.samples for one in reached(estimate)},
+        "reached": {name: samples for name, (samples, _) in reached(estimate).items()},
         "loss": estimate.loss,
         "x0": estimate.x0,
         "trials": [

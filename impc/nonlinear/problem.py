@@ -287,16 +287,6 @@ class OptimalControlProblem(Frozen):
             raise InputError(f"parameter {name}", f"got {number:g}", f"give {wanted}")
         return number
 
-    def start(self, x0: Any) -> Array:
-        """The initial state `x0` as an array (n,), checked.
-
-        Raises
-        ------
-        DataError
-            As `impc.arrays.finite_array`: another size, or entries that are not finite.
-        """
-        return finite_array("x0", x0, (self.n,))
-
     @checked
     def plan(
         self, theta: Mapping[str, float], x0: Any, *, solver: str = "ipopt", mu: float = 1e-10
@@ -321,7 +311,9 @@ class OptimalControlProblem(Frozen):
         """
         from impc.nonlinear.plan import solve_plan  # noqa: PLC0415 - it stands on this module
 
-        return solve_plan(self, self.values(theta), self.start(x0), solver=solver, mu=mu)
+        return solve_plan(
+            self, self.values(theta), finite_array("x0", x0, (self.n,)), solver=solver, mu=mu
+        )
 
     @checked
     def closed_loop(
@@ -359,7 +351,7 @@ class OptimalControlProblem(Frozen):
         shape = (int(steps), self.disturbance_count)
         known = finite_array("d", np.zeros(shape) if d is None else d, shape)
         return simulate_receding(
-            self, self.values(theta), self.start(x0), known, solver=solver, mu=mu
+            self, self.values(theta), finite_array("x0", x0, (self.n,)), known, solver=solver, mu=mu
         )
 
     def recorded_plan(
