@@ -76,10 +76,10 @@ def closed_loop_from(
     x[0], dx[0, :, p:] = x0, np.eye(problem.n)
     plans: list[Plan] = []
     for t in range(steps):
-        old = first if t == 0 else None
-        if before is not None:
-            old = before.plans[t]
-        plan = None if old is None else nearby_plan(old, theta, x[t], mu)
+        near = [] if before is None else [before.plans[t]]
+        near += [plans[-1] if plans else first]
+        found = (nearby_plan(one, theta, x[t], mu) for one in near)
+        plan = next((one for one in found if one is not None), None)
         if plan is None:  # from the last sample's plan, a sample later
             last = plans[-1] if plans else first
             ahead = np.vstack([x[t], last.x[2:], last.x[-1:]])

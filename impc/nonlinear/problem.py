@@ -19,7 +19,7 @@ import casadi as ca
 import numpy as np
 
 from impc.arrays import Array, BoolArray, Frozen, finite_array
-from impc.checking import checked, register
+from impc.checking import checked
 from impc.errors import InputError
 from impc.nonlinear.expressions import (
     function_of,
@@ -389,11 +389,6 @@ class OptimalControlProblem(Frozen):
         return optimal_recording(
             self, x, u, closed_loop=True, d=d, x0=x0, unknown_start=unknown_start
         )
-
-
-register(
-    __name__, "OptimalControlProblem", "make it with OptimalControlProblem(states, inputs, ...)"
-)
 
 
 @functools.lru_cache(maxsize=16)

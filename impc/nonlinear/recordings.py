@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from impc.arrays import Array, Frozen, frozen
-from impc.checking import register
 from impc.errors import DataError
 
 if TYPE_CHECKING:
@@ -30,9 +29,6 @@ class OptimalRecording(Frozen):
     # Whether every input is the first of a plan of its own, and not all of one plan
     closed_loop: bool
     unknown_start: bool  # Whether the initial state is searched too
-
-
-register(__name__, "OptimalRecording", "make it with problem.recorded_plan or recorded_loop")
 
 
 def optimal_recording(
