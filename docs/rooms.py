@@ -28,6 +28,7 @@ ROOMS = {
     "files": "recordings and results in files",
     "reporting": "pages, figures, tables, writing",
     "studies": "example, fit, compare, cohorts, ...",
+    "nonlinear": "optional: problems of the user's own",
     "cli": "commands: parse, call, print",
     "door": "import impc, python -m impc",
 }

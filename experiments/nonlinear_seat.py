@@ -30,11 +30,11 @@ from impc.control.closed_loop import simulate
 from impc.control.simulation import require_complete, scenario
 from impc.inverse.methods import estimate
 from impc.inverse.noisy_fit import free_gain
-from impc.inverse.optimal_control_fit import fit_optimal_control
 from impc.inverse.problem import Problem, recorded_size
 from impc.model.bounds import Bounds
 from impc.model.recordings import Recording
 from impc.model.structure import Structure
+from impc.nonlinear.fit import fit_optimal_control
 from plants import seated_balance_for, ternary_torque
 
 if TYPE_CHECKING:

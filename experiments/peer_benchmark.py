@@ -20,17 +20,17 @@ import numpy as np
 from tqdm import tqdm
 
 from experiments.peer_systems import SYSTEMS
-from impc.control.nlp_solvers import SOLVERS
 from impc.errors import ImpcError
-from impc.inverse.optimal_control_fit import fit_optimal_control
+from impc.nonlinear.fit import fit_optimal_control
+from impc.nonlinear.plan import SOLVERS
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from experiments.peer_systems import PeerSystem
     from impc.arrays import Array
-    from impc.control.optimal_recordings import OptimalRecording
-    from impc.inverse.told_combinations import Combination, Combinations
+    from impc.nonlinear.combinations import Combination, Combinations
+    from impc.nonlinear.recordings import OptimalRecording
 
 __all__ = ["LOOPS", "Outcome", "coverage", "demonstration", "fit_from", "told_error"]
 

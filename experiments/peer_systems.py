@@ -13,7 +13,7 @@ import casadi as ca
 import numpy as np
 
 from impc.arrays import Array
-from impc.control.optimal_control import OptimalControlProblem
+from impc.nonlinear.problem import OptimalControlProblem
 from plants.rigid_bodies import cart_pole, quadrotor, robot_arm, rocket, rotation
 
 __all__ = ["SYSTEMS", "PeerSystem"]

@@ -14,8 +14,8 @@ import numpy as np
 
 from impc.arrays import Array
 from impc.cli.seat import HORIZON
-from impc.control.optimal_control import OptimalControlProblem
 from impc.model.plant import Plant
+from impc.nonlinear.problem import OptimalControlProblem
 from plants import seated_balance_for
 
 __all__ = ["DIRECTION", "TRUTH", "seat_problem"]

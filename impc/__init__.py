@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from impc.control.constraint_rows import directions as directions
     from impc.control.controller import Controller as Controller
     from impc.control.loop_function import closed_loop_function as closed_loop_function
-    from impc.control.optimal_control import OptimalControlProblem as OptimalControlProblem
     from impc.control.simulation import Scenario as Scenario
     from impc.control.simulation import Simulation as Simulation
     from impc.control.simulation import Status as Status
@@ -52,7 +51,6 @@ if TYPE_CHECKING:
     from impc.inverse.inverse_lqr import inverse_lqr_lmi as inverse_lqr_lmi
     from impc.inverse.likelihood_fit import fit_person as fit_person
     from impc.inverse.methods import estimate as estimate
-    from impc.inverse.optimal_control_fit import fit_optimal_control as fit_optimal_control
     from impc.inverse.problem import Problem as Problem
     from impc.inverse.solution_set import gain_fibre as gain_fibre
     from impc.model.bounds import Bounds as Bounds
@@ -66,6 +64,8 @@ if TYPE_CHECKING:
     from impc.model.structure import Structure as Structure
     from impc.model.weights import Weights as Weights
     from impc.model.weights import weight_error as weight_error
+    from impc.nonlinear.fit import fit_optimal_control as fit_optimal_control
+    from impc.nonlinear.problem import OptimalControlProblem as OptimalControlProblem
     from impc.studies.estimate_page import report as report
     from impc.studies.fit.settings import FitSettings as FitSettings
     from impc.studies.fit.subject import fit_problem as fit_problem
@@ -81,7 +81,6 @@ _NAMES = {
     "control.closed_loop": "simulate_and_differentiate",
     "control.constraint_rows": "directions",
     "control.controller": "Controller",
-    "control.optimal_control": "OptimalControlProblem",
     "control.loop_function": "closed_loop_function",
     "control.simulation": "Scenario Simulation Status require_complete scenario",
     "control.terminal_set": "TerminalSet maximal_invariant_set",
@@ -98,7 +97,6 @@ _NAMES = {
     "inverse.likelihood_fit": "fit_person",
     "inverse.inverse_lqr": "inverse_lqr_gradient inverse_lqr_lmi",
     "inverse.methods": "estimate",
-    "inverse.optimal_control_fit": "fit_optimal_control",
     "inverse.problem": "Problem",
     "inverse.solution_set": "gain_fibre",
     "model.bounds": "Bounds",
@@ -109,6 +107,8 @@ _NAMES = {
     "model.riccati": "gain_gradients solve_lqr",
     "model.structure": "Structure",
     "model.weights": "Weights weight_error",
+    "nonlinear.fit": "fit_optimal_control",
+    "nonlinear.problem": "OptimalControlProblem",
     "studies.estimate_page": "report",
     "studies.fit.settings": "FitSettings",
     "studies.fit.subject": "fit_problem fit_recordings",
@@ -125,7 +125,17 @@ if not TYPE_CHECKING:  # a type checker that sees it takes any name for one of o
         if name == "__version__":
             found = import_module("importlib.metadata").version("impc")
         elif name in _MODULES:
-            found = getattr(import_module(f"impc.{_MODULES[name]}"), name)
+            try:
+                found = getattr(import_module(f"impc.{_MODULES[name]}"), name)
+            except ModuleNotFoundError as missing:
+                if not (missing.name or "").startswith("impc."):
+                    raise
+                error = import_module("impc.errors").ImpcError  # an optional subpackage
+                raise error(
+                    f"impc.{name}",
+                    f"needs {missing.name}, which is not there",
+                    "install all of impc",
+                ) from None
         else:
             raise AttributeError(f"module 'impc' has no attribute {name!r}")
         globals()[name] = found

@@ -329,14 +329,10 @@ def _instance(module: str, kind: str) -> Kind:
     return check
 
 
-def _either(module: str, kind: str, other: Kind) -> Kind:
-    """A value of the package, or else what the `other` kind says."""
-
-    def check(name: str, value: Any) -> Any:
-        known = getattr(sys.modules.get(module), kind, None)
-        return value if known is not None and isinstance(value, known) else other(name, value)
-
-    return check
+def _estimate(name: str, value: Any) -> Any:
+    """An estimate, also one of an optional subpackage, which makes its page itself."""
+    known = _instance("impc.inverse.estimates", "Estimate")
+    return value if hasattr(value, "page") else known(name, value)
 
 
 def _path(name: str, value: Any) -> Any:
@@ -444,25 +440,13 @@ _VALUES = {
     "MpcSolver": ("impc.control.casadi_controller", "make it with build_mpc"),
     "FitSettings": ("impc.studies.fit.settings", "make it with FitSettings"),
     "FitProgress": ("impc.studies.fit.subject", "make it with FitProgress, or leave it out"),
-    "OptimalControlProblem": (
-        "impc.control.optimal_control",
-        "make it with OptimalControlProblem(states, inputs, ...)",
-    ),
-    "OptimalRecording": (
-        "impc.control.optimal_recordings",
-        "make it with problem.recorded_plan or recorded_loop",
-    ),
     "Estimate": ("impc.inverse.estimates", "make it with estimate(problem)"),
     "Rows": ("impc.control.constraint_rows", "make it with build_rows"),
 }
 _MADE_BY = {kind: remedy for kind, (_, remedy) in _VALUES.items()}
 _KINDS: dict[str, Kind] = {
     **{kind: _instance(module, kind) for kind, (module, _) in _VALUES.items()},
-    "Estimate | OptimalControlEstimate": _either(
-        "impc.inverse.optimal_control_fit",
-        "OptimalControlEstimate",
-        _instance("impc.inverse.estimates", "Estimate"),
-    ),
+    "Estimate | OwnPage": _estimate,
     "ArrayLike": as_numbers,
     "ArrayLike | Mapping[str, float]": _numbers_or_names,
     "Array": _array,
@@ -491,11 +475,15 @@ _KINDS: dict[str, Kind] = {
     "Mapping[str, float]": _mapping,
     "System": _system,
     "tuple[Array, Array]": _pair,
-    "Sequence[OptimalRecording]": _several(
-        _instance("impc.control.optimal_recordings", "OptimalRecording"), "recordings"
-    ),
     "Mapping[int, IntArray]": _mapping,
 }
+
+
+def register(module: str, kind: str, remedy: str) -> None:
+    """Add a value of an optional subpackage to the table, by itself and in a sequence."""
+    _MADE_BY[kind] = remedy
+    _KINDS[kind] = _instance(module, kind)
+    _KINDS[f"Sequence[{kind}]"] = _several(_KINDS[kind], "recordings")
 
 
 def _kind(annotation: str) -> Kind:

@@ -30,8 +30,8 @@ from impc.errors import InfeasibleError
 from impc.files.formats import write_table
 from impc.files.table import make_table
 from impc.model.weights import Weights
-from tests.control.test_optimal_control import TRUTH, made
 from tests.experiments.test_nonlinear_mpc import linear_step
+from tests.nonlinear.test_problem import TRUTH, made
 from tests.studies.cohort.carts import cart_plant, subject_trial
 
 if TYPE_CHECKING:

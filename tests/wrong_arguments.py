@@ -24,14 +24,13 @@ from impc.control import (
     closed_loop,
     constraint_rows,
     controller,
-    optimal_control,
     simulation,
     terminal_set,
 )
 from impc.files import configuration, formats, reading, table, units
 from impc.files import plant_sources as plant_source
 from impc.inverse import direct_and_reduced as inverse_mpc
-from impc.inverse import equivalent_weights, inverse_lqr, optimal_control_fit, residuals
+from impc.inverse import equivalent_weights, inverse_lqr, residuals
 from impc.inverse import gain_search as gain
 from impc.inverse import noisy_fit as fitted_controller
 from impc.inverse import problem as inverse_problem
@@ -39,6 +38,8 @@ from impc.inverse import solution_set as gain_fibre
 from impc.model import bounds, observer, plant, plant_family, structure, weights
 from impc.model import recordings as recording
 from impc.model import riccati as lqr
+from impc.nonlinear import fit as nonlinear_fit
+from impc.nonlinear import problem as nonlinear_problem
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -83,7 +84,7 @@ def values() -> dict[str, Any]:
         "set": bounded_weights.weights_set(fibre),
         "mpc": mpc.build_mpc(law),
         "structured": replace(problem, structure=structure.Structure(two, "diagonal")),
-        "point": optimal_control.OptimalControlProblem(
+        "point": nonlinear_problem.OptimalControlProblem(
             x, u, {"price": w}, x + u, w * x**2 + u**2, 2
         ),
         "terminal": law.terminal,
@@ -343,7 +344,7 @@ def calls() -> list[Call]:
         ),
         (v["point"].plan, {"theta": {"price": 1.0}, "x0": [1.0], "solver": "ipopt", "mu": 1e-9}),
         (
-            optimal_control_fit.fit_optimal_control,
+            nonlinear_fit.fit_optimal_control,
             {
                 "problem": v["point"],
                 "recordings": [v["point"].recorded_plan(np.ones((3, 1)), np.ones((2, 1)))],

@@ -36,8 +36,8 @@ def command(
     """
     # Imported here: the libraries take seconds to load, and --help needs none.
     from impc.cli.consent import require_consent  # noqa: PLC0415
-    from impc.cli.optimal_subject import fit_optimal  # noqa: PLC0415
     from impc.cli.subject import read_subject  # noqa: PLC0415
+    from impc.extras import installed  # noqa: PLC0415
     from impc.reporting.shown_units import angles_in  # noqa: PLC0415
     from impc.reporting.writer import require_writable, write_files  # noqa: PLC0415
     from impc.studies.effort import fit_effort  # noqa: PLC0415
@@ -52,7 +52,7 @@ def command(
     from impc.studies.fit.verdict import missing  # noqa: PLC0415
 
     require_writable(out)
-    if fit_optimal(files, plant_name, config, out, solver):
+    if installed("impc.nonlinear") and _own_problem(files, plant_name, config, out, solver):
         return
     subject = read_subject("fit", files, plant_name, config, solver)
     problem, settings = subject.problem, subject.settings
@@ -75,6 +75,44 @@ def command(
     if truth is not None:
         click.echo(truth_sentence(result, truth))
     print_files(out, written)
+
+
+def _own_problem(
+    files: tuple[Path, ...], plant_name: str, config: Path, out: Path, solver: str | None
+) -> bool:
+    """Fit, write and print, if the plant is an optimal control problem; else do nothing."""
+    from impc.cli.plant import find_plant  # noqa: PLC0415
+    from impc.files.configuration import read_configuration  # noqa: PLC0415
+    from impc.files.inputs import gather_inputs  # noqa: PLC0415
+    from impc.files.plant_sources import made_by  # noqa: PLC0415
+    from impc.nonlinear.files import fit_files  # noqa: PLC0415
+    from impc.nonlinear.page import abstract, optimal_report, verdict  # noqa: PLC0415
+    from impc.nonlinear.problem import OptimalControlProblem  # noqa: PLC0415
+    from impc.reporting.provenance import Provenance  # noqa: PLC0415
+    from impc.reporting.shown_units import angles_in  # noqa: PLC0415
+    from impc.reporting.writer import write_files  # noqa: PLC0415
+
+    configuration = read_configuration(config)
+    source = find_plant(plant_name, configuration.plant)
+    problem = made_by(source) if ":" in source.name else None  # a file holds matrices
+    if not isinstance(problem, OptimalControlProblem):
+        return False
+    with progress(2, "stage") as done:
+        fit = fit_files(problem, files, configuration, solver)
+        done("search")
+        names = tuple(path.name for path in files)
+        line = f"impc fit {' '.join(names)} --plant {plant_name} --config {config.name}"
+        line += "" if solver is None else f" --solver {solver}"
+        inputs = gather_inputs(files, config, source.name, source.arguments)
+        provenance = Provenance(source.name, line, dict(source.arguments), names, inputs)
+        with angles_in(configuration.report.angles):
+            content = optimal_report(fit, provenance).files()
+        done("page")
+    written = write_files(out, content)
+    for sentence in (verdict(fit), *abstract(fit)):
+        click.echo(sentence)
+    print_files(out, written)
+    return True
 
 
 def _print(result: FitResult) -> None:

@@ -21,7 +21,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from impc.checking import checked
-from impc.control.optimal_control import OptimalControlProblem
 from impc.errors import ImpcError, InputError, PlantError, one_line
 from impc.files.configuration import FILL_IN
 from impc.files.saved_plant import SAVED, read_matrices, state_space
@@ -141,8 +140,8 @@ def make_plant(source: PlantSource, recorded: Sequence[str], **changed: Any) -> 
     Names that are no inputs are ignored; what is `changed` replaces arguments of the source.
     """
     name, system = f"plant {source.name}", made_by(source, **changed)
-    if isinstance(system, OptimalControlProblem):
-        raise PlantError(name, "is an optimal control problem", "impc fit takes one, this does not")
+    if hasattr(system, "no_plant"):  # an optimal control problem
+        raise PlantError(name, *system.no_plant)
     inputs = tuple(getattr(system, "input_labels", ()))
     controls = [item for item in inputs if item not in recorded]
     if inputs and not controls:

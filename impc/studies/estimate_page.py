@@ -7,7 +7,7 @@ the answer of one method, whatever the method, beside its recordings.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import pandas as pd
@@ -19,7 +19,6 @@ from impc.control.named_solver import described
 from impc.errors import InputError
 from impc.inverse.estimates import Estimate
 from impc.inverse.methods import METHODS
-from impc.inverse.optimal_control_fit import OptimalControlEstimate
 from impc.model.signal_units import gain_unit
 from impc.reporting.document import Block, Lines, Report, Section, Verdict
 from impc.reporting.finding import Chart, Finding, Picture
@@ -29,20 +28,27 @@ from impc.reporting.style import drawn, journal_style
 from impc.reporting.writer import owned, write_files
 from impc.studies.charts import chart_figure, methods_chart
 from impc.studies.methods_table import column_terms, methods_data, methods_finding, weight_entries
-from impc.studies.optimal_fit.report import optimal_report
-from impc.studies.optimal_fit.result import OptimalFit
 from impc.studies.signal_words import body_sentence, signal_words
 
 if TYPE_CHECKING:
     from impc.assess.assessments import MethodFit
 
 _CALLER = "of the program that called impc.report"
+
+
+class OwnPage(Protocol):
+    """An estimate with a page of its own, such as that of an optimal control problem."""
+
+    def page(self, provenance: Provenance) -> Report:
+        """The page, its tables and its figures."""
+
+
 # Trials that are drawn, the first ones.
 _DRAWN = 6
 
 
 @checked
-def report(estimate: Estimate | OptimalControlEstimate, folder: str | Path) -> tuple[Path, ...]:
+def report(estimate: Estimate | OwnPage, folder: str | Path) -> tuple[Path, ...]:
     """Write the page of an estimate, its figures, tables and result.json into a folder.
 
     Parameters
@@ -79,20 +85,14 @@ def report(estimate: Estimate | OptimalControlEstimate, folder: str | Path) -> t
     ['report.html', 'result.json']
     """
     place = Path(folder)
-    if isinstance(estimate, OptimalControlEstimate):
+    if not isinstance(estimate, Estimate):
         with owned(place, "report"):
-            return write_files(place, _of_a_problem(estimate).files())
+            return write_files(place, estimate.page(Provenance(_CALLER)).files())
     if estimate.K is None:
         raise InputError("estimate", f"has no gain: {estimate.reason}", "try another method")
     fit = judge(estimate, estimate.problem.bounds)
     with owned(place, "report"):
         return write_files(place, _document(fit).files())
-
-
-def _of_a_problem(estimate: OptimalControlEstimate) -> Report:
-    names = tuple(f"recording {index + 1}" for index in range(len(estimate.recordings)))
-    fit = OptimalFit(estimate, names, ((),) * len(names), estimate.problem.dt)
-    return optimal_report(fit, Provenance(_CALLER))
 
 
 def _document(fit: MethodFit) -> Report:

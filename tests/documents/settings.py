@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from impc.files.configuration import read_configuration
+from impc.nonlinear.files import optimal_fit_settings
 from impc.studies.cohort.study import StudyTable
 from impc.studies.fit.settings import fit_settings
-from impc.studies.optimal_fit.settings import optimal_fit_settings
 from impc.studies.selection.settings import select_settings
 
 if TYPE_CHECKING:

@@ -32,15 +32,12 @@ from impc.cli.plant import find_plant
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
 from impc.control.named_solver import require_solver
-from impc.control.nlp_solvers import require_solver as require_nlp_solver
-from impc.control.optimal_control import OptimalControlProblem
 from impc.control.simulation import require_complete, scenario
 from impc.errors import ImpcError
 from impc.files import apart
 from impc.files.alignment import misaligned
 from impc.files.configuration import read_configuration
 from impc.files.formats import encode_table, read_table
-from impc.files.optimal_reading import OptimalTrial, read_optimal_trials
 from impc.files.plant_sources import PlantSource, make_plant, plant_source
 from impc.files.reading import read_recordings, recording_of
 from impc.files.results import read_result
@@ -59,6 +56,15 @@ from impc.model.recordings import Label, Recording
 from impc.model.riccati import solve_lqr
 from impc.model.structure import Structure
 from impc.model.weights import Weights
+from impc.nonlinear.files import (
+    OptimalTrial,
+    optimal_fit_settings,
+    posed,
+    read_optimal_trials,
+    recorded,
+)
+from impc.nonlinear.plan import require_solver as require_nlp_solver
+from impc.nonlinear.problem import OptimalControlProblem
 from impc.reporting.writer import owned, require_writable, write_files
 from impc.studies.cohort import cluster
 from impc.studies.cohort.sheet import Sheet, column_values, read_sheet
@@ -68,7 +74,6 @@ from impc.studies.effort import Effort
 from impc.studies.fit.asked import fit_structures
 from impc.studies.fit.settings import FitSettings, fit_settings, require_used
 from impc.studies.fit.subject import fit_problem
-from impc.studies.optimal_fit.settings import optimal_fit_settings, posed, recorded
 from impc.studies.selection.subsets import largest_subsets
 from plants import seated_balance_plant
 from tests.documents.blocks import PAGES

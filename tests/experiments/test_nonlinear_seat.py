@@ -9,9 +9,9 @@ import pytest
 from experiments.nonlinear_seat import first_torques, fitted_person
 from impc.cli.seat import HORIZON, seat_controller, seat_weights
 from impc.control.closed_loop import simulate
-from impc.control.optimal_control import OptimalControlProblem
 from impc.control.simulation import scenario
 from impc.model.riccati import solve_lqr
+from impc.nonlinear.problem import OptimalControlProblem
 from plants import seated_balance_for, ternary_torque
 
 pytestmark = pytest.mark.full

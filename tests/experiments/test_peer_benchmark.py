@@ -52,11 +52,7 @@ def test_a_closed_loop_gives_back_what_it_tells(name: str) -> None:
     x0, changes = LOOPS[name]
     truth = system.truth | changes
     loop = system.problem.closed_loop(truth, x0, 60, mu=1e-12)
-    met = {
-        system.problem.rows[row].split("[")[0]
-        for plan in loop.plans
-        for row in np.nonzero(plan.point.lam > plan.point.s)[1]
-    }
+    met = {row.split("[")[0] for plan in loop.plans for row, _ in plan.active}
     assert len(met) == 2
     found = fit_from(system, system.problem.recorded_loop(loop.x, loop.u), truth, 0.1, 0)
     assert found.error < 1e-5

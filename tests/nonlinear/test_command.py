@@ -19,15 +19,15 @@ from click.testing import CliRunner, Result
 import impc
 from impc.cli.main import main
 from impc.files.results import read_result
+from impc.nonlinear import page as figures
 from impc.reporting import style
 from impc.reporting.style import journal_style
-from impc.studies.optimal_fit import figures
 from tests.labelled_axes import require_labels
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from impc.control.optimal_control import OptimalControlProblem
+    from impc.nonlinear.problem import OptimalControlProblem
 
 pytestmark = pytest.mark.full
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import scipy.integrate
 
-from impc.control.optimal_control import OptimalControlProblem
 from impc.errors import InputError
+from impc.nonlinear.problem import OptimalControlProblem
 
 TRUTH = {"drag": 0.3, "price": 5.0}
 

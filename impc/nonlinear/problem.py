@@ -10,16 +10,18 @@ docs/nonlinear.md has the derivation and an example.
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from numbers import Real
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import casadi as ca
 import numpy as np
 
 from impc.arrays import Array, BoolArray, Frozen, finite_array
 from impc.checking import checked
-from impc.control.expressions import (
+from impc.errors import InputError
+from impc.nonlinear.expressions import (
     function_of,
     names_of,
     require_influence,
@@ -28,16 +30,15 @@ from impc.control.expressions import (
     symbols_of,
     with_values,
 )
-from impc.control.optimal_recordings import optimal_recording
-from impc.control.system_equations import is_system, system_equations
-from impc.errors import InputError
+from impc.nonlinear.recordings import optimal_recording
+from impc.nonlinear.systems import is_system, system_equations
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
-    from impc.control.optimal_recordings import OptimalRecording
-    from impc.control.plan import Plan
-    from impc.control.receding_horizon import ClosedLoop
+    from impc.nonlinear.closed_loop import ClosedLoop
+    from impc.nonlinear.plan import Plan
+    from impc.nonlinear.recordings import OptimalRecording
 
 _LONGEST = 10_000  # stages: the program has as many as it has unknowns times states
 
@@ -54,7 +55,7 @@ class OptimalControlProblem(Frozen):
         Name of each unknown -> its scalar symbol in the expressions.
     next_state : casadi expression or control.NonlinearIOSystem
         f(x, u, d; theta) (n); of a system its own equations, with the symbols in the place of its
-        parameters of those names (`impc.control.system_equations`).
+        parameters of those names (`impc.nonlinear.systems`).
     stage_cost : casadi expression
         l(x, u; theta), a number; as a rule prices times features, one price a known number.
     horizon : int
@@ -123,6 +124,9 @@ class OptimalControlProblem(Frozen):
     >>> plan.x.shape, bool(plan.u.min() > -1.0 - 1e-9)
     ((21, 2), True)
     """
+
+    #: Why commands for linear plants refuse it.
+    no_plant: ClassVar = ("is an optimal control problem", "impc fit takes one, this does not")
 
     horizon: int
     state_names: tuple[str, ...]
@@ -214,6 +218,11 @@ class OptimalControlProblem(Frozen):
         """Number of disturbances."""
         return len(self.disturbance_names)
 
+    def slopes(self, x: Array, u: Array, d: Array, theta: Array) -> tuple[Array, Array, Array]:
+        """f (n,), and its derivatives by (x, u) (n, n + m) and theta (n, p), at one sample."""
+        following, f_w, f_theta = _slopes(self)(x, u, d, theta)
+        return following.full().ravel(), f_w.full(), f_theta.full()
+
     def with_horizon(self, horizon: int) -> OptimalControlProblem:
         """The same problem over another `horizon` in samples.
 
@@ -278,21 +287,11 @@ class OptimalControlProblem(Frozen):
             raise InputError(f"parameter {name}", f"got {number:g}", f"give {wanted}")
         return number
 
-    def start(self, x0: Any) -> Array:
-        """The initial state `x0` as an array (n,), checked.
-
-        Raises
-        ------
-        DataError
-            As `impc.arrays.finite_array`: another size, or entries that are not finite.
-        """
-        return finite_array("x0", x0, (self.n,))
-
     @checked
     def plan(
         self, theta: Mapping[str, float], x0: Any, *, solver: str = "ipopt", mu: float = 1e-10
     ) -> Plan:
-        """The optimal plan from a state, as `impc.control.plan.solve_plan`.
+        """The optimal plan from a state, as `impc.nonlinear.plan.solve_plan`.
 
         Parameters
         ----------
@@ -301,18 +300,20 @@ class OptimalControlProblem(Frozen):
         x0 : array_like
             (n,).
         solver : str
-            One of `impc.control.nlp_solvers.SOLVERS`.
+            One of `impc.nonlinear.plan.SOLVERS`.
         mu : float
             Of the relaxed conditions lam g = -mu.
 
         Raises
         ------
         InfeasibleError, SolverError
-            As `impc.control.plan.solve_plan`.
+            As `impc.nonlinear.plan.solve_plan`.
         """
-        from impc.control.plan import solve_plan  # noqa: PLC0415 - it stands on this module
+        from impc.nonlinear.plan import solve_plan  # noqa: PLC0415 - it stands on this module
 
-        return solve_plan(self, self.values(theta), self.start(x0), solver=solver, mu=mu)
+        return solve_plan(
+            self, self.values(theta), finite_array("x0", x0, (self.n,)), solver=solver, mu=mu
+        )
 
     @checked
     def closed_loop(
@@ -341,16 +342,16 @@ class OptimalControlProblem(Frozen):
         InputError, DataError
             When `steps` or `d` are not such.
         InfeasibleError, SolverError
-            As `impc.control.receding_horizon.simulate_receding`.
+            As `impc.nonlinear.closed_loop.simulate_receding`.
         """
-        from impc.control.receding_horizon import simulate_receding  # noqa: PLC0415 - see plan
+        from impc.nonlinear.closed_loop import simulate_receding  # noqa: PLC0415 - see plan
 
         if isinstance(steps, bool) or not isinstance(steps, int | np.integer) or steps < 1:
             raise InputError("steps", f"got {steps!r:.40}", "give a whole number of samples")
         shape = (int(steps), self.disturbance_count)
         known = finite_array("d", np.zeros(shape) if d is None else d, shape)
         return simulate_receding(
-            self, self.values(theta), self.start(x0), known, solver=solver, mu=mu
+            self, self.values(theta), finite_array("x0", x0, (self.n,)), known, solver=solver, mu=mu
         )
 
     def recorded_plan(
@@ -362,7 +363,7 @@ class OptimalControlProblem(Frozen):
         x0: Any = None,
         unknown_start: bool | None = None,
     ) -> OptimalRecording:
-        """A recording that is one plan: `impc.control.optimal_recordings.optimal_recording`.
+        """A recording that is one plan: `impc.nonlinear.recordings.optimal_recording`.
 
         x (N + 1, n), u (N, m), d (N, d), x0 (n,); NaN is not measured. With
         `unknown_start` x0 is searched from what is given: by default where it is the first of x.
@@ -380,7 +381,7 @@ class OptimalControlProblem(Frozen):
         x0: Any = None,
         unknown_start: bool | None = None,
     ) -> OptimalRecording:
-        """A recording of the closed loop: `impc.control.optimal_recordings.optimal_recording`.
+        """A recording of the closed loop: `impc.nonlinear.recordings.optimal_recording`.
 
         x (steps + 1, n), u (steps, m), d (steps, d), x0 (n,); NaN is not measured. With
         `unknown_start` x0 is searched from what is given: by default where it is the first of x.
@@ -388,6 +389,16 @@ class OptimalControlProblem(Frozen):
         return optimal_recording(
             self, x, u, closed_loop=True, d=d, x0=x0, unknown_start=unknown_start
         )
+
+
+@functools.lru_cache(maxsize=16)
+def _slopes(problem: OptimalControlProblem) -> Any:
+    f = problem.functions[0]
+    kind: Any = ca.SX if f.is_a("SXFunction") else ca.MX
+    given = [kind.sym(letter, f.numel_in(index)) for index, letter in enumerate("xudt")]
+    following = f(*given)
+    by_x, by_u, _, by_theta = (ca.jacobian(following, item) for item in given)
+    return ca.Function("slopes", given, [following, ca.horzcat(by_x, by_u), by_theta])
 
 
 def _require_horizon(horizon: Any) -> None:

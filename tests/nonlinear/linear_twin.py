@@ -6,8 +6,8 @@ import casadi as ca
 import numpy as np
 
 from impc.control.controller import Controller
-from impc.control.optimal_control import OptimalControlProblem
 from impc.model.weights import Weights
+from impc.nonlinear.problem import OptimalControlProblem
 
 __all__ = ["linear_twin"]
 

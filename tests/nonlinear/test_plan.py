@@ -10,19 +10,13 @@ import pytest
 from experiments.peer_systems import SYSTEMS, PeerSystem
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
-from impc.control.nlp_solvers import SOLVERS
-from impc.control.optimal_control import OptimalControlProblem
-from impc.control.plan import Plan, nearby_plan
-from impc.control.plan_derivatives import (
-    dependent_rows,
-    differentiate_plan,
-    weakly_active_rows,
-)
 from impc.control.simulation import Status, scenario
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.weights import Weights
-from tests.control.linear_twin import linear_twin
+from impc.nonlinear.plan import SOLVERS, Plan, nearby_plan
+from impc.nonlinear.problem import OptimalControlProblem
+from tests.nonlinear.linear_twin import linear_twin
 from tests.support import extrapolated_slope, random_plant, random_weights
 
 
@@ -66,19 +60,17 @@ def test_the_demonstrations_have_the_active_constraints_of_the_peer(
     system: PeerSystem, plan: Plan
 ) -> None:
     counts: dict[str, int] = {}
-    for row in np.nonzero(plan.point.lam > plan.point.s)[1]:
-        name = system.problem.rows[row].split("[")[0]
+    for row, _ in plan.active:
+        name = row.split("[")[0]
         counts[name] = counts.get(name, 0) + 1
     assert counts == ACTIVE[system.name]
-    assert weakly_active_rows(plan) == ()
-    assert dependent_rows(plan) == ()
+    assert plan.weakly_active == ()
 
 
 def test_derivatives_are_those_of_differences_with_active_constraints(
     system: PeerSystem, plan: Plan
 ) -> None:
     """Along random directions of the logarithms and the initial state, all parameters at once."""
-    found = differentiate_plan(plan)
     rng = np.random.default_rng(3)
     for _ in range(3):
         direction = rng.normal(size=len(plan.theta) + system.problem.n)
@@ -87,13 +79,13 @@ def test_derivatives_are_those_of_differences_with_active_constraints(
 
         def moved(t: float, change: np.ndarray = change, p: int = p) -> np.ndarray:
             there = nearby_plan(
-                plan, plan.theta + t * change[:p], system.x0 + t * change[p:], 1e-10, (), ""
+                plan, plan.theta + t * change[:p], system.x0 + t * change[p:], 1e-10
             )
             assert there is not None
             return np.hstack([there.x[1:], there.u])
 
         expected = extrapolated_slope(moved, 1e-4)
-        slope = np.concatenate([found.x[1:], found.u], axis=1) @ change
+        slope = np.concatenate([plan.dx[1:], plan.du], axis=1) @ change
         # Measured: 1e-8 to 2e-7 of the largest, by rounding in the differences.
         np.testing.assert_allclose(slope, expected, atol=1e-6 * np.max(np.abs(expected)))
 
@@ -103,7 +95,7 @@ def test_solvers_agree_on_the_robot_arm() -> None:
     plans = [arm.problem.plan(arm.truth, arm.x0, solver=name) for name in SOLVERS]
     for other in plans[1:]:
         np.testing.assert_allclose(other.u, plans[0].u, atol=1e-10)
-        np.testing.assert_allclose(other.point.lam, plans[0].point.lam, atol=1e-8)
+        np.testing.assert_allclose(other.y, plans[0].y, atol=1e-8)
 
 
 def one_step(constraints: dict[str, ca.SX], u: ca.SX, p: ca.SX) -> OptimalControlProblem:
@@ -120,21 +112,21 @@ def test_a_weakly_active_row_is_named_and_has_a_slope_between_its_sides() -> Non
     u, p = ca.SX.sym("u"), ca.SX.sym("p")
     problem = one_step({"cap": u - 1}, u, p)
     plan = problem.plan({"p": 1.0}, [0.0])
-    assert weakly_active_rows(plan) == (("cap", 0),)
-    assert differentiate_plan(plan).u[0, 0, 0] == pytest.approx(0.5, abs=1e-4)
+    assert plan.weakly_active == (("cap", 0),)
+    assert plan.du[0, 0, 0] == pytest.approx(0.5, abs=1e-4)
     for value, slope in ((0.9, 1.0), (1.1, 0.0)):
         side = problem.plan({"p": value}, [0.0])
-        assert weakly_active_rows(side) == ()
-        assert differentiate_plan(side).u[0, 0, 0] == pytest.approx(slope, abs=1e-7)
+        assert side.weakly_active == ()
+        assert side.du[0, 0, 0] == pytest.approx(slope, abs=1e-7)
 
 
-def test_dependent_rows_are_named() -> None:
+def test_dependent_rows_do_no_harm() -> None:
     """A cap that is written twice: the plan is told, each multiplier is not."""
     u, p = ca.SX.sym("u"), ca.SX.sym("p")
     plan = one_step({"cap": u - 1, "again": 2 * u - 2}, u, p).plan({"p": 2.0}, [0.0])
     assert plan.u[0, 0] == pytest.approx(1)
-    assert dependent_rows(plan) == (("cap", 0), ("again", 0))
-    assert differentiate_plan(plan).u[0, 0, 0] == pytest.approx(0, abs=1e-7)
+    assert plan.active == (("cap", 0), ("again", 0))
+    assert plan.du[0, 0, 0] == pytest.approx(0, abs=1e-7)
 
 
 def test_a_row_at_the_end_is_kept_and_differentiated() -> None:
@@ -146,7 +138,7 @@ def test_a_row_at_the_end_is_kept_and_differentiated() -> None:
     )  # fmt: skip
     plan = problem.plan({"p": 2.0}, [0.0])
     np.testing.assert_allclose(plan.u[:, 0], 0.4, atol=1e-9)
-    np.testing.assert_allclose(differentiate_plan(plan).u[:, 0, 0], 0.2, atol=1e-8)
+    np.testing.assert_allclose(plan.du[:, 0, 0], 0.2, atol=1e-8)
 
 
 def test_a_solver_writes_nothing(capfd: pytest.CaptureFixture[str]) -> None:

@@ -9,16 +9,16 @@ import pytest
 from experiments.peer_systems import SYSTEMS
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
-from impc.control.optimal_control import OptimalControlProblem
 from impc.control.simulation import Status, scenario
 from impc.errors import DataError, InfeasibleError, InputError
 from impc.inverse.methods import estimate
-from impc.inverse.optimal_control_fit import fit_optimal_control
 from impc.inverse.problem import Problem
 from impc.model.bounds import Bounds
 from impc.model.recordings import Recording
 from impc.model.weights import Weights
-from tests.control.linear_twin import linear_twin
+from impc.nonlinear.fit import fit_optimal_control
+from impc.nonlinear.problem import OptimalControlProblem
+from tests.nonlinear.linear_twin import linear_twin
 from tests.support import random_plant
 
 #: System -> sentences of what is not told; by the mechanics, see docs/nonlinear.md.

@@ -9,9 +9,9 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from impc.control.nlp_solvers import SOLVERS, require_solver
-from impc.control.optimal_control import OptimalControlProblem
 from impc.errors import DataError, ImpcError, InfeasibleError, InputError, SolverError
+from impc.nonlinear.plan import SOLVERS, require_solver
+from impc.nonlinear.problem import OptimalControlProblem
 
 TRUTH = {"mass": 1.5, "price": 10.0, "limit": 1.0}
 

@@ -10,13 +10,12 @@ import pytest
 from experiments.peer_systems import SYSTEMS
 from experiments.seat_problem import DIRECTION, TRUTH, seat_problem
 from impc.arrays import Array
-from impc.control.optimal_control import OptimalControlProblem
-from impc.control.plan import Plan, nearby_plan
-from impc.control.plan_derivatives import differentiate_plan
-from impc.control.receding_horizon import ClosedLoop, closed_loop_from
 from impc.model.plant import Plant
 from impc.model.riccati import solve_lqr
 from impc.model.weights import Weights
+from impc.nonlinear.closed_loop import ClosedLoop, closed_loop_from
+from impc.nonlinear.plan import Plan, nearby_plan
+from impc.nonlinear.problem import OptimalControlProblem
 from plants import seated_balance_for
 from tests.support import extrapolated_slope
 
@@ -73,7 +72,7 @@ def loop(case: Case) -> ClosedLoop:
 
 
 def active(plan: Plan) -> bool:
-    return bool(np.any(plan.point.lam > plan.point.s))
+    return bool(plan.active)
 
 
 def test_a_closed_loop_has_the_derivatives_of_differences(case: Case, loop: ClosedLoop) -> None:
@@ -87,7 +86,7 @@ def test_a_closed_loop_has_the_derivatives_of_differences(case: Case, loop: Clos
     def moved(t: float) -> Array:
         there = closed_loop_from(
             loop.plans[0], case.theta + t * change[:p], case.x0 + t * change[p:], case.d, 1e-10,
-            "", loop,
+            loop,
         )  # fmt: skip
         assert isinstance(there, ClosedLoop)
         return np.hstack([there.x[1:], there.u])
@@ -108,14 +107,11 @@ def test_a_plan_of_the_seat_has_the_derivatives_of_differences() -> None:
     change, p = case.change(5), len(case.theta)
 
     def moved(t: float) -> Array:
-        there = nearby_plan(
-            plan, case.theta + t * change[:p], case.x0 + t * change[p:], 1e-10, (), ""
-        )
+        there = nearby_plan(plan, case.theta + t * change[:p], case.x0 + t * change[p:], 1e-10)
         assert there is not None
         return np.hstack([there.x[1:], there.u])
 
-    found = differentiate_plan(plan)
     expected = extrapolated_slope(moved, 1e-4)
-    slope = np.concatenate([found.x[1:], found.u], axis=1) @ change
+    slope = np.concatenate([plan.dx[1:], plan.du], axis=1) @ change
     for column, exact in zip(slope.T, expected.T, strict=True):
         np.testing.assert_allclose(column, exact, atol=1e-6 * np.max(np.abs(exact)))

@@ -14,7 +14,7 @@ from impc.arrays import Array, Frozen, frozen
 from impc.errors import DataError
 
 if TYPE_CHECKING:
-    from impc.control.optimal_control import OptimalControlProblem
+    from impc.nonlinear.problem import OptimalControlProblem
 
 
 @dataclass(frozen=True, eq=False)

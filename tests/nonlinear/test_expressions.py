@@ -8,7 +8,8 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from impc.control.expressions import (
+from impc.errors import InputError
+from impc.nonlinear.expressions import (
     function_of,
     names_of,
     require_influence,
@@ -17,7 +18,6 @@ from impc.control.expressions import (
     symbols_of,
     with_values,
 )
-from impc.errors import InputError
 
 
 @pytest.mark.parametrize("kind", [ca.SX, ca.MX])

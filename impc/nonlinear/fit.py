@@ -20,18 +20,27 @@ import scipy.stats
 
 from impc.arrays import Array, Frozen, IntArray
 from impc.checking import checked, replace
-from impc.control.nlp_solvers import require_solver
 from impc.errors import DataError, InfeasibleError, InputError, SolverError
-from impc.inverse.optimal_control_residuals import EXPLAINED, begin, first_plan, residuals_of
-from impc.inverse.optimal_control_search import Count, along_mu, guided
-from impc.inverse.told_combinations import Combinations, combinations
+from impc.nonlinear.combinations import Combinations, combinations
+from impc.nonlinear.plan import require_solver
+from impc.nonlinear.search import (
+    EXPLAINED,
+    Count,
+    along_mu,
+    begin,
+    first_plan,
+    guided,
+    residuals_of,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-    from impc.control.optimal_control import OptimalControlProblem
-    from impc.control.optimal_recordings import OptimalRecording
-    from impc.inverse.optimal_control_residuals import Evaluation, Residuals
+    from impc.nonlinear.problem import OptimalControlProblem
+    from impc.nonlinear.recordings import OptimalRecording
+    from impc.nonlinear.search import Evaluation, Residuals
+    from impc.reporting.document import Report
+    from impc.reporting.provenance import Provenance
 
 #: The falling sequence of mu, over the mean cost of a recorded stage where that is below one.
 MU_STEPS = (1e-1, 1e-2, 1e-4, 1e-10)
@@ -65,6 +74,14 @@ class OptimalControlEstimate(Frozen):
     settled: bool  # Whether the search ended by itself
     evaluations: int  # How often all recordings were solved and differentiated
     seconds: float  # Of the search, s
+
+    def page(self, provenance: Provenance) -> Report:
+        """Page, tables and figures, as `impc.report` writes them."""
+        from impc.nonlinear.page import OptimalFit, optimal_report  # noqa: PLC0415 - it shows this
+
+        names = tuple(f"recording {index + 1}" for index in range(len(self.recordings)))
+        fit = OptimalFit(self, names, ((),) * len(names), self.problem.dt)
+        return optimal_report(fit, provenance)
 
     def intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
         """Low and high end of each parameter by its name, at a `level` between 0 and 1.
@@ -108,7 +125,7 @@ def fit_optimal_control(
     start : dict
         First value of each parameter by its name.
     solver : str
-        One of `impc.control.nlp_solvers.SOLVERS`.
+        One of `impc.nonlinear.plan.SOLVERS`.
     mu_steps : sequence of float, optional
         Falling, of the dimension of the cost; by default `MU_STEPS` times the mean cost of a
         recorded stage at the start, at most one, and at least 1e-10.
@@ -313,6 +330,6 @@ def _estimate(
     )
     return OptimalControlEstimate(
         problem, given.recordings, begun, named, loss, found.residual, found.jacobian, signals,
-        given.scales, told, tuple(given.split(found.unknowns)[1]), found.trajectories(), settled,
-        evaluations, seconds,
+        given.scales, told, tuple(given.split(found.unknowns)[1]),
+        tuple((run.x, run.u) for run in found.runs), settled, evaluations, seconds,
     )  # fmt: skip

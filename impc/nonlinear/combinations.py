@@ -20,7 +20,7 @@ from impc.arrays import Array, BoolArray, Frozen, IntArray
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from impc.control.optimal_control import OptimalControlProblem
+    from impc.nonlinear.problem import OptimalControlProblem
 
 # Relative to the largest singular value. On the four systems of docs/nonlinear.md the weakest told
 # direction has 3e-4 and the strongest untold one, of a bound that nothing touches, 5e-11.

@@ -1,1 +1,0 @@
-"""The fit of an optimal control problem of the user's own: settings, result, page."""

@@ -1,0 +1,77 @@
+"""Without its folder the rest works, and asking for it is one line."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from typing import TYPE_CHECKING
+
+import pytest
+
+from docs.rooms import imports, room
+from tests.documents.blocks import ROOT
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+EXAMPLE = """
+import importlib, pkgutil, control, impc
+assert not impc.__file__.startswith(ROOT)
+for one in pkgutil.walk_packages(impc.__path__, "impc."):
+    if one.name != "impc.__main__":
+        importlib.import_module(one.name)
+for name in set(impc.__all__) - {"OptimalControlProblem", "fit_optimal_control"}:
+    getattr(impc, name)
+plant = impc.Plant(control.ss([[0.9]], [[1]], [[1]], 0, 1))
+bounds = impc.Bounds(plant, u_min=-0.3, u_max=0.3)
+truth = impc.Controller(plant, impc.Weights(1, 1), bounds, horizon=3).simulate([1.0], steps=20)
+found = impc.estimate(impc.Problem(plant, bounds, 3, [impc.Recording(plant, truth.x)]))
+impc.report(found, "page")
+print(found.status.value)
+try:
+    impc.OptimalControlProblem
+except impc.ImpcError as error:
+    print(error)
+"""
+
+
+def test_of_the_core_only_the_door_the_commands_and_the_studies_name_it() -> None:
+    named = {
+        name
+        for name, others in imports().items()
+        if room(name) != "nonlinear" and any(room(other) == "nonlinear" for other in others)
+    }
+    assert named <= {"__init__", "cli.fit"}
+
+
+@pytest.mark.full
+def test_the_rest_works_without_the_folder(tmp_path: Path) -> None:
+    def without(folder: str, names: list[str]) -> set[str]:
+        return {"nonlinear", "__pycache__"} & set(names)
+
+    shutil.copytree(ROOT / "impc", tmp_path / "impc", ignore=without)
+    (tmp_path / "own.py").write_text(
+        "import impc\ndef own():\n    return impc.OptimalControlProblem\n"
+    )
+    (tmp_path / "own.toml").write_text('[recording]\ntime = "t"\n[signals.x]\ncolumn = "x"\n')
+    (tmp_path / "own.csv").write_text("t,x\n0,1\n1,2\n")
+    environment = os.environ | {"PYTHONPATH": str(tmp_path)}
+
+    def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [sys.executable, *arguments], cwd=tmp_path, env=environment, capture_output=True,
+            text=True, check=False,
+        )  # fmt: skip
+
+    done = run("-c", f"ROOT = {str(ROOT)!r}\n{EXAMPLE}")
+    assert done.returncode == 0, done.stderr
+    line = "impc.OptimalControlProblem: needs impc.nonlinear, which is not there; install all"
+    status, told = done.stdout.strip().splitlines()
+    assert status in {"explained", "settled"}
+    assert line in told
+    typed = run("-m", "impc", "fit", "own.csv", "--plant", "own:own", "--config", "own.toml")
+    assert typed.returncode == 2
+    (said,) = typed.stderr.strip().splitlines()
+    assert line in said
