@@ -70,6 +70,7 @@ from impc.studies.fit.settings import FitSettings, fit_settings, require_used
 from impc.studies.fit.subject import fit_problem
 from impc.studies.optimal_fit.settings import optimal_fit_settings, posed, recorded
 from impc.studies.pool import Task
+from impc.studies.scheduler import Cluster, connected
 from impc.studies.selection.subsets import largest_subsets
 from plants import seated_balance_plant
 from tests.documents.blocks import PAGES
@@ -343,7 +344,7 @@ def sheet_of(folder: Path, text: str) -> Sheet:
 
 
 def connect(address: str) -> None:
-    with scheduler.connected(scheduler.Cluster(address)):
+    with connected(Cluster(address)):
         pass
 
 
@@ -355,7 +356,7 @@ def lost_scheduler(_: Path) -> None:
     make: Any = distributed.LocalCluster
     with make(
         n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None, silence_logs=60
-    ) as found, scheduler.connected(scheduler.Cluster(found.scheduler_address)) as pool:  # fmt: skip
+    ) as found, connected(Cluster(found.scheduler_address)) as pool:  # fmt: skip
         pool.submit(1, [Task("long", "", time.sleep, (0.5,))])
         found.close()
         pool.take()
