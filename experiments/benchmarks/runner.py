@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 __all__ = ["empty", "runner_rows"]
 
-_TASKS, _SUBJECTS = 600, 3
+_TASKS, _SUBJECTS = 300, 3
 _LIMIT = 0.5  # ms
 
 

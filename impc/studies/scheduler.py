@@ -59,7 +59,7 @@ def _client(cluster: Cluster, address: str) -> Iterator[Client]:
 
     security = _security(cluster, address)
     patience = {"distributed.comm.timeouts.connect": _PATIENCE}
-    with dask.config.set(patience), _silent("distributed"):
+    with dask.config.set(patience), _silent():
         try:
             client = distributed.Client(address, timeout=_PATIENCE, security=security)
         except (OSError, ValueError, TypeError, TimeoutError) as error:
@@ -73,17 +73,13 @@ def _client(cluster: Cluster, address: str) -> Iterator[Client]:
 
 
 @contextmanager
-def _silent(package: str) -> Iterator[None]:
-    """What it would log (112 lines for a lost scheduler), errors say here in one line."""
-    names = [name for name in logging.root.manager.loggerDict if name.startswith(package)]
-    levels = {name: logging.getLogger(name).level for name in names}
-    for name in names:
-        logging.getLogger(name).setLevel(logging.CRITICAL + 1)
+def _silent() -> Iterator[None]:
+    """What Dask would log (112 lines for a lost scheduler), errors say here in one line."""
+    logging.disable(logging.CRITICAL)
     try:
         yield
     finally:
-        for name, level in levels.items():
-            logging.getLogger(name).setLevel(level)
+        logging.disable(logging.NOTSET)
 
 
 def _security(cluster: Cluster, address: str) -> Any:

@@ -158,7 +158,6 @@ def test_the_memory_of_a_fit_knows_all_of_its_problem(tmp_path: Path) -> None:
     plant = Plant(system())
     trial = Recording(plant, np.ones((20, 1)))
     family = PlantFamily(lambda values: Plant(system(values[0])), ["growth"], [1.1])
-    curved = PlantFamily(lambda values: Plant(system(values[0] ** 2 / 1.1)), ["growth"], [1.1])
 
     def problem(**changed: object) -> object:
         made = Problem(plant, Bounds(plant, u_min=-1, u_max=1), 20, (trial,), family=family)
@@ -167,9 +166,8 @@ def test_the_memory_of_a_fit_knows_all_of_its_problem(tmp_path: Path) -> None:
     moved = Recording(plant, np.append(np.ones(19), 1 + 1e-12)[:, None])
     slower = Plant(system(dt=0.2))
     problems = [
-        problem(), problem(horizon=5), problem(family=None), problem(family=curved),
-        problem(recordings=(moved,)), problem(plant=slower), problem(terminal_set=False),
-        problem(output_scale=np.array([2.0])),
+        problem(), problem(horizon=5), problem(recordings=(moved,)), problem(plant=slower),
+        problem(terminal_set=False), problem(output_scale=np.array([2.0])),
         problem(bounds=Bounds(plant, u_min=-1, u_max=2)),
     ]  # fmt: skip
     found = [open_memory(tmp_path, item, FitSettings()).digest for item in problems]  # type: ignore[arg-type]

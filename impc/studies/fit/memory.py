@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from impc.arrays import Array, frozen
+from impc.arrays import frozen
 from impc.assess.person_models import PersonModel
 from impc.assess.resampling import Replicate
 from impc.checking import replace
@@ -39,11 +39,8 @@ if TYPE_CHECKING:
     from impc.inverse.likelihood_fit import PersonFit
     from impc.inverse.problem import Problem
     from impc.model.observer import Observer
-    from impc.model.plant_family import PlantFamily
     from impc.studies.fit.settings import FitSettings
 
-# Where a family of plants is looked at: two families may agree at their nominal values.
-_FACTORS = (0.9, 1.1)
 # Stages of a fit, and of a comparison.
 _LEFT_OUT = re.compile(r"without (?:trial )?(\d+)")
 
@@ -86,22 +83,9 @@ def open_memory(
     folder: Path, problem: Problem, settings: FitSettings, command: str = "fit", made_of: str = ""
 ) -> FitMemory:
     """The memory of a command in a folder, empty when there is none for this very problem."""
-    known = digest(_content(problem), settings, made_of, versions())
+    # Of a family the plant at its nominal values; its code is in `made_of` (`impc.files.inputs`).
+    known = digest(replace(problem, family=None), settings, made_of, versions())
     return FitMemory(Cache(folder / f"{command}-in-progress"), known, problem=problem)
-
-
-def _content(problem: Problem) -> tuple[Any, ...]:
-    """All of a problem that has a content: a family of plants is told by some of its plants."""
-    family = problem.family
-    if family is None:
-        return (problem,)
-    plants = [family.make(values) for values in _probes(family)]
-    return replace(problem, family=None), family.names, family.nominal, plants
-
-
-def _probes(family: PlantFamily) -> list[Array]:
-    changes = [np.eye(len(family.nominal)) * (factor - 1) + 1 for factor in _FACTORS]
-    return [family.nominal * row for row in np.concatenate(changes)]
 
 
 def _seen(problem: Problem, stage: str, method: Method) -> Problem:

@@ -130,7 +130,7 @@ def on_pool(
         found = dict[str, T]()
         queue = deque[Task]()
         for name, given in arguments.items():
-            key = _digest(source, made_of, work, given)
+            key = digest(made_of, work.__module__, work.__qualname__, given)
             queue.append(Task(f"{work.__name__} {name}", key, _with_model, (*named, work, given)))
         for result in run(pool, queue, cache):
             name = result.task.name.removeprefix(f"{work.__name__} ")
@@ -163,20 +163,3 @@ def _model(name: str, arguments: str, made_of: str) -> ParametricModel:
 
 def _made_of(name: str, arguments: Mapping[str, Any]) -> str:
     return digest(versions(), source_digest(name, arguments), dict(arguments))
-
-
-def _digest(
-    source: ModelSource, made_of: str, work: Callable[..., Any], given: tuple[Any, ...]
-) -> str:
-    """Of the versions, the model's code and ranges, the work and its arguments.
-
-    Of a model that computes with other files it is an output that tells.
-    """
-    model = source.model
-    outputs = [
-        model.simulate(np.array(model.typical), item[0].input)
-        for item in given
-        if isinstance(item, tuple) and item and isinstance(item[0], Trial)
-    ]
-    ranges = model.names, model.low, model.high, model.typical
-    return digest(made_of, ranges, outputs, work.__module__, work.__qualname__, given)
