@@ -83,6 +83,8 @@ def _run(
     study: Study, tasks: dict[str, FitTask], store: Store, cluster: Cluster, yes: bool
 ) -> Failures:
     """Do what is left, with a bar, and a message about what is kept when it is interrupted."""
+    import psutil  # noqa: PLC0415
+
     from impc.cli.consent import require_consent  # noqa: PLC0415
     from impc.studies.cohort.engine import require_same, run_study, work_kept  # noqa: PLC0415
     from impc.studies.cohort.tasks import study_effort  # noqa: PLC0415
@@ -106,7 +108,11 @@ def _run(
             now = time.monotonic()
             if here and now - logged > _LOGGED:
                 left, logged = (total - ended) * (now - begun) / here, now
-                store.log(f"{ended} of {total} tasks, {left / 60:.1f} min left")
+                memory = psutil.Process().memory_info().rss / 1e6
+                store.log(
+                    f"{ended} of {total} tasks, {left / 60:.1f} min left; "
+                    f"memory of client {memory:.0f} MB"
+                )
 
         if kept < total:
             one, units = study_effort(tasks)

@@ -17,8 +17,6 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
-import psutil
-
 from impc.errors import InputError
 from impc.files.digests import versions
 from impc.files.writing import IN_ITS_PLACE, require_ordinary, unwritable
@@ -149,9 +147,9 @@ def run_study(
     write_files(store.folder, {"manifest.json": manifest.encode()})
     store.log(f"run of {len(study.units)} units on {pool.threads} threads")
     count = int(study.configuration.fit.get("replicates", 0))
-    failures, client = Failures(), psutil.Process()
+    failures, cache = Failures(), store.cache
     queue = deque(Task(_fit(unit), task.digest, fit_unit, (task,)) for unit, task in tasks.items())
-    for result in run(pool, queue, store.cache):
+    for result in run(pool, queue, cache):
         task, content = result.task, result.content
         unit, _, name = task.name.partition("/")
         index = None if task.work is fit_unit else task.given[-1]
@@ -162,12 +160,12 @@ def run_study(
             else:
                 failures.replicates.setdefault(unit, {})[index + 1] = reason
             store.log(f"{unit}: {name}: {reason}")
-            store.cache.keep(_failed(task.name), task.digest, {"reason": reason})
+            cache.keep(_failed(task.name), task.digest, {"reason": reason})
         elif not result.found:
-            store.cache.discard(_failed(task.name))
+            cache.discard(_failed(task.name))
             store.log(
                 f"{unit}: {name} in {content['seconds']:.2f} s; memory of worker "
-                f"{content['memory_mb']:.0f} MB, of client {client.memory_info().rss / 1e6:.0f} MB"
+                f"{content['memory_mb']:.0f} MB"
             )
         if index is None and result.fault is None:
             # Before other fits: a unit is finished before the next is begun.
