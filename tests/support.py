@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
     import pytest
 
+    from impc.studies.cache import Steps
+
 
 #: How many times the examples of `make test` are drawn: 1, or what `make search` asks for.
 SEARCH = int(os.environ.get("IMPC_SEARCH", "1"))
@@ -120,3 +122,15 @@ def saturated_problem(
                 trial = Recording(plant, run.x, np.append(size * push, 0))
                 problem = Problem(plant, bounds, 5, (trial,), terminal_set=False)
                 return weights, controller, problem
+
+
+def kept_names(steps: Steps) -> set[str]:
+    """Names of the results that a folder keeps for these steps."""
+    found = set()
+    for path in steps.cache.folder.rglob("*.json"):
+        name = path.relative_to(steps.cache.folder).with_suffix("").as_posix()
+        # A name with a space has a file without one.
+        for known in (name, name.replace("-", " ")):
+            if steps.cache.find(known, steps.digest) is not None:
+                found.add(known)
+    return found

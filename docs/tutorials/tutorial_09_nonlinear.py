@@ -131,11 +131,13 @@ show("swing-fit/parameters.png")
 
 # %%
 # The intervals, beside the parameters that made the recording:
-import json
+import impc
 
-found = json.loads((RESULTS / "swing-fit" / "result.json").read_text())["parameters"]
-for name, one in found.items():
-    print(f"{name:6} {one['value']:8.4f}  {one['low']:8.4f} to {one['high']:8.4f}  {truth[name]:6}")
+for one in impc.read_result(RESULTS / "swing-fit").table("parameters").itertuples():
+    print(
+        f"{one.parameter:6} {one.value:8.4f}  {one.low:8.4f} to {one.high:8.4f}  "
+        f"{truth[one.parameter]:6}"
+    )
 
 # %%
 # **What a recording cannot say.** With the length free as well, the page would tell which

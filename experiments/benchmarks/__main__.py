@@ -17,6 +17,7 @@ from experiments.benchmarks.growth import growth_rows
 from experiments.benchmarks.layers import layer_rows
 from experiments.benchmarks.likelihood import likelihood_rows
 from experiments.benchmarks.routes import route_rows
+from experiments.benchmarks.runner import runner_rows
 from experiments.benchmarks.simulation import simulation_rows
 from experiments.benchmarks.solvers import solver_rows
 from experiments.benchmarks.table import write_tables
@@ -29,6 +30,7 @@ _PARTS = {
     "routes": route_rows,
     "layers": layer_rows,
     "likelihood": likelihood_rows,
+    "runner": runner_rows,
 }
 
 

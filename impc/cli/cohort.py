@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,14 +15,16 @@ from impc.cli.plant import named_plant
 from impc.cli.progress import progress
 
 if TYPE_CHECKING:
-    from impc.studies.cohort.cluster import Cluster
-    from impc.studies.cohort.engine import Failures
-    from impc.studies.cohort.store import Store
+    from impc.studies.cohort.engine import Failures, Store
     from impc.studies.cohort.study import Study
-    from impc.studies.cohort.unit_task import FitTask
+    from impc.studies.cohort.tasks import FitTask
+    from impc.studies.pool import Result
+    from impc.studies.scheduler import Cluster
 
 # Of the settings that ask for more, those that a worker takes.
 _USED = ("replicates", "structure")
+# Seconds between two lines of cohort.log that tell the time left.
+_LOGGED = 10.0
 
 
 @click.command("cohort")
@@ -49,8 +50,8 @@ def command(
     """
     # Imported here: the libraries take seconds to load, and --help needs none.
     from impc.files.reading import require_distinct  # noqa: PLC0415
+    from impc.studies.cohort.engine import Store, keep_failure  # noqa: PLC0415
     from impc.studies.cohort.report import write_report  # noqa: PLC0415
-    from impc.studies.cohort.store import Store  # noqa: PLC0415
     from impc.studies.cohort.study import read_study  # noqa: PLC0415
     from impc.studies.cohort.tasks import study_tasks, unused_columns  # noqa: PLC0415
     from impc.studies.fit.settings import fit_settings, require_used  # noqa: PLC0415
@@ -66,7 +67,7 @@ def command(
     tasks, unreadable = study_tasks(study, source)
     store = Store(out, {name: task.digest for name, task in tasks.items()})
     for unit, reason in unreadable.items():
-        store.keep_failure(unit, None, reason)
+        keep_failure(store, unit, reason)
     failures = _run(study, tasks, store, cluster, yes)
     failures.units |= unreadable
     write_report(study, store, failures, f"impc cohort {study_file.name}")
@@ -82,39 +83,45 @@ def _run(
     study: Study, tasks: dict[str, FitTask], store: Store, cluster: Cluster, yes: bool
 ) -> Failures:
     """Do what is left, with a bar, and a message about what is kept when it is interrupted."""
+    import psutil  # noqa: PLC0415
+
     from impc.cli.consent import require_consent  # noqa: PLC0415
-    from impc.studies.cohort.cluster import connected  # noqa: PLC0415
-    from impc.studies.cohort.effort import study_effort  # noqa: PLC0415
-    from impc.studies.cohort.engine import run_study, work_left  # noqa: PLC0415
+    from impc.studies.cohort.engine import require_same, run_study, work_kept  # noqa: PLC0415
+    from impc.studies.cohort.tasks import study_effort  # noqa: PLC0415
+    from impc.studies.scheduler import connected  # noqa: PLC0415
 
-    done, total = work_left(study, store)
-
-    def log(line: str) -> None:
-        store.log(f"{datetime.now(UTC).isoformat(timespec='seconds')} {line}")
-
-    begun, here = time.monotonic(), 0
+    require_same(store)
+    kept, total = work_kept(study, store)
+    begun = logged = time.monotonic()
+    ended = here = 0
 
     def said(_: int) -> str:
-        finished, _ = work_left(study, store)
+        finished, _ = work_kept(study, store)
         return f"{finished} of {total} tasks are kept in {store.folder}; the same command goes on"
 
-    with progress(total, "task", said, done) as tell, connected(cluster) as workers:
+    with progress(total, "task", said) as tell, connected(cluster) as pool:
 
-        def told(name: str) -> None:
-            nonlocal here
-            here += 1
-            tell(name)
-            left = (total - done - here) * (time.monotonic() - begun) / here
-            log(f"{done + here} of {total} tasks, {left / 60:.1f} min left")
+        def told(result: Result) -> None:
+            nonlocal ended, here, logged
+            ended, here = ended + 1, here + (not result.found)
+            tell(result.task.name, found=result.found)
+            now = time.monotonic()
+            if here and now - logged > _LOGGED:
+                left, logged = (total - ended) * (now - begun) / here, now
+                memory = psutil.Process().memory_info().rss / 1e6
+                store.log(
+                    f"{ended} of {total} tasks, {left / 60:.1f} min left; "
+                    f"memory of client {memory:.0f} MB"
+                )
 
-        if done < total:
+        if kept < total:
             one, units = study_effort(tasks)
-            effort = one.shared(units * (total - done) / total, workers.threads)
+            effort = one.shared(units * (total - kept) / total, pool.threads)
             if cluster.scheduler:  # memory is not this machine's
                 effort = replace(effort, gigabytes=0.0)
             require_consent(effort, yes)
-        failures = run_study(study, tasks, store, workers, told, log)
-    log(
+        failures = run_study(study, tasks, store, pool, told)
+    store.log(
         f"end: {len(failures.units)} of {len(study.units)} units without a result, "
         f"{sum(map(len, failures.replicates.values()))} replicates failed"
     )

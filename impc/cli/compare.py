@@ -59,6 +59,6 @@ def command(
     with angles_in(subject.angles):
         content = compare_report(problem, compared, subject.provenance).files()
     written = write_files(out, content)
-    memory.forget()
+    memory.cache.forget()
     click.echo(methods_finding(compared).text())
     print_files(out, written)

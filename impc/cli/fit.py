@@ -70,7 +70,7 @@ def command(
             content = fit_report(result, subject.provenance, truth, unknown).files()
         done("page")
     written = write_files(out, content)
-    memory.forget()
+    memory.cache.forget()
     _print(result)
     if truth is not None:
         click.echo(truth_sentence(result, truth))

@@ -12,7 +12,7 @@ from impc.cli.output import print_files
 from impc.cli.select import kept_results, read_model_study, study_runner
 
 if TYPE_CHECKING:
-    from impc.studies.cohort.cluster import Cluster
+    from impc.studies.scheduler import Cluster
 
 
 @click.command("key-parameters")
@@ -47,7 +47,7 @@ def command(
     """
     from impc.cli.consent import FEWER_STARTS, require_consent  # noqa: PLC0415
     from impc.reporting.writer import write_files  # noqa: PLC0415
-    from impc.studies.selection.effort import key_evaluations, selection_effort  # noqa: PLC0415
+    from impc.studies.effort import key_evaluations, selection_effort  # noqa: PLC0415
     from impc.studies.selection.key_parameters import key_parameters  # noqa: PLC0415
     from impc.studies.selection.key_report import key_report  # noqa: PLC0415
     from impc.studies.selection.settings import select_settings  # noqa: PLC0415

@@ -123,7 +123,7 @@ def scheduler_options(command: F) -> F:
         workers: int | None,
         **named: Any,
     ) -> Any:
-        from impc.studies.cohort.cluster import Cluster  # noqa: PLC0415
+        from impc.studies.scheduler import Cluster  # noqa: PLC0415
 
         cluster = Cluster(scheduler, workers, tls_ca, tls_cert, tls_key)
         return command(*given, cluster=cluster, **named)

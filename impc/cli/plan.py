@@ -14,6 +14,8 @@ from impc.cli.progress import progress
 from impc.cli.seat import TORQUE
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from impc.arrays import Array
     from impc.files.configuration import Configuration
     from impc.files.plant_sources import PlantSource
@@ -35,7 +37,8 @@ _FEWER = "lower fits, draws, amplitude or dwell in [plan]"
 def command(config: Path, plant_name: str, out: Path, yes: bool) -> None:
     """Choose an experiment for a person whom you presume, from the [plan] table of CONFIG.
 
-    The file may be the one that `impc fit` reads later: [plant] and [fit] mean the same there.
+    The file may be the one that `impc fit` reads later: [plant] and [fit] mean the same there. What
+    is done when you interrupt it is kept in the folder: the same command goes on from there.
     """
     # Imported here: the libraries take seconds to load, and --help needs none.
     from impc.cli.consent import require_consent  # noqa: PLC0415
@@ -44,10 +47,12 @@ def command(config: Path, plant_name: str, out: Path, yes: bool) -> None:
     from impc.reporting.provenance import Provenance  # noqa: PLC0415
     from impc.reporting.shown_units import angles_in  # noqa: PLC0415
     from impc.reporting.writer import require_writable, write_files  # noqa: PLC0415
+    from impc.studies.cache import Cache, Steps, from_json  # noqa: PLC0415
     from impc.studies.fit.settings import fit_settings  # noqa: PLC0415
     from impc.studies.plan.report import plan_report  # noqa: PLC0415
     from impc.studies.plan.sentences import plan_sentences  # noqa: PLC0415
     from impc.studies.plan.settings import plan_settings  # noqa: PLC0415
+    from impc.studies.plan.simulated_fits import OneFit  # noqa: PLC0415
     from impc.studies.plan.study import make_plan, plan_effort, steps_of  # noqa: PLC0415
 
     require_writable(out)
@@ -58,15 +63,21 @@ def command(config: Path, plant_name: str, out: Path, yes: bool) -> None:
     recorded = [config.parent / name for name in settings.files]
     perturbation = _perturbation(person.controller.plant, configuration, settings, recorded)
     require_consent(plan_effort(person, settings), yes, _FEWER)
-    with progress(steps_of(settings), "step") as done:
-        plan = make_plan(person, settings, perturbation, done)
-    line = f"impc plan {config.name} --plant {plant_name}"
     inputs = gather_inputs(recorded, config, source.name, source.arguments)
+    steps = Steps(Cache(out / "plan-in-progress"), inputs.digest)
+
+    def remember(name: str, compute: Callable[[], OneFit]) -> OneFit:
+        return steps.get(name, compute, lambda kept: from_json(kept, OneFit))
+
+    with progress(steps_of(settings), "step", lambda _: steps.kept()) as done:
+        plan = make_plan(person, settings, perturbation, done, remember)
+    line = f"impc plan {config.name} --plant {plant_name}"
     names = tuple(path.name for path in recorded)
     made = Provenance(source.name, line, dict(source.arguments), names, inputs)
     with angles_in(configuration.report.angles):
         content, said = plan_report(plan, made).files(), plan_sentences(plan)
     written = write_files(out, content)
+    steps.cache.forget()
     for sentence in said:
         click.echo(sentence)
     print_files(out, written)

@@ -25,34 +25,32 @@ _TICK = 1.0
 
 @contextmanager
 def progress(
-    total: int, unit: str, kept: Callable[[int], str] | None = None, begun: int = 0
-) -> Iterator[Callable[[str], None]]:
-    """A bar while the block lasts; the block gets what is called with each step done."""
+    total: int, unit: str, kept: Callable[[int], str] | None = None
+) -> Iterator[Callable[..., None]]:
+    """A bar while the block lasts; the block gets what is called with each step done.
+
+    It is called with the step's name, and `found=True` where an earlier run had done it.
+    """
     quiet = os.environ.get("IMPC_QUIET", "") not in ("", "0")
-    count = begun  # the bar's own stands still where there is no bar
+    count = begun = 0  # the bar's own stands still where there is no bar
     began = said = time.monotonic()
     # disable=None: no bar where stderr is a file.
     with (
-        tqdm(
-            total=total,
-            initial=begun,
-            unit=unit,
-            file=sys.stderr,
-            disable=quiet or None,
-            leave=False,
-        ) as bar,
+        tqdm(total=total, unit=unit, file=sys.stderr, disable=quiet or None, leave=False) as bar,
         _ticking(bar),
     ):
 
-        def done(name: str) -> None:
-            nonlocal count, said
-            count += 1
+        def done(name: str, *, found: bool = False) -> None:
+            nonlocal count, begun, said
+            count, begun = count + 1, begun + found
             bar.set_postfix_str(name, refresh=False)
+            if found and not bar.disable:
+                bar.initial += 1  # no part of the rate
             bar.update()
             now = time.monotonic()
             if bar.disable and not quiet and now - said >= _PAUSE:
                 said = now
-                left = (now - began) * (total - count) / (count - begun)
+                left = (now - began) * (total - count) / max(count - begun, 1)
                 # The first step may have compiled what the others use: it tells nothing of them.
                 time_left = f", about {left:.0f} s left" if count - begun > 1 else ""
                 which = f" ({name})" if name else ""

@@ -16,12 +16,12 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from impc.files.inputs import Inputs
-    from impc.files.sealed import Kept
-    from impc.studies.cohort.cluster import Cluster
+    from impc.studies.cache import Cache
     from impc.studies.cohort.study import Study
+    from impc.studies.pool import Result
+    from impc.studies.scheduler import Cluster
     from impc.studies.selection.model import Trial
-    from impc.studies.selection.model_source import ModelSource
-    from impc.studies.selection.queue import Runner
+    from impc.studies.selection.model_source import ModelSource, Runner
 
 
 @click.command("select")
@@ -40,8 +40,8 @@ def command(
     """
     from impc.cli.consent import FEWER_STARTS, require_consent  # noqa: PLC0415
     from impc.reporting.writer import write_files  # noqa: PLC0415
+    from impc.studies.effort import select_evaluations, selection_effort  # noqa: PLC0415
     from impc.studies.selection.analysis import select_study  # noqa: PLC0415
-    from impc.studies.selection.effort import select_evaluations, selection_effort  # noqa: PLC0415
     from impc.studies.selection.report import selection_report  # noqa: PLC0415
     from impc.studies.selection.settings import select_settings  # noqa: PLC0415
 
@@ -61,11 +61,11 @@ def command(
     print_files(out, written)
 
 
-def kept_results(out: Path) -> Kept:
+def kept_results(out: Path) -> Cache:
     """Where results of single tasks wait in the folder `out` until the whole is done."""
-    from impc.files.sealed import Kept  # noqa: PLC0415
+    from impc.studies.cache import Cache  # noqa: PLC0415
 
-    return Kept(out / "in-progress")
+    return Cache(out / "in-progress")
 
 
 @contextmanager
@@ -73,16 +73,20 @@ def study_runner(
     source: ModelSource, out: Path, cluster: Cluster, tasks: int
 ) -> Iterator[tuple[Runner, int]]:
     """Workers with a progress bar, and how many; a message of what is kept when interrupted."""
-    from impc.studies.cohort.cluster import connected  # noqa: PLC0415
-    from impc.studies.selection.queue import on_workers  # noqa: PLC0415
+    from impc.studies.scheduler import connected  # noqa: PLC0415
+    from impc.studies.selection.model_source import on_pool  # noqa: PLC0415
 
     kept = kept_results(out)
 
     def said(count: int) -> str:
         return f"{count} of {tasks} tasks are kept in {kept.folder}; the same command goes on"
 
-    with progress(tasks, "task", said) as done, connected(cluster) as workers:
-        yield on_workers(workers, source, kept, done), workers.threads
+    with progress(tasks, "task", said) as tell, connected(cluster) as pool:
+
+        def done(result: Result) -> None:
+            tell(result.task.name, found=result.found)
+
+        yield on_pool(pool, source, kept, done), pool.threads
 
 
 def read_model_study(

@@ -8,26 +8,23 @@ name is an argument of the plant, and not otherwise (docs/security.md).
 
 from __future__ import annotations
 
-import dataclasses
+import ast
 import functools
 import hashlib
 import importlib.metadata
-import numbers
+import os
 import platform
 import sys
-from collections.abc import Mapping, Sequence, Set
-from datetime import date, datetime
-from datetime import time as time_of_day
-from modulefinder import ModuleFinder
+import threading
+from collections.abc import Mapping
 from pathlib import Path, PurePath
-from types import CodeType
 from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
 
 from impc.errors import DataError
-from impc.files.user_code import OURS, is_installed, module_file
+from impc.files.user_code import OURS, is_installed
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -36,59 +33,30 @@ if TYPE_CHECKING:
 # What computes: another version of any of them may give other digits.
 _PACKAGES = ("casadi", "clarabel", "control", "cvxpy", "numba", "numpy", "scipy")
 _PLANT_FILES = (".mat", ".npz", ".json")
-# Digest of a module's source, taken once a process: Python does not read a module again either.
-_SOURCES: dict[ModuleType, str] = {}
+# Two threads that parse at the same time fail now and then in Python 3.11.
+_PARSING = threading.Lock()
 
 
 def digest(*parts: object) -> str:
-    """SHA-256 of the `parts`, hexadecimal: of their kinds, sizes and contents.
+    """SHA-256 of the contents of the `parts`, hexadecimal.
 
-    None, numbers, text, bytes, paths, dates, arrays of numbers, and mappings, sequences, sets,
-    dataclasses and msgspec structs of such.
+    None, numbers, text, bytes, paths, dates, arrays of numbers, and mappings with names, sequences,
+    sets, dataclasses and msgspec structs of such.
     """
-    text = hashlib.sha256()
-    for piece in _pieces(parts):
-        # With its length, so that ("ab", "c") is not ("a", "bc").
-        text.update(f"{len(piece)}:".encode())
-        text.update(piece)
-    return text.hexdigest()
+    text = msgspec.msgpack.encode(parts, enc_hook=_written, order="deterministic")
+    return hashlib.sha256(text).hexdigest()
 
 
-def _pieces(value: Any) -> Iterator[bytes]:
-    kind = type(value).__name__.encode()
-    if value is None or isinstance(value, (bool, str, PurePath, numbers.Number, date, datetime)):
-        number = value.item() if isinstance(value, np.generic) else value
-        yield (
-            type(number).__name__.encode() + b" " + repr(number).encode("utf-8", "backslashreplace")
-        )
-    elif isinstance(value, time_of_day):
-        yield kind + repr(value).encode()
-    elif isinstance(value, bytes):
-        yield b"bytes " + value
-    elif isinstance(value, np.ndarray) and value.dtype.kind in "biufc":
-        yield f"array {value.dtype.str} {value.shape}".encode()
-        yield np.ascontiguousarray(value).tobytes()
-    elif isinstance(value, Mapping):
-        yield f"mapping {len(value)}".encode()
-        for key in sorted(value, key=repr):
-            yield from _pieces(key)
-            yield from _pieces(value[key])
-    elif isinstance(value, Set):
-        yield from _pieces(sorted(value, key=repr))
-    elif isinstance(value, Sequence):
-        yield f"sequence {len(value)}".encode()
-        for item in value:
-            yield from _pieces(item)
-    else:
-        yield kind
-        yield from _pieces(_fields(value))
-
-
-def _fields(value: Any) -> dict[str, Any]:
-    if isinstance(value, msgspec.Struct):
-        return {name: getattr(value, name) for name in value.__struct_fields__}
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {item.name: getattr(value, item.name) for item in dataclasses.fields(value)}
+def _written(value: Any) -> Any:
+    """What msgspec writes for a `value` that it does not know."""
+    if isinstance(value, np.ndarray) and value.dtype.kind in "biufc":
+        return value.dtype.str, value.shape, value.tobytes()
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, PurePath):
+        return os.fsencode(value)
+    if isinstance(value, Mapping):
+        return dict(value)
     raise TypeError(f"no digest of a {type(value).__name__}")
 
 
@@ -126,9 +94,9 @@ def versions() -> dict[str, str]:
 def source_digest(name: str, arguments: Mapping[str, Any] | None = None) -> str:
     """Of the plant or model `name`: a file's content, or the user's code that it is made of.
 
-    The code is the module that is named and all modules that it imports, as long as they are no
-    part of Python, of this package or of what is installed: those are told by `versions`. The
-    module has to be imported already. Of `arguments` that name a file its content counts.
+    The code is the module that is named, imported already, and the modules in its folder and below
+    that it imports: this package and what is installed are told by `versions`. Of `arguments` that
+    name a file its content counts.
     """
     given = {
         key: (value, content_digest(Path(value)) if _names_a_file(value) else None)
@@ -147,63 +115,44 @@ def _names_a_file(value: object) -> bool:
         return False
 
 
+@functools.cache  # once a process: Python does not read a module again either
 def _source(module: ModuleType) -> str:
-    if module not in _SOURCES:
-        found: dict[str, bytes] = {}
-        _gather(module.__name__, module_file(module.__name__, None), found)
-        _SOURCES[module] = digest(found)
-    return _SOURCES[module]
+    file = Path(getattr(module, "__file__", None) or "")
+    found: dict[str, bytes] = {}
+    if file.is_file() and not is_installed(file):
+        depth = module.__name__.count(".") + (file.name == "__init__.py")
+        _gather(file, file.parents[depth], found)
+    return digest(found)
 
 
-def _gather(name: str, file: Path | None, found: dict[str, bytes]) -> None:
-    """Add the source of a module of the user's, and of those of the user's that it imports."""
-    if name in found or name.partition(".")[0] in OURS or file is None or is_installed(file):
+def _gather(file: Path, root: Path, found: dict[str, bytes]) -> None:
+    """Add a `file` of the user's and those in the folder `root` that it imports, anywhere in it."""
+    key = os.path.relpath(file, root)
+    if key in found or Path(key).parts[0] in OURS:
         return
-    found[name] = file.read_bytes()
-    if file.suffix == ".py":
-        package = name if file.name == "__init__.py" else name.rpartition(".")[0]
-        for other in sorted(_imports(found[name], package)):
-            _gather(other, module_file(other, file.parent), found)
+    found[key] = file.read_bytes()
+    for base, name in _imports(file, root) if file.suffix == ".py" else ():
+        parts = name.split(".")
+        for count in range(1, len(parts) + 1):  # a package's own __init__ runs too
+            place = base.joinpath(*parts[:count])
+            for other in (place.with_suffix(".py"), place / "__init__.py"):
+                if other.is_file():
+                    _gather(other, root, found)
 
 
-def _imports(source: bytes, package: str) -> set[str]:
-    """Names of all modules that a source may import, anywhere in it.
-
-    From its code and not from its syntax tree: `ast.parse` fails now and then in Python 3.11 when
-    another thread parses at the same time.
-    """
+def _imports(file: Path, root: Path) -> Iterator[tuple[Path, str]]:
+    """Folder and name of all modules that a `file` may import."""
     try:
-        code = compile(source, package, "exec", dont_inherit=True)
+        with _PARSING:
+            tree = ast.parse(file.read_bytes())
     except (SyntaxError, ValueError):  # of a file that cannot be imported
-        return set()
-    # A package's own __init__ runs too when a module in it is imported.
-    return {part for name in _imported(code, package) for part in _with_parents(name)}
-
-
-def _imported(code: CodeType, package: str) -> Iterator[str]:
-    for kind, found in ModuleFinder().scan_opcodes(code):
-        if kind == "absolute_import":
-            level, (names, base) = 0, found
-        elif kind == "relative_import":
-            level, names, base = found
-        else:
-            continue
-        base = _absolute(base, level, package)
-        yield base
-        yield from (f"{base}.{name}" for name in names or ())
-    for inner in code.co_consts:
-        if isinstance(inner, CodeType):
-            yield from _imported(inner, package)
-
-
-def _absolute(name: str, level: int, package: str) -> str:
-    """What `from ..name import` imports from, its leading dots resolved."""
-    if not level:
-        return name
-    parts = package.split(".")
-    return ".".join([*parts[: len(parts) - level + 1], *([name] if name else [])])
-
-
-def _with_parents(name: str) -> list[str]:
-    parts = name.split(".")
-    return [".".join(parts[: count + 1]) for count in range(len(parts))]
+        return
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from ((root, alias.name) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            up = [".."] * (node.level - 1)
+            base = file.parent.joinpath(*up) if node.level else root
+            yield from (
+                (base, f"{node.module or ''}.{alias.name}".strip(".")) for alias in node.names
+            )

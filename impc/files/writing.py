@@ -34,10 +34,10 @@ def require_ordinary(path: Path) -> None:
         raise OSError(errno.EINVAL, "no ordinary file")
 
 
-def write_whole(path: Path, content: bytes) -> None:
+def write_whole(path: Path, content: bytes, *, flush: bool = True) -> None:
     """Write `content` beside `path`, flush to the disk, rename: the whole file, or the one before.
 
-    Its folder is made when it is missing.
+    Its folder is made when it is missing. What says itself whether it is whole needs no `flush`.
     """
     staging = path.with_name(f".{path.name}.part")
     try:
@@ -47,13 +47,15 @@ def write_whole(path: Path, content: bytes) -> None:
             # "x": never through a link that somebody put there.
             with staging.open("xb") as stream:
                 stream.write(content)
-                stream.flush()
-                os.fsync(stream.fileno())
+                if flush:
+                    stream.flush()
+                    os.fsync(stream.fileno())
             os.replace(staging, path)
         except BaseException:  # also when interrupted from the keyboard
             staging.unlink(missing_ok=True)
             raise
-        flush_folder(path.parent)
+        if flush:
+            flush_folder(path.parent)
     except (OSError, ValueError) as error:
         raise unwritable(f"file {path}", error, IN_ITS_PLACE) from None
 

@@ -296,7 +296,7 @@ def _is_white(problem: Problem, runs: list[Simulation]) -> bool:
 
 
 def encode_estimate(estimate: Estimate) -> dict[str, Any]:
-    """Values that JSON keeps to the last digit; the problem itself is not among them."""
+    """Values that Python's JSON keeps to the last digit; the problem itself is not among them."""
     given = estimate.weights
     return {
         "method": estimate.method,
@@ -307,15 +307,15 @@ def encode_estimate(estimate: Estimate) -> dict[str, Any]:
         "Q": None if given is None else given.Q.tolist(),
         "R": None if given is None else given.R.tolist(),
         "metrics": estimate.metrics.tolist(),
-        "misfit": None if np.isnan(estimate.misfit) else estimate.misfit,
-        "noise": None if np.isnan(estimate.noise) else estimate.noise,
+        "misfit": estimate.misfit,
+        "noise": estimate.noise,
         "status": estimate.status.value,
         "reason": estimate.reason,
         "evaluations": estimate.evaluations,
         "seconds": estimate.seconds,
         "fit": asdict(estimate.fit),
         "terminal_set": bool(estimate.problem.terminal_set),
-        "prices": None if estimate.prices is None else encode_prices(estimate.prices),
+        "prices": None if estimate.prices is None else estimate.prices.tolist(),
     }
 
 
@@ -330,22 +330,12 @@ def decode_estimate(seen: Problem, kept: dict[str, Any]) -> Estimate:
         None if kept["S"] is None else frozen(kept["S"]),
         None if kept["Q"] is None else Weights(kept["Q"], kept["R"]),
         frozen(np.reshape(kept["metrics"], (-1, m, m))),
-        np.nan if kept["misfit"] is None else kept["misfit"],
-        np.nan if kept["noise"] is None else kept["noise"],
+        kept["misfit"],
+        kept["noise"],
         Status(kept["status"]),
         kept["reason"],
         kept["evaluations"],
         kept["seconds"],
         Goodness(**kept["fit"]),
-        None if kept["prices"] is None else decode_prices(kept["prices"]),
+        None if kept["prices"] is None else frozen(kept["prices"]),
     )
-
-
-def encode_prices(prices: Array) -> list[float | None]:
-    """Unknowns as JSON has them: None for a price of zero."""
-    return [float(item) if np.isfinite(item) else None for item in prices]
-
-
-def decode_prices(kept: list[float | None]) -> Array:
-    """Unknowns (count,) from what `encode_prices` made of them."""
-    return frozen([-np.inf if item is None else item for item in kept])

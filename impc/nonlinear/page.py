@@ -7,23 +7,14 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 from markupsafe import Markup
 
 from impc.arrays import Frozen
 from impc.assess.covariance import TWO_SIDED
 from impc.inverse.estimates import Status
-from impc.reporting.document import (
-    Block,
-    Details,
-    Lines,
-    Picture,
-    Report,
-    Section,
-    Terms,
-    TextTable,
-    Verdict,
-)
-from impc.reporting.rendering import number
+from impc.reporting.document import Block, Details, Lines, Report, Section, Terms, Verdict
+from impc.reporting.finding import Finding, Picture, table_of
 from impc.reporting.shown_units import shown_as
 from impc.reporting.style import (
     BLUE,
@@ -325,7 +316,6 @@ _VALUES = Picture(
     "Round: told. Square, on grey: not told, because nothing that was measured moves.",
     narrow=True,
 )
-_WORDS = {"known": "known", "yes": "by itself", "roughly": "roughly", "no": "not by itself"}
 _TOLD = (
     "A product that is told has one value whatever the others have. Along a direction that is not "
     "told the parameters may change together, by any factor a, and the recordings stay what they "
@@ -341,85 +331,41 @@ def optimal_report(fit: OptimalFit, provenance: Provenance) -> Report:
         "The optimal control problem behind the recordings",
         (Verdict(verdict(fit)), Lines(abstract(fit))),
         [
-            Section("1. The parameters", _parameters(fit), "Parameters", together=True),
+            Section("1. The parameters", (parameter_finding(fit),), "Parameters", together=True),
             Section("2. What is told", told, "What is told"),
             Section("3. Recorded and simulated", _trajectories(fit), "Trajectories"),
             Section("4. Checks of the recordings", (_checks(fit),), "Checks", folded=True),
             Section("5. Settings and versions", _made(fit, provenance), "Settings", folded=True),
         ],
         figures=optimal_figures(fit),
-        tables={
-            "parameters": parameters_table(fit),
-            "combinations": _combination_numbers(fit),
-            "trajectories": _samples(fit),
-        },
+        beside=[_samples(fit)],
         data=_data(fit, provenance),
         provenance=provenance,
     )
 
 
-def _rows(fit: OptimalFit) -> list[dict[str, Any]]:
-    """What is known of each parameter, in the order of the problem's."""
+def parameter_finding(fit: OptimalFit) -> Finding:
+    """A row a parameter: unit, value, both ends, level, whether it is told, first value."""
     estimate, problem = fit.estimate, fit.estimate.problem
     ends = estimate.intervals(_LEVEL)
     apart = {name for one in estimate.combinations.untold for name in one.exponents}
     roughly = {one.name for one in estimate.combinations.told if one.rough}
     rows = [
-        {
-            "parameter": name,
-            "unit": unit,
-            "value": value,
-            "low": ends[name][0],
-            "high": ends[name][1],
-            "level": _LEVEL,
-            "told": "no" if name in apart else "roughly" if name in roughly else "yes",
-            "start": estimate.start[name],
-        }
+        (name, unit, value, *ends[name], _LEVEL,
+         "no" if name in apart else "roughly" if name in roughly else "yes", estimate.start[name])
         for (name, value), unit in zip(estimate.theta.items(), problem.units, strict=True)
+    ]  # fmt: skip
+    rows += [
+        (name, unit, value, np.nan, np.nan, np.nan, "known", np.nan)
+        for name, (value, unit) in fit.known.items()
     ]
-    for name, (value, unit) in fit.known.items():
-        row = dict.fromkeys(("low", "high", "level", "start"), np.nan)
-        rows.append({"parameter": name, "unit": unit, "value": value, **row, "told": "known"})
-    return rows
-
-
-def parameters_table(fit: OptimalFit) -> TextTable:
-    """A row a parameter: unit, value, both ends, level, whether it is told, first value."""
-    heads = ("parameter", "unit", "value", "low", "high", "level", "told", "start")
-    return TextTable("", heads, [tuple(row[head] for head in heads) for row in _rows(fit)])
-
-
-def _parameters(fit: OptimalFit) -> list[Block]:
-    rows = []
-    for row in _rows(fit):
-        known, told = row["told"] == "known", row["told"] != "no"
-        ends = f"{number(row['low'], 4)} to {number(row['high'], 4)}" if told else "any"
-        rows.append(
-            (
-                row["parameter"],
-                number(row["value"], 5) + (f" {row['unit']}" if row["unit"] else ""),
-                "-" if known else ends,
-                _WORDS[row["told"]],
-                number(row["start"], 4),
-            )
-        )
-    table = TextTable(
+    heads = ["parameter", "unit", "value", "low", "high", "level", "told", "start"]
+    caption = (
         "Value with its 95 % interval, and where the search began. One that is not told by itself "
-        "stays near its start; section 2 says what of it is told.",
-        ("parameter", "value", "interval", "told", "start"),
-        rows,
+        "stays near its start; section 2 says what of it is told."
     )
-    return [*([_INTERVALS] if interval_rows(fit) else []), table]
-
-
-def _combination_numbers(fit: OptimalFit) -> TextTable:
-    found = fit.estimate.combinations
-    rows = []
-    for one in (*found.told, *found.untold):
-        low, high = _ends(one)
-        told = "no" if one in found.untold else "roughly" if one.rough else "yes"
-        rows.append((one.name, one.value, low, high, _LEVEL, told))
-    return TextTable("", ("product", "value", "low", "high", "level", "told"), rows)
+    figure = _INTERVALS if interval_rows(fit) else None
+    return Finding("parameters", pd.DataFrame(rows, columns=heads), caption, figure=figure)
 
 
 def _ends(one: Combination) -> tuple[float, float]:
@@ -431,38 +377,32 @@ def _ends(one: Combination) -> tuple[float, float]:
     return one.value / factor, one.value * factor
 
 
-def _combinations(fit: OptimalFit) -> TextTable:
-    found = fit.estimate.combinations
-    rows = []
-    for one in filter(lambda one: one.printable, found.told):
-        low, high = _ends(one)
-        rows.append((one.name, number(one.value, 5), f"{number(low, 4)} to {number(high, 4)}"))
-    for one in found.untold:
-        powers = [
-            name if item == 1 else f"{name}^{item:.3g}" for name, item in one.exponents.items()
-        ]
-        moved = ", ".join(powers if one.scaling else one.exponents)
-        said = "any factor a of these together" if one.scaling else "near these values"
-        rows.append((moved, "not identified", said))
-    return TextTable(
-        "Products of parameters with their 95 % intervals, in the problem's units.",
-        ("product", "value", "interval"),
-        rows,
-    )
+def _combinations(fit: OptimalFit) -> Finding:
+    found, rows = fit.estimate.combinations, []
+    for one in (*found.told, *found.untold):
+        told = "no" if one in found.untold else "roughly" if one.rough else "yes"
+        free = "" if told != "no" else "any factor of these" if one.scaling else "near these values"
+        rows.append((one.name, one.value, *_ends(one), _LEVEL, told, free))
+    heads = ["product", "value", "low", "high", "level", "told", "free"]
+    caption = "Products of parameters with their 95 % intervals, in the problem's units."
+    return Finding("combinations", pd.DataFrame(rows, columns=heads), caption)
 
 
 def _trajectories(fit: OptimalFit) -> list[Block]:
-    vaf = signal_vaf(fit.estimate)
-    table = TextTable(
-        "Variance accounted for (3.24), over all recordings.",
-        ("signal", "VAF %"),
-        [(name, number(value, 6)) for name, value in vaf.items()],
+    vaf = pd.DataFrame(signal_vaf(fit.estimate).items(), columns=["signal", "vaf_percent"])
+    limits = table_of(
+        reached(fit.estimate).items(),
+        {
+            "constraint": lambda pair: pair[0],
+            "at_its_limit": lambda pair: pair[1][0],
+            "samples": lambda pair: pair[1][1],
+        },
     )
-    limits = TextTable(
-        "At how many samples each constraint is at its limit.",
-        ("constraint", "at its limit", "samples"),
-        [(name, *map(str, found)) for name, found in reached(fit.estimate).items()],
-    )
+    at_limit = "At how many samples each constraint is at its limit."
+    findings: list[Block] = [
+        Finding("vaf", vaf, "Variance accounted for (3.24), over all recordings.", digits=6),
+        *([Finding("limits", limits, at_limit)] if len(limits) else []),
+    ]
     pictures = [
         Picture(
             f"trajectories-{index + 1}",
@@ -472,7 +412,7 @@ def _trajectories(fit: OptimalFit) -> list[Block]:
         for index in range(min(len(fit.trials), MOST_TRIALS))
     ]
     others = [Details("The other recordings", pictures[1:])] if len(pictures) > 1 else []
-    return [table, *([limits] if limits.rows else []), pictures[0], *others]
+    return [*findings, pictures[0], *others]
 
 
 def _checks(fit: OptimalFit) -> Terms:
@@ -510,7 +450,7 @@ def _made(fit: OptimalFit, provenance: Provenance) -> list[Block]:
     ]  # fmt: skip
 
 
-def _samples(fit: OptimalFit) -> TextTable:
+def _samples(fit: OptimalFit) -> Finding:
     """A row a sample: recorded and simulated signals, and disturbances."""
     problem, step, blocks = fit.estimate.problem, 1.0 if fit.dt is None else fit.dt, []
     for index in range(min(len(fit.trials), MOST_TRIALS)):
@@ -525,7 +465,8 @@ def _samples(fit: OptimalFit) -> TextTable:
     heads = ["trial", "sample" if fit.dt is None else "time"]
     for names in (problem.state_names, problem.input_names):
         heads += [f"{name}_recorded" for name in names] + [f"{name}_simulated" for name in names]
-    return TextTable("", [*heads, *problem.disturbance_names], np.vstack(blocks).tolist())
+    table = pd.DataFrame(np.vstack(blocks), columns=[*heads, *problem.disturbance_names])
+    return Finding("trajectories", table)
 
 
 def _data(fit: OptimalFit, provenance: Provenance) -> dict[str, Any]:
@@ -533,10 +474,6 @@ def _data(fit: OptimalFit, provenance: Provenance) -> dict[str, Any]:
     return {
         "verdict": verdict(fit),
         "sentences": abstract(fit),
-        "parameters": {
-            row["parameter"]: {key: value for key, value in row.items() if key != "parameter"}
-            for row in _rows(fit)
-        },
         "combinations": {
             kind: [
                 {"name": one.name, "exponents": one.exponents, "value": one.value,
@@ -546,7 +483,6 @@ def _data(fit: OptimalFit, provenance: Provenance) -> dict[str, Any]:
             for kind, items in (("told", found.told), ("untold", found.untold))
         },
         "singular_values": found.singular_values,
-        "reached": {name: samples for name, (samples, _) in reached(estimate).items()},
         "loss": estimate.loss,
         "x0": estimate.x0,
         "trials": [

@@ -1,4 +1,4 @@
-"""What a fit will take, told before it is begun: seconds and memory, to their order of magnitude.
+"""What a command will take, told before it is begun: seconds and memory, by orders of magnitude.
 
 The largest arrays are the rows of the constraints, r = 2 N m for bounded inputs, and their
 derivatives along p directions, r x N m x p; and those of the states, samples x n x p
@@ -9,14 +9,21 @@ directions, and as many simulations as a fit, a replicate and a profile took the
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from impc.studies.selection.model import sensitivity
+
 if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
     from impc.inverse.problem import Problem
     from impc.studies.fit.settings import FitSettings
+    from impc.studies.selection.model import ParametricModel, Trial
+    from impc.studies.selection.settings import SelectSettings
 
 #: Seconds for each sample, state and sample of the horizon.
 SECONDS_A_SAMPLE = 5.4e-3 / (3000 * 10 * 20)
@@ -29,6 +36,12 @@ _A_TRIAL = 1e-3
 # Simulations of all trials: of a fit (4 s of three trials of 15 ms), of a replicate (0.6 s of it),
 # of a profile, which fits again at each of its points.
 _FIT, _REPLICATE, _PROFILE = 300, 40, 1000
+# Evaluations with derivatives of a fit from a start far off, of one from its neighbourhood, of a
+# LASSO with its refit, and of Table C.1 (of the outputs alone: a few thousand a solve). Counted on
+# the drug: 7, 5, 74; on the head, whose twelve parameters are hardly told: 200, 17, 23.
+_START, _REFIT, _LASSO, _TABLE = 30, 9, 100, 4000
+# Arrays of the size of the derivative that a fit holds, and fits at a time in a bootstrap.
+_COPIES, _THREADS = 6, 2
 
 
 @dataclass(frozen=True)
@@ -65,3 +78,32 @@ def fit_effort(problem: Problem, settings: FitSettings) -> Effort:
     fits += structures * (1 + left_out)
     simulations = _FIT * fits + _REPLICATE * settings.replicates + _PROFILE * len(settings.profiles)
     return Effort(simulations * once, 8e-9 * numbers)
+
+
+def select_evaluations(settings: SelectSettings) -> int:
+    """Of the model with its derivative, for one subject of `impc select`."""
+    table = _TABLE if settings.nelder_mead else 0
+    return _START * settings.starts + _REFIT * settings.replicates + _LASSO + table
+
+
+def key_evaluations(settings: SelectSettings, most: int = 20) -> int:
+    """Of the model with its derivative, for one subject and visit of `impc key-parameters`."""
+    return _START * (settings.starts + most)
+
+
+def selection_effort(
+    model: ParametricModel, recorded: Iterable[Sequence[Trial]], evaluations: int
+) -> Effort:
+    """What one subject takes, on average; the model is called three times."""
+    subjects = [tuple(trials) for trials in recorded]
+    samples = [sum(len(trial.input) for trial in trials) for trials in subjects]
+    first = subjects[0][0]
+    # The first call compiles, or loads, what the model needs: it took 300 times as long.
+    times = []
+    for _ in range(3):
+        begun = time.perf_counter()
+        outputs, _slopes = sensitivity(model, np.array(model.typical), first.input)
+        times.append(time.perf_counter() - begun)
+    one = min(times) / len(first.input)
+    numbers = max(samples) * outputs.shape[1] * model.size * _COPIES * _THREADS
+    return Effort(one * float(np.mean(samples)) * evaluations, 8e-9 * numbers)

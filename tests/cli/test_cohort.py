@@ -19,10 +19,10 @@ import pytest
 from click.testing import CliRunner, Result
 
 from impc.cli.main import main
-from impc.studies.cohort import cluster
-from impc.studies.cohort.store import open_store
+from impc.reporting.writer import owned
+from impc.studies import scheduler
 from tests.studies.cohort.carts import write_study
-from tests.studies.cohort.test_cluster import certificates
+from tests.studies.test_scheduler import certificates
 from tests.support import leave_blank
 
 if TYPE_CHECKING:
@@ -236,7 +236,7 @@ def test_a_killed_scheduler_is_one_line_and_the_run_goes_on(
 def test_no_scheduler_is_one_line(
     study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(cluster, "_PATIENCE", "1s")
+    monkeypatch.setattr(scheduler, "_PATIENCE", "1s")
     done = run_here(study, tmp_path / "out", "--scheduler", "tcp://127.0.0.1:9")
     assert done.exit_code == 2
     assert len(done.stderr.strip().splitlines()) == 1
@@ -244,7 +244,7 @@ def test_no_scheduler_is_one_line(
 
 
 def test_two_runs_into_one_folder_are_refused(study: Path, tmp_path: Path) -> None:
-    with open_store(tmp_path, {}):
+    with owned(tmp_path, "cohort"):
         done = run(study, tmp_path, "--workers", "1")
     assert done.returncode == 2
     assert "another run is writing to it" in done.stderr

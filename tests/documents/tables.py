@@ -26,9 +26,7 @@ _ENVIRONMENT = "makes an environment; the tests run inside one"
 _WHOLE = "runs what these tests are a part of"
 _SITE = "builds the site: four minutes"
 _PUBLISH = "publishes, or needs a network"
-_CERTIFICATES = (
-    "needs openssl; tests/studies/cohort/test_cluster.py runs these lines where it is there"
-)
+_CERTIFICATES = "needs openssl; tests/studies/test_scheduler.py runs these lines where it is there"
 _CLUSTER = "needs machines of a cluster; tests/cohort starts a scheduler and workers of its own"
 
 #: (page, line) -> why it is not run.

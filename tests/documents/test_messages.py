@@ -41,7 +41,6 @@ from impc.files.formats import encode_table, read_table
 from impc.files.plant_sources import PlantSource, make_plant, plant_source
 from impc.files.reading import read_recordings, recording_of
 from impc.files.results import read_result
-from impc.files.sealed import Kept
 from impc.files.table import Table, make_table
 from impc.files.units import si_unit
 from impc.inverse.likelihood_fit import fit_person
@@ -66,14 +65,17 @@ from impc.nonlinear.files import (
 from impc.nonlinear.plan import require_solver as require_nlp_solver
 from impc.nonlinear.problem import OptimalControlProblem
 from impc.reporting.writer import owned, require_writable, write_files
-from impc.studies.cohort import cluster
+from impc.studies import scheduler
+from impc.studies.cache import Cache
+from impc.studies.cohort.engine import Store, require_same
 from impc.studies.cohort.sheet import Sheet, column_values, read_sheet
-from impc.studies.cohort.store import Store, open_store
 from impc.studies.cohort.study import checked_name, find_by_pattern, read_study
 from impc.studies.effort import Effort
 from impc.studies.fit.asked import fit_structures
 from impc.studies.fit.settings import FitSettings, fit_settings, require_used
 from impc.studies.fit.subject import fit_problem
+from impc.studies.pool import Task
+from impc.studies.scheduler import Cluster, connected
 from impc.studies.selection.subsets import largest_subsets
 from plants import seated_balance_plant
 from tests.documents.blocks import PAGES
@@ -294,15 +296,15 @@ def file_for_a_folder(folder: Path) -> None:
 
 
 def two_runs(folder: Path) -> None:
-    with open_store(folder, {}), open_store(folder, {}):
+    with owned(folder, "cohort"), owned(folder, "cohort"):
         pass
 
 
 def another_study(folder: Path) -> None:
-    with open_store(folder, {"sub-1": "one"}) as store:
-        store.keep_fit("sub-1", {"K": [[1.0]]})
-    with open_store(folder, {"sub-1": "other"}) as store:
-        store.fit("sub-1")
+    (folder / "manifest.json").write_text('{"units": {"sub-1": {"digest": "one"}}}')
+    store = Store(folder, {"sub-1": "other"})
+    store.cache.keep("sub-1/fit", "one", {"K": [[1.0]]})
+    require_same(store)
 
 
 def study_file(folder: Path, text: str) -> Path:
@@ -342,16 +344,11 @@ def file_of_ones_own(folder: Path) -> None:
         write_files(folder, {"gain.png": b""})
 
 
-def damaged_result(folder: Path) -> None:
-    (folder / "fit.json").write_text("{}")
-    Kept(folder).find("fit", "")
-
-
 def no_room(folder: Path) -> None:
     limit = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (10, limit[1]))
     try:
-        Kept(folder / "units").keep("fit", "", {})
+        Cache(folder / "units").keep("fit", "", {})
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limit)
 
@@ -372,7 +369,7 @@ def sheet_of(folder: Path, text: str) -> Sheet:
 
 
 def connect(address: str) -> None:
-    with cluster.connected(cluster.Cluster(address)):
+    with connected(Cluster(address)):
         pass
 
 
@@ -384,10 +381,10 @@ def lost_scheduler(_: Path) -> None:
     make: Any = distributed.LocalCluster
     with make(
         n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None, silence_logs=60
-    ) as found, cluster.connected(cluster.Cluster(found.scheduler_address)) as workers:  # fmt: skip
-        workers.submit("long", time.sleep, 0.5)
+    ) as found, connected(Cluster(found.scheduler_address)) as pool:  # fmt: skip
+        pool.submit(1, [Task("long", "", time.sleep, (0.5,))])
         found.close()
-        list(workers.results())
+        pool.take()
 
 
 def everything_recorded(_: Path) -> None:
@@ -793,7 +790,6 @@ PROVOKED: dict[str, Callable[[Path], object]] = {
     "holds results of impc ...; give another folder": another_command,
     "holds ... of another version or of your own": results_without_a_list,
     "is not of an earlier run of this command": file_of_ones_own,
-    "is damaged, or not what this program wrote": damaged_result,
     "cannot be written (...); make room and start again": no_room,
     "cannot be written (...); move what is in its place, or give another folder": (
         folder_for_a_file
@@ -836,7 +832,7 @@ def test_every_message_of_the_page_is_provoked() -> None:
 def test_the_message_is_what_is_said(
     message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(cluster, "_PATIENCE", "1s")
+    monkeypatch.setattr(scheduler, "_PATIENCE", "1s")
     try:
         said = str(PROVOKED[message](tmp_path))
     except ImpcError as error:

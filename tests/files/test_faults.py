@@ -17,9 +17,8 @@ from typing import Any
 import pytest
 
 from impc.errors import OutputError
-from impc.files.sealed import Kept
 from impc.reporting.writer import owned, write_files
-from impc.studies.cohort.store import Store
+from impc.studies.cache import Cache
 
 OLD = {"report.html": b"old", "figure_9.png": b"old", "sub/old.csv": b"old"}
 NEW = {"report.html": b"new", "result.json": b"new", "sub/new.csv": b"new"}
@@ -29,13 +28,20 @@ STAGES = {"fit": {"K": [[1.5]]}, "without trial 1": {"K": [[2.5]]}}
 def work(folder: Path, files: dict[str, bytes]) -> None:
     """What a command does: stages one by one, then its files, and the stages go."""
     with owned(folder, "fit"):
-        kept = Kept(folder / "fit-in-progress")
+        kept = Cache(folder / "fit-in-progress")
         for name, content in STAGES.items():
-            if name not in kept.recall_all("digest"):
+            if kept.find(name, "digest") is None:
                 kept.keep(name, "digest", content)
-        assert kept.recall_all("digest") == STAGES
+        assert found_in(folder) == STAGES
         write_files(folder, files)
         kept.forget()
+
+
+def found_in(folder: Path) -> dict[str, Any]:
+    """The stages that a folder keeps."""
+    kept = Cache(folder / "fit-in-progress")
+    found = {name: kept.find(name, "digest") for name in STAGES}
+    return {name: content for name, content in found.items() if content is not None}
 
 
 def shown(folder: Path) -> dict[str, bytes]:
@@ -112,28 +118,9 @@ def test_a_disk_that_takes_only_a_part_of_a_file(tmp_path: Path) -> None:
         found = shown(folder)
         assert found in (OLD, NEW) or "INCOMPLETE.txt" in found
         assert not list(folder.rglob("*.part"))
-        assert Kept(folder / "fit-in-progress").recall_all("digest").items() <= STAGES.items()
+        assert found_in(folder).items() <= STAGES.items()
     assert refused >= 5
     assert shown(folder) == NEW
-
-
-@pytest.mark.skipif(os.name != "posix", reason="a limit that the system keeps")
-def test_no_room_for_the_log(tmp_path: Path) -> None:
-    """A line may be cut; the run ends in one line, and the next one goes on below it."""
-    store, said = Store(tmp_path), ""
-    limit = resource.getrlimit(resource.RLIMIT_FSIZE)
-    try:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (50, limit[1]))
-        for _ in range(9):
-            store.log("a line of twenty")
-    except OutputError as error:
-        said = str(error)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
-    assert "cohort.log: cannot be written (File too large); make room" in said
-    assert "\n" not in said
-    store.log("later")
-    assert (tmp_path / "cohort.log").read_text().endswith("later\n")
 
 
 KILLED = """
@@ -164,8 +151,7 @@ def test_a_kill_at_each_rename(tmp_path: Path) -> None:
         found = shown(folder)
         told += "INCOMPLETE.txt" in found
         assert found in (OLD, NEW) or "INCOMPLETE.txt" in found
-        kept = Kept(folder / "fit-in-progress").recall_all("digest")
-        assert kept.items() <= STAGES.items()
+        assert found_in(folder).items() <= STAGES.items()
         work(folder, NEW)
         assert shown(folder) == NEW
         assert {path.name for path in folder.iterdir()} == {*NEW, "sub", ".impc"} - {"sub/new.csv"}
@@ -212,7 +198,7 @@ def _interrupted(folder: Path) -> Path:
     """A folder with the files of a run, what another one had done, and files of somebody's own."""
     work(folder, OLD)
     with owned(folder, "fit"):
-        Kept(folder / "fit-in-progress").keep("fit", "digest", STAGES["fit"])
+        Cache(folder / "fit-in-progress").keep("fit", "digest", STAGES["fit"])
     for name, content in MINE.items():
         (folder / name).write_bytes(content)
     return folder
@@ -246,10 +232,3 @@ try:
 except OutputError as error:
     print(error, end="")
 """
-
-
-def test_a_pipe_in_the_place_of_the_log_is_refused(tmp_path: Path) -> None:
-    """To open it would wait for ever."""
-    os.mkfifo(tmp_path / "cohort.log")
-    with pytest.raises(OutputError, match="no ordinary file"):
-        Store(tmp_path).log("run")

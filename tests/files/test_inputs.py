@@ -9,7 +9,7 @@ import hashlib
 import importlib
 import json
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -17,10 +17,11 @@ from typing import Any
 import pytest
 from click.testing import CliRunner, Result
 
-import impc.studies.cohort.cluster
-import impc.studies.selection.queue
+import impc.studies.pool
+import impc.studies.scheduler
+import impc.studies.selection.model_source
 from impc.cli.main import main
-from tests.studies.cohort.made_up import Here
+from impc.studies.pool import Answer, ThisProcess
 from tests.studies.selection.test_methods import blood_study
 
 COMMANDS = ("select", "key-parameters")
@@ -47,22 +48,19 @@ def here(monkeypatch: pytest.MonkeyPatch, stop: int = -1) -> list[str]:
     """Work in this process, interrupted before task number `stop`; names of what is done."""
     done: list[str] = []
 
-    class Interrupted(Here):
-        def submit(self, key: Any, work: Callable[..., Any], *given: Any) -> None:
-            super().submit(key, work, *given)
-
-        def results(self) -> Any:
-            for item in super().results():
-                if len(done) == stop:
-                    raise KeyboardInterrupt
-                done.append(str(item.key))
-                yield item
+    class Interrupted(ThisProcess):
+        def take(self) -> tuple[int, list[Answer] | str]:
+            if len(done) == stop:
+                raise KeyboardInterrupt
+            done.extend(task.name for task in self._waiting[0][1])
+            return super().take()
 
     @contextmanager
     def connected(_: object) -> Iterator[Interrupted]:
         yield Interrupted()
 
-    monkeypatch.setattr(impc.studies.cohort.cluster, "connected", connected)
+    monkeypatch.setattr(impc.studies.scheduler, "connected", connected)
+    monkeypatch.setattr(impc.studies.pool, "_SECONDS", 0.0)  # one task a batch
     return done
 
 
@@ -141,7 +139,7 @@ def test_an_interrupted_study_goes_on_with_what_is_the_same(
     if changed in CHANGES:
         CHANGES[changed](study)
     elif changed == "versions":
-        monkeypatch.setattr(impc.studies.selection.queue, "versions", lambda: {"numpy": "0"})
+        monkeypatch.setattr(impc.studies.selection.model_source, "versions", lambda: {"numpy": "0"})
     again = here(monkeypatch)
     assert run(command, study).exit_code == 0
     fresh = here(monkeypatch)

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 
 from impc.arrays import Array, Frozen, frozen
-from impc.files.sealed import Kept
-from impc.studies.cache import Cache, by_fields
+from impc.errors import OutputError
+from impc.studies.cache import Cache, Steps, from_json
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -27,7 +28,8 @@ class Found(Frozen):
     value: float | None
 
 
-CODEC = by_fields(Found)
+def decode(kept: Any) -> Found:
+    return from_json(kept, Found)
 
 
 def found(seed: int) -> Found:
@@ -57,11 +59,11 @@ def counted(seed: int, made: list[int]) -> Callable[[], Found]:
     [("nothing", []), ("other digest", [1, 2]), ("cut", [1]), ("flipped", [1]), ("copied", [1])],
 )
 def test_what_is_kept_is_not_done_again(tmp_path: Path, damage: str, again: list[int]) -> None:
-    kept, told, made = Kept(tmp_path / "kept"), list[str](), list[int]()
-    first = Cache(kept, "digest", told.append)
+    kept, told, made = Cache(tmp_path / "kept"), list[str](), list[int]()
+    first = Steps(kept, "digest", told.append)
     assert first.kept() == "nothing was done yet"
     for seed in (1, 2):
-        same(found(seed), first.get(f"step {seed}", counted(seed, made), CODEC))
+        same(found(seed), first.get(f"step {seed}", counted(seed, made), decode))
     assert made == [1, 2]
     path = kept.path("step 1")
     content = path.read_bytes()
@@ -72,20 +74,90 @@ def test_what_is_kept_is_not_done_again(tmp_path: Path, damage: str, again: list
         path.write_bytes(content[:place] + bytes([content[place] ^ 1]) + content[place + 1 :])
     elif damage == "copied":
         path.write_bytes(kept.path("step 2").read_bytes())
-    other = Cache(kept, "another" if damage == "other digest" else "digest", told.append)
+    other = Steps(kept, "another" if damage == "other digest" else "digest", told.append)
     made.clear()
     for seed in (1, 2):
-        same(found(seed), other.get(f"step {seed}", counted(seed, made), CODEC))
+        same(found(seed), other.get(f"step {seed}", counted(seed, made), decode))
     assert made == again
     assert told == ["step 1", "step 2"] * 2
     assert "step 1" in other.kept()
-    other.forget()
+    kept.forget()
     assert not kept.folder.exists()
 
 
 def test_a_step_that_fails_is_not_kept(tmp_path: Path) -> None:
-    cache = Cache(Kept(tmp_path), "digest")
+    steps = Steps(Cache(tmp_path), "digest")
     with pytest.raises(ZeroDivisionError):
-        cache.get("step", lambda: 1 / 0, CODEC)  # type: ignore[arg-type,return-value]
-    assert cache.stages == {}
+        steps.get("step", lambda: 1 / 0, decode)
+    assert steps.names == []
     assert list(tmp_path.iterdir()) == []
+
+
+def test_what_is_kept_reads_the_same(tmp_path: Path) -> None:
+    kept = Cache(tmp_path / "kept")
+    content = {
+        "x": np.random.default_rng(0).standard_normal(50).tolist(),
+        "n": [None, float("inf")],
+        "t": "µ\ud800",
+    }
+    assert kept.find("a/b", "d") is None
+    kept.keep("a/b", "d", content)
+    assert kept.find("a/b", "d") == content
+    assert kept.find("a/b", "other") is None
+    kept.forget()
+    kept.forget()
+    assert not kept.folder.exists()
+
+
+def test_names_that_fall_together_are_told_apart(tmp_path: Path) -> None:
+    kept = Cache(tmp_path)
+    kept.keep("trial 1", "d", 1)
+    assert kept.find("trial-1", "d") is None
+    assert kept.find("trial 1", "d") == 1
+
+
+def test_a_seal_of_the_right_form_and_wrong_value(tmp_path: Path) -> None:
+    kept = Cache(tmp_path)
+    kept.keep("a", "d", {"gain": -24.95})
+    found = json.loads(kept.path("a").read_text())
+    assert list(found) == ["sha256", "content", "digest", "name"]
+    for key, value in (
+        ("digest", "e"),
+        ("name", "b"),
+        ("content", {"gain": -34.04}),
+        ("sha256", 3),
+    ):
+        kept.path("a").write_text(json.dumps(found | {key: value}))
+        assert kept.find("a", found["digest"]) is None
+
+
+def test_a_link_in_the_place_of_the_draft_is_not_followed(tmp_path: Path) -> None:
+    target = tmp_path / "mine"
+    target.write_text("mine")
+    (tmp_path / ".a.json.part").symlink_to(target)
+    Cache(tmp_path).keep("a", "d", 1)
+    assert target.read_text() == "mine"
+
+
+def test_a_file_in_the_way_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "kept").write_text("")
+    with pytest.raises(OutputError, match="cannot be written") as caught:
+        Cache(tmp_path / "kept").keep("a", "d", 1)
+    assert "\n" not in str(caught.value)
+
+
+def test_only_what_was_kept_is_forgotten(tmp_path: Path) -> None:
+    kept = Cache(tmp_path / "fit-in-progress")
+    for name in ("one", "two/three"):
+        kept.keep(name, "digest", [1.0])
+    (tmp_path / "fit-in-progress" / "notes.txt").write_text("mine")
+    (tmp_path / "fit-in-progress" / "table.json").write_text("[1]")
+    kept.forget()
+    left = [path.name for path in tmp_path.rglob("*") if path.is_file()]
+    assert sorted(left) == ["notes.txt", "table.json"]
+    (tmp_path / "fit-in-progress" / "notes.txt").unlink()
+    (tmp_path / "fit-in-progress" / "table.json").unlink()
+    kept.keep("one", "digest", [1.0])
+    kept.forget()
+    assert list(tmp_path.iterdir()) == []
+    kept.forget()

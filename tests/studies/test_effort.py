@@ -27,17 +27,22 @@ from impc.model.bounds import Bounds
 from impc.model.recordings import Recording
 from impc.model.riccati import solve_lqr
 from impc.model.weights import Weights
-from impc.studies.effort import Effort, fit_effort
+from impc.studies.effort import (
+    Effort,
+    fit_effort,
+    key_evaluations,
+    select_evaluations,
+    selection_effort,
+)
 from impc.studies.fit.settings import FitSettings, StructureSettings
 from impc.studies.selection.analysis import select_study
-from impc.studies.selection.effort import key_evaluations, select_evaluations, selection_effort
 from impc.studies.selection.key_parameters import key_parameters
 from impc.studies.selection.model import ParametricModel, Trial, sensitivity
 from impc.studies.selection.model_source import model_source
-from impc.studies.selection.queue import in_turn
 from impc.studies.selection.settings import SelectSettings
 from tests.files.test_inputs import here
 from tests.studies.cohort.carts import write_study
+from tests.studies.selection.dosing import in_turn
 from tests.studies.selection.heads import head_model, head_trials
 from tests.studies.selection.test_methods import blood_study
 from tests.support import random_plant
@@ -177,7 +182,7 @@ def test_compiling_a_model_is_no_part_of_what_a_selection_takes(
     """A clock that shows 6 s for the first call and 0.02 s for the others: 15 minutes, not 79 h."""
     model, trials = drug()
     clock = iter([0.0, 6.0, 6.0, 6.02, 6.02, 6.05])
-    monkeypatch.setattr("impc.studies.selection.effort.time.perf_counter", lambda: next(clock))
+    monkeypatch.setattr("impc.studies.effort.time.perf_counter", lambda: next(clock))
     assert selection_effort(model, [trials], 10).seconds == pytest.approx(0.2)
 
 

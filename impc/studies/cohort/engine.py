@@ -1,37 +1,79 @@
-"""Run a study: fits and replicates as tasks, results to disk as they come.
+"""Run a study: the fit of each unit, then its replicates, results to disk as they come.
 
-A few tasks per worker are given out at a time, so that nobody holds more than that of the study. A
-unit's replicates follow as soon as its fit is written down. A task whose worker dies is given to
-another one; what cannot be fitted is reported and stops nothing else.
+    OUT/manifest.json                  the units, their digests, the versions
+    OUT/units/NAME/fit.json            a fit (`impc.studies.cache`), or
+    OUT/units/NAME/failed.json         why there is none
+    OUT/units/NAME/replicate-0007.json, or replicate-0007-failed.json
+    OUT/cohort.log                     what happened when
+
+What is there is not computed again. What cannot be fitted is reported and stops nothing else.
 """
 
 from __future__ import annotations
 
 import json
-import os
 from collections import deque
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
-import psutil
-
+from impc.errors import InputError
 from impc.files.digests import versions
+from impc.files.writing import IN_ITS_PLACE, require_ordinary, unwritable
 from impc.reporting.writer import write_files
-from impc.studies.cohort.unit_task import FitTask, fit_unit, replicate_unit
+from impc.studies.cache import Cache
+from impc.studies.cohort.tasks import fit_unit, replicate_unit
+from impc.studies.pool import Task, run
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Mapping
+    from pathlib import Path
 
-    from impc.studies.cohort.store import Store
-    from impc.studies.cohort.study import Study, Unit
-    from impc.studies.cohort.workers import Done, Workers
+    from impc.studies.cohort.study import Study
+    from impc.studies.cohort.tasks import FitTask
+    from impc.studies.pool import Pool, Result
 
-# Tasks given out for each thread of the cluster: one that runs, and two that wait for it.
-_AHEAD = 3
-_FIT = -1
 # What a replicate needs of its fit.
 _NEEDED = ("starts", "logarithms", "K", "S", "Q", "R")
+
+
+@dataclass(frozen=True)
+class Store:
+    """The results of a study in its folder."""
+
+    folder: Path
+    # Of every unit, by its name, as the study is now (`unit_digest`). A unit without one, because a
+    # recording cannot be read, has no results.
+    digests: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def cache(self) -> Cache:
+        """Where they are kept."""
+        return Cache(self.folder / "units")
+
+    def fit(self, unit: str) -> dict[str, Any] | None:
+        """The fit of a unit, or None."""
+        return self._find(unit, _fit(unit))
+
+    def replicate(self, unit: str, index: int) -> dict[str, Any] | None:
+        """The replicate `index` of a `unit`, or None."""
+        return self._find(unit, _replicate(unit, index))
+
+    def _find(self, unit: str, name: str) -> dict[str, Any] | None:
+        if unit not in self.digests:
+            return None
+        found: dict[str, Any] | None = self.cache.find(name, self.digests[unit])
+        return found
+
+    def log(self, line: str) -> None:
+        """Add a `line` to cohort.log."""
+        path = self.folder / "cohort.log"
+        try:
+            require_ordinary(path)
+            with path.open("a", encoding="utf-8") as stream:
+                stream.write(f"{datetime.now(UTC).isoformat(timespec='seconds')} {line}\n")
+        except OSError as error:
+            raise unwritable(f"file {path}", error, IN_ITS_PLACE) from None
 
 
 @dataclass
@@ -56,138 +98,94 @@ class Failures:
         return bool(self.units or self.replicates)
 
 
-@dataclass(frozen=True)
-class _Work:
-    """One task: a fit (index -1) or a replicate of a unit."""
-
-    unit: str
-    index: int
-
-    @property
-    def name(self) -> str:
-        return "fit" if self.index == _FIT else f"replicate {self.index + 1}"
+def _fit(unit: str) -> str:
+    return f"{unit}/fit"
 
 
-def work_left(study: Study, store: Store) -> tuple[int, int]:
-    """Number of tasks done and of all tasks; a unit that failed counts as not begun."""
+def _replicate(unit: str, index: int) -> str:
+    return f"{unit}/replicate-{index:04d}"
+
+
+def work_kept(study: Study, store: Store) -> tuple[int, int]:
+    """Number of tasks whose result has a file, and of all tasks."""
     count = int(study.configuration.fit.get("replicates", 0))
-    done = 0
-    for unit in study.units:
-        if store.fit(unit.name) is not None:
-            found = (store.replicate(unit.name, index) for index in range(count))
-            done += 1 + sum(item is not None for item in found)
-    return done, len(study.units) * (1 + count)
+    names = [
+        name
+        for unit in study.units
+        for name in (_fit(unit.name), *(_replicate(unit.name, index) for index in range(count)))
+    ]
+    return sum(store.cache.path(name).exists() for name in names), len(names)
+
+
+def require_same(store: Store) -> None:
+    """Refuse a folder that has fits of other recordings, settings, plants or versions."""
+    try:
+        known = json.loads((store.folder / "manifest.json").read_bytes())["units"]
+        before = {unit: known[unit]["digest"] for unit in store.digests if unit in known}
+    except (OSError, ValueError, KeyError, TypeError):  # none, or damaged: no result is used then
+        return  # that has another digest
+    for unit, digest in before.items():
+        path = store.cache.path(_fit(unit))
+        if digest not in (None, store.digests[unit]) and path.exists():
+            raise InputError(
+                f"file {path}",
+                "was fitted to other recordings or with other settings, plant or versions",
+                "give another folder, or remove it",
+            )
 
 
 def run_study(
     study: Study,
     tasks: Mapping[str, FitTask],
     store: Store,
-    workers: Workers,
-    done: Callable[[str], None] = lambda _: None,
-    log: Callable[[str], None] = lambda _: None,
+    pool: Pool,
+    done: Callable[[Result], None] = lambda _: None,
 ) -> Failures:
     """Do what is left of a study."""
-    run = _Run(study, tasks, store, workers, done, log)
-    for unit in study.units:
-        if unit.name in tasks:
-            run.begin(unit)
+    require_same(store)
     manifest = json.dumps(_manifest(study, tasks), indent=1, sort_keys=True) + "\n"
     write_files(store.folder, {"manifest.json": manifest.encode()})
-    log(f"run of {len(study.units)} units on {workers.threads} threads")
-    run.drain()
-    return run.failures
-
-
-class _Run:
-    """The queue of one run, and how many tasks are out."""
-
-    def __init__(
-        self,
-        study: Study,
-        tasks: Mapping[str, FitTask],
-        store: Store,
-        workers: Workers,
-        done: Callable[[str], None],
-        log: Callable[[str], None],
-    ) -> None:
-        self.store, self.workers, self.tasks = store, workers, tasks
-        self.done, self.log = done, log
-        self.count = int(study.configuration.fit.get("replicates", 0))
-        self.queue: deque[_Work] = deque()
-        self.out = 0
-        self.failures = Failures()
-
-    def begin(self, unit: Unit) -> None:
-        """Queue what a unit lacks."""
-        if self.store.fit(unit.name) is None:
-            self.queue.append(_Work(unit.name, _FIT))
-        else:
-            self.queue.extend(self._replicates(unit.name))
-
-    def drain(self) -> None:
-        """Give out tasks and take in results until none is left."""
-        self._fill()
-        for done in self.workers.results():
-            self.out -= 1
-            self._take(done)
-            self._fill()
-
-    def _take(self, done: Done) -> None:
-        work = done.key
-        assert isinstance(work, _Work)
-        # A fault of the program itself is a reason like any other.
-        content: dict[str, Any] = {"reason": done.fault} if done.fault else done.value
-        reason = content.get("reason")
-        if reason is not None:
-            self._fail(work, reason)
-        elif work.index == _FIT:
-            self.store.keep_fit(work.unit, content)
+    store.log(f"run of {len(study.units)} units on {pool.threads} threads")
+    count = int(study.configuration.fit.get("replicates", 0))
+    failures, cache = Failures(), store.cache
+    queue = deque(Task(_fit(unit), task.digest, fit_unit, (task,)) for unit, task in tasks.items())
+    for result in run(pool, queue, cache):
+        task, content = result.task, result.content
+        unit, _, name = task.name.partition("/")
+        index = None if task.work is fit_unit else task.given[-1]
+        if result.fault is not None:
+            reason = str(result.fault)
+            if index is None:
+                failures.units[unit] = reason
+            else:
+                failures.replicates.setdefault(unit, {})[index + 1] = reason
+            store.log(f"{unit}: {name}: {reason}")
+            cache.keep(_failed(task.name), task.digest, {"reason": reason})
+        elif not result.found:
+            cache.discard(_failed(task.name))
+            store.log(
+                f"{unit}: {name} in {content['seconds']:.2f} s; memory of worker "
+                f"{content['memory_mb']:.0f} MB"
+            )
+        if index is None and result.fault is None:
             # Before other fits: a unit is finished before the next is begun.
-            self.queue.extendleft(reversed(list(self._replicates(work.unit))))
-        else:
-            self.store.keep_replicate(work.unit, work.index, content)
-        self._tell(work, content)
+            needed = {key: content[key] for key in _NEEDED}
+            queue.extendleft(
+                Task(_replicate(unit, k), task.digest, replicate_unit, (*task.given, needed, k))
+                for k in reversed(range(count))
+            )
+        done(result)
+    return failures
 
-    def _fail(self, work: _Work, reason: str) -> None:
-        if work.index == _FIT:
-            self.failures.units[work.unit] = reason
-            self.store.keep_failure(work.unit, None, reason)
-        else:
-            self.failures.replicates.setdefault(work.unit, {})[work.index + 1] = reason
-            self.store.keep_failure(work.unit, work.index, reason)
-        self.log(f"{work.unit}: {work.name}: {reason}")
 
-    def _fill(self) -> None:
-        most = _AHEAD * self.workers.threads
-        while self.queue and self.out < most:
-            work = self.queue.popleft()
-            self._submit(work)
-            self.out += 1
+def keep_failure(store: Store, unit: str, reason: str) -> None:
+    """Write down the `reason` why a `unit` cannot be fitted: none of its recordings can be read."""
+    store.cache.keep(_failed(_fit(unit)), "", {"reason": reason})
 
-    def _submit(self, work: _Work) -> None:
-        task = self.tasks[work.unit]
-        if work.index == _FIT:
-            self.workers.submit(work, fit_unit, task)
-            return
-        fit = self.store.fit(work.unit)
-        assert fit is not None
-        needed = {key: fit[key] for key in _NEEDED}
-        self.workers.submit(work, replicate_unit, task, needed, work.index)
 
-    def _replicates(self, unit: str) -> Iterator[_Work]:
-        for index in range(self.count):
-            if self.store.replicate(unit, index) is None:
-                yield _Work(unit, index)
-
-    def _tell(self, work: _Work, content: dict[str, Any]) -> None:
-        seconds = float(content.get("seconds", 0.0))
-        self.done(f"{work.unit} {work.name}")
-        here = psutil.Process(os.getpid()).memory_info().rss / 1e6
-        self.log(
-            f"{work.unit}: {work.name} in {seconds:.2f} s; memory of worker "
-            f"{content.get('memory_mb', float('nan')):.0f} MB, of client {here:.0f} MB"
-        )
+def _failed(name: str) -> str:
+    """Where the reason is kept why there is no such result."""
+    return f"{name}-failed".replace("/fit-", "/")
 
 
 def _manifest(study: Study, tasks: Mapping[str, FitTask]) -> dict[str, Any]:

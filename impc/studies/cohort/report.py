@@ -27,8 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from impc.studies.cohort.comparison import Comparison
-    from impc.studies.cohort.engine import Failures
-    from impc.studies.cohort.store import Store
+    from impc.studies.cohort.engine import Failures, Store
     from impc.studies.cohort.study import Study, Unit
 
 _QUESTIONS = {

@@ -16,8 +16,7 @@ from impc.studies.cohort.study import safe_name
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from impc.studies.cohort.engine import Failures
-    from impc.studies.cohort.store import Store
+    from impc.studies.cohort.engine import Failures, Store
     from impc.studies.cohort.study import Unit
 
 

@@ -22,7 +22,7 @@ from impc.assess.assessments import ASSESSMENTS
 from impc.studies.cohort.unit_structure import structure_row
 
 if TYPE_CHECKING:
-    from impc.studies.cohort.store import Store
+    from impc.studies.cohort.engine import Store
     from impc.studies.cohort.study import Study, Unit
 
 _CENTRE = "analytic centre (no units)"

@@ -1,23 +1,92 @@
-"""The tasks of a study: for each unit its recordings, the plant of its subject, and the digest."""
+"""The tasks of a study: for each unit its fit, and bootstrap replicates of it.
+
+Tasks carry file names and settings; a worker reads the recordings itself and keeps the last few.
+Nothing here depends on the order of tasks or on how many workers there are.
+"""
 
 from __future__ import annotations
 
+import functools
 import inspect
-from concurrent.futures import ThreadPoolExecutor
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from impc.errors import DataError
-from impc.studies.cohort.unit_digest import unit_digest
-from impc.studies.cohort.unit_task import FitTask
+import numpy as np
+import psutil
+
+from impc.arrays import frozen
+from impc.assess.assessments import assessed, judge
+from impc.assess.intent_rules import intent
+from impc.assess.printed_gain import gain_estimate
+from impc.assess.resampling import DRAWS, bootstrap_model, replicate
+from impc.assess.variance_accounted_for import predict, saturated_share
+from impc.checking import replace
+from impc.errors import DataError, ImpcError
+from impc.files.digests import content_digest, digest, source_digest, versions
+from impc.files.plant_sources import make_plant, plant_family_of, plant_source
+from impc.files.reading import read_unit
+from impc.inverse.noisy_fit import fit_controller
+from impc.model.signal_units import price_unit
+from impc.reporting.rendering import plain
+from impc.reporting.shown_units import angles_in, shown_unit
+from impc.studies.cohort.unit_structure import unit_structure
+from impc.studies.effort import Effort, fit_effort
+from impc.studies.fit.gain_findings import number_units
+from impc.studies.fit.settings import fit_settings
+from impc.studies.fit.subject import fit_problem, state_sizes
+from impc.studies.signal_words import signal_words
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
+    from impc.arrays import Array
+    from impc.assess.assessments import MethodFit
+    from impc.files.configuration import Configuration
     from impc.files.plant_sources import PlantSource
-    from impc.studies.cohort.study import Study, Unit
+    from impc.inverse.estimates import Estimate
+    from impc.inverse.problem import Problem
+    from impc.model.plant import Plant
+    from impc.studies.cohort.study import Study
+    from impc.studies.fit.settings import FitSettings
 
-# Threads that read recordings for their digests: hashing lets others run.
-_THREADS = 4
+# They say how many replicates there are, not what any of them is.
+_COUNTS = ("replicates",)
+# Points of a trajectory that are kept for pictures.
+_SHOWN = 600
+
+
+@dataclass(frozen=True)
+class FitTask:
+    """All that a worker needs of a unit."""
+
+    files: tuple[str, ...]  # Paths of the recordings
+    plant: str  # Its import path or file
+    arguments: dict[str, Any] = field(hash=False)  # Of the plant
+    configuration: Configuration = field(hash=False)
+    digest: str = ""  # Of all of these and of the files' content
+
+
+def study_tasks(study: Study, source: PlantSource) -> tuple[dict[str, FitTask], dict[str, str]]:
+    """Tasks of all units by name, and the reason for each unit that has none.
+
+    All recordings are read from their first byte to their last, for the digests.
+    """
+    unused = set(unused_columns(study, source))
+    tasks: dict[str, FitTask] = {}
+    failed: dict[str, str] = {}
+    for unit in study.units:
+        person = {name: value for name, value in unit.person.items() if name not in unused}
+        arguments = dict(study.configuration.plant) | person
+        files = tuple(str(file.resolve()) for file in unit.files)
+        try:
+            made_of = unit_digest(files, source.name, arguments, study.configuration)
+        except DataError as error:
+            failed[unit.name] = str(error)
+        else:
+            tasks[unit.name] = FitTask(files, source.name, arguments, study.configuration, made_of)
+    return tasks, failed
 
 
 def unused_columns(study: Study, source: PlantSource) -> tuple[str, ...]:
@@ -38,27 +107,160 @@ def _takes(source: PlantSource, name: str) -> bool:
     )
 
 
-def study_tasks(study: Study, source: PlantSource) -> tuple[dict[str, FitTask], dict[str, str]]:
-    """Tasks of all units by name, and the reason for each unit that has none.
+def unit_digest(
+    files: Sequence[str], plant: str, arguments: Mapping[str, Any], configuration: Configuration
+) -> str:
+    """Of the whole content of recordings, of plant, settings and versions."""
+    return digest(
+        [(Path(Path(name).name), content_digest(Path(name))) for name in files],
+        source_digest(plant, arguments),
+        dict(arguments),
+        configuration.recording,
+        configuration.signals,
+        {key: value for key, value in configuration.fit.items() if key not in _COUNTS},
+        versions(),
+    )
 
-    All recordings are read from their first byte to their last, for the digests.
+
+def fit_unit(task: FitTask) -> dict[str, Any]:
+    """Fit a unit."""
+    started = time.perf_counter()
+    problem, settings = unit_problem(task)
+    fitted = fit_controller(problem)
+    with angles_in(task.configuration.report.angles):
+        content = _described(problem, fitted, settings)
+    return _finished(content, started)
+
+
+def replicate_unit(task: FitTask, fit: dict[str, Any], index: int) -> dict[str, Any]:
+    """One bootstrap replicate of a fitted unit, by its number `index`; `fit` is its content."""
+    started = time.perf_counter()
+    problem, settings = unit_problem(task)
+    here = problem.at(np.array(fit["starts"]), np.array(fit["logarithms"]))
+    model = bootstrap_model(here, np.array(fit["K"]), np.array(fit["S"]))
+    found = replicate(model, index, settings.seed, DRAWS[settings.bootstrap])
+    return _finished({"K": found.K, "parameters": found.parameters}, started)
+
+
+def _finished(content: dict[str, Any], started: float) -> dict[str, Any]:
+    memory = psutil.Process().memory_info().rss / 1e6
+    used = {"seconds": time.perf_counter() - started, "memory_mb": memory}
+    found: dict[str, Any] = plain(content | used)
+    return found
+
+
+@functools.lru_cache(maxsize=4)
+def unit_problem(task: FitTask) -> tuple[Problem, FitSettings]:
+    """The recordings of a unit as an inverse problem, read once for all that is done with it."""
+    settings = fit_settings(task.configuration.fit)
+    source = plant_source(task.plant, task.arguments)
+    # A worker on another machine, or one that has run for days, may have other files and code.
+    here = unit_digest(task.files, source.name, task.arguments, task.configuration)
+    if here != task.digest:
+        raise DataError(
+            "worker",
+            "has other recordings, another plant or other versions than this command",
+            "give all machines the same, and start the workers again",
+        )
+    recorded = task.configuration.recorded
+    plant = make_plant(source, recorded)
+    family = plant_family_of(source, recorded, settings.free)
+    paths = [Path(name) for name in task.files]
+    (first, *others), fallen = read_unit(paths, task.configuration, plant)
+    left = (f"{fall.subject}: {fall.problem}; the trial is left out" for fall in fallen)
+    recordings = (replace(first, findings=(*first.findings, *left)), *others)
+    return fit_problem(plant, recordings, settings, family), settings
+
+
+def study_effort(tasks: Mapping[str, FitTask]) -> tuple[Effort, float]:
+    """What the first unit that can be read takes, and as how many such units all `tasks` count.
+
+    Units are compared by the size of their files. A study no unit of which can be read takes
+    nothing: it will end at once.
     """
-    unused = set(unused_columns(study, source))
-    tasks: dict[str, FitTask] = {}
-    failed: dict[str, str] = {}
-    with ThreadPoolExecutor(_THREADS) as pool:
-        pending = [(unit, pool.submit(_task, study, unit, unused, source)) for unit in study.units]
-        for unit, future in pending:
-            try:
-                tasks[unit.name] = future.result()
-            except DataError as error:
-                failed[unit.name] = str(error)
-    return tasks, failed
+    sizes = {
+        name: sum(Path(file).stat().st_size for file in task.files) for name, task in tasks.items()
+    }
+    for name, task in tasks.items():
+        try:
+            problem, settings = unit_problem(task)
+        except ImpcError:  # told as the unit's own when its turn comes
+            continue
+        alone = replace(settings, profiles=[], horizons=[], unknown_limit=False)
+        return fit_effort(problem, alone), sum(sizes.values()) / max(sizes[name], 1)
+    return Effort(0.0, 0.0), 0.0
 
 
-def _task(study: Study, unit: Unit, unused: set[str], source: PlantSource) -> FitTask:
-    person = {name: value for name, value in unit.person.items() if name not in unused}
-    arguments: Mapping[str, Any] = dict(study.configuration.plant) | person
-    files = tuple(str(file.resolve()) for file in unit.files)
-    digest = unit_digest(files, source.name, arguments, study.configuration)
-    return FitTask(files, source.name, dict(arguments), study.configuration, digest)
+def _described(problem: Problem, fitted: Estimate, settings: FitSettings) -> dict[str, Any]:
+    plant, K, weights = fitted.problem.plant, np.array(fitted.gain), fitted.stage_weights
+    fit = judge(fitted, problem.bounds)
+    fit = replace(fit, held_out=_held_out(problem, fitted, settings))
+    estimate = gain_estimate(fitted)
+    sizes = state_sizes(fit.runs)
+    readings = intent(plant, K, np.array(fitted.metrics), sizes, weights)
+    family = estimate.problem.family
+    names = () if family is None else family.names
+    limits = np.array(problem.bounds.u_min), np.array(problem.bounds.u_max)
+    return {
+        "states": plant.states,
+        "controls": plant.controls,
+        "outputs": plant.outputs,
+        "shown_units": [shown_unit(plant, name) for name in plant.outputs],
+        "words": signal_words(plant),
+        "units": _units(plant),
+        "trials": len(problem.recordings),
+        "samples": sum(trial.samples for trial in problem.recordings),
+        "K": estimate.K,
+        "S": estimate.S,
+        "K_deviation": estimate.covariance.entries,
+        "K_told": estimate.covariance.told_entries,
+        "K_of_weights": K,
+        "Q": weights.Q,
+        "R": weights.R,
+        "misfit": fitted.misfit,
+        "exact": fitted.explained,
+        "converged": fitted.converged,
+        **assessed(fit),
+        "saturated": saturated_share(fit.commands, *limits),
+        "state_sizes": sizes,
+        "readings": {
+            item.rule: {"Q": item.weights.Q, "dominant": item.dominant, "angle": item.angle}
+            for item in readings.readings
+        },
+        "parameters": dict(zip(names, estimate.parameters, strict=True)),
+        "starts": [trial.x0 for trial in estimate.problem.recordings],
+        "logarithms": estimate.problem.logarithms,
+        "findings": [trial.findings for trial in problem.recordings],
+        "trajectory": _trajectory(fit),
+        "structure": unit_structure(problem, fitted, settings),
+    }
+
+
+def _units(plant: Plant) -> dict[str, str]:
+    """Units of the measures that a cohort compares, by their columns of units.csv."""
+    prices = {f"centre_price.{name}": price_unit(plant, name, name) for name in plant.states}
+    return {
+        name: "-" if unit == "1" else unit for name, unit in (number_units(plant) | prices).items()
+    }
+
+
+def _held_out(problem: Problem, fitted: Estimate, settings: FitSettings) -> Array:
+    """VAF of each trial left out (trials, p), %; of none when not wanted or there is but one."""
+    count = len(problem.recordings)
+    rows = np.empty((count if settings.held_out and count > 1 else 0, len(problem.plant.outputs)))
+    for index in range(len(rows)):
+        other = fit_controller(fitted.problem.leaving_out(index), fitted.stage_weights)
+        rows[index] = predict(problem, other, fitted, index, settings.settle).vaf
+    return frozen(rows)
+
+
+def _trajectory(fit: MethodFit) -> dict[str, Any]:
+    """Recorded and simulated outputs of the first trial, a few hundred points."""
+    problem = fit.estimate.problem
+    trial, run = problem.recordings[0], fit.runs[0]
+    step = max(1, trial.samples // _SHOWN)
+    return {
+        "dt": problem.plant.dt * step,
+        "recorded": trial.outputs[::step],
+        "simulated": (run.x @ problem.plant.C.T)[::step],
+    }

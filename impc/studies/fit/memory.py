@@ -14,26 +14,23 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from impc.arrays import Array
+from impc.arrays import frozen
 from impc.assess.person_models import PersonModel
 from impc.assess.resampling import Replicate
 from impc.checking import replace
 from impc.files.digests import digest, versions
-from impc.files.sealed import Kept
 from impc.inverse.coordinates import Point
 from impc.inverse.estimates import (
     Estimate,
     decode_estimate,
-    decode_prices,
     encode_estimate,
-    encode_prices,
 )
 from impc.inverse.likelihood_fit import person_at
 from impc.inverse.likelihood_start import Asked, gain_space, prior_about
 from impc.inverse.methods import METHODS, Method
 from impc.inverse.person_coordinates import PersonCoordinates
 from impc.inverse.structured_search import PriceCoordinates
-from impc.studies.cache import Cache, Codec, by_fields
+from impc.studies.cache import Cache, Steps, from_json
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -42,21 +39,15 @@ if TYPE_CHECKING:
     from impc.inverse.likelihood_fit import PersonFit
     from impc.inverse.problem import Problem
     from impc.model.observer import Observer
-    from impc.model.plant_family import PlantFamily
     from impc.studies.fit.settings import FitSettings
 
-# Where a family of plants is looked at: two families may agree at their nominal values.
-_FACTORS = (0.9, 1.1)
 # Stages of a fit, and of a comparison.
 _LEFT_OUT = re.compile(r"without (?:trial )?(\d+)")
 
 
 @dataclass(frozen=True)
-class FitMemory(Cache):
-    """The cache of `impc fit` and `impc compare`; its methods are what these two keep.
-
-    `files`, `digest`, `done` and `stages` are as in `Cache`.
-    """
+class FitMemory(Steps):
+    """The steps of `impc fit` and `impc compare`; its methods are what these two keep."""
 
     problem: Problem = field(kw_only=True)  # As it was posed
 
@@ -66,11 +57,11 @@ class FitMemory(Cache):
         def decode(kept: dict[str, Any]) -> Estimate:
             return decode_estimate(_seen(self.problem, name, METHODS[kept["method"]]), kept)
 
-        return self.get(name, compute, Codec(encode_estimate, decode))
+        return self.get(name, compute, decode, encode_estimate)
 
     def replicate(self, name: str, compute: Callable[[], Replicate]) -> Replicate:
         """The bootstrap replicate of the stage `name`, as `compute` makes it."""
-        return self.get(name, compute, by_fields(Replicate))
+        return self.get(name, compute, lambda kept: from_json(kept, Replicate))
 
     def person(
         self, name: str, posed: Problem, observer: Observer, compute: Callable[[], PersonModel]
@@ -85,29 +76,16 @@ class FitMemory(Cache):
             fit = None if kept["fit"] is None else decode_person(posed, observer, kept["fit"])
             return PersonModel(name, fit, kept["reason"])
 
-        return self.get(name, compute, Codec(encode, decode))
+        return self.get(name, compute, decode, encode)
 
 
 def open_memory(
     folder: Path, problem: Problem, settings: FitSettings, command: str = "fit", made_of: str = ""
 ) -> FitMemory:
     """The memory of a command in a folder, empty when there is none for this very problem."""
-    known = digest(_content(problem), settings, made_of, versions())
-    return FitMemory(Kept(folder / f"{command}-in-progress"), known, problem=problem)
-
-
-def _content(problem: Problem) -> tuple[Any, ...]:
-    """All of a problem that has a content: a family of plants is told by some of its plants."""
-    family = problem.family
-    if family is None:
-        return (problem,)
-    plants = [family.make(values) for values in _probes(family)]
-    return replace(problem, family=None), family.names, family.nominal, plants
-
-
-def _probes(family: PlantFamily) -> list[Array]:
-    changes = [np.eye(len(family.nominal)) * (factor - 1) + 1 for factor in _FACTORS]
-    return [family.nominal * row for row in np.concatenate(changes)]
+    # Of a family the plant at its nominal values; its code is in `made_of` (`impc.files.inputs`).
+    known = digest(replace(problem, family=None), settings, made_of, versions())
+    return FitMemory(Cache(folder / f"{command}-in-progress"), known, problem=problem)
 
 
 def _seen(problem: Problem, stage: str, method: Method) -> Problem:
@@ -124,7 +102,7 @@ def encode_person(fit: PersonFit) -> dict[str, Any]:
     return {
         "K": np.asarray(K).tolist(),
         "S": np.asarray(S).tolist(),
-        "prices": encode_prices(own.prices) if isinstance(own, PriceCoordinates) else None,
+        "prices": own.prices.tolist() if isinstance(own, PriceCoordinates) else None,
         "starts": own.problem.starts.tolist(),
         "logarithms": own.problem.logarithms.tolist(),
         "levels": space.first.tolist(),
@@ -140,7 +118,7 @@ def decode_person(problem: Problem, observer: Observer, kept: dict[str, Any]) ->
     posed = problem.at(np.array(kept["starts"]), np.array(kept["logarithms"], dtype=np.float64))
     point = Point(np.array(kept["K"]), np.array(kept["S"]), posed)
     levels, split = np.array(kept["levels"]), len(observer.levels)
-    own = gain_space(point, None if kept["prices"] is None else decode_prices(kept["prices"]))
+    own = gain_space(point, None if kept["prices"] is None else frozen(kept["prices"]))
     space = PersonCoordinates(own, observer.with_levels(levels[:split]), levels[split:])
     prior = prior_about(space, Asked(observer, None, (), 1.0, 0))
     place = prior.at(np.array(kept["theta"]))

@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import functools
 import time
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -46,9 +44,11 @@ from impc.inverse.structured_fit import fit_structured
 from impc.studies.fit.asked import fit_bounds, fit_observer, fit_structures, moving_body
 from impc.studies.fit.result import LITTLE, FitResult, FittedParameter
 from impc.studies.fit.settings import FitSettings
+from impc.studies.pool import threads
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Sequence
+    from concurrent.futures import Future, ThreadPoolExecutor
 
     from impc.assess.all_intervals import Attempt, Certainty
     from impc.assess.assessments import MethodFit
@@ -299,7 +299,7 @@ def _beside_it(
 ) -> tuple[tuple[MethodFit, ...], tuple[HeldOut, ...], tuple[WeightsSummary | None, str]]:
     """The other methods, trials predicted by the rest, and the set of weights, side by side."""
     problem, methods, held_out = ground.problem, [own], []
-    with _threads() as pool:
+    with threads(_THREADS) as pool:
         pending = _left_out(pool, ground, settings)
         in_background = pool.submit(whole_set)
         for found in others[::-1]:
@@ -400,19 +400,6 @@ def _first_guess(plant: Plant, trial: Recording) -> Recording:
 
 def _leaves_out(trials: int, settings: FitSettings) -> bool:
     return settings.held_out and trials > 1
-
-
-@contextmanager
-def _threads() -> Iterator[ThreadPoolExecutor]:
-    """A few threads: the compiled loop and the semidefinite solver let others run.
-
-    When the block is left early, by an error or from the keyboard, what is not begun is not begun.
-    """
-    pool = ThreadPoolExecutor(_THREADS)
-    try:
-        yield pool
-    finally:
-        pool.shutdown(cancel_futures=True)
 
 
 def _left_out(

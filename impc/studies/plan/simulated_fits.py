@@ -7,6 +7,8 @@ See docs/planning.md.
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -22,8 +24,6 @@ from impc.inverse.structured_search import search_from
 from impc.model.recordings import Recording
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from impc.assess.expected import Expectation
     from impc.inverse.problem import Problem
     from impc.studies.plan.designs import Person
@@ -55,31 +55,48 @@ def spread(values: Array) -> Array:
     return np.asarray((high - low) / 2)
 
 
+@dataclass(frozen=True)
+class OneFit(Frozen):
+    """What one of them found; both empty where it ended without an answer."""
+
+    prices: Array
+    gain: Array
+
+
+#: (name, compute) -> a fit: from memory, or computed now.
+RememberFit = Callable[[str, Callable[[], OneFit]], OneFit]
+
+
 def simulated_fits(
     person: Person,
     problem: Problem,
     count: int,
     seed: int,
     done: Callable[[str], None] = lambda _: None,
+    remember: RememberFit = lambda _, compute: compute(),
 ) -> SimulatedFits:
     """Fit recordings of one experiment with fresh noise, again and again."""
-    prices, gains, failed = [], [], 0
     truth = np.array(person.prices)
-    for number in range(count):
+
+    def fit(number: int) -> OneFit:
         noisy = _measured(person, problem, np.random.default_rng([seed, number]))
         try:
             end = search_from(noisy, person.structure, truth)
             fitted = structured_estimate(noisy, person.structure, end)
             gain = told_gain(fitted.problem, np.array(fitted.gain), np.array(fitted.metric)).K
         except ImpcError:  # counted, and told
-            failed += 1
-        else:
-            prices.append(np.array(end.prices))
-            gains.append(np.array(gain))
+            return OneFit(frozen([]), frozen([]))
+        return OneFit(frozen(end.prices), frozen(gain))
+
+    found = []
+    for number in range(count):
+        found.append(remember(f"fit {number + 1}", functools.partial(fit, number)))
         done(f"fit {number + 1}")
-    shape = (-1, *person.controller.K.shape)
+    ended = [one for one in found if len(one.prices)]
     return SimulatedFits(
-        frozen(np.reshape(prices, (-1, len(truth)))), frozen(np.reshape(gains, shape)), failed
+        frozen(np.reshape([one.prices for one in ended], (-1, len(truth)))),
+        frozen(np.reshape([one.gain for one in ended], (-1, *person.controller.K.shape))),
+        count - len(ended),
     )
 
 

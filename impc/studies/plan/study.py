@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.studies.plan.designs import Person, Perturbation
     from impc.studies.plan.settings import PlanSettings
+    from impc.studies.plan.simulated_fits import RememberFit
 
 _SIZE, _POWER = 0.05, 0.8
 # Persons in a group: a t-test needs two, and nobody measures more.
@@ -75,6 +76,7 @@ def make_plan(
     settings: PlanSettings,
     perturbation: Perturbation,
     done: Callable[[str], None] = lambda _: None,
+    remember: RememberFit = lambda _, compute: compute(),
 ) -> Plan:
     """Try every experiment on the person.
 
@@ -89,7 +91,7 @@ def make_plan(
     best, sharpest = best_of(outcomes, settings.falls / 100)
     fits = None
     if settings.fits and best.problem is not None:
-        fits = simulated_fits(person, best.problem, settings.fits, settings.seed, done)
+        fits = simulated_fits(person, best.problem, settings.fits, settings.seed, done, remember)
     groups = group_powers(person, best, settings)
     return Plan(person, settings, tuple(outcomes), best, sharpest, groups, fits)
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from impc.arrays import Array
     from impc.studies.selection.model import Trial
-    from impc.studies.selection.queue import Runner
+    from impc.studies.selection.model_source import Runner
     from impc.studies.selection.settings import SelectSettings
     from impc.studies.selection.subsets import Selection
 

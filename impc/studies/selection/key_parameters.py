@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from impc.studies.reliability.icc import Icc
     from impc.studies.selection.model import ParametricModel, Trial
-    from impc.studies.selection.queue import Runner
+    from impc.studies.selection.model_source import Runner
     from impc.studies.selection.settings import SelectSettings
     from impc.studies.selection.subsets import Selection
 

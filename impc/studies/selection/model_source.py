@@ -1,4 +1,4 @@
-"""A model by import path, and the recordings of a study for it.
+"""A model by import path, the recordings of a study for it, and work with it on every subject.
 
 The function named returns a mapping (or a `ParametricModel`):
 
@@ -9,27 +9,39 @@ The function named returns a mapping (or a `ParametricModel`):
     matrices                        a CasADi function theta -> A, B, C, continuous: its
                                     sensitivities are exact
     jacobian                        optional, beside simulate: (theta, input) -> outputs, derivative
+
+Workers load the model by its import path; recordings travel with the task.
 """
 
 from __future__ import annotations
 
+import functools
+import json
+from collections import deque
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import control
 import numpy as np
 
 from impc.errors import InputError
+from impc.files.digests import digest, source_digest, versions
 from impc.files.plant_sources import import_function, users_code
 from impc.files.reading import read_recordings
 from impc.model.plant import Plant
+from impc.studies.cache import from_json
+from impc.studies.pool import Task, run
 from impc.studies.selection.linear import linear_functions
 from impc.studies.selection.model import ParametricModel, Trial, parametric_model
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
+    from impc.studies.cache import Cache
     from impc.studies.cohort.study import Study
+    from impc.studies.pool import Pool, Result
+
+T = TypeVar("T")
 
 _NEEDED = ("names", "low", "high", "typical", "inputs", "outputs", "rate")
 
@@ -93,3 +105,61 @@ def read_trials(study: Study, source: ModelSource) -> dict[tuple[str, str], tupl
             Trial(item.disturbance, item.outputs) for item in trials
         )
     return found
+
+
+class Runner(Protocol):
+    """Does the same work for every name of a mapping."""
+
+    def __call__(
+        self, work: Callable[..., T], kind: type[T], arguments: Mapping[str, tuple[Any, ...]]
+    ) -> dict[str, T]:
+        """name -> work(model, *arguments), in the order of `arguments`; `kind` is its dataclass."""
+        ...
+
+
+def on_pool(
+    pool: Pool, source: ModelSource, cache: Cache, done: Callable[[Result], None] = lambda _: None
+) -> Runner:
+    """On the workers of a pool."""
+    made_of = _made_of(source.name, source.arguments)
+    named = source.name, json.dumps(source.arguments), made_of
+
+    def run_all(
+        work: Callable[..., T], kind: type[T], arguments: Mapping[str, tuple[Any, ...]]
+    ) -> dict[str, T]:
+        found = dict[str, T]()
+        queue = deque[Task]()
+        for name, given in arguments.items():
+            key = digest(made_of, work.__module__, work.__qualname__, given)
+            queue.append(Task(f"{work.__name__} {name}", key, _with_model, (*named, work, given)))
+        for result in run(pool, queue, cache):
+            name = result.task.name.removeprefix(f"{work.__name__} ")
+            if result.fault is not None:
+                fault = result.fault
+                raise type(fault)(f"{name}: {fault.subject}", fault.problem, fault.remedy)
+            found[name] = from_json(result.content, kind)
+            done(result)
+        return {name: found[name] for name in arguments}
+
+    return run_all
+
+
+def _with_model(
+    name: str, arguments: str, made_of: str, work: Callable[..., Any], given: tuple[Any, ...]
+) -> Any:
+    return work(_model(name, arguments, made_of), *given)
+
+
+@functools.lru_cache(maxsize=4)
+def _model(name: str, arguments: str, made_of: str) -> ParametricModel:
+    source = model_source(name, json.loads(arguments))
+    if _made_of(name, source.arguments) != made_of:
+        raise InputError(
+            "worker", "has another model or other versions than this command",
+            "give all machines the same, and start the workers again",
+        )  # fmt: skip
+    return source.model
+
+
+def _made_of(name: str, arguments: Mapping[str, Any]) -> str:
+    return digest(versions(), source_digest(name, arguments), dict(arguments))

@@ -13,7 +13,6 @@ Replicate k draws from the k-th child of the seed. Source: chapter 4; Künsch 19
 from __future__ import annotations
 
 import time
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -21,6 +20,7 @@ import numpy as np
 
 from impc.arrays import Array, Frozen, frozen, percentiles
 from impc.assess.resampling import block_residuals
+from impc.studies.pool import threads
 from impc.studies.selection.estimation import Estimate, estimate, multi_start, residuals
 from impc.studies.selection.fisher import (
     Information,
@@ -157,8 +157,7 @@ def bootstrap_subset(
         progress()
         return found
 
-    # The compiled recursion lets other threads run.
-    with ThreadPoolExecutor(_THREADS) as pool:
+    with threads(_THREADS) as pool:
         drawn = np.array(list(pool.map(one, range(replicates))))
     low, high = percentiles(drawn, level)
     return BootstrapIntervals(

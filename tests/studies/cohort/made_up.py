@@ -11,15 +11,12 @@ from impc.assess.assessments import ASSESSMENTS
 from impc.files.configuration import Configuration, RecordingTable
 from impc.model.plant import Plant
 from impc.studies.cohort.study import KEYS, Study, Unit
-from impc.studies.cohort.unit_task import FitTask
-from impc.studies.cohort.workers import Done
+from impc.studies.cohort.tasks import FitTask
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Hashable, Iterator
-
     from impc.assess.assessments import Assessment
 
-__all__ = ["Here", "fit_of", "made_up_study", "replicate_of", "tasks_of"]
+__all__ = ["fit_of", "made_up_study", "replicate_of", "tasks_of"]
 
 
 def made_up_study(subjects: int, replicates: int = 0, **labels: str) -> Study:
@@ -59,7 +56,7 @@ def made_up(item: Assessment, rng: np.random.Generator) -> dict[str, float] | fl
 
 
 def fit_of(seed: int) -> dict[str, Any]:
-    """What `impc.studies.cohort.unit_task.fit_unit` returns."""
+    """What `impc.studies.cohort.tasks.fit_unit` returns."""
     rng = np.random.default_rng(seed)
     gain = [rng.standard_normal(2).tolist()]
     weights = {"Q": [[1.0, 0.0], [0.0, 2.0]], "dominant": [0.6, 0.8], "angle": 1.0}
@@ -83,26 +80,9 @@ def fit_of(seed: int) -> dict[str, Any]:
 
 
 def replicate_of(seed: int) -> dict[str, Any]:
-    """What `impc.studies.cohort.unit_task.replicate_unit` returns."""
+    """What `impc.studies.cohort.tasks.replicate_unit` returns."""
     rng = np.random.default_rng([seed, 1])
     return {
         "K": [rng.standard_normal(2).tolist()], "parameters": [2.0 + rng.random()],
         "seconds": 0.1, "memory_mb": 100.0,
     }  # fmt: skip
-
-
-class Here:
-    """Workers that are this process."""
-
-    threads = 1
-
-    def __init__(self) -> None:
-        self.waiting: list[tuple[Any, Callable[..., Any], tuple[Any, ...]]] = []
-
-    def submit(self, key: Hashable, work: Callable[..., Any], *given: Any) -> None:
-        self.waiting.append((key, work, given))
-
-    def results(self) -> Iterator[Done]:
-        while self.waiting:
-            key, work, given = self.waiting.pop(0)
-            yield Done(key, work(*given))

@@ -10,10 +10,10 @@ import pandas as pd
 import pytest
 import scipy.stats
 
+from impc.reporting.writer import owned
 from impc.studies.cohort.comparison import compare_cohort
-from impc.studies.cohort.engine import Failures
+from impc.studies.cohort.engine import Failures, Store
 from impc.studies.cohort.report import write_report
-from impc.studies.cohort.store import open_store
 from impc.studies.cohort.told import not_told, not_told_sentences, only_told
 from tests.studies.cohort.made_up import fit_of, made_up_study, tasks_of
 
@@ -81,13 +81,14 @@ def test_a_gain_about_zero_is_told_where_all_are_told_as_well() -> None:
 def test_the_page_says_how_many_are_left_out(tmp_path: Path) -> None:
     study = made_up_study(8)
     digests = {name: task.digest for name, task in tasks_of(study).items()}
-    with open_store(tmp_path, digests) as store:
+    store = Store(tmp_path, digests)
+    with owned(tmp_path, "cohort"):
         for number, unit in enumerate(study.units):
             fit = fit_of(number)
             fit["readings"]["analytic centre (no units)"]["Q"] = [[1.0 + number, 0.0], [0.0, 2.0]]
             if number == 2:
                 fit["K"], fit["K_deviation"] = [[0.6, 0.1]], [[1700.0, None]]
-            store.keep_fit(unit.name, fit)
+            store.cache.keep(f"{unit.name}/fit", digests[unit.name], fit)
         write_report(study, store, Failures({}, {}), "impc cohort study.toml")
     page = (tmp_path / "report.html").read_text()
     assert "of 8 units the gain of position to force of 1; the gain of position_rate" in page

@@ -13,14 +13,12 @@ import scipy.stats
 from impc.checking import replace
 from impc.files.plant_sources import plant_source
 from impc.studies.cohort.comparison import compare_cohort, measures_of
-from impc.studies.cohort.engine import Failures
+from impc.studies.cohort.engine import Failures, Store
 from impc.studies.cohort.report import write_report
-from impc.studies.cohort.store import Store
 from impc.studies.cohort.study import Study, read_study
 from impc.studies.cohort.tables import cohort_tables
-from impc.studies.cohort.tasks import study_tasks
+from impc.studies.cohort.tasks import fit_unit, study_tasks
 from impc.studies.cohort.unit_structure import structure_row
-from impc.studies.cohort.unit_task import fit_unit
 from tests.studies.cohort.carts import write_study
 
 pytestmark = pytest.mark.full
@@ -40,7 +38,7 @@ def fitted(tmp_path_factory: pytest.TempPathFactory) -> tuple[Study, Store]:
     assert failed == {}
     store = Store(folder / "out", {name: task.digest for name, task in tasks.items()})
     for name, task in tasks.items():
-        store.keep_fit(name, fit_unit(task))
+        store.cache.keep(f"{name}/fit", task.digest, fit_unit(task))
     return study, store
 
 

@@ -6,13 +6,20 @@ the curve has the same shape and another size: V and the two rates share a direc
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import scipy.signal
 
-__all__ = ["blood_model"]
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
 
+    from impc.studies.selection.model import ParametricModel
+    from impc.studies.selection.model_source import Runner
+
+__all__ = ["blood_model", "in_turn"]
+
+T = TypeVar("T")
 _DT = 0.25
 
 
@@ -37,3 +44,14 @@ def blood_model() -> dict[str, Any]:
         "rate": 1 / _DT,
         "simulate": concentration,
     }
+
+
+def in_turn(model: ParametricModel) -> Runner:
+    """One subject after the other, in this process; nothing is kept."""
+
+    def run(
+        work: Callable[..., T], kind: type[T], arguments: Mapping[str, tuple[Any, ...]]
+    ) -> dict[str, T]:
+        return {name: work(model, *given) for name, given in arguments.items()}
+
+    return run

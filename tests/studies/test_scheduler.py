@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 import time
+from collections import deque
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,8 +16,10 @@ import pytest
 from distributed.security import Security
 
 from impc.errors import InputError, OutputError
-from impc.studies.cohort import cluster
-from impc.studies.cohort.cluster import Cluster, connected
+from impc.studies import scheduler as module
+from impc.studies.cache import Cache
+from impc.studies.pool import Task, run
+from impc.studies.scheduler import Cluster, connected
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -27,7 +30,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptio
 
 def certificates(folder: Path) -> tuple[Path, Path, Path]:
     """An authority, a certificate that it signed, and its key, as docs/cohorts.md makes them."""
-    page = (Path(__file__).parents[3] / "docs" / "cohorts.md").read_text()
+    page = (Path(__file__).parents[2] / "docs" / "cohorts.md").read_text()
     lines = [line for line in page.splitlines() if line.startswith("openssl ")]
     for line in lines:
         subprocess.run(line.split(" #")[0], shell=True, cwd=folder, check=True, capture_output=True)
@@ -59,17 +62,20 @@ def scheduler(files: tuple[Path, Path, Path]) -> Iterator[Any]:
     logging.getLogger("distributed").setLevel(level)
 
 
-def test_a_scheduler_with_certificates(scheduler: Any, files: tuple[Path, Path, Path]) -> None:
+def test_a_scheduler_with_certificates(
+    scheduler: Any, files: tuple[Path, Path, Path], tmp_path: Path
+) -> None:
     address = scheduler.scheduler_address
     assert address.startswith("tls://")
-    with connected(Cluster(address, None, *files)) as workers:
-        assert workers.threads == 1
-        workers.submit("one", abs, -2)
-        workers.submit("two", int, "x\ny")
-        found = {done.key: done for done in workers.results()}
-    assert found["one"].value == 2
-    assert found["two"].fault.startswith("ValueError: ")
-    assert "\n" not in found["two"].fault
+    queue = deque([Task("one", "", abs, (-2,)), Task("two", "", int, ("x\ny",))])
+    queue.extend(Task(f"many {number}", "", abs, (number,)) for number in range(500))
+    with connected(Cluster(address, None, *files)) as pool:
+        assert pool.threads == 1
+        found = {result.task.name: result for result in run(pool, queue, Cache(tmp_path))}
+    assert found["one"].content == 2
+    assert "task two: ValueError: " in str(found["two"].fault)
+    assert "\n" not in str(found["two"].fault)
+    assert [found[f"many {number}"].content for number in range(500)] == list(range(500))
 
 
 @pytest.mark.parametrize("missing", [0, 1, 2])
@@ -99,7 +105,7 @@ def test_certificates_that_are_missing(
 def test_certificates_of_somebody_else(
     scheduler: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(cluster, "_PATIENCE", "1s")
+    monkeypatch.setattr(module, "_PATIENCE", "1s")
     others = certificates(tmp_path)
     broken = tmp_path / "broken.pem"
     broken.write_text("no certificate")
@@ -115,15 +121,16 @@ def test_certificates_of_somebody_else(
 def test_a_scheduler_that_is_lost(
     scheduler: Any, files: tuple[Path, Path, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(cluster, "_PATIENCE", "1s")
-    with connected(Cluster(scheduler.scheduler_address, None, *files)) as workers:
-        workers.submit("long", time.sleep, 0.5)
+    monkeypatch.setattr(module, "_PATIENCE", "1s")
+    monkeypatch.setattr(module, "_HOLDS", 0.0)
+    with connected(Cluster(scheduler.scheduler_address, None, *files)) as pool:
+        pool.submit(1, [Task("long", "", time.sleep, (0.5,))])
         scheduler.close()
         with pytest.raises(OutputError, match="was lost") as caught:
-            list(workers.results())
+            pool.take()
         # How many threads it has was asked while nobody knew that it was gone: a defect once.
         with pytest.raises(OutputError, match="was lost"):
-            assert workers.threads
+            assert pool.threads
     assert "\n" not in str(caught.value)
 
 
@@ -141,14 +148,15 @@ def test_a_scheduler_that_is_killed_leaves_no_log(tmp_path: Path) -> None:
     ]
     code = (
         "import json, sys, time\n"
-        "from impc.studies.cohort.cluster import Cluster, connected\n"
+        "from impc.studies.pool import Task\n"
+        "from impc.studies.scheduler import Cluster, connected\n"
         "from impc.errors import ImpcError\n"
         "try:\n"
-        "    with connected(Cluster(json.load(open(sys.argv[1]))['address'])) as workers:\n"
+        "    with connected(Cluster(json.load(open(sys.argv[1]))['address'])) as pool:\n"
         "        for number in range(100):\n"
-        "            workers.submit(number, time.sleep, 0.5)\n"
-        "        for done in workers.results():\n"
-        "            print(done.key, flush=True)\n"
+        "            pool.submit(number, [Task('', '', time.sleep, (0.5,))])\n"
+        "        for number in range(100):\n"
+        "            print(pool.take(), flush=True)\n"
         "except ImpcError as error:\n"
         "    print(error, file=sys.stderr)\n"
     )

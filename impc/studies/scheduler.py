@@ -3,24 +3,28 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 import logging
+import time
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from impc.errors import InputError, OutputError
 from impc.extras import optional
-from impc.studies.cohort.workers import Done, local_workers
+from impc.studies.pool import answered, processes
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Hashable, Iterator
+    from collections.abc import Iterator
     from pathlib import Path
 
     from distributed import Client
 
-    from impc.studies.cohort.workers import Workers
+    from impc.studies.pool import Answer, Pool, Task
 
 _PATIENCE = "10s"
+# Seconds for which the number of threads holds: to ask takes a millisecond.
+_HOLDS = 5.0
 
 
 @dataclass(frozen=True)
@@ -36,16 +40,16 @@ class Cluster:
 
 
 @contextmanager
-def connected(cluster: Cluster) -> Iterator[Workers]:
+def connected(cluster: Cluster) -> Iterator[Pool]:
     """The workers of a `cluster` while the block lasts."""
     if cluster.scheduler is None:
         if any((cluster.tls_ca, cluster.tls_cert, cluster.tls_key)):
             raise InputError("--tls-ca", "is given without --scheduler", "leave it out")
-        with local_workers(cluster.workers) as workers:
-            yield workers
+        with processes(cluster.workers) as pool:
+            yield pool
         return
     with _client(cluster, cluster.scheduler) as client:
-        yield _SchedulerWorkers(client, cluster.scheduler)
+        yield _Scheduler(client, cluster.scheduler)
 
 
 @contextmanager
@@ -55,7 +59,7 @@ def _client(cluster: Cluster, address: str) -> Iterator[Client]:
 
     security = _security(cluster, address)
     patience = {"distributed.comm.timeouts.connect": _PATIENCE}
-    with dask.config.set(patience), _silent("distributed"):
+    with dask.config.set(patience), _silent():
         try:
             client = distributed.Client(address, timeout=_PATIENCE, security=security)
         except (OSError, ValueError, TypeError, TimeoutError) as error:
@@ -69,17 +73,13 @@ def _client(cluster: Cluster, address: str) -> Iterator[Client]:
 
 
 @contextmanager
-def _silent(package: str) -> Iterator[None]:
-    """What it would log (112 lines for a lost scheduler), errors say here in one line."""
-    names = [name for name in logging.root.manager.loggerDict if name.startswith(package)]
-    levels = {name: logging.getLogger(name).level for name in names}
-    for name in names:
-        logging.getLogger(name).setLevel(logging.CRITICAL + 1)
+def _silent() -> Iterator[None]:
+    """What Dask would log (112 lines for a lost scheduler), errors say here in one line."""
+    logging.disable(logging.CRITICAL)
     try:
         yield
     finally:
-        for name, level in levels.items():
-            logging.getLogger(name).setLevel(level)
+        logging.disable(logging.NOTSET)
 
 
 def _security(cluster: Cluster, address: str) -> Any:
@@ -128,40 +128,42 @@ def _was_lost(address: str) -> OutputError:
     )  # fmt: skip
 
 
-class _SchedulerWorkers:
-    """The workers of a scheduler, see `Workers`; OutputError from each when it is lost."""
+class _Scheduler:
+    """The workers of a scheduler, see `Pool`; OutputError from each when it is lost."""
 
     def __init__(self, client: Client, address: str) -> None:
         self._client, self._address = client, address
-        self._keys: dict[Any, Hashable] = {}
-        self._out = optional("distributed", f"scheduler {address}").as_completed()
+        self._numbers: dict[Any, int] = {}
+        make = optional("distributed", f"scheduler {address}").as_completed
+        # With results: they are fetched while others are looked at.
+        self._out = make(with_results=True, raise_errors=False)
+        self._threads, self._asked = 1, -_HOLDS
 
     @property
     def threads(self) -> int:
         """How many tasks run at a time."""
-        client: Any = self._client
-        with _reached(self._address):
-            return max(int(sum(client.nthreads().values())), 1)
+        if time.monotonic() - self._asked > _HOLDS:
+            client: Any = self._client
+            with _reached(self._address):
+                self._threads = max(int(sum(client.nthreads().values())), 1)
+            self._asked = time.monotonic()
+        return self._threads
 
-    def submit(self, key: Hashable, work: Callable[..., Any], *given: Any) -> None:
-        """As `Workers.submit`."""
+    def submit(self, number: int, batch: list[Task]) -> None:
+        """As `Pool.submit`."""
+        work = functools.partial(answered, batch)  # as one: Dask looks for its own in arguments
         with _reached(self._address):
-            future = self._client.submit(work, *given, pure=False, retries=0)
-        self._keys[future] = key
+            future = self._client.submit(work, pure=False, retries=0)
+        self._numbers[future] = number
         self._out.add(future)
 
-    def results(self) -> Iterator[Done]:
-        """As `Workers.results`."""
-        for future in self._out:
-            with _reached(self._address):
-                found = self._received(future)
-            yield found
-
-    def _received(self, future: Any) -> Done:
-        if future.status in ("cancelled", "lost"):
-            raise _was_lost(self._address)
-        key, error = self._keys.pop(future), future.exception()
-        fault = "" if error is None else " ".join(f"{type(error).__name__}: {error}".split())
-        value = None if error is not None else future.result()
-        future.release()
-        return Done(key, value, fault)
+    def take(self) -> tuple[int, list[Answer] | str]:
+        """As `Pool.take`."""
+        with _reached(self._address):
+            future, answers = next(self._out)
+            if future.status in ("cancelled", "lost"):
+                raise _was_lost(self._address)
+            number, error = self._numbers.pop(future), future.status == "error"
+            fault = future.exception() if error else None
+            future.release()
+        return number, answers if fault is None else f"{type(fault).__name__}: {fault}"

@@ -1,0 +1,139 @@
+"""What the runner takes of a client's processor for each task, where tasks themselves take none."""
+
+from __future__ import annotations
+
+import importlib.util
+import tempfile
+import time
+from collections import deque
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from experiments.benchmarks.table import Row
+from experiments.benchmarks.timing import Timing, side_by_side
+from impc.files.configuration import Configuration, RecordingTable
+from impc.reporting.writer import owned
+from impc.studies.cache import Cache
+from impc.studies.cohort.engine import Store, run_study
+from impc.studies.cohort.study import Study, Unit
+from impc.studies.cohort.tasks import FitTask, fit_unit
+from impc.studies.pool import Task, processes, run
+from impc.studies.scheduler import Cluster, connected
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from impc.studies.pool import Answer, Pool
+
+__all__ = ["empty", "runner_rows"]
+
+_TASKS, _SUBJECTS = 300, 3
+_LIMIT = 0.5  # ms
+
+
+def empty(index: int) -> int:
+    """A task that takes no time."""
+    return index
+
+
+class _Ready:
+    """A pool whose answers are there at once: what is left is the client's."""
+
+    threads = 32
+
+    def __init__(self) -> None:
+        rng = np.random.default_rng(0)
+        numbers = {"seconds": 1e-4, "memory_mb": 400.0, "K": rng.standard_normal((1, 10)).tolist()}
+        # A fit of 70 kB, as one of three trials of the seat has.
+        fit = dict.fromkeys(("starts", "logarithms", "S", "Q", "R"), numbers["K"])
+        self._fit = numbers | fit | {"trajectory": rng.standard_normal((600, 6)).tolist()}
+        self._replicate = numbers | {"parameters": [1.0]}
+        self._waiting: deque[tuple[int, list[Task]]] = deque()
+
+    def submit(self, number: int, batch: list[Task]) -> None:
+        self._waiting.append((number, batch))
+
+    def take(self) -> tuple[int, list[Answer] | str]:
+        number, batch = self._waiting.popleft()
+        contents = [self._fit if one.work is fit_unit else self._replicate for one in batch]
+        return number, [(content, None, 1e-4) for content in contents]
+
+
+def _cohort(folder: str) -> None:
+    settings = Configuration(RecordingTable(), {}, fit={"replicates": _TASKS // _SUBJECTS - 1})
+    units = tuple(Unit(str(number), "1", "", ()) for number in range(_SUBJECTS))
+    study = Study("plants:cursor_plant", settings, units)
+    tasks = {unit.name: FitTask((), study.plant, {}, settings, unit.name) for unit in units}
+    store = Store(Path(tempfile.mkdtemp(dir=folder)), {unit: unit for unit in tasks})
+    with owned(store.folder, "cohort"):
+        run_study(study, tasks, store, _Ready())
+
+
+def _through(pool: Pool, folder: str) -> None:
+    queue = deque(Task(f"{index}", "", empty, (index,)) for index in range(_TASKS))
+    cache = Cache(Path(tempfile.mkdtemp(dir=folder)))
+    found = [result.content for result in run(pool, queue, cache)]
+    assert sorted(found) == list(range(_TASKS))
+
+
+def runner_rows(runs: int, _: Path) -> list[Row]:
+    """The client of a cohort by itself, workers on this machine, and Dask's beside Dask's own."""
+    runs = max(3, runs // 2)
+    with tempfile.TemporaryDirectory() as folder, processes(2) as pool:
+        cases: dict[str, Callable[[], object]] = {
+            "client": lambda: _cohort(folder),
+            "processes": lambda: _through(pool, folder),
+        }
+        found = side_by_side(cases, runs, time.process_time)
+        return [
+            _row("client of a cohort, workers that answer at once", found["client"], _LIMIT),
+            _row("two processes on this machine", found["processes"], None),
+            *_dask_rows(runs, folder),
+        ]
+
+
+def _dask_rows(runs: int, folder: str) -> list[Row]:
+    beside = "a task, two workers of Dask, beside Dask's own time"
+    if importlib.util.find_spec("distributed") is None:
+        return [Row(beside, "", None, _LIMIT, "ms", "not installed: pip install 'impc[cohort]'")]
+    import distributed  # noqa: PLC0415
+
+    make: Any = distributed.LocalCluster
+    with make(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
+        client = cluster.get_client()
+
+        def alone() -> None:
+            futures = [client.submit(empty, index, pure=False) for index in range(_TASKS)]
+            found = distributed.as_completed(futures, with_results=True)
+            assert sorted(result for _, result in found) == list(range(_TASKS))
+
+        with connected(Cluster(cluster.scheduler_address)) as pool:
+            cases: dict[str, Callable[[], object]] = {
+                "alone": alone,
+                "runner": lambda: _through(pool, folder),
+            }
+            found = side_by_side(cases, runs, time.process_time)
+        client.close()
+    difference = _each(found["runner"]) - _each(found["alone"])
+    return [
+        _row("two workers of Dask, Dask alone", found["alone"], None),
+        _row("two workers of Dask, through the runner", found["runner"], None),
+        Row(beside, "", difference, _LIMIT, "ms", "the difference of the two above"),
+    ]
+
+
+def _each(timing: Timing) -> float:
+    """Milliseconds a task."""
+    return 1e3 * timing.median / _TASKS
+
+
+def _row(name: str, timing: Timing, limit: float | None) -> Row:
+    note = f"{_TASKS} empty tasks; processor time of the client"
+    return Row(f"a task, {name}", "", _each(timing), limit, "ms", note)
+
+
+if __name__ == "__main__":
+    for row in runner_rows(7, Path()):
+        print(f"{row.what}: {row.value:.3f} {row.unit}" if row.value is not None else row.note)

@@ -1,0 +1,149 @@
+"""Workers on this machine: they work, they may die, and nobody else reaches them."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+from impc.errors import DataError
+from impc.studies.cache import Cache
+from impc.studies.pool import Pool, Result, Task, ThisProcess, processes, run
+
+ROOT = Path(__file__).parents[2]
+
+
+def square(value: int) -> int:
+    return value * value
+
+
+def die(value: int, marks: str) -> int:
+    """Ends its process the first time, and always for 13."""
+    mark = Path(marks) / str(value)
+    if value == 13 or not mark.exists():
+        mark.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return value
+
+
+def die_of_13(value: int) -> int:
+    if value == 13:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return value
+
+
+def refuse() -> None:
+    raise DataError("subject 3", "fell", "leave it out")
+
+
+def fail(text: str) -> None:
+    if text == "exit":
+        raise SystemExit(0)
+    raise ValueError(f"two\nlines of {text}")
+
+
+def task(name: str, work: Callable[..., Any], *given: Any) -> Task:
+    return Task(name, "digest", work, given)
+
+
+def results(pool: Pool, folder: Path, *tasks: Task) -> dict[str, Result]:
+    return {item.task.name: item for item in run(pool, deque(tasks), Cache(folder))}
+
+
+def test_tasks_deaths_and_faults(tmp_path: Path) -> None:
+    kept = tmp_path / "kept"
+    with processes(2) as pool:
+        squares = [task(f"{value}", square, value) for value in range(300)]
+        found = results(pool, kept, *squares)
+        assert {name: item.content for name, item in found.items()} == {
+            f"{value}": value * value for value in range(300)
+        }
+        found = results(
+            pool, kept,
+            task("once", die, 1, str(tmp_path)), task("always", die, 13, str(tmp_path)),
+            task("exit", fail, "exit"), task("error", fail, "text"),
+            task("refused", refuse), task("unsent", abs, lambda: None),
+        )  # fmt: skip
+        assert found["once"].content == 1
+        faults = {name: str(item.fault) for name, item in found.items()}
+        assert "worker: ended 4 times, at last with signal 9;" in faults["always"]
+        assert "task exit: SystemExit: 0;" in faults["exit"]
+        assert "task error: ValueError: two\\nlines of text;" in faults["error"]
+        assert faults["refused"] == "subject 3: fell; leave it out"
+        assert "pickle" in faults["unsent"]
+        family = [psutil.Process(), *psutil.Process().children(recursive=True)]
+        listening = [
+            one for process in family for one in process.net_connections() if one.status == "LISTEN"
+        ]
+        assert listening == []
+    assert not [one for one in psutil.Process().children() if _works(one)]
+
+
+def test_of_a_batch_only_the_task_that_ends_workers_is_lost(tmp_path: Path) -> None:
+    """Short tasks go together; the one that is the cause is found among them."""
+    tasks = [task(f"{value}", die_of_13, value) for value in range(400)]
+    with processes(1) as pool:
+        found = results(pool, tmp_path, *tasks)
+    assert [name for name, item in found.items() if item.fault] == ["13"]
+    assert len(found) == 400
+
+
+def test_what_is_kept_is_not_done_again_and_more_may_follow(tmp_path: Path) -> None:
+    """Stopped after three results, and gone on with: the same, each once; a damaged one again."""
+    made: list[int] = []
+
+    def count(value: int) -> int:
+        made.append(value)
+        return value
+
+    def whole() -> list[tuple[int, bool]]:
+        queue, found = deque([task("0", count, 0)]), []
+        for item in run(ThisProcess(), queue, Cache(tmp_path)):
+            found.append((item.content, item.found))
+            if item.content < 5:
+                queue.append(task(f"{item.content + 1}", count, item.content + 1))
+        return found
+
+    first = run(ThisProcess(), deque(task(f"{k}", count, k) for k in range(6)), Cache(tmp_path))
+    assert [next(first).content for _ in range(3)] == [0, 1, 2]
+    del first
+    kept = len(list(tmp_path.iterdir()))
+    assert 3 <= kept < 6
+    Cache(tmp_path).path("1").write_text("{}")
+    made.clear()
+    assert whole() == [(k, k < kept and k != 1) for k in range(6)]
+    assert made == [1, *range(kept, 6)]
+
+
+def _works(child: psutil.Process) -> bool:
+    """Whether a child is a worker that lives; what another test left behind has no command line."""
+    if child.status() == psutil.STATUS_ZOMBIE:
+        return False
+    return "spawn_main" in " ".join(child.cmdline())
+
+
+def test_a_module_of_the_current_folder_does_not_stand_in_for_pythons(tmp_path: Path) -> None:
+    """A worker starts with the folder's modules out of reach: multiprocessing, pickle, numpy."""
+    for name in ("multiprocessing", "pickle", "numpy", "impc"):
+        (tmp_path / f"{name}.py").write_text("open('taken', 'w').close()\nraise SystemExit(3)\n")
+    code = (
+        "import sys; sys.path[:0] = sys.argv[1:]\n"
+        "from impc.studies.pool import Task, processes\n"
+        "if __name__ == '__main__':\n"
+        "    with processes(1) as pool:\n"
+        "        pool.submit(1, [Task('', '', abs, (-2,))])\n"
+        "        print(pool.take()[1][0][0])\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", code, str(ROOT)], cwd=tmp_path, capture_output=True, text=True,
+        timeout=120, check=False, env={k: v for k, v in os.environ.items() if k != "PYTHONPATH"},
+    )  # fmt: skip
+    assert done.stdout == "2\n", done.stderr
+    assert not (tmp_path / "taken").exists()
