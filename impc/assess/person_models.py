@@ -17,20 +17,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.arrays import Array, Frozen, frozen
-from impc.assess import likely_people, person_profile
+from impc.assess import person_profile
 from impc.assess.person_covariance import confusion, person_covariance
-from impc.assess.runaways import runaways
 from impc.assess.variance_accounted_for import whiteness
 from impc.checking import replace
 from impc.control.closed_loop import prepare_loop
 from impc.control.constraint_rows import directions
 from impc.control.joint_loop import joint_loop
 from impc.control.noisy_person import run_joint
+from impc.control.simulation import Status
 from impc.errors import ImpcError
 from impc.inverse.likelihood_fit import PersonFit, fit_person
 from impc.inverse.problem import controller_for
 from impc.inverse.regulator_span import kept_to
-from impc.inverse.unbiased_fit import unbiased
 from impc.model.bounds import bound_rows
 
 if TYPE_CHECKING:
@@ -73,30 +72,28 @@ class PersonReport(Frozen):
     """What is said of a person who senses with noise."""
 
     models: tuple[PersonModel, ...]  # The first is the one that was asked for
-    # That one, at a limit without the bias of its score (`unbiased`); None where it has no
-    # likelihood
-    fit: PersonFit | None
-    # Why that bias was not taken away, or not wholly; empty where it was, or there is none
-    biased: str
-    # How far the gain is from the likeliest for that, along the direction where it is farthest, in
-    # standard deviations
-    moved: float
+    fit: PersonFit | None  # That one; None where it has no likelihood
     # Of `fit`, by the sandwich; None where it has no likelihood
     covariance: PersonCovariance | None
     profiled: bool  # Whether intervals follow the likelihood
-    # Intervals of 95 % of its levels (l, 2), in their units; where profiled, by profile for a level
-    # that is weakly told, else of all people as likely
+    # Intervals of 95 % of its levels (l, 2), in their units: by the sandwich, or where profiled by
+    # profile for a level that is weakly told
     levels: Array
-    # The same of the entries of its gain (entries, 2), in their units; where profiled, all by
-    # profile, and NaN where an entry is not told by itself
+    # The same of the entries of its gain (entries, 2); where profiled all by profile, NaN where an
+    # entry is not told by itself
     entries: Array
     confusion: Confusion | None  # What of gain and noise is told least apart
     whiteness: Array  # p-values that the innovations of each output are white (p,)
     ahead: tuple[int, ...]  # Samples ahead
     # Root-mean-square errors of predictions so far ahead (k, p), in the outputs' units
     errors: Array
-    # In how many of sixty simulated trials like the recorded ones the person runs away
-    runaways: int
+
+    @property
+    def at_limit(self) -> bool:
+        """Whether a bound was met, so that the likelihood is an approximation."""
+        return self.fit is not None and any(
+            np.any(trial.status != Status.FREE) for trial in self.fit.told.trials
+        )
 
 
 def person_report(
@@ -120,29 +117,20 @@ def person_report(
         fit_one = functools.partial(_model, name, first, person, budget)
         models.append(remember(name, posed, person, fit_one))
         done(name)
-    likeliest = models[0].fit
-    if likeliest is None:
-        done("mean score of the person")
+    fit = models[0].fit
+    if fit is None:
         done("intervals of the person")
         return _nothing(tuple(models), len(problem.plant.outputs), profiled=profiled)
-    fit, biased = unbiased(likeliest)
-    done("mean score of the person")
+    covariance = person_covariance(fit)
+    levels, entries = covariance.level_intervals(fit.levels), covariance.entry_intervals(fit.K)
     if profiled:
-        covariance = person_covariance(fit)
         levels = person_profile.level_intervals(fit, covariance)
         entries = person_profile.entry_intervals(fit, covariance)
-    else:
-        people = likely_people.people_as_likely(fit)
-        covariance = people[0].covariance
-        levels = likely_people.level_intervals(people)
-        entries = likely_people.entry_intervals(people)
     done("intervals of the person")
     ahead = tuple(sorted({1 + round(time / problem.plant.dt) for time in _AHEAD}))
     return PersonReport(
         tuple(models),
         fit,
-        biased,
-        _moved(likeliest, fit, covariance),
         covariance,
         profiled,
         levels,
@@ -151,7 +139,6 @@ def person_report(
         frozen(_white(fit)),
         ahead,
         frozen(prediction_errors(fit, ahead)),
-        runaways(fit),
     )
 
 
@@ -159,15 +146,7 @@ def _nothing(models: tuple[PersonModel, ...], outputs: int, *, profiled: bool) -
     """What is said where the person that was asked for has no likelihood."""
     none = frozen(np.zeros((0, 2)))
     white = frozen([np.nan] * outputs)
-    return PersonReport(
-        models, None, "", 0.0, None, profiled, none, none, None, white, (), frozen([[]]), 0
-    )
-
-
-def _moved(likeliest: PersonFit, fit: PersonFit, covariance: PersonCovariance) -> float:
-    """Distance of two gains, in standard deviations of the direction in which it is largest."""
-    step = np.array(fit.theta - likeliest.theta)[: fit.space.gain]
-    return float(np.max(np.abs(covariance.directions @ step) / covariance.deviations, initial=0.0))
+    return PersonReport(models, None, None, profiled, none, none, None, white, (), frozen([[]]))
 
 
 def _model(name: str, first: Estimate, person: Observer, budget: int) -> PersonModel:

@@ -72,7 +72,7 @@ class PersonFit(Frozen):
     evaluations: int  # Filters of all recordings with derivatives, about
     theta: Array  # The unknowns, in the coordinates of `space` (count,)
     told: Told  # What the recordings say there
-    unseen: Array  # Slope that scores do not have (q,), nats: see `unseen_slope`
+    unseen: Array  # Slope that scores do not have (q,), nats: of what levels lose
     prior: Prior  # What the search was held by
 
     @property

@@ -12,13 +12,12 @@ made largest is that of `person_prior`.
 
 from __future__ import annotations
 
+import itertools
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.optimize import lsq_linear
-
-from impc.inverse.unseen_slope import learned_slope, unseen_slope
 
 if TYPE_CHECKING:
     from impc.arrays import Array
@@ -39,6 +38,8 @@ _WON = 0.25
 _ROUNDING = 1e-12
 # A place is beside the ridge of all but the levels when a step onto it promises more, nats.
 _BESIDE = 0.05
+# Step of the differences along a level, of its logarithm; square of one that teaches half.
+_DIFFERENCE, _DAMPING = 0.1, 0.1
 # Longest and shortest step of any coordinate; those of initial states may be longer by a factor: of
 # them a likelihood without bounds is a parabola.
 _STEP, _SHORTEST, _AFAR = 1.0, 1e-3, 100.0
@@ -75,8 +76,8 @@ def climb(
             if best.value <= known + _WON or spent >= budget or not differences:
                 return best, unseen, spent, left < _ROUGH
             here, unseen, known = best, unseen_slope(prior, best), best.value
-            # Two filters without derivatives count as one with them.
-            radius, spent, stale = _STEP, spent + len(prior.scales) + prior.space.gain, 0
+            # One or two likelihoods a level.
+            radius, spent, stale = _STEP, spent + len(prior.scales), 0
             continue
         step, within = boxed_step(down, curvature, radius * reach)
         length = float(np.max(np.abs(step) / reach))
@@ -130,3 +131,45 @@ def boxed_step(gradient: Array, curvature: Array, radius: Array | float) -> tupl
     goal = solve_triangular(root, unit * gradient, lower=True)
     step = unit * lsq_linear(root.T, goal, (-radius / unit, radius / unit), method="bvls").x
     return step, float(gradient @ step - step @ curvature @ step / 2)
+
+
+def unseen_slope(prior: Prior, here: Place) -> Array:
+    """Slope of what levels lose (q,), nats, by differences about a place; none without a prior.
+
+    Levels lose with all else fitted to the same noise (`person_prior`), and scores do not have it.
+    """
+    slope = np.zeros(len(here.theta))
+    if prior.used:
+        slope[prior.space.own :] = _lost(prior, here)
+    return slope
+
+
+def learned_slope(prior: Prior, slope: Array, here: Place, there: Place) -> Array:
+    """That slope (q,) after a step, by Broyden's update, damped: short steps tell little.
+
+    `slope` (q,).
+    """
+    own, slope = prior.space.own, slope.copy()
+    moved = (there.theta - here.theta)[own:]
+    missed = here.lost - there.lost - float(slope[own:] @ moved)
+    slope[own:] += missed * moved / (float(moved @ moved) + _DAMPING)
+    # Twice the noise are half the deviations, and no level is more than all of it.
+    slope[own:] = np.clip(slope[own:], 0.0, float(own))
+    return slope
+
+
+def _lost(prior: Prior, here: Place) -> Array:
+    """What levels lose, along each (levels,).
+
+    All else follows a level along its ridge, for `Place.lost` changes along that too. Where neither
+    way has a likelihood the slope is taken for zero.
+    """
+    own, slopes = prior.space.own, np.zeros(len(prior.scales))
+    information = here.told.information + prior.slopes(here.theta)[1]
+    ridges = -np.linalg.solve(information[:own, :own], information[:own, own:])
+    ways = _DIFFERENCE * np.hstack([ridges.T, np.eye(len(slopes))])
+    for (index, way), sign in itertools.product(enumerate(ways), (1, -1)):
+        there = prior.tried(here.theta + sign * way) if slopes[index] == 0.0 else None
+        if there is not None:
+            slopes[index] = sign * (here.lost - there.lost) / _DIFFERENCE
+    return slopes

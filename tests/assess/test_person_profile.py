@@ -20,8 +20,8 @@ from impc.assess.person_profile import (
     profile,
 )
 from impc.inverse.likelihood_fit import PersonFit, fit_person
+from impc.inverse.likelihood_search import unseen_slope
 from impc.inverse.methods import estimate
-from impc.inverse.unseen_slope import unseen_slope
 from impc.model.observer import Observer
 from tests.inverse.test_likelihood_fit import cart, posed
 

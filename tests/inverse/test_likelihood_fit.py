@@ -20,9 +20,9 @@ from impc.errors import ImpcError, InputError, SolverError
 from impc.inverse.estimates import Estimate
 from impc.inverse.gain_search import refine_gain
 from impc.inverse.likelihood_fit import PersonFit, fit_person
+from impc.inverse.likelihood_search import unseen_slope
 from impc.inverse.methods import estimate
 from impc.inverse.problem import Problem
-from impc.inverse.unseen_slope import unseen_slope
 from impc.model.bounds import Bounds
 from impc.model.observer import Observer
 from impc.model.plant import Plant

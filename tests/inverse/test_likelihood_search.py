@@ -10,10 +10,9 @@ import pytest
 from impc.checking import replace
 from impc.control.controller import Controller
 from impc.inverse.likelihood_fit import PersonFit, fit_person
-from impc.inverse.likelihood_search import boxed_step, climb
+from impc.inverse.likelihood_search import boxed_step, climb, learned_slope, unseen_slope
 from impc.inverse.methods import estimate
 from impc.inverse.person_prior import Prior
-from impc.inverse.unseen_slope import unseen_slope
 from impc.model.observer import Observer
 from impc.model.weights import Weights
 from tests.inverse.test_likelihood_fit import cart, posed
@@ -124,3 +123,32 @@ def test_what_levels_lose_is_that_of_the_gain_integrated_out() -> None:
         change.append(here.value - top - np.log(volume))
     # Measured: 0.004 nats.
     assert change[0] == pytest.approx(change[1], abs=0.02)
+
+
+def test_the_slope_of_what_levels_lose_follows_the_ridge(sliding: PersonFit) -> None:
+    """Against searches of all else with a level a little lower and higher."""
+    prior, theta = sliding.prior, np.array(sliding.theta)
+    own = sliding.space.own
+    found, others, step = unseen_slope(prior, prior.at(theta)), np.eye(len(theta))[:, :own], 0.05
+    for index in (own, own + 3):  # those that are told: motor, recorder
+        lost = []
+        for sign in (-1, 1):
+            start = theta + sign * step * np.eye(len(theta))[index]
+            there = prior.at(start)
+            place, _, _, settled = climb(prior, there, 30, others, np.array(sliding.unseen))
+            assert settled
+            lost.append(place.lost)
+        # Measured: .05 apart, for the first is a step of a tenth to one side.
+        assert found[index] == pytest.approx((lost[0] - lost[1]) / (2 * step), abs=0.1)
+
+
+def test_what_levels_lose_is_learned(sliding: PersonFit) -> None:
+    """After a long step along one level the slope along it is what was lost over the length."""
+    prior, theta, own = sliding.prior, np.array(sliding.theta), sliding.space.own
+    here, slope = prior.at(theta.copy()), np.array(sliding.unseen)
+    theta[own] += 2.0
+    theta[0] += 0.1
+    there = prior.at(theta)
+    learned = learned_slope(prior, slope, here, there)
+    assert learned[own] == pytest.approx(np.clip((here.lost - there.lost) / 2, 0, own), rel=0.05)
+    np.testing.assert_array_equal(np.delete(learned, own), np.delete(slope, own))

@@ -92,7 +92,7 @@ def stages(problem: Problem, settings: FitSettings) -> int:
     left_out = trials if _leaves_out(trials, settings) else 0
     structures = (settings.structure is not None) + len(settings.structures)
     asked = fit_observer(problem.plant, settings, problem.recordings)
-    models = 0 if asked is None else len(persons(problem, *asked)) + 2  # bias and intervals
+    models = 0 if asked is None else len(persons(problem, *asked)) + 1  # intervals
     others = structures + models + count_stages(problem, settings)
     return 1 + len(_beside(settings)) + left_out + others
 
