@@ -27,6 +27,7 @@ ROOMS = {
     "assess": "what an estimate is worth",
     "files": "recordings and results in files",
     "reporting": "pages, figures, tables, writing",
+    "output_feedback": "optional: subjects with sensory noise",
     "studies": "example, fit, compare, cohorts, ...",
     "cli": "commands: parse, call, print",
     "door": "import impc, python -m impc",

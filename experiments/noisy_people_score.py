@@ -9,19 +9,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.assess.covariance import gain_covariance
-from impc.assess.person_covariance import person_covariance
-from impc.assess.person_profile import fallen
-from impc.control.noisy_person import simulate_person
-from impc.inverse.likelihood_fit import fit_person
 from impc.inverse.methods import estimate
-from impc.inverse.person_prior import TOLD
+from impc.output_feedback.covariance import person_covariance
+from impc.output_feedback.fit import fit_person
+from impc.output_feedback.prior import TOLD
+from impc.output_feedback.profile import fallen
+from impc.output_feedback.simulation import simulate_person
 
 if TYPE_CHECKING:
     from experiments.noisy_people import Recorded, Subject
     from impc.arrays import Array
-    from impc.assess.person_covariance import PersonCovariance
-    from impc.inverse.likelihood_fit import PersonFit
-    from impc.model.observer import Observer
+    from impc.output_feedback.covariance import PersonCovariance
+    from impc.output_feedback.fit import PersonFit
+    from impc.output_feedback.observer import Observer
 
 __all__ = [
     "FALLEN",

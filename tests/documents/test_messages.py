@@ -47,18 +47,18 @@ from impc.files.results import read_result
 from impc.files.sealed import Kept
 from impc.files.table import Table, make_table
 from impc.files.units import si_unit
-from impc.inverse.likelihood_fit import fit_person
 from impc.inverse.methods import estimate
 from impc.inverse.problem import Problem
 from impc.inverse.structured_fit import fit_structure
 from impc.jit import keep_caches
 from impc.model.bounds import Bounds
-from impc.model.observer import Observer, believed_filter
 from impc.model.plant import Plant
 from impc.model.recordings import Label, Recording
 from impc.model.riccati import solve_lqr
 from impc.model.structure import Structure
 from impc.model.weights import Weights
+from impc.output_feedback.fit import fit_person
+from impc.output_feedback.observer import Observer, believed_filter
 from impc.reporting.writer import owned, require_writable, write_files
 from impc.studies.cohort import cluster
 from impc.studies.cohort.sheet import Sheet, column_values, read_sheet

@@ -7,12 +7,12 @@ import pytest
 
 from experiments.noisy_people import recorded, subject
 from experiments.noisy_people_score import Score, above_truth, blind, falls, passed_over, score
-from impc.assess.person_covariance import person_covariance
-from impc.assess.person_profile import profile
 from impc.checking import replace
-from impc.inverse.likelihood_fit import fit_person
 from impc.inverse.methods import estimate
 from impc.model.structure import Structure
+from impc.output_feedback.covariance import person_covariance
+from impc.output_feedback.fit import fit_person
+from impc.output_feedback.profile import profile
 
 pytestmark = pytest.mark.full
 

@@ -30,7 +30,6 @@ from impc.studies.charts import methods_chart, weights_chart
 from impc.studies.fit.csv_tables import fit_tables
 from impc.studies.fit.figures import fit_figures
 from impc.studies.fit.interval_figures import shown_statements
-from impc.studies.fit.person import person_section
 from impc.studies.fit.result import shown_trials, trial_name
 from impc.studies.fit.schema import fit_data
 from impc.studies.fit.sentences import direction_name, remarks
@@ -125,7 +124,7 @@ def fit_report(
         [
             Section("1. The gain, and how sure it is", gain, "Gain", together=True),
             *([structure_section(result)] if result.structures else []),
-            *([] if result.person is None else [person_section(result, result.person)]),
+            *([] if result.person is None else [result.person.section()]),
             Section("2. What may be said of the weights", _statements(result), "Weights"),
             Section("3. Inverse LQR on the same recordings", _methods(result), "Inverse LQR"),
             Section("4. Recorded and simulated", _trajectories(result), "Trajectories"),

@@ -43,7 +43,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from impc.assess.intent_rules import dominant_sentence
-from impc.studies.fit.person import person_data
 from impc.studies.fit.structures import structure_data
 from impc.studies.methods_table import methods_data
 
@@ -55,7 +54,8 @@ if TYPE_CHECKING:
 
 def fit_data(result: FitResult, provenance: Provenance) -> dict[str, Any]:
     """Content of result.json."""
-    within = {"structures": structure_data(result), "person": person_data(result)}
+    person = None if result.person is None else result.person.data()
+    within = {"structures": structure_data(result), "person": person}
     return _controller(result) | _found(result) | within | _made(result, provenance)
 
 

@@ -8,7 +8,6 @@ import numpy as np
 
 from impc.assess.covariance import TOLD
 from impc.assess.intent_rules import dominant_sentence
-from impc.studies.fit.person import person_sentences
 from impc.studies.fit.result import trial_name
 from impc.studies.fit.structure_words import structure_sentences
 
@@ -30,7 +29,7 @@ def remarks(result: FitResult) -> tuple[str, ...]:
         _determined(result),
         *result.fitted.doubts,
         *_failed(result),
-        *person_sentences(result),
+        *result.person_sentences,
     )
 
 

@@ -63,7 +63,7 @@ class StructureSettings:
 
 @dataclass(frozen=True)
 class ObserverSettings:
-    """How a person senses, and which noise is in the loop (`impc.model.observer`)."""
+    """How a person senses, and which noise is in the loop (`impc.output_feedback`)."""
 
     # Combinations of states and outputs; none for a person who sees every state
     sensed: list[str] = field(default_factory=list)
@@ -168,11 +168,6 @@ class FitSettings:
     body: Literal["nonlinear", "linear"] = "nonlinear"
     solver: str = COMPILED
     observer: ObserverSettings | None = None
-
-    @property
-    def person_profiles(self) -> bool:
-        """Whether intervals of a person who senses with noise follow the likelihood."""
-        return self.observer is not None and self.observer.profiles
 
 
 def require_used(settings: FitSettings, used: Collection[str], command: str) -> None:

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.reporting.rendering import number
-from impc.studies.fit.person import preferred
 from impc.studies.fit.result import LITTLE
 from impc.studies.fit.sentences import bounded, limited
 from impc.studies.fit.structure_words import structure_sentences
@@ -31,7 +30,7 @@ def verdict(result: FitResult) -> str:
         ),
         (other is not None and other.contradicted, other_limit_sentence(result)),
         (
-            result.person is not None and preferred(result.person),
+            result.person is not None and result.person.preferred,
             "A subject with noise inside the loop explains the recordings better than noise in "
             "the recorder: go by the gain of that subject, in its section.",
         ),
