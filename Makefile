@@ -188,7 +188,7 @@ fuzz: env
 
 env: $(PROJECT) $(POLYTOPE) $(COMPILED)
 
-$(COMPILED): $(wildcard impc/control/compiled_*.py) $(PROJECT)
+$(COMPILED): $(wildcard impc/*/compiled_*.py) $(PROJECT)
 	@echo 'Compiling, once: some minutes.'
 	@OPENBLAS_NUM_THREADS=1 $(VENV)/bin/impc warm
 	@touch $@

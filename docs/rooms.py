@@ -27,6 +27,7 @@ ROOMS = {
     "assess": "what an estimate is worth",
     "files": "recordings and results in files",
     "reporting": "pages, figures, tables, writing",
+    "output_feedback": "optional: subjects with sensory noise",
     "studies": "example, fit, compare, cohorts, ...",
     "nonlinear": "optional: problems of the user's own",
     "cli": "commands: parse, call, print",

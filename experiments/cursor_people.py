@@ -28,16 +28,16 @@ import plants
 from experiments.cursor_data import RATE, Condition
 from impc.checking import replace
 from impc.inverse.coordinates import Point
-from impc.inverse.likelihood_fit import PersonFit, fit_person
-from impc.inverse.likelihood_start import gain_space
 from impc.inverse.noisy_fit import fit_controller
-from impc.inverse.person_coordinates import PersonCoordinates
 from impc.inverse.structured_fit import fit_structured
-from impc.model.observer import Observer
 from impc.model.plant import Plant
 from impc.model.plant_family import PlantFamily
 from impc.model.recordings import Recording
 from impc.model.structure import Structure
+from impc.output_feedback.fit import PersonFit, fit_person
+from impc.output_feedback.observer import Observer
+from impc.output_feedback.start import gain_space
+from impc.output_feedback.unknowns import PersonCoordinates
 from impc.studies.fit.settings import FitSettings
 from impc.studies.fit.subject import fit_problem
 

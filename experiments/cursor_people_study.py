@@ -23,14 +23,14 @@ from tqdm import tqdm
 from experiments.cursor_data import RATE, Condition, data_file, read_conditions
 from experiments.cursor_people import FIRST, Follower, fit_follower, judged, nats, regression_nats
 from experiments.cursor_steps import Expected, fit_steps, step_nats
-from impc.assess.person_covariance import person_covariance
-from impc.assess.person_models import prediction_errors
-from impc.assess.person_profile import level_intervals
+from impc.output_feedback.covariance import person_covariance
+from impc.output_feedback.models import prediction_errors
+from impc.output_feedback.profile import level_intervals
 from impc.reporting.writer import write_files
 
 if TYPE_CHECKING:
     from impc.arrays import IntArray
-    from impc.inverse.likelihood_fit import PersonFit
+    from impc.output_feedback.fit import PersonFit
 
 __all__ = ["main"]
 

@@ -20,15 +20,15 @@ from experiments.benchmarks.workloads import seat
 from impc.assess.variance_accounted_for import vaf
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
-from impc.control.noisy_person import simulate_person
 from impc.control.simulation import scenario
 from impc.inverse.problem import Problem
 from impc.model.bounds import Bounds
-from impc.model.observer import Observer
 from impc.model.plant import Plant
 from impc.model.recordings import Recording
 from impc.model.structure import Structure
 from impc.model.weights import Weights
+from impc.output_feedback.observer import Observer
+from impc.output_feedback.simulation import simulate_person
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

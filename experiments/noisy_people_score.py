@@ -9,27 +9,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.assess.covariance import gain_covariance
-from impc.assess.likely_people import (
-    direction_intervals,
-    entry_intervals,
-    level_intervals,
-    people_as_likely,
-)
-from impc.assess.person_covariance import person_covariance
-from impc.assess.person_profile import fallen
-from impc.assess.runaways import running_away
-from impc.inverse.likelihood_fit import fit_person
 from impc.inverse.methods import estimate
-from impc.inverse.person_prior import TOLD
-from impc.inverse.unbiased_fit import unbiased
+from impc.output_feedback.covariance import person_covariance
+from impc.output_feedback.fit import fit_person
+from impc.output_feedback.prior import TOLD
+from impc.output_feedback.profile import fallen
+from impc.output_feedback.simulation import simulate_person
 
 if TYPE_CHECKING:
     from experiments.noisy_people import Recorded, Subject
     from impc.arrays import Array
-    from impc.assess.likely_people import LikelyPerson
-    from impc.assess.person_covariance import PersonCovariance
-    from impc.inverse.likelihood_fit import PersonFit
-    from impc.model.observer import Observer
+    from impc.output_feedback.covariance import PersonCovariance
+    from impc.output_feedback.fit import PersonFit
+    from impc.output_feedback.observer import Observer
 
 __all__ = [
     "FALLEN",
@@ -55,7 +47,7 @@ LIMITS = {
 # Who on the seat is at a limit that is met in fewer samples, or more, is no subject, nor who falls
 # in any trial that is not recorded, from this number on: of people who fall now and then, those who
 # did not have had other noise than the model says.
-_SHARES, _UNSEEN = (0.12, 0.40), 1000
+_SHARES, _UNSEEN, _SIMULATED = (0.12, 0.40), 1000, 60
 #: An angle that is a fall, rad.
 FALLEN = 1.0
 
@@ -82,23 +74,18 @@ class Score:
     least, likely, expected : list of pairs
         Error and deviation along each direction that the method tells, the best first: of least
         squares, and of maximum likelihood by the sandwich and as expected.
-    along : list of pairs
-        Intervals along the directions of `likely` of everybody as likely, less the truth, in
-        deviations.
     entries : list of pairs
-        The same of the entries of the gain, less the truth, as shares of the entry: as printed.
-    people : int
-        How many are as likely.
+        Intervals of the entries of the gain by the sandwich, less the truth, as shares of the
+        entry: as printed.
     fell : list of float
         Where asked for, by how many nats the likelihood falls with each of the directions of
         `likely` held at the truth.
     levels, found : list of float
         Motor, senses, recorder: true, and found.
     level_intervals : list of pairs
-        Of everybody as likely, as printed.
+        By the sandwich, as printed.
     seconds : list of float
-        Of processor time: least squares, likelihood, what is taken away without bias, everybody as
-        likely, what falls.
+        Of processor time: least squares, likelihood, what falls.
     """
 
     study: str
@@ -113,9 +100,7 @@ class Score:
     least: list[tuple[float, float]]
     likely: list[tuple[float, float]]
     expected: list[tuple[float, float]]
-    along: list[tuple[float, float]]
     entries: list[tuple[float, float]]
-    people: int
     fell: list[float]
     levels: list[float]
     found: list[float]
@@ -131,7 +116,7 @@ def score(
     *,
     profiled: bool = False,
 ) -> Score:
-    """Both fits of a subject, what holds for everybody as likely and, asked for, what falls."""
+    """Both fits of a subject and, asked for, what falls."""
     truth = np.array(who.controller.K)
     clock = [time.process_time()]
     first = estimate(trials.problem)
@@ -140,13 +125,10 @@ def score(
     clock.append(time.process_time())
     likely = fit_person(first, blind(who))
     clock.append(time.process_time())
-    likely = unbiased(likely).fit
     expected = person_covariance(likely, "expected")
     robust = person_covariance(likely)
-    clock.append(time.process_time())
-    people = people_as_likely(likely)
-    along, entries = _around_truth(people, robust, who)
-    clock.append(time.process_time())
+    true = truth.reshape(-1, 1)
+    entries = (robust.entry_intervals(likely.K) - true) / np.abs(true)
     fell = _fell(likely, robust, who) if profiled else []
     clock.append(time.process_time())
     size = float(np.linalg.norm(truth @ least.T))
@@ -167,26 +149,13 @@ def score(
         ),
         _steps(likely, robust, truth),
         _steps(likely, expected, truth),
-        along,
-        entries,
-        len(people),
+        entries.tolist(),
         fell,
         [*who.person.levels[who.person.levels > 0], *who.recorder],
         likely.levels.tolist(),
-        level_intervals(people).tolist(),
+        robust.level_intervals(likely.levels).tolist(),
         np.diff(clock).tolist(),
     )
-
-
-def _around_truth(
-    people: list[LikelyPerson], robust: PersonCovariance, who: Subject
-) -> tuple[list[tuple[float, float]], list[tuple[float, float]]]:
-    """Intervals along told directions, and of entries of the gain, less the truth."""
-    true = np.array(who.controller.K).reshape(-1, 1)
-    directions, deviations, aims = _aims(people[0].fit, robust, who)
-    along = (direction_intervals(people, directions) - aims[:, None]) / deviations[:, None]
-    entries = (entry_intervals(people) - true) / np.abs(true)
-    return along.tolist(), entries.tolist()
 
 
 def blind(who: Subject) -> Observer:
@@ -263,6 +232,10 @@ def passed_over(who: Subject, trials: Recorded, seed: int, *, met: bool) -> str:
 
 def falls(who: Subject, seed: int) -> int:
     """In how many of sixty trials that nobody records a subject falls."""
-    rest = np.zeros(who.controller.plant.n)
-    driven = [(np.asarray(push), rest) for push in who.pushes]
-    return running_away(who.controller, who.person, driven, FALLEN, seed, _UNSEEN)
+    found = 0
+    for number in range(_SIMULATED):
+        push = who.pushes[number % len(who.pushes)]
+        drawn = [seed, _UNSEEN + number]
+        outputs = simulate_person(who.controller, who.person, push, seed=drawn).outputs
+        found += bool(np.any(np.abs(np.array(outputs)) > FALLEN))
+    return found

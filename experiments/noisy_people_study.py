@@ -6,9 +6,6 @@ turn, so that a run can be ended at any time, be gone on with, and be summed up:
     python -m experiments.noisy_people_study run --subjects 200 --out a.jsonl
     python -m experiments.noisy_people_study run --body seat --vaf 90 --subjects 20 --out b.jsonl
     python -m experiments.noisy_people_study sum a.jsonl b.jsonl
-
-Those of docs/noisy-people.md that were made by the code as it is are in noisy_people_rows.jsonl
-beside this file; a run with that as `--out` goes on from there.
 """
 
 from __future__ import annotations

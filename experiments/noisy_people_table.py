@@ -21,8 +21,7 @@ HEADS = (
     "people", "count", "at the limit %", "ended at the truth or above", "settled",
     "least squares: error %", "bias / deviation", "95 % holds %",
     "likelihood: error %", "bias / deviation", "95 % holds % (sandwich)", "(expected)",
-    "(everybody as likely)", "(profile)", "entries told, all", "levels hold %",
-    "seconds: least squares, likelihood, without bias, everybody as likely",
+    "(profile)", "entries told, all", "levels hold %", "seconds: least squares, likelihood",
 )  # fmt: skip
 # Nats by which a likelihood falls at either end of an interval of 95 %.
 _LOWER = TWO_SIDED**2 / 2
@@ -71,13 +70,12 @@ def row(scores: list[Score]) -> list[str]:
         cells.append(f"{100 * np.median([getattr(one, f'{name}_error') for one in scores]):.1f}")
         cells += [_bias(pairs), _share([_inside(each) for each in pairs])]
     cells.append(_share([_inside(one.expected) for one in scores]))
-    cells.append(_share([_around(one.along) for one in scores]))
     cells.append(_share([[nats <= _LOWER for nats in one.fell] for one in scores if one.fell]))
     told = [[pair for pair in one.entries if pair[1] - pair[0] < 2 * _TOLD] for one in scores]
     some = f"{_share([_around(each) for each in told])} ({sum(map(len, told))})"
     cells.append(f"{some}, {_share([_around(one.entries) for one in scores])}")
     cells.append(_share([_levels(one) for one in scores]))
-    times = np.median([one.seconds[:4] for one in scores], axis=0)
+    times = np.median([one.seconds[:2] for one in scores], axis=0)
     return [*cells, ", ".join(f"{value:.1f}" for value in times)]
 
 
@@ -113,10 +111,9 @@ def pooled(studies: Sequence[list[Score]]) -> str:
     small = sum(abs(mean) < _BIAS for mean, _ in biases)
     farthest = max((abs(mean) / error for mean, error in biases if error > 0), default=0.0)
     counts = (
-        f"directions {_count([_around(one.along) for one in scores])}",
+        f"directions {_count([_inside(one.likely) for one in scores])}",
         f"entries {_count([_around(one.entries) for one in scores])}",
         f"levels {_count([_levels(one) for one in scores])}",
-        f"directions by the sandwich {_count([_inside(one.likely) for one in scores])}",
         f"settled {sum(one.converged for one in scores)}",
         f"gains off by more than themselves {len(far)}, of which {len(settled)} settled",
         f"mean errors below {_BIAS} {small} of {len(biases)}",

@@ -49,12 +49,10 @@ if TYPE_CHECKING:
     from impc.inverse.estimates import Estimate as Estimate
     from impc.inverse.inverse_lqr import inverse_lqr_gradient as inverse_lqr_gradient
     from impc.inverse.inverse_lqr import inverse_lqr_lmi as inverse_lqr_lmi
-    from impc.inverse.likelihood_fit import fit_person as fit_person
     from impc.inverse.methods import estimate as estimate
     from impc.inverse.problem import Problem as Problem
     from impc.inverse.solution_set import gain_fibre as gain_fibre
     from impc.model.bounds import Bounds as Bounds
-    from impc.model.observer import Observer as Observer
     from impc.model.plant import Plant as Plant
     from impc.model.plant_family import PlantFamily as PlantFamily
     from impc.model.recordings import Label as Label
@@ -66,6 +64,8 @@ if TYPE_CHECKING:
     from impc.model.weights import weight_error as weight_error
     from impc.nonlinear.fit import fit_optimal_control as fit_optimal_control
     from impc.nonlinear.problem import OptimalControlProblem as OptimalControlProblem
+    from impc.output_feedback.fit import fit_person as fit_person
+    from impc.output_feedback.observer import Observer as Observer
     from impc.studies.estimate_page import report as report
     from impc.studies.fit.settings import FitSettings as FitSettings
     from impc.studies.fit.subject import fit_problem as fit_problem
@@ -94,13 +94,13 @@ _NAMES = {
     "inverse.direct_and_reduced": "infer_weights inverse_mpc inverse_mpc_reduced",
     "inverse.equivalent_weights": "least_condition_weights other_weights",
     "inverse.estimates": "Estimate",
-    "inverse.likelihood_fit": "fit_person",
+    "output_feedback.fit": "fit_person",
     "inverse.inverse_lqr": "inverse_lqr_gradient inverse_lqr_lmi",
     "inverse.methods": "estimate",
     "inverse.problem": "Problem",
     "inverse.solution_set": "gain_fibre",
     "model.bounds": "Bounds",
-    "model.observer": "Observer",
+    "output_feedback.observer": "Observer",
     "model.plant": "Plant",
     "model.plant_family": "PlantFamily",
     "model.recordings": "Label Recording",

@@ -423,7 +423,6 @@ _VALUES = {
     "Scenario": ("impc.control.simulation", "make it with scenario"),
     "Simulation": ("impc.control.simulation", "make it with simulate"),
     "Directions": ("impc.control.constraint_rows", "make it with directions"),
-    "Observer": ("impc.model.observer", "make it with Observer(plant, ...)"),
     "Structure": ("impc.model.structure", "make it with Structure(plant, ...)"),
     "Problem": ("impc.inverse.problem", "make it with Problem(plant, ...)"),
     "PlantFamily": ("impc.model.plant_family", "make it with plant_family"),
@@ -444,6 +443,13 @@ _VALUES = {
     "Rows": ("impc.control.constraint_rows", "make it with build_rows"),
 }
 _MADE_BY = {kind: remedy for kind, (_, remedy) in _VALUES.items()}
+
+
+def add_value(kind: str, module: str, remedy: str) -> None:
+    """Have values of an optional subpackage checked too: where the class is, and who makes it."""
+    _KINDS[kind], _MADE_BY[kind] = _instance(module, kind), remedy
+
+
 _KINDS: dict[str, Kind] = {
     **{kind: _instance(module, kind) for kind, (module, _) in _VALUES.items()},
     "Estimate | OwnPage": _estimate,

@@ -35,11 +35,12 @@ from impc.inverse import gain_search as gain
 from impc.inverse import noisy_fit as fitted_controller
 from impc.inverse import problem as inverse_problem
 from impc.inverse import solution_set as gain_fibre
-from impc.model import bounds, observer, plant, plant_family, structure, weights
+from impc.model import bounds, plant, plant_family, structure, weights
 from impc.model import recordings as recording
 from impc.model import riccati as lqr
 from impc.nonlinear import fit as nonlinear_fit
 from impc.nonlinear import problem as nonlinear_problem
+from impc.output_feedback import observer
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -18,9 +18,9 @@ from terminal import RESULTS, show
 
 import impc
 from impc.assess.covariance import gain_covariance
-from impc.assess.person_covariance import person_covariance
-from impc.assess.person_profile import level_intervals
-from impc.control.noisy_person import simulate_person
+from impc.output_feedback.covariance import person_covariance
+from impc.output_feedback.profile import level_intervals
+from impc.output_feedback.simulation import simulate_person
 
 system = control.ss(
     [[1, 0.05], [0, 0.98]],

@@ -20,9 +20,9 @@ from experiments.benchmarks.workloads import seat
 from experiments.noisy_people import recorded, subject
 from impc.checking import replace
 from impc.inverse.coordinates import Coordinates, Point
-from impc.inverse.likelihood_start import gain_space
-from impc.inverse.person_coordinates import PersonCoordinates
 from impc.inverse.residuals import evaluate
+from impc.output_feedback.start import gain_space
+from impc.output_feedback.unknowns import PersonCoordinates
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from impc.arrays import Array, Buffer
-from impc.control.joint_loop import joint_loop
+from impc.output_feedback.joint_loop import joint_loop
 
 if TYPE_CHECKING:
     from impc.model.bounds import Bounds
-    from impc.model.observer import Observer
     from impc.model.plant import Plant
+    from impc.output_feedback.observer import Observer
 
 __all__ = ["ClippedRegulator", "clipped_regulator", "first_state"]
 

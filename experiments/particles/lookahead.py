@@ -20,8 +20,8 @@ import numpy as np
 
 from experiments.particles.clipped_regulator import ClippedRegulator
 from impc.arrays import Buffer
-from impc.control.compiled_clip import Clip, clipped
 from impc.jit import njit
+from impc.output_feedback.compiled_clip import Clip, clipped
 
 __all__ = ["Twist", "twist"]
 

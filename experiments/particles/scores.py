@@ -21,14 +21,14 @@ from experiments.particles.clipped_regulator import clipped_regulator, first_sta
 from experiments.particles.likelihood import particle_likelihood
 from impc.control.constraint_rows import directions
 from impc.control.controller import Controller
-from impc.control.joint_likelihood import NoiseDirections, joint_likelihoods, prepare_filter
-from impc.control.noisy_person import simulate_person
 from impc.model.recordings import Recording
+from impc.output_feedback.likelihood import NoiseDirections, joint_likelihoods, prepare_filter
+from impc.output_feedback.simulation import simulate_person
 
 if TYPE_CHECKING:
     from experiments.noisy_people import Subject
     from impc.arrays import Array
-    from impc.control.joint_likelihood import PreparedFilter
+    from impc.output_feedback.likelihood import PreparedFilter
 
 __all__ = ["differences"]
 

@@ -64,7 +64,7 @@ def command(
     truth = read_truth(files, problem.plant)
     # One more: the page with its figures takes ten seconds.
     with progress(stages(problem, settings) + 1, "stage", lambda _: memory.kept()) as done:
-        told = FitProgress(done, memory.estimate, memory.replicate, memory.person)
+        told = FitProgress(done, memory.estimate, memory.replicate, memory.part)
         result = fit_recordings(problem, settings, told)
         with angles_in(subject.angles):
             content = fit_report(result, subject.provenance, truth, unknown).files()
@@ -118,12 +118,11 @@ def _own_problem(
 def _print(result: FitResult) -> None:
     """The table of methods and the intent, as the page has them."""
     from impc.assess.intent_rules import dominant_sentence  # noqa: PLC0415
-    from impc.studies.fit.person import person_sentences  # noqa: PLC0415
     from impc.studies.fit.structure_words import structure_sentences  # noqa: PLC0415
     from impc.studies.fit.verdict import verdict  # noqa: PLC0415
     from impc.studies.methods_table import methods_finding  # noqa: PLC0415
 
-    told = (*structure_sentences(result), *person_sentences(result), *result.warnings)
+    told = (*structure_sentences(result), *result.person_sentences, *result.warnings)
     for line in dict.fromkeys((verdict(result), *told)):
         click.echo(line)
     plant = result.fitted.problem.plant

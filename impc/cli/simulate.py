@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from impc.control.controller import Controller
-    from impc.model.observer import Observer
+    from impc.output_feedback.observer import Observer
     from impc.studies.simulated_people import SubjectTrial
 
 _ENDINGS = {
@@ -194,7 +194,7 @@ def _observer(controller: Controller, given: dict[str, Any]) -> Observer | None:
     """The person who senses with noise, where one is asked for."""
     import numpy as np  # noqa: PLC0415
 
-    from impc.model.observer import Observer  # noqa: PLC0415
+    from impc.output_feedback.observer import Observer  # noqa: PLC0415
 
     if not given["observer"]:
         return None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib.util
+
 import click
 
 from impc.jit import say_when_compiling
@@ -19,3 +21,8 @@ def command() -> None:
 
     for part in compiled_parts():
         click.echo(f"compiled: {part}")
+    if importlib.util.find_spec("impc.output_feedback"):
+        from impc.output_feedback.warm import compile_filter  # noqa: PLC0415
+
+        compile_filter()
+        click.echo("compiled: subjects who sense with noise")

@@ -8,42 +8,24 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import Any
 
 import pandas as pd
 
-from impc.files.columns import in_columns
 from impc.files.results import SCHEMA
-from impc.reporting.finding import MOST_CELLS, Chart, Finding, csv_bytes, workbook_bytes
-from impc.reporting.finding import Picture as Picture  # noqa: PLC0414
+from impc.reporting.finding import (
+    MOST_CELLS,
+    Chart,
+    Finding,
+    Picture,
+    csv_bytes,
+    workbook_bytes,
+)
 from impc.reporting.glossary import Glossary, used_words
 from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import plain, render_page
-
-T = TypeVar("T")
-
-
-@dataclass(frozen=True)
-class TextTable:
-    """A table of texts, or of numbers when it is only written as CSV."""
-
-    caption: str  # Above the table
-    heads: Sequence[str]  # One a column
-    rows: Sequence[Sequence[Any]]  # Their first cell is a head of its own
-
-    def text(self) -> str:
-        """In columns of a fixed width for a terminal, without the caption."""
-        return in_columns([self.heads, *self.rows])
-
-
-def table_of(
-    caption: str, items: Iterable[T], columns: Mapping[str, Callable[[T], str]]
-) -> TextTable:
-    """A table with a row for each of the `items`."""
-    rows = [tuple(cell(item) for cell in columns.values()) for item in items]
-    return TextTable(caption, tuple(columns), rows)
 
 
 @dataclass(frozen=True)
@@ -91,9 +73,7 @@ class Details:
 
 
 #: What a section is made of; a str is a paragraph.
-Block = (
-    str | Finding | TextTable | Picture | Chart | Lines | Terms | Heading | Note | Verdict | Details
-)
+Block = str | Finding | Picture | Chart | Lines | Terms | Heading | Note | Verdict | Details
 
 
 @dataclass(frozen=True)
@@ -116,8 +96,6 @@ class Report:
     opening: Sequence[Block]  # Before the first section
     sections: Sequence[Section]
     figures: Mapping[str, bytes] = field(default_factory=dict)  # By the name of the file
-    # Written as CSV under these names, and together as tables.xlsx
-    tables: Mapping[str, TextTable] = field(default_factory=dict)
     beside: Sequence[Finding] = ()  # Whose tables are written as files and stand on no page
     # Content of result.json beside the findings and what every one has (docs/results.md)
     data: Mapping[str, Any] = field(default_factory=dict)
@@ -142,11 +120,7 @@ class Report:
 
     def _tables(self) -> dict[str, pd.DataFrame]:
         found = [*self.findings(), *self.beside]
-        old = {
-            name: pd.DataFrame(list(table.rows), columns=list(table.heads))
-            for name, table in self.tables.items()
-        }
-        return {item.name: item.table for item in found if item.table is not None} | old
+        return {item.name: item.table for item in found if item.table is not None}
 
     def files(self) -> dict[str, bytes]:
         """Page, result.json, tables and figures by name."""

@@ -21,13 +21,13 @@ from impc.control.closed_loop import prepare_loop, run_loop
 from impc.control.constraint_rows import directions
 from impc.control.simulation import Scenario, Status
 from impc.errors import InputError
-from impc.model.observer import Observer, believed_filter, believed_matrices
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from impc.control.controller import Controller
     from impc.model.plant import Plant
+    from impc.output_feedback.observer import Observer
 
 
 @dataclass(frozen=True)
@@ -106,6 +106,11 @@ class _Senses:
             raise InputError("process", "cannot be simulated here", "leave it at 0")
         self.estimating = person is not None and person.estimates
         if person is not None and self.estimating:
+            from impc.output_feedback.observer import (  # noqa: PLC0415  # optional
+                believed_filter,
+                believed_matrices,
+            )
+
             self.F, self.C, _, _ = believed_matrices(plant, person)
             self.L = believed_filter(plant, person).L
             self.found = np.zeros(len(self.F))

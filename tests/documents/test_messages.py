@@ -43,13 +43,11 @@ from impc.files.reading import read_recordings, recording_of
 from impc.files.results import read_result
 from impc.files.table import Table, make_table
 from impc.files.units import si_unit
-from impc.inverse.likelihood_fit import fit_person
 from impc.inverse.methods import estimate
 from impc.inverse.problem import Problem
 from impc.inverse.structured_fit import fit_structure
 from impc.jit import keep_caches
 from impc.model.bounds import Bounds
-from impc.model.observer import Observer, believed_filter
 from impc.model.plant import Plant
 from impc.model.recordings import Label, Recording
 from impc.model.riccati import solve_lqr
@@ -64,6 +62,8 @@ from impc.nonlinear.files import (
 )
 from impc.nonlinear.plan import require_solver as require_nlp_solver
 from impc.nonlinear.problem import OptimalControlProblem
+from impc.output_feedback.fit import fit_person
+from impc.output_feedback.observer import Observer, believed_filter
 from impc.reporting.writer import owned, require_writable, write_files
 from impc.studies import scheduler
 from impc.studies.cache import Cache

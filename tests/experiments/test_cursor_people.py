@@ -11,14 +11,14 @@ import scipy.stats
 import plants
 from experiments.cursor_data import RATE, Condition, data_file, read_conditions
 from experiments.cursor_people import FIRST, Follower, fit_follower, judged, nats, regression_nats
-from impc.assess.person_covariance import person_covariance
-from impc.assess.person_profile import level_interval
 from impc.control.controller import Controller
-from impc.control.noisy_person import simulate_person
 from impc.model.bounds import Bounds
-from impc.model.observer import Observer
 from impc.model.plant import Plant
 from impc.model.structure import Structure
+from impc.output_feedback.covariance import person_covariance
+from impc.output_feedback.observer import Observer
+from impc.output_feedback.profile import level_interval
+from impc.output_feedback.simulation import simulate_person
 from tests.experiments.recordings import recorded
 from tests.support import nelder_mead
 

@@ -10,7 +10,7 @@ from experiments.particles.clipped_regulator import ClippedRegulator, clipped_re
 from experiments.particles.drawn_particles import _normal_between
 from experiments.particles.likelihood import particle_likelihood
 from impc.arrays import Array
-from tests.control.test_joint_likelihood import Someone, likelihood, particles, push, recorded
+from tests.output_feedback.test_likelihood import Someone, likelihood, particles, push, recorded
 
 pytestmark = pytest.mark.full
 

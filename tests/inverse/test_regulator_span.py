@@ -10,20 +10,20 @@ import scipy.linalg
 from experiments.benchmarks.workloads import seat
 from impc.arrays import Array
 from impc.control.controller import Controller
-from impc.control.noisy_person import simulate_person
 from impc.inverse.coordinates import Coordinates
-from impc.inverse.likelihood_fit import fit_person
 from impc.inverse.methods import estimate
 from impc.inverse.problem import Problem
 from impc.inverse.regulator_span import kept_to, regulators_alone
 from impc.inverse.solution_set import natural_coordinates
 from impc.model.bounds import Bounds
-from impc.model.observer import Observer
 from impc.model.plant import Plant
 from impc.model.plant_family import PlantFamily
 from impc.model.recordings import Recording
 from impc.model.structure import Structure
 from impc.model.weights import Weights
+from impc.output_feedback.fit import fit_person
+from impc.output_feedback.observer import Observer
+from impc.output_feedback.simulation import simulate_person
 from tests.support import extrapolated_slope
 
 _BODY = np.array([[1.0, 0.1], [0.05, 0.98]])

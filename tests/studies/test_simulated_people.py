@@ -11,9 +11,9 @@ import plants
 from experiments.benchmarks.workloads import seat
 from impc.arrays import Array
 from impc.control.closed_loop import simulate
-from impc.control.noisy_person import simulate_person
 from impc.errors import InputError
-from impc.model.observer import Observer
+from impc.output_feedback.observer import Observer
+from impc.output_feedback.simulation import simulate_person
 from impc.studies.simulated_people import simulate_subject
 
 STEP = plants.seated_balance_step_for()

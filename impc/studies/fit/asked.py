@@ -1,15 +1,15 @@
-"""What the settings of a fit ask for of plant and recordings: bounds, person, structures."""
+"""What the settings of a fit ask for of plant and recordings: bounds, structures."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import importlib
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.signal
 
 from impc.errors import InputError
 from impc.model.bounds import Bounds
-from impc.model.observer import Observer
 from impc.model.structure import Structure
 
 if TYPE_CHECKING:
@@ -24,33 +24,19 @@ if TYPE_CHECKING:
 # A recorded angle is differentiated over this time, by a parabola: noise of 1 % of the largest
 # angle at 100 Hz then gives a rate of a few per cent of the largest.
 _RATE_WINDOW = 0.15
-# Of the command that is noise, where the search begins: what isometric force has, and less.
-_SHARE = 0.1
 
 
-def fit_observer(
-    plant: Plant, settings: FitSettings, recordings: Sequence[Recording]
-) -> tuple[Observer, Array] | None:
-    """The person of [fit.observer], and where steps of an unknown perturbation begin (d,).
-
-    Levels stand at places to begin from; the search finds others by the residuals.
-    """
-    asked = settings.observer
-    if asked is None:
-        return None
-    steps = np.concatenate([np.diff(trial.disturbance, axis=0) for trial in recordings])
-    size = np.sqrt(np.mean(steps**2, axis=0))
-    walk = np.where(size > 0, size, 1.0)
-    person = Observer(
-        plant,
-        asked.sensed,
-        motor=float(asked.motor),
-        share=_SHARE * asked.share,
-        process=float(asked.process),
-        sensory=1.0,
-        walk=None if asked.known else walk,
-    )
-    return person, walk
+def output_feedback() -> Any:
+    """The optional subpackage of subjects with sensory and motor noise."""
+    try:
+        return importlib.import_module("impc.output_feedback.models")
+    except ModuleNotFoundError as error:
+        if not str(error.name).startswith("impc.output_feedback"):
+            raise
+        remedy = "install all of impc, or leave the table out"
+        raise InputError(
+            "[fit.observer]", "needs impc.output_feedback, which is not there", remedy
+        ) from None
 
 
 def fit_structures(plant: Plant, settings: FitSettings) -> tuple[Structure, ...]:

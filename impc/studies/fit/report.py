@@ -63,7 +63,6 @@ from impc.studies.fit.gain_findings import (
     limit_findings,
     parameter_findings,
 )
-from impc.studies.fit.person import person_data, person_section
 from impc.studies.fit.result import shown_trials, trial_name
 from impc.studies.fit.settings import plain_settings
 from impc.studies.fit.structures import structure_data, structure_section
@@ -141,7 +140,7 @@ def fit_report(
         [
             Section("1. The gain, and how sure it is", gain, "Gain", together=True),
             *([structure_section(result)] if result.structures else []),
-            *([] if result.person is None else [person_section(result, result.person)]),
+            *([] if result.person is None else [result.person.section()]),
             Section(
                 "2. What may be said of the weights",
                 [_SAME_GAIN, *statement_findings(result)],
@@ -255,7 +254,7 @@ def fit_data(result: FitResult, provenance: Provenance) -> dict[str, Any]:
         "trials": [_trial(result, index) for index in range(len(result.trials))],
         "methods": methods_data(result.methods),
         "structures": structure_data(result),
-        "person": person_data(result),
+        "person": None if result.person is None else result.person.data(),
         "plant": {
             "name": provenance.plant_name,
             "arguments": dict(provenance.plant_arguments),

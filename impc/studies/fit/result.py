@@ -22,13 +22,13 @@ if TYPE_CHECKING:
     from impc.assess.input_limits import OtherLimit
     from impc.assess.intent_rules import Intent
     from impc.assess.intervals import Interval
-    from impc.assess.person_models import PersonReport
     from impc.assess.printed_gain import GainEstimate
     from impc.assess.structures import StructureFit
     from impc.assess.variance_accounted_for import HeldOut, TrialAgreement
     from impc.assess.weights_test import WeightsTest
     from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
+    from impc.output_feedback.page import PersonReport
     from impc.studies.fit.settings import FitSettings
 
 #: Trials that are drawn one by one: 500 made a page of 51 MB and took 6.3 GB.
@@ -90,6 +90,11 @@ class FitResult:
     # Those that were asked for, that of [fit.structure] first
     structures: tuple[StructureFit, ...] = ()
     person: PersonReport | None = None  # Of [fit.observer]; None where none was asked for
+
+    @property
+    def person_sentences(self) -> tuple[str, ...]:
+        """What may be said of the subject with sensory noise; nothing where none was asked for."""
+        return () if self.person is None else self.person.sentences(np.array(self.intent.sizes))
 
     @property
     def usable(self) -> bool:

@@ -159,11 +159,6 @@ class FitSettings:
     solver: str = COMPILED
     observer: ObserverSettings | None = None
 
-    @property
-    def person_profiles(self) -> bool:
-        """Whether intervals of a person who senses with noise follow the likelihood."""
-        return self.observer is not None and self.observer.profiles
-
 
 def plain_settings(settings: FitSettings) -> dict[str, Any]:
     """Settings as result.json has them; numbers of numpy as Python's."""

@@ -12,6 +12,7 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import msgspec
 import numpy as np
 from tqdm.auto import tqdm
 
@@ -26,7 +27,6 @@ from impc.assess.identified_directions import identifiability
 from impc.assess.input_limits import at_another_limit
 from impc.assess.intent_draws import drawn_gains
 from impc.assess.intent_rules import intent
-from impc.assess.person_models import afresh_person, person_report, persons
 from impc.assess.printed_gain import gain_estimate
 from impc.assess.structures import assess_structure, no_structure
 from impc.assess.variance_accounted_for import agreement, predict
@@ -41,9 +41,9 @@ from impc.inverse.methods import estimate_all
 from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.problem import Problem, simulated
 from impc.inverse.structured_fit import fit_structured
-from impc.studies.fit.asked import fit_bounds, fit_observer, fit_structures, moving_body
+from impc.studies.fit.asked import fit_bounds, fit_structures, moving_body, output_feedback
 from impc.studies.fit.result import LITTLE, FitResult, FittedParameter
-from impc.studies.fit.settings import FitSettings
+from impc.studies.fit.settings import FitSettings, ObserverSettings
 from impc.studies.pool import threads
 
 if TYPE_CHECKING:
@@ -53,7 +53,6 @@ if TYPE_CHECKING:
     from impc.assess.all_intervals import Attempt, Certainty
     from impc.assess.assessments import MethodFit
     from impc.assess.input_limits import OtherLimit
-    from impc.assess.person_models import PersonReport, RememberPerson
     from impc.assess.printed_gain import GainEstimate
     from impc.assess.resampling import Replicate
     from impc.assess.structures import StructureFit
@@ -65,6 +64,7 @@ if TYPE_CHECKING:
     from impc.model.plant_family import PlantFamily
     from impc.model.recordings import Recording
     from impc.model.riccati import LqrSolution
+    from impc.output_feedback.page import PersonReport
 
 _THREADS = 2
 _UNUSABLE = "the controller explains less than half of a recorded signal."
@@ -80,8 +80,8 @@ class FitProgress:
     estimate: Remember = afresh
     # (name of stage, compute) -> a bootstrap replicate, in the same way
     replicate: Callable[[str, Callable[[], Replicate]], Replicate] = lambda _, compute: compute()
-    # (name of stage, problem, person, compute) -> a person who senses with noise, in the same way
-    person: RememberPerson = afresh_person
+    # (name of stage, compute, encode, decode) -> what an optional subpackage finds, likewise
+    part: Callable[..., Any] = lambda _name, compute, _encode, _decode: compute()
 
 
 def stages(problem: Problem, settings: FitSettings) -> int:
@@ -89,8 +89,10 @@ def stages(problem: Problem, settings: FitSettings) -> int:
     trials = len(problem.recordings)
     left_out = trials if _leaves_out(trials, settings) else 0
     structures = (settings.structure is not None) + len(settings.structures)
-    asked = fit_observer(problem.plant, settings, problem.recordings)
-    models = 0 if asked is None else len(persons(problem, *asked)) + 2  # bias and intervals
+    models = 0
+    if settings.observer is not None:
+        feedback = output_feedback()
+        models = len(feedback.persons(problem, *_asked(problem, settings.observer))) + 1
     others = structures + models + count_stages(problem, settings)
     return 1 + len(_beside(settings)) + left_out + others
 
@@ -181,7 +183,8 @@ def fit_recordings(
     --------
     >>> import control
     >>> import impc
-    >>> import numpy as np
+    >>> import msgspec
+    import numpy as np
     >>> rng = np.random.default_rng(1)
     >>> plant = impc.Plant(control.ss([[1.1]], [[1, 1]], [[1]], 0, 1, inputs=["u", "push"]), ["u"])
     >>> bounds = impc.Bounds(plant, u_min=-1, u_max=1)
@@ -202,6 +205,8 @@ def fit_recordings(
                 bar.update()
 
             return fit_recordings(problem, settings, told)
+    if settings.observer is not None:
+        output_feedback()  # refused at once where it is not installed
     if not isinstance(progress, FitProgress):
         progress = FitProgress(progress) if callable(progress) else FitProgress()
     return _fitted(problem, settings, progress)
@@ -347,17 +352,28 @@ def _predicted(
 def _person(
     problem: Problem, settings: FitSettings, fitted: Estimate, progress: FitProgress
 ) -> PersonReport | None:
-    """A person who senses with noise, where one was asked for."""
-    asked = fit_observer(problem.plant, settings, problem.recordings)
+    """A subject with sensory noise, where one was asked for."""
+    asked = settings.observer
     if asked is None:
         return None
-    return person_report(
+    report: PersonReport = output_feedback().person_report(
         fitted,
-        *asked,
-        profiled=settings.person_profiles,
+        *_asked(problem, asked),
+        profiled=asked.profiles,
         done=progress.done,
-        remember=progress.person,
+        remember=progress.part,
     )
+    return report
+
+
+def _asked(problem: Problem, asked: ObserverSettings) -> tuple[Any, Array]:
+    """That subject and its perturbation, as `asked_observer` of the subpackage makes them."""
+    given = msgspec.structs.asdict(asked)
+    del given["profiles"]
+    found: tuple[Any, Array] = output_feedback().asked_observer(
+        problem.plant, problem.recordings, **given
+    )
+    return found
 
 
 def _structures(

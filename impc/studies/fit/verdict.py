@@ -9,7 +9,6 @@ import numpy as np
 from impc.assess.covariance import TOLD
 from impc.assess.intent_rules import dominant_sentence
 from impc.reporting.rendering import number
-from impc.studies.fit.person import person_sentences, preferred
 from impc.studies.fit.result import LITTLE, trial_name
 from impc.studies.fit.structure_words import structure_sentences
 
@@ -39,7 +38,7 @@ def verdict(result: FitResult) -> str:
         ),
         (other is not None and other.contradicted, other_limit_sentence(result)),
         (
-            result.person is not None and preferred(result.person),
+            result.person is not None and result.person.preferred,
             "A subject with noise inside the loop explains the recordings better than noise in "
             "the recorder: go by the gain of that subject, in its section.",
         ),
@@ -216,7 +215,7 @@ def remarks(result: FitResult) -> tuple[str, ...]:
         _determined(result),
         *result.fitted.doubts,
         *_failed(result),
-        *person_sentences(result),
+        *result.person_sentences,
     )
 
 

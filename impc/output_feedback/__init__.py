@@ -1,0 +1,1 @@
+"""Subjects with sensory and motor noise: model, likelihood, fit and report. Optional."""

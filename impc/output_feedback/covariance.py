@@ -1,0 +1,148 @@
+"""How sure a person at the largest likelihood is: gain, levels of noise, and which are confused.
+
+With I the information of all recordings about all that was searched, initial states too,
+
+    expected   I^-1                    Fisher's information, which the search has
+    observed   (-d^2 log L)^-1         by differences of exact gradients
+    sandwich   I^-1 cov(sum s_t) I^-1  s_t the score of a sample; its sum by Newey and West
+
+agree where the model is true. Where it is not, the last still tells how estimates scatter. The
+prior of the search is left out but for a trace: what is not told has a deviation of hundreds
+(docs/noisy-people.md).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.arrays import Array, Frozen, frozen
+from impc.assess.covariance import TWO_SIDED
+from impc.errors import InputError
+
+if TYPE_CHECKING:
+    from impc.output_feedback.fit import PersonFit
+
+#: Ways to a covariance.
+KINDS = ("expected", "observed", "sandwich")
+# Of a coordinate, which none leaves by much more than one: the prior that is left.
+_FARTHEST = 1e3
+# Step of the differences, of a coordinate: their error is the square of it, and rounding over it.
+_STEP = 1e-4
+
+
+@dataclass(frozen=True)
+class PersonCovariance(Frozen):
+    """Covariance of what was searched."""
+
+    kind: str  # One of `KINDS`
+    covariance: Array  # Of the unknowns of the fit (q, q)
+    names: tuple[str, ...]  # Of the levels (l,)
+    levels: Array  # Standard deviations of the logarithms of the levels (l,)
+    entries: Array  # Standard deviations of the entries of the gain (m, n), in their units
+    directions: Array  # Of the coordinates of gain or prices, one a row (g, g), the best told first
+    deviations: Array  # Standard deviation along each (g,)
+
+    def level_intervals(self, values: Array) -> Array:
+        """Intervals of 95 % of the levels (l, 2), in their units.
+
+        `values` (l,).
+        """
+        factors = np.exp(np.minimum(TWO_SIDED * self.levels, 700.0))  # still numbers
+        return frozen(np.stack([values / factors, values * factors], axis=-1))
+
+    def entry_intervals(self, K: Array) -> Array:
+        """Intervals of 95 % of the entries of a gain (entries, 2), in their units.
+
+        `K` (m, n).
+        """
+        about = TWO_SIDED * np.ravel(self.entries)[:, None] * [-1, 1]
+        return frozen(np.ravel(K)[:, None] + about)
+
+
+@dataclass(frozen=True)
+class Confusion(Frozen):
+    """The step of gain and levels together that the recordings tell least apart."""
+
+    # Largest correlation of a combination of gain coordinates with one of levels
+    correlation: float
+    gain: Array  # The step of the gain (m, n), one deviation long, in its units
+    levels: Array  # The logarithms of the levels that go with it (l,)
+
+
+def person_covariance(fit: PersonFit, kind: str = "sandwich") -> PersonCovariance:
+    """Covariance of a fit of `fit_person`."""
+    if kind not in KINDS:
+        raise InputError("kind", f"got {kind!r}", f"give one of {', '.join(KINDS)}")
+    information = _observed(fit) if kind == "observed" else np.array(fit.told.information)
+    values, vectors = np.linalg.eigh(information)
+    kept = np.maximum(values, _FARTHEST**-2)
+    unit = vectors / np.sqrt(kept)
+    if kind != "sandwich":
+        return _described(fit, kind, unit @ unit.T)
+    # As seen where the information is one, and with as much of the prior as it needs for that: of a
+    # direction that is not told scores are rounding, and the bread is the square of 1e6.
+    middle = _meat(fit, unit) + np.diag(1 - values / kept)
+    return _described(fit, kind, unit @ middle @ unit.T)
+
+
+def _described(fit: PersonFit, kind: str, covariance: Array) -> PersonCovariance:
+    """What follows from a covariance (q, q) of all unknowns."""
+    space, shared = fit.space, fit.space.gain
+    dK, _ = space.changes(fit.theta)
+    entries = np.einsum("iab,ij,jab->ab", dK, covariance[: len(dK), : len(dK)], dK)
+    own, rows = np.linalg.eigh(covariance[:shared, :shared])
+    return PersonCovariance(
+        kind,
+        frozen(covariance),
+        tuple(space.names),
+        frozen(np.sqrt(np.diag(covariance)[space.own :])),
+        frozen(np.sqrt(np.maximum(entries, 0.0))),
+        frozen(rows.T),
+        frozen(np.sqrt(np.maximum(own, 0.0))),
+    )
+
+
+def confusion(fit: PersonFit) -> Confusion:
+    """What of gain and levels the recordings tell least apart, by the first canonical pair.
+
+    Coordinates that are hardly told keep the deviation of one that the search gives them.
+    """
+    space = fit.space
+    about = np.diag(np.where(np.arange(len(fit.theta)) < space.own, 1.0, _FARTHEST**-2))
+    covariance = np.linalg.inv(np.array(fit.told.information) + about)
+    gain, levels = slice(0, space.gain), slice(space.own, None)
+    left = np.linalg.cholesky(covariance[gain, gain])
+    right = np.linalg.cholesky(covariance[levels, levels])
+    product = np.linalg.solve(left, covariance[gain, levels])
+    u, values, v = np.linalg.svd(np.linalg.solve(right, product.T).T)
+    dK, _ = space.changes(fit.theta)
+    step = np.tensordot(left @ u[:, 0], dK[gain], 1)
+    return Confusion(float(values[0]), frozen(step), frozen(right @ v[0]))
+
+
+def _observed(fit: PersonFit) -> Array:
+    columns = []
+    for index in range(len(fit.theta)):
+        step = _STEP * np.eye(len(fit.theta))[index]
+        up, down = (fit.space.told(fit.theta + sign * step).gradient for sign in (1, -1))
+        columns.append((down - up) / (2 * _STEP))
+    found = np.array(columns)
+    return np.asarray((found + found.T) / 2)
+
+
+def _meat(fit: PersonFit, unit: Array) -> Array:
+    """Covariance of the sum of all scores along the columns of `unit` (q, q).
+
+    By Newey and West (1987), up to the root of the length.
+    """
+    total = np.zeros((len(fit.theta),) * 2)
+    for own in fit.told.scores:
+        scores, lags = own @ unit, int(np.sqrt(len(own)))
+        total += scores.T @ scores
+        for lag in range(1, lags + 1):
+            both = scores[lag:].T @ scores[:-lag] * (1 - lag / (lags + 1))
+            total += both + both.T
+    return total

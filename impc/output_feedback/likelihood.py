@@ -1,0 +1,288 @@
+"""The likelihood of recordings of a person who senses with noise, and its exact derivatives.
+
+With z of `joint_loop` (plant and estimate) and the innovation e_t = y_t - C z_t of a Kalman filter,
+
+    -2 log L = sum_t  e_t' S_t^-1 e_t + log det S_t + p log 2 pi
+    z_t|t = z_t + P_t C'S_t^-1 e_t,            P_t|t = P_t - P_t C'S_t^-1 C P_t
+    z_t+1 = F z_t|t + B u_t + E d_t,           P_t+1 = F_t P_t|t F_t' + Q,     F_t = F + B D_t H
+
+with u_t = MPC(H z_t|t) and D_t its slope there: H picks the estimate out of z. The law is piecewise
+affine, and its slope that of the active set. While no bound is near D_t = -K, all is linear and the
+likelihood is exact. Elsewhere the filter is an approximation: for one input, whose bounds clip a
+command that is only expected, u_t, D_t and some variance beside follow from the distribution of
+that command (`Clip`); for several inputs it is the extended filter. Derivatives follow the active
+sets, as those of a simulation do, and hold wherever none is about to change.
+
+P_t does not depend on what is recorded while D_t stays: until a bound is near all recordings have
+the same, which no first state moves. Once it has come as near to its stationary value as rounding
+lets a derivative see it is taken for that value, until a bound is met (docs/noisy-people.md).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.arrays import Array, Frozen, frozen
+from impc.control.closed_loop import prepare_loop
+from impc.control.constraint_rows import RowDirections, Rows
+from impc.control.simulation import Status
+from impc.errors import SolverError
+from impc.model.bounds import bound_rows
+from impc.output_feedback.compiled_clip import Clip
+from impc.output_feedback.compiled_filter import Course, FilterParts, Steady, run_filter
+from impc.output_feedback.compiled_room import filter_room
+from impc.output_feedback.compiled_sample import FilterResult
+from impc.output_feedback.joint_loop import PlantMoves, joint_directions, joint_loop
+from impc.output_feedback.kalman import filter_changes, stationary_filter
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from impc.arrays import Buffer
+    from impc.control.closed_loop import PreparedLoop
+    from impc.control.constraint_rows import Directions
+    from impc.control.controller import Controller
+    from impc.model.recordings import Recording
+    from impc.output_feedback.joint_loop import JointLoop
+    from impc.output_feedback.observer import Observer
+
+# How a sample ends at which there is no likelihood.
+_FAILED = (Status.INFEASIBLE, Status.UNSOLVED, Status.DIVERGED)
+
+
+@dataclass(frozen=True)
+class NoiseDirections:
+    """What else moves along q directions, beside what `Directions` has; the last axis of each."""
+
+    C: Array  # Outputs of the plant (p, n, q)
+    levels: Array  # Levels of the person's noise, then of the recorder's (levels + p, q)
+    covariances: int  # How many of the directions, the first ones, move more than the first state
+
+
+@dataclass(frozen=True)
+class PreparedFilter:
+    """All that recordings share; made by `prepare_filter`."""
+
+    law: PreparedLoop  # Of one input without its bounds at the present sample, see `Clip`
+    parts: FilterParts  # With it, and with the system
+
+
+@dataclass(frozen=True)
+class Likelihood(Frozen):
+    """What a recording says, sample by sample."""
+
+    told: Array  # Log-likelihood of each sample given those before (samples,), nats
+    score: Array  # Its derivatives along q directions (samples, q)
+    information: Array  # Fisher's, expected (q, q)
+    # Recorded outputs minus what the filter expects (samples, p), in the outputs' units
+    innovations: Array
+    spreads: Array  # Their covariances (samples, p, p)
+    filtered: Array  # Expected z given the outputs so far (samples, z)
+    u: Array  # Commands there (samples, m)
+    status: np.ndarray[tuple[int], np.dtype[np.int8]]  # `Status` of each sample (samples,)
+
+    @property
+    def value(self) -> float:
+        """Log-likelihood, nats."""
+        return float(np.sum(self.told))
+
+
+def prepare_filter(
+    controller: Controller,
+    person: Observer,
+    recorder: Array,
+    along: Directions,
+    noise: NoiseDirections,
+) -> PreparedFilter:
+    """Build all that does not depend on a recording.
+
+    `recorder` (p,).
+    """
+    plant = controller.plant
+    law, clip = _unclipped(prepare_loop(controller, along))
+    count = along.count if np.any(person.share) or clip.used else noise.covariances
+    first = [np.moveaxis(part[..., :count], -1, 0) for part in
+             (along.A, along.B, along.E, noise.C, noise.levels)]  # fmt: skip
+    joint = joint_loop(plant, person, recorder)
+    moves = joint_directions(plant, person, recorder, PlantMoves(*first[:4]), first[4])
+    at = plant.n if person.estimates else 0
+    steady = _steady(controller, joint, moves, along.K[..., :count], at)
+    parts = FilterParts(
+        law.matrices,
+        law.matrix_directions,
+        law.rows,
+        law.row_directions,
+        law.unit,
+        clip,
+        joint,
+        moves,
+        steady,
+        at,
+        noise.covariances,
+    )
+    return PreparedFilter(law, parts)
+
+
+def joint_likelihoods(
+    prepared: PreparedFilter, recordings: Sequence[Recording], counted: int = 0
+) -> list[Likelihood]:
+    """Likelihood of each recording."""
+    law, at, size = prepared.law, prepared.parts.at, len(prepared.parts.joint.F)
+    plant, q = law.controller.plant, law.along.count
+    begin = np.concatenate([[0], np.cumsum([each.samples for each in recordings])])
+    count, trials, p = int(begin[-1]), len(recordings), len(plant.C)
+    z, dz = np.zeros((trials, size)), np.zeros((trials, size, q))
+    z[:, at : at + plant.n] = [each.x0 for each in recordings]
+    dz[:, at : at + plant.n] = law.along.x0
+    result = FilterResult(
+        np.zeros(count),
+        np.zeros((count, q)),
+        np.zeros((trials, q, q)),
+        np.zeros((count, p)),
+        np.zeros((count, p, p)),
+        np.zeros((count, size)),
+        np.zeros((count, plant.m)),
+        np.full(count, Status.NOT_REACHED, dtype=np.int8),
+        counted,
+    )
+    outputs = np.concatenate([each.outputs for each in recordings])
+    disturbance = np.concatenate([each.disturbance for each in recordings])
+    _filter(prepared.parts, begin, outputs, disturbance, z, dz, result)
+    return [_of_trial(result, i, slice(*begin[i : i + 2])) for i in range(trials)]
+
+
+def _of_trial(result: FilterResult, i: int, rows: slice) -> Likelihood:
+    """What the filter has written of one trial; an error where it ended early."""
+    failed = np.flatnonzero(np.isin(result.status[rows], _FAILED))
+    if len(failed):
+        status = Status(int(result.status[rows][failed[0]]))
+        raise SolverError(
+            f"sample {failed[0]}", f"{status.sentence}, as the filter expects it", "start elsewhere"
+        )
+    information = result.information[i]
+    return Likelihood(
+        frozen(result.told[rows]),
+        frozen(result.score[rows]),
+        frozen(np.tril(information) + np.tril(information, -1).T),
+        frozen(result.innovation[rows]),
+        frozen(result.spread[rows]),
+        frozen(result.filtered[rows]),
+        frozen(result.u[rows]),
+        result.status[rows],
+    )
+
+
+def _filter(
+    parts: FilterParts,
+    begin: np.ndarray[tuple[int], np.dtype[np.int64]],
+    outputs: Array,
+    disturbance: Array,
+    z: Array,
+    dz: Array,
+    result: FilterResult,
+) -> None:
+    """Write the result from the expected first states (trials, z) and their derivatives.
+
+    All trials go together until a bound is near, and then each by itself; once its first state is
+    forgotten, along the directions that are left.
+    """
+    joint, moves, lasting = parts.joint, parts.djoint, parts.lasting
+    count = moves.P0.shape[2]
+
+    def run(some: slice, course: Course, dz: Array) -> None:
+        P, dP, n = course.P[0], course.dP[0], parts.loop.K.shape[1]
+        room = filter_room(parts.rows, joint, moves, P, dP, n, dz.shape[2])
+        own = result._replace(information=result.information[some])
+        run_filter(parts, outputs, disturbance, z[some], dz, room, own, course)
+
+    def alone(i: int) -> None:
+        here, some = together, slice(i, i + 1)
+        mine, P, first, known = dz[some], here.P[i], int(here.reached[i]), bool(here.known[i])
+        dP = np.concatenate([here.dP[i], np.zeros((*P.shape, count - here.dP.shape[3]))], axis=2)
+        while first < begin[i + 1] - begin[i] and result.status[begin[i] + first] not in _FAILED:
+            course = _course(begin[i : i + 2], first, known, False, P, dP)
+            run(some, course, mine)
+            first, known = int(course.reached[0]), False
+            mine = np.ascontiguousarray(mine[:, :, :lasting])
+            P, dP = course.P[0], np.ascontiguousarray(course.dP[0, :, :, :lasting])
+
+    # Noise that is a share of the command differs from trial to trial from the first sample on.
+    sharing = not np.any(joint.share)
+    dP0 = np.ascontiguousarray(moves.P0[:, :, : lasting if sharing else count])
+    together = _course(begin, 0, False, True, joint.P0, dP0)
+    if sharing:
+        run(slice(None), together, dz)
+    left = np.flatnonzero(together.reached < np.diff(begin))
+    if len(left):
+        # The compiled filter lets other threads run.
+        with ThreadPoolExecutor(min(len(left), os.cpu_count() or 1)) as pool:
+            list(pool.map(alone, left))
+
+
+def _course(
+    begin: np.ndarray[tuple[int], np.dtype[np.int64]],
+    first: int,
+    corrected: bool,
+    shared: bool,
+    P: Buffer,
+    dP: Buffer,
+) -> Course:
+    """Trials at one sample, where all have the covariance P and its derivatives dP."""
+    trials = len(begin) - 1
+    reached, known = np.zeros(trials, dtype=np.int64), np.zeros(trials, dtype=np.bool_)
+    each = (np.repeat(part[None], trials, axis=0) for part in (P, dP))
+    return Course(begin, first, corrected, shared, reached, known, *each)
+
+
+def _unclipped(law: PreparedLoop) -> tuple[PreparedLoop, Clip]:
+    """The law of one input without its bounds at the present sample, and these; or the law."""
+    controller, rows, moved = law.controller, law.rows, law.row_directions
+    low, high = (float(side[0]) for side in (controller.bounds.u_min, controller.bounds.u_max))
+    if controller.plant.m > 1 or not (np.isfinite(low) or np.isfinite(high)):
+        return law, Clip(used=False, low=-np.inf, high=np.inf, unit=1.0)
+    on_state = bound_rows(controller.bounds, controller.plant).on_state
+    kept = np.flatnonzero((rows.stage > 0) | on_state[rows.family])
+    inner = Rows(
+        rows.T[kept],
+        rows.M[kept],
+        rows.N[kept],
+        rows.W[kept],
+        np.ascontiguousarray(rows.gram[np.ix_(kept, kept)]),
+        rows.b[kept],
+        rows.limit[kept],
+        rows.family[kept],
+        rows.stage[kept],
+    )
+    others = RowDirections(moved.T[kept], moved.M[kept], moved.b[kept])
+    return (
+        dataclasses.replace(law, rows=inner, row_directions=others),
+        Clip(used=True, low=low, high=high, unit=min(-low, high)),
+    )
+
+
+def _steady(
+    controller: Controller, joint: JointLoop, moves: JointLoop, dK: Array, at: int
+) -> Steady:
+    """The stationary filter without bounds, where there is one."""
+    K, estimate = controller.K, slice(at, at + controller.plant.n)
+    if np.any(joint.share):
+        return Steady(joint.P0, moves.P0, known=False)
+    F = np.array(joint.F)
+    F[:, estimate] -= joint.B @ K
+    parts = (np.moveaxis(part, -1, 0) for part in (moves.F, moves.B, moves.C, moves.Q, moves.R, dK))
+    dF, dB, dC, dQ, dR, dgain = parts
+    dF = np.array(dF)
+    dF[:, :, estimate] -= dB @ K + joint.B @ dgain
+    try:
+        found = stationary_filter(F, joint.C, joint.Q, joint.R)
+    except SolverError:  # a gain that does not stabilise: the covariance has no end
+        return Steady(joint.P0, moves.P0, known=False)
+    changes = filter_changes(found, (F, joint.C), dF, dC, dQ, dR)
+    dP = np.ascontiguousarray(np.moveaxis(changes.P, 0, -1))
+    return Steady(np.ascontiguousarray(found.P), dP, known=True)

@@ -1,0 +1,214 @@
+"""Models of how a person senses, side by side, and what the one that was asked for leaves.
+
+Each is fitted by maximum likelihood to the same recordings, from the same first fit, so that
+Akaike's criterion compares them: noise in the recorder alone, which is least squares; a person who
+sees every state and has noise in the loop; who estimates, the perturbation known, and not known;
+the one that was asked for with any gain, where a structure says which there are; and the same
+without its limits (docs/noisy-people.md).
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from impc.arrays import Array, frozen
+from impc.assess.variance_accounted_for import whiteness
+from impc.checking import replace
+from impc.control.closed_loop import prepare_loop
+from impc.control.constraint_rows import directions
+from impc.errors import ImpcError
+from impc.inverse.problem import controller_for
+from impc.inverse.regulator_span import kept_to
+from impc.model.bounds import bound_rows
+from impc.output_feedback import profile
+from impc.output_feedback.covariance import confusion, person_covariance
+from impc.output_feedback.fit import PersonFit, fit_person
+from impc.output_feedback.joint_loop import joint_loop
+from impc.output_feedback.kept import decode_model, encode_model
+from impc.output_feedback.observer import Observer
+from impc.output_feedback.page import PersonModel, PersonReport
+from impc.output_feedback.simulation import run_joint
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from impc.inverse.estimates import Estimate
+    from impc.inverse.problem import Problem
+    from impc.model.plant import Plant
+    from impc.model.recordings import Recording
+
+# Samples ahead of which predictions are judged, as seconds; and how many starts in a trial at most.
+_AHEAD, _STARTS = (0.0, 0.1, 0.5), 100
+# Likelihoods with derivatives of the model that was asked for, and of those beside it, whose page
+# says where that was not enough.
+_ASKED, _BESIDE = 250, 60
+# Of the command that is noise, where the search begins: what isometric force has, and less.
+_SHARE = 0.1
+# One second of lags tells a rhythm that was missed; fewer than ten tell nothing.
+_LEAST_LAGS = 10
+
+
+#: (name, compute, encode, decode) -> the model: from memory, or computed now.
+Remember = Callable[
+    [str, Callable[[], PersonModel], Callable[[PersonModel], Any], Callable[[Any], PersonModel]],
+    PersonModel,
+]
+
+
+def person_report(
+    found: Estimate,
+    asked: Observer,
+    walk: Array,
+    *,
+    profiled: bool = False,
+    done: Callable[[str], None] = lambda _: None,
+    remember: Remember = lambda _name, compute, _encode, _decode: compute(),
+) -> PersonReport:
+    """Fit a person and the models beside, from a fit of least squares.
+
+    `walk` (d,); `remember` (name, compute, encode, decode).
+    """
+    models: list[PersonModel] = []
+    problem = found.problem
+    for name, posed, person in persons(problem, asked, walk):
+        budget = _BESIDE if models else _ASKED
+        first = replace(found, problem=posed)
+        fit_one = functools.partial(_model, name, first, person, budget)
+        decode = functools.partial(decode_model, name, posed, person)
+        models.append(remember(name, fit_one, encode_model, decode))
+        done(name)
+    fit = models[0].fit
+    if fit is None:
+        done("intervals of the person")
+        return _nothing(tuple(models), found, profiled=profiled)
+    covariance = person_covariance(fit)
+    levels, entries = covariance.level_intervals(fit.levels), covariance.entry_intervals(fit.K)
+    if profiled:
+        levels = profile.level_intervals(fit, covariance)
+        entries = profile.entry_intervals(fit, covariance)
+    done("intervals of the person")
+    ahead = tuple(sorted({1 + round(time / problem.plant.dt) for time in _AHEAD}))
+    return PersonReport(
+        tuple(models),
+        problem.plant,
+        found.gain,
+        fit,
+        covariance,
+        profiled,
+        levels,
+        entries,
+        confusion(fit),
+        frozen(_white(fit)),
+        ahead,
+        frozen(prediction_errors(fit, ahead)),
+    )
+
+
+def _nothing(models: tuple[PersonModel, ...], found: Estimate, *, profiled: bool) -> PersonReport:
+    """What is said where the person that was asked for has no likelihood."""
+    none = frozen(np.zeros((0, 2)))
+    plant = found.problem.plant
+    white = frozen([np.nan] * len(plant.outputs))
+    return PersonReport(
+        models, plant, found.gain, None, None, profiled, none, none, None, white, (), frozen([[]])
+    )
+
+
+def _model(name: str, first: Estimate, person: Observer, budget: int) -> PersonModel:
+    try:
+        return PersonModel(name, fit_person(first, person, max_evaluations=budget), "")
+    except ImpcError as error:
+        return PersonModel(name, None, str(error))
+
+
+def asked_observer(
+    plant: Plant,
+    recordings: Sequence[Recording],
+    *,
+    sensed: Sequence[str],
+    motor: bool,
+    share: bool,
+    process: bool,
+    known: bool,
+) -> tuple[Observer, Array]:
+    """The subject that [fit.observer] asks for, and the steps of an unknown perturbation (d,).
+
+    Levels stand at places to begin from; the search finds others by the residuals.
+    """
+    steps = np.concatenate([np.diff(trial.disturbance, axis=0) for trial in recordings])
+    size = np.sqrt(np.mean(steps**2, axis=0))
+    walk = np.where(size > 0, size, 1.0)
+    person = Observer(
+        plant,
+        sensed,
+        motor=float(motor),
+        share=_SHARE * share,
+        process=float(process),
+        sensory=1.0,
+        walk=None if known else walk,
+    )
+    return person, walk
+
+
+def persons(problem: Problem, asked: Observer, walk: Array) -> list[tuple[str, Problem, Observer]]:
+    """Each model that is compared: its name, the problem and the person; what is asked for first.
+
+    `walk` (d,).
+    """
+    seeing = replace(asked, sensed=(), C=asked.C[:0], sensory=asked.sensory[:0], walk=None)
+    quiet = replace(seeing, motor=0 * asked.motor, share=0 * asked.share, process=0 * asked.process)
+    models = []
+    if asked.estimates:
+        models += [("estimates, perturbation known", problem, replace(asked, walk=None))]
+        if len(walk):
+            unknown = replace(asked, walk=walk if asked.walk is None else asked.walk)
+            models.append(("estimates, perturbation not known", problem, unknown))
+        if asked.walk is not None:
+            models.reverse()
+    if np.any(seeing.levels):
+        models.append(("sees every state, noise in the loop", problem, seeing))
+    models.append(("sees every state, noise in the recorder alone", problem, quiet))
+    if kept_to(problem) is not None:
+        models.append((f"{models[0][0]}, any gain", replace(problem, structure=None), asked))
+    if len(bound_rows(problem.bounds, problem.plant).b):
+        models.append((f"{models[0][0]}, no limit", problem.without_bounds(), asked))
+    return models
+
+
+def _white(fit: PersonFit) -> Array:
+    """Of all trials together: standardised innovations, trial by trial, in a row."""
+    lags = max(_LEAST_LAGS, round(1 / fit.problem.plant.dt))
+    rows = []
+    for trial in fit.told.trials:
+        deviations = np.sqrt(np.einsum("tpp->tp", trial.spreads))
+        rows.append(trial.innovations / deviations)
+    joined = np.concatenate(rows)
+    return whiteness(joined, min(lags, len(joined) - 1))
+
+
+def prediction_errors(fit: PersonFit, ahead: tuple[int, ...]) -> Array:
+    """Root-mean-square errors (k, p) of what the filter expects k numbers of samples `ahead`.
+
+    From the expectation at a sample the plant runs on without noise, perturbations as recorded.
+    """
+    problem, plant = fit.problem, fit.problem.plant
+    controller = controller_for(problem, fit.K, fit.S)
+    law = prepare_loop(controller, directions(controller, 0))
+    joint = joint_loop(plant, fit.observer, fit.recorder)
+    farthest = max(ahead)
+    quiet = np.zeros((farthest, len(joint.F))), np.zeros((farthest, plant.m))
+    errors = []
+    for trial, told in zip(problem.recordings, fit.told.trials, strict=True):
+        starts = range(0, trial.samples - farthest, max(1, trial.samples // _STARTS))
+        for t in starts:
+            driven = np.array(trial.disturbance[t : t + farthest])
+            z, _, _ = run_joint(law, joint, told.filtered[t], driven, quiet)
+            expected = z[list(ahead)] @ joint.C.T
+            errors.append(expected - trial.outputs[t + np.array(ahead)])
+    if not errors:
+        return np.full((len(ahead), len(plant.outputs)), np.nan)
+    return np.asarray(np.sqrt(np.mean(np.square(errors), axis=0)))

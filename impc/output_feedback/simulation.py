@@ -1,0 +1,161 @@
+"""A trial of a person who senses with noise, under the constrained controller.
+
+The system is that of `joint_loop`: commands follow from the estimate, with every bound active
+(docs/noisy-people.md). Samples run in compiled code.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from impc.arrays import Array, Buffer, Frozen, finite_array, frozen
+from impc.checking import checked
+from impc.control.closed_loop import prepare_loop
+from impc.control.compiled_kernel import DIVERGED, LARGEST, SOFTENED, LoopMatrices, law, workspace
+from impc.control.constraint_rows import RowDirections, Rows, directions
+from impc.control.simulation import Status, scenario
+from impc.jit import njit
+from impc.output_feedback.joint_loop import JointLoop, joint_loop
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from impc.control.closed_loop import PreparedLoop
+    from impc.control.controller import Controller
+    from impc.output_feedback.joint_loop import JointLoop
+    from impc.output_feedback.observer import Observer
+
+
+@dataclass(frozen=True)
+class PersonTrial(Frozen):
+    """What a person does, and what is recorded of it."""
+
+    outputs: Array  # Recorded, with the recorder's noise (samples, p)
+    states: Array  # What is, and what the person takes it for (samples, n)
+    estimates: Array
+    u: Array  # Commands without motor noise (samples, m)
+    status: np.ndarray[tuple[int], np.dtype[np.int8]]  # `Status` of each sample (samples,)
+
+    @property
+    def reached(self) -> int:
+        """Samples with a command; where it is less than all, the rest repeats the last."""
+        return int(np.count_nonzero(self.status <= Status.SOFTENED))
+
+
+@checked(x0="n", steps=(1, 10_000_000))
+def simulate_person(
+    controller: Controller,
+    person: Observer,
+    disturbance: ArrayLike | None = None,
+    *,
+    steps: int | None = None,
+    recorder: ArrayLike = 0.0,
+    x0: ArrayLike | None = None,
+    believes: Observer | None = None,
+    seed: Any = 0,
+) -> PersonTrial:
+    """Simulate one trial.
+
+    `recorder` (p,); `x0` (n,).
+    """
+    plant = controller.plant
+    given = scenario(plant, np.zeros(plant.n) if x0 is None else x0, steps, disturbance)
+    rng, p = np.random.default_rng(seed), len(plant.outputs)
+    white = finite_array("recorder", np.full(p, recorder, dtype=np.float64), (p,))
+    joint = joint_loop(plant, person, white, believes)
+    at = plant.n if person.estimates else 0
+    size, (m, n) = len(joint.F), controller.K.shape
+    start = _root(joint.P0) @ rng.standard_normal(size)
+    start[at : at + n] += given.x0
+    noise = rng.standard_normal((given.steps, size)) @ _root(joint.Q).T
+    shared = rng.standard_normal((given.steps, m))
+    law = prepare_loop(controller, directions(controller, 0))
+    z, u, status = run_joint(law, joint, start, np.array(given.disturbance), (noise, shared))
+    z = z[:-1]
+    estimates = z[:, at : at + plant.n]
+    states = estimates + z[:, : plant.n] if person.estimates else estimates
+    outputs = states @ plant.C.T + white * rng.standard_normal((len(u), p))
+    return PersonTrial(frozen(outputs), frozen(states), frozen(estimates), frozen(u), status)
+
+
+def run_joint(
+    law: PreparedLoop,
+    joint: JointLoop,
+    start: Array,
+    disturbance: Array,
+    noise: tuple[Array, Array],
+) -> tuple[Array, Array, np.ndarray[tuple[int], np.dtype[np.int8]]]:
+    """States of plant and estimate, and commands, with noise that has been drawn.
+
+    `start` (z,); `disturbance` (steps, d).
+    """
+    steps, (m, n) = len(disturbance), law.controller.K.shape
+    z, u = np.zeros((steps + 1, len(start))), np.zeros((steps, m))
+    z[0] = start
+    status = np.full(steps, Status.NOT_REACHED, dtype=np.int8)
+    reached = run_person(
+        law.matrices,
+        law.matrix_directions,
+        law.rows,
+        law.row_directions,
+        law.unit,
+        joint,
+        0 if len(start) == n else n,
+        disturbance,
+        *noise,
+        z,
+        u,
+        status,
+    )
+    z[reached + 1 :], u[reached:] = z[reached], u[max(reached - 1, 0)]
+    return z, u, status
+
+
+def _root(covariance: Array) -> Array:
+    """The symmetric A with A A' the covariance, which need not be definite.
+
+    There is one, so that what is drawn is the same everywhere; eigenvectors are not.
+    """
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T)
+
+
+@njit(cache=True, nogil=True)
+def run_person(
+    loop: LoopMatrices,
+    dloop: LoopMatrices,
+    rows: Rows,
+    drows: RowDirections,
+    unit: Buffer,
+    joint: JointLoop,
+    at: int,
+    disturbance: Buffer,
+    noise: Buffer,
+    shared: Buffer,
+    z: Buffer,
+    u: Buffer,
+    status: Buffer,
+) -> int:
+    """Simulate from z[0] with noise that has been drawn, without derivatives.
+
+    `loop, dloop, rows, drows, unit, joint, at` (m,); `disturbance` (samples, d); `noise`
+    (samples, z); `shared` (samples, m); `z` (samples + 1, z); `u` (samples, m); `status`
+    (samples,).
+    """
+    n = loop.K.shape[1]
+    work = workspace(rows, u.shape[1], 0)
+    lam, dx, du = np.zeros(len(rows.b)), np.zeros((n, 0)), np.zeros((u.shape[1], 0))
+    for t in range(len(u)):
+        x = z[t, at : at + n]
+        status[t], _, _ = law(loop, dloop, rows, drows, unit, work, x, dx, lam, False, u[t], du)
+        if status[t] > SOFTENED:
+            return t
+        z[t + 1] = joint.F @ z[t] + joint.B @ u[t] + joint.E @ disturbance[t] + noise[t]
+        z[t + 1] += joint.G @ (joint.share * u[t] * shared[t])
+        if not np.max(np.abs(z[t + 1])) < LARGEST:
+            status[t] = DIVERGED
+            return t
+    return len(u)

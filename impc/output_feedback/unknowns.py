@@ -1,0 +1,230 @@
+"""The unknowns of a likelihood: those of a search for a gain or for prices, then levels of noise.
+
+    theta = (coordinates of `Coordinates` or `PriceCoordinates` | logarithms of the levels)
+
+A level of zero stays zero and one that is held stays as it is, all others are searched: of the
+person's noise, and of the recorder's (docs/noisy-people.md).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.arrays import Array, frozen
+from impc.control.constraint_rows import directions
+from impc.errors import SolverError
+from impc.inverse.coordinates import PARAMETER_UNIT
+from impc.inverse.problem import controller_for
+from impc.inverse.structured_search import PriceCoordinates
+from impc.model.bounds import bound_rows
+from impc.model.plant_family import plant_differential
+from impc.model.riccati import is_stable, lyapunov_series, stabilises
+from impc.output_feedback.likelihood import NoiseDirections, joint_likelihoods, prepare_filter
+from impc.output_feedback.observer import LEVELS
+
+if TYPE_CHECKING:
+    from collections.abc import Collection
+
+    from impc.control.constraint_rows import Directions
+    from impc.control.controller import Controller
+    from impc.inverse.coordinates import Coordinates, Point
+    from impc.output_feedback.likelihood import Likelihood
+    from impc.output_feedback.observer import Observer
+
+# Largest logarithm, either way, of a level whose square double precision can still multiply.
+_SQUARED = 300.0
+
+
+@dataclass(frozen=True)
+class Person:
+    """A point of a search."""
+
+    point: Point  # Gain, metric, and the problem at initial states and parameters
+    observer: Observer  # At its levels
+    recorder: Array  # Standard deviations of the recorder's noise (p,)
+
+
+@dataclass(frozen=True)
+class Told:
+    """What all recordings say at a point."""
+
+    value: float  # Log-likelihood, nats
+    gradient: Array  # Along theta (q,)
+    information: Array  # Fisher's, expected (q, q)
+    scores: list[Array]  # Derivative of each sample's log-likelihood (samples, q), trial by trial
+    trials: list[Likelihood]
+
+
+class PersonCoordinates:
+    """The unknowns of one search.
+
+    `recorder` (p,).
+    """
+
+    def __init__(
+        self,
+        space: Coordinates,
+        observer: Observer,
+        recorder: Array,
+        held: Collection[str] = (),
+        counted: int = 0,
+    ) -> None:
+        self.space, self.observer, self.counted = space, observer, counted
+        self.first = np.concatenate([observer.levels, recorder])
+        kinds = [kind for kind in LEVELS for _ in observer.level(kind)]
+        free = np.array([*(kind not in held for kind in kinds), *[True] * len(recorder)])
+        self.moving = np.flatnonzero((self.first > 0) & free)
+        self.start = np.concatenate([space.start, np.log(self.first[self.moving])])
+        #: How many coordinates gain or prices have, where initial states begin and end, and how
+        #: many unknowns are not levels.
+        self.gain = int(space.ends[0])
+        self.shared, self.after = int(space.ends[1]), int(space.ends[2])
+        self.own = len(space.start)
+        sensed = np.array([*(kind == "sensory" for kind in kinds), *[False] * len(recorder)])
+        #: Which unknowns are levels of the senses.
+        self.senses = self.own + np.flatnonzero(sensed[self.moving])
+
+    @property
+    def names(self) -> list[str]:
+        """What the levels are called that are searched."""
+        plant = self.space.problem.plant
+        every = [*self.observer.names(plant), *(f"recorder {name}" for name in plant.outputs)]
+        return [every[index] for index in self.moving]
+
+    def levels(self, theta: Array) -> Array:
+        """All levels (levels + p,) at theta (q,), those of zero among them."""
+        logarithms = theta[self.own :]
+        if not np.all(np.abs(logarithms) <= _SQUARED):
+            raise SolverError("level of noise", "has no square in double precision", "begin nearer")
+        found = self.first.copy()
+        found[self.moving] = np.exp(logarithms)
+        return found
+
+    def changes(self, theta: Array) -> tuple[Array, Array]:
+        """Changes of K (a, m, n) and S (a, m, m) with the unknowns but levels, at theta (q,)."""
+        return self.space.changes(self.space.unpack(theta[: self.own]), theta[: self.own])
+
+    def unpack(self, theta: Array) -> Person:
+        """The person at theta (q,)."""
+        levels = self.levels(theta)
+        split = len(self.observer.levels)
+        person = self.observer.with_levels(levels[:split])
+        return Person(self.space.unpack(theta[: self.own]), person, frozen(levels[split:]))
+
+    def value(self, theta: Array) -> float:
+        """Log-likelihood at theta (q,), in a fraction of the time of `told`."""
+        person = self.unpack(theta)
+        nothing = _Moved(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), 0)
+        return sum(item.value for item in self._trials(theta, person, [nothing]))
+
+    def told(self, theta: Array) -> Told:
+        """Log-likelihood and its derivatives at theta (q,)."""
+        person, q = self.unpack(theta), len(theta)
+        columns = [self._columns(trial) for trial in range(self.space.trials)]
+        trials = self._trials(theta, person, columns)
+        gradient, information = np.zeros(q), np.zeros((q, q))
+        scores: list[Array] = []
+        for moved, found in zip(columns, trials, strict=True):
+            gradient[moved.all] += found.score.sum(axis=0)
+            information[np.ix_(moved.all, moved.all)] += found.information
+            score: Array = np.zeros((len(found.told), q))
+            score[:, moved.all] = found.score
+            scores.append(score)
+        value = sum(item.value for item in trials)
+        return Told(value, gradient, information, scores, trials)
+
+    def wandering(self, theta: Array) -> tuple[float, Array]:
+        """Logarithm of how far white noise at the inputs drives the loop, beside the start's.
+
+        It grows without end towards the border of gains that stabilise. Prices never meet it.
+
+        `theta` (q,); returns (q,).
+        """
+        space, gradient = self.space, np.zeros(len(theta))
+        if isinstance(space, PriceCoordinates):
+            return 0.0, gradient
+        here = space.unpack(theta[: self.own])
+        plant = here.problem.plant
+        closed = plant.A - plant.B @ here.K
+        if not is_stable(closed, discrete=True):
+            return np.inf, gradient
+        X = lyapunov_series(closed, (plant.B @ space.G @ space.G.T @ plant.B.T)[None])[0]
+        weight = np.asarray(np.linalg.inv(space.T @ space.T.T))
+        Y = lyapunov_series(closed.T, weight[None])[0]
+        size = float(np.sum(weight * X))
+        dK, _ = space.changes(here, theta[: self.own])
+        moved = -plant.B @ dK
+        turned = np.zeros_like(moved)
+        family = here.problem.family
+        if family is not None:
+            differential = plant_differential(family, here.problem.logarithms)
+            mine = slice(self.own - len(family.names), self.own)
+            dB = PARAMETER_UNIT * np.moveaxis(differential.B, -1, 0)
+            moved[mine] += PARAMETER_UNIT * np.moveaxis(differential.A, -1, 0) - dB @ here.K
+            turned[mine] = dB @ space.G @ space.G.T @ plant.B.T
+        change = np.einsum("ij,kij->k", 2 * Y @ closed @ X, moved)
+        change += 2 * np.einsum("ij,kij->k", Y, turned)
+        gradient[: self.own] = change / size
+        return float(np.log(size / len(X))), gradient
+
+    def _columns(self, trial: int) -> _Moved:
+        """Which unknowns move one trial: its own initial state stands last."""
+        start = np.arange(self.shared, self.after)
+        n = self.space.n if len(start) else 0
+        shared = np.delete(np.arange(len(self.start)), start)
+        mine = start[trial * n : (trial + 1) * n]
+        return _Moved(np.concatenate([shared, mine]), shared, n)
+
+    def _trials(self, theta: Array, person: Person, columns: list[_Moved]) -> list[Likelihood]:
+        here = person.point
+        problem, plant = here.problem, here.problem.plant
+        bounded = problem.terminal_set or len(bound_rows(problem.bounds, plant).b) > 0
+        if bounded and not stabilises(plant, here.K):
+            raise SolverError("gain", "does not stabilise the plant", "start elsewhere")
+        controller = controller_for(problem, here.K, here.S)
+        # The initial states of all trials have the same unit, so one law serves them all.
+        along, noise = self._directions(theta, controller, person, columns[0])
+        prepared = prepare_filter(controller, person.observer, person.recorder, along, noise)
+        return joint_likelihoods(prepared, problem.recordings, self.counted)
+
+    def _directions(
+        self, theta: Array, controller: Controller, person: Person, moved: _Moved
+    ) -> tuple[Directions, NoiseDirections]:
+        plant, count = controller.plant, len(moved.all)
+        given: dict[str, Array] = {}
+        levels = np.zeros((len(self.first), count))
+        dC = np.zeros((*plant.C.shape, count))
+        if count:
+            dK, dS = self.space.changes(person.point, theta[: self.own])
+            own = moved.shared[moved.shared < self.own]
+            for name, change in (("K", dK), ("S", dS)):
+                given[name] = np.zeros((*change.shape[1:], count))
+                given[name][..., : len(own)] = np.moveaxis(change[own], 0, -1)
+            at = np.arange(len(own), len(moved.shared))
+            levels[self.moving, at] = self.levels(theta)[self.moving]
+            given["x0"] = np.zeros((plant.n, count))
+            given["x0"][:, count - moved.start :] = self.space.start_unit[:, : moved.start]
+            family = person.point.problem.family
+            if family is not None:
+                differential = plant_differential(family, person.point.problem.logarithms)
+                width = len(family.names)
+                mine = slice(len(own) - width, len(own))
+                for name in ("A", "B", "E"):
+                    change = getattr(differential, name)
+                    given[name] = np.zeros((*change.shape[:-1], count))
+                    given[name][..., mine] = PARAMETER_UNIT * change
+                dC[..., mine] = PARAMETER_UNIT * differential.C
+        along = directions(controller, count, **given)
+        return along, NoiseDirections(dC, levels, len(moved.shared))
+
+
+@dataclass(frozen=True)
+class _Moved:
+    """Unknowns of one trial: those that all share, and so many of its initial state after them."""
+
+    all: np.ndarray[tuple[int], np.dtype[np.int64]]
+    shared: np.ndarray[tuple[int], np.dtype[np.int64]]
+    start: int

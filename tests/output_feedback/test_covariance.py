@@ -1,0 +1,78 @@
+"""Covariances of a person at the largest likelihood: three ways, and against repeated people."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from experiments.noisy_people import recorded, subject
+from experiments.noisy_people_score import blind
+from impc.errors import InputError
+from impc.inverse.methods import estimate
+from impc.output_feedback.covariance import confusion, person_covariance
+from impc.output_feedback.fit import PersonFit, fit_person
+from impc.output_feedback.observer import Observer
+from tests.output_feedback.test_fit import cart, posed
+
+pytestmark = pytest.mark.full
+
+
+@pytest.fixture(scope="module")
+def fitted() -> PersonFit:
+    person = Observer(cart(), ["x"], motor=0.4, sensory=0.05)
+    return fit_person(estimate(posed(person, 0.01, 3.0, trials=4)), person)
+
+
+def test_the_three_agree_where_the_model_is_true(fitted: PersonFit) -> None:
+    found = {kind: person_covariance(fitted, kind) for kind in ("expected", "observed", "sandwich")}
+    for kind in ("observed", "sandwich"):
+        # 1600 samples: a deviation is itself told to a tenth or two.
+        np.testing.assert_allclose(found[kind].entries, found["expected"].entries, rtol=0.4)
+        np.testing.assert_allclose(found[kind].levels, found["expected"].levels, rtol=0.4)
+
+
+def test_the_observed_information_is_the_curvature(fitted: PersonFit) -> None:
+    """Second differences of the likelihood along a line."""
+    space, theta = fitted.space, np.array(fitted.theta)
+    information = np.linalg.inv(np.array(person_covariance(fitted, "observed").covariance))
+    step = np.zeros(len(theta))
+    step[[0, 1, -1]] = 0.3, -0.2, 0.5
+    h = 1e-3
+    values = [space.value(theta + sign * h * step) for sign in (-1, 0, 1)]
+    curvature = -(values[0] - 2 * values[1] + values[2]) / h**2
+    # Rounding of 1e-12 of 5000 nats over 1e-6, and h^2.
+    assert step @ information @ step == pytest.approx(curvature, rel=1e-3)
+
+
+def test_the_step_that_is_least_told_apart(fitted: PersonFit) -> None:
+    """Moved along it together, gain and levels cost less than each of them alone."""
+    found = confusion(fitted)
+    assert 0 < found.correlation < 1
+    covariance = np.array(person_covariance(fitted, "expected").covariance)
+    assert found.gain.shape == (1, 2)
+    assert found.levels.shape == (3,)
+    direction = np.array(found.levels) / np.linalg.norm(found.levels)
+    levels = slice(fitted.space.own, None)
+    inside = direction @ np.linalg.inv(np.linalg.inv(covariance)[levels, levels]) @ direction
+    assert inside <= direction @ covariance[levels, levels] @ direction
+
+
+def test_an_unknown_kind_is_refused(fitted: PersonFit) -> None:
+    with pytest.raises(InputError, match="expected, observed, sandwich"):
+        person_covariance(fitted, "robust")
+
+
+def test_a_direction_that_nothing_tells_leaves_the_others_as_they_are() -> None:
+    """Two inputs and no limit: the metric of the inputs moves no command, nor any likelihood.
+
+    Deviations by the sandwich had been none along four directions of seven.
+    """
+    who = subject("pair", 0, "motor", 90.0, 5.0)
+    found = fit_person(estimate(recorded(who, 0).problem), blind(who))
+    assert np.linalg.eigvalsh(found.told.information)[0] < 1e-8
+    robust, expected = person_covariance(found), person_covariance(found, "expected")
+    assert np.linalg.eigvalsh(robust.covariance)[0] > 0
+    np.testing.assert_allclose(robust.deviations, expected.deviations, rtol=0.3)
+    np.testing.assert_allclose(robust.entries, expected.entries, rtol=0.3)
+    off = (np.array(found.K) - np.array(who.controller.K)) / robust.entries
+    assert np.all(np.abs(off) < 3)

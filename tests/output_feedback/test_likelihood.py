@@ -1,0 +1,361 @@
+"""The likelihood of a person who senses with noise: other filters, differences, particles."""
+
+from __future__ import annotations
+
+from dataclasses import replace as replaced
+from typing import TYPE_CHECKING, NamedTuple
+
+import control
+import numpy as np
+import pytest
+from statsmodels.tsa.statespace.kalman_filter import KalmanFilter
+
+from impc.control.closed_loop import simulate
+from impc.control.constraint_rows import directions
+from impc.control.controller import Controller
+from impc.control.simulation import scenario
+from impc.errors import SolverError
+from impc.model.bounds import Bounds
+from impc.model.plant import Plant
+from impc.model.recordings import Recording
+from impc.output_feedback.joint_loop import joint_loop
+from impc.output_feedback.likelihood import (
+    Likelihood,
+    NoiseDirections,
+    PreparedFilter,
+    joint_likelihoods,
+    prepare_filter,
+)
+from impc.output_feedback.observer import Observer, believed_filter
+from impc.output_feedback.simulation import PersonTrial, simulate_person
+from tests.support import extrapolated_slope
+
+if TYPE_CHECKING:
+    from impc.arrays import Array
+
+pytestmark = pytest.mark.full
+
+
+class Someone(NamedTuple):
+    """A person on a cart, by numbers that can be moved."""
+
+    gain: tuple[float, float] = (8.0, 4.0)
+    motor: float = 0.3
+    share: float = 0.0
+    process: float = 0.01
+    sensory: tuple[float, ...] = (0.02, 0.05)
+    walk: float | None = None
+    persistence: float = 1.0
+    recorder: float = 0.02
+    limit: float = np.inf
+    horizon: int = 5
+    start: tuple[float, float] = (0.05, -0.02)
+
+    def plant(self) -> Plant:
+        system = control.ss(
+            [[1, 0.1], [0, 1]], [[0, 0], [0.1, 0.1]], [[1, 0]], 0, 0.1,
+            states=["x", "v"], inputs=["u", "d"], outputs=["x"],
+        )  # fmt: skip
+        return Plant(system, ["u"])
+
+    def controller(self) -> Controller:
+        plant = self.plant()
+        bounds = Bounds(plant, u_min=-self.limit, u_max=self.limit)
+        return Controller.from_gain(plant, [self.gain], bounds, self.horizon, terminal_set=False)
+
+    def observer(self) -> Observer:
+        sensed = ["x", "v"][: len(self.sensory)]
+        return Observer(
+            self.plant(), sensed, motor=self.motor, share=self.share, process=self.process,
+            sensory=self.sensory, walk=self.walk, persistence=self.persistence,
+        )  # fmt: skip
+
+    def moved(self, step: Array) -> Someone:
+        """The person a step away: gain, logarithms of the levels, first state."""
+        factor = np.exp(step[2:])
+        return self._replace(
+            gain=(self.gain[0] + step[0], self.gain[1] + step[1]),
+            motor=self.motor * factor[0],
+            share=self.share * factor[1],
+            process=self.process * factor[2],
+            sensory=(self.sensory[0] * factor[3], self.sensory[1] * factor[4]),
+            walk=None if self.walk is None else self.walk * factor[5],
+            recorder=self.recorder * factor[6],
+            start=(self.start[0] + step[9], self.start[1] + step[10]),
+        )
+
+
+def push(samples: int, seed: int = 0, size: float = 0.6) -> Array:
+    rng = np.random.default_rng(seed)
+    return np.repeat(rng.choice([-size, 0.0, size], samples // 10 + 1), 10)[:samples, None]
+
+
+def recorded(who: Someone, samples: int, seed: int = 1) -> PersonTrial:
+    found = simulate_person(
+        who.controller(), who.observer(), push(samples), recorder=who.recorder, seed=seed
+    )
+    assert found.reached == samples
+    return found
+
+
+def likelihood(
+    who: Someone, outputs: Array, *, slopes: bool = False, steady: bool = True, counted: int = 0
+) -> Likelihood:
+    prepared = filter_of(who, slopes=slopes, steady=steady)
+    return joint_likelihoods(prepared, [trial_of(who, outputs)], counted)[0]
+
+
+def trial_of(who: Someone, outputs: Array) -> Recording:
+    return Recording(who.plant(), outputs, push(len(outputs)), who.start)
+
+
+def filter_of(who: Someone, *, slopes: bool = False, steady: bool = True) -> PreparedFilter:
+    """Along gain (2), levels in their order, the recorder's, and the first state: `moved`."""
+    person, q = who.observer(), 11 if slopes else 0
+    levels = np.concatenate([person.levels, [who.recorder]])
+    gain, start = np.zeros((1, 2, q)), np.zeros((2, q))
+    along = np.zeros((len(levels), q))
+    if slopes:
+        gain[0, 0, 0] = gain[0, 1, 1] = 1
+        # motor, share, process of both states together, sensory of each, walk, recorder
+        walk = [6] if who.walk is not None else []
+        each = [[4], [5]] if who.sensory else [[], []]
+        groups = [[0], [1], [2, 3], *each, walk, [-1]]
+        for column, group in enumerate(groups, 2):
+            along[group, column] = levels[group]
+        start[0, 9] = start[1, 10] = 1
+    prepared = prepare_filter(
+        who.controller(),
+        person,
+        np.array([who.recorder]),
+        directions(who.controller(), q, K=gain, x0=start),
+        NoiseDirections(np.zeros((1, 2, q)), along, min(q, 9)),
+    )
+    if not steady:
+        parts = prepared.parts
+        return replaced(prepared, parts=parts._replace(steady=parts.steady._replace(known=False)))
+    return prepared
+
+
+SENSES = [
+    Someone(),
+    Someone(walk=0.2),
+    Someone(walk=0.2, persistence=0.6),
+    Someone(sensory=(0.02,)),
+    Someone(sensory=()),
+    Someone(sensory=(), motor=0.0),
+]
+
+
+@pytest.mark.parametrize("who", SENSES)
+def test_without_bounds_it_is_that_of_statsmodels(who: Someone) -> None:
+    outputs = recorded(who, 200).outputs
+    joint = joint_loop(who.plant(), who.observer(), np.array([who.recorder]))
+    size, estimates = len(joint.F), who.observer().estimates
+    at = slice(2, 4) if estimates else slice(0, 2)
+    F = np.array(joint.F)
+    F[:, at] -= joint.B @ who.controller().K
+    other = KalmanFilter(k_endog=1, k_states=size, initialization="known",
+                         initial_state=np.zeros(size), initial_state_cov=joint.P0)  # fmt: skip
+    start = np.zeros(size)
+    start[at] = who.start
+    other.initialize_known(start, joint.P0)
+    other.bind(np.ascontiguousarray(outputs))
+    other["design"], other["obs_cov"] = joint.C, joint.R
+    other["transition"], other["selection"], other["state_cov"] = F, np.eye(size), joint.Q
+    other["state_intercept"] = joint.E @ push(200).T
+    other.tolerance = 0.0
+    found = likelihood(who, outputs)
+    # 1e-9 is asked for; statsmodels and this filter differ by rounding, 1e-13 here.
+    np.testing.assert_allclose(np.sum(found.told), other.loglike(), rtol=1e-11)
+    np.testing.assert_allclose(found.told, other.loglikeobs(), rtol=0, atol=1e-9)
+
+
+SATURATING = Someone(limit=0.6)
+#: Knows so well where the cart is that no bound is near until one is met, after 95 samples.
+QUIET = Someone(limit=0.8, motor=0.01, process=0.001, sensory=(0.001, 0.002), recorder=0.001)
+PEOPLE = [
+    Someone(),
+    Someone(walk=0.2),
+    Someone(walk=0.2, persistence=0.6),
+    Someone(share=0.3),
+    SATURATING,
+    SATURATING._replace(walk=0.2),
+    SATURATING._replace(share=0.3),
+    SATURATING._replace(horizon=1),
+    QUIET,
+]
+
+
+@pytest.mark.parametrize("who", PEOPLE)
+def test_derivatives_equal_differences(who: Someone) -> None:
+    outputs = recorded(who, 100).outputs
+    found = likelihood(who, outputs, slopes=True)
+    assert bool(np.any(found.status > 0)) == bool(np.isfinite(who.limit))
+    for step in np.random.default_rng(4).normal(size=(2, 11)):
+
+        def moved(t: float, step: Array = step) -> Array:
+            return np.array([likelihood(who.moved(t * step), outputs).value])
+
+        slope = extrapolated_slope(moved, 1e-3)
+        exact = found.score.sum(axis=0) @ step
+        # Differences of a sum of size 300 carry 1e-9 of rounding at these steps.
+        assert exact == pytest.approx(slope[0], rel=1e-6, abs=1e-6)
+
+
+@pytest.mark.parametrize("who", [QUIET, QUIET._replace(share=0.3), SATURATING, Someone()])
+def test_recordings_together_tell_what_each_tells(who: Someone) -> None:
+    """Of other lengths and noise, met by bounds at other samples, or by none."""
+    lengths = {1: 120, 2: 30, 3: 80, 4: 120}
+    trials = [
+        trial_of(who, recorded(who, length, seed).outputs) for seed, length in lengths.items()
+    ]
+    prepared = filter_of(who, slopes=True)
+    for found, trial in zip(joint_likelihoods(prepared, trials), trials, strict=True):
+        alone = joint_likelihoods(prepared, [trial])[0]
+        np.testing.assert_array_equal(found.status, alone.status)
+        for name in ("told", "score", "information", "innovations", "spreads", "filtered", "u"):
+            np.testing.assert_allclose(getattr(found, name), getattr(alone, name), 1e-12, 1e-12)
+
+
+def test_a_covariance_that_was_shared_until_a_bound_is_near_is_each_trials_own() -> None:
+    """With noise that is a share of the command, however small, so it is from the first sample."""
+    outputs = recorded(QUIET, 130).outputs
+    own = likelihood(QUIET._replace(share=1e-12), outputs, slopes=True)
+    found = likelihood(QUIET, outputs, slopes=True)
+    assert 60 < np.flatnonzero(found.status)[0] < 120
+    np.testing.assert_allclose(found.told, own.told, rtol=1e-10, atol=1e-10)
+    kept = [0, 1, 2, 4, 5, 6, 8, 9, 10]  # all but the share, and the walk that is none
+    scale = np.sqrt(np.sum(own.score[:, kept] ** 2, axis=0))
+    np.testing.assert_allclose(found.score[:, kept] / scale, own.score[:, kept] / scale, atol=1e-9)
+
+
+def test_a_perturbation_that_does_not_persist_is_noise_to_the_person() -> None:
+    """The person's gain is that of process noise E walk^2 E', and nothing is expected of it."""
+    fades = Someone(process=0.0, walk=0.2, persistence=0.0)
+    plant = fades.plant()
+    moved = Observer(plant, ["x", "v"], motor=np.hypot(0.3, 0.2), sensory=[0.02, 0.05])
+    found = believed_filter(plant, fades.observer()).L
+    np.testing.assert_allclose(found[:2], believed_filter(plant, moved).L, rtol=1e-10)
+    np.testing.assert_allclose(found[2:], 0, atol=1e-14)
+
+
+def test_the_stationary_covariance_changes_nothing() -> None:
+    for who in (Someone(), SATURATING._replace(limit=2.0), Someone(sensory=())):
+        outputs = recorded(who, 400).outputs
+        plain = likelihood(who, outputs, slopes=True, steady=False)
+        short = likelihood(who, outputs, slopes=True)
+        assert short.value == pytest.approx(plain.value, rel=1e-10)
+        gradient = plain.score.sum(axis=0)
+        np.testing.assert_allclose(
+            short.score.sum(axis=0), gradient, rtol=0, atol=1e-8 * np.max(np.abs(gradient))
+        )
+
+
+@pytest.mark.parametrize("limit", [0.8, 50.0])
+def test_samples_that_are_given_are_not_told(limit: float) -> None:
+    """What is left is the likelihood of all samples less that of the given ones."""
+    who = Someone(limit=limit)
+    outputs = recorded(who, 120).outputs
+    every, first = (likelihood(who, each, slopes=True) for each in (outputs, outputs[:40]))
+    rest = likelihood(who, outputs, slopes=True, counted=40)
+    assert rest.value == pytest.approx(every.value - first.value, rel=1e-12)
+    score = every.score.sum(axis=0) - first.score.sum(axis=0)
+    np.testing.assert_allclose(rest.score.sum(axis=0), score, rtol=1e-9, atol=1e-9)
+    information = every.information - first.information
+    np.testing.assert_allclose(rest.information, information, rtol=1e-9, atol=1e-6)
+    assert not rest.told[:40].any()
+    np.testing.assert_array_equal(rest.filtered, every.filtered)
+
+
+def test_scores_have_the_covariance_that_is_expected() -> None:
+    """Without bounds the outer products of the scores are Fisher's information on average."""
+    who = Someone(sensory=(0.02, 0.05), start=(0.0, 0.0))
+    runs = [likelihood(who, recorded(who, 100, seed).outputs, slopes=True) for seed in range(100)]
+    kept = [0, 1, 2, 5, 6, 8]  # what this person has, the first state left aside
+    scores = np.array([run.score.sum(axis=0)[kept] for run in runs])
+    expected = np.mean([run.information for run in runs], axis=0)[np.ix_(kept, kept)]
+    root = np.linalg.inv(np.linalg.cholesky(expected))
+    values = np.linalg.eigvalsh(root @ scores.T @ scores @ root.T / len(runs))
+    # Of 100 draws in six directions: between .57 and 1.55 (Marchenko and Pastur), and some more.
+    assert 0.5 < values[0] < values[-1] < 1.7
+
+
+def test_the_limit_of_no_noise_is_the_simulation() -> None:
+    """W, V -> 0: the innovations are recorded minus simulated outputs."""
+    who = SATURATING._replace(motor=1e-9, process=0.0, sensory=(1e-9, 1e-9))
+    rng = np.random.default_rng(7)
+    run = simulate(who.controller(), scenario(who.plant(), who.start, disturbance=push(200)))
+    outputs = run.x[:200, :1] + who.recorder * rng.standard_normal((200, 1))
+    found = likelihood(who, outputs)
+    np.testing.assert_allclose(found.innovations, outputs - run.x[:200, :1], rtol=0, atol=1e-9)
+
+
+def test_who_does_what_is_believed_errs_as_the_filter_says() -> None:
+    """Simulated errors of the estimate have the stationary covariance of the person's filter."""
+    who = Someone(sensory=(0.02, 0.05))
+    found = recorded(who, 20000)
+    joint = joint_loop(who.plant(), who.observer(), np.array([who.recorder]))
+    error = found.states - found.estimates
+    # 20000 samples, correlated over some ten: 3 % of a covariance.
+    np.testing.assert_allclose(np.cov(error.T), joint.P0[:2, :2], rtol=0.15)
+
+
+def test_an_expectation_without_a_command_is_an_error() -> None:
+    plant = Plant(control.ss([[2.0]], [[1.0]], [[1.0]], 0, 1))
+    law = Controller.from_gain(plant, [[1.5]], Bounds(plant, u_max=1, u_min=-1), 30,
+                               terminal_set=False)  # fmt: skip
+    nothing = NoiseDirections(np.zeros((1, 1, 0)), np.zeros((4, 0)), 0)
+    prepared = prepare_filter(law, Observer(plant), np.array([1.0]), directions(law, 0), nothing)
+    with pytest.raises(SolverError, match="as the filter expects it"):
+        joint_likelihoods(prepared, [Recording(plant, np.zeros((60, 1)), x0=[3.0])])
+
+
+def particles(who: Someone, outputs: Array, count: int, seed: int) -> float:
+    """Log-likelihood by a bootstrap filter; with one sample ahead the law is a clipped gain."""
+    rng, pushes = np.random.default_rng(seed), push(len(outputs))
+    joint = joint_loop(who.plant(), who.observer(), np.array([who.recorder]))
+    roots = []
+    for covariance in (joint.Q, joint.P0):
+        values, vectors = np.linalg.eigh(covariance)
+        roots.append(vectors * np.sqrt(np.maximum(values, 0)))
+    size = len(joint.F)
+    z = rng.standard_normal((count, size)) @ roots[1].T
+    z[:, 2:4] += who.start
+    total = 0.0
+    for output, d in zip(outputs, pushes, strict=True):
+        e = (output[0] - z @ joint.C[0]) / who.recorder
+        weight = np.exp(-(e**2 - np.min(e**2)) / 2)
+        total += np.log(np.mean(weight)) - np.min(e**2) / 2 - np.log(who.recorder)
+        total -= np.log(2 * np.pi) / 2
+        ladder = (np.arange(count) + rng.random()) / count
+        z = z[np.minimum(np.searchsorted(np.cumsum(weight) / weight.sum(), ladder), count - 1)]
+        u = np.clip(-z[:, 2:4] @ np.array(who.gain), -who.limit, who.limit)[:, None]
+        z = z @ joint.F.T + u @ joint.B.T + d @ joint.E.T
+        z += rng.standard_normal((count, size)) @ roots[0].T
+    return float(total)
+
+
+def check_with_particles(who: Someone, samples: int, count: int) -> None:
+    outputs = recorded(who, samples).outputs
+    found = likelihood(who, outputs)
+    assert 0.05 < np.mean(found.status > 0) < 0.95
+    draws = [particles(who, outputs, count, seed) for seed in range(4)]
+    error = np.std(draws, ddof=1)
+    assert abs(found.value - np.mean(draws)) < 3 * error
+    assert error < 0.6
+
+
+def test_with_a_bound_it_is_that_of_particles() -> None:
+    who = Someone(limit=0.8, horizon=1, sensory=(0.1, 0.2), start=(0.0, 0.0))
+    check_with_particles(who, 60, 4000)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("limit", [0.5, 1.0])
+@pytest.mark.parametrize("senses", [(0.05, 0.1), (0.1, 0.2)])
+def test_with_a_bound_it_is_that_of_many_particles(
+    limit: float, senses: tuple[float, float]
+) -> None:
+    who = Someone(limit=limit, horizon=1, sensory=senses, start=(0.0, 0.0))
+    check_with_particles(who, 200, 100_000)

@@ -1,0 +1,55 @@
+"""Without its folder all the rest imports and works, and asking for it is one line."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+# What is tried in a package without the folder; each line that is printed is compared.
+TRIED = """
+import importlib, pkgutil
+import control, numpy as np
+import impc
+
+for module in pkgutil.walk_packages(impc.__path__, "impc."):
+    if module.name != "impc.__main__":
+        importlib.import_module(module.name)
+plant = impc.Plant(control.ss([[1, 0.1], [0, 1]], [[0], [0.1]], np.eye(2), 0, 0.1))
+bounds = impc.Bounds(plant, u_min=-1, u_max=1)
+law = impc.Controller(plant, impc.Weights(np.eye(2), 1), bounds, horizon=3)
+trials = [impc.Recording(plant, law.simulate([0.5, 0.1], steps=40).x)]
+def fit(**others):
+    given = dict(horizon=3, u_max=1.0, methods=[], intent_draws=False, **others)
+    settings = impc.read_settings(given)
+    return impc.fit_recordings(impc.fit_problem(plant, trials, settings), settings)
+"""
+
+
+def test_the_rest_works_without_it(tmp_path: Path) -> None:
+    shutil.copytree(
+        ROOT / "impc", tmp_path / "impc", ignore=shutil.ignore_patterns("output_feedback")
+    )
+    code = TRIED.replace("impc.read_settings", "fit_settings") + (
+        "from impc.studies.fit.settings import fit_settings\n"
+        "print(np.abs(fit().fitted.K - law.K).max() < 1e-6)\n"
+        "for ask in (lambda: fit(observer={}), lambda: impc.fit_person):\n"
+        "    try:\n"
+        "        ask()\n"
+        "    except (impc.ImpcError, ImportError) as error:\n"
+        "        print(error)\n"
+    )
+    place = os.environ | {"PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}"}
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", code], env=place, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines() == [
+        "True",
+        "[fit.observer]: needs impc.output_feedback, which is not there; install all of impc, or "
+        "leave the table out",
+        "No module named 'impc.output_feedback'",
+    ]

@@ -1,0 +1,229 @@
+"""A fit with a person who senses with noise: first sentences, tables, what result.json keeps."""
+
+from __future__ import annotations
+
+import functools
+import json
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+import pytest
+
+from impc.arrays import frozen
+from impc.assess.diagnostics import ResidualDiagnostics
+from impc.assess.loop_noise import LoopNoise
+from impc.checking import replace
+from impc.control.controller import Controller
+from impc.errors import InputError
+from impc.model.bounds import Bounds
+from impc.model.recordings import Recording
+from impc.model.weights import Weights
+from impc.output_feedback.models import asked_observer
+from impc.output_feedback.observer import Observer
+from impc.output_feedback.simulation import simulate_person
+from impc.reporting.document import Report
+from impc.reporting.rendering import plain
+from impc.studies.fit.result import FitResult
+from impc.studies.fit.settings import FitSettings, fit_settings
+from impc.studies.fit.subject import fit_problem, fit_recordings, stages
+from impc.studies.fit.truth import truth_sentence
+from impc.studies.fit.verdict import verdict
+from tests.output_feedback.test_fit import cart
+
+pytestmark = pytest.mark.full
+
+TABLE: dict[str, Any] = {
+    "horizon": 5,
+    "u_max": 0.9,
+    "methods": [],
+    "held_out": False,
+    "intent_draws": False,
+    "observer": {"sensed": ["x", "v"]},
+}
+
+
+def trials() -> list[Recording]:
+    """Someone whose senses err by half of what is to be seen."""
+    plant = cart()
+    bounds = Bounds(plant, u_min=-0.9, u_max=0.9)
+    law = Controller(plant, Weights(np.diag([8.0, 1.0]), 1), bounds, 5, terminal_set=False)
+    person = Observer(plant, ["x", "v"], motor=0.05, sensory=[0.05, 0.1])
+    rng, found = np.random.default_rng(3), []
+    for seed in range(2):
+        push = np.repeat(rng.choice([-0.7, 0.0, 0.7], 40), 10)
+        outputs = simulate_person(law, person, push, recorder=0.002, seed=seed).outputs
+        found.append(Recording(plant, outputs, push))
+    return found
+
+
+@functools.cache
+def fitted() -> FitResult:
+    settings = fit_settings(TABLE)
+    return fit_recordings(fit_problem(cart(), trials(), settings), settings)
+
+
+def test_who_senses_with_noise_is_preferred_to_who_sees_all() -> None:
+    result = fitted()
+    assert result.person is not None
+    criteria = {item.name: item.fit.criterion for item in result.person.models if item.fit}
+    asked = result.person.models[0].name
+    assert asked == "estimates, perturbation known"
+    assert criteria[asked] < criteria["sees every state, noise in the loop"] - 10
+    assert criteria[asked] < criteria["sees every state, noise in the recorder alone"] - 100
+    assert f"{asked}, no limit" in criteria
+    lines = result.person_sentences
+    assert "Akaike's criterion" in lines[0]
+    assert any("sensory" in line and "of a sample (95 %)" in line for line in lines[1:])
+
+
+def test_it_is_said_how_much_of_the_gain_is_told() -> None:
+    result = fitted()
+    report = result.person
+    assert report is not None
+    assert report.fit is not None
+    settled = replace(report, fit=replace(report.fit, converged=True))
+
+    def said(intervals: list[list[float]], *, loose: bool = False) -> str:
+        fit = replace(report.fit, converged=not loose)
+        other = replace(settled, entries=np.array(intervals), fit=fit)
+        (line,) = [
+            line
+            for line in replace(result, person=other).person_sentences
+            if "told from zero" in line
+        ]
+        return line
+
+    both, one = [[1.0, 2.0], [-2.0, -1.0]], [[1.0, 2.0], [-1.0, 3.0]]
+    assert said(both).startswith("2 of the 2 entries of this person's gain are told from zero")
+    assert said(one).startswith("1 of the 2 entries")
+    # By profile an entry that is not told by itself has no interval.
+    nothing = said([[np.nan, np.nan], [-1.0, np.inf]])
+    assert nothing.startswith("None of the 2 entries")
+    assert nothing.endswith("several times as large or as small.")
+    assert said(both, loose=True).endswith("The search did not settle: another may end beside it.")
+
+
+def test_the_truth_stands_beside_the_gain_of_the_person() -> None:
+    result = fitted()
+    report = result.person
+    assert report is not None
+    ends = np.array(report.entries)
+    inside = np.mean(ends, axis=1)[None]
+    ours = "Of the gain of the person who senses with noise"
+    assert truth_sentence(result, inside).endswith(f"{ours} 2 of 2 lie inside theirs.")
+    beside = np.add(inside, [[0.0, 2 * np.ptp(ends[1])]])
+    assert truth_sentence(result, beside).endswith(f"{ours} 1 of 2 lie inside theirs.")
+    one = replace(report, entries=np.array([[np.nan, np.nan], ends[1]]))
+    said = truth_sentence(replace(result, person=one), inside)
+    assert said.endswith(f"{ours} 1 of 1 lie inside theirs.")
+    nobody = truth_sentence(replace(result, person=None), inside)
+    assert "senses with noise" not in nobody
+
+
+def test_the_section_and_result_json_have_the_same_numbers() -> None:
+    result = fitted()
+    assert result.person is not None
+    section = result.person.section()
+    tables = [block for block in section.blocks if hasattr(block, "rows")]
+    assert [len(table.rows) for table in tables] == [5, 4, 2, 1]
+    kept = json.loads(json.dumps(plain(result.person.data())))
+    assert [item["name"] for item in kept["models"]] == [row[0] for row in tables[0].rows]
+    level = kept["levels"]["motor u"]
+    assert level["low"] < level["value"] < level["high"]
+    assert kept["known"] is True
+    assert kept["sensed"] == ["x", "v"]
+    assert np.array(kept["errors_ahead"]).shape == (len(kept["ahead"]), 1)
+    np.testing.assert_allclose(kept["K"], result.person.fit.K)  # type: ignore[union-attr]
+    assert kept["at_limit"] is True
+
+
+def test_the_page_says_what_intervals_held_where_a_limit_was_met() -> None:
+    result = fitted()
+    assert result.person is not None
+    assert any("90 to 95 %" in line for line in result.person_sentences)
+    fit = result.person.fit
+    assert fit is not None
+    free = [replace(one, status=0 * one.status) for one in fit.told.trials]
+    never = replace(result.person, fit=replace(fit, told=replace(fit.told, trials=free)))
+    assert not any("90 to 95 %" in line for line in replace(result, person=never).person_sentences)
+
+
+def test_each_model_is_a_stage_and_intervals_follow_the_likelihood_where_asked() -> None:
+    table = TABLE | {"observer": {"sensed": ["x", "v"], "profiles": True}}
+    settings = fit_settings(table)
+    without = fit_settings({key: item for key, item in TABLE.items() if key != "observer"})
+    problem = fit_problem(cart(), trials(), settings)
+    heard: list[str] = []
+    result = fit_recordings(problem, settings, heard.append)
+    quick = fitted()
+    assert result.person is not None
+    assert quick.person is not None
+    assert len(heard) == stages(problem, settings)
+    assert len(heard) - stages(problem, without) == len(result.person.models) + 1
+    assert stages(problem, fit_settings(TABLE)) == len(heard)
+    kept, rough = result.person.data(), quick.person.data()
+    assert (kept["profiled"], rough["profiled"]) == (True, False)
+    fit, covariance = quick.person.fit, quick.person.covariance
+    assert fit is not None
+    assert covariance is not None
+    about = np.asarray(fit.K)[..., None] + 1.959964 * covariance.entries[..., None] * [-1, 1]
+    np.testing.assert_allclose(rough["K_intervals"], about, rtol=1e-6)
+    # The gain is well told: ends are half a width at most from those of deviations.
+    width = np.ptp(about, axis=-1, keepdims=True)
+    assert np.all(np.abs((kept["K_intervals"] - about) / width) < 0.5)
+    assert "follows the likelihood" in str(quick.person.section())
+    assert "follows the likelihood" not in str(result.person.section())
+
+
+def test_the_page_says_by_which_gain_to_go() -> None:
+    """By that of the person, where least squares leaves noise inside the loop."""
+    result = fitted()
+    loop = LoopNoise(np.array([0.5]), 50.0, 9.0, 0.0)
+    held = tuple(replace(item, saturated=0.2) for item in result.trials)
+    result = replace(result, diagnostics=ResidualDiagnostics(loop, None), trials=held)
+    report = result.person
+    assert report is not None
+    assert report.fit is not None
+    assert report.preferred
+    assert verdict(result).endswith("go by the gain of that subject, in its section.")
+    unsettled = replace(report.models[0], fit=replace(report.fit, converged=False))
+    for first in (unsettled, replace(unsettled, fit=None)):
+        other = replace(report, models=(first, *report.models[1:]))
+        assert not other.preferred
+        assert "do not rely on its gain" in verdict(replace(result, person=other))
+    best = replace(report.models[1], fit=replace(report.fit, log_likelihood=1e6))
+    assert not replace(report, models=(report.models[0], best)).preferred
+
+
+@pytest.mark.parametrize(
+    ("ends", "words"),
+    [
+        ([-np.inf, 2.5], ["not determined", "2.5"]),
+        ([np.nan, np.nan], ["-", "-"]),
+        ([2.5, 3.5], ["2.5", "3.5"]),
+    ],
+)
+def test_an_interval_without_end_says_so(ends: list[float], words: list[str]) -> None:
+    result = fitted()
+    assert result.person is not None
+    section = replace(result.person, entries=frozen([ends, ends])).section()
+    found = {item.name: item for item in Report("", "", (), [section]).findings()}
+    assert [row[2:4] for row in found["person_gain"].rows] == [words, words]
+
+
+def test_settings_of_a_person() -> None:
+    table = {"observer": {"sensed": ["x"], "known": False, "share": True, "motor": False}}
+    asked = fit_settings(table).observer
+    assert asked is not None
+    given = asdict(asked)
+    del given["profiles"]
+    person, walk = asked_observer(cart(), trials(), **given)
+    assert person.walk is not None
+    # A push of one of three sizes every tenth sample: steps of .7 or 1.4, most of them none.
+    np.testing.assert_allclose(walk, person.walk)
+    assert 0.1 < walk[0] < 0.7
+    assert person.motor[0] == 0 < person.share[0]
+    with pytest.raises(InputError, match=r"\[fit.observer\] senses: is not a setting"):
+        fit_settings({"observer": {"senses": ["x"]}})
+    assert FitSettings().observer is None
