@@ -24,10 +24,10 @@ from impc.output_feedback.observer import Observer
 from impc.output_feedback.simulation import simulate_person
 from impc.reporting.document import Report
 from impc.reporting.rendering import plain
+from impc.studies.fit.gain_findings import truth_sentence
 from impc.studies.fit.result import FitResult
 from impc.studies.fit.settings import FitSettings, fit_settings
 from impc.studies.fit.subject import fit_problem, fit_recordings, stages
-from impc.studies.fit.truth import truth_sentence
 from impc.studies.fit.verdict import verdict
 from tests.output_feedback.test_fit import cart
 

@@ -55,6 +55,7 @@ from impc.reporting.document import (
     Verdict,
 )
 from impc.reporting.finding import Chart, Picture
+from impc.reporting.shown_units import body_sentence, signal_words
 from impc.studies.charts import methods_chart
 from impc.studies.fit.figures import fit_figures
 from impc.studies.fit.gain_findings import (
@@ -62,6 +63,7 @@ from impc.studies.fit.gain_findings import (
     gain_finding,
     limit_findings,
     parameter_findings,
+    truth_finding,
 )
 from impc.studies.fit.result import shown_trials, trial_name
 from impc.studies.fit.settings import plain_settings
@@ -73,11 +75,9 @@ from impc.studies.fit.trial_findings import (
     residual_findings,
     trajectory_finding,
 )
-from impc.studies.fit.truth import truth_finding
 from impc.studies.fit.verdict import abstract, remarks, verdict
 from impc.studies.fit.weight_findings import reading_finding, statement_findings, weight_finding
 from impc.studies.methods_table import column_terms, methods_data, methods_finding
-from impc.studies.signal_words import body_sentence, signal_words
 
 if TYPE_CHECKING:
     from impc.arrays import Array
