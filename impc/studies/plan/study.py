@@ -1,10 +1,8 @@
 """A plan as a value: every experiment tried, the best of them, and what groups would show.
 
-See docs/planning.md.
-
-Beside it fits of simulated recordings: what the plan foresaw, seen. Each fit begins at the truth and searches the recordings without linearisation. So it shows how the
-best answer scatters, not whether a search finds it from the default start (docs/structures.md).
-See docs/planning.md.
+Beside it fits of simulated recordings, which show what the plan foresaw. Each begins at the truth
+and searches without linearisation: it shows how the best answer scatters, not whether a search
+finds it from the default start. See docs/planning.md, docs/structures.md.
 """
 
 from __future__ import annotations
