@@ -53,5 +53,5 @@ def test_the_rest_works_without_it(tmp_path: Path) -> None:
         "True",
         "[fit.observer]: needs impc.output_feedback, which is not there; install all of impc, or "
         "leave the table out",
-        "No module named 'impc.output_feedback'",
+        "impc.fit_person: needs impc.output_feedback, which is not there; install all of impc",
     ]
