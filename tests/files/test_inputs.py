@@ -74,6 +74,7 @@ def run(command: str, study: Path, out: str = "out") -> Result:
 
 def told(study: Path, out: str = "out") -> dict[str, Any]:
     found: dict[str, Any] = json.loads((study.parent / out / "result.json").read_text())
+    found["findings"].get("methods", {}).get("table", {}).pop("seconds_a_subject", None)
     return {key: value for key, value in found.items() if key not in _TIMES}
 
 
@@ -165,5 +166,5 @@ def test_a_flipped_byte_in_what_is_kept_is_computed_again(
         path.write_bytes(content)
     again = here(monkeypatch)
     assert run(command, study).exit_code == 0
-    assert len(again) == (8 if command == "key-parameters" else 9)
+    assert len(again) == 8
     assert told(study) == told(study, "fresh")

@@ -155,7 +155,7 @@ def test_a_shift_of_a_part_of_a_sample_and_one_too_far(tmp_path: Path) -> None:
     np.testing.assert_allclose(trial.disturbance[:, 0], means, atol=1e-9)
     with pytest.raises(DataError, match=r"signals.push.shift: moves it by 301 of 600 samples"):
         read(tmp_path, angle, push, ("# shift = 0", "shift = 301"))
-    with pytest.raises(InputError, match=r"signals.push.shift: is inf"):
+    with pytest.raises(InputError, match=r"signals.push.shift: got inf"):
         read(tmp_path, angle, push, ("# shift = 0", "shift = inf"))
 
 
