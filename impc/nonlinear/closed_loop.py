@@ -18,6 +18,7 @@ import numpy as np
 from impc.arrays import Array, Frozen
 from impc.errors import SolverError
 from impc.nonlinear.plan import Plan, nearby_plan, solve_plan, solved_plan
+from impc.nonlinear.problem import slopes
 
 if TYPE_CHECKING:
     from impc.nonlinear.problem import OptimalControlProblem
@@ -90,7 +91,7 @@ def closed_loop_from(
         u[t] = plan.u[0]
         own = np.vstack([np.hstack([np.eye(p), np.zeros((p, problem.n))]), dx[t]])
         du[t] = plan.du[0] @ own
-        x[t + 1], f_w, f_theta = problem.slopes(x[t], u[t], d[t], theta)
+        x[t + 1], f_w, f_theta = slopes(problem, x[t], u[t], d[t], theta)
         dx[t + 1] = f_w @ np.concatenate([dx[t], du[t]])
         dx[t + 1, :, :p] += f_theta
         plans.append(plan)

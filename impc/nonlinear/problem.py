@@ -76,6 +76,8 @@ class OptimalControlProblem(Frozen):
 
     Attributes
     ----------
+    no_plant : tuple of str
+        Why commands for linear plants refuse it, and what to do.
     horizon : int
         N.
     state_names, input_names, parameter_names : tuple of str
@@ -217,11 +219,6 @@ class OptimalControlProblem(Frozen):
     def disturbance_count(self) -> int:
         """Number of disturbances."""
         return len(self.disturbance_names)
-
-    def slopes(self, x: Array, u: Array, d: Array, theta: Array) -> tuple[Array, Array, Array]:
-        """f (n,), and its derivatives by (x, u) (n, n + m) and theta (n, p), at one sample."""
-        following, f_w, f_theta = _slopes(self)(x, u, d, theta)
-        return following.full().ravel(), f_w.full(), f_theta.full()
 
     def with_horizon(self, horizon: int) -> OptimalControlProblem:
         """The same problem over another `horizon` in samples.
@@ -389,6 +386,14 @@ class OptimalControlProblem(Frozen):
         return optimal_recording(
             self, x, u, closed_loop=True, d=d, x0=x0, unknown_start=unknown_start
         )
+
+
+def slopes(
+    problem: OptimalControlProblem, x: Array, u: Array, d: Array, theta: Array
+) -> tuple[Array, Array, Array]:
+    """f (n,), and its derivatives by (x, u) (n, n + m) and theta (n, p), at one sample."""
+    following, f_w, f_theta = _slopes(problem)(x, u, d, theta)
+    return following.full().ravel(), f_w.full(), f_theta.full()
 
 
 @functools.lru_cache(maxsize=16)

@@ -475,7 +475,7 @@ def caches_without_a_home(folder: Path) -> str:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tempfile, "tempdir", str(folder))
         for name in ("XDG_CACHE_HOME", "XDG_CONFIG_HOME"):
-            patch.setenv(name, "/proc/none")
+            patch.setenv(name, f"{__file__}/none")
         for name in ("NUMBA_CACHE_DIR", "MPLCONFIGDIR"):
             patch.setenv(name, "")  # so that it is put back afterwards
             patch.delenv(name)
