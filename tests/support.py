@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import deque
 from typing import TYPE_CHECKING, Any
 
 import control
@@ -19,6 +20,7 @@ from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.recordings import Recording
 from impc.model.weights import Weights
+from impc.studies.pool import Answer, Task, answered
 
 if TYPE_CHECKING:
     import io
@@ -134,3 +136,21 @@ def kept_names(steps: Steps) -> set[str]:
             if steps.cache.find(known, steps.digest) is not None:
                 found.add(known)
     return found
+
+
+class ThisProcess:
+    """One task after the other, in this process."""
+
+    threads = 1
+
+    def __init__(self) -> None:
+        self._waiting: deque[tuple[int, list[Task]]] = deque()
+
+    def submit(self, number: int, batch: list[Task]) -> None:
+        """As `Pool.submit`."""
+        self._waiting.append((number, batch))
+
+    def take(self) -> tuple[int, list[Answer] | str]:
+        """As `Pool.take`."""
+        number, batch = self._waiting.popleft()
+        return number, answered(batch)

@@ -39,10 +39,6 @@ class MethodRecord(msgspec.Struct, frozen=True):
     reason: str = ""
 
 
-class _Case(msgspec.Struct, frozen=True):
-    methods: dict[str, Any]
-
-
 class ResultFile(msgspec.Struct, frozen=True):
     """result.json of any command."""
 

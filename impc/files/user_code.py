@@ -8,17 +8,10 @@ whoever types the command. The plants of this package, and saved matrices, need 
 
 from __future__ import annotations
 
-import importlib.machinery
-import importlib.util
-import sys
 import sysconfig
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from impc.errors import InputError
-
-if TYPE_CHECKING:
-    from importlib.machinery import ModuleSpec
 
 #: This package's own modules; they are known by their version.
 OURS = ("impc", "plants")
@@ -46,38 +39,6 @@ def consented_name(
             f"look at it, then say --{option} {name}, or --allow-{option}",
         )  # fmt: skip
     return name
-
-
-def module_file(name: str, beside: Path | None) -> Path | None:
-    """Where the module `name` comes from, without importing it; None for built in or not found.
-
-    The folder `beside`, if there is one, is looked in too.
-    """
-    if name in sys.modules:
-        file = getattr(sys.modules[name], "__file__", None)
-        return Path(file) if file else None
-    try:
-        spec = _spec(name, beside)
-    except (ImportError, ValueError):
-        return None
-    if spec is None or not spec.has_location or spec.origin is None:
-        return None
-    return Path(spec.origin)
-
-
-def _spec(name: str, beside: Path | None) -> ModuleSpec | None:
-    """By the packages it is in, none of which is imported."""
-    top, *below = name.split(".")
-    spec = importlib.util.find_spec(top)
-    if spec is None and beside is not None:
-        spec = importlib.machinery.PathFinder.find_spec(top, [str(beside)])
-    for part in below:
-        if spec is None or spec.submodule_search_locations is None:
-            return None
-        top = f"{top}.{part}"
-        places = list(spec.submodule_search_locations)
-        spec = importlib.machinery.PathFinder.find_spec(top, places)
-    return spec
 
 
 def is_installed(file: Path) -> bool:

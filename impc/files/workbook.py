@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
     from impc.files.table import Table
 
-#: Rows of a sheet; Excel opens no more.
-MOST_ROWS = 1_048_576
 _LONGEST_NAME = 31  # characters of a sheet's
 _FORBIDDEN = str.maketrans("[]:*?/\\'", "________")
 _MAIN = "http://schemas.openxmlformats.org/spreadsheetml/2006/main"

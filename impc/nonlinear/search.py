@@ -232,8 +232,8 @@ def _levenberg(
 ) -> tuple[Evaluation, bool]:
     """Levenberg and Marquardt's steps until the loss no longer falls; on the way a rough answer.
 
-    Damping keeps directions that nothing moves where they are; scipy's trust region walks along
-    them, to where there is no plan, and takes five times as long on the robot arm.
+    Damping keeps directions that nothing moves where they are. scipy's trust region walked along
+    them and named wrong combinations in two fits: rocket (S = .3), quadrotor (S = .1).
     """
     damping, patience, enough = (1e-3, 60, 1e-13) if last else (1e-2, 12, 1e-2)
     for _ in range(patience):

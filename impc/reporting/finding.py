@@ -112,18 +112,8 @@ def csv_bytes(table: pd.DataFrame) -> bytes:
     return stream.getvalue().encode()
 
 
-def workbook_bytes(tables: Mapping[str, pd.DataFrame]) -> bytes:
-    """Tables as sheets of one workbook (.xlsx)."""
-    stream = io.BytesIO()
-    with pd.ExcelWriter(stream, engine="openpyxl") as writer:
-        for name, table in tables.items():
-            as_data(table).to_excel(writer, sheet_name=name[:_LONGEST_NAME], index=False)
-    return stream.getvalue()
-
-
 #: Cells of a table that is in the workbook too; a larger one, some seconds to write, is CSV alone.
 MOST_CELLS = 200_000
-_LONGEST_NAME = 31  # characters of a sheet's
 _ANY_LENGTH = 32_767  # characters of a cell
 _NUMBER = re.compile(r"[+-]?\d+(\.\d*)?")
 
@@ -134,9 +124,11 @@ def as_data(table: pd.DataFrame) -> pd.DataFrame:
     A spreadsheet runs what begins with = + - or @, and names come from files of others: such a text
     gets an apostrophe, which spreadsheets know as the mark of text.
     """
-    safe = table.map(_safe)
-    safe.columns = pd.Index([_safe(name) for name in table.columns])
-    return safe
+    safe = table.copy(deep=False)
+    for place, kind in enumerate(table.dtypes):
+        if kind.kind not in "iuf":
+            safe.isetitem(place, [_safe(value) for value in table.iloc[:, place]])
+    return safe.set_axis([_safe(name) for name in table.columns], axis=1)
 
 
 def _safe(value: Any) -> Any:

@@ -19,7 +19,6 @@ from impc.control.named_solver import described
 from impc.errors import InputError
 from impc.inverse.estimates import Estimate
 from impc.inverse.methods import METHODS
-from impc.model.signal_units import gain_unit
 from impc.reporting.document import Block, Lines, Report, Section, Verdict
 from impc.reporting.finding import Chart, Finding, Picture
 from impc.reporting.provenance import Provenance
@@ -28,7 +27,13 @@ from impc.reporting.shown_units import body_sentence, signal_words
 from impc.reporting.style import drawn, journal_style
 from impc.reporting.writer import owned, write_files
 from impc.studies.charts import chart_figure, methods_chart
-from impc.studies.methods_table import column_terms, methods_data, methods_finding, weight_entries
+from impc.studies.methods_table import (
+    column_terms,
+    gain_entries,
+    methods_data,
+    methods_finding,
+    weight_entries,
+)
 
 if TYPE_CHECKING:
     from impc.assess.assessments import MethodFit
@@ -175,12 +180,7 @@ def _findings(fit: MethodFit) -> list[str]:
 
 
 def _gain(estimate: Estimate) -> Finding:
-    plant = estimate.problem.plant
-    rows = [
-        (control, state, gain_unit(plant, control, state), float(value))
-        for control, row in zip(plant.controls, estimate.gain, strict=True)
-        for state, value in zip(plant.states, row, strict=True)
-    ]
+    rows = gain_entries(estimate.problem.plant, estimate.gain)
     table = pd.DataFrame(rows, columns=["input", "state", "unit", "value"])
     return Finding("gain", table, "Gain K of u = -Kx.", digits=6)
 

@@ -12,16 +12,17 @@ import pandas as pd
 
 from impc.assess.assessments import ASSESSMENTS, assessed
 from impc.inverse.methods import METHODS
-from impc.model.signal_units import price_unit
+from impc.model.signal_units import gain_unit, price_unit
 from impc.reporting.document import Terms
 from impc.reporting.finding import Finding
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     from impc.arrays import Array
     from impc.assess.assessments import MethodFit
     from impc.control.simulation import Simulation
+    from impc.inverse.problem import Problem
     from impc.model.plant import Plant
     from impc.model.weights import Weights
 
@@ -82,6 +83,34 @@ def weight_entries(plant: Plant, weights: Weights) -> list[tuple[str, str, str, 
         for i, one in enumerate(names)
         for j, other in enumerate(names[: i + 1])
     ]
+
+
+def gain_entries(plant: Plant, gain: Array) -> list[tuple[str, str, str, float]]:
+    """One row an entry of a gain (m, n): input, state, unit, value."""
+    return [
+        (control, state, gain_unit(plant, control, state), float(value))
+        for control, row in zip(plant.controls, gain, strict=True)
+        for state, value in zip(plant.states, row, strict=True)
+    ]
+
+
+def trajectory_table(
+    problem: Problem, trials: Iterable[int], runs: Mapping[str, Sequence[Simulation]]
+) -> pd.DataFrame:
+    """A row a sample of these trials: recorded, what drove them, and the runs of each name."""
+    plant, blocks = problem.plant, []
+    for index in trials:
+        trial = problem.recordings[index]
+        steps = trial.samples
+        parts = [np.full((steps, 1), index + 1.0), plant.dt * np.arange(steps)[:, None]]
+        parts += [np.asarray(trial.outputs), np.asarray(trial.disturbance)]
+        for each in runs.values():
+            parts += until_its_end(plant, each[index])
+        blocks.append(np.hstack(parts))
+    heads = ["trial", "time", *(f"{name}_recorded" for name in plant.outputs), *plant.disturbances]
+    for ending in runs:
+        heads += [f"{name}_{ending}" for name in (*plant.outputs, *plant.controls)]
+    return pd.DataFrame(np.vstack(blocks), columns=heads)
 
 
 def until_its_end(plant: Plant, run: Simulation) -> tuple[Array, Array]:

@@ -75,7 +75,7 @@ Answer = tuple[Any, ImpcError | None, float]
 
 
 class Pool(Protocol):
-    """Where tasks run: in this process, in others, or on a scheduler."""
+    """Where tasks run: in processes on this machine, or on a scheduler."""
 
     @property
     def threads(self) -> int:
@@ -158,24 +158,6 @@ def answered(batch: list[Task]) -> list[Answer]:
             )
         answers.append((content, fault, time.perf_counter() - begun))
     return answers
-
-
-class ThisProcess:
-    """One task after the other, in this process."""
-
-    threads = 1
-
-    def __init__(self) -> None:
-        self._waiting: deque[tuple[int, list[Task]]] = deque()
-
-    def submit(self, number: int, batch: list[Task]) -> None:
-        """As `Pool.submit`."""
-        self._waiting.append((number, batch))
-
-    def take(self) -> tuple[int, list[Answer] | str]:
-        """As `Pool.take`."""
-        number, batch = self._waiting.popleft()
-        return number, answered(batch)
 
 
 class Processes:

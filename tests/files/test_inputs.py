@@ -21,8 +21,9 @@ import impc.studies.pool
 import impc.studies.scheduler
 import impc.studies.selection.model_source
 from impc.cli.main import main
-from impc.studies.pool import Answer, ThisProcess
+from impc.studies.pool import Answer
 from tests.studies.selection.test_methods import blood_study
+from tests.support import ThisProcess
 
 COMMANDS = ("select", "key-parameters")
 MODEL = "my_model:blood_model"

@@ -15,7 +15,8 @@ import psutil
 
 from impc.errors import DataError
 from impc.studies.cache import Cache
-from impc.studies.pool import Pool, Result, Task, ThisProcess, processes, run
+from impc.studies.pool import Pool, Result, Task, processes, run
+from tests.support import ThisProcess
 
 ROOT = Path(__file__).parents[2]
 

@@ -11,7 +11,6 @@ from markupsafe import Markup
 from impc.assess.assessments import ASSESSMENTS
 from impc.control.named_solver import described
 from impc.inverse.methods import METHODS
-from impc.model.signal_units import gain_unit
 from impc.reporting.document import Lines, Report, Section, Terms, Verdict
 from impc.reporting.finding import Chart, Finding, Picture
 from impc.reporting.shown_units import axis_label, body_sentence, signal_words
@@ -19,9 +18,10 @@ from impc.reporting.style import BLUE, DOUBLE_COLUMN, INK, drawn, journal_style,
 from impc.studies.charts import chart_figure, methods_chart
 from impc.studies.methods_table import (
     column_terms,
+    gain_entries,
     methods_data,
     methods_finding,
-    until_its_end,
+    trajectory_table,
     weight_entries,
 )
 
@@ -163,13 +163,11 @@ def _score(item: MethodFit) -> Array:
 
 
 def _gain(problem: Problem, compared: Sequence[MethodFit]) -> Finding:
-    plant = problem.plant
     rows = [
-        (f"K.{control}.{state}", gain_unit(plant, control, state), item.name, float(K[i, j]))
+        (f"K.{control}.{state}", unit, item.name, value)
         for item in compared
         if (K := item.estimate.K) is not None
-        for i, control in enumerate(plant.controls)
-        for j, state in enumerate(plant.states)
+        for control, state, unit, value in gain_entries(problem.plant, K)
     ]
     return Finding("gain", pd.DataFrame(rows, columns=["number", "unit", "method", "value"]))
 
@@ -188,19 +186,9 @@ def _weights(problem: Problem, compared: Sequence[MethodFit]) -> Finding:
 
 def _trajectories(problem: Problem, compared: Sequence[MethodFit]) -> Finding:
     """Every trial; a method that falls has no numbers from there on."""
-    plant, blocks = problem.plant, []
-    shown = [item for item in compared if item.runs]
-    for index, trial in enumerate(problem.recordings):
-        steps = trial.samples
-        parts = [np.full((steps, 1), index + 1.0), plant.dt * np.arange(steps)[:, None]]
-        parts += [np.asarray(trial.outputs), np.asarray(trial.disturbance)]
-        for item in shown:
-            parts += until_its_end(plant, item.runs[index])
-        blocks.append(np.hstack(parts))
-    heads = ["trial", "time", *(f"{name}_recorded" for name in plant.outputs), *plant.disturbances]
-    for item in shown:
-        heads += [f"{name}_{item.name}" for name in (*plant.outputs, *plant.controls)]
-    return Finding("trajectories", pd.DataFrame(np.vstack(blocks), columns=heads))
+    runs = {item.name: item.runs for item in compared if item.runs}
+    every = range(len(problem.recordings))
+    return Finding("trajectories", trajectory_table(problem, every, runs))
 
 
 def _figure(problem: Problem, compared: Sequence[MethodFit]) -> Figure:

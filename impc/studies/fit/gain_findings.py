@@ -46,8 +46,7 @@ def gain_finding(result: FitResult) -> Finding:
     of_weights = dict(zip(entry_names(plant), np.ravel(result.fitted.gain), strict=True))
     found = {(item.name, item.method): item for item in certainty.intervals}
     units, rows = number_units(plant), []
-    for name in dict.fromkeys(item.name for item in certainty.intervals):
-        item = next(one for (number, _), one in found.items() if number == name)
+    for name, item in result.preferred.items():
         row = {
             "number": number_name(plant, name),
             "unit": units.get(name, UNKNOWN),
@@ -268,9 +267,7 @@ def truth_finding(result: FitResult, truth: Array) -> Finding:
 
 def _pairs(result: FitResult, truth: Array) -> list[tuple[Interval, float]]:
     """The interval of each entry, that for the residuals' colour, with its true value."""
-    first: dict[str, Interval] = {}
-    for item in result.certainty.intervals:
-        first.setdefault(item.name, item)
+    first = result.preferred
     values = zip(entry_names(result.given.plant), truth.ravel(), strict=True)
     return [(first[name], float(value)) for name, value in values]
 

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
     from impc.arrays import Array
     from impc.assess.intent_statements import Statement
-    from impc.assess.intervals import Interval
     from impc.studies.fit.result import FitResult
 
 _WIDTH = 4.2  # inches: 8 points are 9 pixels at the width of a phone
@@ -36,9 +35,7 @@ def gain_figure(result: FitResult) -> Figure:
     """Each entry of the gain as the command that it gives at a typical state, with its interval."""
     plant = result.fitted.problem.plant
     sizes = np.tile(np.array(result.intent.sizes), plant.m)
-    first: dict[str, Interval] = {}
-    for item in result.certainty.intervals:  # that of the residuals' colour comes first
-        first.setdefault(item.name, item)
+    first = result.preferred
     names = [name for name in entry_names(plant) if name in first]
     scale = dict(zip(entry_names(plant), sizes, strict=True))
     ends = np.array(

@@ -26,8 +26,6 @@ if TYPE_CHECKING:
 
 Part = TypeVar("Part")
 
-# Where a family of plants is looked at: two families may agree at their nominal values.
-_FACTORS = (0.9, 1.1)
 # Stages of a fit, and of a comparison.
 _LEFT_OUT = re.compile(r"without (?:trial )?(\d+)")
 

@@ -117,6 +117,14 @@ class FitResult:
         )
 
     @property
+    def preferred(self) -> dict[str, Interval]:
+        """The first interval of every number by its name: the sandwich's, where it has one."""
+        first: dict[str, Interval] = {}
+        for item in self.certainty.intervals:
+            first.setdefault(item.name, item)
+        return first
+
+    @property
     def reported_P(self) -> Array:  # noqa: N802
         """Terminal weight (3.4) of the reported weights (n, n)."""
         return solve_lqr(self.fitted.problem.plant, self.intent.reported.weights).P

@@ -9,7 +9,7 @@ import pandas as pd
 
 from impc.reporting.finding import Finding, Picture, Severity
 from impc.studies.fit.result import shown_trials, trial_name
-from impc.studies.methods_table import until_its_end
+from impc.studies.methods_table import trajectory_table
 
 if TYPE_CHECKING:
     from impc.studies.fit.result import FitResult
@@ -85,21 +85,8 @@ def check_finding(result: FitResult) -> Finding:
 
 def trajectory_finding(result: FitResult) -> Finding:
     """A row a sample of the trials that the page draws: recorded and simulated."""
-    plant, blocks = result.given.plant, []
-    for index in shown_trials(result):
-        trial, run = result.given.recordings[index], result.inverse_mpc.runs[index]
-        number = np.full((trial.samples, 1), index + 1.0)
-        time = plant.dt * np.arange(trial.samples)[:, None]
-        simulated, commands = until_its_end(plant, run)
-        blocks.append(
-            np.hstack([number, time, trial.outputs, simulated, commands, trial.disturbance])
-        )
-    heads = [
-        "trial",
-        "time",
-        *(f"{name}_recorded" for name in plant.outputs),
-        *(f"{name}_simulated" for name in plant.outputs),
-        *(f"{name}_simulated" for name in plant.controls),
-        *plant.disturbances,
-    ]
-    return Finding("trajectories", pd.DataFrame(np.vstack(blocks), columns=heads))
+    runs = {"simulated": result.inverse_mpc.runs}
+    table = trajectory_table(result.given, shown_trials(result), runs)
+    drives = list(result.given.plant.disturbances)
+    others = [name for name in table.columns if name not in drives]
+    return Finding("trajectories", table[[*others, *drives]])

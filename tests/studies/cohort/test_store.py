@@ -19,8 +19,8 @@ from impc.studies.cohort import engine
 from impc.studies.cohort.engine import Failures, Store, require_same, run_study, work_kept
 from impc.studies.cohort.report import write_report
 from impc.studies.cohort.tables import cohort_tables
-from impc.studies.pool import ThisProcess
 from tests.studies.cohort.made_up import fit_of, made_up_study, replicate_of, tasks_of
+from tests.support import ThisProcess
 
 REPLICATES = 3
 STUDY = made_up_study(2, REPLICATES)

@@ -9,12 +9,13 @@ import pytest
 
 from impc.errors import DataError
 from impc.studies.cache import Cache
-from impc.studies.pool import Result, ThisProcess
+from impc.studies.pool import Result
 from impc.studies.scheduler import Cluster, connected
 from impc.studies.selection.key_parameters import Refits, refit_subsets
 from impc.studies.selection.model import Trial
 from impc.studies.selection.model_source import model_source, on_pool
 from tests.studies.selection.dosing import in_turn
+from tests.support import ThisProcess
 
 if TYPE_CHECKING:
     from pathlib import Path
