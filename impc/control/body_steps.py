@@ -2,54 +2,46 @@
 
 docs/nonlinear.md has the equations.
 
-CasADi evaluates a body. What it calls with minimal overhead, a buffer that knows where to read and
-to write, is a function of the C interface with one pointer, so that compiled code calls it too.
+A body's list of operations is machine code, translated once for all samples by LLVM, which numba
+brings: a function of (constants, given, found) that reads and writes where they point to. The
+operations stand one behind the other without a branch, and none is taken together with another, so
+that every processor gives the same numbers. Parameters are among the constants, so that bodies
+which differ by them alone share their code (docs/nonlinear.md, "A body that is not linear").
 """
 
 from __future__ import annotations
 
-import ctypes
 import functools
-import importlib
+import threading
 from typing import TYPE_CHECKING, Any
 
+import llvmlite.binding as llvm
 import numpy as np
+from llvmlite import ir
 
 from impc.arrays import Array
 from impc.control.compiled_body import BodyTape, move_along, states_along
-from impc.model.body import function_of
+from impc.model.body import OPERATIONS
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from impc.control.constraint_rows import Directions
     from impc.model.body import Body
     from impc.model.plant import Plant
 
 
-def body_tape(body: Body | None, n: int, given: int, *, moving: bool) -> tuple[BodyTape, Any]:
-    """A body for the compiled loop, empty where there is none, and what has to live as long.
+def body_tape(body: Body | None, n: int, given: int, *, moving: bool) -> BodyTape:
+    """A body for the compiled loop, empty where there is none.
 
     With arrays of its own each time, because trials are simulated side by side.
     """
     if body is None:
-        return BodyTape(0, 0, np.zeros(0), np.zeros(0), np.zeros((0, 0))), None
-    tape = BodyTape(0, 0, np.zeros(given), np.zeros(n), np.zeros((n, given)))
-    buffer, _ = function_of(body, moving=moving).buffer()
-    buffer.set_arg(0, tape.given.data)
-    buffer.set_res(0, tape.found.data)
-    if moving:
-        buffer.set_res(1, tape.slopes.data)
-    code, pointer = _evaluation()
-    return tape._replace(code=code, buffer=pointer(buffer._self(), None)), buffer
-
-
-@functools.cache
-def _evaluation() -> tuple[int, Any]:
-    """Where CasADi's function begins that evaluates a buffer, and what tells where a buffer is."""
-    library = importlib.import_module("casadi._casadi").__file__
-    function = ctypes.CDLL(library)["_ZN6casadi21_function_buffer_evalEPv"]
-    pointer = ctypes.pythonapi.PyCapsule_GetPointer
-    pointer.restype, pointer.argtypes = ctypes.c_void_p, [ctypes.py_object, ctypes.c_char_p]
-    return int(ctypes.cast(function, ctypes.c_void_p).value or 0), pointer
+        return BodyTape(0, np.zeros(0), np.zeros(0), np.zeros(0), np.zeros((0, 0)))
+    found = np.zeros(n * (1 + given))
+    code = address(body, n, moving=moving)
+    constants = np.array(body.constants)
+    return BodyTape(code, constants, np.zeros(given), found, found[n:].reshape(n, given))
 
 
 def next_state(plant: Plant, x: Array, u: Array, d: Array) -> Array:
@@ -75,7 +67,7 @@ def pushes(along: Directions, x: Array, u: Array, d: Array) -> Array:
 def _ahead(body: Body, x: Array, u: Array, d: Array) -> Array:
     ahead = np.empty(x.shape)
     given = x.shape[1] + u.shape[1] + d.shape[1]
-    tape, _buffer = body_tape(body, x.shape[1], given, moving=False)
+    tape = body_tape(body, x.shape[1], given, moving=False)
     states_along(tape, np.array(x), np.array(u), np.array(d), ahead)
     return ahead
 
@@ -90,7 +82,7 @@ def slopes_along(plant: Plant, x: Array, u: Array, d: Array) -> tuple[Array, Arr
         A, B, E = (np.broadcast_to(part, (steps, *part.shape)) for part in _matrices(plant))
         return A, B, E
     given = n + m + plant.E.shape[1]
-    tape, _buffer = body_tape(plant.body, n, given, moving=True)
+    tape = body_tape(plant.body, n, given, moving=True)
     found = np.empty((steps, n, given))
     move_along(tape, np.array(x), np.array(u), np.array(d), found)
     return found[..., :n], found[..., n : n + m], found[..., n + m :]
@@ -98,3 +90,120 @@ def slopes_along(plant: Plant, x: Array, u: Array, d: Array) -> tuple[Array, Arr
 
 def _matrices(plant: Plant) -> tuple[Array, Array, Array]:
     return plant.A, plant.B, plant.E
+
+
+_NUMBER, _PLACE = ir.DoubleType(), ir.IntType(64)
+_ZERO, _ONE, _MINUS = (_NUMBER(value) for value in (0.0, 1.0, -1.0))
+# Of LLVM, which takes a sine and a cosine of one number together, and of the C library, by name.
+_CALLED = {
+    **{"SIN": "llvm.sin", "COS": "llvm.cos", "SQRT": "llvm.sqrt", "FABS": "llvm.fabs"},
+    **{"EXP": "exp", "LOG": "log", "POW": "pow", "CONSTPOW": "pow"},
+    **{"TAN": "tan", "TANH": "tanh", "SINH": "sinh"},
+    **{"COSH": "cosh", "ASIN": "asin", "ACOS": "acos", "ATAN": "atan", "ATAN2": "atan2"},
+    **{"FMIN": "fmin", "FMAX": "fmax", "HYPOT": "hypot", "LOG1P": "log1p", "EXPM1": "expm1"},
+}
+_OF_TWO = {"POW", "CONSTPOW", "ATAN2", "FMIN", "FMAX", "HYPOT"}
+# Of instructions, from a builder and two operands.
+_WRITTEN: dict[str, Callable[[Any, Any, Any], Any]] = {
+    "MUL": lambda to, a, b: to.fmul(a, b),
+    "ADD": lambda to, a, b: to.fadd(a, b),
+    "SUB": lambda to, a, b: to.fsub(a, b),
+    "DIV": lambda to, a, b: to.fdiv(a, b),
+    "NEG": lambda to, a, _: to.fneg(a),
+    "SQ": lambda to, a, _: to.fmul(a, a),
+    "TWICE": lambda to, a, _: to.fadd(a, a),
+    "INV": lambda to, a, _: to.fdiv(_ONE, a),
+    "ASSIGN": lambda _, a, __: a,
+    "SIGN": lambda to, a, _: to.select(
+        to.fcmp_ordered(">", a, _ZERO), _ONE, to.select(to.fcmp_ordered("<", a, _ZERO), _MINUS, a)
+    ),
+    "LT": lambda to, a, b: to.uitofp(to.fcmp_ordered("<", a, b), _NUMBER),
+    "LE": lambda to, a, b: to.uitofp(to.fcmp_ordered("<=", a, b), _NUMBER),
+    "EQ": lambda to, a, b: to.uitofp(to.fcmp_ordered("==", a, b), _NUMBER),
+    "NE": lambda to, a, b: to.uitofp(to.fcmp_unordered("!=", a, b), _NUMBER),
+    "NOT": lambda to, a, _: to.uitofp(to.fcmp_ordered("==", a, _ZERO), _NUMBER),
+    "AND": lambda to, a, b: to.uitofp(to.and_(_true(to, a), _true(to, b)), _NUMBER),
+    "OR": lambda to, a, b: to.uitofp(to.or_(_true(to, a), _true(to, b)), _NUMBER),
+    "IF_ELSE_ZERO": lambda to, a, b: to.select(_true(to, a), b, _ZERO),
+}
+_one_at_a_time = threading.Lock()
+
+
+def address(body: Body, states: int, *, moving: bool) -> int:
+    """Where the machine code of a body begins; it stays there as long as the process."""
+    with _one_at_a_time:
+        place, _ = _translated(body.code.tobytes(), len(body.constants), None if moving else states)
+    return place
+
+
+def _of_states(code: list[list[int]], states: int) -> list[list[int]]:
+    """The operations that the next states need."""
+    needed: set[int] = set()
+    kept = []
+    for line in code[::-1]:
+        operation, to, a, b = line
+        if OPERATIONS[operation] == "OUTPUT":
+            wanted = to < states
+        else:
+            wanted = to in needed
+            needed.discard(to)
+        if wanted:
+            needed |= {a, b}
+            kept.append(line)
+    return kept[::-1]
+
+
+@functools.cache
+def _translated(code: bytes, constants: int, states: int | None) -> tuple[int, Any]:
+    """The address of a function of `states` alone, if any, and what keeps it there."""
+    lines: list[list[int]] = np.frombuffer(code, dtype=np.int64).reshape(-1, 4).tolist()
+    if states is not None:
+        lines = _of_states(lines, states)
+    module = ir.Module()
+    pointer = _NUMBER.as_pointer()
+    kind = ir.FunctionType(ir.VoidType(), [pointer] * 3)
+    function = ir.Function(module, kind, "body")
+    builder = ir.IRBuilder(function.append_basic_block())
+    held, given, found = function.args
+    slots: dict[int, Any] = {}
+
+    def read(slot: int) -> Any:
+        if slot not in slots:  # what is computed is written before it is read
+            source, place = (held, slot) if slot < constants else (given, slot - constants)
+            slots[slot] = builder.load(builder.gep(source, [_PLACE(place)]))
+        return slots[slot]
+
+    for operation, to, a, b in lines:
+        name = OPERATIONS[operation]
+        if name == "OUTPUT":
+            builder.store(read(a), builder.gep(found, [_PLACE(to)]))
+        elif name in _WRITTEN:
+            slots[to] = _WRITTEN[name](builder, read(a), read(b))
+        else:
+            operands = [read(a), read(b)] if name in _OF_TWO else [read(a)]
+            slots[to] = builder.call(_library(module, _CALLED[name], len(operands)), operands)
+    builder.ret_void()
+    return _compiled(str(module))
+
+
+def _compiled(text: str) -> tuple[int, Any]:
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    parsed = llvm.parse_assembly(text)
+    machine = llvm.Target.from_default_triple().create_target_machine(opt=2, jit=True)
+    engine = llvm.create_mcjit_compiler(parsed, machine)
+    engine.finalize_object()
+    return int(engine.get_function_address("body")), engine
+
+
+def _library(module: Any, name: str, operands: int) -> Any:
+    """A function of LLVM or of the C library, declared once."""
+    if name.startswith("llvm."):
+        return module.declare_intrinsic(name, [_NUMBER])
+    if name in module.globals:
+        return module.globals[name]
+    return ir.Function(module, ir.FunctionType(_NUMBER, [_NUMBER] * operands), name)
+
+
+def _true(builder: Any, a: Any) -> Any:
+    return builder.fcmp_unordered("!=", a, _ZERO)

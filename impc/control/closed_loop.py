@@ -136,10 +136,9 @@ def run_loop(
     x[0], dx[0] = given.x0, along.x0
     multipliers = np.zeros(len(prepared.rows.b))
     program, asked = prepared.program, prepared.program is not None
-    body, _buffer = body_tape(plant.body, n, n + m + given.disturbance.shape[1], moving=p > 0)
     loop = (
         *(prepared.matrices, prepared.matrix_directions, prepared.rows, prepared.row_directions),
-        body,
+        body_tape(plant.body, n, n + m + given.disturbance.shape[1], moving=p > 0),
         _pushes(prepared, given),
         *(np.array(given.disturbance), _divergence(prepared.matrices.E, given), prepared.unit),
         workspace(prepared.rows, m, p),

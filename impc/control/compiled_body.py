@@ -1,8 +1,8 @@
 """Compiled code: one sample of a body that is not linear, with its derivative.
 
-CasADi writes the next state and its derivatives by state, input and disturbance; those along p
-directions follow by the chain rule, so that they are exact (docs/nonlinear.md). A division by zero
-is infinite here, and the loop then diverges.
+The machine code of the body (`native_body`) writes the next state and its derivatives by state,
+input and disturbance; those along p directions follow by the chain rule, so that they are exact
+(docs/nonlinear.md). A division by zero is infinite here, and the loop then diverges.
 """
 
 from __future__ import annotations
@@ -21,13 +21,15 @@ if TYPE_CHECKING:
 
 
 class BodyTape(NamedTuple):
-    """A body for compiled code, with what it reads and writes."""
+    """The operations of a `Body` as machine code, with what it reads and writes."""
 
-    code: int  # Where the function begins that evaluates it; 0 where the linear plant moves
-    buffer: int  # Where its argument is
+    address: int  # Where it begins; 0 where the linear plant moves
+    constants: Buffer  # (c,)
     given: Buffer  # Written at every sample: state, input and disturbance (g,)
-    found: Buffer  # Written by the function: the next state (n,)
-    slopes: Buffer  # And its derivatives by what is given (n, g)
+    found: Buffer  # Written by the code: the next state and behind it its slopes (n + n*g,)
+    # The same numbers as `found` has there: derivatives of the next state by what is given (n, g).
+    # Zero where the code does not write.
+    slopes: Buffer
 
 
 @njit(cache=True)
@@ -74,7 +76,7 @@ def states_along(body: BodyTape, x: Buffer, u: Buffer, disturbance: Buffer, ahea
     """
     for t in range(len(ahead)):
         _find(body, x[t], u[t], disturbance[t])
-        ahead[t] = body.found
+        ahead[t] = body.found[: x.shape[1]]
 
 
 @njit(cache=True)
@@ -97,20 +99,22 @@ def _find(body: BodyTape, x: Buffer, u: Buffer, disturbance: Buffer) -> None:
         body.given[n + i] = u[i]
     for i in range(len(disturbance)):
         body.given[n + m + i] = disturbance[i]
-    _call(body.code, body.buffer)
+    _call(body.address, body.constants, body.given, body.found)
 
 
-def _called(context: Any, code: Any, buffer: Any) -> Any:
-    """Call what begins at an address with a pointer."""
+def _called(context: Any, address: Any, constants: Any, given: Any, found: Any) -> Any:
+    """Call what begins at an address with pointers to three arrays."""
 
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        pointer = ir.IntType(8).as_pointer()
-        kind = ir.FunctionType(ir.VoidType(), [pointer])
-        function = builder.inttoptr(values[0], kind.as_pointer())
-        builder.call(function, [builder.inttoptr(values[1], pointer)])
+        arrays = zip(signature.args[1:], values[1:], strict=True)
+        pointers = [
+            context.make_array(kind)(context, builder, value).data for kind, value in arrays
+        ]
+        kind = ir.FunctionType(ir.VoidType(), [pointer.type for pointer in pointers])
+        builder.call(builder.inttoptr(values[0], kind.as_pointer()), pointers)
         return context.get_dummy_value()
 
-    return types.void(code, buffer), generate
+    return types.void(address, constants, given, found), generate
 
 
-_call: Callable[[int, int], None] = cast("Any", intrinsic(_called))
+_call: Callable[[int, Buffer, Buffer, Buffer], None] = cast("Any", intrinsic(_called))

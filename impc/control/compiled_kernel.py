@@ -5,7 +5,7 @@
 v is zero while the gain keeps every bound, and else the answer of the least-distance problem
 (`compiled_dual`); each answer is checked before it is given out. The letters and the checks are
 those of docs/theory.md, section 4; `closed_loop` has the equations of the derivatives. Where the
-body that moves is not linear, CasADi is called (`compiled_body`).
+body that moves is not linear, its machine code is called (`compiled_body`).
 """
 
 from __future__ import annotations
@@ -147,7 +147,7 @@ def run(
                 _hold(x, dx, t)
                 return weakly_active, row
             weakly_active += near
-        if body.code:
+        if body.address:
             move_body(body, x[t], u[t], disturbance[t], dx[t], du[t], x[t + 1], dx[t + 1])
             if len(pushes):
                 dx[t + 1] += pushes[t]

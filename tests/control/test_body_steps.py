@@ -11,10 +11,9 @@ import scipy.integrate
 from impc.arrays import Array
 from impc.checking import replace
 from impc.cli.seat import seat_controller
-from impc.control.body_steps import body_tape, next_state, slopes_along
+from impc.control.body_steps import next_state, slopes_along
 from impc.control.casadi_controller import build_mpc, simulate_mpc
 from impc.control.closed_loop import simulate, simulate_and_differentiate
-from impc.control.compiled_body import states_along
 from impc.control.constraint_rows import directions
 from impc.control.controller import Controller
 from impc.control.loop_function import closed_loop_function
@@ -79,19 +78,6 @@ def test_every_operation_is_casadis_and_its_slopes_are_differences() -> None:
     for state, u, d, point in zip(*given, points, strict=True):
         exact = function(point[:2], point[2:]).full().ravel()
         assert np.allclose(next_state(plant, state, u, d), exact, rtol=1e-13)
-
-
-def test_the_same_states_with_derivatives_and_without() -> None:
-    """To the last digit, and without them no slope is written."""
-    body = pendulum().body
-    x, rest = np.random.default_rng(0).standard_normal((30, 2)), np.zeros((30, 1))
-    found = []
-    for moving in (False, True):
-        (tape, _buffer), ahead = body_tape(body, 2, 4, moving=moving), np.empty((30, 2))
-        states_along(tape, x, rest, rest, ahead)
-        assert bool(np.any(tape.slopes)) == moving
-        found.append(ahead)
-    assert np.array_equal(found[0], found[1])
 
 
 def test_what_a_condition_leaves_out_may_be_infinite() -> None:

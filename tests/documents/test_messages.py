@@ -108,21 +108,6 @@ def with_body(body: Any) -> Plant:
     return Plant(control.ss([[0.9]], [[1]], [[1]], 0, 0.1), body=body)
 
 
-def calls_python() -> Plant:
-    """A body whose next state Python computes."""
-
-    class Half(casadi.Callback):
-        def __init__(self) -> None:
-            casadi.Callback.__init__(self)
-            self.construct("half", {})
-
-        def eval(self, values: Any) -> Any:
-            return [values[0] / 2]
-
-    half, x, w = Half(), casadi.MX.sym("x"), casadi.MX.sym("w")
-    return with_body(casadi.Function("f", [x, w], [half(x) + 0.4 * x + w]))
-
-
 def damaged(name: str) -> Callable[[Path], None]:
     """Read one of the damaged recordings of tests/files."""
 
@@ -755,7 +740,9 @@ PROVOKED: dict[str, Callable[[Path], object]] = {
     "plant.body: takes ... and gives ...": lambda _: with_body(
         casadi.Function("f", [PLACE], [PLACE])
     ),
-    "plant.body: calls Python; write it as an expression": lambda _: calls_python(),
+    "plant.body: has the operation ...; write it without": lambda _: with_body(
+        casadi.Function("f", [PLACE, PUSH], [0.9 * PLACE + PUSH * casadi.erf(PLACE)])
+    ),
     "plant.body: has another linearisation at rest than A and B": lambda _: with_body(
         casadi.Function("f", [PLACE, PUSH], [PLACE + PUSH])
     ),
