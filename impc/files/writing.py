@@ -30,7 +30,7 @@ def unwritable(subject: str, error: OSError | ValueError, remedy: str) -> Output
 
 def require_ordinary(path: Path) -> None:
     """Refuse a pipe or a device at `path`, in the place of a file: to open it may wait for ever."""
-    if path.exists() and not path.is_file():
+    if not path.is_file() and path.exists():
         raise OSError(errno.EINVAL, "no ordinary file")
 
 
@@ -41,7 +41,8 @@ def write_whole(path: Path, content: bytes, *, flush: bool = True) -> None:
     """
     staging = path.with_name(f".{path.name}.part")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        if not path.parent.is_dir():
+            path.parent.mkdir(parents=True, exist_ok=True)
         staging.unlink(missing_ok=True)  # of a run that was killed
         try:
             # "x": never through a link that somebody put there.
