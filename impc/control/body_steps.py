@@ -26,10 +26,7 @@ if TYPE_CHECKING:
 
 
 def body_tape(body: Body | None, n: int, given: int, *, moving: bool) -> tuple[BodyTape, Any]:
-    """A body for the compiled loop, empty where there is none, and what has to live as long.
-
-    With arrays of its own each time, because trials are simulated side by side.
-    """
+    """A body for the compiled loop, empty where there is none, and what has to live as long."""
     if body is None:
         return BodyTape(0, 0, np.zeros(0), np.zeros(0), np.zeros((0, 0))), None
     tape = BodyTape(0, 0, np.zeros(given), np.zeros(n), np.zeros((n, given)))
@@ -61,10 +58,7 @@ def next_state(plant: Plant, x: Array, u: Array, d: Array) -> Array:
 
 
 def pushes(along: Directions, x: Array, u: Array, d: Array) -> Array:
-    """What the parameters in the body add to each derivative of the next state.
-
-    `x` (steps, n); `u` (steps, m); `d` (steps, d); returns (steps, n, p).
-    """
+    """What the parameters in the body add to each derivative of the next state."""
     found = np.zeros((*x.shape, along.count))
     for index, bodies in enumerate(along.bodies):
         for factor, body in bodies:
@@ -81,10 +75,7 @@ def _ahead(body: Body, x: Array, u: Array, d: Array) -> Array:
 
 
 def slopes_along(plant: Plant, x: Array, u: Array, d: Array) -> tuple[Array, Array, Array]:
-    """Derivatives of the next state by state, input and disturbance, at every sample.
-
-    `x` (steps, n); `u` (steps, m); `d` (steps, d).
-    """
+    """Derivatives of the next state by state, input and disturbance, at every sample."""
     n, m, steps = plant.n, plant.m, len(x)
     if plant.body is None:
         A, B, E = (np.broadcast_to(part, (steps, *part.shape)) for part in _matrices(plant))

@@ -19,7 +19,7 @@ from impc.control.named_solver import described
 from impc.errors import InputError
 from impc.inverse.estimates import Estimate
 from impc.inverse.methods import METHODS
-from impc.model.signal_units import gain_unit
+from impc.model.plant import gain_unit
 from impc.reporting.document import Block, Lines, Report, Section, Verdict
 from impc.reporting.finding import Chart, Finding, Picture
 from impc.reporting.provenance import Provenance

@@ -11,7 +11,7 @@ from markupsafe import Markup
 from impc.assess.assessments import ASSESSMENTS
 from impc.control.named_solver import described
 from impc.inverse.methods import METHODS
-from impc.model.signal_units import gain_unit
+from impc.model.plant import gain_unit
 from impc.reporting.document import Lines, Report, Section, Terms, Verdict
 from impc.reporting.finding import Chart, Finding, Picture
 from impc.reporting.shown_units import axis_label

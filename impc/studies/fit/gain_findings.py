@@ -8,9 +8,9 @@ import numpy as np
 import pandas as pd
 
 from impc.assess.covariance import TOLD
-from impc.assess.intervals import entry_names
-from impc.assess.other_models import verdict
-from impc.model.signal_units import UNKNOWN, gain_unit
+from impc.assess.printed_gain import entry_names
+from impc.assess.variance_accounted_for import verdict
+from impc.model.plant import UNKNOWN, gain_unit
 from impc.reporting.finding import Finding, Picture, Severity, table_of
 from impc.studies.fit.verdict import direction_name, other_limit_sentence
 

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.assess.intervals import entry_names
-from impc.model.signal_units import UNKNOWN
+from impc.assess.printed_gain import entry_names
+from impc.model.plant import UNKNOWN
 from impc.reporting.style import BLUE, INK, VERMILLION, new_figure
 from impc.studies.fit.gain_findings import number_name
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from impc.arrays import Array
     from impc.assess.intent_statements import Statement
-    from impc.assess.intervals import Interval
+    from impc.assess.printed_gain import Interval
     from impc.studies.fit.result import FitResult
 
 _WIDTH = 4.2  # inches: 8 points are 9 pixels at the width of a phone

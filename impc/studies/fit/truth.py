@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.assess.intervals import entry_names
+from impc.assess.printed_gain import entry_names
 from impc.files.names import LARGEST
 from impc.reporting.finding import Finding, table_of
 from impc.reporting.rendering import number
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from impc.arrays import Array
-    from impc.assess.intervals import Interval
+    from impc.assess.printed_gain import Interval
     from impc.model.plant import Plant
     from impc.studies.fit.result import FitResult
 
