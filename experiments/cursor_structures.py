@@ -23,11 +23,10 @@ from experiments.cursor_data import Condition, data_file, read_conditions
 from experiments.cursor_tracking import condition_problem
 from impc.assess.covariance import gain_covariance
 from impc.assess.long_run_covariance import residual_noise
-from impc.assess.other_models import residuals_of
 from impc.assess.price_profiles import PriceProfiles
 from impc.assess.structured_weights import tangent
 from impc.assess.structures import StructureFit, assess_structure, criterion_of
-from impc.assess.variance_accounted_for import left_out_vaf, vaf
+from impc.assess.variance_accounted_for import left_out_vaf, residuals_of, vaf
 from impc.control.closed_loop import simulate
 from impc.errors import SolverError, WeightsError
 from impc.inverse.noisy_fit import fit_controller
@@ -124,7 +123,7 @@ def _any_weights(blur: float, problem: Problem, near: Estimate) -> StructureRow:
     held = []
     for index in range(len(problem.recordings)):
         other = fit_controller(problem.leaving_out(index), near.stage_weights)
-        held.append(left_out_vaf(other, problem.recordings[index], 1.0)[0])
+        held.append(left_out_vaf(other, problem.recordings[index], 1.0).vaf)
     at = near.problem, np.array(near.gain), np.array(near.metric)
     told = int(np.count_nonzero(gain_covariance(*at).told))
     roots = np.asarray(residual_noise(residuals_of(near, near.problem)).root)

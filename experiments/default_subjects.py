@@ -20,8 +20,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from impc.assess.intervals import covariance_intervals
-from impc.assess.printed_gain import gain_estimate
+from impc.assess.printed_gain import covariance_intervals, gain_estimate
 from impc.cli.simulate import command
 from impc.cli.subject import read_subject
 from impc.inverse.noisy_fit import fit_controller

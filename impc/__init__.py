@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from impc.assess.expected import expected_intervals as expected_intervals
-    from impc.assess.identified_directions import identifiability as identifiability
     from impc.assess.variance_accounted_for import vaf as vaf
     from impc.assess.variance_accounted_for import whiteness as whiteness
+    from impc.assess.weights_test import identifiability as identifiability
     from impc.control.casadi_controller import mpc_function as mpc_function
     from impc.control.closed_loop import simulate_and_differentiate as simulate_and_differentiate
     from impc.control.constraint_rows import directions as directions
@@ -75,7 +75,7 @@ if TYPE_CHECKING:
 
 _NAMES = {
     "assess.expected": "expected_intervals",
-    "assess.identified_directions": "identifiability",
+    "assess.weights_test": "identifiability",
     "assess.variance_accounted_for": "vaf whiteness",
     "control.casadi_controller": "mpc_function",
     "control.closed_loop": "simulate_and_differentiate",

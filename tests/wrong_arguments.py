@@ -16,8 +16,8 @@ import pandas as pd
 import scipy.sparse
 
 from impc.assess import bounded_weights, expected
-from impc.assess import identified_directions as identifiability
 from impc.assess import variance_accounted_for as agreement
+from impc.assess import weights_test as identifiability
 from impc.checking import replace
 from impc.control import casadi_controller as mpc
 from impc.control import (
@@ -206,8 +206,6 @@ def calls() -> list[Call]:
         (weights.condition_number, {"weights": v["weights"]}),
         (weights.normalised, {"weights": v["weights"]}),
         (weights.weight_error, {"estimate": v["weights"], "truth": v["weights"]}),
-        (weights.cholesky_parameters, {"weights": v["weights"]}),
-        (weights.weights_from_parameters, {"parameters": np.ones(5), "n": 2, "m": 2}),
         (
             recording.Recording,
             {
@@ -247,8 +245,6 @@ def calls() -> list[Call]:
             },
         ),
         (terminal_set.contains, {"terminal": v["terminal"], "x": size}),
-        (terminal_set.invariance_violation, {"terminal": v["terminal"]}),
-        (terminal_set.maximality_violation, {"terminal": v["terminal"]}),
         (
             controller.Controller,
             {**limits, "horizon": 4, "terminal_set": True, "softening": 1e6},

@@ -9,10 +9,11 @@ import cvxpy as cp
 import numpy as np
 import scipy.optimize
 
+from experiments.certificates import weights_from_parameters
 from impc.errors import SolverError
 from impc.model.bounds import bound_rows
 from impc.model.riccati import solve_lqr
-from impc.model.weights import Weights, condition_number, weights_from_parameters
+from impc.model.weights import Weights, condition_number
 
 if TYPE_CHECKING:
     from experiments.benchmarks.workloads import Workload

@@ -14,11 +14,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy.optimize
 
+from experiments.certificates import cholesky_parameters, weights_from_parameters
 from impc.inverse.direct_and_reduced import CONDITION_WEIGHT, inverse_mpc
 from impc.inverse.proximal_search import Residual, weight_jacobian
 from impc.inverse.residuals import evaluate
 from impc.model.riccati import solve_lqr
-from impc.model.weights import cholesky_parameters, condition_number, weights_from_parameters
+from impc.model.weights import condition_number
 
 if TYPE_CHECKING:
     from impc.arrays import Array

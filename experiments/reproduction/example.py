@@ -6,15 +6,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from experiments.certificates import (
+    cholesky_parameters,
+    invariance_violation,
+    maximality_violation,
+    weights_from_parameters,
+)
 from experiments.reproduction.entry import Entry, Verdict, agrees, kind
 from impc.control.casadi_controller import build_mpc, simulate_mpc
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
 from impc.control.simulation import scenario
 from impc.control.terminal_set import (
-    invariance_violation,
     maximal_invariant_set,
-    maximality_violation,
 )
 from impc.errors import InputError
 from impc.inverse.direct_and_reduced import infer_weights, inverse_mpc
@@ -23,7 +27,7 @@ from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.recordings import Recording
 from impc.model.riccati import solve_lqr
-from impc.model.weights import Weights, cholesky_parameters, weights_from_parameters
+from impc.model.weights import Weights
 from impc.studies.example.cases import BOUND, CASES, HORIZON, STEPS
 from plants import yalmip_example
 
@@ -132,10 +136,7 @@ def controller_entries() -> list[Entry]:
         Entry(
             "(3.6)",
             "The same with R = 1, Q = LL', L lower triangular with positive diagonal.",
-            (
-                "impc.inverse.direct_and_reduced:inverse_mpc",
-                "impc.model.weights:cholesky_parameters",
-            ),
+            ("impc.inverse.direct_and_reduced:inverse_mpc",),
             f"From Q = diag(2, 0.5): Q = I to {off:.0e}; L and back:"
             f" {float(np.max(np.abs(factor.Q - np.eye(2)))):.0e}.",
             agrees(off < 1e-6),
@@ -144,7 +145,7 @@ def controller_entries() -> list[Entry]:
             "(3.7)",
             "Auxiliary problem: weights with a gain near the estimated one, and a small condition"
             " number; where inverse MPC starts.",
-            ("impc.inverse.nearest_regulator:auxiliary_weights",),
+            ("impc.inverse.proximal_search:auxiliary_weights",),
             "Used on the gradient branch; its result in the example is under (3.14).",
             Verdict.IN_KIND,
             "Whether the gain estimated from data or the one of the gradient problem is fitted is"
@@ -301,7 +302,7 @@ def example_entries(evidence: Evidence) -> list[Entry]:
             "Claim, 3.3",
             "Minimising the condition number addresses the uniqueness of the solution.",
             (
-                "impc.assess.identified_directions:identifiability",
+                "impc.assess.weights_test:identifiability",
                 "impc.inverse.equivalent_weights",
             ),
             f"{case['identifiability']['rank']} of {case['identifiability']['free']} directions"

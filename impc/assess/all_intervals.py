@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from impc.assess.input_limits import input_limit
-from impc.assess.intervals import LEVEL, Interval, covariance_intervals
-from impc.assess.other_models import fit_alternatives
+from impc.assess.printed_gain import LEVEL, Interval, covariance_intervals
 from impc.assess.profiles import profile_likelihood, require_numbers
 from impc.assess.resampling import (
     DRAWS,
@@ -24,14 +23,15 @@ from impc.assess.resampling import (
     bootstrap_model,
     replicate,
 )
+from impc.assess.variance_accounted_for import fit_alternatives
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from impc.assess.input_limits import LimitEstimate
-    from impc.assess.other_models import Alternative
     from impc.assess.printed_gain import GainEstimate
     from impc.assess.resampling import Replicate
+    from impc.assess.variance_accounted_for import Alternative
     from impc.assess.weights_ranges import WeightsSummary
     from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
@@ -108,10 +108,7 @@ def assess(
     remember: Callable[[str, Callable[[], Replicate]], Replicate],
     attempt: Attempt,
 ) -> Certainty:
-    """Run what the settings ask for.
-
-    `remember` (name, compute); `attempt` (stage, compute, default).
-    """
+    """Run what the settings ask for."""
     intervals = [
         *covariance_intervals(estimate, estimate.covariance, "sandwich"),
         *covariance_intervals(estimate, estimate.white, "cramer-rao"),

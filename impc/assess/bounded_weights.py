@@ -81,10 +81,7 @@ class WeightsSet(Frozen):
 
 @checked
 def weights_set(fibre: GainFibre, ratio: float = 10.0, *, rough: bool = False) -> WeightsSet:
-    """Prepare the set of weights with condition number up to `ratio` times the least.
-
-    `rough` as in `least_condition_weights`.
-    """
+    """Prepare the set of weights with condition number up to `ratio` times the least."""
     if not 1 < ratio < np.inf:
         raise InputError("ratio", f"got {ratio}", "give a number above 1")
     least = least_condition_weights(fibre, rough=rough)
@@ -164,10 +161,7 @@ class Range:
 def linear_ranges(
     found: WeightsSet, directions: Array, *, tolerance: float = _GAP
 ) -> tuple[Range, ...]:
-    """Range over the set of each trace(direction blkdiag(Q, R)).
-
-    `directions` (k, n + m, n + m).
-    """
+    """Range over the set of each trace(direction blkdiag(Q, R)); `directions` (k, n + m, n + m)."""
     ends = _minima(found, np.concatenate([directions, -directions]), tolerance)
     half = len(directions)
     return tuple(
@@ -179,10 +173,7 @@ def linear_ranges(
 def linear_maxima(
     found: WeightsSet, directions: Array, *, tolerance: float = _GAP
 ) -> tuple[End, ...]:
-    """Largest value over the set of each trace(direction blkdiag(Q, R)).
-
-    `directions` (k, n + m, n + m) and `tolerance` as in `linear_ranges`.
-    """
+    """Largest value over the set of each trace(direction blkdiag(Q, R))."""
     return tuple(_negative(end) for end in _minima(found, -directions, tolerance))
 
 
@@ -239,10 +230,7 @@ def _bound(constant: float, scale: float, solved: SemidefiniteSolution) -> float
 
 
 def _member(found: WeightsSet, y: Array) -> Array:
-    """The point of a program, drawn towards the centre until it is a member beyond doubt.
-
-    A program's error, 1e-8 of the largest weight, can outweigh the least eigenvalue.
-    """
+    """The point of a program, drawn towards the centre until it is a member beyond doubt."""
     X = found.first + np.tensordot(y[: len(found.level)], found.level, 1)
     X = (X + X.T) / 2
     n = found.fibre.plant.n

@@ -107,10 +107,7 @@ def gain_covariance(
     curvature: bool = False,
     evaluation: Evaluation | None = None,
 ) -> GainCovariance:
-    """Covariance of a gain fitted by least squares, and of the parameters fitted with it.
-
-    `gain` (m, n); `metric` (m, m); `noise` (samples, p).
-    """
+    """Covariance of a gain fitted by least squares, and of the parameters fitted with it."""
     m, n = problem.plant.m, problem.plant.n
     T, G = natural_coordinates(problem.plant, gain)
     found = evaluation or evaluate(problem, gain, metric)
@@ -168,11 +165,7 @@ def _shifts(problem: Problem, gain: Array, metric: Array, steps: Array) -> Array
 
 
 def _entries(back: Array, deviations: Array, spread: Array) -> tuple[Array, Array]:
-    """Deviations of the entries, and the share in each of what is not told.
-
-    Where an entry is told, that share is in its deviation. `back` turns steps along the directions
-    into entries, one direction a column.
-    """
+    """Deviations of the entries, and the share in each of what is not told."""
     usable, told = np.isfinite(deviations), deviations < TOLD
     own = spread[np.ix_(told[usable], told[usable])]
     by_itself = np.sqrt(np.maximum(np.diag(back[:, told] @ own @ back[:, told].T), 0.0))

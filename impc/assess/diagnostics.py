@@ -52,10 +52,7 @@ class ResidualDiagnostics:
 
 
 def residual_diagnostics(problem: Problem, gain: Array, metric: Array) -> ResidualDiagnostics:
-    """Run both tests.
-
-    `gain` (m, n); `metric` (m, m).
-    """
+    """Run both tests; `gain` (m, n); `metric` (m, m)."""
     found = evaluate(problem, gain, metric)
     if found.reason:
         return ResidualDiagnostics(None, None)
@@ -147,10 +144,7 @@ class ResidualStructure:
 def residual_structure(
     problem: Problem, gain: Array, found: Evaluation
 ) -> ResidualStructure | None:
-    """Test both families.
-
-    `gain` (m, n).
-    """
+    """Test both families; `gain` (m, n)."""
     problem, found = _thinned(problem, found)
     p = len(problem.plant.outputs)
     lengths = [trial.samples for trial in problem.recordings]

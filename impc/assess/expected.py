@@ -23,9 +23,9 @@ import scipy.special
 from impc.arrays import Array, Frozen, finite_array, frozen, with_shape
 from impc.assess.covariance import GainCovariance, by_trial, gain_covariance
 from impc.assess.input_limits import on_limit
-from impc.assess.intervals import LEVEL
 from impc.assess.long_run_covariance import ResidualNoise, spread_of_sum
 from impc.assess.price_profiles import PriceInterval, PriceProfiles
+from impc.assess.printed_gain import LEVEL
 from impc.assess.structured_weights import PriceCovariance, price_covariance, tangent
 from impc.checking import checked, replace
 from impc.errors import InputError

@@ -22,8 +22,8 @@ import scipy.special
 
 from impc.arrays import Array, Frozen, frozen
 from impc.assess.covariance import by_trial
-from impc.assess.intervals import LEVEL
 from impc.assess.long_run_covariance import residual_noise, spread_of_sum, white_noise
+from impc.assess.printed_gain import LEVEL
 from impc.checking import replace
 from impc.control.closed_loop import simulate_and_differentiate
 from impc.control.constraint_rows import directions
@@ -259,10 +259,7 @@ def _colour_factor(fit: GainFit, limit: float, control: int) -> float:
 
 
 def on_limit(problem: Problem, gain: Array, metric: Array, limit: float, control: int = 0) -> Array:
-    """Derivative of the residual with respect to the symmetric limit of one input (r,).
-
-    `gain` (m, n); `metric` (m, m).
-    """
+    """Derivative of the residual with respect to the symmetric limit of one input (r,)."""
     controller = controller_for(problem, gain, metric)
     rows = bound_rows(controller.bounds, problem.plant)
     moves = np.abs(rows.F[:, control]) * np.isclose(np.abs(rows.b), limit)
@@ -277,10 +274,7 @@ def on_limit(problem: Problem, gain: Array, metric: Array, limit: float, control
 def _crossing(
     distance: Callable[[float], float], inside: float, outside: float, quantile: float
 ) -> float:
-    """Limit between two at which D passes the quantile; the outer one when it does not.
-
-    Steps from inside grow until D is beyond: an interval may be a thousandth of the limit.
-    """
+    """Limit between two at which D passes the quantile; the outer one when it does not."""
     step = _RESOLUTION * inside
     while step < abs(outside - inside):
         there = inside + np.sign(outside - inside) * step

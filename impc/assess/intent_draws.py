@@ -27,6 +27,7 @@ from impc.assess.bounded_weights import linear_maxima, linear_ranges, weights_se
 from impc.assess.intent_statements import price_direction
 from impc.checking import replace
 from impc.errors import SolverError, WeightsError
+from impc.inverse.proximal_step import block_basis
 from impc.inverse.solution_set import gain_fibre
 from impc.model.riccati import gain_gradients, solve_lqr
 from impc.model.weights import Weights
@@ -85,10 +86,7 @@ def drawn_gains(
     covariance: GainCovariance,
     count: int = DRAWS,
 ) -> tuple[LqrSolution, ...]:
-    """Regulators whose gains the recordings allow.
-
-    `gain` (m, n).
-    """
+    """Regulators whose gains the recordings allow; `gain` (m, n)."""
     rng = np.random.default_rng(0)
     n = plant.n
     factor: Array = np.asarray(np.linalg.cholesky(weights.block), dtype=np.float64)
@@ -126,12 +124,9 @@ def drawn_gains(
 def _directions(
     centre: LqrSolution, factor: Array, covariance: GainCovariance, deviations: Array
 ) -> tuple[Array, Array, Array]:
-    """Steps D that move the gain (k, n + m, n + m), and the left singular vectors and values.
-
-    Those of the derivative of the gain, in the covariance's directions and deviations, along D.
-    """
+    """Steps D that move the gain (k, n + m, n + m), and the left singular vectors and values."""
     n, m = centre.plant.n, centre.plant.m
-    basis = _symmetric_blocks(n, m)
+    basis = block_basis(n, m)
     moved = factor @ basis @ factor.T
     slopes = gain_gradients(centre)
     dK = np.einsum("abij,kij->kab", slopes.Q, moved[:, :n, :n])
@@ -157,10 +152,7 @@ def with_confidence(
 def prices_over_gains(
     own: Mapping[str, tuple[float, float]], sets: tuple[DrawnSet, ...]
 ) -> tuple[PriceRange, ...]:
-    """Prices of some states, over the weights of the fitted gain and of those drawn.
-
-    `own` (float, float).
-    """
+    """Prices of some states, over the weights of the fitted gain and of those drawn."""
     result = []
     for position, (name, (low, high)) in enumerate(own.items()):
         ends = [one.prices[position] for one in sets]
@@ -178,10 +170,7 @@ def set_of_gain(
     states: tuple[str, ...],
     statements: tuple[Statement, ...],
 ) -> DrawnSet:
-    """What holds for all weights of a drawn gain.
-
-    `metrics` (k, m, m); `sizes` (n,).
-    """
+    """What holds for all weights of a drawn gain; `metrics` (k, m, m); `sizes` (n,)."""
     tried = [item for item in statements if item.holds is not None]
     try:
         own = np.concatenate([np.array(solution.S)[None], metrics[1:]])
@@ -250,15 +239,3 @@ def _slice(
             return moved, there
         low, high = (angle, high) if angle < 0 else (low, angle)
         angle = rng.uniform(low, high)
-
-
-def _symmetric_blocks(n: int, m: int) -> Array:
-    """Orthonormal basis of blkdiag(D_Q, D_R), symmetric, (k, n + m, n + m)."""
-    found = []
-    for first, last in ((0, n), (n, n + m)):
-        for i in range(first, last):
-            for j in range(first, i + 1):
-                D = np.zeros((n + m, n + m))
-                D[i, j] = D[j, i] = 1.0 if i == j else np.sqrt(0.5)
-                found.append(D)
-    return np.array(found)

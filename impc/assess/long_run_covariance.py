@@ -62,26 +62,17 @@ class ResidualNoise(Frozen):
 
 
 def residual_noise(trials: list[Array], fitted: TrialSpan | None = None) -> ResidualNoise:
-    """Estimate the colour of residuals.
-
-    `trials` (samples, p).
-    """
+    """Estimate the colour of residuals; `trials` (samples, p)."""
     return _restored(_first_order, trials, fitted)
 
 
 def white_noise(trials: list[Array], fitted: TrialSpan | None = None) -> ResidualNoise:
-    """As `residual_noise` if the residuals were white: outputs may be correlated, samples not.
-
-    `trials` (samples, p).
-    """
+    """As `residual_noise` if the residuals were white: outputs may be correlated, samples not."""
     return _restored(_white, trials, fitted)
 
 
 def spread_of_sum(noise: ResidualNoise, columns: list[Array]) -> Array:
-    """Covariance of sum over trials and samples of columns_t' e_t, (k, k).
-
-    `columns` (samples, p, k).
-    """
+    """Covariance of sum over trials and samples of columns_t' e_t, (k, k)."""
     count = columns[0].shape[2]
     result = np.zeros((count, count))
     for part in columns:

@@ -94,10 +94,7 @@ def spectrum(residuals: list[Array]) -> Spectrum | None:
 
 
 def loop_shapes(plant: Plant, gain: Array, found: Spectrum) -> Complex:
-    """G_j G_j* of each input, averaged over each bin, outputs over their size (b, m, p, p).
-
-    `gain` (m, n).
-    """
+    """G_j G_j* of each input, averaged over each bin, outputs over their size (b, m, p, p)."""
     closed = plant.A - plant.B @ gain
     shares = (np.arange(_INSIDE) + 0.5) / _INSIDE
     angles = found.edges[:-1, None] + np.diff(found.edges)[:, None] * shares
@@ -113,10 +110,7 @@ def size(p: int) -> int:
 
 
 def outputs(theta: Array, found: Spectrum) -> tuple[Complex, Callable[[Complex], Array]]:
-    """S_0 (b, p, p), and what reads its gradient off W (b, p, p) as in the module's text.
-
-    `theta` (any,).
-    """
+    """S_0 (b, p, p), and what reads its gradient off W (b, p, p) as in the module's text."""
     p = len(found.size)
     H, slopes = _filters(theta[: ORDER * p].reshape(p, ORDER), found.angles)
     factor, free = np.zeros((p, p)), np.ones((p, p))
@@ -141,10 +135,7 @@ def outputs(theta: Array, found: Spectrum) -> tuple[Complex, Callable[[Complex],
 
 
 def _filters(theta: Array, angles: Array) -> tuple[Complex, Complex]:
-    """H (b, p) of each output, and its slopes along the arguments of its reflections (b, p, r).
-
-    With k a reflection and a the polynomial so far in z^-1, the next is (a, 0) + k (0, a reversed).
-    """
+    """H (b, p) of each output, and its slopes along the arguments of its reflections (b, p, r)."""
     powers = np.exp(-1j * np.outer(angles, np.arange(ORDER + 1)))
     arguments, free = _clipped(theta, -_REFLECTION, _REFLECTION)
     reflections = np.tanh(arguments)
@@ -164,10 +155,7 @@ def _filters(theta: Array, angles: Array) -> tuple[Complex, Complex]:
 def loops(
     theta: Array, shapes: Complex, found: Spectrum
 ) -> tuple[Complex, Callable[[Complex], Array]]:
-    """G W G* (b, p, p), and what reads its gradient off as for `outputs`.
-
-    `theta` (m + 1,); `shapes` (b, m, p, p).
-    """
+    """G W G* (b, p, p), and what reads its gradient off as for `outputs`."""
     logs, moving = _clipped(theta[:-1], *_VARIANCE)
     root, variances = root_of(theta), np.exp(logs)
     free = _clipped(theta[-1], -_ROOT, _ROOT)[1]
@@ -228,10 +216,7 @@ class LoopNoise:
 
 
 def loop_noise(plant: Plant, gain: Array, residuals: list[Array]) -> LoopNoise | None:
-    """Compare the two models on the residuals of a fit.
-
-    `gain` (m, n); `residuals` (samples, p).
-    """
+    """Compare the two models on the residuals of a fit; `gain` (m, n); `residuals` (samples, p)."""
     found = spectrum(residuals)
     if found is None:
         return None

@@ -30,7 +30,7 @@ import scipy.optimize
 import scipy.stats
 
 from impc.arrays import Array
-from impc.assess.intervals import LEVEL
+from impc.assess.printed_gain import LEVEL
 from impc.assess.structured_weights import tangent
 from impc.errors import WeightsError
 from impc.inverse.residuals import scaled_changes
@@ -69,10 +69,7 @@ class NearFit:
         self.rest = float(residual @ residual - self.inside @ self.inside)
 
     def least(self, z: Array, along: Array, aim: LqrSolution | None = None) -> tuple[float, Array]:
-        """Least m^2 from z along columns, and the unknowns there.
-
-        `z` (count,); `along` (moving, a); returns (count,).
-        """
+        """Least m^2 from z along columns, and the unknowns there."""
         moving = np.isfinite(z)
         offset, rest = self.inside, self.rest
         if aim is not None:
@@ -173,10 +170,7 @@ class PriceProfiles:
         self.base = self.near.least(np.array(at.prices), np.eye(int(np.sum(at.moving))))[0]
 
     def interval(self, combination: Array, level: float = LEVEL) -> PriceInterval:
-        """Interval of a'z.
-
-        `combination` (count,).
-        """
+        """Interval of a'z; `combination` (count,)."""
         deviation, wider = self.covariance.spread(combination)
         quantile = float(scipy.stats.chi2.ppf(level, 1)) * wider**2
         moving, prices = self.at.moving, np.array(self.at.prices)

@@ -28,7 +28,7 @@ import scipy.optimize
 import scipy.special
 
 from impc.arrays import Array, Frozen, frozen
-from impc.assess.intervals import LEVEL, Interval, entry_names
+from impc.assess.printed_gain import LEVEL, Interval, entry_names
 from impc.errors import InputError
 from impc.inverse.coordinates import PARAMETER_UNIT, Coordinates
 

@@ -23,8 +23,7 @@ import numpy as np
 import scipy.signal
 
 from impc.arrays import Array, Frozen, frozen
-from impc.assess.intervals import Interval, entry_names
-from impc.assess.printed_gain import told_gain
+from impc.assess.printed_gain import Interval, entry_names, told_gain
 from impc.checking import replace
 from impc.inverse.problem import simulated
 
@@ -60,10 +59,7 @@ class BootstrapModel(Frozen):
 
 
 def bootstrap_model(problem: Problem, gain: Array, metric: Array) -> BootstrapModel:
-    """Simulate an estimate once, for all replicates.
-
-    `gain` (m, n); `metric` (m, m).
-    """
+    """Simulate an estimate once, for all replicates; `gain` (m, n); `metric` (m, m)."""
     runs = simulated(problem, gain, metric)
     outputs = tuple(frozen(run.x @ problem.plant.C.T) for run in runs)
     return BootstrapModel(problem, frozen(gain), frozen(metric), outputs)

@@ -72,10 +72,7 @@ class Tangent(Frozen):
         return np.isfinite(self.prices)
 
     def without_nuisance(self, columns: Array, *beside: Array) -> Array:
-        """What initial states, parameters and others cannot make up of columns.
-
-        `columns` (r, a); `*beside` (r, b); returns (r, a).
-        """
+        """What initial states, parameters and others cannot make up of columns."""
         return self.span(*beside).without(columns)
 
     def span(self, *beside: Array) -> TrialSpan:
@@ -84,10 +81,7 @@ class Tangent(Frozen):
         return trial_span(self.found.dx0, sizes, np.hstack([self.on_parameters, *beside]))
 
     def gain_columns(self) -> tuple[Array, Array]:
-        """Derivatives with respect to gain and metric.
-
-        Returns (r, mn), (r, b).
-        """
+        """Derivatives with respect to gain and metric."""
         gain, metric = np.array(self.solution.K), np.array(self.solution.S)
         T, G = natural_coordinates(self.problem.plant, gain)
         on_metric = self.found.along_metric(metric, metric_directions(metric))
@@ -162,10 +156,7 @@ class PriceCovariance(Frozen):
 def price_covariance(
     at: Tangent, noise: NoiseModel = residual_noise, white: NoiseModel = white_noise
 ) -> PriceCovariance:
-    """Covariance of the unknowns of a structured fit.
-
-    `noise, white` (samples, p).
-    """
+    """Covariance of the unknowns of a structured fit; `noise, white` (samples, p)."""
     values, chain = at.structure.reported(at.prices)
     moving = at.moving
     slopes = np.linalg.inv(chain[np.ix_(moving, moving)])

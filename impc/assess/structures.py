@@ -1,7 +1,7 @@
 """What recordings say of structures: prices with intervals, whether each is true, which is better.
 
 Each structure is fitted from the weights that fit at all, and again without each trial in turn. The
-criterion is Akaike's for the innovations of the residuals (`other_models`), with two for each
+criterion is Akaike's for the innovations of the residuals (`variance_accounted_for`), with two
 combination of unknowns that the recordings tell (docs/structures.md).
 
 Is a structure true? A score test of it against any gain, for residuals of any colour.
@@ -30,12 +30,16 @@ import scipy.stats
 
 from impc.arrays import Array, Frozen, frozen
 from impc.assess.covariance import TOLD, by_trial
-from impc.assess.intervals import LEVEL
 from impc.assess.long_run_covariance import residual_noise, spread_of_sum
-from impc.assess.other_models import innovations_criterion, residuals_of
 from impc.assess.price_profiles import NearFit, PriceInterval, PriceProfiles
+from impc.assess.printed_gain import LEVEL
 from impc.assess.structured_weights import PriceCovariance, price_covariance, tangent
-from impc.assess.variance_accounted_for import left_out_vaf, vaf
+from impc.assess.variance_accounted_for import (
+    innovations_criterion,
+    left_out_vaf,
+    residuals_of,
+    vaf,
+)
 from impc.control.closed_loop import simulate
 from impc.inverse.problem import EXPLAINED, recorded_size, scenarios
 from impc.inverse.structured_fit import feature_sizes, structured_estimate
@@ -156,7 +160,7 @@ def _left_out(problem: Problem, structure: Structure, end: Estimate, settle: flo
         others = start.leaving_out(index)
         one = search_from(others, structure, prices)
         other = structured_estimate(others, structure, one)
-        found.append(left_out_vaf(other, problem.recordings[index], settle)[0])
+        found.append(left_out_vaf(other, problem.recordings[index], settle).vaf)
     return found
 
 
@@ -253,10 +257,7 @@ def structure_test(at: Tangent) -> StructureTest:
 
 
 def _powers(at: Tangent, variance: float, freedom: int) -> tuple[CrossTerm, ...]:
-    """What the test would see: how far prices one by one stay from what a cross term does.
-
-    `variance` is that of a residual along the directions tested, its colour counted.
-    """
+    """What the test would see: how far prices one by one stay from what a cross term does."""
     structure, near = at.structure, NearFit(at)
     if structure.coupled:
         return ()

@@ -69,10 +69,7 @@ def summarise_weights(
     sizes: Array,
     draws: tuple[LqrSolution, ...] = (),
 ) -> WeightsSummary:
-    """Run the programs over the set of weights of a gain.
-
-    `gain` (m, n); `metrics` (k, m, m); `sizes` (n,).
-    """
+    """Run the programs over the set of weights of a gain."""
     found = weights_set(gain_fibre(plant, gain, metrics), RATIO)
     named = _shown(plant, found.least.weights, sizes)
     names = tuple(plant.states[index] for index in named)
@@ -111,10 +108,7 @@ def weights_summary_or_reason(
     sizes: Array,
     draws: tuple[LqrSolution, ...] = (),
 ) -> tuple[WeightsSummary | None, str]:
-    """The summary, or None and why there is none.
-
-    `gain` (m, n); `metrics` (k, m, m); `sizes` (n,).
-    """
+    """The summary, or None and why there is none."""
     try:
         return summarise_weights(plant, gain, metrics, sizes, draws=draws), ""
     except (WeightsError, SolverError) as error:

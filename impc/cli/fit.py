@@ -117,7 +117,7 @@ def _own_problem(
 
 def _print(result: FitResult) -> None:
     """The table of methods and the intent, as the page has them."""
-    from impc.assess.intent_rules import dominant_sentence  # noqa: PLC0415
+    from impc.assess.intent_statements import dominant_sentence  # noqa: PLC0415
     from impc.studies.fit.structure_words import structure_sentences  # noqa: PLC0415
     from impc.studies.fit.verdict import verdict  # noqa: PLC0415
     from impc.studies.methods_table import methods_finding  # noqa: PLC0415

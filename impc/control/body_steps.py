@@ -53,10 +53,7 @@ def next_state(plant: Plant, x: Array, u: Array, d: Array) -> Array:
 
 
 def pushes(along: Directions, x: Array, u: Array, d: Array) -> Array:
-    """What the parameters in the body add to each derivative of the next state.
-
-    `x` (steps, n); `u` (steps, m); `d` (steps, d); returns (steps, n, p).
-    """
+    """What the parameters in the body add to each derivative of the next state."""
     found = np.zeros((*x.shape, along.count))
     for index, bodies in enumerate(along.bodies):
         for factor, body in bodies:
@@ -73,10 +70,7 @@ def _ahead(body: Body, x: Array, u: Array, d: Array) -> Array:
 
 
 def slopes_along(plant: Plant, x: Array, u: Array, d: Array) -> tuple[Array, Array, Array]:
-    """Derivatives of the next state by state, input and disturbance, at every sample.
-
-    `x` (steps, n); `u` (steps, m); `d` (steps, d).
-    """
+    """Derivatives of the next state by state, input and disturbance, at every sample."""
     n, m, steps = plant.n, plant.m, len(x)
     if plant.body is None:
         A, B, E = (np.broadcast_to(part, (steps, *part.shape)) for part in _matrices(plant))

@@ -22,7 +22,7 @@ from impc.checking import checked
 from impc.control.body_steps import next_state
 from impc.control.constraint_rows import build_rows
 from impc.control.controller import Controller
-from impc.control.named_solver import excluded_row, plugin, silent
+from impc.control.named_solver import PLUGINS, SOLVERS, excluded_row, silent
 from impc.control.simulation import Simulation, Status
 from impc.errors import InputError
 
@@ -38,9 +38,6 @@ if TYPE_CHECKING:
 _DAQP_SLACK = 1e-8
 # A row that is exceeded by this share of its bound is not kept, whatever the solver's flag says.
 _EXCEEDED = 1e-6
-
-#: Names of the solvers that `build_mpc` takes.
-SOLVERS = ("daqp", "qpoases", "ipopt")
 
 
 @dataclass(frozen=True)
@@ -102,7 +99,7 @@ def build_mpc(controller: Controller, solver: str = "daqp") -> MpcSolver:
             - ca.mtimes(ca.DM(placed / rows.b[:, None]), slack)
         ),
     }
-    name, options = plugin(solver)
+    name, options = PLUGINS[solver]
     if soft.any():  # qpOASES loses a program with a singular Hessian when it begins without bounds
         options = {key: value for key, value in options.items() if key != "initialStatusBounds"}
     with silent():
@@ -112,10 +109,7 @@ def build_mpc(controller: Controller, solver: str = "daqp") -> MpcSolver:
 
 @checked(x="n")
 def solve_mpc(mpc: MpcSolver, x: ArrayLike) -> MpcStep:
-    """Solve the program at a state.
-
-    `x` (n,).
-    """
+    """Solve the program at a state; `x` (n,)."""
     controller, rows = mpc.controller, mpc.rows
     state = finite_array("x", x, (controller.plant.n,))
     width, slacks = rows.M.shape[1], int(mpc.soft.sum())

@@ -162,10 +162,7 @@ def run_loop(
 
 
 def _pushes(prepared: PreparedLoop, given: Scenario) -> Array:
-    """What parameters in the body add to the derivatives, along the trajectory.
-
-    (steps, n, p), or nothing. The trajectory is simulated first, without derivatives.
-    """
+    """What parameters in the body add to the derivatives, along the trajectory."""
     controller, along = prepared.controller, prepared.along
     if not any(along.bodies):
         return np.zeros((0, controller.plant.n, along.count))

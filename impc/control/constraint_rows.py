@@ -48,10 +48,7 @@ class Rows(NamedTuple):
 
 
 class RowDirections(NamedTuple):
-    """Derivatives of `Rows` along p directions, which are the last axis of every array.
-
-    The axis is last so that the innermost loops of the compiled code run over contiguous memory.
-    """
+    """Derivatives of `Rows` along p directions, which are the last axis of every array."""
 
     T: Array  # (r, n, p)
     M: Array  # (r, N m, p)
@@ -197,10 +194,7 @@ def _powers(controller: Controller, bounds: BoundRows, last: int) -> Array:
 def _inputs(
     controller: Controller, family: IntArray, stage: IntArray, response: Array, direct: Array
 ) -> Array:
-    """Place the response H Phi^j B at column k - 1 - j, and the direct term at column k < N.
-
-    Both may have one axis more, of directions.
-    """
+    """Place the response H Phi^j B at column k - 1 - j, and the direct term at column k < N."""
     horizon, m = controller.horizon, controller.plant.m
     placed = np.zeros((len(family), horizon, *direct.shape[1:]))
     delay = stage[:, None] - 1 - np.arange(horizon)

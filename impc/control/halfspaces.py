@@ -1,4 +1,4 @@
-"""Geometry of sets {z : Z z <= 1}: supports by linear programming, needed rows.
+"""Geometry of sets {z : Z z <= 1}: supports by linear programming, needed rows, corners.
 
 What `terminal_set` needs of it (Gilbert and Tan 1991).
 
@@ -14,16 +14,20 @@ active) and mu, and when both are feasible the two are optimal, by duality and w
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.optimize import linprog
 from scipy.sparse import csc_array
+from scipy.spatial import HalfspaceIntersection
 
-from impc.errors import SolverError
+from impc.errors import InputError, SolverError
+from impc.extras import optional
 
 if TYPE_CHECKING:
     from impc.arrays import Array, BoolArray, IntArray
+    from impc.control.terminal_set import TerminalSet
+
 
 # A direction that the normalised rows see less than this, relative to the best seen one, counts
 # as unbounded: rounding (2e-16) would move the set along it by more than 1e-6 of its size.
@@ -55,10 +59,7 @@ def seen_directions(rows: Array) -> Array:
 def supports(
     Z: Array, targets: Array, own: IntArray | None = None, hints: IntArray | None = None
 ) -> tuple[Array, IntArray]:
-    """Support of each target row d over {z : Z z <= 1, d z <= 2}.
-
-    `Z` (s, q); `targets` (t, q); `own` (t,); `hints` (t, q); returns (t,), (t, q).
-    """
+    """Support of each target row d over {z : Z z <= 1, d z <= 2}."""
     count, q = targets.shape
     values, bases = np.zeros(count), np.full((count, q), -1)
     for start in range(0, count, _BATCH):
@@ -204,3 +205,33 @@ def _first_hit(Z: Array, mirrored: bool, factor: float) -> BoolArray:
         clear = reach[order[-1], columns] > factor * reach[order[-2], columns]
         hit[order[-1, clear]] = True
     return hit
+
+
+def polygon(terminal: TerminalSet) -> Array:
+    """Corners (v, 2) of a bounded set of two states, counter-clockwise, in the units of x."""
+    n = terminal.H.shape[1]
+    if n != 2:
+        raise InputError("terminal set", f"has {n} states", "corners are drawn for two")
+    rows = terminal.H / terminal.h[:, None]
+    scale = np.max(np.abs(rows), axis=0, initial=0.0)
+    rows = rows / np.where(scale > 0, scale, 1.0)
+    # Bounded: the normals leave no half plane free, so no gap between neighbours reaches pi.
+    angles = np.sort(np.arctan2(rows[:, 1], rows[:, 0]))
+    gaps = np.diff(angles, append=angles[:1] + 2 * np.pi)
+    if np.max(gaps, initial=0.0 if len(gaps) else np.inf) >= np.pi - 1e-9:
+        remedy = "bound the states or inputs that show that direction, from both sides"
+        raise InputError("terminal set", "is unbounded and has no polygon", remedy)
+    halves = np.column_stack([rows, -np.ones(len(rows))])
+    corners = HalfspaceIntersection(halves, np.zeros(2)).intersections
+    order = np.argsort(np.arctan2(corners[:, 1], corners[:, 0]))
+    return np.asarray(corners[order] / scale)
+
+
+def as_pytope(terminal: TerminalSet) -> Any:
+    """Return the set as a `pytope.Polytope` in half-space form; pytope finds corners when asked."""
+    pytope = optional("pytope", "terminal set")
+    if not len(terminal.h):
+        raise InputError("terminal set", "is the whole space", "give at least one bound")
+    # pytope 0.0.4 squeezes the right side to a scalar when there is one row: state it twice.
+    twice = slice(None) if len(terminal.h) > 1 else [0, 0]
+    return pytope.Polytope(np.array(terminal.H[twice]), np.array(terminal.h[twice]))

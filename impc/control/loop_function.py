@@ -6,21 +6,16 @@ active set's equations, docs/theory.md, section 4),
 
     du_t = L_t dx_t + G_t dtheta,      dx_{t+1} = A dx_t + B du_t + E dd_t,
 
-A, B and E being the slopes of the plant's body at the sample, where it has one,
-
-and every derivative is a pass over these: forward as written, in reverse by the adjoint
-
-    p_t = xbar_t + L_t'ubar_t + (A + B L_t)'p_{t+1},     p_T = xbar_T,
-    thetabar = sum G_t'(ubar_t + B'p_{t+1}),    x0bar = p_0,    dbar_t = E'p_{t+1}.
-
-theta are the entries of K and of the scaled metric. The terminal set is made anew for every gain,
-by linear programs whose number depends on it: no graph of fixed size has it, and so the loop cannot
-be saved or turned into C. The controller at one state can (`casadi_controller.mpc_function`).
+A, B and E being the slopes of the plant's body at the sample, where it has one. theta are the
+entries of K and of the scaled metric. One pass over these is the Jacobian, which CasADi is given.
+The terminal set is made anew for every gain, by linear programs whose number depends on it: no
+graph of fixed size has it, and so the loop cannot be saved or turned into C. The controller at one
+state can (`casadi_controller.mpc_function`).
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
@@ -28,7 +23,6 @@ import numpy as np
 from impc.arrays import Array, frozen
 from impc.checking import checked
 from impc.control.body_steps import slopes_along
-from impc.control.casadi_callback import Linear, Matrix, Signature, differentiable
 from impc.control.closed_loop import prepare_loop, run_loop
 from impc.control.constraint_rows import directions
 from impc.control.controller import Controller
@@ -38,11 +32,17 @@ from impc.model.riccati import regulator_changes, solve_lqr
 from impc.model.weights import Weights
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
     from numpy.typing import ArrayLike
 
-    from impc.control.simulation import Simulation
-    from impc.control.terminal_set import TerminalSet
+    from impc.model.plant import Plant
     from impc.model.riccati import LqrSolution
+
+    Shapes = dict[str, tuple[int, int]]
+
+# CasADi's graphs do not keep alive what they call in Python: a function that is made stays.
+_alive: list[Any] = []
 
 
 @checked(steps=(1, 10_000_000))
@@ -106,10 +106,10 @@ def closed_loop_function(
         raise InputError("of", f"got {of!r}", "choose gain or weights")
     plant = controller.plant
     drive = scenario(plant, np.zeros(plant.n), steps, disturbance).disturbance
-    loop = differentiable("closed_loop", _LoopOfGain(controller, drive, disturbance is not None))
+    loop = _loop_of_gain(controller, drive, disturbance is not None)
     if of == "gain":
         return loop
-    regulator = differentiable("regulator", _RegulatorOfWeights(controller))
+    regulator = _regulator_of_weights(controller.plant)
     Q, R = ca.MX.sym("Q", plant.n, plant.n), ca.MX.sym("R", plant.m, plant.m)
     given = {"Q": Q, "R": R, "x0": ca.MX.sym("x0", plant.n)}
     if disturbance is None:
@@ -118,182 +118,195 @@ def closed_loop_function(
     return ca.Function("closed_loop", [*given.values()], [x, u], [*given], ["x", "u"])
 
 
-class _LoopOfGain:
+class _Matrices(ca.Callback):
+    """Matrices from matrices, as CasADi calls what is evaluated; with their Jacobian."""
+
+    def __init__(
+        self,
+        name: str,
+        inputs: Shapes,
+        outputs: Shapes,
+        evaluate: Callable[[list[Array]], list[Array]],
+        slopes: Callable[[list[Array]], list[list[Array]]] | None = None,
+    ) -> None:
+        ca.Callback.__init__(self)
+        self._inputs, self._outputs, self._evaluate = inputs, outputs, evaluate
+        self._slopes = slopes  # Of each output by each input, (rows, columns, rows, columns)
+        _alive.append(self)
+        self.construct(name, {"enable_forward": False, "enable_reverse": False})
+
+    def get_n_in(self) -> int:
+        return len(self._inputs)
+
+    def get_n_out(self) -> int:
+        return len(self._outputs)
+
+    def get_name_in(self, index: int) -> str:
+        return list(self._inputs)[index]
+
+    def get_name_out(self, index: int) -> str:
+        return list(self._outputs)[index]
+
+    def get_sparsity_in(self, index: int) -> ca.Sparsity:
+        return ca.Sparsity.dense(*list(self._inputs.values())[index])
+
+    def get_sparsity_out(self, index: int) -> ca.Sparsity:
+        return ca.Sparsity.dense(*list(self._outputs.values())[index])
+
+    def eval(self, given: Sequence[ca.DM]) -> list[Array]:
+        return self._evaluate([np.asarray(part.full()) for part in given])
+
+    def has_jacobian(self) -> bool:
+        return self._slopes is not None
+
+    def get_jacobian(
+        self, name: str, names: Sequence[str], told: Sequence[str], _: Any
+    ) -> ca.Function:
+        """Blocks of entries column after column; the outputs are inputs of it too."""
+        ins, outs = list(self._inputs.values()), list(self._outputs.values())
+        blocks = [(a * b, rows * columns) for a, b in outs for rows, columns in ins]
+
+        def evaluate(point: list[Array]) -> list[Array]:
+            assert self._slopes is not None
+            found = [part for parts in self._slopes(point[: len(ins)]) for part in parts]
+            return [
+                part.transpose(1, 0, 3, 2).reshape(shape)
+                for part, shape in zip(found, blocks, strict=True)
+            ]
+
+        given = dict(zip(names, ins + outs, strict=True))
+        return _Matrices(name, given, dict(zip(told, blocks, strict=True)), evaluate)
+
+
+def _loop_of_gain(controller: Controller, given: Array, fixed: bool) -> ca.Function:
     """(K, S, x0) -> (x, u) under a disturbance, or (K, S, x0, disturbance) -> (x, u)."""
+    plant, near = controller.plant, controller.terminal
+    n, m, (steps, d) = plant.n, plant.m, given.shape
+    inputs: Shapes = {"K": (m, n), "S": (m, m), "x0": (n, 1)}
+    if not fixed:
+        inputs["disturbance"] = (steps, d)
 
-    def __init__(self, controller: Controller, disturbance: Array, fixed: bool) -> None:
-        n, m, steps = controller.plant.n, controller.plant.m, len(disturbance)
-        inputs: dict[str, tuple[int, int]] = {"K": (m, n), "S": (m, m), "x0": (n, 1)}
-        if not fixed:
-            inputs["disturbance"] = (steps, disturbance.shape[1])
-        self.signature = Signature(inputs, {"x": (steps + 1, n), "u": (steps, m)})
-        self._fixed = [disturbance] if fixed else []
-        self._controller = controller
-        self._near: TerminalSet | None = controller.terminal
-
-    def value(self, point: list[Array]) -> list[Array]:
-        """States and inputs."""
-        point = [*point, *self._fixed]
-        made = self._make(point)
-        if made is None:
-            return [np.full(shape, np.nan) for shape in self.signature.outputs.values()]
-        run, _ = run_loop(prepare_loop(made, directions(made, 0)), _scenario(point))
-        return list(_reached(run))
-
-    def linearised(self, point: list[Array]) -> Linear:
-        """The linear map of changes at a point, and its adjoint."""
-        point = [*point, *self._fixed]
-        made = self._make(point)
-        plant, steps = self._controller.plant, len(point[3])
-        n, m = plant.n, plant.m
-        low = np.tril_indices(m)
-        count = n + m * n + len(low[0])
-        dx0, dK = np.eye(n, count), np.eye(m * n, count, n)
-        dS = np.zeros((m, m, count))
-        at = np.arange(n + m * n, count)
-        dS[low[0], low[1], at] = dS[low[1], low[0], at] = 1.0
-        local: Array = np.full((steps, m, count), np.nan)
-        x: Array = np.zeros((steps, n))
-        u: Array = np.zeros((steps, m))
-        if made is not None:
-            along = directions(made, count, x0=dx0, K=dK, S=dS)
-            run, moved = run_loop(prepare_loop(made, along), _scenario(point), local=True)
-            local[: run.reached] = moved.u[: run.reached]
-            x, u = run.x[:-1], run.u
-        slopes = slopes_along(plant, x, u, point[3])
-        return _LinearLoop(slopes, local[..., :n], local[..., n:], point[1], bool(self._fixed))
-
-    def _make(self, point: list[Array]) -> Controller | None:
-        K, S, x0, disturbance = point
-        if not all(np.all(np.isfinite(part)) for part in (K, S, x0, disturbance)):
+    def made(K: Array, S: Array, *others: Array) -> Controller | None:
+        nonlocal near
+        if not all(np.all(np.isfinite(part)) for part in (K, S, *others)):
             return None
-        given = self._controller
         try:
-            made = Controller.from_gain(
-                given.plant,
+            law = Controller.from_gain(
+                plant,
                 K,
-                given.bounds,
-                given.horizon,
+                controller.bounds,
+                controller.horizon,
                 metric=(S + S.T) / 2,
-                terminal_set=given.terminal is not None,
-                softening=given.softening,
-                near=self._near,
-                solver=given.solver,
+                terminal_set=controller.terminal is not None,
+                softening=controller.softening,
+                near=near,
+                solver=controller.solver,
             )
         except ImpcError:  # there is no such controller, which NaN says
             return None
-        self._near = made.terminal
-        return made
+        near = law.terminal
+        return law
+
+    def drive(x0: Array, disturbance: Array = given) -> Scenario:
+        return Scenario(frozen(x0.ravel()), frozen(disturbance))
+
+    def value(point: list[Array]) -> list[Array]:
+        law = made(*point)
+        if law is None:
+            return [np.full((steps + 1, n), np.nan), np.full((steps, m), np.nan)]
+        run, _ = run_loop(prepare_loop(law, directions(law, 0)), drive(*point[2:]))
+        x, u = np.array(run.x), np.array(run.u)
+        if not run.complete:
+            x[run.reached + 1 :], u[run.reached :] = np.nan, np.nan
+        return [x, u]
+
+    def slopes(point: list[Array]) -> list[list[Array]]:
+        K, S = slice(n, n + m * n), slice(n + m * n, n + m * n + m * m)
+        local: Array = np.full((steps, m, S.stop), np.nan)
+        x: Array = np.zeros((steps, n))
+        u: Array = np.zeros((steps, m))
+        driven = drive(*point[2:])
+        law = made(*point)
+        if law is not None:
+            dS = np.zeros((m, m, S.stop))
+            dS[..., S] = _scaled(point[1])
+            along = directions(law, S.stop, x0=np.eye(n, S.stop), K=np.eye(m * n, S.stop, n), S=dS)
+            run, moved = run_loop(prepare_loop(law, along), driven, local=True)
+            local[: run.reached] = moved.u[: run.reached]
+            x, u = run.x[:-1], run.u
+        A, B, E = slopes_along(plant, x, u, driven.disturbance)
+        L, G = local[..., :n], np.concatenate([np.zeros((steps, m, n)), local[..., n:]], axis=2)
+        closed = A + B @ L
+        dx = _passed(closed, np.eye(n, S.stop), lambda t: B[t] @ G[t])
+        found = [
+            [
+                part[..., K].reshape(*part.shape[:2], m, n),
+                part[..., S].reshape(*part.shape[:2], m, m),
+                part[..., :n, None],
+            ]
+            for part in (dx, L @ dx[:-1] + G)
+        ]
+        if not fixed:
+            unit = np.eye(steps * d).reshape(steps, d, steps * d)
+            dx = _passed(closed, np.zeros((n, steps * d)), lambda t: E[t] @ unit[t])
+            found[0].append(dx.reshape(steps + 1, n, steps, d))
+            found[1].append((L @ dx[:-1]).reshape(steps, m, steps, d))
+        return found
+
+    return _Matrices("closed_loop", inputs, {"x": (steps + 1, n), "u": (steps, m)}, value, slopes)
 
 
-class _RegulatorOfWeights:
+def _passed(closed: Array, start: Array, push: Callable[[int], Array]) -> Array:
+    """Derivatives of the states, one pass over the samples (steps + 1, n, columns)."""
+    x = np.empty((len(closed) + 1, *start.shape))
+    x[0] = start
+    for t, step in enumerate(closed):
+        x[t + 1] = step @ x[t] + push(t)
+    return x
+
+
+def _scaled(S: Array) -> Array:
+    """Changes of the metric that a controller takes by the entries of S (m, m, m * m)."""
+    m, trace = len(S), np.trace(S)
+    units = np.eye(m * m).reshape(m, m, -1)
+    symmetric = (units + units.swapaxes(0, 1)) / 2
+    along = np.trace(symmetric) / trace
+    return np.asarray((symmetric - ((S + S.T) / 2)[..., None] * along) * (m / trace))
+
+
+def _regulator_of_weights(plant: Plant) -> ca.Function:
     """(Q, R) -> (K, S) by the Riccati equation."""
+    n, m = plant.n, plant.m
 
-    def __init__(self, controller: Controller) -> None:
-        n, m = controller.plant.n, controller.plant.m
-        self.signature = Signature({"Q": (n, n), "R": (m, m)}, {"K": (m, n), "S": (m, m)})
-        self._plant = controller.plant
-
-    def value(self, point: list[Array]) -> list[Array]:
-        """Gain and metric."""
-        found = self._solve(point)
-        if found is None:
-            return [np.full(shape, np.nan) for shape in self.signature.outputs.values()]
-        return [found.K, found.S]
-
-    def linearised(self, point: list[Array]) -> Linear:
-        """The linear map of changes at a point, and its adjoint: a matrix, which is small."""
-        n, m = self._plant.n, self._plant.m
-        found, count = self._solve(point), n * n + m * m
-        if found is None:
-            return Matrix(np.full((m * n + m * m, count), np.nan), self.signature)
-        units = np.eye(count)
-        dQ, dR = units[:, : n * n].reshape(-1, n, n), units[:, n * n :].reshape(-1, m, m)
-        dQ, dR = (dQ + dQ.swapaxes(1, 2)) / 2, (dR + dR.swapaxes(1, 2)) / 2
-        still = np.zeros((count, n, n)), np.zeros((count, n, m))
-        dK, dS = regulator_changes(found, dQ, dR, *still)
-        return Matrix(
-            np.column_stack([dK.reshape(count, -1), dS.reshape(count, -1)]).T, self.signature
-        )
-
-    def _solve(self, point: list[Array]) -> LqrSolution | None:
+    def solved(point: list[Array]) -> LqrSolution | None:
         Q, R = ((part + part.T) / 2 for part in point)
         try:
-            return solve_lqr(self._plant, Weights(Q, R))
+            return solve_lqr(plant, Weights(Q, R))
         except ImpcError:  # no weights, or none with a regulator, which NaN says
             return None
 
+    def value(point: list[Array]) -> list[Array]:
+        found = solved(point)
+        if found is None:
+            return [np.full((m, n), np.nan), np.full((m, m), np.nan)]
+        return [found.K, found.S]
 
-class _LinearLoop:
-    """The equations of the module's text at one point."""
-
-    def __init__(
-        self, slopes: tuple[Array, Array, Array], L: Array, G: Array, S: Array, fixed: bool
-    ) -> None:
-        A, self._B, self._E = slopes  # (steps, n, ...)
-        self._L, self._G, self._fixed = L, G, fixed
-        self._F = A + self._B @ L  # (steps, n, n)
-        self._S = (S + S.T) / 2
-        self._low = np.tril_indices(len(S))
-
-    def forward(self, seeds: list[Array]) -> list[Array]:
-        """Directions of the inputs (k, ...) to those of the outputs."""
-        dK, dS, dx0, *drive = seeds
-        count, steps = len(dK), len(self._F)
-        theta = np.column_stack([dK.reshape(count, -1), self._scaled(dS)[:, *self._low]])
-        moved = np.moveaxis(self._G @ theta.T, 1, 2)  # (steps, k, m)
-        push = moved @ np.swapaxes(self._B, 1, 2)
-        for dd in drive:
-            push = push + np.moveaxis(dd, 0, 1) @ np.swapaxes(self._E, 1, 2)
-        x = np.empty((steps + 1, count, dx0.shape[1]))
-        x[0] = dx0[..., 0]
-        for t in range(steps):
-            x[t + 1] = x[t] @ self._F[t].T + push[t]
-        u = x[:-1] @ np.swapaxes(self._L, 1, 2) + moved
-        return [np.moveaxis(x, 1, 0), np.moveaxis(u, 1, 0)]
-
-    def reverse(self, seeds: list[Array]) -> list[Array]:
-        """Weights of the outputs (k, ...) to those of the inputs."""
-        x, u = (np.moveaxis(part, 0, 1) for part in seeds)  # (steps, k, ...)
-        p = np.array(x)
-        p[:-1] += u @ self._L
-        for t in range(len(self._F) - 1, -1, -1):
-            p[t] += p[t + 1] @ self._F[t]
-        pull = u + p[1:] @ self._B
-        theta = np.einsum("tkm,tmq->kq", pull, self._G)
-        count, m, n = x.shape[1], u.shape[2], x.shape[2]
-        entries = np.zeros((count, m, m))
-        entries[:, *self._low] = theta[:, m * n :]
+    def slopes(point: list[Array]) -> list[list[Array]]:
+        found, count = solved(point), n * n + m * m
+        dK: Array = np.full((count, m, n), np.nan)
+        dS: Array = np.full((count, m, m), np.nan)
+        if found is not None:
+            units = np.eye(count)
+            dQ, dR = units[:, : n * n].reshape(-1, n, n), units[:, n * n :].reshape(-1, m, m)
+            dQ, dR = (dQ + dQ.swapaxes(1, 2)) / 2, (dR + dR.swapaxes(1, 2)) / 2
+            still = np.zeros((count, n, n)), np.zeros((count, n, m))
+            dK, dS = regulator_changes(found, dQ, dR, *still)
+        last = [np.moveaxis(part, 0, -1) for part in (dK, dS)]
         return [
-            theta[:, : m * n].reshape(count, m, n),
-            self._scaled_back(entries),
-            p[0][..., None],
-            *([] if self._fixed else [np.moveaxis(p[1:] @ self._E, 1, 0)]),
-        ]
+            [part[..., : n * n].reshape(*part.shape[:2], n, n),
+             part[..., n * n :].reshape(*part.shape[:2], m, m)]
+            for part in last
+        ]  # fmt: skip
 
-    def _scaled(self, dS: Array) -> Array:
-        """Change of the metric that a controller takes: symmetric, with a mean diagonal of 1."""
-        m, trace = len(self._S), np.trace(self._S)
-        symmetric = (dS + np.swapaxes(dS, 1, 2)) / 2
-        along = np.trace(symmetric, axis1=1, axis2=2)[:, None, None]
-        scaled: Array = (symmetric - self._S * along / trace) * (m / trace)
-        return scaled
-
-    def _scaled_back(self, entries: Array) -> Array:
-        """The adjoint of `_scaled` for weights of the lower triangle."""
-        m, trace = len(self._S), np.trace(self._S)
-        symmetric = (entries + np.swapaxes(entries, 1, 2)) / 2
-        along = np.einsum("kij,ij->k", symmetric, self._S)[:, None, None]
-        scaled: Array = (symmetric - np.eye(m) * along / trace) * (m / trace)
-        return scaled
-
-
-def _scenario(point: list[Array]) -> Scenario:
-    return Scenario(frozen(point[2].ravel()), frozen(point[3]))
-
-
-def _reached(run: Simulation) -> tuple[Array, Array]:
-    x, u = np.array(run.x), np.array(run.u)
-    if not run.complete:
-        x[run.reached + 1 :], u[run.reached :] = np.nan, np.nan
-    return x, u
+    outputs = {"K": (m, n), "S": (m, m)}
+    return _Matrices("regulator", {"Q": (n, n), "R": (m, m)}, outputs, value, slopes)

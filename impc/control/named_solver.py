@@ -19,7 +19,7 @@ import contextlib
 import sys
 import threading
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
@@ -52,12 +52,13 @@ _IPOPT: dict[str, Any] = {
         "jac_d_constant": "yes",
     },
 }
-# Plugin and options of each. Active-set methods end at round-off, IPOPT's interior-point method at
+#: Plugin of CasADi and its options, of each solver that may be asked for.
+# Active-set methods end at round-off, IPOPT's interior-point method at
 # its tolerance, which is tightened from 1e-8. Of 180 random loops (hard state bounds, soft ones,
 # soft ones at a price of a million) these three find every input. Not offered: qrqp, which had no
 # answer in 2 of 30 loops with hard rows and in most with soft ones; OSQP, in 7 of 90; fatrop, which
 # wants the stages apart and prints.
-_PLUGINS: dict[str, tuple[str, dict[str, Any]]] = {
+PLUGINS: dict[str, tuple[str, dict[str, Any]]] = {
     "daqp": ("daqp", {"error_on_fail": False}),
     "qpoases": (
         "qpoases",
@@ -73,7 +74,7 @@ _PLUGINS: dict[str, tuple[str, dict[str, Any]]] = {
     "ipopt": ("nlpsol", {"error_on_fail": False, "nlpsol": "ipopt", "nlpsol_options": _IPOPT}),
 }
 #: Names of CasADi's solvers that may be asked for.
-SOLVERS = tuple(_PLUGINS)
+SOLVERS = tuple(PLUGINS)
 
 # Slacks enter the cost linearly, so the Hessian is singular, which DAQP does not take. They get a
 # quadratic cost about a centre, of this share of their price, and the problem is solved again about
@@ -95,15 +96,6 @@ _printing = threading.Lock()
 _Answer = tuple[Array, Array, Array, float]
 
 
-class _Shape(NamedTuple):
-    """minimise y'H y / 2 + g'y  subject to  A y <= right,  y >= least; H is a diagonal."""
-
-    H: Array
-    g: Array
-    A: Array
-    least: Array
-
-
 @dataclass(frozen=True)
 class Program:
     """The problem of the module's text for one controller; made by `build_program`."""
@@ -115,7 +107,7 @@ class Program:
     b: Array  # Bounds (r,)
     soft: BoolArray  # Which rows may be exceeded (r,)
     price: float  # Of the excess, in the problem's numbers
-    # What does not change from sample to sample, with all rows hard and with slacks
+    # H, rows and least y of  min y'H y / 2 + g'y,  with all rows hard and with slacks
     hard: tuple[ca.DM, ...]
     softened: tuple[ca.DM, ...]
 
@@ -136,7 +128,7 @@ def require_solver(name: str) -> str:
     if name not in (COMPILED, *SOLVERS):
         known = ", ".join((COMPILED, *SOLVERS))
         raise InputError("solver", f"got {given!r}", f"choose one of {known}")
-    if name != COMPILED and not _installed(name):
+    if name != COMPILED and not (ca.has_nlpsol if name == "ipopt" else ca.has_conic)(name):
         raise InputError(
             "solver",
             f"{name!r} is not part of the CasADi that is installed",
@@ -145,18 +137,9 @@ def require_solver(name: str) -> str:
     return name
 
 
-def _installed(name: str) -> bool:
-    return bool(ca.has_nlpsol("ipopt") if name == "ipopt" else ca.has_conic(name))
-
-
 def described(name: str) -> str:
     """A solver by its `name` as a page says it."""
     return "the package's own" if name == COMPILED else f"{name}, of CasADi"
-
-
-def plugin(name: str) -> tuple[str, dict[str, Any]]:
-    """CasADi's name of the plugin of a solver, as `conic` and `qpsol` take it, and its options."""
-    return _PLUGINS[name]
 
 
 class _Silence:
@@ -177,11 +160,7 @@ class _Silence:
 
 @contextlib.contextmanager
 def silent() -> Iterator[None]:
-    """Keep from standard output what a solver prints while it is built or solves.
-
-    qpOASES prints its licence whenever one is made, and no option turns that off. CasADi writes it
-    through `sys.stdout`; what other threads print meanwhile is passed on.
-    """
+    """Keep off standard output what a solver prints; qpOASES always prints its licence."""
     with _printing, contextlib.redirect_stdout(_Silence(sys.stdout)):
         yield
 
@@ -196,22 +175,19 @@ def build_program(solver: str, rows: Rows) -> Program:
     soft = np.isfinite(rows.limit)
     price = float(np.max(rows.limit[soft] * rows.b[soft], initial=0.0)) / unit**2
     width, slacks = rows.W.shape[1], int(soft.sum())
-    hard = _Shape(np.ones(width), np.zeros(width), A, np.full(width, -np.inf))
-    softened = _Shape(
-        np.r_[np.ones(width), np.full(slacks, _PROXIMAL * np.sqrt(price))],
-        np.r_[np.zeros(width), np.full(slacks, price)],
-        np.column_stack([A, -np.eye(len(A))[:, soft]]),
-        np.r_[np.full(width, -np.inf), np.zeros(slacks)],
+    curvature = np.r_[np.ones(width), np.full(slacks, _PROXIMAL * np.sqrt(price))]
+    wide = np.column_stack([A, -np.eye(len(A))[:, soft]])
+    least = np.r_[np.full(width, -np.inf), np.zeros(slacks)]
+    hard, softened = (
+        (ca.diag(ca.DM(curvature[:size])), ca.DM(wide[:, :size]), ca.DM(least[:size]))
+        for size in (width, width + slacks)
     )
     lengths = unit**2 * squares / rows.b**2
-    return Program(solver, A, lengths, unit, rows.b, soft, price, _given(hard), _given(softened))
+    return Program(solver, A, lengths, unit, rows.b, soft, price, hard, softened)
 
 
 def active_set(program: Program, d: Array) -> ActiveSet | None:
-    """Ask a solver which rows hold; None when its answer breaks the conditions of optimality.
-
-    `d` (r,).
-    """
+    """Ask a solver which rows hold; None when its answer breaks the conditions of optimality."""
     if not (np.all(np.isfinite(program.A)) and np.all(np.isfinite(d))):
         return None
     A, right, soft = program.A, d / program.b, program.soft
@@ -270,12 +246,10 @@ def _solve(
 ) -> _Answer | None:
     """The solver's answer, when it keeps the rows and its multipliers belong to it."""
     A, soft = program.A, program.soft
-    H, g, rows, least = given
-    if given is program.softened:
-        g = np.r_[
-            np.zeros(A.shape[1]), program.price - _PROXIMAL * np.sqrt(program.price) * centre[soft]
-        ]
+    H, rows, least = given
     (count, width) = A.shape
+    pull = program.price - _PROXIMAL * np.sqrt(program.price) * centre[soft]
+    g = np.r_[np.zeros(width), pull][: H.size1()]
     function = _function(program.solver, H.size1(), count)
     with silent():
         answer = function(h=H, g=g, a=rows, lba=-np.inf, uba=right, lbx=least, ubx=np.inf)
@@ -295,11 +269,7 @@ def _solve(
 
 
 def _independent(A: Array, held: IntArray, multipliers: Array, pull: Array) -> IntArray:
-    """Rows among those held that carry the pull, linearly independent.
-
-    Where some depend on the others, non-negative least squares chooses: it ends with an
-    independent set whose multipliers have their signs.
-    """
+    """Rows among those held that carry the pull, independent; where some depend, by `nnls`."""
     if len(held) == 0:
         return held
     diagonal = np.abs(np.diagonal(np.linalg.qr(A[held].T, mode="r")))
@@ -311,17 +281,12 @@ def _independent(A: Array, held: IntArray, multipliers: Array, pull: Array) -> I
     return np.sort(order[chosen > 0])
 
 
-def _given(shape: _Shape) -> tuple[ca.DM, ...]:
-    """Of the problem, what does not change from sample to sample, as CasADi takes it."""
-    return ca.diag(ca.DM(shape.H)), ca.DM(shape.g), ca.DM(shape.A), ca.DM(shape.least)
-
-
 def _function(solver: str, width: int, count: int) -> Callable[..., Any]:
     """The solver for problems of this size, one for each thread."""
     kept: dict[tuple[str, int, int], Any] = _own.__dict__.setdefault("functions", {})
     key = solver, width, count
     if key not in kept:
-        name, options = plugin(solver)
+        name, options = PLUGINS[solver]
         shapes = {"h": ca.Sparsity.diag(width), "a": ca.Sparsity.dense(count, width)}
         with silent():
             kept[key] = ca.conic("mpc", name, shapes, options)

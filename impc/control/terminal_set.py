@@ -30,7 +30,6 @@ from impc.control.halfspaces import (
     needed_rows,
     redundant_rows,
     seen_directions,
-    supports,
     with_mirror,
 )
 from impc.errors import BoundsError, InputError, SolverError
@@ -185,41 +184,6 @@ def contains(terminal: TerminalSet, x: ArrayLike) -> bool:
     return bool(np.all(terminal.H @ state <= terminal.h * (1 + terminal.tolerance)))
 
 
-@checked
-def invariance_violation(terminal: TerminalSet) -> float:
-    """By how much F leaves the set: the largest support of H F x over the set, less h, over h.
-
-    At most about the tolerance when the set is invariant; capped at 1; 0 for a set without rows.
-    With `maximality_violation` it proves the set: invariant and inside the bounds, hence within
-    O; bounded by rows of O only, hence not smaller.
-    """
-    normal = terminal.H / terminal.h[:, None]
-    return _excess(terminal, normal @ terminal.F)
-
-
-@checked
-def maximality_violation(terminal: TerminalSet) -> float:
-    """By how much the set differs from O_k*, relative to the bounds; capped at 1.
-
-    The larger of two numbers. First, the relative distance of the rows from rows (c, k) computed
-    afresh, by powers of F: every trajectory that keeps the bounds obeys those, so the set is not
-    too small. Second, the largest violation, over the set, of any removed row (c, k <= k*): the
-    set is not too large.
-    """
-    rows, count = terminal.rows, terminal.determinedness + 1
-    normal = (rows.E - rows.F @ terminal.gain) / rows.b[:, None]
-    powers = np.array([np.linalg.matrix_power(terminal.F, k) for k in range(count)])
-    every = normal @ powers
-    afresh = every[terminal.step, terminal.family]
-    given = terminal.H / terminal.h[:, None]
-    basis = seen_directions(np.concatenate([given, afresh]))
-    error = np.linalg.norm((given - afresh) @ basis, axis=1)
-    wrong = float(np.max(error / np.linalg.norm(afresh @ basis, axis=1), initial=0.0))
-    removed = np.ones(every.shape[:2], dtype=bool)
-    removed[terminal.step, terminal.family] = False
-    return max(wrong, _excess(terminal, every[removed]))
-
-
 def _check(plant: Plant, F: Array, bounds: Bounds, tolerance: float, max_steps: int) -> None:
     radius = float(np.max(np.abs(np.linalg.eigvals(F))))
     if not radius < 1:
@@ -295,15 +259,6 @@ def _grow(
         blocks.append(new)
         rows, k = rows @ loop.F, k + 1
     return np.concatenate(family), np.concatenate(step), np.concatenate(blocks), bases
-
-
-def _excess(terminal: TerminalSet, targets: Array) -> float:
-    """Largest support of the normalised target rows (t, n) over the set, less 1."""
-    if not np.any(targets):
-        return 0.0
-    normal = terminal.H / terminal.h[:, None]
-    basis = seen_directions(np.concatenate([normal, targets]))
-    return float(np.max(supports(normal @ basis, targets @ basis)[0])) - 1.0
 
 
 def _read_only(values: IntArray) -> IntArray:

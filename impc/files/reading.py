@@ -22,8 +22,8 @@ from impc.files.formats import read_table
 from impc.files.one_step import departures, rows_later
 from impc.files.resampling import held_means, instants, resampled_samples, same_rate, shifted
 from impc.files.units import si_unit
+from impc.model.plant import UNKNOWN
 from impc.model.recordings import Label, Recording
-from impc.model.signal_units import UNKNOWN
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence

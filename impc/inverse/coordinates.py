@@ -53,11 +53,7 @@ class Point:
 
 @dataclass(frozen=True)
 class Compressed:
-    """Residual and derivative in bases of the derivative's QR factorisations, trial by trial.
-
-    A search uses their norms and inner products only, which are those of the full ones; a
-    recording of thousands of samples becomes a few dozen rows.
-    """
+    """Residual and derivative in bases of the derivative's QR factorisations, trial by trial."""
 
     rows: Rows  # Gain, metric and parameters are shared, initial states the trial's own
     # How many of the shared columns stand before those of initial states; the rest after
@@ -81,12 +77,7 @@ class Compressed:
 
 
 class Coordinates:
-    """The coordinates of one search, and the residual in them.
-
-    Caches the last evaluation, because the residual and its derivative come from one pass.
-
-    `gain` (m, n); `metric` (m, m); `gains` (k, m, n).
-    """
+    """The coordinates of one search, and the residual in them."""
 
     def __init__(
         self,
@@ -135,10 +126,7 @@ class Coordinates:
         return Point(gain, self._metric(factor), self.problem_at(starts, parameters))
 
     def problem_at(self, starts: Array, parameters: Array) -> Problem:
-        """The problem at coordinates of its other unknowns.
-
-        `parameters` (k,).
-        """
+        """The problem at coordinates of its other unknowns; `parameters` (k,)."""
         given = np.array([trial.x0 for trial in self.problem.recordings])
         if len(starts):
             given = given + starts.reshape(self.trials, self.n) @ self.start_unit.T
@@ -186,10 +174,7 @@ class Coordinates:
         return self.last[1:]
 
     def without_nuisance(self, z: Array) -> Array:
-        """Derivative at z (q,) with respect to gain and metric that the rest leaves.
-
-        Returns (r, g).
-        """
+        """Derivative at z (q,) with respect to gain and metric that the rest leaves."""
         rows = self.at(z).rows
         left, values, _ = np.linalg.svd(rows.own, full_matrices=False)
         largest = np.max(values, initial=0.0)
@@ -262,10 +247,7 @@ def descend(
     own: float = 0.0,
     along: Array | None = None,
 ) -> tuple[Array, int, bool]:
-    """Least squares from z (q,) with a normal prior about the origin of the coordinates.
-
-    `shared, own` (a,); `along` (g, a).
-    """
+    """Least squares from z (q,) with a normal prior about the origin of the coordinates."""
     model = _Along(space, z, along)
     centre = model.apart(space.start)
     weights = np.broadcast_to(shared, model.columns.shape[1])

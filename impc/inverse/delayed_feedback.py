@@ -17,10 +17,10 @@ import numpy as np
 from impc.arrays import Array, BoolArray, Frozen, frozen
 from impc.errors import InputError, SolverError
 from impc.inverse.coordinates import Coordinates, descend
+from impc.inverse.gain_search import regulators
 from impc.inverse.least_squares import Stop
 from impc.inverse.residuals import misfit_or_reason
 from impc.inverse.solution_set import natural_coordinates
-from impc.inverse.starting_regulators import regulators
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -43,10 +43,7 @@ class PreliminaryGain(Frozen):
 
 
 def preliminary_gain(problem: Problem, states: Sequence[str]) -> PreliminaryGain:
-    """Fit gains on some states, with initial states and physical parameters, without bounds.
-
-    From the gains of balanced regulators on those states, at the scale at which they fit best.
-    """
+    """Fit gains on some states, with initial states and physical parameters, without bounds."""
     loose = problem.without_bounds()
     names = problem.plant.states
     unknown = [name for name in states if name not in names]
@@ -72,10 +69,7 @@ def _basis(plant: Plant, gain: Array, kept: BoolArray) -> Array:
 
 
 def _start(problem: Problem, kept: BoolArray) -> tuple[Array, Array]:
-    """The best multiple of a balanced regulator's gains on the kept states, and all its gains.
-
-    Over a recording that is short enough the best one need not stabilise.
-    """
+    """The best multiple of a balanced regulator's gains on the kept states, and all its gains."""
     metric = np.eye(problem.plant.m)
     best: tuple[Array, Array] | None = None
     least = np.inf

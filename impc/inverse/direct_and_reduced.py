@@ -16,17 +16,19 @@ from impc.arrays import Array
 from impc.checking import checked, replace
 from impc.errors import SolverError
 from impc.inverse.explaining_weights import weights_behind
-from impc.inverse.gain_search import GainFit, fit_gain, refine_gain
+from impc.inverse.gain_search import GainFit, fit_gain, refine_gain, regulators
 from impc.inverse.inverse_lqr import inverse_lqr_gradient, inverse_lqr_lmi
-from impc.inverse.nearest_regulator import (
+from impc.inverse.problem import EXPLAINED, recorded_size, typical_output, with_or_without_set
+from impc.inverse.proximal_search import (
     AUXILIARY_CONDITION_WEIGHT,
+    ConditionedFit,
+    Objective,
+    Residual,
     auxiliary_weights,
+    conditioned_fit,
     definite,
 )
-from impc.inverse.problem import EXPLAINED, recorded_size, typical_output, with_or_without_set
-from impc.inverse.proximal_search import ConditionedFit, Objective, Residual, conditioned_fit
 from impc.inverse.residuals import evaluate, keeps_hard
-from impc.inverse.starting_regulators import regulators
 from impc.model.riccati import solve_lqr
 from impc.model.weights import Weights
 

@@ -253,10 +253,7 @@ def _interior(fibre: GainFibre, member: Weights | None = None) -> Weights:
 
 @dataclass(frozen=True)
 class _Centred:
-    """A fibre as seen from a member, whose least eigenvalue is 1 and whose largest is `largest`.
-
-    Members are sum_i y_i raw_i; the inequalities on them, block by block, are of size one.
-    """
+    """A fibre as seen from a member, whose least eigenvalue is 1 and whose largest is `largest`."""
 
     raw: Array
     seen: Array  # L^-1 raw L^-T, orthonormal: the programs' variables are well scaled
@@ -313,10 +310,7 @@ def _centred_program(fibre: GainFibre, centre: Weights, scaled: bool) -> tuple[W
 
 
 def _least_norm(fibre: GainFibre, centre: Weights, limit: float) -> Weights:
-    """Of the members with I <= X <= limit I that of least Frobenius norm in natural coordinates.
-
-    The least condition number has many members; this one is unique, and as exact as the program.
-    """
+    """Of the members with I <= X <= limit I that of least Frobenius norm in natural coordinates."""
     at = _Centred.about(fibre, centre)
     last = np.eye(len(at.raw) + 1)[-1]
     size = np.linalg.norm(fibre.to_natural(centre)) / np.linalg.eigvalsh(centre.block)[0]
@@ -355,10 +349,7 @@ def _distance(X: Array, Y: Array) -> float:
 
 
 def inverse_factor(fibre: GainFibre, weights: Weights) -> Array:
-    """L^-1 (n + m, n + m) of blkdiag(Q, R) = LL', by way of the natural coordinates.
-
-    It is accurate there. This L is a factor, not a triangular one.
-    """
+    """L^-1 (n + m, n + m) of blkdiag(Q, R) = LL', by way of the natural coordinates."""
     factor = np.linalg.cholesky(fibre.to_natural(weights))
     return np.linalg.inv(factor) @ scipy.linalg.block_diag(fibre.T, fibre.G).T
 

@@ -259,10 +259,7 @@ def goodness(problem: Problem, gain: Array, metric: Array) -> tuple[float, Goodn
 
 
 def gain_rank(problem: Problem, gain: Array, metric: Array) -> int:
-    """How many directions of a `gain` (m, n) with a `metric` (m, m) the recordings identify.
-
-    To first order: docs/fitting.md.
-    """
+    """How many directions of a `gain` (m, n) with a `metric` (m, m) the recordings identify."""
     found = evaluate(problem, gain, metric)
     if found.reason:
         return 0
@@ -276,10 +273,7 @@ def gain_rank(problem: Problem, gain: Array, metric: Array) -> int:
 
 
 def determined(problem: Problem, values: Array) -> BoolArray:
-    """Which falling singular values (k,) of the outputs' derivative are more than rounding (k,).
-
-    See docs/fitting.md.
-    """
+    """Which falling singular values (k,) of the outputs' derivative are more than rounding (k,)."""
     return np.asarray(values > max(DETERMINED * values[0], ROUNDING * recorded_size(problem)))
 
 

@@ -192,10 +192,7 @@ def fitted_metric(
 
 
 def unidentified_metrics(problem: Problem, gain: Array, family: MetricFamily, z: Array) -> Array:
-    """The metric at z (count,), then directions (k, m, m) that nothing identifies.
-
-    Of the family of a `gain` (m, n).
-    """
+    """The metric at z (count,), then directions (k, m, m) that nothing identifies."""
     S, changes = family.metric(z), family.changes(z)
     found = evaluate(problem, gain, S)
     seen = found.along_metric(S, changes)

@@ -7,6 +7,8 @@ predictions one sample ahead has few, and can be computed at every gain (`predic
 search minimises that first, and begins the search of the simulation at its end. Recordings of a
 few hundred numbers are searched from other regulators too, until three searches have the least
 misfit; longer ones where the simulation leaves much more than the prediction, until two have it.
+Searches begin at balanced regulators, those of Bryson's rule (outputs of recorded size cost as much
+as commands of full size), and at random ones about these. Every regulator stabilises.
 
 Without bounds this is the first line of Table 3.1; with them it is the reduced form of inverse
 MPC: the recordings determine K, and for several inputs the metric S while bounds are active, and
@@ -22,21 +24,23 @@ import numpy as np
 
 from impc.arrays import Array, Frozen, frozen
 from impc.checking import checked, replace
-from impc.errors import ImpcError, SolverError
+from impc.errors import ImpcError, SolverError, WeightsError
 from impc.inverse.coordinates import Coordinates, Point, descend
 from impc.inverse.inactive_samples import pair_of_inactive_samples
 from impc.inverse.least_squares import Stop
-from impc.inverse.prediction import correction
+from impc.inverse.prediction import command_sizes, correction
 from impc.inverse.problem import EXPLAINED, recorded_size
 from impc.inverse.residuals import misfit_or_reason
-from impc.inverse.starting_regulators import balanced_regulator, drawn_start, state_sizes
-from impc.model.riccati import stabilises
+from impc.inverse.solution_set import natural_coordinates
+from impc.model.riccati import solve_lqr, stabilises
+from impc.model.weights import Weights, normalised
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from impc.inverse.problem import Problem
     from impc.model.riccati import LqrSolution
+
 
 #: Numbers recorded up to which a search may be made many times.
 FEW = 2000
@@ -128,10 +132,7 @@ def refine_gain(
     max_evaluations: int = _SIMULATED,
     prior: float = 0.0,
 ) -> GainFit:
-    """One search of the simulation's misfit from a gain and a metric.
-
-    `gain` (m, n); `metric` (m, m).
-    """
+    """One search of the simulation's misfit from a gain and a metric."""
     _, reason = misfit_or_reason(problem, gain, metric)
     if reason:
         raise SolverError("gain", f"the start cannot be simulated: {reason}", "start elsewhere")
@@ -185,10 +186,7 @@ def _predicted(problem: Problem, begin: LqrSolution, ratio: float) -> tuple[Poin
 
 
 def _simulated(problem: Problem, begin: LqrSolution, predicted: Point) -> GainFit:
-    """The least simulation error from the end of a search of predictions.
-
-    Where that does not stabilise, or cannot be simulated, from a point on the way there.
-    """
+    """The least simulation error from the end of a search of predictions."""
     K = np.array(begin.K)
     starts = np.array(predicted.problem.starts)
     there = problem.at(starts, np.array(problem.logarithms))
@@ -236,3 +234,71 @@ def _gain_fit(space: Coordinates, z: Array, evaluations: int) -> GainFit:
         frozen(np.linalg.svd(space.without_nuisance(z), compute_uv=False)),
         evaluations,
     )
+
+
+# Cost weights of states that no output sees, of the others'.
+_UNSEEN = 1e-8
+# Costs of the command, of that of the balanced regulator.
+_EFFORTS = 10.0 ** np.arange(-4, 5)
+# Random weights: share of the identity, and decades of the cost of the command on either side.
+_DEFINITE, _DECADES = 0.05, 2.0
+
+
+def balanced_regulator(problem: Problem, effort: float = 1.0) -> LqrSolution:
+    """The regulator with R = effort diag(1/u^2), u the size of the commands, Q = C'diag(1/y^2)C."""
+    plant, scale = problem.plant, np.asarray(problem.output_scale)
+    Q = plant.C.T @ np.diag(1 / scale**2) @ plant.C
+    Q += _UNSEEN * np.trace(Q) / plant.n * np.eye(plant.n)
+    R = effort * np.diag(1 / command_sizes(problem) ** 2)
+    return solve_lqr(plant, normalised(Weights(Q, R)))
+
+
+def regulators(problem: Problem) -> list[LqrSolution]:
+    """Those over eight decades of effort that double precision allows, the balanced one first."""
+    found: list[LqrSolution] = []
+    refused: list[WeightsError] = []
+    for effort in sorted(_EFFORTS, key=lambda one: abs(np.log(one))):
+        try:
+            found.append(balanced_regulator(problem, effort))
+        except WeightsError as error:  # so cheap a command that R is lost beside B'PB
+            refused.append(error)
+    if not found:
+        raise refused[0]
+    return found
+
+
+def state_sizes(problem: Problem, regulator: LqrSolution) -> Array:
+    """Unit of states (n, n) in which the outputs are of their recorded size."""
+    plant = problem.plant
+    T, _ = natural_coordinates(plant, np.array(regulator.K))
+    natural = float(np.linalg.norm(plant.C @ T / problem.output_scale[:, None]))
+    return T * (np.sqrt(len(plant.outputs)) / natural if natural > 0 else 1.0)
+
+
+def drawn_start(
+    problem: Problem, sizes: Array, rng: np.random.Generator
+) -> tuple[Problem, LqrSolution]:
+    """A random regulator, and initial states that are random where no output sees them."""
+    plant, regulator = problem.plant, None
+    while regulator is None:
+        try:
+            regulator = solve_lqr(plant, _random_weights(sizes, command_sizes(problem), rng))
+        except WeightsError:  # too far apart for double precision
+            continue
+    if not problem.unknown_start:
+        return problem, regulator
+    unseen = np.eye(plant.n) - np.linalg.pinv(plant.C) @ plant.C
+    drawn = rng.standard_normal((len(problem.recordings), plant.n)) @ sizes.T @ unseen.T
+    return problem.at(problem.starts + drawn, np.array(problem.logarithms)), regulator
+
+
+def _random_weights(sizes: Array, commands: Array, rng: np.random.Generator) -> Weights:
+    """Random weights of states and commands, each over its size."""
+    parts = []
+    for size in (len(sizes), len(commands)):
+        L = np.tril(rng.standard_normal((size, size)))
+        parts.append(L @ L.T + _DEFINITE * np.eye(size))
+    back, unit = np.linalg.inv(sizes), np.diag(1 / commands)
+    R = 10 ** rng.uniform(-_DECADES, _DECADES) * unit @ parts[1] @ unit
+    Q = back.T @ parts[0] @ back
+    return normalised(Weights((Q + Q.T) / 2, (R + R.T) / 2))

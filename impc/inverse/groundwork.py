@@ -32,12 +32,11 @@ from impc.inverse.equivalent_weights import least_condition_weights
 from impc.inverse.estimates import Estimate
 from impc.inverse.explaining_weights import weights_behind
 from impc.inverse.gain_search import GainFit, fit_gain, refine_gain
-from impc.inverse.initial_states import with_fitted_starts
 from impc.inverse.inverse_lqr import InverseLqr, inverse_lqr_gradient, inverse_lqr_lmi
 from impc.inverse.natural_search import in_plant_units, inverse_mpc_natural
-from impc.inverse.nearest_regulator import auxiliary_weights
-from impc.inverse.noisy_fit import fit_controller, free_gain, noise_of
+from impc.inverse.noisy_fit import fit_controller, free_gain, noise_of, with_fitted_starts
 from impc.inverse.problem import EXPLAINED, recorded_size
+from impc.inverse.proximal_search import auxiliary_weights
 from impc.inverse.solution_set import gain_fibre, natural_coordinates
 from impc.model.plant import change_coordinates
 from impc.model.riccati import solve_lqr, stabilises
@@ -139,10 +138,7 @@ class PlantUnits:
 
 
 class NaturalUnits:
-    """For recordings with noise, in natural coordinates.
-
-    `remember` (name, compute).
-    """
+    """For recordings with noise, in natural coordinates; `remember` (name, compute)."""
 
     def __init__(
         self,

@@ -305,10 +305,7 @@ def inverse_lqr_cross_term(plant: Plant, gain: ArrayLike) -> CrossTerm:
 
 
 def lifted(matrix: Array, least: float) -> Array:
-    """A symmetric matrix with its eigenvalues raised to a least one.
-
-    `matrix` (k, k); returns (k, k).
-    """
+    """A symmetric matrix with its eigenvalues raised to a least one."""
     values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
     raised: Array = (vectors * np.maximum(values, least)) @ vectors.T
     return (raised + raised.T) / 2

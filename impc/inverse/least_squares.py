@@ -270,10 +270,7 @@ class TrialSpan:
 
 
 def trial_span(own: Array, sizes: Sequence[int], shared: Array) -> TrialSpan:
-    """Span of columns, each in its own scale, to 1e-10.
-
-    `own` (r, n); `shared` (r, c).
-    """
+    """Span of columns, each in its own scale, to 1e-10; `own` (r, n); `shared` (r, c)."""
     parts = np.split(own, np.cumsum(sizes)[:-1])
     bases = tuple(_basis(_of_length_one(part)) for part in parts)
     return TrialSpan(bases, _basis(_without(bases, _of_length_one(shared))))

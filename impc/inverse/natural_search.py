@@ -99,10 +99,7 @@ def inverse_mpc_natural(
 
 
 def in_plant_units(weights: Weights, T: Array, G: Array) -> Weights:
-    """Weights of z = T^-1 x and v = G^-1 u as weights of x and u, scaled to R[0, 0] = 1.
-
-    `T` (n, n); `G` (m, m).
-    """
+    """Weights of z = T^-1 x and v = G^-1 u as weights of x and u, scaled to R[0, 0] = 1."""
     z, v = np.linalg.inv(T), np.linalg.inv(G)
     block = pair_blocks((z.T @ weights.Q @ z)[None], (v.T @ weights.R @ v)[None])[0]
     return normalised(split_blocks(block, len(T)))
@@ -158,9 +155,5 @@ def _residual(
 
 
 def _scale_ratio(metric: Array, natural: Array) -> float:
-    """Both metrics are scaled to a mean diagonal of 1 before they are differentiated.
-
-    The residual does not change along the metric's own scale, so the derivative with respect to
-    one scaled metric is that with respect to the other, times the ratio of their scales.
-    """
+    """Both metrics are scaled to a mean diagonal of 1 before they are differentiated."""
     return float(np.trace(natural) / np.trace(metric))

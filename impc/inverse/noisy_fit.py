@@ -6,27 +6,28 @@ A gain that explains its recordings to 1e-9 has weights to find, and the reduced
 one semidefinite program. With noise a fitted gain usually has none. Then the direct form in natural
 coordinates (`natural_search`) takes the weights that fit best. It begins at balanced weights, and
 where these leave more than noise does at those whose gain is nearest as the recordings see it,
-|J (K(Q, R) - K)|^2 with J the derivative of the residual, which takes no simulation
-(docs/fitting.md).
+|J (K(Q, R) - K)|^2 with J the derivative of the residual, which takes no simulation. Last the
+states in which trials start are fitted again, the controller being known (docs/fitting.md).
 """
 
 from __future__ import annotations
 
 import contextlib
+import functools
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy.optimize
 import scipy.special
 
 from impc.arrays import Array, frozen
 from impc.checking import checked, replace
 from impc.errors import InputError, SolverError, WeightsError
-from impc.inverse.coordinates import Coordinates
+from impc.inverse.coordinates import Coordinates, start_unit
 from impc.inverse.equivalent_weights import least_condition_weights
 from impc.inverse.estimates import Estimate, Status, goodness
 from impc.inverse.explaining_weights import metric_family, unidentified_metrics, weights_behind
-from impc.inverse.gain_search import FEW, GainFit, fit_gain, refine_gain
-from impc.inverse.initial_states import with_fitted_starts
+from impc.inverse.gain_search import FEW, GainFit, fit_gain, refine_gain, regulators
 from impc.inverse.inverse_lqr import inverse_lqr_gradient
 from impc.inverse.natural_search import (
     CONDITION_SHARE,
@@ -35,23 +36,23 @@ from impc.inverse.natural_search import (
     in_plant_units,
     inverse_mpc_natural,
 )
-from impc.inverse.nearest_regulator import weights_near
 from impc.inverse.problem import EXPLAINED, misfit, recorded_size, with_or_without_set
-from impc.inverse.residuals import keeps_hard, misfit_or_reason, verify_hard
+from impc.inverse.proximal_search import weights_near
+from impc.inverse.residuals import keeps_hard, misfit_or_reason, start_residual, verify_hard
 from impc.inverse.solution_set import gain_fibre, natural_coordinates
-from impc.inverse.starting_regulators import regulators
 from impc.model.plant import change_coordinates
 from impc.model.riccati import solve_lqr
 from impc.model.weights import condition_number, normalised
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from impc.inverse.problem import Problem
     from impc.inverse.proximal_search import ConditionedFit
     from impc.model.plant import Plant
     from impc.model.riccati import LqrSolution
     from impc.model.weights import Weights
+
 
 # Weights that leave more than the free gain by what noise does in one of a hundred recordings are
 # looked for again.
@@ -133,10 +134,7 @@ def noise_of(free: GainFit) -> float:
 
 
 def _weights(free: GainFit, start: Weights | None) -> tuple[ConditionedFit, int]:
-    """Weights of the direct form from a few beginnings.
-
-    Until one leaves what noise does, or two end at one misfit.
-    """
+    """Weights of the direct form from a few beginnings."""
     best, spent, reason = None, 0, ""
     enough = _unlikely(free) * free.misfit
     for begin in _beginnings(free, start):
@@ -248,3 +246,79 @@ def _metrics(problem: Problem, solution: LqrSolution) -> Array:
     if family is None:
         return metric[None]
     return unidentified_metrics(problem, gain, family, family.nearest(metric))
+
+
+_EVALUATIONS = 20
+# The first round also counts as noise what saturation keeps from being linear; a second, which does
+# not, is worth its simulations where that was more than a share of it.
+_ROUNDS, _SHARE = 2, 1e-4
+
+
+def with_fitted_starts(
+    problem: Problem, gain: Array, metric: Array, samples: int | None = None
+) -> Problem:
+    """Return the problem with each trial's x0 fitted to its first samples under a controller.
+
+    From the given x0, by trust-region least squares. Where the samples leave x0 free it stays: it
+    is given a normal prior of the size of the trial's other states (`start_unit`), which weighs as
+    the residual's own noise does.
+
+    `gain` (m, n); `metric` (m, m).
+    """
+    fitted = []
+    for trial in problem.recordings:
+        seen = trial.samples if samples is None else min(samples, trial.samples)
+        short = replace(trial, outputs=trial.outputs[:seen], disturbance=trial.disturbance[:seen])
+        one = replace(problem, recordings=(short,), unknown_start=True)
+        fitted.append(replace(trial, x0=frozen(_fit(one, gain, metric))))
+    return replace(problem, recordings=tuple(fitted))
+
+
+def _fit(problem: Problem, gain: Array, metric: Array) -> Array:
+    unit = start_unit(problem, gain)
+    (trial,) = problem.recordings
+    simulated = start_residual(problem, gain, metric)
+
+    @functools.lru_cache(maxsize=1)  # the search asks for residual and derivative one by one
+    def seen(z: tuple[float, ...]) -> tuple[Array, Array]:
+        residual, slope = simulated(trial.x0 + unit @ np.array(z))
+        return residual, slope @ unit
+
+    def at(z: Array) -> tuple[Array, Array]:
+        return seen(tuple(z))
+
+    z: Array = np.zeros(problem.plant.n)
+    before = np.inf
+    for _ in range(_ROUNDS):
+        noise = _noise(*at(z))
+        if abs(noise - before) <= _SHARE * noise:
+            break
+        z, before = _round(at, z, noise), noise
+    return np.asarray(trial.x0 + unit @ z)
+
+
+def _noise(residual: Array, derivative: Array) -> float:
+    """What no x0 explains: to first order, the residual beside the derivative's columns."""
+    left = residual - derivative @ np.linalg.lstsq(derivative, residual)[0]
+    return float(np.linalg.norm(left) / np.sqrt(len(left)))
+
+
+def _round(at: Callable[[Array], tuple[Array, Array]], z: Array, noise: float) -> Array:
+    """One fit from z, with that noise."""
+
+    def residual(z: Array) -> Array:
+        return np.concatenate([at(z)[0], noise * z])
+
+    def derivative(z: Array) -> Array:
+        return np.vstack([at(z)[1], noise * np.eye(len(z))])
+
+    found = scipy.optimize.least_squares(
+        residual,
+        z,
+        jac=derivative,
+        ftol=1e-10,
+        xtol=1e-12,
+        gtol=1e-15,
+        max_nfev=_EVALUATIONS,
+    )
+    return np.asarray(found.x)

@@ -226,10 +226,7 @@ def _root_mean_square(recordings: Sequence[Recording]) -> Array:
 def controller_for(
     problem: Problem, gain: Array, metric: Array, near: TerminalSet | None = None
 ) -> Controller:
-    """Return the controller of the problem with that `gain` (m, n) and `metric` (m, m).
-
-    `near` is the terminal set of a gain nearby: the same answer in less time.
-    """
+    """Return the controller of the problem with that `gain` (m, n) and `metric` (m, m)."""
     return Controller.from_gain(
         problem.plant,
         gain,
@@ -265,10 +262,7 @@ def recorded_states(plant: Plant, recordings: Sequence[Recording]) -> list[Array
 
 
 def follows_plant(plant: Plant, recordings: Sequence[Recording]) -> bool:
-    """Whether recordings of all states are exact: what inputs cannot do is rounding.
-
-    Where there are as many inputs as states they could do anything, and nothing says so.
-    """
+    """Whether recordings of all states are exact: what inputs cannot do is rounding."""
     rank, states = int(np.linalg.matrix_rank(plant.B)), recorded_states(plant, recordings)
     if states is None or rank == plant.n:
         return False
@@ -291,10 +285,7 @@ T = TypeVar("T", bound=_Fitted)
 def with_or_without_set(
     problem: Problem, fit: Callable[[Problem], T], settled: Callable[[T], bool]
 ) -> T:
-    """The better fit of a `problem` that leaves open whether there is a terminal set.
-
-    Without the set first; with it too where that is not `settled`.
-    """
+    """The better fit of a `problem` that leaves open whether there is a terminal set."""
     if problem.terminal_set is not None:
         return fit(problem)
     without = fit(replace(problem, terminal_set=False))

@@ -27,6 +27,7 @@ import numpy as np
 import scipy.linalg
 
 from impc.arrays import Array, Frozen, frozen
+from impc.checking import checked
 from impc.errors import SolverError, WeightsError
 from impc.inverse.proximal_step import StepProgram, block_basis, solve_step
 from impc.model.riccati import gain_gradients, metric_gradients, solve_lqr
@@ -127,10 +128,7 @@ def conditioned_fit(
 
 
 def _step(program: StepProgram, radius: float) -> tuple[Array, float, float]:
-    """`solve_step`, within a smaller radius where that fails, and the radius.
-
-    A step of zero is feasible, so failures are numerical, and a shorter step is another program.
-    """
+    """`solve_step`, within a smaller radius where that fails, and the radius."""
     while True:
         try:
             return *solve_step(program, radius), radius
@@ -141,10 +139,7 @@ def _step(program: StepProgram, radius: float) -> tuple[Array, float, float]:
 
 
 def weight_jacobian(solution: LqrSolution, residual: Residual, basis: Array) -> Array:
-    """Derivative of the residual along directions of blkdiag(Q, R): (r, k).
-
-    `basis` (k, n + m, n + m).
-    """
+    """Derivative of the residual along directions of blkdiag(Q, R): (r, k)."""
     n = solution.plant.n
     dQ, dR = basis[:, :n, :n], basis[:, n:, n:]
     gain = gain_gradients(solution)
@@ -224,11 +219,7 @@ def _linearise(here: _Point, objective: Objective) -> StepProgram:
 
 
 def _try(plant: Plant, objective: Objective, here: _Point, step: Array) -> _Point | None:
-    """The point at the end of a step, or None when there is no regulator.
-
-    A step may leave the cone of definite weights, or come so near to its edge that no Riccati
-    solution is found.
-    """
+    """The point at the end of a step, or None when there is no regulator."""
     n = plant.n
     X = here.weights.block
     L = np.linalg.cholesky(X)
@@ -240,3 +231,79 @@ def _try(plant: Plant, objective: Objective, here: _Point, step: Array) -> _Poin
         return _point(plant, objective, Weights(frozen(moved[:n, :n]), frozen(moved[n:, n:])))
     except WeightsError:
         return None
+
+
+#: Weight of the condition number in (3.7), against 1 for a distance as large as the gain in
+#: `infer_weights`.
+AUXILIARY_CONDITION_WEIGHT = 1e-3
+# Starting weights are kept this definite: the search takes the Cholesky factor of them.
+_LARGEST_START_CONDITION = 1e6
+# Steps of a search for weights near a gain, and the decrease of the objective that is worth one.
+_STEPS, _NEAR = 60, 1e-4
+
+
+@checked(gain="m n", condition_weight=0)
+def auxiliary_weights(
+    plant: Plant,
+    gain: Array,
+    start: Weights | None,
+    *,
+    metric: Array | None = None,
+    condition_weight: float = AUXILIARY_CONDITION_WEIGHT,
+) -> ConditionedFit:
+    """Auxiliary problem (3.7): weights whose regulator is near the gain, and well conditioned.
+
+    minimise  ||K(Q, R) - gain||_2 + condition_weight kappa(blkdiag(Q, R))
+
+    `gain` (m, n); `metric` (m, m).
+    """
+    m, size = plant.m, gain.size
+    target = None if metric is None else m * metric / np.trace(metric)
+    rows = size if target is None else size + m * m
+    dK, dS = np.zeros((rows, *gain.shape)), np.zeros((rows, m, m))
+    dK[:size] = np.eye(size).reshape(size, *gain.shape)
+    dS[size:] = np.eye(m * m)[: rows - size].reshape(-1, m, m)
+
+    def distance(solution: LqrSolution) -> Residual:
+        beyond = (solution.K - gain).ravel()
+        if target is not None:
+            S = m * solution.S / np.trace(solution.S)
+            beyond = np.concatenate([beyond, (S - target).ravel()])
+        return Residual(beyond, dK, dS, usable=True)
+
+    begin = Weights(np.eye(plant.n), np.eye(plant.m)) if start is None else start
+    return conditioned_fit(
+        plant, Objective(distance, 1.0, condition_weight, squared=False), definite(begin)
+    )
+
+
+def weights_near(
+    plant: Plant, form: Array, gain: Array, start: Weights, condition_share: float
+) -> ConditionedFit:
+    """Weights whose gain is nearest in a quadratic form, such as that of recordings about a fit.
+
+    minimise  1 + |form vec(K(Q, R) - gain)|^2 + condition_share kappa(blkdiag(Q, R))
+
+    `form` (r, columns); `gain` (m, n).
+    """
+    dK = np.concatenate([form, np.zeros((1, gain.size))]).reshape(-1, *gain.shape)
+    dS = np.zeros((len(dK), plant.m, plant.m))
+
+    def distance(solution: LqrSolution) -> Residual:
+        beyond = np.append(form @ (solution.K - gain).ravel(), 1.0)
+        return Residual(beyond, dK, dS, usable=True)
+
+    objective = Objective(distance, 1.0, condition_share, squared=True)
+    return conditioned_fit(plant, objective, start, max_iterations=_STEPS, tolerance=_NEAR)
+
+
+def definite(weights: Weights) -> Weights:
+    """Lift the least eigenvalues of Q and R so that the condition number is at most 1e6."""
+    if condition_number(weights) <= _LARGEST_START_CONDITION:
+        return normalised(weights)
+    floor = float(np.linalg.eigvalsh(weights.block)[-1]) / _LARGEST_START_CONDITION
+    lifted = []
+    for matrix in (weights.Q, weights.R):
+        values, vectors = np.linalg.eigh(matrix)
+        lifted.append((vectors * np.maximum(values, floor)) @ vectors.T)
+    return normalised(Weights(*lifted))

@@ -35,11 +35,7 @@ _BESIDE = 1e-3
 
 
 def kept_to(problem: Problem) -> Structure | None:
-    """The structure that the gain of a person keeps to, where the problem's own says anything.
-
-    It says nothing where every combination of the states has a price, or with several inputs. Where
-    physical parameters are searched the space would move with them, and every gain is searched.
-    """
+    """The structure that the gain of a person keeps to, where the problem's own says anything."""
     structure = problem.structure
     if structure is None or len(problem.logarithms) or problem.plant.m > 1:
         return None

@@ -127,10 +127,7 @@ def evaluate(
 
 
 def start_residual(problem: Problem, gain: Array, metric: Array) -> StartResidual:
-    """Residual of the only trial of a problem as a function of its initial state.
-
-    `gain` (m, n); `metric` (m, m).
-    """
+    """Residual of the only trial of a problem as a function of its initial state."""
     controller = controller_for(problem, gain, metric)
     n = problem.plant.n
     prepared = prepare_loop(controller, directions(controller, n, x0=np.eye(n)))
@@ -159,10 +156,7 @@ def misfit_or_reason(problem: Problem, gain: Array, metric: Array) -> tuple[floa
 def residual_or_reason(
     problem: Problem, gain: Array, metric: Array, correction: Correction | None = None
 ) -> tuple[Array, str]:
-    """`residual_only` (r,) and an empty string, or nothing (0,) and why there is none.
-
-    At a `gain` (m, n) and a `metric` (m, m); `correction` as in `evaluate`.
-    """
+    """`residual_only` (r,) and an empty string, or nothing (0,) and why there is none."""
     refused = _refused(problem, gain, correction)
     if refused:
         return np.zeros(0), refused
@@ -182,10 +176,7 @@ def residual_or_reason(
 
 
 def residual_only(problem: Problem, gain: Array, metric: Array) -> Array:
-    """Residual without derivatives, for differences and comparisons.
-
-    `gain` (m, n); `metric` (m, m); returns (r,).
-    """
+    """Residual without derivatives, for differences and comparisons."""
     controller, seen = controller_for(problem, gain, metric), _Seen.of(problem, None)
     return np.concatenate(
         [
@@ -346,11 +337,7 @@ def scaled_changes(metric: Array, changes: Array) -> Array:
 
 @checked
 def verify_hard(problem: Problem, weights: Weights) -> list[Simulation]:
-    """Simulate every recording with hard state bounds and terminal set.
-
-    The search softens those rows; this says whether the controller found keeps them. Pass each
-    result to `require_complete` to turn a failure into an error.
-    """
+    """Simulate every recording with hard state bounds and terminal set."""
     controller = Controller(
         problem.plant,
         weights,

@@ -64,10 +64,7 @@ def matrix_inequality(constant: Array, basis: Array) -> Cone:
 def norm_bound(
     vectors: Array, bound: Array, *, offset: Array | None = None, constant: float = 0.0
 ) -> Cone:
-    """||offset + sum y_i vectors_i|| <= constant + bound @ y.
-
-    `vectors` (k, r); `bound` (k,); `offset` (r,).
-    """
+    """||offset + sum y_i vectors_i|| <= constant + bound @ y."""
     rows = -np.vstack([bound, vectors.T])
     right = np.concatenate([[constant], np.zeros(len(rows) - 1) if offset is None else offset])
     return Cone(rows, right, clarabel.SecondOrderConeT(len(rows)))
@@ -82,10 +79,7 @@ def solve_semidefinite(
     scaled: bool = False,
     tolerance: float = 1e-11,
 ) -> SemidefiniteSolution:
-    """Minimise objective @ y + squares @ y^2 over the cones.
-
-    `objective` (k,); `squares` (k,); `reach` (k,).
-    """
+    """Minimise objective @ y + squares @ y^2 over the cones."""
     (found,) = solve_each(
         objective[None], cones, squares=squares, reach=reach, scaled=scaled, tolerance=tolerance
     )
@@ -101,12 +95,7 @@ def solve_each(
     scaled: bool = False,
     tolerance: float = 1e-11,
 ) -> list[SemidefiniteSolution]:
-    """Minimise each of some objectives over the same cones, written down once.
-
-    That is a sixth of the time of a program on the seat.
-
-    `objectives` (programs, k); `squares, reach` (k,).
-    """
+    """Minimise each of some objectives over the same cones, written down once."""
     settings = clarabel.DefaultSettings()
     settings.verbose = False
     settings.max_threads = 1

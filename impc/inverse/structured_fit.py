@@ -55,10 +55,7 @@ _ALIKE = 0.5
 def fit_structure(
     problem: Problem, structure: Structure, gain: Array, metric: Array, *starts: Array
 ) -> StructuredEnd:
-    """Fit the unknowns of a structure.
-
-    `gain` (m, n); `metric` (m, m); `*starts` (count,).
-    """
+    """Fit the unknowns of a structure; `gain` (m, n); `metric` (m, m); `*starts` (count,)."""
     target = _Target(problem, structure, gain, metric)
     ladder = bryson_prices(problem, structure, gain, metric)
     ends = _distinct([target.nearest(prices) for prices in ladder])
@@ -111,10 +108,7 @@ def feature_sizes(problem: Problem, structure: Structure, gain: Array, metric: A
 def bryson_prices(
     problem: Problem, structure: Structure, gain: Array, metric: Array
 ) -> list[Array]:
-    """Unknowns (count,) by which every feature costs a multiple of the command, at its size.
-
-    Of the states and commands under the controller of a gain (m, n) and a metric (m, m).
-    """
+    """Unknowns (count,) by which every feature costs a multiple of the command, at its size."""
     sizes = feature_sizes(problem, structure, gain, metric)
     runs = simulated(problem, gain, metric)
     u = np.concatenate([run.u[: max(run.reached, 1)] for run in runs])
@@ -214,10 +208,7 @@ def _ranked(problem: Problem, structure: Structure, starts: Sequence[Array]) -> 
 def structured_estimate(
     problem: Problem, structure: Structure, end: StructuredEnd, seconds: float = 0.0
 ) -> Estimate:
-    """The end of a search as the estimate of the method "structured".
-
-    `seconds` in s.
-    """
+    """The end of a search as the estimate of the method "structured"; `seconds` in s."""
     _, fit = goodness(end.problem, np.array(end.K), np.array(end.S))
     explained = end.misfit <= EXPLAINED * recorded_size(problem)
     settled = Status.SETTLED if end.settled else Status.STOPPED

@@ -78,10 +78,7 @@ def regulator_slopes(
 
 
 class PriceCoordinates(Coordinates):
-    """The unknowns of a structure in the place of gain and metric; z is the way from the start.
-
-    `prices` (count,).
-    """
+    """The unknowns of a structure in the place of gain and metric; z is the way from the start."""
 
     def __init__(self, problem: Problem, structure: Structure, prices: Array) -> None:
         first = solve_lqr(problem.plant, structure.weights(prices))
@@ -150,10 +147,7 @@ class PriceCoordinates(Coordinates):
         return dK, scaled_changes(here.S, dS)
 
     def deviations(self, z: Array, noise: float) -> tuple[Array, Array]:
-        """How far the unknowns that move (a,) are told, once all else has taken what it can.
-
-        `z` (q,); returns (a, a), (a,).
-        """
+        """How far the unknowns that move (a,) are told, once all else has taken what it can."""
         _, values, rows = np.linalg.svd(self.without_nuisance(z), full_matrices=False)
         return rows, noise / np.maximum(values, 1e-300)
 
@@ -172,10 +166,7 @@ class StructuredEnd:
 
 
 def search_from(problem: Problem, structure: Structure, prices: Array) -> StructuredEnd:
-    """One search from given unknowns.
-
-    `prices` (count,).
-    """
+    """One search from given unknowns; `prices` (count,)."""
     space = PriceCoordinates(problem, structure, prices)
     beside = len(problem.logarithms)
     shared = np.concatenate([np.full(int(space.ends[0]), 1 / _SPREAD), np.ones(beside)])

@@ -7,6 +7,8 @@ u are the inputs that the controller commands, d the recorded disturbances. A pl
 disturbances has an E with no columns. What the controller makes of it: docs/theory.md, section 1.
 A plant may also offer the body that really moves, x_{t+1} = f(x_t, u_t, d_t), whose linearisation
 at rest the matrices are: every simulation moves that one, and the controller predicts with these.
+Units of gains and weights follow from those of the signals: a gain takes a state to an input, a
+weight prices a product of two against R[0, 0] = 1, the square of the first input.
 """
 
 from __future__ import annotations
@@ -22,7 +24,6 @@ from impc.arrays import Array, System, frozen
 from impc.checking import Value, checked, replace
 from impc.errors import PlantError, brief
 from impc.model.body import Body, read_body
-from impc.model.signal_units import UNKNOWN
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -291,3 +292,43 @@ def _require_stabilisable(plant: Plant) -> None:
                 f"is not stabilisable: no input reaches the mode {mode:.4g}",
                 "add an input or remove that mode",
             )
+
+
+#: What is written where a plant does not say in which unit a signal is.
+UNKNOWN = "SI"
+
+
+def gain_unit(plant: Plant, control: str, state: str) -> str:
+    """Unit of the gain from a `state` to a `control`, both by name: "N m/rad"."""
+    return _ratio(plant.unit(control), plant.unit(state))
+
+
+def price_unit(plant: Plant, one: str, other: str) -> str:
+    """Unit of the weight on the product of two signals, `one` and `other`: "(N m)²/rad²"."""
+    first = _power(plant.unit(plant.controls[0]))
+    pair = plant.unit(one), plant.unit(other)
+    if UNKNOWN in pair:
+        return UNKNOWN
+    bottom = _power(pair[0]) if pair[0] == pair[1] else " ".join(map(_grouped, sorted(pair)))
+    return "1" if bottom == first else _ratio(first, bottom)
+
+
+def _ratio(top: str, bottom: str) -> str:
+    if UNKNOWN in (top, bottom):
+        return UNKNOWN
+    return top if bottom == "1" else f"{top}/{_factor(bottom)}"
+
+
+def _factor(unit: str) -> str:
+    """In brackets where a division before it would be read in two ways."""
+    return unit if unit.endswith("²") and unit.count("²") == 1 else _grouped(unit)
+
+
+def _power(unit: str) -> str:
+    if unit in ("1", UNKNOWN):
+        return unit
+    return f"{_grouped(unit)}²"
+
+
+def _grouped(unit: str) -> str:
+    return f"({unit})" if set(unit) & set(" /") else unit

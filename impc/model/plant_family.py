@@ -116,10 +116,7 @@ def plant_at(family: PlantFamily, logarithms: Array) -> Plant:
 
 
 def plant_differential(family: PlantFamily, logarithms: Array) -> PlantDifferential:
-    """Derivatives of the plant's matrices with respect to the logarithms of its parameters.
-
-    At `logarithms` (k,) of the parameters over their nominal values.
-    """
+    """Derivatives of the plant's matrices with respect to the logarithms of its parameters."""
     parts: list[tuple[Array, ...]] = []
     bodies: list[tuple[tuple[float, Body], ...]] = []
     for index, name in enumerate(family.names):

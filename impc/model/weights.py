@@ -112,35 +112,3 @@ def weight_error(estimate: Weights, truth: Weights) -> float:
     3.0
     """
     return float(np.linalg.norm(normalised(estimate).block - normalised(truth).block))
-
-
-@checked
-def cholesky_parameters(weights: Weights) -> Array:
-    """Lower-triangular entries (k,) of the Cholesky factors of Q and R, row by row.
-
-    R is scaled to R[0, 0] = 1 first and its first entry, then always 1, is left out, so that
-    k = n(n+1)/2 + m(m+1)/2 - 1: scale is not one of them. Equation (3.6).
-    """
-    scaled = normalised(weights)
-    try:
-        q_factor, r_factor = np.linalg.cholesky(scaled.Q), np.linalg.cholesky(scaled.R)
-    except np.linalg.LinAlgError:
-        raise WeightsError("Q", "is singular", "add a small multiple of the identity") from None
-    q_entries = q_factor[np.tril_indices(len(q_factor))]
-    r_entries = r_factor[np.tril_indices(len(r_factor))]
-    return np.concatenate([q_entries, r_entries[1:]])
-
-
-@checked(parameters="*", n=(1, 10_000), m=(1, 10_000))
-def weights_from_parameters(parameters: Array, n: int, m: int) -> Weights:
-    """Inverse of `cholesky_parameters`: Q = LL' (n, n), R = GG' (m, m) with G[0, 0] = 1.
-
-    `parameters` (k,).
-    """
-    count, total = n * (n + 1) // 2, (n * (n + 1) + m * (m + 1)) // 2 - 1
-    if len(parameters) != total:
-        raise WeightsError("parameters", f"has {len(parameters)} numbers", f"give {total}")
-    q_factor, r_factor = np.zeros((n, n)), np.zeros((m, m))
-    q_factor[np.tril_indices(n)] = parameters[:count]
-    r_factor[np.tril_indices(m)] = np.concatenate([[1.0], parameters[count:]])
-    return Weights(frozen(q_factor @ q_factor.T), frozen(r_factor @ r_factor.T))

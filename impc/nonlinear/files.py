@@ -33,7 +33,7 @@ from impc.files.reading import (
 )
 from impc.files.resampling import held_means, instants, same_rate
 from impc.files.units import si_unit
-from impc.model.signal_units import UNKNOWN
+from impc.model.plant import UNKNOWN
 from impc.nonlinear.fit import fit_optimal_control
 from impc.nonlinear.page import OptimalFit
 from impc.nonlinear.plan import require_solver

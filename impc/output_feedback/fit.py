@@ -18,7 +18,7 @@ from impc.arrays import Array, Frozen, frozen
 from impc.checking import checked
 from impc.errors import ImpcError, InputError
 from impc.inverse.coordinates import Point
-from impc.inverse.starting_regulators import regulators
+from impc.inverse.gain_search import regulators
 from impc.output_feedback.observer import LEVELS
 from impc.output_feedback.prior import Place, Prior
 from impc.output_feedback.search import climb

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from impc.arrays import Array, Frozen
-from impc.assess.intervals import entry_names
+from impc.assess.printed_gain import entry_names
 from impc.control.simulation import Status
 from impc.inverse.regulator_span import kept_to
 from impc.output_feedback.profile import FARTHEST

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import TYPE_CHECKING
 
-from impc.model.signal_units import UNKNOWN
+from impc.model.plant import UNKNOWN
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

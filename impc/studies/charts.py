@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
     from impc.arrays import Array
     from impc.assess.assessments import MethodFit
-    from impc.assess.intent_rules import Intent
+    from impc.assess.intent_statements import Intent
     from impc.inverse.problem import Problem
 
 # Samples that are drawn of a trial. Of the weights' chart, which has a curve a position: how many

@@ -12,7 +12,7 @@ import pandas as pd
 
 from impc.assess.assessments import ASSESSMENTS, assessed
 from impc.inverse.methods import METHODS
-from impc.model.signal_units import gain_unit, price_unit
+from impc.model.plant import gain_unit, price_unit
 from impc.reporting.document import Terms
 from impc.reporting.finding import Finding
 

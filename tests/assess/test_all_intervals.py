@@ -7,9 +7,9 @@ import pytest
 
 from experiments.coverage import cart, noisy_trial, true_controller
 from experiments.printed_intervals import carts, fit, noisy_recording, regulator
-from impc.assess.other_models import Alternative, fit_alternatives, verdict
 from impc.assess.printed_gain import gain_estimate
 from impc.assess.profiles import profile_likelihood
+from impc.assess.variance_accounted_for import Alternative, fit_alternatives, verdict
 from impc.checking import replace
 from impc.errors import InputError
 from impc.inverse.noisy_fit import fit_controller

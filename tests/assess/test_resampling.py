@@ -10,8 +10,7 @@ import scipy.signal
 
 from experiments.coverage import cart, noisy_trial
 from impc.arrays import Array
-from impc.assess.intervals import Interval, covariance_intervals, entry_names
-from impc.assess.printed_gain import gain_estimate
+from impc.assess.printed_gain import Interval, covariance_intervals, entry_names, gain_estimate
 from impc.assess.profiles import profile_likelihood
 from impc.assess.resampling import (
     Draw,

@@ -6,9 +6,10 @@ import control
 import numpy as np
 import pytest
 
-from impc.control.casadi_controller import SOLVERS, build_mpc, simulate_mpc, solve_mpc
+from impc.control.casadi_controller import build_mpc, simulate_mpc, solve_mpc
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
+from impc.control.named_solver import SOLVERS
 from impc.control.simulation import Status, require_complete, scenario
 from impc.errors import (
     BoundsError,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from experiments.benchmarks.workloads import Workload, seat
-from impc.assess.identified_directions import identifiability
+from impc.assess.weights_test import identifiability
 from impc.control.closed_loop import simulate, simulate_and_differentiate
 from impc.control.constraint_rows import directions
 from impc.control.controller import Controller

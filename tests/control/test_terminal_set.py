@@ -14,15 +14,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
+from experiments.certificates import invariance_violation, maximality_violation
 from impc.checking import replace
-from impc.control.halfspaces import supports
-from impc.control.polygon import as_pytope, polygon
+from impc.control.halfspaces import as_pytope, polygon, supports
 from impc.control.terminal_set import (
     TerminalSet,
     contains,
-    invariance_violation,
     maximal_invariant_set,
-    maximality_violation,
 )
 from impc.errors import DataError, ImpcError, InputError, PlantError, SolverError
 from impc.model.bounds import Bounds, bound_rows

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from impc.assess.identified_directions import identifiability
+from experiments.certificates import cholesky_parameters, weights_from_parameters
+from impc.assess.weights_test import identifiability
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
 from impc.control.simulation import Status, require_complete, scenario
@@ -32,10 +33,8 @@ from impc.model.recordings import Recording
 from impc.model.riccati import solve_lqr
 from impc.model.weights import (
     Weights,
-    cholesky_parameters,
     condition_number,
     weight_error,
-    weights_from_parameters,
 )
 from impc.studies.example.cases import CASES, run_case
 from tests.support import nelder_mead, random_plant, random_weights
@@ -113,7 +112,7 @@ def test_what_is_determined_is_told_where_no_other_weights_can_be_found(
     def undecided(*_: object) -> None:
         raise SolverError("least condition number", "proven only to 0.89", "scale the states")
 
-    monkeypatch.setattr("impc.assess.identified_directions.other_weights", undecided)
+    monkeypatch.setattr("impc.assess.weights_test.other_weights", undecided)
     found = identifiability(problem, IDENTITY)
     assert found.others == ()
     assert (found.rank, found.free) == (expected.rank, expected.free)

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from impc.inverse.nearest_regulator import AUXILIARY_CONDITION_WEIGHT, auxiliary_weights
+from experiments.certificates import weights_from_parameters
+from impc.inverse.proximal_search import AUXILIARY_CONDITION_WEIGHT, auxiliary_weights
 from impc.model.plant import Plant
 from impc.model.riccati import solve_lqr
-from impc.model.weights import Weights, condition_number, weights_from_parameters
+from impc.model.weights import Weights, condition_number
 from tests.support import nelder_mead, random_plant, random_weights
 
 IDENTITY = Weights(np.eye(2), 1)

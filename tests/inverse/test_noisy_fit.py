@@ -17,9 +17,8 @@ from impc.control.simulation import scenario
 from impc.inverse.coordinates import Coordinates
 from impc.inverse.estimates import Estimate
 from impc.inverse.groundwork import NaturalUnits
-from impc.inverse.initial_states import with_fitted_starts
 from impc.inverse.methods import estimate_all
-from impc.inverse.noisy_fit import fit_controller
+from impc.inverse.noisy_fit import fit_controller, with_fitted_starts
 from impc.inverse.problem import Problem
 from impc.inverse.residuals import evaluate
 from impc.model.plant import Plant

@@ -10,8 +10,7 @@ import pint
 import pytest
 
 from impc.errors import PlantError
-from impc.model.plant import Plant
-from impc.model.signal_units import gain_unit, price_unit
+from impc.model.plant import Plant, gain_unit, price_unit
 from plants import cursor_plant, seated_balance_plant, yalmip_example
 
 UNITS = {"angle": "rad", "rate": "rad/s", "torque": "N m", "share": "1"}

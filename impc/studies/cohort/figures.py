@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from impc.model.signal_units import UNKNOWN
+from impc.model.plant import UNKNOWN
 from impc.reporting.style import DOUBLE_COLUMN, INK, STATE_MARKS, VERMILLION, new_figure
 from impc.studies.cohort.told import measure_words
 

@@ -18,17 +18,17 @@ import psutil
 
 from impc.arrays import frozen
 from impc.assess.assessments import assessed, judge
-from impc.assess.intent_rules import intent
+from impc.assess.intent_statements import intent
 from impc.assess.printed_gain import gain_estimate
 from impc.assess.resampling import DRAWS, bootstrap_model, replicate
-from impc.assess.variance_accounted_for import predict, saturated_share
+from impc.assess.variance_accounted_for import left_out_vaf, saturated_share
 from impc.checking import replace
 from impc.errors import DataError, ImpcError
 from impc.files.digests import content_digest, digest, source_digest, versions
 from impc.files.plant_sources import make_plant, plant_family_of, plant_source
 from impc.files.reading import read_unit
 from impc.inverse.noisy_fit import fit_controller
-from impc.model.signal_units import price_unit
+from impc.model.plant import price_unit
 from impc.reporting.rendering import plain
 from impc.reporting.shown_units import angles_in, shown_unit, signal_words
 from impc.studies.cohort.unit_structure import unit_structure
@@ -249,7 +249,7 @@ def _held_out(problem: Problem, fitted: Estimate, settings: FitSettings) -> Arra
     rows = np.empty((count if settings.held_out and count > 1 else 0, len(problem.plant.outputs)))
     for index in range(len(rows)):
         other = fit_controller(fitted.problem.leaving_out(index), fitted.stage_weights)
-        rows[index] = predict(problem, other, fitted, index, settings.settle).vaf
+        rows[index] = left_out_vaf(other, problem.recordings[index], settings.settle).vaf
     return frozen(rows)
 
 

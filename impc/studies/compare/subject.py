@@ -73,5 +73,5 @@ def _held_out(problem: Problem, estimates: list[Estimate | None], settle: float)
     rows = np.full((len(estimates), len(problem.plant.outputs)), np.nan)
     for index, estimate in enumerate(estimates):
         if estimate is not None and estimate.K is not None:
-            rows[index], _ = left_out_vaf(estimate, problem.recordings[index], settle)
+            rows[index] = left_out_vaf(estimate, problem.recordings[index], settle).vaf
     return frozen(rows)

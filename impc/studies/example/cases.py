@@ -14,7 +14,7 @@ import numpy as np
 
 from impc.arrays import Array, Frozen, frozen
 from impc.assess.assessments import judge
-from impc.assess.identified_directions import Identifiability, identifiability
+from impc.assess.weights_test import Identifiability, identifiability
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
 from impc.control.named_solver import COMPILED
@@ -22,8 +22,8 @@ from impc.control.simulation import Simulation, require_complete, scenario
 from impc.inverse.direct_and_reduced import CONDITION_WEIGHT
 from impc.inverse.groundwork import PlantUnits
 from impc.inverse.methods import METHODS
-from impc.inverse.nearest_regulator import AUXILIARY_CONDITION_WEIGHT
 from impc.inverse.problem import Problem, misfit
+from impc.inverse.proximal_search import AUXILIARY_CONDITION_WEIGHT
 from impc.model.bounds import Bounds
 from impc.model.recordings import Recording
 from impc.model.weights import Weights, weight_error

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.control.polygon import polygon
+from impc.control.halfspaces import polygon
 from impc.reporting.style import (
     BLUE,
     DOUBLE_COLUMN,

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from impc.arrays import Array
-    from impc.assess.identified_directions import Identifiability
+    from impc.assess.weights_test import Identifiability
     from impc.model.weights import Weights
     from impc.reporting.provenance import Provenance
     from impc.studies.example.cases import CaseResult, MethodResult

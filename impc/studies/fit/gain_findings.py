@@ -12,10 +12,10 @@ import numpy as np
 import pandas as pd
 
 from impc.assess.covariance import TOLD
-from impc.assess.intervals import entry_names
-from impc.assess.other_models import verdict
+from impc.assess.printed_gain import entry_names
+from impc.assess.variance_accounted_for import verdict
 from impc.files.names import LARGEST
-from impc.model.signal_units import UNKNOWN, gain_unit
+from impc.model.plant import UNKNOWN, gain_unit
 from impc.reporting.finding import Finding, Picture, Severity, table_of
 from impc.reporting.rendering import number
 from impc.studies.fit.verdict import direction_name, other_limit_sentence
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from impc.arrays import Array
-    from impc.assess.intervals import Interval
+    from impc.assess.printed_gain import Interval
     from impc.model.plant import Plant
     from impc.studies.fit.result import FitResult
 

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.assess.intervals import entry_names
-from impc.model.signal_units import UNKNOWN
+from impc.assess.printed_gain import entry_names
+from impc.model.plant import UNKNOWN
 from impc.reporting.style import BLUE, INK, VERMILLION, new_figure
 from impc.studies.fit.gain_findings import number_name
 

@@ -41,7 +41,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from markupsafe import Markup
 
-from impc.assess.intent_rules import dominant_sentence
+from impc.assess.intent_statements import dominant_sentence
 from impc.control.named_solver import described
 from impc.reporting.document import (
     Block,

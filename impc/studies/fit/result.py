@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.assess.diagnostics import residual_warnings
-from impc.assess.intervals import PARAMETER, entry_names
+from impc.assess.printed_gain import PARAMETER, entry_names
 from impc.control.simulation import Status
 from impc.model.riccati import solve_lqr
 
@@ -18,14 +18,12 @@ if TYPE_CHECKING:
     from impc.assess.all_intervals import Certainty
     from impc.assess.assessments import MethodFit
     from impc.assess.diagnostics import ResidualDiagnostics
-    from impc.assess.identified_directions import Identifiability
     from impc.assess.input_limits import OtherLimit
-    from impc.assess.intent_rules import Intent
-    from impc.assess.intervals import Interval
-    from impc.assess.printed_gain import GainEstimate
+    from impc.assess.intent_statements import Intent
+    from impc.assess.printed_gain import GainEstimate, Interval
     from impc.assess.structures import StructureFit
     from impc.assess.variance_accounted_for import HeldOut, TrialAgreement
-    from impc.assess.weights_test import WeightsTest
+    from impc.assess.weights_test import Identifiability, WeightsTest
     from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
     from impc.output_feedback.page import PersonReport

@@ -8,9 +8,9 @@ import numpy as np
 import pandas as pd
 
 from impc.assess.long_run_covariance import residual_noise
-from impc.assess.other_models import residuals_of
 from impc.assess.structured_weights import TOLD_FACTOR
 from impc.assess.structures import criterion_of
+from impc.assess.variance_accounted_for import residuals_of
 from impc.reporting.document import Block, Details, Heading, Section
 from impc.reporting.finding import Finding, Picture, table_of
 from impc.reporting.style import BLUE, INK, VERMILLION, new_figure

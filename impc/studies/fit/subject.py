@@ -23,15 +23,14 @@ from impc.assess.diagnostics import (
     ResidualDiagnostics,
     residual_diagnostics,
 )
-from impc.assess.identified_directions import identifiability
 from impc.assess.input_limits import at_another_limit
 from impc.assess.intent_draws import drawn_gains
-from impc.assess.intent_rules import intent
+from impc.assess.intent_statements import intent
 from impc.assess.printed_gain import gain_estimate
 from impc.assess.structures import assess_structure, no_structure
-from impc.assess.variance_accounted_for import agreement, predict
+from impc.assess.variance_accounted_for import agreement, left_out_vaf
 from impc.assess.weights_ranges import weights_summary_or_reason
-from impc.assess.weights_test import weights_test
+from impc.assess.weights_test import identifiability, weights_test
 from impc.checking import checked, replace
 from impc.errors import DataError, ImpcError, SolverError, WeightsError
 from impc.inverse.cross_check import cross_checked
@@ -311,7 +310,7 @@ def _beside_it(
             progress.done(found.method)
         for index, other in enumerate(pending):
             predicted = functools.partial(
-                _predicted, problem, other, own.estimate, index, settings.settle
+                _predicted, other, problem.recordings[index], settings.settle
             )
             held_out.append(attempt(_without(index), predicted, None))
             progress.done(_without(index))
@@ -342,10 +341,8 @@ def _free_limit(
     return found
 
 
-def _predicted(
-    problem: Problem, other: Future[Estimate], fitted: Estimate, index: int, settle: float
-) -> HeldOut:
-    return predict(problem, other.result(), fitted, index, settle)
+def _predicted(other: Future[Estimate], trial: Recording, settle: float) -> HeldOut:
+    return left_out_vaf(other.result(), trial, settle)
 
 
 def _person(

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.assess.covariance import TOLD
-from impc.assess.intent_rules import dominant_sentence
+from impc.assess.intent_statements import dominant_sentence
 from impc.reporting.rendering import number
 from impc.studies.fit.result import LITTLE, trial_name
 from impc.studies.fit.structure_words import structure_sentences

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 from markupsafe import Markup
 
-from impc.model.signal_units import gain_unit
+from impc.model.plant import gain_unit
 from impc.reporting.document import Lines, Report, Section, Terms, Verdict
 from impc.reporting.finding import Finding, Picture, table_of
 from impc.reporting.rendering import number

@@ -11,7 +11,7 @@ from msgspec import Meta
 
 from impc.errors import InputError, brief
 from impc.files.units import si_unit
-from impc.model.signal_units import UNKNOWN
+from impc.model.plant import UNKNOWN
 from impc.model.structure import Structure
 from impc.studies.fit.settings import read_settings
 
