@@ -17,8 +17,8 @@ from impc.files.delimited import encode_delimited, read_delimited
 from impc.files.matlab import encode_matlab
 from impc.files.matlab73 import HDF5_SIGNATURE, matlab73_bytes
 from impc.files.names import LARGEST, damaged, require_ordinary
+from impc.files.spreadsheet import encode_workbook
 from impc.files.tdms import encode_tdms
-from impc.files.workbook import encode_workbook
 from impc.files.writing import unwritable
 
 if TYPE_CHECKING:

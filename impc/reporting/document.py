@@ -15,13 +15,13 @@ from typing import Any
 import pandas as pd
 
 from impc.files.results import SCHEMA
+from impc.files.spreadsheet import workbook_bytes
 from impc.reporting.finding import (
     MOST_CELLS,
     Chart,
     Finding,
     Picture,
     csv_bytes,
-    workbook_bytes,
 )
 from impc.reporting.glossary import Glossary, used_words
 from impc.reporting.provenance import Provenance
