@@ -18,11 +18,19 @@ import numpy as np
 
 from impc.errors import DataError, one_line
 from impc.extras import optional
-from impc.files.blocks import EMPTY, HEAD, NUMBER, WORD, Block, first_block
 from impc.files.delimited import is_number, text_cell
-from impc.files.headings import find_headings, written_heading
+from impc.files.layout import (
+    EMPTY,
+    HEAD,
+    NUMBER,
+    WORD,
+    Block,
+    find_headings,
+    first_block,
+    require_no_thousands,
+    written_heading,
+)
 from impc.files.table import make_table
-from impc.files.thousands import require_no_thousands
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence

@@ -17,8 +17,8 @@ from typing import Any, TypeVar
 import numpy as np
 import pandas as pd
 
-from impc.files.columns import in_columns
 from impc.files.spreadsheet import as_data
+from impc.files.table import in_columns
 from impc.reporting.rendering import number
 
 T = TypeVar("T")

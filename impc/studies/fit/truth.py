@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.assess.intervals import entry_names
-from impc.files.names import LARGEST
+from impc.files.disk import LARGEST
 from impc.reporting.finding import Finding, table_of
 from impc.reporting.rendering import number
 from impc.studies.fit.gain_findings import number_name
