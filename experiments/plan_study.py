@@ -23,7 +23,7 @@ from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.structure import Structure
 from impc.studies.plan.designs import Design, Person, designs, try_design
-from impc.studies.plan.simulated_fits import simulated_fits
+from impc.studies.plan.study import simulated_fits
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -16,13 +16,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 import plants
+from impc.studies.selection.analysis import bootstrap_subset
 from impc.studies.selection.estimation import estimate, free_indices
-from impc.studies.selection.fisher import fisher_information
+from impc.studies.selection.fisher import fisher_information, largest_subsets, sweep
 from impc.studies.selection.lasso import lasso_of_size, table_c1
 from impc.studies.selection.model import Trial
 from impc.studies.selection.model_source import model_source
-from impc.studies.selection.subject import bootstrap_subset
-from impc.studies.selection.subsets import largest_subsets, sweep
 
 if TYPE_CHECKING:
     from impc.arrays import Array

@@ -13,11 +13,10 @@ from experiments.reproduction.entry import Entry, Verdict, agrees
 from experiments.selection_claims import FIM_SUBSET, mean_subject
 from impc.checking import replace
 from impc.studies.selection.estimation import estimate, free_indices
-from impc.studies.selection.fisher import fisher_information
+from impc.studies.selection.fisher import exhaustive, fisher_information, largest_subsets
 from impc.studies.selection.lasso import lasso_of_size
 from impc.studies.selection.linear import Discrete, sampled
 from impc.studies.selection.model import Trial, normalised, sensitivity
-from impc.studies.selection.subsets import exhaustive, largest_subsets
 
 if TYPE_CHECKING:
     from impc.arrays import Array
@@ -161,7 +160,7 @@ def _selection(information: Information) -> list[Entry]:
         Entry(
             "(C.1) to (C.3)",
             "Selection matrices; the FIM of a subset is a submatrix.",
-            ("impc.studies.selection.subsets:subset_variances",),
+            ("impc.studies.selection.fisher:subset_variances",),
             "Indices in place of matrices of zeros and ones.",
             Verdict.REPRODUCED,
         ),
@@ -170,8 +169,8 @@ def _selection(information: Information) -> list[Entry]:
             "Most parameters such that the reciprocal condition number is above machine epsilon and"
             " the largest variance at most v; all 4083 subsets are tried.",
             (
-                "impc.studies.selection.subsets:exhaustive",
-                "impc.studies.selection.subsets:largest_subsets",
+                "impc.studies.selection.fisher:exhaustive",
+                "impc.studies.selection.fisher:largest_subsets",
             ),
             f"All subsets in {1000 * seconds:.0f} ms: {len(all_of_them.subsets)} of size"
             f" {all_of_them.size} at v = .05, largest variance {worst:.3f}. Growing feasible sets"

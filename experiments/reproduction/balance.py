@@ -129,7 +129,7 @@ def _figures(result: dict[str, Any]) -> list[Entry]:
         Entry(
             "Figure 2.5",
             "Transfer functions of one subject over three visits.",
-            ("impc.studies.reliability.transfer:transfer_function",),
+            ("impc.studies.reliability.measures:transfer_function",),
             "Amplitude and phase, from the torque to each angle, over the passband.",
             Verdict.IN_KIND,
             _STUDY,
@@ -138,7 +138,7 @@ def _figures(result: dict[str, Any]) -> list[Entry]:
         Entry(
             "Figure 2.6",
             "Transfer functions of three subjects.",
-            ("impc.studies.reliability.transfer:transfer_function",),
+            ("impc.studies.reliability.measures:transfer_function",),
             "The same for three subjects: they differ more than visits do.",
             Verdict.IN_KIND,
             _STUDY,
@@ -152,7 +152,7 @@ def _claims(result: dict[str, Any]) -> list[Entry]:
         Entry(
             "Claim, 2.3",
             item["statement"],
-            ("impc.studies.reliability.findings:findings",),
+            ("impc.studies.reliability.verdict:findings",),
             item["numbers"] + ".",
             kind(item["found"]),
             _STUDY
@@ -205,7 +205,7 @@ def _p_values(result: dict[str, Any], item: str, measure: str, quoted: str) -> E
         item,
         f"Means over visits, and p values of the analysis of variance (lower and upper body):"
         f" {quoted}.",
-        ("impc.studies.reliability.anova:visit_anova", "impc.studies.reliability.findings:QUOTED"),
+        ("impc.studies.reliability.anova:visit_anova", "impc.studies.reliability.verdict:QUOTED"),
         f"p: {found}.",
         Verdict.LOST,
         "The means are lost; p values belong to the thirty subjects. The simulated ones do not"

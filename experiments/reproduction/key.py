@@ -53,7 +53,7 @@ def _key_equations(yaw: dict[str, Any]) -> list[Entry]:
         Entry(
             "(5.4), (5.5)",
             "Largest subsets whose variance is below v for every subject and visit.",
-            ("impc.studies.selection.subsets:largest_subsets",),
+            ("impc.studies.selection.fisher:largest_subsets",),
             f"At v = .35: {len(yaw['candidates'])} subsets of {yaw['size']}, largest variance"
             f" {worst:.2g}.",
             agrees(worst <= 0.35),

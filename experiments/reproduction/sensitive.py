@@ -11,8 +11,8 @@ from experiments.reproduction.entry import Entry, Verdict, agrees, kind
 from experiments.reproduction.evidence import table
 from experiments.selection_claims import FIM_SUBSET, mean_subject, nominal_information
 from impc.studies.selection.estimation import estimate, free_indices, pooled_vaf
+from impc.studies.selection.fisher import exhaustive, largest_subsets
 from impc.studies.selection.model import normalised, physical
-from impc.studies.selection.subsets import exhaustive, largest_subsets
 
 if TYPE_CHECKING:
     from experiments.reproduction.evidence import Evidence
@@ -140,14 +140,14 @@ def _tables(
         Entry(
             "Figure 4.3",
             "Model-based bootstrap with 1000 replicates.",
-            ("impc.studies.selection.subject:bootstrap_subset",),
+            ("impc.studies.selection.analysis:bootstrap_subset",),
             "The same, with a block draw for coloured residuals; the number is a setting.",
             Verdict.REPRODUCED,
         ),
         Entry(
             "Figure 4.4",
             "Size and number of the subsets for ten bounds from .05 to .95: 3 to 5 parameters.",
-            ("impc.studies.selection.subsets:sweep",),
+            ("impc.studies.selection.fisher:sweep",),
             f"{min(sizes)} to {max(sizes)} by the worst case over subjects; at the nominal column"
             f" five at .05, first {first}.",
             kind(min(sizes) == 3),
@@ -187,7 +187,7 @@ def _claims(
             "Claim, 4.3",
             "FIM selects {Kvis, Kccr, tau, tau1A, tauCNS1}, five of twelve.",
             (
-                "impc.studies.selection.subsets:largest_subsets",
+                "impc.studies.selection.fisher:largest_subsets",
                 "impc.studies.selection.analysis:select_study",
             ),
             f"At the nominal column number {place} of {len(selection.subsets)} subsets of"
@@ -223,7 +223,7 @@ def _claims(
         Entry(
             "Claim, 4.1",
             "4083 subsets of two parameters or more.",
-            ("impc.studies.selection.subsets:exhaustive",),
+            ("impc.studies.selection.fisher:exhaustive",),
             f"2^12 - 1 - 12 = {2**12 - 1 - 12}.",
             Verdict.REPRODUCED,
         ),
@@ -239,7 +239,7 @@ def _claims(
         Entry(
             "Claim, 4.2.4",
             "Bootstrap intervals, from the 2.5th to the 97.5th percentile.",
-            ("impc.studies.selection.subject:bootstrap_subset",),
+            ("impc.studies.selection.analysis:bootstrap_subset",),
             "First subject: "
             + "; ".join(
                 f"{row.parameter} {row.low:.3g} to {row.high:.3g}"

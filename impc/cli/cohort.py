@@ -158,8 +158,8 @@ def reliability_command(
     from impc.reporting.writer import write_files  # noqa: PLC0415
     from impc.studies.cohort.study import read_study  # noqa: PLC0415
     from impc.studies.reliability.analysis import analyse  # noqa: PLC0415
-    from impc.studies.reliability.findings import findings  # noqa: PLC0415
     from impc.studies.reliability.report import reliability_report  # noqa: PLC0415
+    from impc.studies.reliability.verdict import findings  # noqa: PLC0415
 
     study = read_study(study_file)
     require_distinct([file for unit in study.units for file in unit.files])

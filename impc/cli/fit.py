@@ -41,6 +41,7 @@ def command(
     from impc.reporting.shown_units import angles_in  # noqa: PLC0415
     from impc.reporting.writer import require_writable, write_files  # noqa: PLC0415
     from impc.studies.effort import fit_effort  # noqa: PLC0415
+    from impc.studies.fit.gain_findings import read_truth, truth_sentence  # noqa: PLC0415
     from impc.studies.fit.memory import open_memory  # noqa: PLC0415
     from impc.studies.fit.report import fit_report  # noqa: PLC0415
     from impc.studies.fit.subject import (  # noqa: PLC0415
@@ -48,7 +49,6 @@ def command(
         fit_recordings,
         stages,
     )
-    from impc.studies.fit.truth import read_truth, truth_sentence  # noqa: PLC0415
     from impc.studies.fit.verdict import missing  # noqa: PLC0415
 
     require_writable(out)

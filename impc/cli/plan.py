@@ -51,8 +51,12 @@ def command(config: Path, plant_name: str, out: Path, yes: bool) -> None:
     from impc.studies.plan.report import plan_report  # noqa: PLC0415
     from impc.studies.plan.sentences import plan_sentences  # noqa: PLC0415
     from impc.studies.plan.settings import plan_settings  # noqa: PLC0415
-    from impc.studies.plan.simulated_fits import OneFit  # noqa: PLC0415
-    from impc.studies.plan.study import make_plan, plan_effort, steps_of  # noqa: PLC0415
+    from impc.studies.plan.study import (  # noqa: PLC0415
+        OneFit,
+        make_plan,
+        plan_effort,
+        steps_of,
+    )
 
     require_writable(out)
     configuration = read_configuration(config)

@@ -1,8 +1,8 @@
-"""Compiled code: the filter of plant and estimate, of many trials at once, with its derivatives.
+"""Compiled code: the filter of plant and estimate of one trial, with its derivatives.
 
 The filter is that of `likelihood` (docs/noisy-people.md), a sample of it that of
-`compiled_sample`. While no bound is near, what is recorded changes no covariance, so that trials
-share one: it is most of what a filter costs.
+`compiled_sample`. While no bound is near the covariance, which is most of what a filter costs,
+soon stands still.
 """
 
 from __future__ import annotations
@@ -42,22 +42,6 @@ class Steady(NamedTuple):
     known: bool  # Whether there is one
 
 
-class Course(NamedTuple):
-    """Trials that are filtered together, and where each leaves."""
-
-    begin: Buffer  # The row at which each trial begins, and the one after the last (trials + 1,)
-    first: int  # The sample at which all are
-    corrected: bool  # Whether z knows the outputs of that sample
-    # Whether trials share a covariance, and leave where a bound is near; one alone need not
-    shared: bool
-    reached: Buffer  # Written: the sample at which each leaves, or how many it has (trials,)
-    known: Buffer  # Written: whether its z knows the outputs of that sample (trials,)
-    # Covariance before the first sample (trials, z, z), and its derivatives (trials, z, z, k);
-    # written, of each that leaves before its end: those before the sample at which it does
-    P: Buffer
-    dP: Buffer
-
-
 class FilterParts(NamedTuple):
     """What is filtered with, along q directions of which the first k move covariances."""
 
@@ -84,63 +68,41 @@ def run_filter(
     dz: Buffer,
     room: Room,
     result: FilterResult,
-    course: Course,
-) -> None:
-    """Filter trials from the sample at which all are.
+    first: int,
+) -> int:
+    """Filter one trial from the first sample on; returns the sample at which it ends.
 
-    A trial leaves at its end; at a sample whose status has been written, at which the law has no
-    answer or the state leaves every range; at the first one at which a bound is near, where
-    covariances are shared; and where they are not, at the first one that remembers nothing of the
-    first state, from where `lasting` directions are enough.
+    It ends after the last sample; at one whose status has been written, at which the law has no
+    answer or the state leaves every range; and at the first one that remembers nothing of the first
+    state, from where `lasting` directions are enough. Until there the room has the covariance.
 
-    `outputs` (rows, p); `disturbance` (rows, d); `z` (trials, z); `dz` (trials, z, q).
+    `outputs` (samples, p); `disturbance` (samples, d); `z` (z,); `dz` (z, q).
     """
-    u, here, joint, djoint, lasting = room.u, room.here, parts.joint, parts.djoint, parts.lasting
-    begin, reached, first, at = course.begin, course.reached, course.first, parts.at
+    u, joint, djoint, at = room.u, parts.joint, parts.djoint, parts.at
     n = parts.loop.K.shape[1]
-    settled, quiet, left, t = False, 0, len(reached), first
-    reached[:] = begin[1:] - begin[:-1]
-    course.known[:] = False
+    settled, quiet = False, 0
     weigh(joint, djoint, room)
-    while left > 0:
-        met, left = False, 0
-        for i in range(len(reached)):
-            row = begin[i] + t
-            if t >= reached[i]:
-                continue
-            if not (t == first and course.corrected):
-                if quiet > 2 * z.shape[1] and dz.shape[2] > lasting:
-                    _leave(course, here, i, t, False)
-                    continue
-                forgotten = update(
-                    joint, djoint, room, outputs[row], z[i], dz[i], result, i, row, t, lasting
-                )
-                quiet = quiet + 1 if forgotten and not course.shared else 0
-            x, dx = z[i, at : at + n], dz[i, at : at + n]
-            status, near = _command(parts, room, course.shared, x, dx)
-            result.u[row], result.status[row] = u, status
-            if status > SOFTENED:
-                reached[i] = t
-                continue
-            if course.shared and near:
-                _leave(course, here, i, t, True)
-                continue
-            met = met or near
-            ahead(joint, djoint, room, u, disturbance[row], z[i], dz[i])
-            if not np.max(np.abs(z[i])) < LARGEST:
-                result.status[row], reached[i] = DIVERGED, t
-                continue
-            left += 1
-        if left > 0 and (not settled or met):
-            settled = _advanced(parts, room, met)
-        t += 1
+    for t in range(first, len(outputs)):
+        if quiet > 2 * len(z) and dz.shape[1] > parts.lasting:
+            return t
+        forgotten = update(joint, djoint, room, outputs[t], z, dz, result, t, parts.lasting)
+        quiet = quiet + 1 if forgotten else 0
+        status, near = _command(parts, room, z[at : at + n], dz[at : at + n])
+        result.u[t], result.status[t] = u, status
+        if status > SOFTENED:
+            return t
+        ahead(joint, djoint, room, u, disturbance[t], z, dz)
+        if not np.max(np.abs(z)) < LARGEST:
+            result.status[t] = DIVERGED
+            return t
+        if not settled or near:
+            settled = _advanced(parts, room, near)
+    return len(outputs)
 
 
 @njit(cache=True, inline="always")
-def _command(
-    parts: FilterParts, room: Room, shared: bool, x: Buffer, dx: Buffer
-) -> tuple[int, bool]:
-    """The room has what is expected of a command, but of one near a bound if that is to be shared.
+def _command(parts: FilterParts, room: Room, x: Buffer, dx: Buffer) -> tuple[int, bool]:
+    """The room has what is expected of a command.
 
     The estimate x (n,) and its derivatives (n, q) are those that are expected. Returns the status,
     and whether a bound is near.
@@ -149,15 +111,14 @@ def _command(
     work, lam, u, du = room.work, room.lam, room.u, room.du
     status, _, _ = law(loop, dloop, rows, drows, unit, work, x, dx, lam, False, u, du)
     near = status > 0
-    if status > SOFTENED or (shared and near):
+    if status > SOFTENED:
         return status, near
     slope_of_law(loop, dloop, rows, drows, work, room.slope, room.dslope)
     if parts.clip.used:
         found, s = expected_command(parts.clip, room, parts.at, u)
         near = near or found.near
-        if not (shared and near):
-            clip_command(found, s, parts.joint, parts.djoint, room, parts.at, u)
-            status = max(status, found.beyond)
+        clip_command(found, s, parts.joint, parts.djoint, room, parts.at, u)
+        status = max(status, found.beyond)
     return status, near
 
 
@@ -173,13 +134,6 @@ def _advanced(parts: FilterParts, room: Room, met: bool) -> bool:
         here.P[:], here.dP[:] = steady.P, steady.dP[:, :, : here.dP.shape[2]]
     weigh(joint, djoint, room)
     return settled
-
-
-@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
-def _leave(course: Course, here: Covariance, i: int, t: int, known: bool) -> None:
-    """One trial leaves at a sample, with the covariance before it."""
-    course.reached[i], course.known[i] = t, known
-    course.P[i], course.dP[i] = here.P, here.dP
 
 
 @njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)

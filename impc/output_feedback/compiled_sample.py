@@ -25,18 +25,18 @@ _FORGOTTEN = 1e-9
 
 
 class FilterResult(NamedTuple):
-    """What the filter writes, sample by sample, the trials one after the other."""
+    """What the filter writes, sample by sample of one trial."""
 
-    told: Buffer  # Log-likelihood of each sample given the earlier ones of its trial (rows,)
-    score: Buffer  # Its derivatives along the q directions (rows, q)
-    # Of each trial, the sum of their expected products (trials, q, q), the lower half
+    told: Buffer  # Log-likelihood of each sample given the earlier ones (samples,)
+    score: Buffer  # Its derivatives along the q directions (samples, q)
+    # The sum of their expected products (q, q), the lower half
     information: Buffer
-    # Recorded outputs minus what is expected (rows, p), and their covariance (rows, p, p)
+    # Recorded outputs minus what is expected (samples, p), and their covariance (samples, p, p)
     innovation: Buffer
     spread: Buffer
-    filtered: Buffer  # Expected z given all outputs so far (rows, z)
-    u: Buffer  # Command expected there (rows, m)
-    status: Buffer  # Of each sample: the value of `closed_loop.Status` (rows,)
+    filtered: Buffer  # Expected z given all outputs so far (samples, z)
+    u: Buffer  # Command expected there (samples, m)
+    status: Buffer  # Of each sample: the value of `closed_loop.Status` (samples,)
     # The first sample of a trial that is told: those before it tell nothing, and are what the
     # others are told given
     counted: int
@@ -51,8 +51,6 @@ def update(
     z: Buffer,
     dz: Buffer,
     result: FilterResult,
-    i: int,
-    row: int,
     t: int,
     lasting: int,
 ) -> bool:
@@ -61,10 +59,10 @@ def update(
     `output` (p,); `z` (z,); `dz` (z, q).
     """
     _innovate(joint, djoint, room, output, z, dz)
-    result.innovation[row], result.spread[row] = room.e, room.here.S
-    _tell(room, result, i, row, t)
+    result.innovation[t], result.spread[t] = room.e, room.here.S
+    _tell(room, result, t)
     _correct(room, z, dz)
-    result.filtered[row] = z
+    result.filtered[t] = z
     return _forgotten(room, lasting)
 
 
@@ -93,7 +91,7 @@ def _innovate(
 
 
 @njit(cache=True, inline="always")
-def _tell(room: Room, result: FilterResult, i: int, row: int, t: int) -> None:
+def _tell(room: Room, result: FilterResult, t: int) -> None:
     """Write likelihood and score, and add the information."""
     here, e, we, de, moved = room.here, room.e, room.we, room.de, room.moved
     inverse, dS, (p, q), k = here.inverse, here.dS, de.shape, moved.shape[1]
@@ -104,8 +102,8 @@ def _tell(room: Room, result: FilterResult, i: int, row: int, t: int) -> None:
                 moved[a, c] += dS[a, b, c] * we[b]
     if t < result.counted:
         return
-    result.told[row] = -(np.dot(e, we) + here.volume[0] + p * np.log(2 * np.pi)) / 2
-    score = result.score[row, :q]
+    result.told[t] = -(np.dot(e, we) + here.volume[0] + p * np.log(2 * np.pi)) / 2
+    score = result.score[t, :q]
     for a in range(p):
         for c in range(q):
             score[c] -= we[a] * de[a, c]
@@ -114,7 +112,7 @@ def _tell(room: Room, result: FilterResult, i: int, row: int, t: int) -> None:
         for b in range(p):
             for c in range(k):
                 score[c] -= inverse[a, b] * dS[a, b, c] / 2
-    _inform(result.information[i], de, room.wde, here.half)
+    _inform(result.information, de, room.wde, here.half)
 
 
 @njit(cache=True, inline="always")

@@ -3,7 +3,6 @@
 With I the information of all recordings about all that was searched, initial states too,
 
     expected   I^-1                    Fisher's information, which the search has
-    observed   (-d^2 log L)^-1         by differences of exact gradients
     sandwich   I^-1 cov(sum s_t) I^-1  s_t the score of a sample; its sum by Newey and West
 
 agree where the model is true. Where it is not, the last still tells how estimates scatter. The
@@ -26,11 +25,9 @@ if TYPE_CHECKING:
     from impc.output_feedback.fit import PersonFit
 
 #: Ways to a covariance.
-KINDS = ("expected", "observed", "sandwich")
+KINDS = ("expected", "sandwich")
 # Of a coordinate, which none leaves by much more than one: the prior that is left.
 _FARTHEST = 1e3
-# Step of the differences, of a coordinate: their error is the square of it, and rounding over it.
-_STEP = 1e-4
 
 
 @dataclass(frozen=True)
@@ -76,7 +73,7 @@ def person_covariance(fit: PersonFit, kind: str = "sandwich") -> PersonCovarianc
     """Covariance of a fit of `fit_person`."""
     if kind not in KINDS:
         raise InputError("kind", f"got {kind!r}", f"give one of {', '.join(KINDS)}")
-    information = _observed(fit) if kind == "observed" else np.array(fit.told.information)
+    information = np.array(fit.told.information)
     values, vectors = np.linalg.eigh(information)
     kept = np.maximum(values, _FARTHEST**-2)
     unit = vectors / np.sqrt(kept)
@@ -121,16 +118,6 @@ def confusion(fit: PersonFit) -> Confusion:
     dK, _ = space.changes(fit.theta)
     step = np.tensordot(left @ u[:, 0], dK[gain], 1)
     return Confusion(float(values[0]), frozen(step), frozen(right @ v[0]))
-
-
-def _observed(fit: PersonFit) -> Array:
-    columns = []
-    for index in range(len(fit.theta)):
-        step = _STEP * np.eye(len(fit.theta))[index]
-        up, down = (fit.space.told(fit.theta + sign * step).gradient for sign in (1, -1))
-        columns.append((down - up) / (2 * _STEP))
-    found = np.array(columns)
-    return np.asarray((found + found.T) / 2)
 
 
 def _meat(fit: PersonFit, unit: Array) -> Array:

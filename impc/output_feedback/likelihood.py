@@ -13,9 +13,9 @@ command that is only expected, u_t, D_t and some variance beside follow from the
 that command (`Clip`); for several inputs it is the extended filter. Derivatives follow the active
 sets, as those of a simulation do, and hold wherever none is about to change.
 
-P_t does not depend on what is recorded while D_t stays: until a bound is near all recordings have
-the same, which no first state moves. Once it has come as near to its stationary value as rounding
-lets a derivative see it is taken for that value, until a bound is met (docs/noisy-people.md).
+P_t does not depend on what is recorded while D_t stays. Once it has come as near to its stationary
+value as rounding lets a derivative see it is taken for that value, until a bound is met
+(docs/noisy-people.md).
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from impc.control.simulation import Status
 from impc.errors import SolverError
 from impc.model.bounds import bound_rows
 from impc.output_feedback.compiled_clip import Clip
-from impc.output_feedback.compiled_filter import Course, FilterParts, Steady, run_filter
+from impc.output_feedback.compiled_filter import FilterParts, Steady, run_filter
 from impc.output_feedback.compiled_room import filter_room
 from impc.output_feedback.compiled_sample import FilterResult
 from impc.output_feedback.joint_loop import PlantMoves, joint_directions, joint_loop
@@ -44,7 +44,6 @@ from impc.output_feedback.kalman import filter_changes, stationary_filter
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from impc.arrays import Buffer
     from impc.control.closed_loop import PreparedLoop
     from impc.control.constraint_rows import Directions
     from impc.control.controller import Controller
@@ -132,18 +131,26 @@ def prepare_filter(
 def joint_likelihoods(
     prepared: PreparedFilter, recordings: Sequence[Recording], counted: int = 0
 ) -> list[Likelihood]:
-    """Likelihood of each recording."""
-    law, at, size = prepared.law, prepared.parts.at, len(prepared.parts.joint.F)
-    plant, q = law.controller.plant, law.along.count
-    begin = np.concatenate([[0], np.cumsum([each.samples for each in recordings])])
-    count, trials, p = int(begin[-1]), len(recordings), len(plant.C)
-    z, dz = np.zeros((trials, size)), np.zeros((trials, size, q))
-    z[:, at : at + plant.n] = [each.x0 for each in recordings]
-    dz[:, at : at + plant.n] = law.along.x0
+    """Likelihood of each recording; the compiled filter lets other threads run."""
+    with ThreadPoolExecutor(min(len(recordings), os.cpu_count() or 1)) as pool:
+        return list(pool.map(lambda trial: _filtered(prepared, trial, counted), recordings))
+
+
+def _filtered(prepared: PreparedFilter, trial: Recording, counted: int) -> Likelihood:
+    """Likelihood of one recording.
+
+    Once its first state is forgotten the trial goes on along the directions that are left.
+    """
+    law, parts = prepared.law, prepared.parts
+    plant, q, count = law.controller.plant, law.along.count, trial.samples
+    joint, size, p = parts.joint, len(parts.joint.F), len(law.controller.plant.C)
+    z, dz = np.zeros(size), np.zeros((size, q))
+    z[parts.at : parts.at + plant.n] = trial.x0
+    dz[parts.at : parts.at + plant.n] = law.along.x0
     result = FilterResult(
         np.zeros(count),
         np.zeros((count, q)),
-        np.zeros((trials, q, q)),
+        np.zeros((q, q)),
         np.zeros((count, p)),
         np.zeros((count, p, p)),
         np.zeros((count, size)),
@@ -151,93 +158,35 @@ def joint_likelihoods(
         np.full(count, Status.NOT_REACHED, dtype=np.int8),
         counted,
     )
-    outputs = np.concatenate([each.outputs for each in recordings])
-    disturbance = np.concatenate([each.disturbance for each in recordings])
-    _filter(prepared.parts, begin, outputs, disturbance, z, dz, result)
-    return [_of_trial(result, i, slice(*begin[i : i + 2])) for i in range(trials)]
+    outputs, disturbance = np.array(trial.outputs), np.array(trial.disturbance)
+    P, dP, first = joint.P0, parts.djoint.P0, 0
+    while first < count and result.status[first] not in _FAILED:
+        room = filter_room(parts.rows, joint, parts.djoint, P, dP, plant.n, dz.shape[1])
+        first = run_filter(parts, outputs, disturbance, z, dz, room, result, first)
+        dz = np.ascontiguousarray(dz[:, : parts.lasting])
+        P, dP = room.here.P, np.ascontiguousarray(room.here.dP[:, :, : parts.lasting])
+    return _checked(result)
 
 
-def _of_trial(result: FilterResult, i: int, rows: slice) -> Likelihood:
-    """What the filter has written of one trial; an error where it ended early."""
-    failed = np.flatnonzero(np.isin(result.status[rows], _FAILED))
+def _checked(result: FilterResult) -> Likelihood:
+    """What the filter has written; an error where it ended early."""
+    failed = np.flatnonzero(np.isin(result.status, _FAILED))
     if len(failed):
-        status = Status(int(result.status[rows][failed[0]]))
+        status = Status(int(result.status[failed[0]]))
         raise SolverError(
             f"sample {failed[0]}", f"{status.sentence}, as the filter expects it", "start elsewhere"
         )
-    information = result.information[i]
+    information = result.information
     return Likelihood(
-        frozen(result.told[rows]),
-        frozen(result.score[rows]),
+        frozen(result.told),
+        frozen(result.score),
         frozen(np.tril(information) + np.tril(information, -1).T),
-        frozen(result.innovation[rows]),
-        frozen(result.spread[rows]),
-        frozen(result.filtered[rows]),
-        frozen(result.u[rows]),
-        result.status[rows],
+        frozen(result.innovation),
+        frozen(result.spread),
+        frozen(result.filtered),
+        frozen(result.u),
+        result.status,
     )
-
-
-def _filter(
-    parts: FilterParts,
-    begin: np.ndarray[tuple[int], np.dtype[np.int64]],
-    outputs: Array,
-    disturbance: Array,
-    z: Array,
-    dz: Array,
-    result: FilterResult,
-) -> None:
-    """Write the result from the expected first states (trials, z) and their derivatives.
-
-    All trials go together until a bound is near, and then each by itself; once its first state is
-    forgotten, along the directions that are left.
-    """
-    joint, moves, lasting = parts.joint, parts.djoint, parts.lasting
-    count = moves.P0.shape[2]
-
-    def run(some: slice, course: Course, dz: Array) -> None:
-        P, dP, n = course.P[0], course.dP[0], parts.loop.K.shape[1]
-        room = filter_room(parts.rows, joint, moves, P, dP, n, dz.shape[2])
-        own = result._replace(information=result.information[some])
-        run_filter(parts, outputs, disturbance, z[some], dz, room, own, course)
-
-    def alone(i: int) -> None:
-        here, some = together, slice(i, i + 1)
-        mine, P, first, known = dz[some], here.P[i], int(here.reached[i]), bool(here.known[i])
-        dP = np.concatenate([here.dP[i], np.zeros((*P.shape, count - here.dP.shape[3]))], axis=2)
-        while first < begin[i + 1] - begin[i] and result.status[begin[i] + first] not in _FAILED:
-            course = _course(begin[i : i + 2], first, known, False, P, dP)
-            run(some, course, mine)
-            first, known = int(course.reached[0]), False
-            mine = np.ascontiguousarray(mine[:, :, :lasting])
-            P, dP = course.P[0], np.ascontiguousarray(course.dP[0, :, :, :lasting])
-
-    # Noise that is a share of the command differs from trial to trial from the first sample on.
-    sharing = not np.any(joint.share)
-    dP0 = np.ascontiguousarray(moves.P0[:, :, : lasting if sharing else count])
-    together = _course(begin, 0, False, True, joint.P0, dP0)
-    if sharing:
-        run(slice(None), together, dz)
-    left = np.flatnonzero(together.reached < np.diff(begin))
-    if len(left):
-        # The compiled filter lets other threads run.
-        with ThreadPoolExecutor(min(len(left), os.cpu_count() or 1)) as pool:
-            list(pool.map(alone, left))
-
-
-def _course(
-    begin: np.ndarray[tuple[int], np.dtype[np.int64]],
-    first: int,
-    corrected: bool,
-    shared: bool,
-    P: Buffer,
-    dP: Buffer,
-) -> Course:
-    """Trials at one sample, where all have the covariance P and its derivatives dP."""
-    trials = len(begin) - 1
-    reached, known = np.zeros(trials, dtype=np.int64), np.zeros(trials, dtype=np.bool_)
-    each = (np.repeat(part[None], trials, axis=0) for part in (P, dP))
-    return Course(begin, first, corrected, shared, reached, known, *each)
 
 
 def _unclipped(law: PreparedLoop) -> tuple[PreparedLoop, Clip]:

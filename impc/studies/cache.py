@@ -13,17 +13,17 @@ import hashlib
 import json
 import re
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import msgspec
 
 from impc.arrays import frozen
 from impc.errors import OutputError
-from impc.files.disk import remove_empty, require_ordinary, write_whole
+from impc.files.disk import remove_empty, write_whole
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from pathlib import Path
 
 T = TypeVar("T")
 
@@ -50,7 +50,7 @@ class Cache:
 
     def path(self, name: str) -> Path:
         """The file of the result `name`; a slash in it makes a folder."""
-        return self.folder / f"{_UNSAFE.sub('-', name)}.json"
+        return Path(f"{self.folder}/{_UNSAFE.sub('-', name)}.json")
 
     def find(self, name: str, digest: str) -> Any:
         """The content kept under that `name` and `digest`; None where there is none to use."""
@@ -89,7 +89,8 @@ class Cache:
 def _unsealed(path: Path) -> dict[str, Any] | None:
     """What a sealed file holds; None where there is none, or its seal is broken."""
     try:
-        require_ordinary(path)
+        if not path.is_file():  # a pipe would be waited for
+            return None
         text = path.read_bytes()
     except OSError:
         return None

@@ -24,11 +24,11 @@ from impc.reporting.document import Block, Lines, Report, Section, Verdict
 from impc.reporting.finding import Chart, Finding, Picture
 from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import number
+from impc.reporting.shown_units import body_sentence, signal_words
 from impc.reporting.style import drawn, journal_style
 from impc.reporting.writer import owned, write_files
 from impc.studies.charts import chart_figure, methods_chart
 from impc.studies.methods_table import column_terms, methods_data, methods_finding, weight_entries
-from impc.studies.signal_words import body_sentence, signal_words
 
 if TYPE_CHECKING:
     from impc.assess.assessments import MethodFit

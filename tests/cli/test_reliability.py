@@ -17,9 +17,8 @@ from impc.cli.main import main
 from impc.files.plant_sources import make_plant, plant_source
 from impc.files.reading import read_recordings
 from impc.studies.cohort.study import read_study
-from impc.studies.reliability.findings import QUOTED
 from impc.studies.reliability.icc import icc
-from impc.studies.reliability.verdict import band_of
+from impc.studies.reliability.verdict import QUOTED, band_of
 
 pytestmark = pytest.mark.full
 

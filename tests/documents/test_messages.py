@@ -76,7 +76,7 @@ from impc.studies.fit.settings import FitSettings, fit_settings, require_used
 from impc.studies.fit.subject import fit_problem
 from impc.studies.pool import Task
 from impc.studies.scheduler import Cluster, connected
-from impc.studies.selection.subsets import largest_subsets
+from impc.studies.selection.fisher import largest_subsets
 from plants import seated_balance_plant
 from tests.documents.blocks import PAGES
 from tests.files.damaged import DAMAGED, PLANT
@@ -503,7 +503,7 @@ def held_by_nobody(_: Path) -> None:
 
 def too_many_subsets(_: Path) -> None:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("impc.studies.selection.subsets._MOST", 1000)
+        patch.setattr("impc.studies.selection.fisher._MOST", 1000)
         largest_subsets([np.eye(40)], 2.0)
 
 

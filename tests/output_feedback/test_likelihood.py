@@ -218,7 +218,7 @@ def test_recordings_together_tell_what_each_tells(who: Someone) -> None:
             np.testing.assert_allclose(getattr(found, name), getattr(alone, name), 1e-12, 1e-12)
 
 
-def test_a_covariance_that_was_shared_until_a_bound_is_near_is_each_trials_own() -> None:
+def test_a_stationary_covariance_says_what_that_of_every_sample_does() -> None:
     """With noise that is a share of the command, however small, so it is from the first sample."""
     outputs = recorded(QUIET, 130).outputs
     own = likelihood(QUIET._replace(share=1e-12), outputs, slopes=True)

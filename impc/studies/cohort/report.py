@@ -20,8 +20,7 @@ from impc.studies.cohort.figures import group_figure
 from impc.studies.cohort.study import safe_name
 from impc.studies.cohort.subject_page import kept_words, subject_files
 from impc.studies.cohort.tables import cohort_tables
-from impc.studies.cohort.told import not_told, not_told_sentences, only_told
-from impc.studies.cohort.words import measure_words
+from impc.studies.cohort.told import measure_words, not_told, not_told_sentences, only_told
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -30,13 +30,12 @@ from impc.files.reading import read_unit
 from impc.inverse.noisy_fit import fit_controller
 from impc.model.signal_units import price_unit
 from impc.reporting.rendering import plain
-from impc.reporting.shown_units import angles_in, shown_unit
+from impc.reporting.shown_units import angles_in, shown_unit, signal_words
 from impc.studies.cohort.unit_structure import unit_structure
 from impc.studies.effort import Effort, fit_effort
 from impc.studies.fit.gain_findings import number_units
 from impc.studies.fit.settings import fit_settings
 from impc.studies.fit.subject import fit_problem, state_sizes
-from impc.studies.signal_words import signal_words
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

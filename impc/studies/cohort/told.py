@@ -1,4 +1,7 @@
-"""Gains that the recordings of a unit do not tell: no data of a comparison, and left out of it."""
+"""Gains that the recordings of a unit do not tell: no data of a comparison, and left out of it.
+
+What the columns of units.csv are, in words: for the pages of a cohort (docs/cohorts.md).
+"""
 
 from __future__ import annotations
 
@@ -6,13 +9,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.studies.cohort.words import measure_words
-
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     import pandas as pd
-
 
 # A deviation may be so many times the usual size of an entry. Small entries that are well told
 # stay: those of a gain whose truth is zero have a median size of 0.67 of their deviation. It is
@@ -63,3 +63,21 @@ def not_told_sentences(counts: Mapping[str, int], of: int) -> list[str]:
         "A gain whose standard deviation is more than twice its usual size is not told, and not "
         f"compared: of {of} units {each}."
     ]
+
+
+_WORDS = {
+    "K": "gain of {1} to {0}",
+    "K_of_weights": "gain of the weights, {1} to {0}",
+    "vaf": "VAF of {0}",
+    "held_out_vaf": "VAF of {0}, left out",
+    "price": "price of {0}",
+    "centre_price": "price of {0}, analytic centre",
+    "largest_input": "largest {0}",
+    "log_price": "logarithm of the price of {0}",
+}
+
+
+def measure_words(name: str) -> str:
+    """A column by its `name` in words: "K.command.theta1" is "gain of theta1 to command"."""
+    kind, *rest = name.split(".", 2 if name.startswith("K") else 1)
+    return _WORDS[kind].format(*rest) if kind in _WORDS and rest else name.replace("_", " ")

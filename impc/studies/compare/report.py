@@ -14,7 +14,7 @@ from impc.inverse.methods import METHODS
 from impc.model.signal_units import gain_unit
 from impc.reporting.document import Lines, Report, Section, Terms, Verdict
 from impc.reporting.finding import Chart, Finding, Picture
-from impc.reporting.shown_units import axis_label
+from impc.reporting.shown_units import axis_label, body_sentence, signal_words
 from impc.reporting.style import BLUE, DOUBLE_COLUMN, INK, drawn, journal_style, new_figure
 from impc.studies.charts import chart_figure, methods_chart
 from impc.studies.methods_table import (
@@ -24,7 +24,6 @@ from impc.studies.methods_table import (
     until_its_end,
     weight_entries,
 )
-from impc.studies.signal_words import body_sentence, signal_words
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

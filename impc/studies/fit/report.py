@@ -55,6 +55,7 @@ from impc.reporting.document import (
     Verdict,
 )
 from impc.reporting.finding import Chart, Picture
+from impc.reporting.shown_units import body_sentence, signal_words
 from impc.studies.charts import methods_chart
 from impc.studies.fit.figures import fit_figures
 from impc.studies.fit.gain_findings import (
@@ -62,6 +63,7 @@ from impc.studies.fit.gain_findings import (
     gain_finding,
     limit_findings,
     parameter_findings,
+    truth_finding,
 )
 from impc.studies.fit.result import shown_trials, trial_name
 from impc.studies.fit.settings import plain_settings
@@ -73,11 +75,9 @@ from impc.studies.fit.trial_findings import (
     residual_findings,
     trajectory_finding,
 )
-from impc.studies.fit.truth import truth_finding
 from impc.studies.fit.verdict import abstract, remarks, verdict
 from impc.studies.fit.weight_findings import reading_finding, statement_findings, weight_finding
 from impc.studies.methods_table import column_terms, methods_data, methods_finding
-from impc.studies.signal_words import body_sentence, signal_words
 
 if TYPE_CHECKING:
     from impc.arrays import Array
@@ -113,16 +113,6 @@ def fit_report(
     `truth` (m, n).
     """
     subject = str(result.given.recordings[0].label.subject) or "a subject"
-    gain: list[Block] = [verdict(result)]
-    if result.usable:
-        limits = limit_findings(result)
-        gain = [
-            gain_finding(result),
-            *parameter_findings(result),
-            direction_finding(result),
-        ]
-        if limits:
-            gain += [Heading("Limit and horizon"), *limits]
     others: list[Block] = [*residual_findings(result)]
     if missing:
         others.append(Note("Not given:", missing.removeprefix("Not given: ")))
@@ -137,41 +127,44 @@ def fit_report(
             Lines(abstract(result)),
             Details("What stands behind these sentences", (Lines(remarks(result)),)),
         ],
-        [
-            Section("1. The gain, and how sure it is", gain, "Gain", together=True),
-            *([structure_section(result)] if result.structures else []),
-            *([] if result.person is None else [result.person.section()]),
-            Section(
-                "2. What may be said of the weights",
-                [_SAME_GAIN, *statement_findings(result)],
-                "Weights",
-            ),
-            Section(
-                "3. Inverse LQR on the same recordings",
-                (
-                    _METHODS,
-                    methods_finding(result.methods),
-                    Details("What each column says", (column_terms(),)),
-                ),
-                "Inverse LQR",
-            ),
-            Section("4. Recorded and simulated", _trajectories(result), "Trajectories"),
-            Section("5. What is left", (_LEFT, RESIDUALS), "What is left", folded=True),
-            Section(
-                "6. All weights with this gain",
-                (reading_finding(result), weight_finding(result)),
-                "Intent",
-                folded=True,
-            ),
-            Section("7. Checks of the recordings", (check_finding(result),), "Checks", folded=True),
-            Section("8. Settings and versions", _made(result, provenance), "Settings", folded=True),
-        ],
+        _sections(result, provenance),
         figures=fit_figures(result),
         beside=[trajectory_finding(result)],
         data={**fit_data(result, provenance), "truth": None if truth is None else {"K": truth}},
         provenance=provenance,
         words=signal_words(result.given.plant),
     )
+
+
+def _sections(result: FitResult, provenance: Provenance) -> list[Section]:
+    """What a page has, in its order; a finding more is a line here."""
+    weights: list[Block] = [_SAME_GAIN, *statement_findings(result)]
+    methods: list[Block] = [
+        _METHODS,
+        methods_finding(result.methods),
+        Details("What each column says", (column_terms(),)),
+    ]
+    every = [reading_finding(result), weight_finding(result)]
+    return [
+        Section("1. The gain, and how sure it is", _gain(result), "Gain", together=True),
+        *([structure_section(result)] if result.structures else []),
+        *([] if result.person is None else [result.person.section()]),
+        Section("2. What may be said of the weights", weights, "Weights"),
+        Section("3. Inverse LQR on the same recordings", methods, "Inverse LQR"),
+        Section("4. Recorded and simulated", _trajectories(result), "Trajectories"),
+        Section("5. What is left", (_LEFT, RESIDUALS), "What is left", folded=True),
+        Section("6. All weights with this gain", every, "Intent", folded=True),
+        Section("7. Checks of the recordings", (check_finding(result),), "Checks", folded=True),
+        Section("8. Settings and versions", _made(result, provenance), "Settings", folded=True),
+    ]
+
+
+def _gain(result: FitResult) -> list[Block]:
+    if not result.usable:
+        return [verdict(result)]
+    limits = limit_findings(result)
+    found = [gain_finding(result), *parameter_findings(result), direction_finding(result)]
+    return [*found, *([Heading("Limit and horizon")] if limits else []), *limits]
 
 
 def _trajectories(result: FitResult) -> list[Block]:

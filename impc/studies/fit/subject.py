@@ -183,8 +183,7 @@ def fit_recordings(
     --------
     >>> import control
     >>> import impc
-    >>> import msgspec
-    import numpy as np
+    >>> import numpy as np
     >>> rng = np.random.default_rng(1)
     >>> plant = impc.Plant(control.ss([[1.1]], [[1, 1]], [[1]], 0, 1, inputs=["u", "push"]), ["u"])
     >>> bounds = impc.Bounds(plant, u_min=-1, u_max=1)

@@ -16,13 +16,12 @@ from impc.model.signal_units import gain_unit
 from impc.reporting.document import Lines, Report, Section, Terms, Verdict
 from impc.reporting.finding import Finding, Picture, table_of
 from impc.reporting.rendering import number
-from impc.reporting.shown_units import shown_unit
+from impc.reporting.shown_units import shown_unit, signal_words
 from impc.reporting.style import drawn, journal_style
 from impc.studies.fit.gain_findings import number_name
 from impc.studies.plan.figures import experiments_figure, prices_figure
 from impc.studies.plan.sentences import plan_sentences
-from impc.studies.plan.simulated_fits import spread
-from impc.studies.signal_words import signal_words
+from impc.studies.plan.study import spread
 
 if TYPE_CHECKING:
     from impc.reporting.provenance import Provenance

@@ -12,7 +12,7 @@ import numpy as np
 
 from impc.reporting.rendering import number
 from impc.reporting.shown_units import shown_unit
-from impc.studies.plan.simulated_fits import spread
+from impc.studies.plan.study import spread
 
 if TYPE_CHECKING:
     from impc.assess.price_profiles import PriceInterval

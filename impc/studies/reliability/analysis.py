@@ -26,22 +26,29 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.errors import DataError
-from impc.studies.reliability.anova import learning_trend, paired_tests, visit_anova
+from impc.studies.reliability.anova import (
+    learning_trend,
+    paired_tests,
+    variance_components,
+    visit_anova,
+)
 from impc.studies.reliability.icc import icc, measurement_error
-from impc.studies.reliability.measures import band_energy, passband, rms
-from impc.studies.reliability.transfer import ComplexArray, transfer_function
-from impc.studies.reliability.variance_components import variance_components
+from impc.studies.reliability.measures import (
+    ComplexArray,
+    band_energy,
+    passband,
+    rms,
+    transfer_function,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from impc.arrays import Array
     from impc.model.recordings import Recording
-    from impc.studies.reliability.anova import Anova, PairedTest, Trend
+    from impc.studies.reliability.anova import Anova, PairedTest, Trend, VarianceComponent
     from impc.studies.reliability.icc import Form, Icc, MeasurementError
-    from impc.studies.reliability.measures import Passband
-    from impc.studies.reliability.transfer import TransferFunction
-    from impc.studies.reliability.variance_components import VarianceComponent
+    from impc.studies.reliability.measures import Passband, TransferFunction
 
 #: Name of a measure -> what it is.
 MEASURES = {"rms": "root-mean-square about upright", "energy": "mean bandpass signal energy (2.1)"}

@@ -17,8 +17,7 @@ from impc.reporting.finding import Finding, Picture
 from impc.reporting.provenance import Provenance
 from impc.studies.reliability.analysis import MEASURES
 from impc.studies.reliability.figures import reliability_figures
-from impc.studies.reliability.findings import QUOTED, findings
-from impc.studies.reliability.verdict import answer, interval_band, shown_score
+from impc.studies.reliability.verdict import QUOTED, answer, findings, interval_band, shown_score
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

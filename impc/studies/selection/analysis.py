@@ -1,25 +1,54 @@
-"""Sensitive parameters of a study (chapter 4): per subject, in common, and for all at once."""
+"""Sensitive parameters of a study (chapter 4): per subject, in common, and for all at once.
+
+Work on one subject: what its recordings tell of all parameters, then of the chosen ones.
+
+The steps of chapter 4, as docs/selection.md lists them.
+
+Model-based bootstrap of a subset of parameters: percentile intervals.
+
+fit -> residuals, centred -> drawn again, one by one or in blocks -> added to the fit's outputs ->
+fitted again from the fit -> percentiles. Residuals of people are coloured: drawn one by one they
+give intervals that are too narrow, in blocks they do not (`impc.assess.resampling.block_length`).
+Replicate k draws from the k-th child of the seed. Source: chapter 4; Künsch 1989 for the blocks.
+"""
 
 from __future__ import annotations
 
+import time
 from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from impc.arrays import Array, Frozen, frozen, percentiles
+from impc.assess.resampling import block_residuals
 from impc.errors import DataError
-from impc.studies.selection.subject import Chosen, Nominal, fit_chosen, fit_nominal
-from impc.studies.selection.subsets import largest_subsets, sweep
+from impc.studies.pool import threads
+from impc.studies.selection.estimation import Estimate, estimate, multi_start, residuals
+from impc.studies.selection.fisher import (
+    Information,
+    NullDirection,
+    Selection,
+    fisher_information,
+    largest_subsets,
+    null_directions,
+    sweep,
+    unseen_scalings,
+)
+from impc.studies.selection.lasso import Lasso, lasso_of_size, table_c1
+from impc.studies.selection.model import Trial
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from impc.arrays import Array
-    from impc.studies.selection.model import Trial
+    from impc.assess.resampling import Draw
+    from impc.studies.selection.estimation import Estimate
+    from impc.studies.selection.fisher import Selection
+    from impc.studies.selection.model import ParametricModel, Trial
     from impc.studies.selection.model_source import Runner
     from impc.studies.selection.settings import SelectSettings
-    from impc.studies.selection.subsets import Selection
 
 
 @dataclass(frozen=True)
@@ -101,3 +130,131 @@ def _intersection(
         set(largest_subsets([F], settings.bound, settings.least).subsets) for F in informations
     ]
     return tuple(sorted(set.intersection(*lists)))
+
+
+@dataclass(frozen=True)
+class Nominal:
+    """All parameters of one subject, and what the recordings tell of them."""
+
+    fit: Estimate  # All parameters fitted
+    information: Information  # At that estimate
+    unseen: tuple[NullDirection, ...]
+    scalings: tuple[tuple[str, ...], ...]  # Parameters that may be scaled together unseen
+    sweep: tuple[Selection, ...]
+    seconds: float  # Time of information and sweep, s
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """The chosen parameters of one subject, and what the LASSO would have chosen."""
+
+    refit: Estimate  # Others at typical values
+    intervals: BootstrapIntervals
+    lasso: Lasso
+    nelder_mead: Lasso | None  # Table C.1, when asked for
+    seconds_lasso: float  # Time of each, s
+    seconds_nelder_mead: float
+
+
+def fit_nominal(
+    model: ParametricModel, trials: Sequence[Trial], settings: SelectSettings
+) -> Nominal:
+    """Fit all parameters; information, rank, unseen directions and feasible subsets."""
+    nominal = multi_start(model, trials, range(model.size), settings.starts, settings.seed)[0]
+    started = time.perf_counter()
+    found = fisher_information(model, np.array(nominal.theta), trials)
+    swept = sweep([found.F], settings.bounds, settings.least)
+    seconds = time.perf_counter() - started
+    return Nominal(
+        nominal, found, null_directions(model, found), unseen_scalings(model, found), swept, seconds
+    )
+
+
+def fit_chosen(
+    model: ParametricModel,
+    trials: Sequence[Trial],
+    settings: SelectSettings,
+    chosen: tuple[int, ...],
+) -> Chosen:
+    """Fit chosen parameters, with intervals; and select by LASSO for comparison."""
+    refit = estimate(model, trials, chosen, np.array(model.typical))
+    intervals = bootstrap_subset(
+        model, trials, refit, settings.replicates, settings.seed, _DRAW[settings.draw]
+    )
+    started = time.perf_counter()
+    lasso = lasso_of_size(model, trials, settings.size)
+    between = time.perf_counter()
+    nelder_mead = table_c1(model, trials, settings.size) if settings.nelder_mead else None
+    ended = time.perf_counter()
+    return Chosen(refit, intervals, lasso, nelder_mead, between - started, ended - between)
+
+
+_THREADS = 2
+
+
+@dataclass(frozen=True)
+class BootstrapIntervals(Frozen):
+    """Percentiles of the replicates."""
+
+    names: tuple[str, ...]  # Free parameters
+    value: Array  # (free,), in their units
+    low: Array
+    high: Array
+    level: float  # Share of the replicates inside
+    drawn: Array  # (replicates, free)
+
+    @property
+    def width(self) -> Array:
+        """Of the intervals (free,), in the parameters' units."""
+        return np.asarray(self.high - self.low)
+
+
+def draw_single(parts: list[Array], rng: np.random.Generator) -> list[Array]:
+    """A `Draw` row by row: residuals `parts` (samples, p) of each trial to as many, (samples, p).
+
+    Rows come from all trials; `rng` is what is drawn from.
+    """
+    pooled = np.concatenate([item - np.mean(item, axis=0) for item in parts])
+    return [pooled[rng.integers(len(pooled), size=len(item))] for item in parts]
+
+
+_DRAW = {"single": draw_single, "block": block_residuals}
+
+
+def bootstrap_subset(
+    model: ParametricModel,
+    trials: Sequence[Trial],
+    fit: Estimate,
+    replicates: int,
+    seed: int,
+    draw: Draw = draw_single,
+    *,
+    level: float = 0.95,
+    progress: Callable[[], None] = lambda: None,
+) -> BootstrapIntervals:
+    """Intervals of the free parameters of a fit."""
+    theta = np.array(fit.theta)
+    left = residuals(model, theta, trials)
+    clean = [np.asarray(model.simulate(theta, item.input)) for item in trials]
+
+    def one(index: int) -> Array:
+        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index,)))
+        again = [
+            Trial(item.input, outputs + noise)
+            for item, outputs, noise in zip(trials, clean, draw(left, rng), strict=True)
+        ]
+        found = np.array(estimate(model, again, fit.free, theta).theta)[list(fit.free)]
+        progress()
+        return found
+
+    with threads(_THREADS) as pool:
+        drawn = np.array(list(pool.map(one, range(replicates))))
+    low, high = percentiles(drawn, level)
+    return BootstrapIntervals(
+        tuple(model.names[index] for index in fit.free),
+        frozen(theta[list(fit.free)]),
+        frozen(low),
+        frozen(high),
+        level,
+        frozen(drawn),
+    )

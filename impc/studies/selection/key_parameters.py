@@ -18,18 +18,18 @@ import numpy as np
 
 from impc.arrays import Array, Frozen, frozen
 from impc.studies.reliability.icc import icc
+from impc.studies.selection.analysis import Nominal, fit_nominal
 from impc.studies.selection.estimation import Estimate, estimate
-from impc.studies.selection.subject import Nominal, fit_nominal
-from impc.studies.selection.subsets import largest_subsets, sweep
+from impc.studies.selection.fisher import largest_subsets, sweep
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
     from impc.studies.reliability.icc import Icc
+    from impc.studies.selection.fisher import Selection
     from impc.studies.selection.model import ParametricModel, Trial
     from impc.studies.selection.model_source import Runner
     from impc.studies.selection.settings import SelectSettings
-    from impc.studies.selection.subsets import Selection
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import pytest
 from impc.studies.cohort.engine import Failures
 from impc.studies.cohort.report import _falls
 from impc.studies.cohort.study import Unit
-from impc.studies.cohort.words import measure_words
+from impc.studies.cohort.told import measure_words
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from impc.studies.fit.truth import read_truth, truth_finding, truth_sentence
+from impc.studies.fit.gain_findings import read_truth, truth_finding, truth_sentence
 from tests.studies.fit.test_verdict import fitted
 
 if TYPE_CHECKING:

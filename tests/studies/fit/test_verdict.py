@@ -18,14 +18,13 @@ from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.recordings import Recording
 from impc.model.weights import Weights
-from impc.reporting.shown_units import angles_in
+from impc.reporting.shown_units import angles_in, signal_words
 from impc.studies.charts import methods_chart, weights_chart
 from impc.studies.fit.figures import trajectory_figure
 from impc.studies.fit.interval_figures import gain_figure, shown_statements, statements_figure
 from impc.studies.fit.settings import FitSettings
 from impc.studies.fit.subject import fit_problem, fit_recordings, stages
 from impc.studies.fit.verdict import abstract, missing, verdict
-from impc.studies.signal_words import signal_words
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -24,8 +24,7 @@ from impc.studies.plan.settings import (
     plan_settings,
     presumed_prices,
 )
-from impc.studies.plan.simulated_fits import recorded_noise, simulated_fits, spread
-from impc.studies.plan.study import make_plan, steps_of
+from impc.studies.plan.study import make_plan, recorded_noise, simulated_fits, spread, steps_of
 
 PRICES = {"x[0]": 4.0, "x[1]": 1.0}
 SETTINGS = PlanSettings(

@@ -11,8 +11,12 @@ from statsmodels.formula.api import ols
 
 from impc.arrays import Array
 from impc.errors import DataError
-from impc.studies.reliability.anova import learning_trend, paired_tests, visit_anova
-from impc.studies.reliability.variance_components import variance_components
+from impc.studies.reliability.anova import (
+    learning_trend,
+    paired_tests,
+    variance_components,
+    visit_anova,
+)
 
 SEED = 5
 

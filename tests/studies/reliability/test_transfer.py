@@ -10,8 +10,7 @@ import plants
 from impc.arrays import Array
 from impc.errors import DataError
 from impc.studies.reliability.analysis import cmc_between, cmc_within
-from impc.studies.reliability.measures import band_energy, passband, rms
-from impc.studies.reliability.transfer import transfer_function
+from impc.studies.reliability.measures import band_energy, passband, rms, transfer_function
 
 RATE = 100.0
 TORQUE = plants.ternary_torque(dwell=0.12, duration=29.04, rate=RATE)

@@ -8,19 +8,21 @@ import tracemalloc
 import numpy as np
 import pytest
 
-import impc.studies.selection.subsets
+import impc.studies.selection.fisher
 import plants
 from experiments.reproduction.appendices import discretised, kronecker_sensitivity
 from impc.errors import DataError, InputError
 from impc.studies.selection.estimation import estimate, free_indices, multi_start
 from impc.studies.selection.fisher import (
     common_scaling,
+    exhaustive,
     fisher_information,
+    largest_subsets,
     null_directions,
+    subset_variances,
     unseen_scalings,
 )
 from impc.studies.selection.model import normalised, parametric_model, physical, sensitivity
-from impc.studies.selection.subsets import exhaustive, largest_subsets, subset_variances
 from tests.studies.selection.heads import NAMES_FIM, head_model, head_trials
 
 SEED = 1
@@ -165,7 +167,7 @@ def test_models_are_checked() -> None:
 
 def test_subsets_beyond_number_are_refused_and_not_begun(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of forty parameters that are all told: a million subsets of five, and more of six."""
-    monkeypatch.setattr(impc.studies.selection.subsets, "_MOST", 2000)
+    monkeypatch.setattr(impc.studies.selection.fisher, "_MOST", 2000)
     tracemalloc.start()
     try:
         with pytest.raises(InputError, match="more than 2000 subsets keep a variance of 2"):

@@ -11,13 +11,13 @@ from click.testing import CliRunner, Result
 
 from impc.assess.resampling import block_residuals
 from impc.cli.main import main
+from impc.studies.selection.analysis import bootstrap_subset, draw_single
 from impc.studies.selection.estimation import estimate, free_indices
 from impc.studies.selection.fisher import fisher_information
 from impc.studies.selection.key_parameters import key_parameters
 from impc.studies.selection.lasso import proximal_lasso, table_c1
 from impc.studies.selection.model import ParametricModel, Trial, normalised, parametric_model
 from impc.studies.selection.settings import SelectSettings
-from impc.studies.selection.subject import bootstrap_subset, draw_single
 from tests.studies.selection.dosing import blood_model, in_turn
 from tests.studies.selection.heads import head_model
 
