@@ -21,8 +21,8 @@ import numpy as np
 from tqdm import tqdm
 
 from impc.assess.printed_gain import covariance_intervals, gain_estimate
+from impc.cli.plant import read_subject
 from impc.cli.simulate import command
-from impc.cli.subject import read_subject
 from impc.inverse.noisy_fit import fit_controller
 
 __all__ = ["Found", "fitted_subject", "simulated_files"]

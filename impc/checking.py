@@ -24,8 +24,7 @@ import math
 import numbers
 import os
 import re
-import sys
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, ParamSpec, TypeVar, cast, overload
 
 import numpy as np
@@ -34,7 +33,7 @@ from impc.arrays import Frozen, as_numbers, require_finite, with_shape
 from impc.errors import DataError, InputError, PlantError, brief
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Container, Hashable
+    from collections.abc import Callable, Hashable
 
     Kind = Callable[[str, Any], Any]
     Rule = str | float | tuple[float, float]
@@ -60,68 +59,39 @@ def checked(function: Any = None, /, **rules: Rule) -> Any:
 
 
 def _checked(function: Callable[P, R], rules: dict[str, Rule]) -> Callable[P, R]:
-    kinds: dict[str, Kind] = {}
-    names: list[str] = []  # of those that can be given by position
-    rest: dict[Any, tuple[str, Kind]] = {}  # of *args and **kwargs
     signature = inspect.signature(function)
+    kinds: dict[str, Kind] = {}
     for name, parameter in signature.parameters.items():
-        if parameter.kind in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
-            rest[parameter.kind] = name, _kind(str(parameter.annotation))
-        elif name not in ("self", "cls"):
-            kinds[name] = _kind(str(parameter.annotation))
-        if parameter.kind is parameter.POSITIONAL_OR_KEYWORD:
-            names.append(name)
-    needed = {
-        name
-        for name, parameter in signature.parameters.items()
-        if parameter.default is parameter.empty and (name in kinds or name in names)
-    }
-    more = rest.get(inspect.Parameter.VAR_POSITIONAL)
-    others = rest.get(inspect.Parameter.VAR_KEYWORD)
+        if name not in ("self", "cls"):
+            kinds[name] = _of_all(_kind(str(parameter.annotation)), parameter.kind)
 
     @functools.wraps(function)
     def at_the_door(*args: P.args, **kwargs: P.kwargs) -> R:
+        try:
+            bound = signature.bind(*args, **kwargs)
+        except TypeError as error:
+            name = function.__qualname__.removesuffix(".__init__")
+            raise InputError(name, str(error), f"its arguments are {', '.join(kinds)}") from None
         sizes: dict[str, int] = {}
-        named = dict(zip(names, args, strict=False)) | kwargs
-        extra: Any = args[len(names) :]
-        if not needed <= named.keys() or (extra and more is None):
-            raise _wrong_call(function, signature, args, kwargs)
-        for name, value in named.items():
-            if name in kinds:
-                found = kinds[name](name, value)
-                _require_sizes(name, found, sizes)
-                named[name] = found
-            elif name not in names and others is None:
-                raise _wrong_call(function, signature, args, kwargs)
-            elif name not in names and others is not None:
-                named[name] = others[1](name, value)
-        if more is not None:
-            extra = (more[1](f"{more[0]}[{k}]", value) for k, value in enumerate(extra))
+        for name in [name for name in kinds if name in bound.arguments]:
+            found = kinds[name](name, bound.arguments[name])
+            _require_sizes(name, found, sizes)
+            bound.arguments[name] = found
         for name, rule in rules.items():
-            if named.get(name) is not None:
-                named[name] = _ruled(name, named[name], rule, sizes)
-        given = [named.pop(name) for name in names[: len(args)]]
-        return function(*given, *extra, **named)  # type: ignore[arg-type]
+            if bound.arguments.get(name) is not None:
+                bound.arguments[name] = _ruled(name, bound.arguments[name], rule, sizes)
+        return function(*bound.args, **bound.kwargs)
 
     return at_the_door
 
 
-def _wrong_call(
-    function: Callable[..., Any], signature: inspect.Signature, args: Any, kwargs: Any
-) -> InputError:
-    """What Python would say of arguments that are missing or too many, and how to call it."""
-    name = function.__qualname__.removesuffix(".__init__")
-    try:
-        signature.bind(*args, **kwargs)
-        said = "has wrong arguments"
-    except TypeError as error:
-        said = str(error)
-    known = [
-        f"*{item.name}" if item.kind is item.VAR_POSITIONAL else item.name
-        for item in signature.parameters.values()
-        if item.name not in ("self", "cls") and item.kind is not item.VAR_KEYWORD
-    ]
-    return InputError(name, said, f"its arguments are {', '.join(known)}")
+def _of_all(kind: Kind, place: Any) -> Kind:
+    """Of each of *args or **kwargs, where the parameter is one of these."""
+    if place is inspect.Parameter.VAR_POSITIONAL:
+        return lambda name, given: tuple(kind(f"{name}[{k}]", one) for k, one in enumerate(given))
+    if place is inspect.Parameter.VAR_KEYWORD:
+        return lambda _, given: {name: kind(name, one) for name, one in given.items()}
+    return kind
 
 
 class Value(Frozen):
@@ -138,26 +108,19 @@ class Value(Frozen):
         """Take the fields, all of them, and check them."""
         for name, value in fields.items():
             object.__setattr__(self, name, value)
-        self._check(fields)
+        self.__post_init__()
 
     def __post_init__(self) -> None:
-        self._check({field.name for field in dataclasses.fields(self)})  # type: ignore[arg-type]
-
-    def _check(self, changed: Container[str]) -> None:
-        """Check the changed fields, the others having been checked when they were given."""
         sizes: dict[str, int] = {}
         for name, kind in _field_kinds(cast("Hashable", type(self))):
             value = getattr(self, name)
-            if name not in changed:
-                _require_sizes(name, value, sizes)
-                _take_sizes(value, self._rules.get(name), sizes)
-                continue
             found = kind(name, value)
             _require_sizes(name, found, sizes)
-            rule = self._rules.get(name)
-            if rule is not None and found is not None:
-                found = _ruled(name, found, rule, sizes)
-            found = _sealed(found)
+            if found is not None and name in self._rules:
+                found = _ruled(name, found, self._rules[name], sizes)
+            if isinstance(found, np.ndarray) and found.flags.writeable:
+                found = found.copy()  # it may be the caller's
+                found.flags.writeable = False
             if found is not value:
                 object.__setattr__(self, name, found)
 
@@ -174,9 +137,7 @@ def replace(value: _V, **changes: Any) -> _V:
     if unknown:
         raise TypeError(f"{type(value).__name__} has no field {', '.join(unknown)}")
     made = object.__new__(type(value))
-    for name, given in (fields | changes).items():
-        object.__setattr__(made, name, given)
-    made._check(changes)
+    made._fill(**(fields | changes))
     return made
 
 
@@ -199,20 +160,12 @@ def _sizes_of(value: Any) -> dict[str, int]:
         inner = getattr(value, owner, None)
         if isinstance(inner, Frozen):
             sizes |= _sizes_of(inner)
-    if isinstance(value, Value):
-        for name, rule in value._rules.items():
-            shape = getattr(value, name)
-            if isinstance(rule, str) and isinstance(shape, np.ndarray):
-                pairs = zip(rule.lstrip("~").split(), shape.shape, strict=False)
-                sizes |= {symbol: size for symbol, size in pairs if symbol in _SIZES}
+    for name, rule in value._rules.items() if isinstance(value, Value) else ():
+        array = getattr(value, name)
+        if isinstance(rule, str) and isinstance(array, np.ndarray):
+            pairs = zip(rule.lstrip("~").split(), array.shape, strict=False)
+            sizes |= {symbol: size for symbol, size in pairs if symbol in _SIZES}
     return sizes
-
-
-def _take_sizes(value: Any, rule: Rule | None, sizes: dict[str, int]) -> None:
-    if isinstance(rule, str) and isinstance(value, np.ndarray):
-        for symbol, size in zip(rule.lstrip("~").split(), value.shape, strict=True):
-            if symbol in _SIZES:
-                sizes.setdefault(symbol, size)
 
 
 def _ruled(name: str, value: Any, rule: Rule, sizes: dict[str, int]) -> Any:
@@ -220,14 +173,12 @@ def _ruled(name: str, value: Any, rule: Rule, sizes: dict[str, int]) -> Any:
         least, most = rule if isinstance(rule, tuple) else (rule, math.inf)
         if not least <= value <= most:
             what = "a whole number of " if isinstance(value, int) else ""
-            wanted = f"{what}at least {least:g}" + (
-                f" and at most {most:g}" if most < math.inf else ""
-            )
-            raise InputError(name, f"got {_described(value)}", f"give {wanted}")
+            end = f" and at most {most:g}" if most < math.inf else ""
+            remedy = f"give {what}at least {least:g}{end}"
+            raise InputError(name, f"got {_described(value)}", remedy)
         return value
     symbols = rule.lstrip("~").split()
-    expected = tuple(_size(symbol, sizes) for symbol in symbols)
-    value = with_shape(name, value, expected)
+    value = with_shape(name, value, tuple(_size(symbol, sizes) for symbol in symbols))
     if not rule.startswith("~"):
         require_finite(name, value)
     for symbol, size in zip(symbols, value.shape, strict=True):
@@ -242,18 +193,14 @@ def _size(symbol: str, sizes: dict[str, int]) -> int | None:
     return None if None in parts else sum(part for part in parts if part is not None)
 
 
-def _sealed(value: Any) -> Any:
-    """An array that cannot be written: itself, or a copy, for it may be the caller's."""
-    if isinstance(value, np.ndarray) and value.flags.writeable:
-        value = value.copy()
-        value.flags.writeable = False
-    return value
-
-
 @functools.cache
 def _field_kinds(owner: Any) -> tuple[tuple[str, Kind], ...]:
     fields = dataclasses.fields(owner)
     return tuple((field.name, _kind(str(field.type))) for field in fields)
+
+
+def _refused(name: str, value: Any, remedy: str) -> InputError:
+    return InputError(name, f"got {_described(value)}", remedy)
 
 
 def _array(name: str, value: Any) -> Any:
@@ -263,7 +210,7 @@ def _array(name: str, value: Any) -> Any:
 
 def _whole(name: str, value: Any) -> int:
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, numbers.Integral):
-        raise InputError(name, f"got {_described(value)}", "give a whole number")
+        raise _refused(name, value, "give a whole number")
     if abs(int(value)) > _LARGEST_COUNT:
         raise InputError(name, f"is beyond {_LARGEST_COUNT}", "give a smaller whole number")
     return int(value)
@@ -272,7 +219,7 @@ def _whole(name: str, value: Any) -> int:
 def _number(name: str, value: Any) -> float:
     scalar = value[()] if isinstance(value, np.ndarray) and value.ndim == 0 else value
     if isinstance(scalar, (bool, np.bool_)) or not isinstance(scalar, numbers.Real):
-        raise InputError(name, f"got {_described(value)}", "give a number")
+        raise _refused(name, value, "give a number")
     try:
         found = float(scalar)
     except OverflowError:
@@ -284,46 +231,63 @@ def _number(name: str, value: Any) -> float:
 
 def _truth(name: str, value: Any) -> bool:
     if not isinstance(value, (bool, np.bool_)):
-        raise InputError(name, f"got {_described(value)}", "give True or False")
+        raise _refused(name, value, "give True or False")
     return bool(value)
 
 
-def _text(name: str, value: Any) -> str:
-    if not isinstance(value, str):
-        raise InputError(name, f"got {_described(value)}", "give a text")
-    return value
+def _only(fits: Callable[[Any], bool], remedy: str) -> Kind:
+    def check(name: str, value: Any) -> Any:
+        if not fits(value):
+            raise _refused(name, value, remedy)
+        return value
+
+    return check
 
 
 def _as_it_is(_name: str, value: Any) -> Any:
     return value
 
 
-def _function(name: str, value: Any) -> Any:
-    if not callable(value):
-        raise InputError(name, f"got {_described(value)}", "give a function")
-    return value
+def _maps(value: Any) -> bool:
+    return hasattr(value, "keys") and hasattr(value, "__getitem__") and not hasattr(value, "dtypes")
 
 
-def _mapping(name: str, value: Any) -> Any:
-    if not hasattr(value, "keys") or not hasattr(value, "__getitem__") or hasattr(value, "dtypes"):
-        raise InputError(name, f"got {_described(value)}", "give a dictionary")
-    return value
+_text = _only(lambda value: isinstance(value, str), "give a text")
+_function = _only(callable, "give a function")
+_mapping = _only(_maps, "give a dictionary")
+
+
+def _mapping_of(kind: Kind) -> Kind:
+    def check(name: str, value: Any) -> dict[str, Any]:
+        items = _mapping(name, value).items()
+        return {_text(f"{name}: a key", key): kind(f"{name}[{key!r}]", one) for key, one in items}
+
+    return check
+
+
+def _column(name: str, value: Any) -> Any:
+    return with_shape(name, as_numbers(name, value), (None,))
+
+
+def _columns(name: str, value: Any) -> Any:
+    """A dictionary of columns, each of numbers along one axis; of a frame its columns."""
+    given = dict(value.items()) if hasattr(value, "dtypes") else value
+    return _mapping_of(_column)(name, given)
 
 
 def _numbers_or_names(name: str, value: Any) -> Any:
     """Numbers, or a dictionary of them by the names of signals."""
-    if not isinstance(value, Mapping):
-        return as_numbers(name, value)
-    return {_text(name, key): _number(f"{name}[{key!r}]", item) for key, item in value.items()}
+    of = _mapping_of(_number) if isinstance(value, Mapping) else as_numbers
+    return of(name, value)
 
 
-def _instance(module: str, kind: str) -> Kind:
-    """A value of the package. Its module is loaded if there is one."""
+def _instance(kind: str, remedy: str) -> Kind:
+    """A value of the package, by the name of its class: its module need not be loaded."""
 
     def check(name: str, value: Any) -> Any:
-        known = getattr(sys.modules.get(module), kind, None)
-        if known is None or not isinstance(value, known):
-            raise InputError(name, f"expected a {kind}, got {_described(value)}", _MADE_BY[kind])
+        ours = (one.__name__ for one in type(value).__mro__ if one.__module__.startswith("impc."))
+        if kind not in ours:
+            raise InputError(name, f"expected a {kind}, got {_described(value)}", remedy)
         return value
 
     return check
@@ -331,14 +295,13 @@ def _instance(module: str, kind: str) -> Kind:
 
 def _estimate(name: str, value: Any) -> Any:
     """An estimate, also one of an optional subpackage, which makes its page itself."""
-    known = _instance("impc.inverse.estimates", "Estimate")
-    return value if hasattr(value, "page") else known(name, value)
+    return value if hasattr(value, "page") else _KINDS["Estimate"](name, value)
 
 
 def _path(name: str, value: Any) -> Any:
     """What may be the name of a file; whether there is one is for who opens it."""
     if not isinstance(value, (str, os.PathLike)):
-        raise InputError(name, f"got {_described(value)}", "give a path, as text or a Path")
+        raise _refused(name, value, "give a path, as text or a Path")
     try:
         text = os.fsencode(value)
     except UnicodeEncodeError:
@@ -346,17 +309,6 @@ def _path(name: str, value: Any) -> Any:
     if b"\0" in text:
         raise InputError(name, f"has a zero byte: {brief(ascii(value))}", "give a path without")
     return value
-
-
-def _vectors(name: str, value: Any) -> Any:
-    """A dictionary of columns, each of numbers along one axis; of a frame its columns."""
-    columns = value if hasattr(value, "dtypes") else _mapping(name, value)
-    return {
-        _text(f"{name}: the name of a column", key): with_shape(
-            f"{name}[{key!r}]", as_numbers(f"{name}[{key!r}]", column), (None,)
-        )
-        for key, column in columns.items()
-    }
 
 
 def _system(name: str, value: Any) -> Any:
@@ -368,27 +320,17 @@ def _system(name: str, value: Any) -> Any:
 
 def _pair(name: str, value: Any) -> Any:
     if not isinstance(value, (tuple, list)) or len(value) != 2:
-        raise InputError(name, f"got {_described(value)}", "give a pair (K, S) of arrays")
-    return tuple(as_numbers(f"{name}[{index}]", part) for index, part in enumerate(value))
+        raise _refused(name, value, "give a pair (K, S) of arrays")
+    return _several(as_numbers)(name, value)
 
 
-def _texts(name: str, value: Any) -> Any:
-    given = _mapping(name, value)
-    return {
-        _text(f"{name}: a key", key): _text(f"{name}[{key!r}]", item) for key, item in given.items()
-    }
-
-
-def _several(kind: Kind, what: str) -> Kind:
+def _several(kind: Kind) -> Kind:
     """A tuple of the items of any sequence but a text, an array or a frame of several columns."""
 
     def check(name: str, values: Any) -> tuple[Any, ...]:
-        one_axis = getattr(values, "ndim", 1) == 1 and not hasattr(values, "keys")
-        listed = hasattr(values, "__len__") and hasattr(values, "__iter__") and one_axis
-        if not listed and type(values).__name__ == "Series":
-            listed = True
-        if isinstance(values, (str, bytes, set, frozenset)) or not listed:
-            raise InputError(name, f"got {_described(values)}", f"give a list of {what}")
+        single = isinstance(values, (str, bytes, set, frozenset, Mapping))
+        if single or not isinstance(values, Collection) or getattr(values, "ndim", 1) != 1:
+            raise _refused(name, values, "give a list")
         return tuple(kind(f"{name}[{index}]", value) for index, value in enumerate(values))
 
     return check
@@ -396,62 +338,42 @@ def _several(kind: Kind, what: str) -> Kind:
 
 def _described(value: object) -> str:
     """A wrong value in a few words: of an array its shape."""
-    if value is None or isinstance(value, (bool, float, str, bytes)):
-        return brief(repr(value))
-    shape = getattr(value, "shape", None)
-    kind = type(value).__name__
+    kind, shape = type(value).__name__, getattr(value, "shape", ())
     if isinstance(shape, tuple) and shape:
         return f"{kind} of shape {shape}"
-    if isinstance(value, int):
-        return brief(value)
     if isinstance(value, (list, tuple, dict, set)):
         return f"{kind} of {len(value)}"
-    return kind
+    if value is None or isinstance(value, (float, str, bytes)):
+        return brief(repr(value))
+    return brief(value) if isinstance(value, int) else kind
 
 
-# Who makes a value, for the remedy; and where its class is.
-_VALUES = {
-    "Plant": ("impc.model.plant", "make it with Plant(system)"),
-    "Body": ("impc.model.body", "make it with Plant(system, body=function)"),
-    "Bounds": ("impc.model.bounds", "make it with Bounds(plant, ...)"),
-    "BoundRows": ("impc.model.bounds", "make it with bound_rows"),
-    "Weights": ("impc.model.weights", "make it with Weights(Q, R)"),
-    "Recording": ("impc.model.recordings", "make it with Recording(plant, ...)"),
-    "Label": ("impc.model.recordings", "make it with Label"),
-    "Controller": ("impc.control.controller", "make it with Controller(plant, ...)"),
-    "TerminalSet": ("impc.control.terminal_set", "make it with maximal_invariant_set"),
-    "Scenario": ("impc.control.simulation", "make it with scenario"),
-    "Simulation": ("impc.control.simulation", "make it with simulate"),
-    "Directions": ("impc.control.constraint_rows", "make it with directions"),
-    "Structure": ("impc.model.structure", "make it with Structure(plant, ...)"),
-    "Problem": ("impc.inverse.problem", "make it with Problem(plant, ...)"),
-    "PlantFamily": ("impc.model.plant_family", "make it with plant_family"),
-    "Table": ("impc.files.table", "make it with read_table or make_table"),
-    "Configuration": ("impc.files.configuration", "make it with read_configuration"),
-    "PlantSource": ("impc.files.plant_sources", "make it with plant_source"),
-    "LqrSolution": ("impc.model.riccati", "make it with solve_lqr"),
-    "GainFibre": ("impc.inverse.solution_set", "make it with gain_fibre"),
-    "EquivalentWeights": (
-        "impc.inverse.equivalent_weights",
-        "make it with least_condition_weights",
-    ),
-    "WeightsSet": ("impc.assess.bounded_weights", "make it with weights_set"),
-    "MpcSolver": ("impc.control.casadi_controller", "make it with build_mpc"),
-    "FitSettings": ("impc.studies.fit.settings", "make it with FitSettings"),
-    "FitProgress": ("impc.studies.fit.subject", "make it with FitProgress, or leave it out"),
-    "Estimate": ("impc.inverse.estimates", "make it with estimate(problem)"),
-    "Rows": ("impc.control.constraint_rows", "make it with build_rows"),
+# What makes a value, for the remedy, where it is not its class.
+_MAKERS = {
+    "Body": "Plant(system, body=function)",
+    "BoundRows": "bound_rows",
+    "TerminalSet": "maximal_invariant_set",
+    "Scenario": "scenario",
+    "Simulation": "simulate",
+    "Directions": "directions",
+    "PlantFamily": "plant_family",
+    "Table": "read_table or make_table",
+    "Configuration": "read_configuration",
+    "PlantSource": "plant_source",
+    "LqrSolution": "solve_lqr",
+    "GainFibre": "gain_fibre",
+    "EquivalentWeights": "least_condition_weights",
+    "WeightsSet": "weights_set",
+    "MpcSolver": "build_mpc",
+    "Estimate": "estimate(problem)",
+    "Rows": "build_rows",
 }
-_MADE_BY = {kind: remedy for kind, (_, remedy) in _VALUES.items()}
-
-
-def add_value(kind: str, module: str, remedy: str) -> None:
-    """Have values of an optional subpackage checked too: where the class is, and who makes it."""
-    _KINDS[kind], _MADE_BY[kind] = _instance(module, kind), remedy
-
+_CLASSES = (
+    *("Plant", "Bounds", "Weights", "Recording", "Label", "Controller", "Structure", "Problem"),
+    *("FitSettings", "FitProgress"),
+)
 
 _KINDS: dict[str, Kind] = {
-    **{kind: _instance(module, kind) for kind, (module, _) in _VALUES.items()},
     "Estimate | OwnPage": _estimate,
     "ArrayLike": as_numbers,
     "ArrayLike | Mapping[str, float]": _numbers_or_names,
@@ -464,41 +386,39 @@ _KINDS: dict[str, Kind] = {
     "str": _text,
     "str | Path": _path,
     "Path | str": _path,
-    "Sequence[Path]": _several(_path, "paths"),
+    "Path": _path,
     "Any": _as_it_is,
-    "Sequence[str]": _several(_text, "names"),
-    "tuple[str, ...]": _several(_text, "names"),
     "tuple[tuple[str, str], ...]": _as_it_is,
-    "Sequence[int]": _several(_whole, "whole numbers"),
-    "Sequence[float]": _several(_number, "numbers"),
-    "tuple[Recording, ...]": _several(
-        _instance("impc.model.recordings", "Recording"), "recordings"
-    ),
-    "Sequence[Recording]": _several(_instance("impc.model.recordings", "Recording"), "recordings"),
     "Mapping[str, Any]": _mapping,
-    "Mapping[str, ArrayLike]": _vectors,
-    "Mapping[str, str]": _texts,
+    "Mapping[str, ArrayLike]": _columns,
+    "Mapping[str, str]": _mapping_of(_text),
     "Mapping[str, float]": _mapping,
+    "Mapping[int, IntArray]": _mapping,
     "System": _system,
     "tuple[Array, Array]": _pair,
-    "Mapping[int, IntArray]": _mapping,
 }
 
 
-def register(module: str, kind: str, remedy: str) -> None:
-    """Add a value of an optional subpackage to the table, by itself and in a sequence."""
-    _MADE_BY[kind] = remedy
-    _KINDS[kind] = _instance(module, kind)
-    _KINDS[f"Sequence[{kind}]"] = _several(_KINDS[kind], "recordings")
+def add_value(kind: str, maker: str) -> None:
+    """Have values of a class of this package checked too, such as of an optional subpackage."""
+    _KINDS[kind] = _instance(kind, f"make it with {maker}")
+
+
+for _name in (*_CLASSES, *_MAKERS):
+    add_value(_name, _MAKERS.get(_name, f"{_name}(...)"))
 
 
 def _kind(annotation: str) -> Kind:
-    optional = annotation.endswith(" | None")
-    name = re.sub(r" \| None$", "", annotation)
-    kind = _function if name.startswith("Callable[") else _KINDS.get(name)
-    if kind is None:
+    name = annotation.removesuffix(" | None")
+    several = re.fullmatch(r"Sequence\[(.*)\]|tuple\[(.*), \.\.\.\]", name)
+    if name.startswith("Callable["):
+        kind = _function
+    elif name in _KINDS:
+        kind = _KINDS[name]
+    elif several:
+        kind = _several(_kind(several[1] or several[2]))
+    else:
         raise TypeError(f"{annotation} is not in the table of impc.checking")
-    chosen = kind
-    if not optional:
-        return chosen
-    return lambda name, value: None if value is None else chosen(name, value)
+    if name == annotation:
+        return kind
+    return lambda name, value: None if value is None else kind(name, value)

@@ -55,7 +55,7 @@ def _tables(result: dict[str, Any]) -> list[Entry]:
         Entry(
             "Table 2.1",
             "Height, weight and age of 19 females and 11 males.",
-            ("impc.cli.simulate_reliability",),
+            ("impc.cli.simulate_studies",),
             "The simulated study draws subjects about 79.7 kg and 1.66 m.",
             Verdict.LOST,
             "The table's numbers are lost.",

@@ -76,7 +76,7 @@ def _key_tables(yaw: dict[str, Any], pitch: dict[str, Any]) -> list[Entry]:
         Entry(
             "Table 5.1",
             "Height, weight and age of forty subjects.",
-            ("impc.cli.simulate_head_tracking",),
+            ("impc.cli.simulate_studies",),
             "-",
             Verdict.LOST,
             "The table's numbers are lost.",

@@ -93,7 +93,7 @@ def _tables(
         Entry(
             "Table 4.1",
             "Height, weight and age of ten subjects.",
-            ("impc.cli.simulate_head_tracking",),
+            ("impc.cli.simulate_studies",),
             "-",
             Verdict.LOST,
             "The table's numbers are lost.",

@@ -9,33 +9,32 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import logging
 import os
 import signal
 import sys
-import warnings
+import traceback
 from enum import IntEnum
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from impc.errors import ImpcError, one_line
-from impc.files.writing import NO_ROOM
+from impc.files.disk import NO_ROOM
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
-    from types import FrameType, TracebackType
 
 
-class InterruptionError(Exception):
-    """The keyboard's interruption of a command, as an exception that click leaves alone."""
+class ExitStatus(IntEnum):
+    """What a script may ask of a command that has ended."""
 
-
-class UnreadError(Exception):
-    """Nobody reads the output any more."""
-
-
-class StrayError(Exception):
-    """A call of `sys.exit` or a broken pipe inside a command, which click would take for an end."""
+    DONE = 0
+    PARTIAL = 1
+    BAD_INPUT = 2
+    DEFECT = 70
+    INTERRUPTED = 130
+    UNREAD = 141
 
 
 def ended(run: Callable[[], Any]) -> int:
@@ -46,9 +45,7 @@ def ended(run: Callable[[], Any]) -> int:
             return int(run() or ExitStatus.DONE)
     except SystemExit:  # of click's shell completion
         raise
-    except UnreadError:
-        return ExitStatus.UNREAD
-    except (InterruptionError, click.Abort) as error:
+    except click.Abort as error:
         kept = f"; {error}" if error.args else ""
         return _say(f"interrupted{kept}", ExitStatus.INTERRUPTED)
     except (ImpcError, click.ClickException) as error:
@@ -67,19 +64,19 @@ def interruptions() -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt as interruption:
-        raise InterruptionError(*interruption.args) from None
+        raise click.Abort(*interruption.args) from None
     except SystemExit as error:
-        raise StrayError(f"sys.exit({error.code!r}) was called") from error
+        raise RuntimeError(f"sys.exit({error.code!r}) was called") from error
     except BrokenPipeError as error:
-        raise (UnreadError() if _printing(error) else StrayError("a pipe broke")) from error
+        if _frames(error)[-1][0].startswith("click"):  # nobody reads the output any more
+            raise click.exceptions.Exit(ExitStatus.UNREAD) from None
+        raise RuntimeError("a pipe broke") from error
 
 
-def _printing(error: BaseException) -> bool:
-    """Whether it is the program's output that broke, and not a pipe to another process."""
-    last = error.__traceback__
-    while last is not None and last.tb_next is not None:
-        last = last.tb_next
-    return last is not None and str(last.tb_frame.f_globals.get("__name__")).startswith("click")
+def _frames(error: BaseException) -> list[tuple[str, int]]:
+    """Module and line of every call that led to an error."""
+    steps = traceback.walk_tb(error.__traceback__)
+    return [(str(frame.f_globals.get("__name__", "?")), line) for frame, line in steps]
 
 
 @contextlib.contextmanager
@@ -97,7 +94,7 @@ def own_process() -> Iterator[None]:
     sys.unraisablehook = lambda _: None
     threading.excepthook = lambda _: None
     with contextlib.suppress(ValueError):  # not the main thread
-        signal.signal(signal.SIGINT, _Interrupts())
+        signal.signal(signal.SIGINT, _interrupt)
         # After all that may take long: Python itself would end by the signal, and not with 130.
         atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
     yield
@@ -109,19 +106,16 @@ def own_process() -> Iterator[None]:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-class _Interrupts:
-    """Of the keyboard: the first raises, the second ends the process."""
+def _interrupt(_signum: int, _frame: object) -> None:
+    """The first interruption raises, the second ends the process."""
+    signal.signal(signal.SIGINT, _end_at_once)
+    raise KeyboardInterrupt
 
-    def __init__(self) -> None:
-        self.first = True
 
-    def __call__(self, signum: int, frame: FrameType | None) -> None:
-        if self.first:
-            self.first = False
-            raise KeyboardInterrupt
-        if not _SAID:
-            os.write(2, b"impc: interrupted twice; ended at once\n")
-        os._exit(ExitStatus.INTERRUPTED)
+def _end_at_once(_signum: int, _frame: object) -> None:
+    if not _SAID:
+        os.write(2, b"impc: interrupted twice; ended at once\n")
+    os._exit(ExitStatus.INTERRUPTED)
 
 
 # Whether the line of this process is written: there is only one.
@@ -139,28 +133,18 @@ def _say(message: str, status: ExitStatus) -> ExitStatus:
 def _defect(error: BaseException, heard: list[str]) -> ExitStatus:
     what = "out of memory" if isinstance(error, MemoryError) else f"{type(error).__name__}: "
     text = one_line(error, 200)
-    found = f"defect: {what}{text} ({_place(error.__traceback__)}); {_logged(error, heard)}"
+    frames = _frames(error)
+    ours = [place for place in frames if place[0].partition(".")[0] in ("impc", "plants")]
+    name, line = (ours or frames)[-1]
+    place = f"{name}, line {line}"
+    found = f"defect: {what}{text} ({place}); {_logged(error, heard)}"
     return _say(found, ExitStatus.DEFECT)
-
-
-def _place(traceback: TracebackType | None) -> str:
-    """The line of this project that was reached last; of the library where there is none."""
-    found = "unknown place"
-    ours = False
-    while traceback is not None:
-        name = str(traceback.tb_frame.f_globals.get("__name__", "?"))
-        here = name.partition(".")[0] in ("impc", "plants")
-        if here or not ours:
-            found, ours = f"{name}, line {traceback.tb_lineno}", here
-        traceback = traceback.tb_next
-    return found
 
 
 def _logged(error: BaseException, heard: list[str]) -> str:
     """Write all that is known to a log that only the user can read, and say where it is."""
     import platform  # noqa: PLC0415  # --help needs none of these
     import tempfile  # noqa: PLC0415
-    import traceback  # noqa: PLC0415
 
     path = ""
     try:
@@ -184,31 +168,12 @@ def _logged(error: BaseException, heard: list[str]) -> str:
 @contextlib.contextmanager
 def _quiet(heard: list[str]) -> Iterator[None]:
     """Keep what libraries warn of for the log; warnings that are errors are raised as before."""
-    import logging  # noqa: PLC0415  # where click needs it not
-
-    def keep(message: Warning | str, category: type[Warning], *place: Any) -> None:
-        heard.append(f"{category.__name__}: {message} ({place[0]}, line {place[1]})")
-
-    class Keep(logging.Handler):
-        def emit(self, record: logging.LogRecord) -> None:
-            heard.append(f"{record.name}: {record.getMessage()}")
-
-    handler = Keep(logging.WARNING)
+    handler = logging.Handler(logging.WARNING)
+    handler.emit = lambda record: heard.append(f"{record.name}: {record.getMessage()}")  # type: ignore[method-assign]
     logging.getLogger().addHandler(handler)
+    logging.captureWarnings(True)
     try:
-        with warnings.catch_warnings():
-            warnings.showwarning = keep  # type: ignore[assignment]
-            yield
+        yield
     finally:
+        logging.captureWarnings(False)
         logging.getLogger().removeHandler(handler)
-
-
-class ExitStatus(IntEnum):
-    """What a script may ask of a command that has ended."""
-
-    DONE = 0
-    PARTIAL = 1
-    BAD_INPUT = 2
-    DEFECT = 70
-    INTERRUPTED = 130
-    UNREAD = 141

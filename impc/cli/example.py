@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING
 
 import click
 
+from impc.cli.console import print_files, progress
 from impc.cli.options import out_option, solver_option
-from impc.cli.output import print_files
 from impc.cli.plant import load_plant
-from impc.cli.progress import progress
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

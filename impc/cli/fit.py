@@ -1,4 +1,4 @@
-"""`impc fit`: the control intent of a subject from recordings in files."""
+"""`impc fit` and `impc compare`: the control intent of a subject, by one method or by all."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import click
 
+from impc.checking import replace
+from impc.cli.console import print_files, progress
 from impc.cli.options import out_option, solver_option, subject_arguments, yes_option
-from impc.cli.output import print_files
-from impc.cli.progress import progress
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -35,8 +35,8 @@ def command(
     Where the plant is an impc.OptimalControlProblem, its parameters are fitted (docs/nonlinear.md).
     """
     # Imported here: the libraries take seconds to load, and --help needs none.
-    from impc.cli.consent import require_consent  # noqa: PLC0415
-    from impc.cli.subject import read_subject  # noqa: PLC0415
+    from impc.cli.console import require_consent  # noqa: PLC0415
+    from impc.cli.plant import read_subject  # noqa: PLC0415
     from impc.extras import installed  # noqa: PLC0415
     from impc.reporting.shown_units import angles_in  # noqa: PLC0415
     from impc.reporting.writer import require_writable, write_files  # noqa: PLC0415
@@ -83,7 +83,7 @@ def _own_problem(
     """Fit, write and print, if the plant is an optimal control problem; else do nothing."""
     from impc.cli.plant import find_plant  # noqa: PLC0415
     from impc.files.configuration import read_configuration  # noqa: PLC0415
-    from impc.files.inputs import gather_inputs  # noqa: PLC0415
+    from impc.files.digests import gather_inputs  # noqa: PLC0415
     from impc.files.plant_sources import made_by  # noqa: PLC0415
     from impc.nonlinear.files import fit_files  # noqa: PLC0415
     from impc.nonlinear.page import abstract, optimal_report, verdict  # noqa: PLC0415
@@ -137,3 +137,52 @@ def _print(result: FitResult) -> None:
         f"Other weights that explain the recordings equally well turn that direction by up to "
         f"{result.widest_angle:.0f} degrees: so far it is not the subject's."
     )
+
+
+@click.command("compare")
+@subject_arguments("What the columns mean, and settings, as for `impc fit`.")
+@out_option("compare", "report.html, result.json, tables and the figure")
+@solver_option
+@yes_option
+def compare_command(
+    files: tuple[Path, ...],
+    plant_name: str,
+    config: Path,
+    out: Path,
+    solver: str | None,
+    yes: bool,
+) -> None:
+    """Compare feedback gain, inverse LQR and inverse MPC, one file a trial.
+
+    Each method is fitted to all trials and to all but each one. What is done when you interrupt it
+    is kept in the folder: the same command goes on from there.
+    """
+    # Imported here: the libraries take seconds to load, and --help needs none.
+    from impc.cli.console import require_consent  # noqa: PLC0415
+    from impc.cli.plant import read_subject  # noqa: PLC0415
+    from impc.reporting.shown_units import angles_in  # noqa: PLC0415
+    from impc.reporting.writer import require_writable, write_files  # noqa: PLC0415
+    from impc.studies.compare.report import compare_report  # noqa: PLC0415
+    from impc.studies.compare.subject import compare_recordings, stages  # noqa: PLC0415
+    from impc.studies.effort import fit_effort  # noqa: PLC0415
+    from impc.studies.fit.memory import open_memory  # noqa: PLC0415
+    from impc.studies.fit.settings import require_used  # noqa: PLC0415
+    from impc.studies.methods_table import methods_finding  # noqa: PLC0415
+
+    require_writable(out)
+    subject = read_subject("compare", files, plant_name, config, solver)
+    problem, settings = subject.problem, subject.settings
+    require_used(settings, (), "compare")
+    require_consent(fit_effort(problem, settings), yes)
+    memory = open_memory(out, problem, settings, "compare", subject.inputs.digest)
+    held_out = settings.held_out
+    count = stages(len(problem.recordings), held_out=held_out)
+    with progress(count, "estimate", lambda _: memory.kept()) as done:
+        remember = replace(memory, done=done).estimate
+        compared = compare_recordings(problem, settings.settle, remember, held_out=held_out)
+    with angles_in(subject.angles):
+        content = compare_report(problem, compared, subject.provenance).files()
+    written = write_files(out, content)
+    memory.cache.forget()
+    click.echo(methods_finding(compared).text())
+    print_files(out, written)

@@ -98,7 +98,7 @@ def _require_new(out: Path | None) -> None:
 
 
 def _write(out: Path, text: str) -> None:
-    from impc.files.writing import unwritable  # noqa: PLC0415
+    from impc.files.disk import unwritable  # noqa: PLC0415
 
     made = False
     try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import os
 import sys
 from typing import Any
@@ -13,19 +14,19 @@ from impc.cli.ending import ExitStatus, ended, interruptions, own_process
 from impc.jit import keep_caches, say_when_compiling
 from impc.settings_files import ignore_settings_files
 
-# One module a command, loaded when it is asked for: name -> module, which holds it as `command`.
+# Where each command is, loaded when it is asked for: name -> module and its function.
 _COMMANDS = {
-    "cohort": "impc.cli.cohort",
-    "compare": "impc.cli.compare",
-    "example": "impc.cli.example",
-    "fit": "impc.cli.fit",
-    "inspect": "impc.cli.inspect",
-    "key-parameters": "impc.cli.key_parameters",
-    "plan": "impc.cli.plan",
-    "reliability": "impc.cli.reliability",
-    "select": "impc.cli.select",
-    "simulate": "impc.cli.simulate",
-    "warm": "impc.cli.warm",
+    "cohort": ("impc.cli.cohort", "command"),
+    "compare": ("impc.cli.fit", "compare_command"),
+    "example": ("impc.cli.example", "command"),
+    "fit": ("impc.cli.fit", "command"),
+    "inspect": ("impc.cli.inspect", "command"),
+    "key-parameters": ("impc.cli.select", "key_command"),
+    "plan": ("impc.cli.plan", "command"),
+    "reliability": ("impc.cli.cohort", "reliability_command"),
+    "select": ("impc.cli.select", "command"),
+    "simulate": ("impc.cli.simulate", "command"),
+    "warm": (__name__, "warm"),
 }
 
 
@@ -36,10 +37,10 @@ class _Program(click.Group):
         return list(_COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        module = _COMMANDS.get(cmd_name)
-        if module is None:
+        if cmd_name not in _COMMANDS:
             return None
-        found: click.Command = importlib.import_module(module).command
+        module, function = _COMMANDS[cmd_name]
+        found: click.Command = getattr(importlib.import_module(module), function)
         return found
 
     def make_context(self, *args: Any, **kwargs: Any) -> click.Context:
@@ -79,3 +80,22 @@ def main(context: click.Context) -> None:
     """Inverse model predictive control: the weights behind a recorded closed loop."""
     if context.invoked_subcommand is None:
         click.echo(context.get_help())
+
+
+@click.command("warm")
+def warm() -> None:
+    """Compile what the other commands run, once: some minutes, after which none compiles.
+
+    `make env` ends with it; after an installation by pip it is yours to call. Without it the first
+    command compiles what it needs and says so.
+    """
+    say_when_compiling(lambda _: None)  # nobody has to be told here
+    from impc.control.warm import compiled_parts  # noqa: PLC0415  # loads numba
+
+    for part in compiled_parts():
+        click.echo(f"compiled: {part}")
+    if importlib.util.find_spec("impc.output_feedback"):
+        from impc.output_feedback.warm import compile_filter  # noqa: PLC0415
+
+        compile_filter()
+        click.echo("compiled: subjects who sense with noise")

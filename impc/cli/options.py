@@ -40,7 +40,7 @@ solver_option = click.option(
     "ipopt, sqpmethod or fatrop.",
 )
 
-#: --yes of what may take hours, see `impc.cli.consent`.
+#: --yes of what may take hours, see `impc.cli.console`.
 yes_option = click.option(
     "--yes", is_flag=True, help="Do not ask before what takes hours or much memory."
 )

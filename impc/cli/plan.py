@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from impc.cli.console import print_files, progress
 from impc.cli.options import out_option, yes_option
-from impc.cli.output import print_files
 from impc.cli.plant import KNOWN, find_plant
-from impc.cli.progress import progress
 from impc.cli.seat import TORQUE
 
 if TYPE_CHECKING:
@@ -41,9 +40,9 @@ def command(config: Path, plant_name: str, out: Path, yes: bool) -> None:
     is done when you interrupt it is kept in the folder: the same command goes on from there.
     """
     # Imported here: the libraries take seconds to load, and --help needs none.
-    from impc.cli.consent import require_consent  # noqa: PLC0415
+    from impc.cli.console import require_consent  # noqa: PLC0415
     from impc.files.configuration import read_configuration  # noqa: PLC0415
-    from impc.files.inputs import gather_inputs  # noqa: PLC0415
+    from impc.files.digests import gather_inputs  # noqa: PLC0415
     from impc.reporting.provenance import Provenance  # noqa: PLC0415
     from impc.reporting.shown_units import angles_in  # noqa: PLC0415
     from impc.reporting.writer import require_writable, write_files  # noqa: PLC0415

@@ -1,16 +1,23 @@
-"""A plant by name: the one place where the library meets plants."""
+"""A plant by name, and a subject: the one place where the library meets plants."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from impc.checking import replace
+
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
+    from impc.files.digests import Inputs
     from impc.files.plant_sources import PlantSource
+    from impc.inverse.problem import Problem
     from impc.model.plant import Plant
+    from impc.reporting.provenance import Provenance
     from impc.studies.cohort.study import Study
+    from impc.studies.fit.settings import FitSettings
 
 #: Short names of plants, by their import paths: the library itself knows no plant.
 KNOWN = {"seated-balance": "plants:seated_balance_for", "cursor": "plants:cursor_plant"}
@@ -51,8 +58,63 @@ def load_plant(path: str) -> Plant:
 
 def named_plant(study_file: Path, study: Study, given: str | None, allowed: bool) -> PlantSource:
     """The plant of a study, when the command line consents to it."""
-    from impc.files.user_code import consented_name  # noqa: PLC0415
+    from impc.files.plant_sources import consented_name  # noqa: PLC0415
 
     where = f"{study_file}: study.plant"
     name = consented_name(where, study.plant, given, allowed, "plant", tuple(KNOWN))
     return find_plant(name, study.configuration.plant)
+
+
+@dataclass(frozen=True)
+class Subject:
+    """The recordings of a subject as an inverse problem."""
+
+    problem: Problem
+    settings: FitSettings
+    source: PlantSource  # Of the plant
+    inputs: Inputs  # Digests of all files that went in
+    command: str  # The command line, without folders
+    files: tuple[str, ...]  # Names of the recordings
+    angles: str = "degrees"  # "degrees" or "radians", as [report] says
+
+    @property
+    def provenance(self) -> Provenance:
+        """Where what is made of it now comes from."""
+        from impc.reporting.provenance import Provenance  # noqa: PLC0415
+
+        source = self.source
+        arguments = dict(source.arguments)
+        return Provenance(source.name, self.command, arguments, self.files, self.inputs)
+
+
+def read_subject(
+    command: str,
+    files: Sequence[Path],
+    plant_name: str,
+    config: Path,
+    solver: str | None = None,
+) -> Subject:
+    """Read recordings, one file a trial."""
+    from impc.control.named_solver import require_solver  # noqa: PLC0415
+    from impc.files.configuration import read_configuration  # noqa: PLC0415
+    from impc.files.digests import gather_inputs  # noqa: PLC0415
+    from impc.files.plant_sources import make_plant, plant_family_of  # noqa: PLC0415
+    from impc.files.reading import read_recordings  # noqa: PLC0415
+    from impc.studies.fit.settings import fit_settings  # noqa: PLC0415
+    from impc.studies.fit.subject import fit_problem  # noqa: PLC0415
+
+    configuration = read_configuration(config)
+    settings = fit_settings(configuration.fit)
+    if solver is not None:
+        settings = replace(settings, solver=require_solver(solver))
+    source = find_plant(plant_name, configuration.plant)
+    recorded = configuration.recorded
+    plant = make_plant(source, recorded)
+    family = plant_family_of(source, recorded, settings.free)
+    recordings = read_recordings(files, configuration, plant)
+    inputs = gather_inputs(files, config, source.name, source.arguments)
+    names = tuple(path.name for path in files)
+    line = f"impc {command} {' '.join(names)} --plant {plant_name} --config {config.name}"
+    line += "" if solver is None else f" --solver {solver}"
+    problem = fit_problem(plant, recordings, settings, family)
+    return Subject(problem, settings, source, inputs, line, names, configuration.report.angles)

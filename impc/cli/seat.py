@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import json
 from typing import TYPE_CHECKING, Any
 
-from impc.cli.progress import progress
+import click
+
+from impc.cli.console import print_next, progress
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from pathlib import Path
 
     import numpy as np
 
@@ -107,3 +111,18 @@ def seat_table(name: str, degrees: Array, torque: Array, rate: float) -> Table:
     }
     units = {"time": "s", "seat_angle": "deg", "trunk_angle": "deg", "perturbation": "Nm"}
     return make_table(name, columns, units=units, rate=rate)
+
+
+def write_study(out: Path, command: str, study: str, truth: dict[str, Any], **more: str) -> None:
+    """Write study.toml, truth.json and `more` texts, by their stem and ending, and say what next.
+
+    `truth` has the settings, and the subjects by their names.
+    """
+    from impc.reporting.writer import write_files  # noqa: PLC0415
+
+    texts = {"study.toml": study, "truth.json": json.dumps(truth, indent=1) + "\n"}
+    texts |= {name.replace("_", "."): text for name, text in more.items()}
+    write_files(out, {name: text.encode() for name, text in texts.items()})
+    subjects, visits = len(truth["subjects"]), truth["settings"]["visits"]
+    click.echo(f"{subjects} subjects, {visits} visits: {out / 'study.toml'}")
+    print_next(f"impc {command} {{}}", out, "study.toml")

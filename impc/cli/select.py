@@ -1,4 +1,4 @@
-"""`impc select`: which parameters of a model recordings can tell."""
+"""`impc select` and `impc key-parameters`: which parameters of a model recordings can tell."""
 
 from __future__ import annotations
 
@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from impc.cli.options import code_options, out_option, scheduler_options, yes_option
-from impc.cli.output import print_files
-from impc.cli.progress import progress
+from impc.cli.console import print_files, progress
+from impc.cli.options import Number, code_options, out_option, scheduler_options, yes_option
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from impc.files.inputs import Inputs
+    from impc.files.digests import Inputs
     from impc.studies.cache import Cache
     from impc.studies.cohort.study import Study
     from impc.studies.pool import Result
@@ -38,7 +37,7 @@ def command(
     [study] model names the model by import path, [model] its arguments, [select] the settings. It
     may be stopped at any time: the same command goes on from there.
     """
-    from impc.cli.consent import FEWER_STARTS, require_consent  # noqa: PLC0415
+    from impc.cli.console import FEWER_STARTS, require_consent  # noqa: PLC0415
     from impc.reporting.writer import write_files  # noqa: PLC0415
     from impc.studies.effort import select_evaluations, selection_effort  # noqa: PLC0415
     from impc.studies.selection.analysis import select_study  # noqa: PLC0415
@@ -93,9 +92,9 @@ def read_model_study(
     path: Path, given: str | None, allowed: bool
 ) -> tuple[Study, ModelSource, dict[tuple[str, str], tuple[Trial, ...]], Inputs]:
     """The study at `path`, its model, all recordings, and the digests of these."""
-    from impc.files.inputs import study_inputs  # noqa: PLC0415
+    from impc.files.digests import study_inputs  # noqa: PLC0415
+    from impc.files.plant_sources import consented_name  # noqa: PLC0415
     from impc.files.reading import require_distinct  # noqa: PLC0415
-    from impc.files.user_code import consented_name  # noqa: PLC0415
     from impc.studies.cohort.study import read_study  # noqa: PLC0415
     from impc.studies.selection.model_source import model_source, read_trials  # noqa: PLC0415
 
@@ -106,3 +105,59 @@ def read_model_study(
     source = model_source(name, arguments)
     recorded = read_trials(study, source)
     return study, source, recorded, study_inputs(study.units, path, "model", name, arguments)
+
+
+@click.command("key-parameters")
+@click.argument("study_file", metavar="STUDY", type=click.Path(path_type=Path))
+@code_options("model")
+@out_option("key-parameters", "report.html, result.json, table and figure")
+@click.option(
+    "--bound",
+    type=Number(min=0, max=1e6, min_open=True),
+    default=0.35,
+    help="Largest variance, in halves of the ranges, squared.",
+)
+@click.option("--vaf", type=Number(), default=69.0, help="Least mean VAF, %.")
+@click.option("--icc", type=Number(), default=0.75, help="Least ICC(A,k).")
+@scheduler_options
+@yes_option
+def key_command(
+    study_file: Path,
+    model_name: str | None,
+    allowed: bool,
+    out: Path,
+    bound: float,
+    vaf: float,
+    icc: float,
+    cluster: Cluster,
+    yes: bool,
+) -> None:
+    """Key parameters of a study of several subjects and visits.
+
+    The study file is that of `impc select`. It may be stopped at any time: the same command goes on
+    from there.
+    """
+    from impc.cli.console import FEWER_STARTS, require_consent  # noqa: PLC0415
+    from impc.reporting.writer import write_files  # noqa: PLC0415
+    from impc.studies.effort import key_evaluations, selection_effort  # noqa: PLC0415
+    from impc.studies.selection.key_parameters import key_parameters  # noqa: PLC0415
+    from impc.studies.selection.key_report import key_report  # noqa: PLC0415
+    from impc.studies.selection.settings import select_settings  # noqa: PLC0415
+
+    study, source, recorded, inputs = read_model_study(study_file, model_name, allowed)
+    settings = select_settings(study.configuration.select)
+    effort = selection_effort(source.model, recorded.values(), key_evaluations(settings))
+    with study_runner(source, out, cluster, 2 * len(recorded)) as (run, threads):
+        require_consent(effort.shared(len(recorded), threads), yes, FEWER_STARTS)
+        found = key_parameters(
+            source.model, recorded, settings, run,
+            bound=bound, least_vaf=vaf, least_reliability=icc,
+        )  # fmt: skip
+    options = f"--model {source.name} --bound {bound:g} --vaf {vaf:g} --icc {icc:g}"
+    line = f"impc key-parameters {study_file.name} {options}"
+    written = write_files(out, key_report(source.model, found, line, inputs).files())
+    kept_results(out).forget()
+    names = source.model.names
+    chosen = ", ".join(names[index] for index in found.chosen) or "none passes all filters"
+    click.echo(f"key parameters: {chosen}")
+    print_files(out, written)

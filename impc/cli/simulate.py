@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from impc.cli.console import print_files, print_next
 from impc.cli.options import Number, out_option, seed_option
-from impc.cli.output import print_files, print_next
 from impc.cli.seat import (
     HORIZON,
     SIGNALS,
@@ -21,8 +21,7 @@ from impc.cli.seat import (
     seat_weights,
 )
 from impc.cli.simulate_cohort import cohort
-from impc.cli.simulate_head_tracking import head_tracking
-from impc.cli.simulate_reliability import reliability_study
+from impc.cli.simulate_studies import head_tracking, reliability_study
 from impc.extras import installed
 
 if TYPE_CHECKING:

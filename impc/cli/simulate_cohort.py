@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from impc.cli.options import Number, out_option, seed_option
-from impc.cli.output import print_next
 from impc.cli.seat import (
     HORIZON,
     SIGNALS,
@@ -19,6 +17,7 @@ from impc.cli.seat import (
     random_person,
     seat_controller,
     seat_table,
+    write_study,
 )
 
 if TYPE_CHECKING:
@@ -97,14 +96,9 @@ def cohort(out: Path, **given: Any) -> None:
             for file, when in falls.items():
                 click.echo(f"{file}: the subject fell at {when:.2f} s")
             write_files(out / f"sub-{name}" / f"ses-{visit}", files)
-    texts = {
-        "participants.tsv": "\n".join(rows) + "\n",
-        "study.toml": _study(given),
-        "truth.json": json.dumps({"settings": given, "subjects": truth}, indent=1) + "\n",
-    }
-    write_files(out, {name: text.encode() for name, text in texts.items()})
-    click.echo(f"{given['subjects']} subjects, {given['visits']} visits: {out / 'study.toml'}")
-    print_next("impc cohort {}", out, "study.toml")
+    everything = {"settings": given, "subjects": truth}
+    people = "\n".join(rows) + "\n"
+    write_study(out, "cohort", _study(given), everything, participants_tsv=people)
 
 
 def _visit(

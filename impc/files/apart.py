@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from impc.errors import DataError, ImpcError, InputError, brief
-from impc.files.names import damaged
+from impc.files.disk import damaged
 from impc.files.table import Table
 
 #: Module, function and library of each format that is read here.
@@ -33,8 +33,8 @@ READERS = {
     "matlab": ("impc.files.matlab", "read_matlab", "scipy.io"),
     "matrices": ("impc.files.matlab", "read_matrices", "scipy.io"),
     "matlab73": ("impc.files.matlab73", "read_matlab73", "h5py"),
-    "tdms": ("impc.files.tdms", "read_tdms", "nptdms"),
-    "c3d": ("impc.files.c3d_analog", "read_c3d", "c3d"),
+    "tdms": ("impc.files.recorders", "read_tdms", "nptdms"),
+    "c3d": ("impc.files.recorders", "read_c3d", "c3d"),
     "spreadsheet": ("impc.files.spreadsheet", "read_spreadsheet", "python_calamine"),
     "cells": ("impc.files.spreadsheet", "read_cells", "python_calamine"),
 }

@@ -20,7 +20,7 @@ import msgspec
 
 from impc.checking import checked
 from impc.errors import InputError, brief
-from impc.files.names import require_ordinary
+from impc.files.disk import require_readable
 from impc.files.units import si_unit
 
 if TYPE_CHECKING:
@@ -161,7 +161,7 @@ def read_configuration(path: Path | str, *more: str) -> Configuration:
 def _parsed(source: str, path: Path) -> dict[str, Any]:
     if not os.path.lexists(path):
         raise InputError(source, "does not exist", "`impc inspect FILE --out` writes one")
-    require_ordinary(path, _LARGEST, InputError)
+    require_readable(path, _LARGEST, InputError)
     try:
         text = path.read_text(encoding="utf-8-sig")
         # tomllib keeps every prefix of a dotted key: one of 32 kB takes 1 GB.

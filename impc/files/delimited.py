@@ -16,11 +16,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from impc.errors import DataError
-from impc.files.blocks import EMPTY, HEAD, NUMBER, WORD, Block, first_block
-from impc.files.headings import find_headings, written_heading
-from impc.files.names import LARGEST
+from impc.files.disk import LARGEST
+from impc.files.layout import (
+    EMPTY,
+    HEAD,
+    NUMBER,
+    WORD,
+    Block,
+    find_headings,
+    first_block,
+    require_no_thousands,
+    written_heading,
+)
 from impc.files.table import make_table
-from impc.files.thousands import require_no_thousands
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

@@ -1,9 +1,10 @@
 """What a result depends on, as one number: recordings, plant, settings and versions, all of them.
 
-A result that is kept carries the digest of everything that went into it. `digest` takes values,
-`content_digest` a file from its first byte to its last, `source_digest` the code or the file of a
-plant or model, and `versions` what computes. A file that a plant's own code opens is known when its
-name is an argument of the plant, and not otherwise (docs/security.md).
+A result that is kept carries the digest of everything that went into it, and result.json tells it
+(`Inputs`). `digest` takes values, `content_digest` a file from its first byte to its last,
+`source_digest` the code or the file of a plant or model, and `versions` what computes. A file that
+a plant's own code opens is known when its name is an argument of the plant, and not otherwise
+(docs/security.md).
 """
 
 from __future__ import annotations
@@ -15,21 +16,24 @@ import importlib.metadata
 import os
 import platform
 import sys
+import sysconfig
 import threading
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path, PurePath
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import msgspec
 import numpy as np
 
 from impc.errors import DataError
-from impc.files.user_code import OURS, is_installed
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
     from types import ModuleType
 
+# This package's own modules; they are known by their version.
+_OURS = ("impc", "plants")
 # What computes: another version of any of them may give other digits.
 _PACKAGES = ("casadi", "clarabel", "control", "cvxpy", "numba", "numpy", "scipy")
 _PLANT_FILES = (".mat", ".npz", ".json")
@@ -84,7 +88,7 @@ def versions() -> dict[str, str]:
         except importlib.metadata.PackageNotFoundError:
             found[name] = "not installed"
     here = Path(__file__).resolve().parents[1]
-    sources = sorted(path for name in OURS for path in (here.parent / name).rglob("*.py"))
+    sources = sorted(path for name in _OURS for path in (here.parent / name).rglob("*.py"))
     found["impc"] = digest(
         [(path.relative_to(here.parent).as_posix(), path.read_bytes()) for path in sources]
     )
@@ -119,16 +123,25 @@ def _names_a_file(value: object) -> bool:
 def _source(module: ModuleType) -> str:
     file = Path(getattr(module, "__file__", None) or "")
     found: dict[str, bytes] = {}
-    if file.is_file() and not is_installed(file):
+    if file.is_file() and not _is_installed(file):
         depth = module.__name__.count(".") + (file.name == "__init__.py")
         _gather(file, file.parents[depth], found)
     return digest(found)
 
 
+def _is_installed(file: Path) -> bool:
+    """Whether the `file` of a module belongs to Python or was installed."""
+    path = file.resolve()
+    if {"site-packages", "dist-packages"} & set(path.parts):
+        return True
+    libraries = (Path(sysconfig.get_path(key)).resolve() for key in ("stdlib", "platstdlib"))
+    return any(path.is_relative_to(library) for library in libraries)
+
+
 def _gather(file: Path, root: Path, found: dict[str, bytes]) -> None:
     """Add a `file` of the user's and those in the folder `root` that it imports, anywhere in it."""
     key = os.path.relpath(file, root)
-    if key in found or Path(key).parts[0] in OURS:
+    if key in found or Path(key).parts[0] in _OURS:
         return
     found[key] = file.read_bytes()
     for base, name in _imports(file, root) if file.suffix == ".py" else ():
@@ -156,3 +169,72 @@ def _imports(file: Path, root: Path) -> Iterator[tuple[Path, str]]:
             yield from (
                 (base, f"{node.module or ''}.{alias.name}".strip(".")) for alias in node.names
             )
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """SHA-256 of what went into a result."""
+
+    # Of each file, in the order given; of a study, by the name of the unit
+    recordings: tuple[str, ...] | Mapping[str, tuple[str, ...]]
+    configuration: str  # Of the configuration or the study file
+    code: str  # Of the plant's or model's code or file, and its arguments
+    versions: str  # Of Python, of the packages that compute, and of this package's source
+    kind: str = "plant"  # What the code is: "plant" or "model"
+
+    @property
+    def digest(self) -> str:
+        """All of them as one."""
+        return digest(self)
+
+    def plain(self) -> Mapping[str, Any]:
+        """As result.json has them."""
+        return {
+            "recordings": self.recordings,
+            "configuration": self.configuration,
+            self.kind: self.code,
+            "versions": self.versions,
+            "all": self.digest,
+        }
+
+
+def gather_inputs(
+    files: Sequence[Path], configuration: Path, name: str, arguments: Mapping[str, Any]
+) -> Inputs:
+    """Digests of the recordings `files`, of the `configuration` and of a plant as they are now.
+
+    The plant is a file or an import path, the `name`, imported already, with its `arguments`.
+    """
+    recordings = tuple(content_digest(path) for path in files)
+    return Inputs(
+        recordings, content_digest(configuration), _code(name, arguments), digest(versions())
+    )
+
+
+class Recorded(Protocol):
+    """What is read here of a unit of a study."""
+
+    @property
+    def name(self) -> str:
+        """Of the unit."""
+
+    @property
+    def files(self) -> Sequence[Path]:
+        """Its recordings."""
+
+
+def study_inputs(
+    units: Sequence[Recorded], study: Path, kind: str, name: str, arguments: Mapping[str, Any]
+) -> Inputs:
+    """Digests of the recordings of `units`, of the `study` file and of its plant or model.
+
+    `kind` is "plant" or "model"; `name` and `arguments` are as in `gather_inputs`.
+    """
+    recordings = {unit.name: tuple(content_digest(path) for path in unit.files) for unit in units}
+    return Inputs(
+        recordings, content_digest(study), _code(name, arguments), digest(versions()), kind
+    )
+
+
+def _code(name: str, arguments: Mapping[str, Any]) -> str:
+    return digest(source_digest(name, arguments), dict(arguments))

@@ -12,14 +12,12 @@ from typing import TYPE_CHECKING
 from impc.checking import checked
 from impc.errors import DataError, ImpcError, InputError, OutputError
 from impc.files.apart import read_apart
-from impc.files.c3d_analog import encode_c3d
 from impc.files.delimited import encode_delimited, read_delimited
+from impc.files.disk import LARGEST, damaged, require_readable, unwritable
 from impc.files.matlab import encode_matlab
 from impc.files.matlab73 import HDF5_SIGNATURE, matlab73_bytes
-from impc.files.names import LARGEST, damaged, require_ordinary
-from impc.files.tdms import encode_tdms
-from impc.files.workbook import encode_workbook
-from impc.files.writing import unwritable
+from impc.files.recorders import encode_c3d, encode_tdms
+from impc.files.spreadsheet import encode_workbook
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -151,7 +149,7 @@ def _suffix(path: Path, error: type[InputError | OutputError]) -> str:
 
 def _head(path: Path, largest: int) -> bytes:
     """The first bytes of a file that can be read and is neither empty nor too large."""
-    require_ordinary(path, largest)
+    require_readable(path, largest)
     try:
         with path.open("rb") as file:
             return file.read(1024)

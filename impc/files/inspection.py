@@ -13,10 +13,10 @@ import numpy as np
 
 from impc.errors import InputError
 from impc.files.clock import counts_days
-from impc.files.columns import in_columns
 from impc.files.configuration import FILL_IN
 from impc.files.plant_sources import OWN
-from impc.files.units import guessed_unit, si_unit
+from impc.files.table import in_columns
+from impc.files.units import si_unit
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -157,24 +157,17 @@ def _fits(table: Table, column: str, signal: str, wanted: Wanted) -> int:
 
 def _column_unit(table: Table, column: str) -> tuple[str, str]:
     """The unit of a column and how it is known: by the file, or by the end of its name."""
-    if table.units.get(column):
-        return _read_unit(table.units[column])
+    told = table.units.get(column)
+    if told:
+        try:
+            si_unit(told)
+        except InputError:
+            return FILL_IN, f"the file says {told!r}, which is not known"
+        return told, "as the file says"
     last = re.split(r"[_ .]", column)[-1]
     if last != column and last in _IN_NAMES:
         return _IN_NAMES[last], "a guess: by its name"
     return FILL_IN, ""
-
-
-def _read_unit(told: str) -> tuple[str, str]:
-    """The unit that a file's own word for it stands for, and how sure that is."""
-    try:
-        si_unit(told)
-    except InputError:
-        guess = guessed_unit(told)
-        if guess:
-            return guess, f"a guess: the file says {told!r}"
-        return FILL_IN, f"the file says {told!r}, which is not known"
-    return told, "as the file says"
 
 
 def _row(table: Table, name: str) -> tuple[str, ...]:

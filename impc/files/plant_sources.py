@@ -4,6 +4,11 @@ A module that comes with the package, or with what is installed, is never looked
 folder: a file there called plants.py or numpy.py replaces nothing. Only a module of another name is
 looked for there, last, as long as it is being imported. What a user's function does wrong, whatever
 it raises, is one line that names it.
+
+A study file that names a plant `module:function` asks for that module to be imported and that
+function to be called. Somebody else may have written the file: such a name needs the consent of
+whoever types the command. The plants of this package, and saved matrices, need none
+(docs/security.md).
 """
 
 from __future__ import annotations
@@ -57,6 +62,29 @@ class PlantSource:
         defaults = {} if Path(self.name).suffix in SAVED else self.defaults()
         left = (name for name in OWN if name in defaults and name not in self.arguments)
         return {name: defaults[name] for name in left if defaults[name] != FILL_IN}
+
+
+def consented_name(
+    where: str, named: str, given: str | None, allowed: bool, option: str, known: tuple[str, ...]
+) -> str:
+    """The plant or model that may be run, when the place `where` in a file has `named` one.
+
+    What the command line has `given` replaces it; `allowed` says whether it allows what the file
+    names. `option` is "plant" or "model", and `known` are short names of this package's own.
+    """
+    name = given or named
+    if not name:
+        raise InputError(where, "is missing", f'write {option} = "module:function"')
+    module = name.partition(":")[0]
+    data = option == "plant" and Path(name).suffix in SAVED  # a model is never a file
+    if name in known or data or module == "plants" or ":" not in name:
+        return name  # the last: no name of code at all, and told so by who looks for it
+    if given is None and not allowed:
+        raise InputError(
+            where, f"names code that would be run, {name!a}",
+            f"look at it, then say --{option} {name}, or --allow-{option}",
+        )  # fmt: skip
+    return name
 
 
 @checked

@@ -13,13 +13,12 @@ import numpy as np
 from impc.checking import checked, replace
 from impc.errors import DataError, FallError, InputError
 from impc.files import checks
-from impc.files.alignment import misaligned
 from impc.files.apart import match_apart
+from impc.files.causality import departures, misaligned, rows_later
 from impc.files.clock import column_of, on_even_instants, read_clock
 from impc.files.configuration import FILL_IN
 from impc.files.digests import content_digest
 from impc.files.formats import read_table
-from impc.files.one_step import departures, rows_later
 from impc.files.resampling import held_means, instants, resampled_samples, same_rate, shifted
 from impc.files.units import si_unit
 from impc.model.plant import UNKNOWN

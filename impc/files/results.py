@@ -14,7 +14,7 @@ import msgspec
 
 from impc.checking import checked
 from impc.errors import DataError
-from impc.files.writing import require_ordinary
+from impc.files.disk import require_ordinary
 
 if TYPE_CHECKING:
     import pandas as pd

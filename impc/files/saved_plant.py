@@ -12,7 +12,7 @@ import numpy as np
 
 from impc.errors import ImpcError, InputError, brief
 from impc.files.apart import matrices_apart
-from impc.files.names import require_ordinary
+from impc.files.disk import require_readable
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -36,7 +36,7 @@ def read_matrices(path: Path) -> dict[str, Any]:
 
     It is .mat up to version 7, .npz or .json. No pickles are opened.
     """
-    require_ordinary(path, _LARGEST, InputError)
+    require_readable(path, _LARGEST, InputError)
     subject = f"plant {path}"
     read = {".json": _from_json, ".npz": _from_npz, ".mat": _from_mat}[path.suffix]
     try:

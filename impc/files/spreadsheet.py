@@ -2,34 +2,49 @@
 
 The recording is the sheet that is asked for, else the first that is not hidden and has a block of
 rows of numbers; the others are named. What stands above and below the block is as in delimited
-text. Of a formula the value counts that was saved with it.
+text. Of a formula the value counts that was saved with it. Workbooks are written by openpyxl.
 """
 
 from __future__ import annotations
 
 import datetime
+import io
+import re
 import zipfile
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from impc.errors import DataError
+from impc.errors import DataError, one_line
 from impc.extras import optional
-from impc.files.blocks import EMPTY, HEAD, NUMBER, WORD, Block, first_block
-from impc.files.delimited import is_number
-from impc.files.headings import find_headings
+from impc.files.delimited import is_number, text_cell
+from impc.files.layout import (
+    EMPTY,
+    HEAD,
+    NUMBER,
+    WORD,
+    Block,
+    find_headings,
+    first_block,
+    require_no_thousands,
+    written_heading,
+)
 from impc.files.table import make_table
-from impc.files.thousands import require_no_thousands
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
+
+    import pandas as pd
 
     from impc.arrays import Array
     from impc.files.table import Table
 
 _DAY = 86_400.0
+_LONGEST_NAME = 31  # characters of a sheet's
+_ANY_LENGTH = 32_767  # characters of a cell
+_NUMBER = re.compile(r"[+-]?\d+(\.\d*)?")
 _TIMES = (datetime.datetime, datetime.date, datetime.time, datetime.timedelta)
 
 
@@ -237,3 +252,49 @@ def _text(cell: Any) -> str:
     if isinstance(cell, float) and cell.is_integer() and abs(cell) < 1e15:
         return str(int(cell))
     return str(cell).strip()
+
+
+def workbook_bytes(tables: Mapping[str, pd.DataFrame]) -> bytes:
+    """Tables as sheets of one workbook (.xlsx); what is not finite is an empty cell."""
+    import openpyxl  # noqa: PLC0415  # for who writes workbooks only
+
+    book = openpyxl.Workbook(write_only=True)
+    for name, table in tables.items():
+        sheet = book.create_sheet(name[:_LONGEST_NAME])
+        data = as_data(table).replace([np.inf, -np.inf], np.nan)
+        sheet.append(list(data.columns))
+        for row in data.itertuples(index=False, name=None):
+            sheet.append(row)
+    stream = io.BytesIO()
+    book.save(stream)
+    return stream.getvalue()
+
+
+def encode_workbook(table: Table) -> bytes:
+    """The bytes of a workbook with one sheet, its headings with their units, to 16 digits."""
+    import pandas as pd  # noqa: PLC0415  # half a second, for who reads text only
+
+    heads = [written_heading(name, table.units.get(name)) for name in table.columns]
+    columns = pd.DataFrame(dict(enumerate(table.columns.values())))
+    return workbook_bytes({"recording": columns.set_axis(heads, axis=1)})
+
+
+def as_data(table: pd.DataFrame) -> pd.DataFrame:
+    """A table whose texts no spreadsheet takes for formulas; truth values are yes and no.
+
+    A spreadsheet runs what begins with = + - or @, and names come from files of others: such a text
+    gets an apostrophe, which spreadsheets know as the mark of text.
+    """
+    safe = table.copy(deep=False)
+    for place, kind in enumerate(table.dtypes):
+        if kind.kind not in "iuf":
+            safe.isetitem(place, [_safe(value) for value in table.iloc[:, place]])
+    return safe.set_axis([_safe(name) for name in table.columns], axis=1)
+
+
+def _safe(value: Any) -> Any:
+    if isinstance(value, bool | np.bool_):
+        return "yes" if value else "no"
+    if not isinstance(value, str):
+        return value
+    return one_line(value if _NUMBER.fullmatch(value) else text_cell(value), _ANY_LENGTH)

@@ -11,7 +11,7 @@ from impc.checking import checked
 from impc.errors import DataError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import ArrayLike
 
@@ -108,3 +108,18 @@ def _line(text: str) -> str:
     """A name or a unit of a file's, of printable signs."""
     line = "".join(mark if mark.isprintable() else " " for mark in text[: 10 * _LONGEST]).strip()
     return line if len(line) <= _LONGEST else f"{line[: _LONGEST - 3]}..."
+
+
+def in_columns(rows: Sequence[Sequence[str]], left: int = 1) -> str:
+    """The `rows`, a line each: the first `left` columns flush left, the others flush right.
+
+    pandas would set all of them flush right, names of methods too, or want a formatter a column.
+    """
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return "\n".join(
+        "  ".join(
+            cell.ljust(width) if place < left else cell.rjust(width)
+            for place, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in rows
+    )

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import math
 import re
-import unicodedata
 from dataclasses import dataclass
 from typing import Any
 
@@ -33,23 +32,6 @@ _UNCLEAR_WORDS = {
     "pct": "write %",
     "u": "write rpm for revolutions a minute",
 }
-# Words of German, French, Spanish and Italian laboratories, without accents.
-_FOREIGN = {
-    "deg": "grad grade degre degres grado grados gradi graus",
-    "rad": "radiant radiante radianti radianes bogenmass",
-    "s": "sek sekunde sekunden seconde secondes seg segundo segundos secondo secondi",
-    "ms": "msek millisekunde millisekunden milliseconde millisecondes milisegundo milisegundos"
-    " millisecondo millisecondi",
-    "m": "metro metri metros",
-    "cm": "zentimeter centimetro centimetri centimetros",
-    "mm": "millimetro millimetri milimetro milimetros",
-    "N*m": "newtonmeter newtonmetre newtonmetres newtonmetro newtonmetri newtonmetros",
-    "V": "voltio voltios",
-    "%": "prozent pourcent",
-    "turn": "umdrehung umdrehungen tour tours tr giro giri",
-    "min": "minuten minuto minuti minutos mn",
-}
-_MEANT = {word: unit for unit, words in _FOREIGN.items() for word in words.split()}
 _WORD = re.compile(r"[^\W\d_]+")
 # Letters, products, quotients and one-digit exponents. Longer numbers would be computed by pint,
 # and 9**9**9 takes as long as it likes.
@@ -110,26 +92,12 @@ def si_unit(written: str) -> Unit:
 
 
 def is_unit(text: str) -> bool:
-    """Whether the `text` behind a column's name is a unit, or a word for one."""
+    """Whether the `text` behind a column's name is a unit, or may be one of two."""
     try:
         si_unit(text)
     except InputError:
-        return bool(_unclear(text.strip()) or guessed_unit(text))
+        return bool(_unclear(text.strip()))
     return bool(text.strip())
-
-
-def guessed_unit(written: str) -> str:
-    """The unit that a `written` word of another language means: Grad/s -> deg/s; else empty."""
-    parts = unicodedata.normalize("NFKD", written.strip().translate(_DEGREES)).casefold()
-    plain = "".join(mark for mark in parts if not unicodedata.combining(mark)).rstrip(".")
-    joined = re.sub(r"\bnewtons?[ ·*._-]+(met)", r"newton\1", plain)
-    found = _WORD.sub(lambda word: _MEANT.get(word[0], word[0]), joined)
-    if found == joined:
-        return ""
-    try:
-        return si_unit(found).written
-    except InputError:
-        return ""
 
 
 def _unclear(text: str) -> str:
@@ -164,6 +132,5 @@ def _registry() -> Any:
 
 
 def _unknown(written: str) -> InputError:
-    meant = guessed_unit(written)
-    remedy = f'as "{meant}"' if meant else 'as in "deg", "rad/s", "N*m", "mV", "1"'
-    return InputError(f"unit {brief(written, 40)!r}", "is not known", f"write it {remedy}")
+    remedy = 'write it as in "deg", "rad/s", "N*m", "mV", "1"'
+    return InputError(f"unit {brief(written, 40)!r}", "is not known", remedy)

@@ -1,14 +1,6 @@
 """Optional: optimal control problems of the user's own, all of them (docs/nonlinear.md)."""
 
-from impc.checking import register
+from impc.checking import add_value
 
-register(
-    "impc.nonlinear.problem",
-    "OptimalControlProblem",
-    "make it with OptimalControlProblem(states, inputs, ...)",
-)
-register(
-    "impc.nonlinear.recordings",
-    "OptimalRecording",
-    "make it with problem.recorded_plan or recorded_loop",
-)
+add_value("OptimalControlProblem", "OptimalControlProblem(states, inputs, ...)")
+add_value("OptimalRecording", "problem.recorded_plan or recorded_loop")

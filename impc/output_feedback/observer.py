@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
     from impc.output_feedback.kalman import StationaryFilter
 
-add_value("Observer", __name__, "make it with Observer(plant, ...)")
+add_value("Observer", "Observer(plant, ...)")
 
 #: The levels of noise, in the order in which they are searched.
 LEVELS = ("motor", "share", "process", "sensory", "walk")

@@ -15,8 +15,14 @@ from typing import Any
 import pandas as pd
 
 from impc.files.results import SCHEMA
-from impc.files.workbook import workbook_bytes
-from impc.reporting.finding import MOST_CELLS, Chart, Finding, Picture, as_data, csv_bytes
+from impc.files.spreadsheet import workbook_bytes
+from impc.reporting.finding import (
+    MOST_CELLS,
+    Chart,
+    Finding,
+    Picture,
+    csv_bytes,
+)
 from impc.reporting.glossary import Glossary, used_words
 from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import plain, render_page
@@ -119,11 +125,7 @@ class Report:
     def files(self) -> dict[str, bytes]:
         """Page, result.json, tables and figures by name."""
         tables = self._tables()
-        sheets = {
-            name: (list(one.columns), one.itertuples(index=False, name=None))
-            for name, one in ((name, as_data(table)) for name, table in tables.items())
-            if one.size <= MOST_CELLS
-        }
+        sheets = {name: one for name, one in tables.items() if one.size <= MOST_CELLS}
         found = {item.name: item.data() for item in self.findings()}
         own = {"schema": SCHEMA, **self.provenance.data(), **self.data}
         return {

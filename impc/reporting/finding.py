@@ -17,9 +17,8 @@ from typing import Any, TypeVar
 import numpy as np
 import pandas as pd
 
-from impc.errors import one_line
-from impc.files.columns import in_columns
-from impc.files.delimited import text_cell
+from impc.files.spreadsheet import as_data
+from impc.files.table import in_columns
 from impc.reporting.rendering import number
 
 T = TypeVar("T")
@@ -114,29 +113,6 @@ def csv_bytes(table: pd.DataFrame) -> bytes:
 
 #: Cells of a table that is in the workbook too; a larger one, some seconds to write, is CSV alone.
 MOST_CELLS = 200_000
-_ANY_LENGTH = 32_767  # characters of a cell
-_NUMBER = re.compile(r"[+-]?\d+(\.\d*)?")
-
-
-def as_data(table: pd.DataFrame) -> pd.DataFrame:
-    """A table whose texts no spreadsheet takes for formulas; truth values are yes and no.
-
-    A spreadsheet runs what begins with = + - or @, and names come from files of others: such a text
-    gets an apostrophe, which spreadsheets know as the mark of text.
-    """
-    safe = table.copy(deep=False)
-    for place, kind in enumerate(table.dtypes):
-        if kind.kind not in "iuf":
-            safe.isetitem(place, [_safe(value) for value in table.iloc[:, place]])
-    return safe.set_axis([_safe(name) for name in table.columns], axis=1)
-
-
-def _safe(value: Any) -> Any:
-    if isinstance(value, bool | np.bool_):
-        return "yes" if value else "no"
-    if not isinstance(value, str):
-        return value
-    return one_line(value if _NUMBER.fullmatch(value) else text_cell(value), _ANY_LENGTH)
 
 
 def _shown(column: str, value: Any, digits: int) -> str:

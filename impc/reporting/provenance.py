@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from impc.files.inputs import Inputs
+    from impc.files.digests import Inputs
 
 _PACKAGES = ("impc", "casadi", "clarabel", "control", "cvxpy", "numba", "numpy", "scipy")
 

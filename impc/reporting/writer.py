@@ -12,23 +12,29 @@ import hashlib
 import json
 import os
 import shutil
-import tempfile
 from contextlib import ExitStack, contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import IO, TYPE_CHECKING
+
+import msgspec
 
 from impc.errors import OutputError
-from impc.files.writing import remove_empty, require_ordinary, unwritable, write_whole
-from impc.reporting.lock import locked
+from impc.files.disk import remove_empty, require_ordinary, unwritable, write_whole
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    import msvcrt
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
 
 _REMEDY = "give another folder"
-_LIST, _NOTICE = ".impc", "INCOMPLETE.txt"
-_STAGING = ".impc-"  # how the name of the folder begins from which files are moved
+# List, lock, and where files are written before they are moved to their places.
+_LIST, _LOCK, _STAGING = ".impc", ".impc-lock", ".impc-new"
+_NOTICE = "INCOMPLETE.txt"
 _SAID = b"A run was stopped while it wrote these files: they may be of two runs. Run it again.\n"
 # Files by which results are known that have no list: of an older version, or not of this program.
 _TELLING = ("report.html", "result.json", "study.toml", "truth.json")
@@ -40,10 +46,10 @@ class _Run:
 
     folder: Path
     command: str
-    before: Mapping[str, str]
+    before: Mapping[str, str]  # SHA-256 by name
     written: dict[str, str] = field(default_factory=dict)
 
-    def begin(self, new: dict[str, bytes]) -> None:
+    def begin(self, new: Mapping[str, bytes]) -> None:
         """List files before they are written, so that a killed run leaves none unlisted."""
         for name in new:
             known = name in self.before or name in self.written
@@ -54,14 +60,13 @@ class _Run:
                 )  # fmt: skip
         if not self.written and self.before:
             write_whole(self.folder / _NOTICE, _SAID)
-        found = {name: hashlib.sha256(content).hexdigest() for name, content in new.items()}
-        self.note(found)
-        self.written |= found
+        self.written |= {name: hashlib.sha256(one).hexdigest() for name, one in new.items()}
+        self.list({**self.before, **self.written})
 
-    def note(self, seals: Mapping[str, str]) -> None:
-        """Add files to the list, by name and SHA-256."""
-        with (self.folder / _LIST).open("a", encoding="utf-8") as stream:
-            stream.writelines(json.dumps([name, seal]) + "\n" for name, seal in seals.items())
+    def list(self, files: Mapping[str, str]) -> None:
+        """Write the list: the command, and a line for each file."""
+        lines = [self.command, *(json.dumps(item) for item in files.items())]
+        write_whole(self.folder / _LIST, ("\n".join(lines) + "\n").encode())
 
     def undo(self, names: Iterable[str]) -> None:
         """These files were put back as they were."""
@@ -74,13 +79,12 @@ class _Run:
         """Remove what the last run wrote and this one did not."""
         for name in self.before.keys() - self.written.keys():
             # What somebody has changed since, or a damaged list names by mistake, is not ours.
-            if not _has(self.folder / name, self.before[name]):
-                continue
-            (self.folder / name).unlink()
-            for parent in Path(name).parents[:-1]:
-                _remove_if_empty(self.folder / parent)
-        lines = [self.command, *(json.dumps(item) for item in self.written.items())]
-        write_whole(self.folder / _LIST, ("\n".join(lines) + "\n").encode())
+            if _has(self.folder / name, self.before[name]):
+                (self.folder / name).unlink()
+                for parent in Path(name).parents[:-1]:
+                    if not os.listdir(self.folder / parent):
+                        (self.folder / parent).rmdir()
+        self.list(self.written)
         (self.folder / _NOTICE).unlink(missing_ok=True)
 
 
@@ -96,12 +100,17 @@ def owned(folder: Path, command: str) -> Iterator[None]:
     require_writable(folder)
     with ExitStack() as undo:
         try:
-            for path in reversed((folder, *folder.parents)):  # undone from the inside out
-                if not path.exists():
-                    undo.callback(_remove_if_empty, path)
+            missing = _missing(folder)
+            if missing:
+                undo.callback(remove_empty, missing[-1])
             folder.mkdir(parents=True, exist_ok=True)
-            undo.enter_context(locked(folder))
-            run = _begun(folder, command, undo)
+            undo.enter_context(_locked(folder))
+            run = _Run(folder, command, _listed(folder, command))
+            shutil.rmtree(folder / _STAGING, ignore_errors=True)  # of a run that was killed
+            if not (folder / _LIST).exists():
+                there = set(os.listdir(folder))
+                run.list({})
+                undo.callback(_unlist, folder, there)
         except OSError as error:
             raise _unwritable(folder, error) from None
         token = _RUN.set(run)
@@ -116,35 +125,23 @@ def owned(folder: Path, command: str) -> Iterator[None]:
             raise _unwritable(folder, error) from None
 
 
-def _begun(folder: Path, command: str, undo: ExitStack) -> _Run:
-    listed = _listed(folder, command)
-    staged = [name for name in listed if name.startswith(_STAGING)]
-    here = Path(os.path.realpath(folder))
-    for name in staged:  # of `write_files` in a run that was killed; never through a link
-        if Path(os.path.realpath((here / name).parent)) == (here / name).parent:
-            (here / name).unlink(missing_ok=True)
-    for name in {Path(name).parts[0] for name in staged}:
-        remove_empty(folder / name)
-    before = {name: seal for name, seal in listed.items() if name not in staged}
-    run = _Run(folder, command, before)
-    if not (folder / _LIST).exists():
-        there = set(os.listdir(folder))
-        write_whole(folder / _LIST, f"{command}\n".encode())
-        undo.callback(_unlist, folder, there)
-    return run
-
-
 def _unlist(folder: Path, before: set[str]) -> None:
     """Take the list away again when nothing was written, and no work is kept."""
     if set(os.listdir(folder)) == before | {_LIST}:
         (folder / _LIST).unlink()
 
 
+def _missing(folder: Path) -> list[Path]:
+    """The folder and those above it that are not there yet."""
+    return [path for path in (folder, *folder.parents) if not path.exists()]
+
+
 def _listed(folder: Path, command: str) -> dict[str, str]:
     """What a run of the `command` wrote to the folder before: SHA-256 by name."""
     try:
         require_ordinary(folder / _LIST)
-        owner, *lines = (folder / _LIST).read_text(encoding="utf-8").split("\n")
+        owner, *lines = (folder / _LIST).read_text(encoding="utf-8").splitlines()
+        found = dict(msgspec.json.decode(line, type=tuple[str, str]) for line in lines)
     except FileNotFoundError:
         telling = [name for name in _TELLING if (folder / name).exists()]
         if telling:
@@ -152,34 +149,20 @@ def _listed(folder: Path, command: str) -> dict[str, str]:
                 f"folder {folder}", f"holds {telling[0]} of another version or of your own", _REMEDY
             ) from None
         return {}
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         raise OutputError(f"folder {folder}", f"its list {_LIST} is damaged", _REMEDY) from None
     if owner != command:
         raise OutputError(f"folder {folder}", f"holds results of impc {owner}", _REMEDY)
-    return dict(item for line in lines if (item := _item(line)) is not None)
+    return {name: seal for name, seal in found.items() if _is_inside(Path(name))}
+
+
+def _is_inside(name: Path) -> bool:
+    return not name.is_absolute() and ".." not in name.parts
 
 
 def _has(path: Path, seal: str) -> bool:
     """Whether the content of a file has that SHA-256."""
-    if not path.is_file():
-        return False
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest() == seal
-
-
-def _item(line: str) -> tuple[str, str] | None:
-    """A line of the list; None for one that a killed run left half, and for no safe name."""
-    try:
-        name, seal = json.loads(line)
-    except (ValueError, TypeError, RecursionError):
-        return None
-    inside = isinstance(name, str) and not Path(name).is_absolute() and ".." not in Path(name).parts
-    return (name, str(seal)) if inside else None
-
-
-def _remove_if_empty(folder: Path) -> None:
-    if folder.is_dir() and not os.listdir(folder):
-        folder.rmdir()
+    return path.is_file() and hashlib.sha256(path.read_bytes()).hexdigest() == seal
 
 
 def require_writable(folder: Path) -> None:
@@ -200,7 +183,7 @@ def require_writable(folder: Path) -> None:
 def write_files(folder: Path, files: Mapping[str, bytes]) -> tuple[Path, ...]:
     """Write files by name into a folder, which is made when it is missing.
 
-    They are written into a temporary folder first and moved from there one by one. When anything
+    They are written into a folder of their own first and moved from there one by one. When anything
     fails, files that were there before are put back and what was made is removed.
     """
     require_writable(folder)
@@ -208,63 +191,90 @@ def write_files(folder: Path, files: Mapping[str, bytes]) -> tuple[Path, ...]:
     if run is not None and not folder.is_relative_to(run.folder):
         run = None
     # In the folder that is owned: the next run finds there what a killed one left.
-    beside = folder if run is None else run.folder
+    staging = (folder if run is None else run.folder) / _STAGING
     try:
-        with _made(folder), tempfile.TemporaryDirectory(prefix=_STAGING, dir=beside) as staging:
-            new, old = Path(staging, "new"), Path(staging, "old")
+        with ExitStack() as undo, ExitStack() as always:
+            missing = _missing(folder)
+            if missing:
+                undo.callback(remove_empty, missing[-1])
+            staging.mkdir(parents=True, exist_ok=True)
+            always.callback(shutil.rmtree, staging, ignore_errors=True)
+            for index, content in enumerate(files.values()):
+                with (staging / str(index)).open("wb") as stream:
+                    stream.write(content)
+                    stream.flush()
+                    os.fsync(stream.fileno())
             if run is not None:
-                parts = (
-                    f"{new.parent.name}/{part}/{name}" for part in ("new", "old") for name in files
-                )
-                run.note(dict.fromkeys(parts, ""))
-            for name, content in files.items():
-                (new / name).parent.mkdir(parents=True, exist_ok=True)
-                (old / name).parent.mkdir(parents=True, exist_ok=True)
-                _write_flushed(new / name, content)
-            with ExitStack() as undo:
-                if run is not None:
-                    place = folder.relative_to(run.folder)
-                    listed = {(place / name).as_posix(): files[name] for name in files}
-                    undo.callback(run.undo, listed)
-                    run.begin(listed)
-                for name in files:
-                    (folder / name).parent.mkdir(parents=True, exist_ok=True)
-                    _move(new / name, folder / name, old / name, undo)
-                undo.pop_all()
+                place = folder.relative_to(run.folder)
+                listed = {(place / name).as_posix(): files[name] for name in files}
+                undo.callback(run.undo, listed)
+                run.begin(listed)
+            for index, name in enumerate(files):
+                _move(staging / str(index), folder / name, undo)
+            undo.pop_all()
     except OSError as error:
         raise _unwritable(folder, error) from None
     return tuple(folder / name for name in files)
 
 
-def _write_flushed(path: Path, content: bytes) -> None:
-    with path.open("wb") as stream:
-        stream.write(content)
-        stream.flush()
-        os.fsync(stream.fileno())
-
-
-def _move(source: Path, target: Path, backup: Path, undo: ExitStack) -> None:
+def _move(source: Path, target: Path, undo: ExitStack) -> None:
     """Put source in the place of target in one step, and note how to undo it."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    require_ordinary(target)
     if target.exists():
-        shutil.copy2(target, backup)  # a copy, so that the target exists at every moment
-        undo.callback(os.replace, backup, target)
+        undo.callback(write_whole, target, target.read_bytes())
     else:
         undo.callback(target.unlink, missing_ok=True)
     os.replace(source, target)
 
 
 @contextmanager
-def _made(folder: Path) -> Iterator[None]:
-    """Make a folder and its parents; remove those that were missing when the block fails."""
-    missing = [path for path in (folder, *folder.parents) if not path.exists()]
+def _locked(folder: Path) -> Iterator[None]:
+    """Hold an existing `folder` while the block lasts; the system lets go when the process dies."""
+    path = folder / _LOCK
+    stream = _lock_of(path)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
         yield
-    except BaseException:  # also when interrupted from the keyboard
-        for path in missing:
-            if path.is_dir():
-                path.rmdir()
-        raise
+    finally:
+        # Taken away while it is still held: whoever opened it before finds that it is gone.
+        if os.name == "posix":
+            path.unlink(missing_ok=True)
+        stream.close()
+
+
+def _lock_of(path: Path) -> IO[bytes]:
+    while True:
+        try:
+            require_ordinary(path)
+            stream = path.open("ab")
+        except OSError as error:
+            raise _unwritable(path.parent, error) from None
+        try:
+            _take(stream)
+        except OSError:
+            stream.close()
+            raise OutputError(
+                f"folder {path.parent}",
+                "another run is writing to it",
+                "wait, or give another folder",
+            ) from None
+        if _is_there(path, stream):
+            return stream
+        stream.close()  # its holder took it away in between: once more
+
+
+def _take(stream: IO[bytes]) -> None:
+    if os.name == "posix":
+        fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    else:
+        msvcrt.locking(stream.fileno(), msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined]
+
+
+def _is_there(path: Path, stream: IO[bytes]) -> bool:
+    try:
+        return os.path.samestat(path.stat(), os.fstat(stream.fileno()))
+    except FileNotFoundError:
+        return False
 
 
 def _unwritable(folder: Path, error: OSError | ValueError) -> OutputError:

@@ -20,7 +20,7 @@ import msgspec
 
 from impc.arrays import frozen
 from impc.errors import OutputError
-from impc.files.writing import remove_empty, write_whole
+from impc.files.disk import remove_empty, write_whole
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -29,21 +29,16 @@ def test_a_run_replaces_the_one_before_whole(tmp_path: Path) -> None:
     with owned(folder, "fit"):
         write_files(folder, PAGE | {"old.png": b"", "deep/er/old.csv": b""})
     (folder / "notes.txt").write_text("mine")
-    # What a killed run leaves: its files are in the list, those of the user are not.
-    for left in (".impc-k3/new/old.png", ".impc-k3/old/new.png", ".impc-notes/thesis.txt"):
+    for left in (".impc-new/0", ".impc-notes/thesis.txt"):  # of a killed run, and of the user
         (folder / left).parent.mkdir(parents=True, exist_ok=True)
         (folder / left).write_text("left")
-    with (folder / ".impc").open("a") as stream:
-        stream.writelines(
-            f'["{left}", ""]\n' for left in (".impc-k3/new/old.png", ".impc-k3/old/new.png")
-        )
     with owned(folder, "fit"):
         write_files(folder, {"new.png": b""})
         write_files(folder / "sub", {"x.csv": b""})
     mine = {"notes.txt", ".impc-notes/thesis.txt"}
     assert names(folder) == {*mine, "new.png", "sub/x.csv", ".impc"}
     assert not (folder / "deep").exists()
-    assert not (folder / ".impc-k3").exists()
+    assert not (folder / ".impc-new").exists()
 
 
 def test_no_list_removes_through_a_link(tmp_path: Path) -> None:

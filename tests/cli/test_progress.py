@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from impc.cli.progress import progress
+from impc.cli.console import progress
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -35,7 +35,7 @@ def test_a_first_step_tells_nothing_of_the_others(
 ) -> None:
     """It may have compiled what they use."""
     times = iter(range(0, 1000, 20))
-    monkeypatch.setattr("impc.cli.progress.time.monotonic", lambda: next(times))
+    monkeypatch.setattr("impc.cli.console.time.monotonic", lambda: next(times))
     with progress(9, "step") as done:
         done("a")
     assert capsys.readouterr().err == "1 of 9 steps (a)\n"
@@ -56,7 +56,7 @@ def test_lines_stand_in_a_pipe_every_ten_seconds(
         yield from range(0, 1000, 4)
 
     times = clock()
-    monkeypatch.setattr("impc.cli.progress.time.monotonic", lambda: next(times))
+    monkeypatch.setattr("impc.cli.console.time.monotonic", lambda: next(times))
     with progress(8, "stage") as done:
         done("step 1", found=True)
         for step in range(2, 9):
@@ -72,7 +72,7 @@ def test_nothing_is_said_where_quiet_is_asked_for(
 ) -> None:
     monkeypatch.setenv("IMPC_QUIET", "1")
     times = iter(range(0, 1000, 20))
-    monkeypatch.setattr("impc.cli.progress.time.monotonic", lambda: next(times))
+    monkeypatch.setattr("impc.cli.console.time.monotonic", lambda: next(times))
     with progress(3, "step") as done:
         done("a")
     assert capsys.readouterr().err == ""

@@ -26,7 +26,7 @@ import scipy.io
 from click.testing import CliRunner
 from nptdms import ChannelObject, TdmsWriter
 
-from impc.cli.consent import require_consent
+from impc.cli.console import require_consent
 from impc.cli.main import main
 from impc.cli.plant import find_plant
 from impc.control.closed_loop import simulate
@@ -35,7 +35,7 @@ from impc.control.named_solver import require_solver
 from impc.control.simulation import require_complete, scenario
 from impc.errors import ImpcError
 from impc.files import apart
-from impc.files.alignment import misaligned
+from impc.files.causality import misaligned
 from impc.files.configuration import read_configuration
 from impc.files.formats import encode_table, read_table
 from impc.files.plant_sources import PlantSource, make_plant, plant_source
@@ -717,7 +717,7 @@ PROVOKED: dict[str, Callable[[Path], object]] = {
     ),
     "names the same file twice": trial_twice,
     "the same trial in two formats": lambda folder: trial_twice(folder, "1.xlsx"),
-    "no whole number of samples apart": late_channel,
+    "begins at another time than": late_channel,
     "cannot be imported (...)": lambda _: plant_source("nowhere:stick", {}),
     "refuses its arguments (...)": lambda _: make_plant(
         plant_source("plants:cursor_plant", {"size": 3}), ()

@@ -17,7 +17,7 @@ from nptdms import ChannelObject, TdmsFile, TdmsWriter
 
 from impc.errors import DataError, OutputError
 from impc.files.formats import read_table, write_matlab73, write_table
-from impc.files.headings import split_heading
+from impc.files.layout import split_heading
 from impc.files.table import Table, make_table
 from tests.files.samples import csv_text, hdf5_mat, opaque_variable, pushed_seat, save_mat
 
@@ -290,28 +290,8 @@ def tdms(path: Path, *channels: tuple[str, Any, dict[str, Any]]) -> Path:
 def test_tdms_channels_that_begin_at_different_times(tmp_path: Path, late: dict[str, Any]) -> None:
     begins = {"wf_start_time": np.datetime64("2026-01-01"), "wf_increment": 0.02}
     signal = np.sin(0.1 * np.arange(100.0))
-    apart = {"push": signal[:80], "seat": signal[20:]}
-    path = tdms(
-        tmp_path / "a.tdms", ("push", apart["push"], begins), ("seat", apart["seat"], begins | late)
-    )
-    table = read_table(path)
-    assert_columns(table, {"push": signal[20:80], "seat": signal[20:80]}, 0)
-    assert table.rate == 50.0
-
-
-@pytest.mark.parametrize(
-    ("offset", "said"), [(0.41, "begins at 0 s and seat at 0.41 s"), (90.0, "and seat at 90 s")]
-)
-def test_tdms_channels_without_simultaneous_samples(
-    tmp_path: Path, offset: float, said: str
-) -> None:
-    step = {"wf_increment": 0.02}
-    path = tdms(
-        tmp_path / "a.tdms",
-        ("push", np.arange(99.0), step),
-        ("seat", np.arange(99.0), step | {"wf_start_offset": offset}),
-    )
-    with pytest.raises(DataError, match=said):
+    path = tdms(tmp_path / "a.tdms", ("push", signal, begins), ("seat", signal, begins | late))
+    with pytest.raises(DataError, match="channel seat begins at another time than push"):
         read_table(path)
 
 
@@ -356,8 +336,13 @@ def test_written_and_read_again(tmp_path: Path, ending: str) -> None:
     units = {"seat": "deg", "push": "N*m"}
     write_table(path, make_table("trial", SEAT, units, 100.0))
     again = read_table(path)
-    kept = np.float32 if ending == ".c3d" else np.float64
-    assert_columns(again, {name: values.astype(kept) for name, values in SEAT.items()})
+    kept = dict(SEAT)
+    if ending == ".c3d":
+        kept = {name: values.astype(np.float32) for name, values in SEAT.items()}
+    if ending == ".xlsx":  # openpyxl writes 16 digits
+        digits = {name: [f"{value:.16g}" for value in values] for name, values in SEAT.items()}
+        kept = {name: np.array(texts, dtype=np.float64) for name, texts in digits.items()}
+    assert_columns(again, kept)
     if ending != ".mat":
         assert again.units == units
     if ending in (".tdms", ".c3d"):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from impc.errors import DataError, InputError
-from impc.files.alignment import misaligned
+from impc.files.causality import misaligned
 from impc.files.configuration import read_configuration
 from impc.files.reading import read_recordings
 from impc.model.plant import Plant

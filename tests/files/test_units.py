@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from impc.errors import InputError
-from impc.files.units import USUAL, as_pint_says, guessed_unit, is_unit, si_unit
+from impc.files.units import USUAL, as_pint_says, is_unit, si_unit
 
 
 @pytest.mark.parametrize(
@@ -69,7 +69,7 @@ def test_si_base_units(written: str, factor: float, base: str) -> None:
         ("Mrad", "a capital M is mega"),
         ("Ms", "a capital M is mega"),
         ("MV", "a capital M is mega"),
-        ("Sekunden", 'write it as "s"'),
+        ("Sekunden", "is not known; write it as in"),
         ("9**9**9", "is not known"),
         ("m**999999999", "is not known"),
         ("(2)**9", "is not known"),
@@ -83,37 +83,8 @@ def test_units_that_cannot_be_used(written: str, phrase: str) -> None:
 
 
 def test_what_in_brackets_is_a_unit() -> None:
-    assert all(is_unit(text) for text in ("deg", "N*m", "g", "ms", "Grad", "Sek", "degrés/s"))
+    assert all(is_unit(text) for text in ("deg", "N*m", "g", "ms", "Grad", "grad/s"))
     assert not any(is_unit(text) for text in ("", "left", "channel 3", "raw"))
-
-
-@pytest.mark.parametrize(
-    ("written", "unit"),
-    [
-        ("Grad", "deg"),
-        ("GRAD/s", "deg/s"),
-        ("Grad/Sek.", "deg/s"),
-        ("degrés", "deg"),
-        ("Degre\u0301s/s", "deg/s"),  # accents that are not composed
-        ("grados / seg", "deg / s"),
-        ("gradi/secondo", "deg/s"),
-        ("Bogenmaß", "rad"),
-        ("Sek", "s"),
-        ("Millisekunden", "ms"),
-        ("Newtonmeter", "N*m"),
-        ("newton-mètres", "N*m"),
-        ("newton metro", "N*m"),
-        ("tr/min", "turn/min"),
-        ("Prozent", "%"),
-        ("deg", ""),
-        ("wibble", ""),
-        ("", ""),
-    ],
-)
-def test_words_of_other_languages_are_guesses(written: str, unit: str) -> None:
-    assert guessed_unit(written) == unit
-    if unit:
-        assert si_unit(unit).factor > 0
 
 
 @pytest.mark.parametrize("written", USUAL)

@@ -10,7 +10,7 @@ from click.testing import CliRunner
 import impc.cli.plant as known
 from impc.cli.main import main
 from impc.errors import InputError
-from impc.files.user_code import consented_name
+from impc.files.plant_sources import consented_name
 
 OWN = "tests.studies.cohort.carts:cart_plant"
 HOSTILE = """

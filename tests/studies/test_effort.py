@@ -11,11 +11,11 @@ import psutil
 import pytest
 from click.testing import CliRunner
 
-import impc.cli.consent
+import impc.cli.console
 import impc.studies.cohort.engine
 import impc.studies.fit.subject
 from impc.checking import replace
-from impc.cli.consent import require_consent
+from impc.cli.console import require_consent
 from impc.cli.main import main
 from impc.control.closed_loop import prepare_loop
 from impc.control.constraint_rows import directions
@@ -228,12 +228,12 @@ def test_a_selection_asks_too(
     done = here(monkeypatch, stop=0)
     study = blood_study(tmp_path, 1, 2)
     words = [command, str(study), "--allow-model", "--out", str(tmp_path / "out")]
-    monkeypatch.setattr(impc.cli.consent, "_SECONDS", 0.0)
+    monkeypatch.setattr(impc.cli.console, "_SECONDS", 0.0)
     refused = CliRunner().invoke(main, words)
     assert refused.exit_code == 2, refused.output
     assert "lower replicates or starts in [select]" in refused.stderr
     assert not (tmp_path / "out").exists()
     assert CliRunner().invoke(main, [*words, "--yes"]).exit_code == 130
-    monkeypatch.setattr(impc.cli.consent, "_SECONDS", 7200.0)
+    monkeypatch.setattr(impc.cli.console, "_SECONDS", 7200.0)
     assert CliRunner().invoke(main, words).exit_code == 130
     assert done == []

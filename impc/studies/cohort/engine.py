@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from impc.errors import InputError
 from impc.files.digests import versions
-from impc.files.writing import IN_ITS_PLACE, require_ordinary, unwritable
+from impc.files.disk import IN_ITS_PLACE, require_ordinary, unwritable
 from impc.reporting.writer import write_files
 from impc.studies.cache import Cache
 from impc.studies.cohort.tasks import fit_unit, replicate_unit

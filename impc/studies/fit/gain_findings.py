@@ -14,7 +14,7 @@ import pandas as pd
 from impc.assess.covariance import TOLD
 from impc.assess.printed_gain import entry_names
 from impc.assess.variance_accounted_for import verdict
-from impc.files.names import LARGEST
+from impc.files.disk import LARGEST
 from impc.model.plant import UNKNOWN, gain_unit
 from impc.reporting.finding import Finding, Picture, Severity, table_of
 from impc.reporting.rendering import number

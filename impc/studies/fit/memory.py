@@ -63,7 +63,7 @@ def open_memory(
     folder: Path, problem: Problem, settings: FitSettings, command: str = "fit", made_of: str = ""
 ) -> FitMemory:
     """The memory of a command in a folder, empty when there is none for this very problem."""
-    # Of a family the plant at its nominal values; its code is in `made_of` (`impc.files.inputs`).
+    # Of a family the plant at its nominal values; its code is in `made_of` (`impc.files.digests`).
     known = digest(replace(problem, family=None), settings, made_of, versions())
     return FitMemory(Cache(folder / f"{command}-in-progress"), known, problem=problem)
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from impc.arrays import Array
-    from impc.files.inputs import Inputs
+    from impc.files.digests import Inputs
     from impc.studies.reliability.analysis import MeasureResult, Reliability, Trials
 
 _TABLES = {

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from impc.arrays import Array
-    from impc.files.inputs import Inputs
+    from impc.files.digests import Inputs
     from impc.studies.selection.key_parameters import KeyParameters
     from impc.studies.selection.model import ParametricModel
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from matplotlib.figure import Figure
 
-    from impc.files.inputs import Inputs
+    from impc.files.digests import Inputs
     from impc.studies.selection.analysis import StudySelection
     from impc.studies.selection.model import ParametricModel
 

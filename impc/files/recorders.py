@@ -1,16 +1,20 @@
-"""National Instruments TDMS, by nptdms (LGPL, the extra `tdms`)."""
+"""National Instruments TDMS, by nptdms (LGPL), and the analog channels of C3D, by c3d (MIT).
+
+Both are extras, `tdms` and `c3d`. Marker positions of C3D are not read.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import io
 import logging
+import warnings
 from collections import Counter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from impc.errors import DataError
+from impc.errors import DataError, OutputError
 from impc.extras import optional
 from impc.files.table import make_table
 
@@ -26,15 +30,13 @@ _SCALES = (
     *("Linear", "Polynomial", "Table", "Add", "Subtract", "AdvancedAPI"),
     *("RTD", "Strain", "Thermistor", "Thermocouple"),
 )
-_BETWEEN = 0.1  # of a sample, by which two channels may be apart
 
 
 def read_tdms(path: Path, largest: int) -> Table:
     """Read the channels of all groups at `path`; `group/channel` where two groups name one alike.
 
     Time stamps become seconds after the first. The rate is 1 / wf_increment, where it is given.
-    Channels that begin at different times are cut to the time that they have in common. Arrays take
-    `largest` bytes at most.
+    Arrays take `largest` bytes at most.
     """
     source = str(path)
     nptdms = optional("nptdms", source)
@@ -122,7 +124,7 @@ def _table(source: str, channels: list[Any], unknown: dict[str, str]) -> Table:
         units[name] = unit
         if float(channel.properties.get("wf_increment", 0) or 0) > 0:
             timed[name] = channel.properties
-    columns = _simultaneous(source, columns, timed)
+    _require_together(source, timed)
     table = make_table(source, columns, units, None, skipped)
     told = {1 / float(timed[name]["wf_increment"]) for name in table.columns if name in timed}
     if len(told) > 1:
@@ -134,38 +136,18 @@ def _table(source: str, channels: list[Any], unknown: dict[str, str]) -> Table:
     return make_table(source, table.columns, table.units, next(iter(told), None), table.skipped)
 
 
-def _simultaneous(
-    source: str, columns: dict[str, Array], timed: dict[str, Any]
-) -> dict[str, Array]:
-    """The columns, cut to the time that those with a clock have in common."""
-    moments = {name: item.get("wf_start_time") for name, item in timed.items()}
-    earliest = min((moment for moment in moments.values() if moment is not None), default=None)
-    begins: dict[str, float] = {}
-    for name, item in timed.items():
-        begins[name] = float(item.get("wf_start_offset", 0) or 0)
-        if moments[name] is not None:
-            begins[name] += float((moments[name] - earliest) / np.timedelta64(1, "s"))
-    if len(set(begins.values())) < 2:
-        return columns
-    last = max(begins, key=begins.__getitem__)
-    step = float(timed[last]["wf_increment"])
-    rows = {name: (begins[last] - begin) / step for name, begin in begins.items()}
-    left = min(len(columns[name]) - lost for name, lost in rows.items())
-    for name, lost in rows.items():
-        if left < 2 or abs(lost - round(lost)) > _BETWEEN:
-            raise DataError(
-                source,
-                f"channel {name} begins at {_when(moments, begins, name)} and {last} at "
-                f"{_when(moments, begins, last)}, no whole number of samples apart",
-                "export channels that are recorded together into a file of their own",
-            )
-    whole = {name: round(lost) for name, lost in rows.items()}
-    return columns | {name: columns[name][lost : lost + int(left)] for name, lost in whole.items()}
-
-
-def _when(moments: dict[str, Any], begins: dict[str, float], name: str) -> str:
-    moment = moments[name]
-    return f"{begins[name]:g} s" if moment is None else f"{begins[name]:g} s ({moment})"
+def _require_together(source: str, timed: dict[str, Any]) -> None:
+    """Refuse channels with a clock that begin at different times."""
+    begins = {
+        name: (item.get("wf_start_time"), float(item.get("wf_start_offset", 0) or 0))
+        for name, item in timed.items()
+    }
+    for name, begin in begins.items():
+        first, earliest = next(iter(begins.items()))
+        if begin != earliest:
+            problem = f"channel {name} begins at another time than {first}"
+            remedy = "export channels that are recorded together into a file of their own"
+            raise DataError(source, problem, remedy)
 
 
 @contextlib.contextmanager
@@ -178,3 +160,66 @@ def _silent(nptdms: Any) -> Iterator[None]:
         yield
     finally:
         handler.setLevel(before)
+
+
+def read_c3d(path: Path, largest: int) -> Table:
+    """Read the analog channels of the file at `path`, with their units and rate.
+
+    Its arrays take `largest` bytes at most.
+    """
+    source = str(path)
+    c3d = optional("c3d", source)
+    # c3d warns of headers that contradict themselves in small things; what matters is checked here.
+    with warnings.catch_warnings(), path.open("rb") as handle:
+        warnings.simplefilter("ignore")
+        reader = c3d.Reader(handle)
+        expected = int(reader.last_frame) - int(reader.first_frame) + 1
+        if not reader.analog_used or reader.analog_per_frame < 1:
+            raise DataError(source, "has no analog channels", "export them; markers are not read")
+        samples = expected * int(reader.analog_per_frame)
+        if 8 * samples * int(reader.analog_used) > largest:
+            raise DataError(source, "is too large", "export only the channels that are needed")
+        frames = [analog for _, _, analog in reader.read_frames(copy=False)]
+        if len(frames) < expected:
+            raise DataError(
+                source, f"ends after {len(frames)} of {expected} frames", "copy or export it again"
+            )
+        labels = [str(label).strip() for label in reader.analog_labels]
+        units = _c3d_units(reader)
+        rate = float(reader.analog_rate)
+    values = np.concatenate(frames, axis=1)
+    repeated = next((label for label, times in Counter(labels).items() if times > 1), None)
+    if repeated is not None or len(labels) < len(values):
+        problem = f"names two channels {repeated!r}" if repeated is not None else "lacks names"
+        raise DataError(source, problem, "give each analog channel its own label")
+    columns: dict[str, Array] = dict(zip(labels, values, strict=False))
+    return make_table(source, columns, dict(zip(labels, units, strict=False)), rate)
+
+
+def encode_c3d(table: Table) -> bytes:
+    """The bytes of a C3D file with the columns as analog channels, in single precision."""
+    c3d = optional("c3d", "C3D")
+    if table.rate is None:
+        raise OutputError("C3D", "needs the rate of the samples", "give the table a rate")
+    writer = c3d.Writer(point_rate=table.rate, analog_rate=table.rate, point_scale=-1.0)
+    names = list(table.columns)
+    writer.set_point_labels(["none"])  # the format has no file without a marker
+    writer.set_analog_labels(names)
+    writer.set_analog_scales(np.ones(len(names)))
+    writer.set_analog_offsets(np.zeros(len(names)))
+    packed, width = c3d.Writer.pack_labels([table.units.get(name, "") or " " for name in names])
+    writer.analog_group.add_str("UNITS", "Analog units.", packed, width, len(names))
+    samples = np.array(list(table.columns.values()))
+    marker = np.zeros((1, 5))
+    writer.add_frames([(marker, samples[:, index : index + 1]) for index in range(table.samples)])
+    content = io.BytesIO()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        writer.write(content)
+    return content.getvalue()
+
+
+def _c3d_units(reader: Any) -> list[str]:
+    group = reader.get("ANALOG")
+    units = group.get("UNITS") if group is not None else None
+    return [] if units is None else [str(unit).strip() for unit in units.string_array]

@@ -1,21 +1,58 @@
-"""One bar for all that takes long; lines where no bar can be drawn, as in a pipe or a log.
+"""What commands say: a question before hours of work, a bar meanwhile, the files at the end.
 
-With IMPC_QUIET=1 in the environment there is neither, for scripts that read what is said.
+The bar becomes lines where none can be drawn, as in a pipe or a log. With IMPC_QUIET=1 in the
+environment there is neither, for scripts that read what is said.
 """
 
 from __future__ import annotations
 
 import os
+import shlex
 import sys
 import threading
 import time
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
+import click
 from tqdm import tqdm
 
+from impc.errors import one_line
+
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Sequence
+    from pathlib import Path
+
+    from impc.studies.effort import Effort
+
+# What is begun without a question: two hours, and what a machine of 8 GB has to spare.
+_LONG, _MUCH = 7200.0, 4.0
+
+
+#: What to do about a large request of a fit.
+FEWER = "lower horizon, replicates or profiles in [fit], or shorten the trials"
+#: What to do about one of a selection of parameters.
+FEWER_STARTS = "lower replicates or starts in [select], or shorten the trials"
+
+
+def require_consent(effort: Effort, given: bool, lower: str = FEWER) -> None:
+    """Ask before a large request is begun, unless consent is `given` by --yes."""
+    import psutil  # noqa: PLC0415  # --help needs none
+
+    from impc.errors import InputError  # noqa: PLC0415
+
+    needs = f"would need {effort.gigabytes:.3g} GB of memory"
+    if effort.gigabytes > psutil.virtual_memory().total / 1e9:
+        raise InputError("this request", f"{needs}, more than this machine has", lower)
+    if given or (effort.seconds <= _LONG and effort.gigabytes <= _MUCH):
+        return
+    takes = f"would take about {effort.seconds / 3600:.3g} hours"
+    problem = needs if effort.seconds <= _LONG else takes
+    asked = sys.stdin is not None and sys.stdin.isatty()
+    if asked and click.confirm(f"impc: this request {problem}; go on?", err=True):
+        return
+    raise InputError("this request", problem, f"{lower}; or say --yes")
+
 
 # Seconds between two lines, and from the start to the first: what is quick says nothing.
 _PAUSE = 10.0
@@ -84,3 +121,19 @@ def _ticking(bar: tqdm[Any]) -> Iterator[None]:
     finally:
         over.set()
         thread.join()
+
+
+def print_files(out: Path, written: Sequence[Path]) -> None:
+    """Name the files `written` to the folder `out`, one line for each name with its endings."""
+    kinds: dict[str, list[str]] = {}
+    for path in written:
+        kinds.setdefault(path.stem, []).append(path.suffix)
+    click.echo(f"\nWritten to {one_line(out)}:")
+    for stem, suffixes in kinds.items():
+        click.echo(f"  {stem}{' '.join(suffixes)}")
+
+
+def print_next(command: str, out: Path, *names: str) -> None:
+    """Say in one line what to type next: `command` with files of the folder `out`."""
+    folder = shlex.quote(one_line(out))
+    click.echo(f"next: {command.format(*(f'{folder}/{name}' for name in names))}")

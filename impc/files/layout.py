@@ -1,0 +1,283 @@
+"""Rows of text or cells: where the recording begins and ends, what its columns are called.
+
+A row is known by its kinds: a number, a word or nothing in each place. The recording begins at the
+first row whose width and kinds go on below it. Names and units of its columns stand above it:
+``angle (deg)``, or a row of units.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from impc.errors import DataError
+from impc.files.units import is_unit
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+
+#: Kinds of a cell.
+EMPTY, NUMBER, WORD = 0, 1, 2
+#: Rows among which the first row of numbers must be.
+HEAD = 100
+# Rows of one shape that are a recording, and where they begin with a word, as settings do.
+_SEVERAL, _NAMED = 3, 20
+
+
+@dataclass
+class Block:
+    """Rows of one shape: the index of the first, kinds of each place of all, and counts."""
+
+    first: int  # Index of the first row, and how many rows, numbers and words it has
+    kinds: list[int] = field(default_factory=list)  # Of each place, of all rows together
+    rows: int = 0
+    numbers: int = 0
+    words: int = 0
+
+    @property
+    def width(self) -> int:
+        """Places up to the last one that has numbers."""
+        return max(
+            (place + 1 for place, kind in enumerate(self.kinds) if kind == NUMBER), default=0
+        )
+
+    @property
+    def share(self) -> float:
+        """Share of numbers among all that is not empty."""
+        return self.numbers / max(self.numbers + self.words, 1)
+
+    @property
+    def several(self) -> bool:
+        """Whether it has several rows, which are mostly numbers."""
+        return self.share > 0.5 and self.rows >= (_NAMED if self.kinds[0] == WORD else _SEVERAL)
+
+    def fits(self, row: Sequence[int], after_blank: bool = False) -> bool:
+        """Whether a row has the same shape: as many places, or fewer or more without numbers.
+
+        One `after_blank`, an empty row, must have the first number of the rows above: the clock.
+        """
+        if after_blank and row[self.kinds.index(NUMBER) :][:1] != [NUMBER]:
+            return False
+        if len(row) < self.width or NUMBER in row[len(self.kinds) :]:
+            return False
+        return not any(
+            {kind, own} == {NUMBER, WORD} for kind, own in zip(row, self.kinds, strict=False)
+        )
+
+    def add(self, row: Sequence[int]) -> None:
+        """Take in a row that fits."""
+        self.kinds += [EMPTY] * (len(row) - len(self.kinds))
+        self.kinds[: len(row)] = [kind or own for kind, own in zip(row, self.kinds, strict=False)]
+        self.rows += 1
+        self.numbers += row.count(NUMBER)
+        self.words += row.count(WORD)
+
+    def ends_at(self, row: Sequence[int], following: Sequence[int], after_blank: bool) -> bool:
+        """Whether a row that does not fit is where the block ends, and not a row that is damaged.
+
+        It is `after_blank`, behind an empty row; or a head of words; or it begins with a word, as
+        statistics do, and the `following` row does not fit either.
+        """
+        words = NUMBER not in row
+        if after_blank or (words and row.count(WORD) > 1):
+            return True
+        label = WORD in row[: self.kinds.index(NUMBER) + 1]
+        return (words or label) and not (following and self.fits(following))
+
+
+def first_block(rows: Sequence[Sequence[int]], alone: bool) -> Block | None:
+    """The first block of several `rows` that are mostly numbers, else that with most numbers.
+
+    The rows are kinds, from the top of a file; `alone` says whether one may be a number alone. Rows
+    as long as its own right above it that begin with a number too belong to it: they have a word in
+    the place of a number.
+    """
+    blocks: list[Block] = []
+    for index, row in enumerate(rows):
+        if NUMBER not in row or (len(row) < 2 and not alone):
+            continue
+        if not (blocks and blocks[-1].first + blocks[-1].rows == index and blocks[-1].fits(row)):
+            blocks.append(Block(index))
+        blocks[-1].add(row)
+    found = [block for block in blocks if block.share >= 0.5 and block.first < HEAD]
+    if not found:
+        return None
+    most = max(found, key=lambda block: block.numbers)
+    best = next((block for block in found if block.several), most)
+    for above in reversed(blocks[: blocks.index(best)]):
+        same = len(above.kinds) == len(best.kinds) and above.kinds[0] == best.kinds[0] == NUMBER
+        if not same or above.share < 0.5 or above.first + above.rows != best.first:
+            break
+        best.first = above.first
+    return best
+
+
+# What may end the settings of a file without heads: LabVIEW's, OpenSim's.
+_NO_HEAD = ("endofheader", "endheader")
+# Columns that rows may leave away where they are empty.
+_REMARKS = ("comment", "comments", "kommentar", "event", "events", "note", "notes", "remarks")
+
+_HEADING = re.compile(r"(.*\S)\s*[(\[]([^()\[\]]*)[)\]]")
+
+
+def split_heading(heading: str) -> tuple[str, str]:
+    """Name and unit of a heading such as ``angle (deg)``; the unit is empty when it has none."""
+    found = _HEADING.fullmatch(heading.strip())
+    if found and is_unit(found[2]):
+        return found[1], found[2].strip()
+    return heading.strip(), ""
+
+
+def written_heading(name: str, unit: str | None) -> str:
+    """The heading of a `name` and its `unit` that `split_heading` takes apart."""
+    return f"{name} ({unit})" if unit else name
+
+
+def are_units(row: Sequence[str]) -> bool:
+    """Whether a row of headings names units and nothing else."""
+    plain = [_bare(item) for item in row]
+    return any(plain) and all(not item or is_unit(item) for item in plain)
+
+
+@dataclass(frozen=True)
+class Headings:
+    """What stands above the numbers."""
+
+    names: tuple[str, ...]  # Of all columns; empty for one without a name
+    units: dict[str, str]  # Of the columns that have one
+    notes: tuple[str, ...] = ()  # Which names are not those of the file
+
+
+def find_headings(
+    source: str, above: Sequence[Sequence[str]], empty: Sequence[bool], named_rows: bool
+) -> Headings:
+    """Names and units from the rows `above` the numbers, the last of which are the header.
+
+    `empty` says which columns below have no value, `named_rows` whether the first may be names of
+    rows, above which nothing stands; `source` is the file.
+    """
+    width = len(empty)
+    rows = [row for row in map(_trimmed, above) if row]
+    if rows and rows[-1][0].strip("*_ ").lower().replace("_", "") in _NO_HEAD:
+        rows = []
+    units: Sequence[str] = ()
+    if len(rows) > 1 and len(rows[-1]) <= width and are_units(rows[-1]) and not are_units(rows[-2]):
+        units = rows.pop()
+    if not rows:
+        return Headings(tuple(f"column_{place + 1}" for place in range(width)), {})
+    heads = rows[-1]
+    if len(heads) == width - 1 and not empty[-1] and named_rows:
+        heads, rows = ["", *heads], [["", *row] for row in rows]
+    if all(item.lower() in _REMARKS for item in heads[width:]):
+        heads = heads[:width]
+    if len(heads) > width or not all(empty[len(heads) :]):
+        raise DataError(
+            source,
+            f"the header names {len(heads)} columns, and the rows below have {width} values",
+            "export with a point as decimal sign, or with semicolons between columns",
+        )
+    level = rows[-2] if len(rows) > 1 and len(rows[-2]) <= width else ()
+    return named_columns(_padded(heads, width), _padded(units, width), _padded(level, width))
+
+
+def named_columns(heads: Sequence[str], units: Sequence[str], level: Sequence[str]) -> Headings:
+    """Names from the `heads` of all columns, made distinct, and units of those that have one.
+
+    `units` is a row of their own, empty where there is none; `level` the row above the heads, which
+    names what has no name, and tells apart what has the same.
+    """
+    split = [split_heading(item) for item in heads]
+    names = [name or above for (name, _), above in zip(split, level, strict=True)]
+    if _repeated([name for name, _ in split]) and not _repeated(heads):
+        names = [head or above for head, above in zip(heads, level, strict=True)]  # angle (rad) too
+    found = _distinct(names, level)
+    changed = [f"{new!r}" for old, new in zip(names, found, strict=True) if old != new]
+    note = f"columns of one name are told apart: {', '.join(changed[:12])}"
+    told = {
+        name: _bare(below) or own
+        for name, (_, own), below in zip(found, split, units, strict=True)
+        if name and (_bare(below) or own)
+    }
+    return Headings(tuple(found), told, (note,) if changed else ())
+
+
+def _distinct(names: Sequence[str], level: Sequence[str]) -> list[str]:
+    """Names that differ: by what stands above them, else by a number."""
+    groups, group = [], ""
+    for above in level:
+        group = above or group
+        groups.append(group)
+    repeated = _repeated(names)
+    found = [
+        f"{group} {name}" if name in repeated and group else name
+        for name, group in zip(names, groups, strict=True)
+    ]
+    made: list[str] = []
+    seen: set[str] = set()
+    numbers = Counter[str]()
+    for name in found:
+        other = name
+        while other and other in seen:
+            numbers[name] += 1
+            other = f"{name}_{numbers[name] + 1}"
+        seen.add(other)
+        made.append(other)
+    return made
+
+
+def _repeated(names: Sequence[str]) -> set[str]:
+    """The names that come again; columns without a name do not count."""
+    return {name for name, times in Counter(names).items() if name and times > 1}
+
+
+def _trimmed(row: Sequence[str]) -> list[str]:
+    """Without empty fields at the end."""
+    filled = [place for place, item in enumerate(row) if item]
+    return list(row[: filled[-1] + 1]) if filled else []
+
+
+def _padded(row: Sequence[str], width: int) -> list[str]:
+    return [*row, *[""] * (width - len(row))]
+
+
+def _bare(item: str) -> str:
+    return item.strip("()[] ")
+
+
+def require_no_thousands(
+    source: str, names: Mapping[int, str], rows: Iterable[tuple[int, Sequence[str]]], sign: str
+) -> None:
+    """Refuse a column whose decimal `sign` may divide thousands.
+
+    It may where the sign always stands before three digits and behind one to three that do not
+    begin with 0, and other values are whole numbers without a sign. A program that writes decimals
+    writes 999.000 there, or 1. `names` are those of the columns by their place in `rows`, which are
+    numbers of lines with their fields; `source` is the file.
+    """
+    grouped = re.compile(rf"[+-]?[1-9]\d{{0,2}}(?:{re.escape(sign)}\d{{3}})+")
+    left = dict(names)
+    first: dict[int, tuple[int, str]] = {}
+    whole: set[int] = set()
+    for number, fields in rows:
+        for index in list(left):
+            item = fields[index].strip()
+            if sign not in item:
+                if item.lstrip("+-").isdigit():
+                    whole.add(index)
+            elif grouped.fullmatch(item):
+                first.setdefault(index, (number, item))
+            else:
+                del left[index]  # decimals, without a doubt
+        if not left:
+            return
+    for index, name in left.items():
+        if index in whole and index in first:
+            line, item = first[index]
+            raise DataError(
+                source,
+                f"column {name!r} has whole numbers and {item!r} in line {line}, which may "
+                "be a thousand",
+                "export it without thousands separators, or with as many decimals in every row",
+            )
