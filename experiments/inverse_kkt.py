@@ -35,13 +35,14 @@ import scipy.linalg
 import scipy.optimize
 
 from impc.arrays import Array, BoolArray, Frozen, frozen
-from impc.checking import replace
 from impc.errors import DataError
-from impc.inverse.groundwork import regulator
+from impc.inverse.estimates import Estimate, simulated_estimate
 from impc.inverse.methods import Method
+from impc.inverse.problem import Problem
 from impc.inverse.proximal_step import block_basis
 from impc.inverse.semidefinite import matrix_inequality, norm_bound, solve_semidefinite
 from impc.inverse.solution_set import natural_coordinates, split_blocks
+from impc.model.riccati import solve_lqr
 from impc.model.weights import Weights, normalised
 
 if TYPE_CHECKING:
@@ -159,15 +160,23 @@ _RATIOS = (-8.0, 8.0)
 # Variance of states and commands at the first sample, over that of the outputs.
 _DIFFUSE = 1e6
 
+
+def _estimate(problem: Problem, start: Estimate) -> Estimate:
+    known = start.problem.known()
+    weights = inverse_kkt(known, np.array(start.gain))
+    K = np.array(solve_lqr(known.plant, weights).K)
+    return simulated_estimate(
+        "inverse_kkt", known, K, start.metric, noise=start.noise, weights=weights
+    )
+
+
 #: The method for `Method.estimate`, as the noise study compares it with those of the registry.
 INVERSE_KKT = Method(
     "inverse_kkt",
     "inverse KKT",
     "Weights that make the smoothed states and commands look like optimal plans.",
     lambda problem: problem,
-    lambda ground: replace(
-        regulator(ground, inverse_kkt(ground.known, ground.starting_gain)), problem=ground.known
-    ),
+    _estimate,
 )
 
 

@@ -27,8 +27,7 @@ from experiments.inverse_kkt import INVERSE_KKT
 from impc.assess.variance_accounted_for import vaf
 from impc.checking import replace
 from impc.control.closed_loop import simulate
-from impc.inverse.groundwork import NaturalUnits
-from impc.inverse.methods import METHODS
+from impc.inverse.methods import METHODS, fit
 from impc.inverse.problem import controller_for
 from impc.inverse.solution_set import natural_coordinates
 from impc.model.recordings import Recording
@@ -126,9 +125,9 @@ def study_cell(cell: Cell) -> dict[str, Outcome]:
     problem = fit_problem(plant, [trial], FitSettings(u_max=cell.limit))
     truth = np.array(work.controller.K)
     judged = replace(work.problem, recordings=(unseen,))
-    ground = NaturalUnits(problem)
+    start = fit(problem)
     return {
-        name: _judge(method.estimate(ground), judged, work.drives[1], truth)
+        name: _judge(method.estimate(problem, start), judged, work.drives[1], truth)
         for name, method in COMPARED.items()
     }
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.assess.covariance import gain_covariance
-from impc.inverse.methods import estimate
+from impc.inverse.methods import fit
 from impc.output_feedback.covariance import person_covariance
 from impc.output_feedback.fit import fit_person
 from impc.output_feedback.prior import TOLD
@@ -119,7 +119,7 @@ def score(
     """Both fits of a subject and, asked for, what falls."""
     truth = np.array(who.controller.K)
     clock = [time.process_time()]
-    first = estimate(trials.problem)
+    first = fit(trials.problem)
     gain, metric = np.array(first.gain), np.array(first.metric)
     least = gain_covariance(first.problem, gain, metric, curvature=True)
     clock.append(time.process_time())

@@ -47,6 +47,7 @@ _FALLEN = 1e6
 class NonlinearMpc:
     """A nonlinear controller, built."""
 
+    plant: Plant  # Its linearisation
     step: Any  # (state (n), all inputs (m + d)) -> next state: the plant, with its disturbances
     solver: Any  # CasADi's nlpsol: start x and parameters -> sequence
     horizon: int  # N in samples, number of states, number of inputs
@@ -78,7 +79,7 @@ def build_nonlinear_mpc(
     program = {"x": ca.vec(u), "p": x0, "f": cost / size}
     solver = ca.nlpsol("nonlinear_mpc", "ipopt", program, _OPTIONS)
     return NonlinearMpc(
-        step, solver, horizon, n, m, np.array(bounds.u_min), np.array(bounds.u_max), finite
+        plant, step, solver, horizon, n, m, np.array(bounds.u_min), np.array(bounds.u_max), finite
     )
 
 
@@ -109,4 +110,4 @@ def simulate_nonlinear(mpc: NonlinearMpc, given: Scenario) -> Simulation:
             break
     reached = int(np.count_nonzero(status <= Status.SOFTENED))
     x[reached + 1 :] = x[reached]
-    return Simulation(x, u, status, 0, -1)
+    return Simulation(mpc.plant, x, u, status, 0, -1)

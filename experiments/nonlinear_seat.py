@@ -28,7 +28,7 @@ from impc.cli.seat import HORIZON, seat_controller, seat_weights
 from impc.control.casadi_controller import build_mpc, solve_mpc
 from impc.control.closed_loop import simulate
 from impc.control.simulation import require_complete, scenario
-from impc.inverse.methods import estimate
+from impc.inverse.methods import fit
 from impc.inverse.noisy_fit import free_gain
 from impc.inverse.problem import Problem, recorded_size
 from impc.model.bounds import Bounds
@@ -196,7 +196,7 @@ def fitted_prices(amplitude: float, steps: int) -> dict[str, Array]:
     bounds = Bounds(plant, u_min=-_SHARE * amplitude, u_max=_SHARE * amplitude)
     trial = Recording(plant, loop.x @ plant.C.T, np.vstack([torque, torque[-1:]]), loop.x[0])
     posed = Problem(plant, bounds, HORIZON, [trial], terminal_set=False, structure=structure)
-    linear = estimate(posed, "structured").prices
+    linear = fit(posed, "structured").prices
     assert linear is not None
     true = np.array([truth[name] for name in names])
     return {

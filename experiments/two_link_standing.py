@@ -130,7 +130,7 @@ def main() -> None:
         problem = standing_problem(1, noisy=noisy)
         print("noisy" if noisy else "clean")
         for method in ("inverse_mpc", "feedback_gain"):
-            print(impc.estimate(problem, method))
+            print(impc.fit(problem, method))
 
 
 if __name__ == "__main__":

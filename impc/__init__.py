@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from impc.assess.variance_accounted_for import vaf as vaf
     from impc.assess.variance_accounted_for import whiteness as whiteness
     from impc.assess.weights_test import identifiability as identifiability
+    from impc.checking import replace as replace
     from impc.control.casadi_controller import mpc_function as mpc_function
     from impc.control.closed_loop import simulate_and_differentiate as simulate_and_differentiate
     from impc.control.constraint_rows import directions as directions
@@ -39,19 +40,17 @@ if TYPE_CHECKING:
     from impc.files.formats import read_table as read_table
     from impc.files.formats import write_table as write_table
     from impc.files.reading import read_recordings as read_recordings
-    from impc.files.results import read_result as read_result
+    from impc.files.saved_estimates import load as load
     from impc.files.table import make_table as make_table
-    from impc.inverse.direct_and_reduced import infer_weights as infer_weights
-    from impc.inverse.direct_and_reduced import inverse_mpc as inverse_mpc
-    from impc.inverse.direct_and_reduced import inverse_mpc_reduced as inverse_mpc_reduced
     from impc.inverse.equivalent_weights import least_condition_weights as least_condition_weights
     from impc.inverse.equivalent_weights import other_weights as other_weights
     from impc.inverse.estimates import Estimate as Estimate
     from impc.inverse.inverse_lqr import inverse_lqr_gradient as inverse_lqr_gradient
     from impc.inverse.inverse_lqr import inverse_lqr_lmi as inverse_lqr_lmi
-    from impc.inverse.methods import estimate as estimate
+    from impc.inverse.methods import fit as fit
     from impc.inverse.problem import Problem as Problem
     from impc.inverse.solution_set import gain_fibre as gain_fibre
+    from impc.inverse.table31 import table_3_1 as table_3_1
     from impc.model.bounds import Bounds as Bounds
     from impc.model.plant import Plant as Plant
     from impc.model.plant_family import PlantFamily as PlantFamily
@@ -69,7 +68,6 @@ if TYPE_CHECKING:
     from impc.studies.estimate_page import report as report
     from impc.studies.fit.settings import FitSettings as FitSettings
     from impc.studies.fit.subject import fit_problem as fit_problem
-    from impc.studies.fit.subject import fit_recordings as fit_recordings
 
     __version__: str
 
@@ -77,6 +75,7 @@ _NAMES = {
     "assess.expected": "expected_intervals",
     "assess.weights_test": "identifiability",
     "assess.variance_accounted_for": "vaf whiteness",
+    "checking": "replace",
     "control.casadi_controller": "mpc_function",
     "control.closed_loop": "simulate_and_differentiate",
     "control.constraint_rows": "directions",
@@ -89,16 +88,16 @@ _NAMES = {
     "files.configuration": "read_configuration",
     "files.formats": "read_table write_table",
     "files.reading": "read_recordings",
-    "files.results": "read_result",
+    "files.saved_estimates": "load",
     "files.table": "make_table",
-    "inverse.direct_and_reduced": "infer_weights inverse_mpc inverse_mpc_reduced",
     "inverse.equivalent_weights": "least_condition_weights other_weights",
     "inverse.estimates": "Estimate",
     "output_feedback.fit": "fit_person",
     "inverse.inverse_lqr": "inverse_lqr_gradient inverse_lqr_lmi",
-    "inverse.methods": "estimate",
+    "inverse.methods": "fit",
     "inverse.problem": "Problem",
     "inverse.solution_set": "gain_fibre",
+    "inverse.table31": "table_3_1",
     "model.bounds": "Bounds",
     "output_feedback.observer": "Observer",
     "model.plant": "Plant",
@@ -111,7 +110,7 @@ _NAMES = {
     "nonlinear.problem": "OptimalControlProblem",
     "studies.estimate_page": "report",
     "studies.fit.settings": "FitSettings",
-    "studies.fit.subject": "fit_problem fit_recordings",
+    "studies.fit.subject": "fit_problem",
 }
 _MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
 

@@ -28,8 +28,18 @@ Buffer = np.ndarray[Any, np.dtype[Any]]
 class Frozen:
     """Base of frozen dataclasses: their arrays stay read-only when copied and out of a pickle.
 
-    numpy makes arrays that can be written of those that it copies or finds in a pickle.
+    numpy makes arrays that can be written of those that it copies or finds in a pickle. In an
+    interpreter they are one line: small arrays in full, others by their shapes.
     """
+
+    def __init_subclass__(cls) -> None:
+        if "__repr__" not in vars(cls):  # else the dataclass would write every sample
+            cls.__repr__ = Frozen.__repr__  # type: ignore[method-assign]
+
+    def __repr__(self) -> str:
+        named = fields(self)  # type: ignore[arg-type]  # a dataclass
+        parts = (f"{item.name}={_brief(getattr(self, item.name))}" for item in named)
+        return f"{type(self).__name__}({', '.join(parts)})"
 
     def __getstate__(self) -> dict[str, Any]:
         """Its fields: what was computed from them once is computed again where it is wanted."""
@@ -42,6 +52,19 @@ class Frozen:
                 if isinstance(item, np.ndarray):
                     item.flags.writeable = False
             object.__setattr__(self, name, value)
+
+
+def _brief(value: Any) -> str:
+    if isinstance(value, np.ndarray):
+        if value.size <= 6:
+            return np.array2string(value, precision=4, separator=", ").replace("\n", "")
+        return f"array{value.shape}"
+    if isinstance(value, Frozen):
+        return f"<{type(value).__name__}>"
+    if isinstance(value, tuple) and value and isinstance(value[0], Frozen):
+        return f"<{len(value)} {type(value[0]).__name__}>"
+    text = repr(value)
+    return text if len(text) <= 60 else f"<{type(value).__name__}>"
 
 
 def frozen(values: ArrayLike) -> Array:

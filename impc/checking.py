@@ -298,6 +298,11 @@ def _estimate(name: str, value: Any) -> Any:
     return value if hasattr(value, "page") else _KINDS["Estimate"](name, value)
 
 
+def _start(name: str, value: Any) -> Any:
+    kind = "Weights" if type(value).__name__ == "Weights" else "Estimate"
+    return _KINDS[kind](name, value)
+
+
 def _path(name: str, value: Any) -> Any:
     """What may be the name of a file; whether there is one is for who opens it."""
     if not isinstance(value, (str, os.PathLike)):
@@ -365,7 +370,7 @@ _MAKERS = {
     "EquivalentWeights": "least_condition_weights",
     "WeightsSet": "weights_set",
     "MpcSolver": "build_mpc",
-    "Estimate": "estimate(problem)",
+    "Estimate": "fit(problem)",
     "Rows": "build_rows",
 }
 _CLASSES = (
@@ -375,6 +380,7 @@ _CLASSES = (
 
 _KINDS: dict[str, Kind] = {
     "Estimate | OwnPage": _estimate,
+    "Estimate | Weights": _start,
     "ArrayLike": as_numbers,
     "ArrayLike | Mapping[str, float]": _numbers_or_names,
     "Array": _array,

@@ -24,7 +24,7 @@ from typing import Any
 
 from impc.control.controller import Controller
 from impc.inverse.estimates import Estimate
-from impc.inverse.methods import estimate
+from impc.inverse.methods import fit
 from impc.inverse.problem import Problem
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
@@ -163,7 +163,7 @@ def _estimate() -> Estimate:
     plant = Plant(yalmip_example())
     bounds = Bounds(plant, u_min=-1, u_max=1)
     law = Controller(plant, Weights([[1, 0], [0, 1]], 1), bounds, 3)
-    return estimate(Problem(plant, bounds, 3, [Recording(plant, law.simulate([1, 3], 20).x)]))
+    return fit(Problem(plant, bounds, 3, [Recording(plant, law.simulate([1, 3], 20).x)]))
 
 
 def _impc(folder: Path, *arguments: str) -> None:

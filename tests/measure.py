@@ -67,7 +67,7 @@ def _share_of_documents() -> tuple[int, float]:
 
 def _followed() -> tuple[int, int, int]:
     """Files and functions that the README's Python example enters, and the depth of its calls."""
-    (example,) = [one.text for one in blocks("README.md") if "impc.estimate(" in one.text]
+    (example,) = [one.text for one in blocks("README.md") if "impc.fit(" in one.text]
     package, entered = str(ROOT / "impc"), set[tuple[str, str]]()
     depth = deepest = 0
 

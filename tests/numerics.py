@@ -33,7 +33,7 @@ FILES = (
     "tests/control/test_hard_plants.py",
     "tests/experiments/test_inverse_kkt.py",
     "tests/inverse/test_inverse_lqr.py",
-    "tests/inverse/test_direct_and_reduced.py",
+    "tests/inverse/test_table31.py",
     "tests/model/test_riccati.py",
     "tests/control/test_casadi_controller.py",
     "tests/control/test_solvers.py",

@@ -20,7 +20,7 @@ from impc.control.simulation import scenario
 from impc.errors import DataError, ImpcError, InputError
 from impc.files.formats import read_table
 from impc.files.reading import read_recordings
-from impc.files.results import read_result
+from impc.files.saved_estimates import load
 from impc.files.table import make_table
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 # Calls of more than half a second: numbers that mean something are left out.
 SLOW = (
-    *("infer_weights", "inverse_mpc_reduced", "starting_point", "fit_gain", "fit_controller"),
+    *("table_3_1", "inverse_mpc_reduced", "fit_gain", "fit_controller"),
     "fit_optimal_control",
 )
 PLANT = Plant(control.ss([[2, -1], [1, 0.2]], [[1], [0]], np.eye(2), 0, True))
@@ -200,8 +200,8 @@ WRONG_CALLS: dict[str, tuple[Callable[[], object], str]] = {
     "too few": (lambda: Weights([[1]]), "Weights: missing a required argument: 'R'"),  # type: ignore[call-arg]
     "too many": (lambda: Weights([[1]], 1, 1), "too many positional arguments"),  # type: ignore[call-arg]
     "unknown": (lambda: Weights([[1]], R=1, S=1), "unexpected keyword argument 'S'"),  # type: ignore[call-arg]
-    "NUL": (lambda: read_result("a\0b"), "path: has a zero byte"),
-    "long": (lambda: read_result("x" * 5000), "File name too long"),
+    "NUL": (lambda: load("a\0b"), "path: has a zero byte"),
+    "long": (lambda: load("x" * 5000), "File name too long"),
     "no text": (lambda: read_table("\ud800.csv"), "give a name that is text"),
     "no path": (lambda: read_table(None), "path: got None; give a path"),  # type: ignore[arg-type]
     "no settings": (lambda: read_recordings([], None, PLANT), "configuration: expected a Conf"),  # type: ignore[arg-type]

@@ -29,12 +29,12 @@ from impc.control import (
 )
 from impc.files import configuration, formats, reading, table, units
 from impc.files import plant_sources as plant_source
-from impc.inverse import direct_and_reduced as inverse_mpc
 from impc.inverse import equivalent_weights, inverse_lqr, residuals
 from impc.inverse import gain_search as gain
 from impc.inverse import noisy_fit as fitted_controller
 from impc.inverse import problem as inverse_problem
 from impc.inverse import solution_set as gain_fibre
+from impc.inverse import table31 as inverse_mpc
 from impc.model import bounds, plant, plant_family, structure, weights
 from impc.model import recordings as recording
 from impc.model import riccati as lqr
@@ -244,7 +244,6 @@ def calls() -> list[Call]:
                 "near": v["terminal"],
             },
         ),
-        (terminal_set.contains, {"terminal": v["terminal"], "x": size}),
         (
             controller.Controller,
             {**limits, "horizon": 4, "terminal_set": True, "softening": 1e6},
@@ -303,8 +302,7 @@ def calls() -> list[Call]:
             {**about, "start": v["weights"], "max_evaluations": 3},
         ),
         (inverse_lqr.inverse_lqr_cross_term, about),
-        (inverse_mpc.infer_weights, problem),
-        (inverse_mpc.starting_point, problem),
+        (inverse_mpc.table_3_1, problem),
         (
             inverse_mpc.inverse_mpc,
             {

@@ -133,7 +133,7 @@ show("swing-fit/parameters.png")
 # The intervals, beside the parameters that made the recording:
 import impc
 
-for one in impc.read_result(RESULTS / "swing-fit").table("parameters").itertuples():
+for one in impc.load(RESULTS / "swing-fit").table("parameters").itertuples():
     print(
         f"{one.parameter:6} {one.value:8.4f}  {one.low:8.4f} to {one.high:8.4f}  "
         f"{truth[one.parameter]:6}"

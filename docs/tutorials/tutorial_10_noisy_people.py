@@ -65,7 +65,7 @@ recordings = [
     impc.Recording(plant, trial.outputs, push) for trial, push in zip(trials, pushes, strict=True)
 ]
 problem = impc.Problem(plant, bounds, 5, recordings, terminal_set=False, unknown_start=True)
-least = impc.estimate(problem)
+least = impc.fit(problem)
 least_deviations = gain_covariance(
     least.problem, np.array(least.gain), np.array(least.metric), curvature=True
 ).entries

@@ -11,18 +11,18 @@ from experiments.benchmarks.peers import casadi_loop, cvxpy_nelder_mead
 from experiments.benchmarks.table import Row, compare
 from experiments.benchmarks.timing import side_by_side
 from experiments.benchmarks.workloads import example, seat
-from impc.inverse.direct_and_reduced import (
+from impc.inverse.table31 import (
     CONDITION_WEIGHT,
     inverse_mpc,
     inverse_mpc_reduced,
-    starting_point,
+    starting_weights,
 )
 from impc.model.weights import weight_error
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from impc.inverse.direct_and_reduced import ReducedFit
+    from impc.inverse.estimates import Estimate
 
 __all__ = ["fit_rows"]
 
@@ -43,7 +43,7 @@ def _seat(runs: int) -> list[Row]:
     timings = side_by_side(
         {
             "qpoases": lambda: loop(one.controller.K),
-            "start": lambda: starting_point(one.problem),
+            "start": lambda: starting_weights(one.problem),
             "one": lambda: inverse_mpc_reduced(one.problem),
             "three": lambda: inverse_mpc_reduced(three.problem),
             "long": lambda: inverse_mpc_reduced(long.problem),
@@ -65,11 +65,9 @@ def _seat(runs: int) -> list[Row]:
     ]
 
 
-def _check(found: ReducedFit, gain: np.ndarray) -> None:
-    if found.equivalent is None or np.linalg.norm(found.gain.K - gain) > 1e-6 * np.linalg.norm(
-        gain
-    ):
-        raise AssertionError(f"the fit missed the true gain: misfit {found.gain.misfit:.3g}")
+def _check(found: Estimate, gain: np.ndarray) -> None:
+    if found.weights is None or np.linalg.norm(found.gain - gain) > 1e-6 * np.linalg.norm(gain):
+        raise AssertionError(f"the fit missed the true gain: misfit {found.misfit:.3g}")
 
 
 def _memory() -> list[Row]:
@@ -90,9 +88,9 @@ def _memory() -> list[Row]:
 
 def _example(runs: int) -> list[Row]:
     work = example()
-    start = starting_point(work.problem).weights
+    start = starting_weights(work.problem)
     for found in (inverse_mpc(work.problem, start), inverse_mpc_reduced(work.problem)):
-        if weight_error(found.weights, work.weights) > 1e-6:
+        if weight_error(found.stage_weights, work.weights) > 1e-6:
             raise AssertionError("W1 missed the true weights")
     timings = side_by_side(
         {

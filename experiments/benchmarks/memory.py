@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from experiments.benchmarks.workloads import seat
-from impc.inverse.direct_and_reduced import inverse_mpc_reduced
+from impc.inverse.table31 import inverse_mpc_reduced
 
 __all__ = ["peak_megabytes"]
 

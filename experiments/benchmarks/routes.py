@@ -9,7 +9,7 @@ import numpy as np
 from experiments.benchmarks.table import Row
 from experiments.benchmarks.upper_level import Route, prox_linear, smooth_surrogate
 from experiments.benchmarks.workloads import example, seat
-from impc.inverse.direct_and_reduced import starting_point
+from impc.inverse.table31 import starting_weights
 from impc.model.weights import Weights
 
 if TYPE_CHECKING:
@@ -22,9 +22,9 @@ def route_rows(_: int, __: Path) -> list[Row]:
     """One run of each: what is compared is the objective, which does not vary."""
     short, person = example(), seat()
     cases = {
-        "W1 from the Table 3.1 start": (short, starting_point(short.problem).weights),
+        "W1 from the Table 3.1 start": (short, starting_weights(short.problem)),
         "W1 from diag(2, 0.2)": (short, Weights(np.diag([2.0, 0.2]), 1)),
-        "W2 from the Table 3.1 start": (person, starting_point(person.problem).weights),
+        "W2 from the Table 3.1 start": (person, starting_weights(person.problem)),
     }
     rows = []
     for name, (work, start) in cases.items():

@@ -16,7 +16,7 @@ from impc.control.closed_loop import simulate_and_differentiate
 from impc.control.constraint_rows import directions
 from impc.control.loop_function import closed_loop_function
 from impc.control.named_solver import COMPILED, SOLVERS
-from impc.inverse.direct_and_reduced import inverse_mpc_reduced
+from impc.inverse.table31 import inverse_mpc_reduced
 from impc.model.weights import weight_error
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from impc.arrays import Array
-    from impc.inverse.direct_and_reduced import ReducedFit
+    from impc.inverse.estimates import Estimate
 
 __all__ = ["solver_rows"]
 
@@ -85,7 +85,7 @@ def _example_fits(runs: int) -> list[Row]:
     work = example()
     problems = {name: replace(work.problem, solver=name) for name in (COMPILED, *SOLVERS)}
     for name, problem in problems.items():
-        if weight_error(inverse_mpc_reduced(problem).weights, work.weights) > 1e-6:
+        if weight_error(inverse_mpc_reduced(problem).stage_weights, work.weights) > 1e-6:
             raise AssertionError(f"W1 missed the true weights with {name}")
     timings = side_by_side(
         {name: partial(inverse_mpc_reduced, problem) for name, problem in problems.items()}, runs
@@ -100,11 +100,11 @@ def _example_fits(runs: int) -> list[Row]:
 
 def _seat_fits(runs: int) -> list[Row]:
     work = seat()
-    fits: dict[str, Callable[[], ReducedFit]] = {
+    fits: dict[str, Callable[[], Estimate]] = {
         name: partial(inverse_mpc_reduced, replace(work.problem, solver=name))
         for name in (COMPILED, *_FITS)
     }
-    found = {name: np.array(fit().gain.K) for name, fit in fits.items()}
+    found = {name: np.array(fit().gain) for name, fit in fits.items()}
     for name in _FITS:
         _require_close(found[name], found[COMPILED], 1e-6)
     timings = side_by_side(dict(fits), runs)

@@ -15,9 +15,9 @@ import numpy as np
 import scipy.optimize
 
 from experiments.certificates import cholesky_parameters, weights_from_parameters
-from impc.inverse.direct_and_reduced import CONDITION_WEIGHT, inverse_mpc
 from impc.inverse.proximal_search import Residual, weight_jacobian
 from impc.inverse.residuals import evaluate
+from impc.inverse.table31 import CONDITION_WEIGHT, inverse_mpc
 from impc.model.riccati import solve_lqr
 from impc.model.weights import condition_number
 
@@ -43,7 +43,9 @@ def prox_linear(problem: Problem, start: Weights) -> Route:
     """The package's own route, with the condition weight of the other."""
     begin = time.perf_counter()
     fit = inverse_mpc(problem, start, condition_weight=CONDITION_WEIGHT)
-    return Route(fit.weights, fit.objective, fit.evaluations, time.perf_counter() - begin)
+    weights = fit.stage_weights
+    objective = fit.misfit + CONDITION_WEIGHT * condition_number(weights)
+    return Route(weights, objective, fit.evaluations, time.perf_counter() - begin)
 
 
 def smooth_surrogate(problem: Problem, start: Weights) -> Route:

@@ -21,8 +21,8 @@ from impc.control.terminal_set import (
     maximal_invariant_set,
 )
 from impc.errors import InputError
-from impc.inverse.direct_and_reduced import infer_weights, inverse_mpc
 from impc.inverse.problem import Problem
+from impc.inverse.table31 import inverse_mpc, table_3_1
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.recordings import Recording
@@ -34,7 +34,7 @@ from plants import yalmip_example
 if TYPE_CHECKING:
     from experiments.reproduction.evidence import Evidence
     from impc.arrays import Array
-    from impc.inverse.direct_and_reduced import Inference
+    from impc.inverse.estimates import Estimate
 
 __all__ = ["STAND_IN", "controller_entries", "example_entries"]
 
@@ -68,7 +68,7 @@ def controller_entries() -> list[Entry]:
         Problem(plant, bounds, HORIZON, (Recording(plant, ours.x),)),
         Weights(np.diag([2.0, 0.5]), 1.0),
     )
-    off = float(np.max(np.abs(direct.weights.Q - np.eye(2))))
+    off = float(np.max(np.abs(direct.stage_weights.Q - np.eye(2))))
     whole = [_table_3_1(plant, bounds, controller, case) for case in ("A", "B")]
     factor = weights_from_parameters(cholesky_parameters(weights), 2, 1)
     return [
@@ -127,7 +127,7 @@ def controller_entries() -> list[Entry]:
             " form a manifold: multiples (aQ, aR, aP) are solutions too.",
             (
                 "impc.inverse.proximal_search:conditioned_fit",
-                "impc.inverse.direct_and_reduced:inverse_mpc",
+                "impc.inverse.table31:inverse_mpc",
             ),
             f"Inputs with (7Q, 7R) differ by {ray:.0e}. The manifold is larger than multiples: with"
             " one input the law depends on the weights through K alone (docs/theory.md).",
@@ -136,7 +136,7 @@ def controller_entries() -> list[Entry]:
         Entry(
             "(3.6)",
             "The same with R = 1, Q = LL', L lower triangular with positive diagonal.",
-            ("impc.inverse.direct_and_reduced:inverse_mpc",),
+            ("impc.inverse.table31:inverse_mpc",),
             f"From Q = diag(2, 0.5): Q = I to {off:.0e}; L and back:"
             f" {float(np.max(np.abs(factor.Q - np.eye(2)))):.0e}.",
             agrees(off < 1e-6),
@@ -154,25 +154,22 @@ def controller_entries() -> list[Entry]:
         Entry(
             "Table 3.1",
             "The algorithm: gain, LMI; where infeasible gradient and (3.7); then (3.6).",
-            (
-                "impc.inverse.direct_and_reduced:infer_weights",
-                "impc.inverse.direct_and_reduced:starting_point",
-            ),
+            ("impc.inverse.table31:table_3_1",),
             "; ".join(
-                f"case {case}: {'LMI' if inference.start.lmi.feasible else 'gradient'} branch,"
-                f" Q = I to {np.max(np.abs(inference.fit.weights.Q - np.eye(2))):.0e}"
-                for case, inference in zip("AB", whole, strict=True)
+                f"case {case}: {_branch(lines)} branch,"
+                f" Q = I to {np.max(np.abs(_found_Q(lines) - np.eye(2))):.0e}"
+                for case, lines in zip("AB", whole, strict=True)
             )
             + ".",
             agrees(
-                all(np.allclose(item.fit.weights.Q, np.eye(2), atol=1e-6) for item in whole)
-                and [item.start.lmi.feasible for item in whole] == [False, True]
+                all(np.allclose(_found_Q(lines), np.eye(2), atol=1e-6) for lines in whole)
+                and list(map(_branch, whole)) == ["gradient", "LMI"]
             ),
         ),
         Entry(
             "Figure 3.1",
             "Block diagram of the loop with MPC, and of the two levels.",
-            ("impc.inverse.direct_and_reduced",),
+            ("impc.inverse.table31",),
             "docs/architecture.md has the drawing of this package.",
             Verdict.IN_KIND,
             "A drawing of structure, not a result.",
@@ -223,7 +220,7 @@ def example_entries(evidence: Evidence) -> list[Entry]:
             "(3.15)",
             "Inverse MPC estimated the weights accurately; its residual is below that of inverse"
             " LQR.",
-            ("impc.inverse.direct_and_reduced:inverse_mpc",),
+            ("impc.inverse.table31:inverse_mpc",),
             f"Residual {mpc['residual']:.1e}; the least of inverse LQR is {least_lqr:.2g}."
             " The recording determines two of three directions, the condition number chose the"
             " third, which falls on the truth because Q = I has the least there is.",
@@ -232,7 +229,7 @@ def example_entries(evidence: Evidence) -> list[Entry]:
         Entry(
             "(3.16)",
             "Inverse LQR with the penalty on outputs in place of gains.",
-            ("impc.inverse.direct_and_reduced:output_penalty_weights",),
+            ("impc.inverse.table31:inverse_mpc",),
             f"Misfit of the states {output['state_misfit']:.3f}.",
             Verdict.IN_KIND,
             "Weights w1, w2 and c are lost.",
@@ -327,9 +324,19 @@ def _dynamic_programming(A: Array, B: Array) -> tuple[Array, Array]:
     return np.asarray(K), np.asarray(P)
 
 
-def _table_3_1(plant: Plant, bounds: Bounds, controller: Controller, case: str) -> Inference:
+def _table_3_1(
+    plant: Plant, bounds: Bounds, controller: Controller, case: str
+) -> dict[str, Estimate]:
     states = simulate(controller, scenario(plant, x0=CASES[case], steps=STEPS)).x
-    return infer_weights(Problem(plant, bounds, HORIZON, (Recording(plant, states),)))
+    return table_3_1(Problem(plant, bounds, HORIZON, (Recording(plant, states),)))
+
+
+def _branch(lines: dict[str, Estimate]) -> str:
+    return "gradient" if lines["inverse_lqr_lmi"].weights is None else "LMI"
+
+
+def _found_Q(lines: dict[str, Estimate]) -> np.ndarray:  # noqa: N802
+    return np.array(lines["inverse_mpc"].stage_weights.Q)
 
 
 def _refusal(Q: Any, R: float) -> str:

@@ -32,9 +32,12 @@ from impc.inverse.coordinates import Coordinates, descend
 from impc.inverse.least_squares import Stop
 from impc.inverse.problem import EXPLAINED, recorded_size
 from impc.inverse.residuals import evaluate
+from impc.model.plant import UNKNOWN, gain_unit
 from impc.model.riccati import stabilises
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from impc.arrays import Array
     from impc.assess.covariance import GainCovariance
     from impc.inverse.estimates import Estimate
@@ -214,3 +217,18 @@ def _around(value: Array, half: float) -> tuple[float, float]:
     if half > 700:  # exp overflows: the logarithm is as good as free
         return 0.0, float("inf")
     return float(value * np.exp(-half)), float(value * np.exp(half))
+
+
+def interval_table(fitted: Estimate) -> pd.DataFrame:
+    """Intervals of the gain and of fitted parameters, for the noise that the residuals show."""
+    import pandas as pd  # noqa: PLC0415  # a third of a second
+
+    found, plant = gain_estimate(fitted), fitted.problem.plant
+    units = [gain_unit(plant, u, x) for u in plant.controls for x in plant.states]
+    items = covariance_intervals(found, found.covariance, "sandwich")
+    units += [UNKNOWN] * (len(items) - len(units))  # of parameters
+    rows = [
+        (item.name, unit, item.value, item.low, item.high, item.told)
+        for item, unit in zip(items, units, strict=True)
+    ]
+    return pd.DataFrame(rows, columns=["name", "unit", "value", "low", "high", "identified"])

@@ -151,7 +151,7 @@ def simulate_mpc(mpc: MpcSolver, given: Scenario) -> Simulation:
             break
         u[t] = step.u
         x[t + 1] = next_state(plant, x[t], u[t], given.disturbance[t])
-    return Simulation(x, u, status, 0, failed_row)
+    return Simulation(plant, x, u, status, 0, failed_row)
 
 
 @checked

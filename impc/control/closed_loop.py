@@ -158,7 +158,7 @@ def run_loop(
         if status[t] > Status.SOFTENED:
             failed_row = failed_row if row >= 0 and failed_row >= 0 else row
             break
-    return Simulation(x, u, status, weakly_active, failed_row), Sensitivity(dx, du)
+    return Simulation(plant, x, u, status, weakly_active, failed_row), Sensitivity(dx, du)
 
 
 def _pushes(prepared: PreparedLoop, given: Scenario) -> Array:

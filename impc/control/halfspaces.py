@@ -14,19 +14,17 @@ active) and mu, and when both are feasible the two are optimal, by duality and w
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.optimize import linprog
 from scipy.sparse import csc_array
-from scipy.spatial import HalfspaceIntersection
+from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 
 from impc.errors import InputError, SolverError
-from impc.extras import optional
 
 if TYPE_CHECKING:
     from impc.arrays import Array, BoolArray, IntArray
-    from impc.control.terminal_set import TerminalSet
 
 
 # A direction that the normalised rows see less than this, relative to the best seen one, counts
@@ -207,31 +205,42 @@ def _first_hit(Z: Array, mirrored: bool, factor: float) -> BoolArray:
     return hit
 
 
-def polygon(terminal: TerminalSet) -> Array:
-    """Corners (v, 2) of a bounded set of two states, counter-clockwise, in the units of x."""
-    n = terminal.H.shape[1]
-    if n != 2:
-        raise InputError("terminal set", f"has {n} states", "corners are drawn for two")
-    rows = terminal.H / terminal.h[:, None]
+def corners(rows: Array) -> Array:
+    """Corners (v, n) of the bounded set rows x <= 1; of two states counter-clockwise."""
     scale = np.max(np.abs(rows), axis=0, initial=0.0)
     rows = rows / np.where(scale > 0, scale, 1.0)
-    # Bounded: the normals leave no half plane free, so no gap between neighbours reaches pi.
+    n = rows.shape[1]
+    if n == 1:
+        ends = [1 / np.max(rows, initial=0.0), 1 / np.min(rows, initial=0.0)] if len(rows) else []
+        found: Array = np.array(ends).reshape(-1, 1)
+    elif n > 2 or _surround(rows):
+        halves = np.column_stack([rows, -np.ones(len(rows))])
+        found = _intersections(halves)
+    else:
+        found = np.zeros((0, n))
+    if not len(found) or not np.all(np.isfinite(found)):
+        remedy = "bound the states or inputs that show that direction, from both sides"
+        raise InputError("terminal set", "is unbounded and has no corners", remedy)
+    if n == 2:
+        found = found[np.argsort(np.arctan2(found[:, 1], found[:, 0]))]
+    return np.asarray(found / scale)
+
+
+def _surround(rows: Array) -> bool:
+    """Whether normals in a plane leave no half of it free: no gap of neighbours reaches pi."""
     angles = np.sort(np.arctan2(rows[:, 1], rows[:, 0]))
     gaps = np.diff(angles, append=angles[:1] + 2 * np.pi)
-    if np.max(gaps, initial=0.0 if len(gaps) else np.inf) >= np.pi - 1e-9:
-        remedy = "bound the states or inputs that show that direction, from both sides"
-        raise InputError("terminal set", "is unbounded and has no polygon", remedy)
-    halves = np.column_stack([rows, -np.ones(len(rows))])
-    corners = HalfspaceIntersection(halves, np.zeros(2)).intersections
-    order = np.argsort(np.arctan2(corners[:, 1], corners[:, 0]))
-    return np.asarray(corners[order] / scale)
+    return bool(np.max(gaps, initial=0.0 if len(gaps) else np.inf) < np.pi - 1e-9)
 
 
-def as_pytope(terminal: TerminalSet) -> Any:
-    """Return the set as a `pytope.Polytope` in half-space form; pytope finds corners when asked."""
-    pytope = optional("pytope", "terminal set")
-    if not len(terminal.h):
-        raise InputError("terminal set", "is the whole space", "give at least one bound")
-    # pytope 0.0.4 squeezes the right side to a scalar when there is one row: state it twice.
-    twice = slice(None) if len(terminal.h) > 1 else [0, 0]
-    return pytope.Polytope(np.array(terminal.H[twice]), np.array(terminal.h[twice]))
+def _intersections(halves: Array) -> Array:
+    n = halves.shape[1] - 1
+    try:
+        return np.asarray(HalfspaceIntersection(halves, np.zeros(n)).intersections)
+    except QhullError:  # fewer rows than corners need, or none along a direction
+        return np.zeros((0, n))
+
+
+def hull(points: Array) -> Array:
+    """Corners (v, 2) of the convex hull of points (p, 2), counter-clockwise."""
+    return np.asarray(points[ConvexHull(points).vertices])

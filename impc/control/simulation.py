@@ -23,6 +23,7 @@ from impc.model.bounds import bound_rows
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    import pandas as pd
     from numpy.typing import ArrayLike
 
     from impc.control.controller import Controller
@@ -109,6 +110,7 @@ class Simulation(Frozen):
 
     Attributes
     ----------
+    plant : Plant
     x : Array
         States (steps + 1, n). Samples that were not reached repeat the last state.
     u : Array
@@ -130,15 +132,58 @@ class Simulation(Frozen):
     >>> run = truth.simulate([1, 3], steps=20)
     >>> run.x.shape, run.u.shape, run.complete
     ((21, 2), (20, 1), True)
-    >>> float(abs(run.u).max().round(9))
-    1.0
+    >>> run.statuses[0], run.frame().columns.tolist()
+    (<Status.ACTIVE: 1>, ['time', 'x[0]', 'x[1]', 'y[0]', 'y[1]', 'u[0]'])
     """
 
+    plant: Plant
     x: Array
     u: Array
     status: np.ndarray[tuple[int], np.dtype[np.int8]]
     weakly_active: int
     failed_row: int
+
+    @property
+    def time(self) -> Array:
+        """Of every state, s (steps + 1,)."""
+        return np.asarray(self.plant.dt * np.arange(len(self.x)), dtype=np.float64)
+
+    @property
+    def states(self) -> Array:
+        """x (steps + 1, n)."""
+        return self.x
+
+    @property
+    def outputs(self) -> Array:
+        """y = C x (steps + 1, p)."""
+        return np.asarray(self.x @ self.plant.C.T)
+
+    @property
+    def inputs(self) -> Array:
+        """u (steps, m)."""
+        return self.u
+
+    @property
+    def statuses(self) -> tuple[Status, ...]:
+        """What happened at every sample."""
+        return tuple(Status(int(code)) for code in self.status)
+
+    def frame(self) -> pd.DataFrame:
+        """Time, states, outputs and inputs as columns with their names; the last input is NaN.
+
+        `frame().attrs["units"]` has the unit of each column.
+        """
+        import pandas as pd  # noqa: PLC0415  # a third of a second
+
+        plant, last = self.plant, np.full((1, self.u.shape[1]), np.nan)
+        columns = [self.time[:, None], self.x, self.outputs, np.vstack([self.u, last])]
+        names = ["time", *plant.states, *plant.outputs, *plant.controls]
+        found = pd.DataFrame(np.hstack(columns), columns=names)
+        found = found.loc[:, ~found.columns.duplicated()]  # an output may be a state
+        found.attrs["units"] = {
+            name: "s" if name == "time" else plant.unit(name) for name in found.columns
+        }
+        return found
 
     @property
     def complete(self) -> bool:

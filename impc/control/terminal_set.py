@@ -20,19 +20,22 @@ E. G. Gilbert, K. T. Tan, Linear systems with state and control constraints, IEE
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from impc.arrays import Array, Frozen, IntArray, finite_array, frozen
 from impc.checking import Value, checked
 from impc.control.halfspaces import (
+    corners,
+    hull,
     needed_rows,
     redundant_rows,
     seen_directions,
     with_mirror,
 )
 from impc.errors import BoundsError, InputError, SolverError
+from impc.extras import optional
 from impc.model.bounds import BoundRows, bound_rows
 
 if TYPE_CHECKING:
@@ -42,6 +45,10 @@ if TYPE_CHECKING:
 
     from impc.model.bounds import Bounds
     from impc.model.plant import Plant
+
+
+# States of a set whose corners are listed: with more they are thousands.
+_MOST_STATES = 6
 
 
 @dataclass(frozen=True)
@@ -77,8 +84,8 @@ class TerminalSet(Value):
     >>> plant = impc.Plant(yalmip_example())
     >>> bounds = impc.Bounds(plant, u_min=-1, u_max=1)
     >>> reached = impc.maximal_invariant_set(plant, [[1.5, -0.9]], bounds)
-    >>> [bool((reached.H @ x <= reached.h).all()) for x in ([0.1, 0.1], [9, 9])]
-    [True, False]
+    >>> reached.contains([0.1, 0.1]), reached.contains([9, 9]), reached.vertices().shape
+    (True, False, (4, 2))
     """
 
     H: Array
@@ -91,6 +98,43 @@ class TerminalSet(Value):
     F: Array
     rows: BoundRows
     bases: Mapping[int, IntArray] = field(repr=False, compare=False)
+
+    def contains(self, x: ArrayLike) -> bool:
+        """Whether the state x (n,) is in the set, within its tolerance of each bound."""
+        state = finite_array("x", x, (self.H.shape[1],))
+        return bool(np.all(self.H @ state <= self.h * (1 + self.tolerance)))
+
+    def vertices(self) -> Array:
+        """Corners (v, n) in the units of the states; of two states counter-clockwise.
+
+        Raises
+        ------
+        InputError
+            When the set is unbounded, or has more than 6 states.
+        """
+        n = self.H.shape[1]
+        if n > _MOST_STATES:
+            raise InputError("terminal set", f"has {n} states", f"corners: {_MOST_STATES} at most")
+        return corners(self.H / self.h[:, None])
+
+    def project(self, first: int, second: int) -> Array:
+        """Corners (v, 2) of its shadow on two states, by their places; counter-clockwise.
+
+        Raises
+        ------
+        InputError
+            As `vertices`.
+        """
+        return hull(self.vertices()[:, [first, second]])
+
+    def to_pytope(self) -> Any:
+        """The set as a `pytope.Polytope` in half-space form, which finds corners when asked."""
+        pytope = optional("pytope", "terminal set")
+        if not len(self.h):
+            raise InputError("terminal set", "is the whole space", "give at least one bound")
+        # pytope 0.0.4 squeezes the right side to a scalar when there is one row: state it twice.
+        twice = slice(None) if len(self.h) > 1 else [0, 0]
+        return pytope.Polytope(np.array(self.H[twice]), np.array(self.h[twice]))
 
 
 @dataclass(frozen=True)
@@ -175,13 +219,6 @@ def maximal_invariant_set(
         rows=rows,
         bases=bases,
     )
-
-
-@checked
-def contains(terminal: TerminalSet, x: ArrayLike) -> bool:
-    """Whether the state x (n,) is in the set, within its tolerance of each bound."""
-    state = finite_array("x", x, (terminal.H.shape[1],))
-    return bool(np.all(terminal.H @ state <= terminal.h * (1 + terminal.tolerance)))
 
 
 def _check(plant: Plant, F: Array, bounds: Bounds, tolerance: float, max_steps: int) -> None:

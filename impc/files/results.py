@@ -6,17 +6,18 @@ reads results sees from it whether it knows them.
 
 from __future__ import annotations
 
+import json
 import os
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from impc.checking import checked
 from impc.errors import DataError
 from impc.files.disk import require_ordinary
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     import pandas as pd
 
 #: Of the files that are written now. Before the first one that has a number there were others.
@@ -81,47 +82,27 @@ class ResultFile(msgspec.Struct, frozen=True):
         return pd.DataFrame(found[name]["table"])
 
 
-@checked
-def read_result(path: str | Path) -> ResultFile:
-    """Read the result of a command, from its folder or its result.json.
-
-    Parameters
-    ----------
-    path : str or Path
-        The folder or the file.
-
-    Raises
-    ------
-    DataError
-        When there is none, it is damaged, or another version of impc wrote it.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> import control
-    >>> import impc
-    >>> plant = impc.Plant(control.ss([[0.9]], [[1]], [[1]], 0, 1))
-    >>> bounds = impc.Bounds(plant, u_min=-0.3, u_max=0.3)
-    >>> truth = impc.Controller(plant, impc.Weights(1, 1), bounds, horizon=3)
-    >>> trial = impc.Recording(plant, truth.simulate([1.0], steps=20).x)
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     files = impc.report(impc.estimate(impc.Problem(plant, bounds, 3, [trial])), folder)
-    ...     found = impc.read_result(folder)
-    >>> found.methods["inverse_mpc"].status, found.content["states"]
-    ('explained', ['x[0]'])
-    """
-    place = Path(path)
-    file = place / "result.json" if os.path.isdir(place) else place
+def read_content(file: Path) -> dict[str, Any]:
+    """What stands in a file of JSON that this version of impc wrote."""
     try:
         require_ordinary(file)
-        content = msgspec.json.decode(file.read_bytes(), type=dict[str, Any])
-    except (OSError, msgspec.DecodeError, RecursionError) as error:
+        content = json.loads(file.read_bytes())
+    except (OSError, ValueError, RecursionError) as error:
         raise _refused(
             file, f"is no result ({getattr(error, 'strerror', None) or error})"
         ) from None
+    if not isinstance(content, dict):
+        raise _refused(file, "is no result (no names at its top)")
     schema = content.get("schema", 1)
     if schema != SCHEMA:
         raise _refused(file, f"is of another version of impc (schema {schema}, not {SCHEMA})")
+    return content
+
+
+def read_result(place: Path) -> ResultFile:
+    """The result of a command, from its folder or its result.json."""
+    file = place / "result.json" if os.path.isdir(place) else place
+    content = read_content(file)
     try:
         return msgspec.convert({**content, "content": content}, ResultFile)
     except msgspec.ValidationError as error:

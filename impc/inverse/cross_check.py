@@ -17,14 +17,14 @@ import numpy as np
 from impc.checking import replace
 from impc.errors import ImpcError
 from impc.inverse.gain_search import refine_gain
-from impc.inverse.groundwork import NaturalUnits
-from impc.inverse.methods import estimate_all, estimate_of
+from impc.inverse.methods import METHODS, of_fitted_gain, output_penalty
 from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.residuals import misfit_or_reason
 
 if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.inverse.estimates import Estimate
+    from impc.inverse.problem import Problem
 
 # Misfits that differ by less, of themselves, are the same.
 _SAME = 1e-3
@@ -32,28 +32,26 @@ _SAME = 1e-3
 _WEIGHTS = ("inverse_mpc", "inverse_lqr_output")
 
 
-def cross_checked(
-    ground: NaturalUnits, found: dict[str, Estimate]
-) -> tuple[NaturalUnits, dict[str, Estimate]]:
+def cross_checked(problem: Problem, found: dict[str, Estimate]) -> dict[str, Estimate]:
     """The estimates of some methods, inverse MPC among them, none beaten in its own model."""
     own = found["inverse_mpc"]
     winner = _winner(own, found)
     if winner is not None:
         again = _begun_again(own, winner)
         if again.misfit < own.misfit:
-            ground = NaturalUnits(
-                ground.problem, fitted=again, feedback_states=ground.feedback_states
-            )
-            found = estimate_all(ground, list(found))
+            found = {
+                name: again if name == "inverse_mpc" else METHODS[name].estimate(problem, again)
+                for name in found
+            }
     checked = {}
     for name, first in found.items():
         last, winner = first, _winner(first, found)
         if winner is not None and name != "inverse_mpc":
-            last = _searched_again(ground, first, winner)
+            last = _searched_again(problem, found["inverse_mpc"], first, winner)
             winner = _winner(last, found)
         beaten = "" if winner is None else winner.method
         checked[name] = replace(last, fit=replace(last.fit, beaten=beaten))
-    return ground, checked
+    return checked
 
 
 def _winner(own: Estimate, found: dict[str, Estimate]) -> Estimate | None:
@@ -82,14 +80,15 @@ def _begun_again(own: Estimate, winner: Estimate) -> Estimate:
         return own
 
 
-def _searched_again(ground: NaturalUnits, own: Estimate, winner: Estimate) -> Estimate:
+def _searched_again(problem: Problem, start: Estimate, own: Estimate, winner: Estimate) -> Estimate:
     """The method's own search from another method's answer; the better of both."""
     try:
         if own.method == "feedback_gain":
-            posed = replace(own.problem, unknown_start=ground.problem.unknown_start)
-            again = estimate_of(ground, own.method, refine_gain(posed, *_pair(winner), prior=1.0))
+            posed = replace(own.problem, unknown_start=problem.unknown_start)
+            gain = refine_gain(posed, *_pair(winner), prior=1.0)
+            again = of_fitted_gain(problem, start, gain)
         else:
-            again = estimate_of(ground, own.method, ground.output(winner.stage_weights))
+            again = output_penalty(problem, start, winner.stage_weights)
     except ImpcError:
         return own
     return again if again.misfit < own.misfit else own

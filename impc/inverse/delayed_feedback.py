@@ -9,12 +9,11 @@ predicts over the delay is not in this family, and the parameters make up for it
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.arrays import Array, BoolArray, Frozen, frozen
+from impc.arrays import Array, BoolArray
 from impc.errors import InputError, SolverError
 from impc.inverse.coordinates import Coordinates, descend
 from impc.inverse.gain_search import regulators
@@ -33,17 +32,11 @@ _SCALES = np.geomspace(1.0, 1e-3, 25)
 _FINE, _EVALUATIONS = 0.01, 60
 
 
-@dataclass(frozen=True)
-class PreliminaryGain(Frozen):
-    """Result of `preliminary_gain`."""
+def preliminary_gain(problem: Problem, states: Sequence[str]) -> tuple[Array, Problem]:
+    """Fit gains on some states, with initial states and physical parameters, without bounds.
 
-    K: Array  # (m, n), zero outside the chosen states
-    problem: Problem  # Without bounds, at the initial states and parameters found
-    misfit: float  # 2-norm of the scaled residual
-
-
-def preliminary_gain(problem: Problem, states: Sequence[str]) -> PreliminaryGain:
-    """Fit gains on some states, with initial states and physical parameters, without bounds."""
+    The gain (m, n), zero on the other states, and the problem at what was found with it.
+    """
     loose = problem.without_bounds()
     names = problem.plant.states
     unknown = [name for name in states if name not in names]
@@ -56,8 +49,7 @@ def preliminary_gain(problem: Problem, states: Sequence[str]) -> PreliminaryGain
     space = Coordinates(loose, centre, np.eye(problem.plant.m), _basis(loose.plant, centre, kept))
     z, _, _ = descend(space, space.at_gain(gain), Stop(_FINE, 0.0, _EVALUATIONS))
     found = space.unpack(z)
-    misfit = float(np.linalg.norm(space.at(z).residual))
-    return PreliminaryGain(frozen(np.where(kept, found.K, 0.0)), found.problem, misfit)
+    return np.where(kept, found.K, 0.0), found.problem
 
 
 def _basis(plant: Plant, gain: Array, kept: BoolArray) -> Array:

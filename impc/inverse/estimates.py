@@ -6,8 +6,10 @@ The unknowns are those of docs/theory.md, section 6; what one more function says
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from enum import Enum
+from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,13 +20,17 @@ from impc.control.controller import Controller
 from impc.control.simulation import Status as SampleStatus
 from impc.errors import SolverError, WeightsError
 from impc.inverse.least_squares import trial_span
-from impc.inverse.problem import controller_for, misfit, recorded_size, simulated
+from impc.inverse.problem import controller_for, explains, misfit, recorded_size, simulated
 from impc.inverse.residuals import evaluate
 from impc.inverse.solution_set import natural_coordinates
 from impc.model.riccati import stabilises
-from impc.model.weights import Weights
+from impc.model.weights import Weights, normalised
 
 if TYPE_CHECKING:
+    import pandas as pd
+    from numpy.typing import ArrayLike
+
+    from impc.assess.weights_test import Identifiability
     from impc.control.simulation import Simulation
     from impc.inverse.problem import Problem
 
@@ -79,7 +85,7 @@ class Goodness:
     beaten: str = ""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)  # itself alone: so what is derived from one may be cached
 class Estimate(Frozen):
     """A controller that a method found behind recordings.
 
@@ -121,11 +127,16 @@ class Estimate(Frozen):
     >>> bounds = impc.Bounds(plant, u_min=-0.3, u_max=0.3)
     >>> truth = impc.Controller(plant, impc.Weights(1, 1), bounds, horizon=3)
     >>> trial = impc.Recording(plant, truth.simulate([1.0], steps=20).x)
-    >>> found = impc.estimate(impc.Problem(plant, bounds, 3, [trial]))
+    >>> found = impc.fit(impc.Problem(plant, bounds, 3, [trial]))
+    >>> found
+    <Estimate inverse_mpc: explained, misfit 0>
     >>> found.status.sentence
     'The weights reproduce the recordings to 1e-9 of them.'
-    >>> bool(abs(found.gain - truth.K) < 1e-9)
-    True
+    >>> found.intervals().round(3)
+            name unit  value    low   high  identified
+    0  K.u[0].x[0]   SI  0.553  0.553  0.553        True
+    >>> found.vaf, found.outputs[0].shape
+    (array([100.]), (21, 1))
     """
 
     method: str
@@ -149,6 +160,9 @@ class Estimate(Frozen):
         misfit = f"Misfit {self.misfit:.3g}."
         said = (self.status.sentence, ended, *self.doubts, misfit, gain)
         return f"{self.method}: {' '.join(part for part in said if part)}"
+
+    def __repr__(self) -> str:
+        return f"<Estimate {self.method}: {self.status.value}, misfit {self.misfit:.3g}>"
 
     @property
     def doubts(self) -> tuple[str, ...]:
@@ -242,10 +256,149 @@ class Estimate(Frozen):
         """
         return controller_for(self.problem, self.gain, self.metric)
 
+    @cached_property
+    def simulations(self) -> tuple[Simulation, ...]:
+        """The recorded trials under this controller, one each."""
+        return tuple(simulated(self.problem, self.gain, self.metric))
+
+    @property
+    def time(self) -> tuple[Array, ...]:
+        """Of the samples of each trial, s; so are the next ones, a trial each."""
+        return tuple(run.time for run in self.simulations)
+
+    @property
+    def states(self) -> tuple[Array, ...]:
+        """Simulated states (samples, n)."""
+        return tuple(run.states for run in self.simulations)
+
+    @property
+    def outputs(self) -> tuple[Array, ...]:
+        """Simulated outputs (samples, p)."""
+        return tuple(run.outputs for run in self.simulations)
+
+    @property
+    def inputs(self) -> tuple[Array, ...]:
+        """Simulated inputs (samples - 1, m)."""
+        return tuple(run.inputs for run in self.simulations)
+
+    def frame(self) -> pd.DataFrame:
+        """All trials as one table with the names of the signals; the first column counts trials."""
+        import pandas as pd  # noqa: PLC0415  # a third of a second
+
+        frames = [run.frame() for run in self.simulations]
+        found = pd.concat(dict(enumerate(frames)), names=["trial"]).reset_index("trial")
+        found.attrs = frames[0].attrs
+        return found
+
+    @property
+    def vaf(self) -> Array:
+        """Variance accounted for (3.24), over all trials, % (p,)."""
+        from impc.assess.assessments import judge  # noqa: PLC0415  # as all below: where used
+
+        return judge(self, self.problem.bounds).vaf
+
+    def intervals(self) -> pd.DataFrame:
+        """The gain, and fitted parameters, with 95 % intervals, a row each.
+
+        Columns `name`, `unit`, `value`, `low`, `high` and `identified`: whether the recordings
+        determine this number by itself. The value is that of least squares along what they
+        determine (docs/fitting.md), and may differ from K, which is that of weights.
+        """
+        from impc.assess.printed_gain import interval_table  # noqa: PLC0415
+
+        return interval_table(self)
+
+    def identifiability(self) -> Identifiability:
+        """How many directions of the weights the recordings determine (`impc.identifiability`)."""
+        from impc.assess.weights_test import identifiability  # noqa: PLC0415
+
+        return identifiability(self.problem, self.stage_weights)
+
+    def simulate(
+        self, x0: ArrayLike, steps: int | None = None, disturbance: ArrayLike | None = None
+    ) -> Simulation:
+        """Simulate the controller found from another state, as `Controller.simulate`."""
+        return self.controller().simulate(x0, steps=steps, disturbance=disturbance)
+
+    def summary(self) -> str:
+        """Method, problem, agreement, gain with intervals, weights and doubts as text."""
+        from impc.reporting.estimate_text import summary  # noqa: PLC0415
+
+        return summary(self)
+
+    def plot(self, trial: int = 0, axes: Any = None) -> np.ndarray[Any, Any]:
+        """Draw the outputs and inputs of a trial, counted from 0; returns matplotlib axes."""
+        from impc.reporting.estimate_text import plot  # noqa: PLC0415
+
+        return plot(self, trial, axes)
+
+    def save(self, path: str | Path) -> Path:
+        """Write the estimate and its problem into a file (JSON), which `impc.load` reads."""
+        from impc.files.saved_estimates import save_estimate  # noqa: PLC0415
+
+        return save_estimate(self, Path(path))
+
+    def _repr_html_(self) -> str:
+        from impc.reporting.estimate_text import as_html  # noqa: PLC0415
+
+        return as_html(self)
+
     def _found(self, matrix: Array | None) -> Array:
         if matrix is None:
             raise SolverError(self.method, f"found no gain: {self.reason}", "try another method")
         return matrix
+
+
+def simulated_estimate(
+    method: str,
+    problem: Problem,
+    K: Array,
+    S: Array,
+    *,
+    noise: float,
+    weights: Weights | None = None,
+    metrics: Array | None = None,
+    reason: str = "",
+    evaluations: int = 0,
+    settled: bool = True,
+    lone: bool = False,
+    prices: Array | None = None,
+) -> Estimate:
+    """What a method found, simulated; the last arguments are fields of `Estimate`."""
+    misfit, fit = goodness(problem, K, S)
+    if weights is None:
+        status = Status.GAIN_ONLY
+    elif explains(problem, misfit) and not reason:
+        status = Status.EXPLAINED
+    else:
+        status = Status.SETTLED if settled else Status.STOPPED
+    return Estimate(
+        method,
+        problem,
+        frozen(K),
+        frozen(S),
+        None if weights is None else normalised(weights),
+        frozen(S[None] if metrics is None else metrics),
+        misfit,
+        noise,
+        status,
+        reason,
+        evaluations,
+        0.0,
+        replace(fit, lone=lone),
+        None if prices is None else frozen(prices),
+    )
+
+
+def no_estimate(method: str, problem: Problem, reason: str) -> Estimate:
+    """A method that ended without a gain, and why."""
+    m, none = problem.plant.m, float("nan")
+    metrics = frozen(np.zeros((0, m, m)))
+    nothing = Goodness(white=True, softened=0, samples=0, rank=0)
+    status = Status.NONE
+    return Estimate(
+        method, problem, None, None, None, metrics, none, none, status, reason, 0, 0.0, nothing
+    )
 
 
 def goodness(problem: Problem, gain: Array, metric: Array) -> tuple[float, Goodness]:
@@ -287,49 +440,3 @@ def _is_white(problem: Problem, runs: list[Simulation]) -> bool:
     squares = np.maximum(np.sum(first**2, axis=0), 1e-300)
     correlation = np.sum(first * second, axis=0) / squares
     return bool(np.all(np.abs(correlation) <= max(_WHITE / np.sqrt(len(first)), _LEAST)))
-
-
-def encode_estimate(estimate: Estimate) -> dict[str, Any]:
-    """Values that Python's JSON keeps to the last digit; the problem itself is not among them."""
-    given = estimate.weights
-    return {
-        "method": estimate.method,
-        "starts": estimate.problem.starts.tolist(),
-        "logarithms": estimate.problem.logarithms.tolist(),
-        "K": None if estimate.K is None else estimate.K.tolist(),
-        "S": None if estimate.S is None else estimate.S.tolist(),
-        "Q": None if given is None else given.Q.tolist(),
-        "R": None if given is None else given.R.tolist(),
-        "metrics": estimate.metrics.tolist(),
-        "misfit": estimate.misfit,
-        "noise": estimate.noise,
-        "status": estimate.status.value,
-        "reason": estimate.reason,
-        "evaluations": estimate.evaluations,
-        "seconds": estimate.seconds,
-        "fit": asdict(estimate.fit),
-        "terminal_set": bool(estimate.problem.terminal_set),
-        "prices": None if estimate.prices is None else estimate.prices.tolist(),
-    }
-
-
-def decode_estimate(seen: Problem, kept: dict[str, Any]) -> Estimate:
-    """Make an estimate again."""
-    m = seen.plant.m
-    posed = replace(seen, terminal_set=kept["terminal_set"])
-    return Estimate(
-        kept["method"],
-        posed.at(np.array(kept["starts"]), np.array(kept["logarithms"], dtype=np.float64)),
-        None if kept["K"] is None else frozen(kept["K"]),
-        None if kept["S"] is None else frozen(kept["S"]),
-        None if kept["Q"] is None else Weights(kept["Q"], kept["R"]),
-        frozen(np.reshape(kept["metrics"], (-1, m, m))),
-        kept["misfit"],
-        kept["noise"],
-        Status(kept["status"]),
-        kept["reason"],
-        kept["evaluations"],
-        kept["seconds"],
-        Goodness(**kept["fit"]),
-        None if kept["prices"] is None else frozen(kept["prices"]),
-    )

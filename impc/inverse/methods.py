@@ -1,13 +1,19 @@
 """Every method for the weights behind recordings, by the name that it has everywhere.
 
+A method is a function (problem, start) -> estimate. It starts from what inverse MPC found: initial
+states and physical parameters are its, every search begins at its weights, so that none loses by
+where it began, and each method's own gain has its initial states fitted again. All work in natural
+coordinates, and weigh squared misfits against the noise that the best gain leaves
+(docs/fitting.md). Table 3.1 as printed, in the units of the plant, is `impc.inverse.table31`.
+
 The names are those in result.json, the labels those of tables and figures; commands and tests
-choose from `METHODS`. In which units a method works, and from where it starts, is its `Groundwork`:
-Table 3.1 in the units of the plant, or docs/fitting.md in natural coordinates.
+choose from `METHODS`.
 """
 
 from __future__ import annotations
 
 import functools
+import logging
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,22 +21,33 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.arrays import frozen
 from impc.checking import checked, replace
-from impc.errors import ImpcError, InputError
+from impc.errors import ImpcError, InputError, WeightsError
 from impc.inverse.delayed_feedback import preliminary_gain
-from impc.inverse.estimates import Estimate, Goodness, Status, goodness
-from impc.inverse.gain_search import GainFit
-from impc.inverse.groundwork import Found, Groundwork, NaturalUnits, PlantUnits, regulator
-from impc.inverse.problem import EXPLAINED, recorded_size
+from impc.inverse.equivalent_weights import least_condition_weights
+from impc.inverse.estimates import Estimate, no_estimate, simulated_estimate
+from impc.inverse.explaining_weights import weights_behind
+from impc.inverse.gain_search import refine_gain
+from impc.inverse.inverse_lqr import inverse_lqr_gradient, inverse_lqr_lmi
+from impc.inverse.natural_search import in_plant_units, inverse_mpc_natural
+from impc.inverse.noisy_fit import fit_controller, free_gain, noise_of, with_fitted_starts
+from impc.inverse.proximal_search import auxiliary_weights
+from impc.inverse.solution_set import gain_fibre, natural_coordinates
 from impc.inverse.structured_fit import fit_structured
 from impc.model.bounds import Bounds
-from impc.model.weights import normalised
+from impc.model.plant import change_coordinates
+from impc.model.riccati import solve_lqr, stabilises
+from impc.model.weights import Weights
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
+    from impc.arrays import Array
+    from impc.inverse.gain_search import GainFit
     from impc.inverse.problem import Problem
+    from impc.model.plant import Plant
+
+_LOG = logging.getLogger("impc")
+# Share by which weights may miss the recordings by more than the gain that they were found for.
+_AS_GOOD = 1e-3
 
 
 @dataclass(frozen=True)
@@ -42,69 +59,156 @@ class Method:
     sentence: str  # For readers who do not know it
     # The problem as posed -> as the method sees it: inverse LQR knows no bounds
     sees: Callable[[Problem], Problem]
-    find: Callable[[Groundwork], Found | GainFit | Estimate]  # What it finds on a `Groundwork`
+    # The problem as posed, the estimate of inverse MPC -> its own
+    find: Callable[[Problem, Estimate], Estimate]
 
-    def estimate(self, ground: Groundwork) -> Estimate:
-        """Run the method; one that ends without a gain says why in its estimate.
-
-        Parameters
-        ----------
-        ground : Groundwork
-            What it starts from; its making is not in the method's time.
-        """
+    def estimate(self, problem: Problem, start: Estimate) -> Estimate:
+        """Run the method; one that ends without a gain says why in its estimate."""
         started = time.perf_counter()
         try:
-            found = self.find(ground)
+            found = self.find(problem, start)
         except ImpcError as error:
-            seen = self.sees(ground.known)
-            return _nothing(self.name, seen, str(error), time.perf_counter() - started)
-        if isinstance(found, Estimate):
-            return found
-        return estimate_of(ground, self.name, found, started)
+            found = no_estimate(self.name, self.sees(start.problem.known()), str(error))
+        return replace(found, seconds=time.perf_counter() - started)
 
 
-def estimate_of(
-    ground: Groundwork, name: str, found: Found | GainFit, started: float | None = None
+def of_gain(
+    name: str,
+    problem: Problem,
+    start: Estimate,
+    K: Array,
+    S: Array | None = None,
+    *,
+    seen: Problem | None = None,
+    weights: Weights | None = None,
+    reason: str = "",
+    evaluations: int = 0,
 ) -> Estimate:
-    """What a method found, simulated: its estimate."""
-    if isinstance(found, GainFit):
-        found = Found(np.array(found.K), None, found.evaluations, problem=found.problem.known())
-    S = ground.metric if found.S is None else found.S
-    settled = ground.settle(found.problem or METHODS[name].sees(ground.known), found.K, S)
-    seconds = 0.0 if started is None else time.perf_counter() - started
-    misfit, fit = goodness(settled, found.K, S)
-    return Estimate(
+    """The estimate of a method from its gain (m, n), metric (m, m) and weights.
+
+    Without a metric it has that of inverse MPC; `seen` is the problem at initial states and
+    parameters of its own.
+    """
+    metric = start.metric if S is None else S
+    settled = METHODS[name].sees(start.problem.known()) if seen is None else seen
+    if problem.unknown_start:
+        settled = with_fitted_starts(settled, K, metric)
+    return simulated_estimate(
         name,
         settled,
-        frozen(found.K),
-        frozen(S),
-        None if found.weights is None else normalised(found.weights),
-        frozen(S[None]),
-        misfit,
-        ground.noise,
-        _status(found, settled, misfit),
-        found.reason,
-        found.evaluations,
-        seconds,
-        fit,
+        K,
+        metric,
+        noise=start.noise,
+        weights=weights,
+        reason=reason,
+        evaluations=evaluations,
     )
 
 
-def _status(found: Found, settled: Problem, misfit: float) -> Status:
-    if found.weights is None:
-        return Status.GAIN_ONLY
-    if misfit <= EXPLAINED * recorded_size(settled):
-        return Status.EXPLAINED
-    return Status.SETTLED if found.settled else Status.STOPPED
+def of_weights(
+    name: str, problem: Problem, start: Estimate, weights: Weights | None, evaluations: int = 0
+) -> Estimate:
+    """The estimate of a method from its weights, if it has found any."""
+    if weights is None:
+        raise WeightsError("weights", "none have the feedback gain", "see the gradient method")
+    K = np.array(solve_lqr(problem.plant, weights).K)
+    return of_gain(name, problem, start, K, weights=weights, evaluations=evaluations)
 
 
-def _nothing(name: str, seen: Problem, reason: str, seconds: float) -> Estimate:
-    m, none = seen.plant.m, float("nan")
-    metrics = frozen(np.zeros((0, m, m)))
-    nothing = Goodness(white=True, softened=0, samples=0, rank=0)
-    return Estimate(
-        name, seen, None, None, None, metrics, none, none, Status.NONE, reason, 0, seconds, nothing
+def feedback_gain(problem: Problem, start: Estimate) -> Estimate:
+    """The best gain without bounds (3.12)."""
+    return of_fitted_gain(problem, start, _feedback(start))
+
+
+def of_fitted_gain(problem: Problem, start: Estimate, found: GainFit) -> Estimate:
+    """The estimate of a gain without bounds."""
+    K, seen = np.array(found.K), found.problem.known()
+    evaluations = found.evaluations
+    return of_gain("feedback_gain", problem, start, K, seen=seen, evaluations=evaluations)
+
+
+@functools.lru_cache(maxsize=4)
+def _feedback(start: Estimate) -> GainFit:
+    """That gain, which five methods share.
+
+    Searched again from where it ends: the prior is about the start, which may be far. Without
+    bounds the best gain may be unstable, of a person who saturates; it has no coordinates.
+    """
+    first = free_gain(start.problem.without_bounds(), start.stage_weights)
+    if not stabilises(start.problem.plant, np.array(first.K)):
+        return first
+    again = refine_gain(first.problem, np.array(first.K), np.array(first.S), prior=1.0)
+    return replace(again, evaluations=first.evaluations + again.evaluations)
+
+
+@functools.lru_cache(maxsize=4)
+def _coordinates(start: Estimate) -> tuple[Plant, Array, Weights, Array, Array]:
+    """Plant and feedback gain in natural coordinates, weights to start from, T and G."""
+    plant, K, own = start.problem.plant, np.array(_feedback(start).K), np.array(start.gain)
+    T, G = natural_coordinates(plant, K if stabilises(plant, K) else own)
+    natural = change_coordinates(plant, T, G)
+    target, near = (np.asarray(np.linalg.solve(G, gain @ T)) for gain in (K, own))
+    return natural, target, least_condition_weights(gain_fibre(natural, near)).weights, T, G
+
+
+def _lmi(start: Estimate) -> Weights | None:
+    """Weights with exactly that gain, if there are any."""
+    natural, target, _, T, G = _coordinates(start)
+    found = inverse_lqr_lmi(natural, target).weights
+    return None if found is None else in_plant_units(found, T, G)
+
+
+def _gradient(start: Estimate) -> Weights | None:
+    """Weights with the nearest gain."""
+    natural, target, centre, T, G = _coordinates(start)
+    found = inverse_lqr_gradient(natural, target, centre).weights
+    return None if found is None else in_plant_units(found, T, G)
+
+
+def _auxiliary(start: Estimate) -> Weights:
+    """Weights of the auxiliary problem (3.7)."""
+    natural, target, centre, T, G = _coordinates(start)
+    return in_plant_units(auxiliary_weights(natural, target, centre).weights, T, G)
+
+
+def output_penalty(problem: Problem, start: Estimate, begin: Weights | None = None) -> Estimate:
+    """(3.16), from some weights, or those of inverse MPC."""
+    loose, noise = start.problem.known().without_bounds(), noise_of(_feedback(start))
+    found = inverse_mpc_natural(loose, begin or start.stage_weights, noise)
+    name = "inverse_lqr_output"
+    return of_weights(name, problem, start, found.weights, found.evaluations)
+
+
+def _reduced(problem: Problem, start: Estimate) -> Estimate:
+    """Gain under the bounds, then weights with that gain."""
+    behind = weights_behind(free_gain(start.problem.known(), start.stage_weights))
+    weights = None if behind.equivalent is None else behind.equivalent.weights
+    gain = behind.gain
+    # What the gain leaves too is noise, and no fault of the weights.
+    missed = weights is None or behind.misfit > (1 + _AS_GOOD) * gain.misfit
+    return of_gain(
+        "inverse_mpc_reduced",
+        problem,
+        start,
+        np.array(gain.K),
+        np.array(gain.S),
+        weights=weights,
+        reason=behind.reason if missed else "",
+        evaluations=gain.evaluations,
     )
+
+
+def _preliminary(problem: Problem, start: Estimate) -> Estimate:
+    K, there = preliminary_gain(problem, problem.feedback_states)
+    return of_gain("preliminary", problem, start, K, seen=there.known())
+
+
+def _structured(problem: Problem, start: Estimate) -> Estimate:
+    if problem.structure is None:
+        raise InputError(
+            "structured", "the problem names no structure", "give Problem(..., structure=...)"
+        )
+    return fit_structured(problem, problem.structure, start)
 
 
 def _as_posed(problem: Problem) -> Problem:
@@ -121,27 +225,6 @@ def _cut_off(problem: Problem) -> Problem:
     return replace(problem, bounds=limits, horizon=1, terminal_set=False)
 
 
-def _clipped(ground: Groundwork) -> Found:
-    assert isinstance(ground, NaturalUnits)  # no row of Table 3.1
-    return Found(np.array(ground.fitted.gain), ground.fitted.weights)
-
-
-def _preliminary(ground: Groundwork) -> Found | Estimate:
-    assert isinstance(ground, NaturalUnits)  # no row of Table 3.1
-    found = preliminary_gain(ground.problem, ground.feedback_states)
-    return Found(np.array(found.K), problem=found.problem.known())
-
-
-def _structured(ground: Groundwork) -> Estimate:
-    structure = ground.problem.structure
-    if structure is None:
-        raise InputError(
-            "structured", "the problem names no structure", "give Problem(..., structure=...)"
-        )
-    assert isinstance(ground, NaturalUnits)  # no row of Table 3.1
-    return fit_structured(ground.problem, structure, ground.fitted)
-
-
 _TABLE = (
     Method(
         "preliminary",
@@ -156,7 +239,7 @@ _TABLE = (
         "The fixed gain K of u = -Kx whose loop fits the outputs best (3.12). It knows no bounds "
         "and has no weights.",
         _without_bounds,
-        lambda ground: ground.feedback,
+        feedback_gain,
     ),
     Method(
         "inverse_lqr_lmi",
@@ -165,21 +248,23 @@ _TABLE = (
         "none, and for a gain fitted to noise there are none as a rule: then the program is "
         "infeasible.",
         _without_bounds,
-        lambda ground: regulator(ground, ground.lmi.weights),
+        lambda problem, start: of_weights("inverse_lqr_lmi", problem, start, _lmi(start)),
     ),
     Method(
         "inverse_lqr_gradient",
         "inverse LQR, gradient",
         "Weights whose optimal gain comes nearest to that K.",
         _without_bounds,
-        lambda ground: regulator(ground, ground.gradient.weights),
+        lambda problem, start: of_weights("inverse_lqr_gradient", problem, start, _gradient(start)),
     ),
     Method(
         "inverse_lqr_auxiliary",
         "inverse LQR, gain penalty (3.7)",
         "The same, with a price on the condition number that keeps the weights away from singular.",
         _without_bounds,
-        lambda ground: regulator(ground, ground.auxiliary),
+        lambda problem, start: of_weights(
+            "inverse_lqr_auxiliary", problem, start, _auxiliary(start)
+        ),
     ),
     Method(
         "inverse_lqr",
@@ -187,21 +272,25 @@ _TABLE = (
         "Weights with exactly that K where there are any, otherwise those of the gain penalty "
         "(3.7): where Table 3.1 starts inverse MPC.",
         _without_bounds,
-        lambda ground: regulator(ground, ground.lmi.weights or ground.auxiliary),
+        lambda problem, start: of_weights(
+            "inverse_lqr", problem, start, _lmi(start) or _auxiliary(start)
+        ),
     ),
     Method(
         "inverse_lqr_output",
         "inverse LQR, output penalty (3.16)",
         "Weights whose optimal gain, without bounds, fits the outputs themselves best.",
         _without_bounds,
-        lambda ground: ground.output(),
+        output_penalty,
     ),
     Method(
         "clipped_lqr",
         "LQR of inverse MPC, clipped",
         "The regulator of inverse MPC, its command cut off at the bounds.",
         _cut_off,
-        _clipped,
+        lambda problem, start: of_gain(
+            "clipped_lqr", problem, start, np.array(start.gain), weights=start.weights
+        ),
     ),
     Method(
         "inverse_mpc_reduced",
@@ -209,14 +298,14 @@ _TABLE = (
         "First the gain of the bounded controller that fits the outputs best, then the weights of "
         "least condition number that have this gain, if any.",
         _as_posed,
-        lambda ground: ground.reduced(),
+        _reduced,
     ),
     Method(
         "inverse_mpc",
         "inverse MPC, direct (3.6)",
         "Weights whose controller, with its bounds, fits the outputs best.",
         _as_posed,
-        lambda ground: ground.inverse_mpc(),
+        lambda problem, start: fit_controller(problem, start.stage_weights),
     ),
     Method(
         "structured",
@@ -245,21 +334,27 @@ def method_named(name: str) -> Method:
 
 
 @checked
-def estimate(
+def fit(
     problem: Problem,
     method: str = "inverse_mpc",
-    progress: Callable[[str], None] | None = None,
+    *,
+    start: Estimate | Weights | None = None,
 ) -> Estimate:
-    """Find the controller behind recordings by one method.
+    """Find the controller behind recordings.
+
+    Each stage is named in the log "impc" when it is done; logging.basicConfig(level="INFO") shows
+    it.
 
     Parameters
     ----------
     problem : Problem
     method : str
-        A key of `METHODS`.
-    progress : callable, optional
-        Told the name of each stage when it is done, such as `print`: every method but inverse MPC
-        begins with it.
+        A key of `METHODS`: "inverse_mpc", or one to compare it with, such as "feedback_gain",
+        "inverse_lqr_lmi", "inverse_lqr_gradient", "inverse_lqr_output" or "clipped_lqr".
+    start : Estimate or Weights, optional
+        Where the search begins: an earlier estimate of inverse MPC, of the same recordings or
+        others, or weights. By default several starts are tried. The methods beside inverse MPC
+        begin with its estimate, which is fitted first where none is given.
 
     Raises
     ------
@@ -276,31 +371,29 @@ def estimate(
     >>> bounds = impc.Bounds(plant, u_min=-1, u_max=1)
     >>> truth = impc.Controller(plant, impc.Weights([[1, 0], [0, 1]], 1), bounds, horizon=3)
     >>> trial = impc.Recording(plant, truth.simulate([1, 3], steps=20).x)
-    >>> found = impc.estimate(impc.Problem(plant, bounds, 3, [trial]), "inverse_mpc")
+    >>> found = impc.fit(impc.Problem(plant, bounds, 3, [trial]))
     >>> found.weights.Q.round(6) + 0.0
     array([[1., 0.],
            [0., 1.]])
     """
-    ground, name = NaturalUnits(problem), method_named(method).name
-    if progress is not None and name != "inverse_mpc":
-        _ = ground.fitted
-        progress("inverse_mpc")
-    found = estimate_all(ground, [name])[name]
-    if progress is not None:
-        progress(name)
+    chosen, first = method_named(method), start
+    if chosen.name == "inverse_mpc" or not isinstance(first, Estimate):
+        started = time.perf_counter()
+        first = fit_controller(*_begun(problem, start))
+        first = replace(first, seconds=time.perf_counter() - started)
+        _LOG.info("%s", first)
+    if chosen.name == "inverse_mpc":
+        return first
+    found = chosen.estimate(problem, first)
+    _LOG.info("%s", found)
     return found
 
 
-def estimate_all(
-    ground: Groundwork,
-    names: Sequence[str],
-) -> dict[str, Estimate]:
-    """Run methods on the same recordings."""
-    found = {}
-    for name in names:
-        make = functools.partial(METHODS[name].estimate, ground)
-        if isinstance(ground, PlantUnits) or name == "inverse_mpc":
-            found[name] = make()
-        else:
-            found[name] = ground.remember(name, make)
-    return found
+def _begun(problem: Problem, start: Estimate | Weights | None) -> tuple[Problem, Weights | None]:
+    """The problem and the weights from which a search begins."""
+    if not isinstance(start, Estimate):
+        return problem, start
+    there, same = start.problem, start.problem.starts.shape == problem.starts.shape
+    if problem.unknown_start and same and there.logarithms.shape == problem.logarithms.shape:
+        problem = problem.at(np.array(there.starts), np.array(there.logarithms))
+    return problem, start.stage_weights

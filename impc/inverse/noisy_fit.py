@@ -25,7 +25,7 @@ from impc.checking import checked, replace
 from impc.errors import InputError, SolverError, WeightsError
 from impc.inverse.coordinates import Coordinates, start_unit
 from impc.inverse.equivalent_weights import least_condition_weights
-from impc.inverse.estimates import Estimate, Status, goodness
+from impc.inverse.estimates import Estimate, simulated_estimate
 from impc.inverse.explaining_weights import metric_family, unidentified_metrics, weights_behind
 from impc.inverse.gain_search import FEW, GainFit, fit_gain, refine_gain, regulators
 from impc.inverse.inverse_lqr import inverse_lqr_gradient
@@ -209,24 +209,17 @@ def _finish(
     metrics = _metrics(problem, solve_lqr(problem.plant, weights))
     weights = _by_convention(problem.plant, weights, metrics)
     solution = solve_lqr(problem.plant, weights)
-    K, S = np.array(solution.K), np.array(solution.S)
-    left, fit = goodness(problem, K, S)
-    explained = left <= EXPLAINED * recorded_size(problem)
-    status = Status.SETTLED if converged else Status.STOPPED
-    return Estimate(
-        method="inverse_mpc",
-        problem=problem,
-        K=solution.K,
-        S=solution.S,
+    return simulated_estimate(
+        "inverse_mpc",
+        problem,
+        np.array(solution.K),
+        np.array(solution.S),
         weights=weights,
-        metrics=frozen(metrics),
-        misfit=left,
+        metrics=metrics,
         noise=noise_of(free),
-        status=Status.EXPLAINED if explained else status,
-        reason="",
         evaluations=free.evaluations + evaluations,
-        seconds=0.0,
-        fit=replace(fit, lone=free.lone),
+        settled=converged,
+        lone=free.lone,
     )
 
 

@@ -55,7 +55,7 @@ class Problem(Value):
     horizon : int
         N, in samples.
     recordings : sequence of Recording
-    terminal_set, softening, unknown_start, family, structure, solver
+    terminal_set, softening, unknown_start, family, structure, feedback_states, solver
         See the attributes.
     output_scale : array_like, optional
         (p,), positive; by default the root-mean-square of each output over all recordings, so
@@ -69,7 +69,7 @@ class Problem(Value):
         N, in samples.
     recordings : tuple of Recording
     terminal_set : bool or None
-        Whether the controller ends in its maximal invariant set. None, the default: `estimate` and
+        Whether the controller ends in its maximal invariant set. None, the default: `impc.fit` and
         `impc fit` decide by which explains the recordings better, and the problem of their answer
         says which; everything else takes None for False.
     softening : float
@@ -88,6 +88,8 @@ class Problem(Value):
     structure : Structure or None
         What may be costed, for the method "structured" and the gain of a person (`fit_person`);
         other methods do not ask.
+    feedback_states : tuple of str
+        States on which the preliminary gain (3.20) acts, for the method "preliminary".
     solver : str
         What solves the controller's quadratic programs in every simulation of a search, see
         `Controller`.
@@ -127,6 +129,7 @@ class Problem(Value):
     family: PlantFamily | None
     logarithms: Array
     structure: Structure | None
+    feedback_states: tuple[str, ...]
     solver: str
 
     @checked(horizon=(1, LONGEST_HORIZON), output_scale="p")
@@ -143,6 +146,7 @@ class Problem(Value):
         unknown_start: bool | None = None,
         family: PlantFamily | None = None,
         structure: Structure | None = None,
+        feedback_states: Sequence[str] = (),
         solver: str = COMPILED,
     ) -> None:
         plant.require_discrete()
@@ -166,6 +170,7 @@ class Problem(Value):
             family=family,
             logarithms=frozen(np.zeros(0 if family is None else len(family.names))),
             structure=structure,
+            feedback_states=tuple(feedback_states),
             solver=require_solver(solver),
         )
 
@@ -272,6 +277,11 @@ def follows_plant(plant: Plant, recordings: Sequence[Recording]) -> bool:
         rest = x[1:] - x[:-1] @ plant.A.T - trial.disturbance[:-1] @ plant.E.T
         missed, size = missed + float(np.sum((rest @ left) ** 2)), size + float(np.sum(x**2))
     return missed <= _EXACT**2 * size
+
+
+def explains(problem: Problem, misfit: float) -> bool:
+    """Whether a misfit is at most 1e-9 of the recorded outputs."""
+    return misfit <= EXPLAINED * recorded_size(problem)
 
 
 class _Fitted(Protocol):

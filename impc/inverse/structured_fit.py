@@ -15,23 +15,21 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
-import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.optimize
 
-from impc.arrays import Array, frozen
+from impc.arrays import Array
 from impc.checking import replace
 from impc.errors import SolverError, WeightsError
 from impc.inverse.coordinates import Coordinates
-from impc.inverse.estimates import Estimate, Status, goodness
+from impc.inverse.estimates import Estimate, simulated_estimate
 from impc.inverse.problem import EXPLAINED, recorded_size, simulated
 from impc.inverse.residuals import misfit_or_reason
 from impc.inverse.structured_search import StructuredEnd, regulator_slopes, search_from
 from impc.model.riccati import solve_lqr
-from impc.model.weights import normalised
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -80,7 +78,6 @@ def fit_structure(
 
 def fit_structured(problem: Problem, structure: Structure, near: Estimate) -> Estimate:
     """Fit a structure from an estimate that fits, with its initial states and parameters."""
-    started = time.perf_counter()
     posed = problem.at(np.array(near.problem.starts), np.array(near.problem.logarithms))
     end = fit_structure(posed, structure, np.array(near.gain), np.array(near.metric))
     given = np.array(problem.logarithms)
@@ -91,7 +88,7 @@ def fit_structured(problem: Problem, structure: Structure, near: Estimate) -> Es
             spent = end.evaluations + again.evaluations
             best = min(end, again, key=lambda one: one.misfit)
             end = dataclasses.replace(best, evaluations=spent)
-    return structured_estimate(posed, structure, end, time.perf_counter() - started)
+    return structured_estimate(posed, structure, end)
 
 
 def feature_sizes(problem: Problem, structure: Structure, gain: Array, metric: Array) -> Array:
@@ -205,26 +202,16 @@ def _ranked(problem: Problem, structure: Structure, starts: Sequence[Array]) -> 
     return [prices for _, prices in usable]
 
 
-def structured_estimate(
-    problem: Problem, structure: Structure, end: StructuredEnd, seconds: float = 0.0
-) -> Estimate:
-    """The end of a search as the estimate of the method "structured"; `seconds` in s."""
-    _, fit = goodness(end.problem, np.array(end.K), np.array(end.S))
-    explained = end.misfit <= EXPLAINED * recorded_size(problem)
-    settled = Status.SETTLED if end.settled else Status.STOPPED
-    return Estimate(
-        method="structured",
-        problem=replace(end.problem, structure=structure),
-        K=end.K,
-        S=end.S,
-        weights=normalised(structure.weights(np.array(end.prices))),
-        metrics=frozen(np.array(end.S)[None]),
-        misfit=end.misfit,
+def structured_estimate(problem: Problem, structure: Structure, end: StructuredEnd) -> Estimate:
+    """The end of a search as the estimate of the method "structured"."""
+    return simulated_estimate(
+        "structured",
+        replace(end.problem, structure=structure),
+        np.array(end.K),
+        np.array(end.S),
+        weights=structure.weights(np.array(end.prices)),
         noise=max(end.misfit, EXPLAINED * recorded_size(problem)),
-        status=Status.EXPLAINED if explained else settled,
-        reason="",
         evaluations=end.evaluations,
-        seconds=seconds,
-        fit=fit,
-        prices=end.prices,
+        settled=end.settled,
+        prices=np.array(end.prices),
     )

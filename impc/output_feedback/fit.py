@@ -157,7 +157,7 @@ def fit_person(
     >>> push = np.repeat([1.0, -1.0, 0.0, 1.0, 0.0, -1.0, 1.0, -1.0], 50)
     >>> y = simulate_person(law, person, push, recorder=0.01).outputs
     >>> trial = impc.Recording(plant, y, push)
-    >>> found = impc.estimate(impc.Problem(plant, bounds, 3, [trial], terminal_set=False))
+    >>> found = impc.fit(impc.Problem(plant, bounds, 3, [trial], terminal_set=False))
     >>> likely = impc.fit_person(found, person)
     >>> likely.converged, bool(0.4 < likely.observer.motor[0] < 0.6)
     (True, True)

@@ -27,6 +27,9 @@ from impc.reporting.shown_units import body_sentence, signal_words
 from impc.reporting.style import drawn, journal_style
 from impc.reporting.writer import owned, write_files
 from impc.studies.charts import chart_figure, methods_chart
+from impc.studies.fit.report import fit_report
+from impc.studies.fit.settings import FitSettings
+from impc.studies.fit.subject import FitProgress, fit_recordings
 from impc.studies.methods_table import (
     column_terms,
     gain_entries,
@@ -38,6 +41,7 @@ from impc.studies.methods_table import (
 if TYPE_CHECKING:
     from impc.assess.assessments import MethodFit
 
+_OURS = "inverse_mpc"
 _CALLER = "of the program that called impc.report"
 
 
@@ -53,15 +57,20 @@ _DRAWN = 6
 
 
 @checked
-def report(estimate: Estimate | OwnPage, folder: str | Path) -> tuple[Path, ...]:
+def report(
+    estimate: Estimate | OwnPage, folder: str | Path, settings: FitSettings | None = None
+) -> tuple[Path, ...]:
     """Write the page of an estimate, its figures, tables and result.json into a folder.
 
     Parameters
     ----------
     estimate : Estimate or OptimalControlEstimate
-        Of `estimate`, or of `fit_optimal_control`.
+        Of `impc.fit`, or of `fit_optimal_control`.
     folder : str or Path
         Made when it is missing; an earlier report in it is replaced.
+    settings : FitSettings, optional
+        Of an estimate of inverse MPC: the page is that of `impc fit` with these settings, with
+        intervals, other methods and trials left out. It takes as long as that.
 
     Returns
     -------
@@ -84,7 +93,7 @@ def report(estimate: Estimate | OwnPage, folder: str | Path) -> tuple[Path, ...]
     >>> bounds = impc.Bounds(plant, u_min=-0.3, u_max=0.3)
     >>> truth = impc.Controller(plant, impc.Weights(1, 1), bounds, horizon=3)
     >>> trial = impc.Recording(plant, truth.simulate([1.0], steps=20).x)
-    >>> found = impc.estimate(impc.Problem(plant, bounds, 3, [trial]))
+    >>> found = impc.fit(impc.Problem(plant, bounds, 3, [trial]))
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     [path.name for path in impc.report(found, folder)][:2]
     ['report.html', 'result.json']
@@ -93,11 +102,18 @@ def report(estimate: Estimate | OwnPage, folder: str | Path) -> tuple[Path, ...]
     if not isinstance(estimate, Estimate):
         with owned(place, "report"):
             return write_files(place, estimate.page(Provenance(_CALLER)).files())
+    if settings is not None and estimate.method != _OURS:
+        raise InputError("settings", f"are of {_OURS}, not {estimate.method}", "leave them out")
     if estimate.K is None:
         raise InputError("estimate", f"has no gain: {estimate.reason}", "try another method")
-    fit = judge(estimate, estimate.problem.bounds)
+    if settings is None:
+        document = _document(judge(estimate, estimate.problem.bounds))
+    else:
+        kept = FitProgress(estimate=lambda name, make: estimate if name == _OURS else make())
+        result = fit_recordings(estimate.problem, settings, kept)
+        document = fit_report(result, Provenance(_CALLER))
     with owned(place, "report"):
-        return write_files(place, _document(fit).files())
+        return write_files(place, document.files())
 
 
 def _document(fit: MethodFit) -> Report:

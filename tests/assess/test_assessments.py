@@ -8,7 +8,7 @@ import pytest
 from experiments.coverage import cart, noisy_trial
 from impc.assess.assessments import ASSESSMENTS, MethodFit, assessed, judge
 from impc.checking import replace
-from impc.inverse.methods import estimate
+from impc.inverse import methods
 from impc.studies.fit.settings import FitSettings
 from impc.studies.fit.subject import fit_problem
 
@@ -18,7 +18,7 @@ def fit() -> MethodFit:
     """A gain that exceeds the bound of the cart."""
     settings = FitSettings(horizon=10, u_max=1.0)
     problem = fit_problem(cart(), [noisy_trial(seed, 0.0) for seed in (21, 22)], settings)
-    return judge(estimate(problem, "feedback_gain"), problem.bounds)
+    return judge(methods.fit(problem, "feedback_gain"), problem.bounds)
 
 
 def test_numbers_of_a_gain(fit: MethodFit) -> None:
@@ -49,7 +49,7 @@ def test_a_method_without_a_gain(fit: MethodFit) -> None:
 
 def test_the_condition_number_is_that_of_both_weights(fit: MethodFit) -> None:
     problem = fit.estimate.problem
-    found = estimate(problem, "inverse_lqr_output")
+    found = methods.fit(problem, "inverse_lqr_output")
     values = np.concatenate(
         [np.linalg.eigvalsh(found.stage_weights.Q), np.linalg.eigvalsh(found.stage_weights.R)]
     )

@@ -18,7 +18,7 @@ from tests.support import random_plant, random_weights
 
 
 def compared(problem: Problem) -> WeightsTest:
-    fitted = impc.estimate(problem)
+    fitted = impc.fit(problem)
     return weights_test(fitted, gain_estimate(fitted))
 
 

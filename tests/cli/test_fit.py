@@ -314,7 +314,7 @@ def test_an_interrupted_command_says_what_it_kept(
                  "seated-balance", "--config", str(quick), "--out",
                  str(tmp_path / "out"))  # fmt: skip
     with monkeypatch.context() as patch:
-        patch.setattr("impc.studies.fit.subject.estimate_all", interrupt)
+        patch.setattr("impc.studies.fit.subject.cross_checked", interrupt)
         stopped = run(*arguments)
     assert stopped.exit_code == 130
     assert "fit" in stopped.stderr

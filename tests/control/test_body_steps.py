@@ -18,7 +18,7 @@ from impc.control.constraint_rows import directions
 from impc.control.controller import Controller
 from impc.control.loop_function import closed_loop_function
 from impc.control.simulation import Scenario, Status, scenario
-from impc.inverse.methods import estimate
+from impc.inverse.methods import fit
 from impc.inverse.problem import Problem
 from impc.inverse.residuals import evaluate, residual_only
 from impc.model.bounds import Bounds, bound_rows
@@ -163,7 +163,7 @@ def test_a_linear_body_is_the_linear_plant(limit: float) -> None:
         noise = 1e-3 * np.random.default_rng(0).standard_normal(clean.shape)
         trial = Recording(one, clean + noise, np.vstack([mild, mild[-1:]]), [0.1, 0.0])
         problem = Problem(one, controller.bounds, 8, [trial], terminal_set=False)
-        fits.append(estimate(problem))
+        fits.append(fit(problem))
     (run, moved), (twin_run, twin_moved) = runs
     assert np.any(run.status > Status.FREE) == (limit < 1)
     assert np.allclose(run.x, twin_run.x, atol=1e-12)

@@ -24,17 +24,17 @@ def test_a_diverging_loop_is_named(example_plant: Plant) -> None:
         require_complete(controller, run)
 
 
-def ended(statuses: list[Status]) -> Simulation:
+def ended(plant: Plant, statuses: list[Status]) -> Simulation:
     steps = len(statuses)
     codes = np.array(statuses, dtype=np.int8)
-    return Simulation(np.zeros((steps + 1, 2)), np.zeros((steps, 1)), codes, 0, -1)
+    return Simulation(plant, np.zeros((steps + 1, 2)), np.zeros((steps, 1)), codes, 0, -1)
 
 
-def test_a_simulation_ends_at_the_first_sample_without_an_input() -> None:
-    whole = ended([Status.FREE, Status.ACTIVE, Status.SOFTENED])
+def test_a_simulation_ends_at_the_first_sample_without_an_input(example_plant: Plant) -> None:
+    whole = ended(example_plant, [Status.FREE, Status.ACTIVE, Status.SOFTENED])
     assert whole.complete
     assert whole.reached == 3
-    broken = ended([Status.FREE, Status.ACTIVE, Status.UNSOLVED, Status.NOT_REACHED])
+    broken = ended(example_plant, [Status.FREE, Status.ACTIVE, Status.UNSOLVED, Status.NOT_REACHED])
     assert not broken.complete
     assert broken.reached == 2
 
@@ -46,7 +46,7 @@ def test_every_status_is_said_in_words(status: Status, example_plant: Plant) -> 
     controller = Controller(
         example_plant, Weights(np.eye(2), 1), Bounds(example_plant, u_max=1, u_min=-1), 3
     )
-    run = ended([Status.FREE, status])
+    run = ended(example_plant, [Status.FREE, status])
     if status <= Status.SOFTENED:
         assert require_complete(controller, run) is run
     elif status is not Status.INFEASIBLE:

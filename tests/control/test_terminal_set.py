@@ -16,10 +16,9 @@ from scipy.optimize import linprog
 
 from experiments.certificates import invariance_violation, maximality_violation
 from impc.checking import replace
-from impc.control.halfspaces import as_pytope, polygon, supports
+from impc.control.halfspaces import supports
 from impc.control.terminal_set import (
     TerminalSet,
-    contains,
     maximal_invariant_set,
 )
 from impc.errors import DataError, ImpcError, InputError, PlantError, SolverError
@@ -156,7 +155,7 @@ def test_deadbeat_double_integrator_has_the_parallelogram_of_two_steps() -> None
     # K = (1, 3/2) gives F^2 = 0: |x1 + 3/2 x2| <= 1 and, a step later, |x1 + x2 / 2| <= 1.
     plant = sampled([[1, 1], [0, 1]], [[0.5], [1]])
     terminal = maximal_invariant_set(plant, [[1, 1.5]], Bounds(plant, u_min=-1, u_max=1))
-    corners = polygon(terminal)
+    corners = terminal.vertices()
     start = int(np.argmin(np.abs(corners - [1, 0]).sum(axis=1)))
     expected = [[1, 0], [-2, 2], [-1, 0], [2, -2]]
     np.testing.assert_allclose(np.roll(corners, -start, axis=0), expected, atol=1e-12)
@@ -233,8 +232,8 @@ def test_inside_stays_inside_and_outside_leaves(case: Case, seed: int) -> None:
     for direction, gauge in zip(directions, reach, strict=True):
         if gauge > 1e-6:  # else unbounded that way
             edge = direction / gauge
-            assert contains(terminal, 0.999 * edge)
-            assert not contains(terminal, 1.001 * edge)
+            assert terminal.contains(0.999 * edge)
+            assert not terminal.contains(1.001 * edge)
             assert worst_excess(terminal, 0.999 * edge, 300) <= 0
             assert worst_excess(terminal, 1.001 * edge, 300) > 5e-4
 
@@ -312,7 +311,7 @@ def test_a_direction_that_no_bound_sees_is_free() -> None:
     terminal = maximal_invariant_set(plant, K, Bounds(plant, u_min=-1, u_max=1))
     assert len(terminal.h) > 2
     np.testing.assert_allclose(terminal.H @ T[:, 2], 0, atol=1e-12)
-    assert contains(terminal, 1e4 * T[:, 2])
+    assert terminal.contains(1e4 * T[:, 2])
     assert_certified(terminal)
     plane = sampled([[0.9, 0.4], [-0.4, 0.9]], [[1.0], [0.0]])
     same = maximal_invariant_set(plane, [[0.5, 0.2]], Bounds(plane, u_min=-1, u_max=1))
@@ -323,13 +322,13 @@ def test_no_bounds_no_rows() -> None:
     plant, K, _ = example()
     terminal = maximal_invariant_set(plant, K, Bounds(plant))
     assert terminal.H.shape == (0, 2)
-    assert contains(terminal, [1e9, -1e9])
+    assert terminal.contains([1e9, -1e9])
     assert invariance_violation(terminal) == maximality_violation(terminal) == 0
     still = sampled([[0.5]], [[1.0]])
     unused = maximal_invariant_set(still, [[0.0]], Bounds(still, u_min=-1, u_max=1))
     assert unused.H.shape == (0, 1)
     with pytest.raises(InputError, match="whole space"):
-        as_pytope(terminal)
+        terminal.to_pytope()
 
 
 def test_certificates_notice_a_wrong_set() -> None:
@@ -363,8 +362,8 @@ def test_pytope_agrees_in_the_plane(case: Case) -> None:
     normal = rows.E - rows.F @ terminal.gain
     powers = [np.linalg.matrix_power(terminal.F, k) for k in range(count)]
     every = pytope.Polytope(np.vstack([normal @ power for power in powers]), np.tile(rows.b, count))
-    corners = polygon(terminal)
-    for other in (every, as_pytope(terminal)):
+    corners = terminal.vertices()
+    for other in (every, terminal.to_pytope()):
         assert len(other.V) == len(corners) == len(terminal.h)
         gaps = np.linalg.norm(other.V[:, None] - corners, axis=2)
         assert np.max(np.min(gaps, axis=1)) <= 1e-9 * np.max(np.abs(corners))
@@ -374,21 +373,21 @@ def test_pytope_agrees_in_the_plane(case: Case) -> None:
     assert area(corners) > 0
     low, high = 1.2 * corners.min(axis=0), 1.2 * corners.max(axis=0)
     for x in np.random.default_rng(3).uniform(low, high, (60, 2)):
-        assert contains(terminal, x) == bool(np.all(every.A @ x <= every.b[:, 0]))
+        assert terminal.contains(x) == bool(np.all(every.A @ x <= every.b[:, 0]))
 
 
 def test_pytope_takes_one_row_and_ten_states_without_corners() -> None:
     pytest.importorskip("pytope", reason="the extra polytope is not installed")
     plant = sampled([[0.5]], [[1.0]])
     half_line = maximal_invariant_set(plant, [[0.0]], Bounds(plant, x_max=1))
-    assert np.all(as_pytope(half_line).A == 1)
-    assert not as_pytope(maximal_invariant_set(*seat())).in_V_rep
+    assert np.all(half_line.to_pytope().A == 1)
+    assert not maximal_invariant_set(*seat()).to_pytope().in_V_rep
 
 
 def test_pytope_absent_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pytope", None)
     with pytest.raises(ImpcError, match=r"impc\[polytope\]"):
-        as_pytope(maximal_invariant_set(*example()))
+        maximal_invariant_set(*example()).to_pytope()
 
 
 def test_polygon_refuses_what_it_cannot_draw() -> None:
@@ -398,9 +397,9 @@ def test_polygon_refuses_what_it_cannot_draw() -> None:
     none = maximal_invariant_set(plant, [[0.0, 0.0]], Bounds(plant))
     for terminal in (strip, cone, none):
         with pytest.raises(InputError, match="unbounded"):
-            polygon(terminal)
+            terminal.vertices()
     with pytest.raises(InputError, match="10 states"):
-        polygon(maximal_invariant_set(*slow_rotations()))
+        maximal_invariant_set(*slow_rotations()).vertices()
 
 
 # Errors
@@ -425,7 +424,7 @@ def test_errors_say_what_is_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(PlantError, match="continuous"):
         maximal_invariant_set(continuous, [[0.0]], Bounds(continuous, u_max=1))
     with pytest.raises(DataError, match="x: expected shape"):
-        contains(maximal_invariant_set(plant, K, bounds), [1.0])
+        maximal_invariant_set(plant, K, bounds).contains([1.0])
 
     def fail(*arguments: Any, **options: Any) -> Any:
         return linprog(*arguments, **{**options, "options": {"maxiter": 0, "presolve": False}})

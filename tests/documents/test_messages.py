@@ -43,7 +43,7 @@ from impc.files.reading import read_recordings, recording_of
 from impc.files.results import read_result
 from impc.files.table import Table, make_table
 from impc.files.units import si_unit
-from impc.inverse.methods import estimate
+from impc.inverse.methods import fit
 from impc.inverse.problem import Problem
 from impc.inverse.structured_fit import fit_structure
 from impc.jit import keep_caches
@@ -562,7 +562,7 @@ def nobody_estimates(_: Path) -> None:
     noisy = outputs + 0.01 * np.random.default_rng(1).standard_normal(outputs.shape)
     problem = Problem(plant, Bounds(plant), 3, [Recording(plant, noisy, x0=[1, 0])],
                       terminal_set=False)  # fmt: skip
-    fit_person(estimate(problem), Observer(plant, ["v"], motor=1.0, sensory=1.0))
+    fit_person(fit(problem), Observer(plant, ["v"], motor=1.0, sensory=1.0))
 
 
 def beyond_feasibility(_: Path) -> str:

@@ -8,7 +8,7 @@ import pytest
 from experiments.noisy_people import recorded, subject
 from experiments.noisy_people_score import Score, above_truth, blind, falls, passed_over, score
 from impc.checking import replace
-from impc.inverse.methods import estimate
+from impc.inverse.methods import fit
 from impc.model.structure import Structure
 from impc.output_feedback.covariance import person_covariance
 from impc.output_feedback.fit import fit_person
@@ -70,7 +70,7 @@ def test_on_the_seat_a_person_is_told_where_least_squares_is_far_off() -> None:
     """Noise in the senses: least squares has five times the gain, in coordinates of its own."""
     who = subject("seat", 2, "sensory", 90.0, 70.0)
     trials, truth = recorded(who, 2), np.array(who.controller.K)
-    first = estimate(trials.problem)
+    first = fit(trials.problem)
     assert np.array(first.gain)[0, 0] > 4 * truth[0, 0]
     found = fit_person(first, blind(who))
     assert found.converged
@@ -87,7 +87,7 @@ def test_on_the_seat_a_person_is_told_where_least_squares_is_far_off() -> None:
 def test_a_search_leaves_somebody_who_knows_the_rates_exactly() -> None:
     """The likeliest start leads there, 80 nats below the truth, and settles."""
     who = subject("seat", 16, "motor", 70.0, 70.0)
-    found = fit_person(estimate(recorded(who, 16).problem), blind(who))
+    found = fit_person(fit(recorded(who, 16).problem), blind(who))
     truth = np.array(who.controller.K)
     assert found.converged
     assert above_truth(found, who) > 0
@@ -98,7 +98,7 @@ def test_a_search_leaves_somebody_who_knows_the_rates_exactly() -> None:
 def test_a_profile_tells_the_first_entry() -> None:
     """N m/rad: 844 +- 204 by the sandwich, by profile 678 to 1342; 970 is true."""
     who = subject("seat", 1, "both", 70.0, 70.0)
-    found = fit_person(estimate(recorded(who, 1).problem), blind(who))
+    found = fit_person(fit(recorded(who, 1).problem), blind(who))
     truth, K = float(np.array(who.controller.K)[0, 0]), float(np.array(found.K)[0, 0])
     slopes = found.space.changes(found.theta)[0][:, 0, 0]
     length = float(np.linalg.norm(slopes))
@@ -114,7 +114,7 @@ def test_a_structure_that_is_wrong_is_seen() -> None:
     who = subject("seat", 1, "motor", 90.0, 70.0)
     problem = recorded(who, 1).problem
     shape = Structure(problem.plant, "full", over=["theta1", "theta1_rate"])
-    first = estimate(replace(problem, structure=shape))
+    first = fit(replace(problem, structure=shape))
     kept = fit_person(first, blind(who))
     free = fit_person(replace(first, problem=replace(problem, structure=None)), blind(who))
     assert kept.space.gain < 5

@@ -9,8 +9,8 @@ import pytest
 
 from experiments.benchmarks.upper_level import Route, prox_linear, smooth_surrogate
 from experiments.benchmarks.workloads import example
-from impc.inverse.direct_and_reduced import CONDITION_WEIGHT
 from impc.inverse.residuals import evaluate
+from impc.inverse.table31 import CONDITION_WEIGHT
 from impc.model.riccati import solve_lqr
 from impc.model.weights import Weights, condition_number
 

@@ -87,7 +87,7 @@ def _example(folder: Path) -> Numbers:
 
 def _recovered(problem: Problem) -> Numbers:
     """The gain behind exact recordings."""
-    found = impc.estimate(problem)
+    found = impc.fit(problem)
     return {"gain": _exact(found.gain), "status": found.status.value}
 
 

@@ -9,10 +9,10 @@ import pytest
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
 from impc.control.simulation import scenario
-from impc.inverse.direct_and_reduced import infer_weights, inverse_mpc_reduced
 from impc.inverse.gain_search import fit_gain
 from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.problem import Problem
+from impc.inverse.table31 import inverse_mpc_reduced, table_3_1
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant, change_coordinates
 from impc.model.recordings import Recording
@@ -37,14 +37,14 @@ def recorded(scale: float, name: str) -> Problem:
 @pytest.mark.parametrize("name", ["A", "B"])
 def test_table_3_1_does_not_depend_on_a_common_unit(name: str) -> None:
     """With numbers 1e12 times as large it returned (1.19, -.79) for (1.494, -.881)."""
-    plain = infer_weights(recorded(1.0, name))
-    truth = solve_lqr(plain.fit.solution.plant, Weights(np.eye(2), 1)).K
+    plain = table_3_1(recorded(1.0, name))
+    truth = solve_lqr(plain["inverse_mpc"].problem.plant, Weights(np.eye(2), 1)).K
     for scale in [1.0, *UNITS]:
-        found = infer_weights(recorded(scale, name))
-        assert found.fit.explained
-        np.testing.assert_allclose(found.fit.solution.K, truth, rtol=1e-9)
-        evaluations = found.start.gain.evaluations + found.fit.evaluations
-        assert evaluations < 1.5 * (plain.start.gain.evaluations + plain.fit.evaluations)
+        found = table_3_1(recorded(scale, name))
+        assert found["inverse_mpc"].explained
+        np.testing.assert_allclose(found["inverse_mpc"].gain, truth, rtol=1e-9)
+        for line in ("feedback_gain", "inverse_mpc"):
+            assert found[line].evaluations < 1.5 * plain[line].evaluations + 3
 
 
 @pytest.mark.parametrize("scale", UNITS)
@@ -56,8 +56,8 @@ def test_two_inputs_do_not_depend_on_a_common_unit(scale: float) -> None:
     other = Problem(plant, bounds, 5, (scaled,), terminal_set=False)
     found = inverse_mpc_reduced(other)
     assert found.explained
-    np.testing.assert_allclose(found.gain.K, controller.K, rtol=1e-9, atol=1e-10)
-    assert found.gain.evaluations < 2 * inverse_mpc_reduced(problem).gain.evaluations
+    np.testing.assert_allclose(found.gain, controller.K, rtol=1e-9, atol=1e-10)
+    assert found.evaluations < 2 * inverse_mpc_reduced(problem).evaluations
     np.testing.assert_allclose(fit_controller(other).gain, controller.K, rtol=1e-8, atol=1e-9)
 
 

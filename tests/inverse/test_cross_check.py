@@ -10,8 +10,6 @@ import impc
 from impc.checking import replace
 from impc.control.closed_loop import simulate
 from impc.inverse.cross_check import cross_checked
-from impc.inverse.groundwork import NaturalUnits
-from impc.inverse.methods import estimate_all
 from impc.inverse.problem import Problem, controller_for, misfit, scenarios
 
 
@@ -37,11 +35,15 @@ def at(problem: Problem, K: np.ndarray, S: np.ndarray) -> float:
     return misfit(problem, [simulate(law, drive) for drive in scenarios(problem)])
 
 
+def fitted(problem: Problem, names: list[str]) -> dict[str, impc.Estimate]:
+    start = impc.fit(problem)
+    return {name: impc.fit(problem, name, start=start) for name in names}
+
+
 def test_a_method_that_loses_begins_again(problem: Problem) -> None:
     """Inverse MPC and the search of weights without bounds, both put at poor weights."""
-    ground = NaturalUnits(problem)
     names = ["feedback_gain", "inverse_lqr_output", "inverse_mpc"]
-    found = estimate_all(ground, names)
+    found = fitted(problem, names)
     poor = impc.solve_lqr(problem.plant, impc.Weights(np.eye(2) * 50, 1))
     changed = dict(found)
     for name in ("inverse_lqr_output", "feedback_gain"):
@@ -49,22 +51,20 @@ def test_a_method_that_loses_begins_again(problem: Problem) -> None:
         left = at(one.problem, np.array(poor.K), np.array(poor.S))
         assert left > 1.01 * one.misfit
         changed[name] = replace(one, K=poor.K, S=poor.S, weights=poor.weights, misfit=left)
-    _, checked = cross_checked(ground, changed)
+    checked = cross_checked(problem, changed)
     for name in names:
         assert checked[name].misfit <= found[name].misfit * (1 + 2e-3)
         assert not checked[name].fit.beaten
     worse = replace(found["inverse_mpc"], K=poor.K, S=poor.S, weights=poor.weights)
     worse = replace(worse, misfit=at(worse.problem, np.array(poor.K), np.array(poor.S)))
-    ground = NaturalUnits(problem, fitted=worse)
-    _, checked = cross_checked(ground, found | {"inverse_mpc": worse})
+    checked = cross_checked(problem, found | {"inverse_mpc": worse})
     assert checked["inverse_mpc"].misfit <= found["inverse_mpc"].misfit * (1 + 1e-4)
 
 
 def test_no_answer_is_beaten_and_nested_models_are_ordered(problem: Problem) -> None:
     """A free gain leaves no more than weights without bounds; each is the least of its model."""
-    ground = NaturalUnits(problem)
     names = ["feedback_gain", "inverse_lqr_gradient", "inverse_lqr_output", "inverse_mpc"]
-    _, found = cross_checked(ground, estimate_all(ground, names))
+    found = cross_checked(problem, fitted(problem, names))
     assert found["feedback_gain"].misfit <= found["inverse_lqr_output"].misfit * (1 + 1e-3)
     assert found["inverse_lqr_output"].misfit <= found["inverse_lqr_gradient"].misfit * (1 + 1e-3)
     for own in (found["inverse_mpc"], found["inverse_lqr_output"]):

@@ -16,8 +16,7 @@ from impc.control.closed_loop import simulate
 from impc.control.simulation import scenario
 from impc.inverse.coordinates import Coordinates
 from impc.inverse.estimates import Estimate
-from impc.inverse.groundwork import NaturalUnits
-from impc.inverse.methods import estimate_all
+from impc.inverse.methods import fit
 from impc.inverse.noisy_fit import fit_controller, with_fitted_starts
 from impc.inverse.problem import Problem
 from impc.inverse.residuals import evaluate
@@ -67,10 +66,9 @@ def test_without_noise_all_that_is_determined_comes_out(
 def test_inverse_mpc_against_inverse_lqr(clean: tuple[Workload, Estimate]) -> None:
     """It wins and keeps the limit where the subject saturates, and equals where none is active."""
     work, fitted = clean
-    ground = NaturalUnits(fitted.problem, lambda name, make: fitted if name == OURS else make())
     names = ("feedback_gain", "inverse_lqr", "inverse_lqr_output", "clipped_lqr", OURS)
     bounds = fitted.problem.bounds
-    found = estimate_all(ground, names)
+    found = {name: fit(fitted.problem, name, start=fitted) for name in names[:-1]} | {OURS: fitted}
     methods = {name: judge(item, bounds) for name, item in found.items()}
     mpc = methods["inverse_mpc"]
     limit = float(work.controller.bounds.u_max[0])

@@ -11,7 +11,7 @@ from experiments.benchmarks.workloads import seat
 from impc.arrays import Array
 from impc.control.controller import Controller
 from impc.inverse.coordinates import Coordinates
-from impc.inverse.methods import estimate
+from impc.inverse.methods import fit
 from impc.inverse.problem import Problem
 from impc.inverse.regulator_span import kept_to, regulators_alone
 from impc.inverse.solution_set import natural_coordinates
@@ -143,7 +143,7 @@ def test_a_person_is_searched_within_the_span() -> None:
     """Three numbers fewer, a gain that predicts, and derivatives that are those of differences."""
     problem = late_problem(structure=Structure(late_body(), ["p", "v"]))
     person = Observer(problem.plant, ["p", "v"], motor=0.1, sensory=[0.02, 0.02])
-    first = estimate(problem)
+    first = fit(problem)
     found = fit_person(first, person)
     assert found.converged
     assert found.space.gain == 2

@@ -18,7 +18,6 @@ from impc.control.controller import Controller
 from impc.control.simulation import scenario
 from impc.errors import ImpcError
 from impc.inverse.coordinates import Coordinates
-from impc.inverse.direct_and_reduced import infer_weights, inverse_mpc_reduced
 from impc.inverse.equivalent_weights import least_condition_weights, other_weights
 from impc.inverse.explaining_weights import metric_family, weights_behind
 from impc.inverse.gain_search import fit_gain, refine_gain
@@ -27,6 +26,7 @@ from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.problem import Problem
 from impc.inverse.residuals import evaluate
 from impc.inverse.solution_set import gain_fibre, natural_coordinates
+from impc.inverse.table31 import inverse_mpc_reduced, table_3_1
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.recordings import Recording
@@ -69,12 +69,12 @@ def by_fit(problem: Problem) -> tuple[Weights, bool]:
 def by_reduced(problem: Problem) -> tuple[Weights, bool]:
     found = inverse_mpc_reduced(problem)
     assert found.explained == (not found.reason)
-    return found.weights, found.explained
+    return found.stage_weights, found.explained
 
 
 def by_direct(problem: Problem) -> tuple[Weights, bool]:
-    found = infer_weights(problem).fit
-    return found.weights, found.explained
+    found = table_3_1(problem)["inverse_mpc"]
+    return found.stage_weights, found.explained
 
 
 PATHS = {"fit": by_fit, "reduced": by_reduced, "direct": by_direct}

@@ -150,18 +150,18 @@ def test_no_search_without_derivatives_does_better() -> None:
 
 
 def test_the_method_of_the_registry() -> None:
-    """Through `impc.estimate`, with an estimate that knows its prices."""
+    """Through `impc.fit`, with an estimate that knows its prices."""
     plant = carts(1)
     structure = Structure(plant)
     truth, push = pushed(structure, plant, np.log([4.0, 1.0]))
     run = truth.simulate(np.zeros(2), disturbance=push)
     trial = Recording(plant, (run.x @ plant.C.T)[:-1], push)
-    found = impc.estimate(posed(truth, trial, structure=structure), "structured")
+    found = impc.fit(posed(truth, trial, structure=structure), "structured")
     assert found.explained
     assert found.prices is not None
     np.testing.assert_allclose(found.prices, np.log([4.0, 1.0]), atol=1e-6)
     np.testing.assert_allclose(found.stage_weights.Q, np.diag([4.0, 1.0]), rtol=1e-6)
-    without = impc.estimate(posed(truth, trial), "structured")
+    without = impc.fit(posed(truth, trial), "structured")
     assert without.K is None
     assert "the problem names no structure" in without.reason
 

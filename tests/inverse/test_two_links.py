@@ -45,8 +45,8 @@ def test_two_links_end_at_the_least_misfit(noisy: bool, samples: int) -> None:
     problem = standing_problem(1, noisy=noisy, samples=samples)
     least = least_misfit(problem, GAIN)
     count = problem.recordings[0].outputs.size
-    fitted = impc.estimate(problem)
-    feedback = impc.estimate(problem, "feedback_gain")
+    fitted = impc.fit(problem)
+    feedback = impc.fit(problem, "feedback_gain")
     for misfit in (gain_estimate(fitted).misfit, feedback.misfit):
         assert abs(count * ((misfit / least) ** 2 - 1)) < 0.1
     assert fitted.noise <= least * (1 + 0.05 / count)

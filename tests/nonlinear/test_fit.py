@@ -11,7 +11,7 @@ from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
 from impc.control.simulation import Status, scenario
 from impc.errors import DataError, InfeasibleError, InputError
-from impc.inverse.methods import estimate
+from impc.inverse.methods import fit
 from impc.inverse.problem import Problem
 from impc.model.bounds import Bounds
 from impc.model.recordings import Recording
@@ -60,7 +60,7 @@ def test_a_linear_loop_has_the_weights_of_the_linear_route(limit: float) -> None
     controller = Controller(plant, weights, bounds, 6, terminal_set=False)
     run = simulate(controller, scenario(plant, [0.8, -0.5], 20))
     assert bool(np.any(run.status == Status.ACTIVE)) == (limit < 1)
-    linear = estimate(Problem(plant, bounds, 6, (Recording(plant, run.x),), terminal_set=False))
+    linear = fit(Problem(plant, bounds, 6, (Recording(plant, run.x),), terminal_set=False))
     problem, _ = linear_twin(controller, weights)
     found = fit_optimal_control(
         problem, [problem.recorded_loop(run.x, run.u)], {"q0": 1.5, "q1": 0.7}

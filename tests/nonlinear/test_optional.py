@@ -27,7 +27,7 @@ for name in set(impc.__all__) - {"OptimalControlProblem", "fit_optimal_control"}
 plant = impc.Plant(control.ss([[0.9]], [[1]], [[1]], 0, 1))
 bounds = impc.Bounds(plant, u_min=-0.3, u_max=0.3)
 truth = impc.Controller(plant, impc.Weights(1, 1), bounds, horizon=3).simulate([1.0], steps=20)
-found = impc.estimate(impc.Problem(plant, bounds, 3, [impc.Recording(plant, truth.x)]))
+found = impc.fit(impc.Problem(plant, bounds, 3, [impc.Recording(plant, truth.x)]))
 impc.report(found, "page")
 print(found.status.value)
 try:

@@ -8,7 +8,7 @@ import pytest
 from experiments.noisy_people import recorded, subject
 from experiments.noisy_people_score import blind
 from impc.errors import InputError
-from impc.inverse.methods import estimate
+from impc.inverse.methods import fit
 from impc.output_feedback.covariance import confusion, person_covariance
 from impc.output_feedback.fit import PersonFit, fit_person
 from impc.output_feedback.observer import Observer
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.full
 @pytest.fixture(scope="module")
 def fitted() -> PersonFit:
     person = Observer(cart(), ["x"], motor=0.4, sensory=0.05)
-    return fit_person(estimate(posed(person, 0.01, 3.0, trials=4)), person)
+    return fit_person(fit(posed(person, 0.01, 3.0, trials=4)), person)
 
 
 def test_both_agree_where_the_model_is_true(fitted: PersonFit) -> None:
@@ -54,7 +54,7 @@ def test_a_direction_that_nothing_tells_leaves_the_others_as_they_are() -> None:
     Deviations by the sandwich had been none along four directions of seven.
     """
     who = subject("pair", 0, "motor", 90.0, 5.0)
-    found = fit_person(estimate(recorded(who, 0).problem), blind(who))
+    found = fit_person(fit(recorded(who, 0).problem), blind(who))
     assert np.linalg.eigvalsh(found.told.information)[0] < 1e-8
     robust, expected = person_covariance(found), person_covariance(found, "expected")
     assert np.linalg.eigvalsh(robust.covariance)[0] > 0

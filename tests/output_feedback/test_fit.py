@@ -16,7 +16,7 @@ from impc.control.controller import Controller
 from impc.errors import ImpcError, InputError, SolverError
 from impc.inverse.estimates import Estimate
 from impc.inverse.gain_search import refine_gain
-from impc.inverse.methods import estimate
+from impc.inverse.methods import fit
 from impc.inverse.problem import Problem
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
@@ -59,7 +59,7 @@ def posed(person: Observer, recorder: float, limit: float, trials: int = 2) -> P
 @pytest.fixture(scope="module")
 def noisy() -> tuple[Observer, Estimate]:
     person = Observer(cart(), ["x"], motor=0.15, sensory=0.02)
-    return person, estimate(posed(person, 0.01, 0.9))
+    return person, fit(posed(person, 0.01, 0.9))
 
 
 @pytest.fixture(scope="module")
@@ -173,7 +173,7 @@ def test_a_level_that_cannot_be_squared_has_no_likelihood(
 def test_without_noise_in_the_loop_it_is_the_fit_of_least_squares() -> None:
     """W, V -> 0: the same gain to 1e-6, where neither has a prior."""
     problem = posed(Observer(cart()), 0.01, 0.9)
-    found = estimate(problem)
+    found = fit(problem)
     least = refine_gain(found.problem, np.array(found.gain), np.array(found.metric))
     start = replace(found, K=least.K, problem=least.problem)
     tiny = Observer(cart(), ["x", "v"], motor=1e-9, sensory=1e-9)
@@ -203,7 +203,7 @@ def test_prices_of_a_structure_are_searched() -> None:
         given.plant, given.bounds, 5, given.recordings, terminal_set=False, unknown_start=True,
         structure=Structure(given.plant, ["x", "v"]),
     )  # fmt: skip
-    found = fit_person(estimate(problem, "structured"), person)
+    found = fit_person(fit(problem, "structured"), person)
     assert found.prices is not None
     assert found.converged
     weights = found.problem.structure.weights(found.prices)  # type: ignore[union-attr]

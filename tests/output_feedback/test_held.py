@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from impc.inverse.methods import estimate
+from impc.inverse.methods import fit
 from impc.output_feedback.fit import PersonFit, fit_person
 from impc.output_feedback.observer import Observer
 from impc.output_feedback.profile import held_person
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.full
 @pytest.fixture(scope="module")
 def fitted() -> PersonFit:
     person = Observer(cart(), ["x"], motor=0.4, sensory=0.05)
-    return fit_person(estimate(posed(person, 0.01, 3.0)), person)
+    return fit_person(fit(posed(person, 0.01, 3.0)), person)
 
 
 def test_all_else_is_at_its_best(fitted: PersonFit) -> None:

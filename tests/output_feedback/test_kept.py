@@ -10,7 +10,7 @@ from numpy.testing import assert_array_equal
 
 from impc.checking import replace
 from impc.inverse.estimates import Estimate
-from impc.inverse.methods import estimate
+from impc.inverse.methods import fit
 from impc.inverse.structured_fit import fit_structured
 from impc.model.structure import Structure
 from impc.output_feedback.covariance import person_covariance
@@ -25,12 +25,12 @@ pytestmark = pytest.mark.full
 
 def any_gain() -> tuple[Estimate, Observer]:
     person = Observer(cart(), ["x"], motor=0.15, sensory=0.02)
-    return estimate(posed(person, 0.01, 0.9)), person
+    return fit(posed(person, 0.01, 0.9)), person
 
 
 def gain_of_a_structure() -> tuple[Estimate, Observer]:
     problem = late_problem(structure=Structure(late_body(), ["p", "v"]))
-    return estimate(problem), Observer(problem.plant, ["p", "v"], motor=0.1, sensory=[0.02, 0.02])
+    return fit(problem), Observer(problem.plant, ["p", "v"], motor=0.1, sensory=[0.02, 0.02])
 
 
 def prices() -> tuple[Estimate, Observer]:
@@ -38,7 +38,7 @@ def prices() -> tuple[Estimate, Observer]:
     problem = posed(person, 0.01, 0.9)
     structure = Structure(problem.plant, ["x", "v"])
     problem = replace(problem, structure=structure)
-    return fit_structured(problem, structure, estimate(problem)), person
+    return fit_structured(problem, structure, fit(problem)), person
 
 
 @pytest.mark.parametrize("make", [any_gain, gain_of_a_structure, prices])

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from impc.inverse.methods import estimate
+from impc.inverse.methods import fit
 from impc.output_feedback.models import person_report
 from impc.output_feedback.observer import Observer
 from impc.output_feedback.page import PersonModel
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.full
 def test_persons_of_an_interrupted_fit_are_not_fitted_again(tmp_path: Path) -> None:
     person = Observer(cart(), ["x"], motor=0.15, sensory=0.02)
     problem, settings = posed(person, 0.01, 0.9), FitSettings(horizon=5, u_max=0.9)
-    found, stopped = estimate(problem), "sees every state, noise in the loop"
+    found, stopped = fit(problem), "sees every state, noise in the loop"
 
     def interrupt(name: str) -> None:
         if name == stopped:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from impc.inverse.methods import estimate
+from impc.inverse.methods import fit
 from impc.model.structure import Structure
 from impc.output_feedback.covariance import person_covariance
 from impc.output_feedback.fit import PersonFit, fit_person
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.full
 @pytest.fixture(scope="module")
 def fitted() -> PersonFit:
     person = Observer(cart(), ["x"], motor=0.15, sensory=0.02)
-    return fit_person(estimate(posed(person, 0.01, 3.0)), person)
+    return fit_person(fit(posed(person, 0.01, 3.0)), person)
 
 
 def test_errors_ahead_are_those_that_the_filter_expects(fitted: PersonFit) -> None:
@@ -35,7 +35,7 @@ def test_errors_ahead_are_those_that_the_filter_expects(fitted: PersonFit) -> No
 
 def test_without_limit_and_perturbation_there_are_three_models() -> None:
     person = Observer(cart(), ["x"], motor=0.15, sensory=0.02)
-    found = estimate(posed(person, 0.01, np.inf, trials=1))
+    found = fit(posed(person, 0.01, np.inf, trials=1))
     report = person_report(found, person, np.zeros(0))
     assert [item.name for item in report.models] == [
         "estimates, perturbation known",
@@ -52,7 +52,7 @@ def test_without_limit_and_perturbation_there_are_three_models() -> None:
 
 def test_who_cannot_estimate_has_a_reason() -> None:
     asked = Observer(cart(), ["v"], motor=0.15, sensory=0.02)
-    found = estimate(posed(Observer(cart()), 0.01, np.inf, trials=1))
+    found = fit(posed(Observer(cart()), 0.01, np.inf, trials=1))
     report = person_report(found, asked, np.zeros(0))
     assert report.models[0].fit is None
     assert "no stationary gain" in report.models[0].reason
@@ -63,7 +63,7 @@ def test_a_structure_is_set_beside_any_gain() -> None:
     """Behind a delay: the same recordings, with fewer numbers and hardly less likelihood."""
     problem = late_problem(structure=Structure(late_body(), ["p", "v"]))
     person = Observer(problem.plant, ["p", "v"], motor=0.1, sensory=[0.02, 0.02])
-    report = person_report(estimate(problem), person, np.zeros(0))
+    report = person_report(fit(problem), person, np.zeros(0))
     found = {item.name: item.fit for item in report.models}
     kept, free = report.fit, found["estimates, perturbation known, any gain"]
     assert kept is not None

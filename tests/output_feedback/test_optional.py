@@ -27,7 +27,7 @@ trials = [impc.Recording(plant, law.simulate([0.5, 0.1], steps=40).x)]
 def fit(**others):
     given = dict(horizon=3, u_max=1.0, methods=[], intent_draws=False, **others)
     settings = impc.read_settings(given)
-    return impc.fit_recordings(impc.fit_problem(plant, trials, settings), settings)
+    return fit_recordings(impc.fit_problem(plant, trials, settings), settings)
 """
 
 

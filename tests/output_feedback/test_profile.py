@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import scipy.optimize
 
+import impc
 from experiments.noisy_people import recorded, subject
 from experiments.noisy_people_score import blind
 from impc.arrays import Array
-from impc.inverse.methods import estimate
 from impc.output_feedback.covariance import person_covariance
 from impc.output_feedback.fit import PersonFit, fit_person
 from impc.output_feedback.observer import Observer
@@ -32,7 +32,7 @@ pytestmark = pytest.mark.full
 def fitted() -> PersonFit:
     """Motor noise is well told; the sense of a state that is recorded too is not."""
     person = Observer(cart(), ["x"], motor=0.4, sensory=0.01)
-    return fit_person(estimate(posed(person, 0.01, 3.0)), person)
+    return fit_person(impc.fit(posed(person, 0.01, 3.0)), person)
 
 
 def test_a_level_that_is_well_told_has_the_interval_of_its_deviation(fitted: PersonFit) -> None:
@@ -103,7 +103,7 @@ def test_a_level_that_is_hardly_told_has_its_interval_by_profile(fitted: PersonF
 def test_a_level_that_may_be_none_is_told_on_one_side() -> None:
     """Someone who sees all but exactly."""
     person = Observer(cart(), ["x", "v"], motor=0.4, sensory=[1e-4, 1e-4])
-    fit = fit_person(estimate(posed(person, 0.01, 3.0)), person)
+    fit = fit_person(impc.fit(posed(person, 0.01, 3.0)), person)
     low, high = level_interval(fit, fit.space.names.index("sensory x"))
     assert low == 0.0
     assert 1e-4 < high < 10.0  # metres: closed above, whatever is not expected of it
@@ -113,7 +113,7 @@ def test_a_level_that_may_be_none_is_told_on_one_side() -> None:
 def test_a_sense_that_is_hardly_told_leaves_the_motor_noise_its_own(seed: int) -> None:
     """Without a prior of levels a sense slides to none here, and the motor noise takes its part."""
     who = subject("cart", seed, "both", 90.0, 0.7)
-    first, motor = estimate(recorded(who, seed).problem), float(who.person.levels[0])
+    first, motor = impc.fit(recorded(who, seed).problem), float(who.person.levels[0])
     fit = fit_person(first, blind(who))
     low, high = person_covariance(fit, "expected").level_intervals(fit.levels)[0]
     assert low < motor < high
@@ -127,7 +127,7 @@ def test_a_sense_that_is_hardly_told_leaves_the_motor_noise_its_own(seed: int) -
 def test_all_levels_are_in_their_intervals() -> None:
     """A person with noise in motor and senses, at the limit, as the page prints it."""
     who = subject("cart", 1, "both", 90.0, 0.7)
-    fit = fit_person(estimate(recorded(who, 1).problem), blind(who))
+    fit = fit_person(impc.fit(recorded(who, 1).problem), blind(who))
     true = [*who.person.levels[who.person.levels > 0], *who.recorder]
     intervals = level_intervals(fit, person_covariance(fit, "expected"))
     assert all(low < level < high for level, (low, high) in zip(true, intervals, strict=True))

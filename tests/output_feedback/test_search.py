@@ -7,9 +7,9 @@ import itertools
 import numpy as np
 import pytest
 
+import impc
 from impc.checking import replace
 from impc.control.controller import Controller
-from impc.inverse.methods import estimate
 from impc.model.weights import Weights
 from impc.output_feedback.fit import PersonFit, fit_person
 from impc.output_feedback.observer import Observer
@@ -24,7 +24,7 @@ def sliding_person() -> PersonFit:
     """Someone whose senses err so little that these levels are not told."""
     person = Observer(cart(), ["x", "v"], motor=0.4, sensory=[0.002, 0.004])
     return fit_person(
-        estimate(posed(person, 0.01, 0.9)), person.with_levels(np.array([0.1, 0, 0, 0, 0.1, 0.1]))
+        impc.fit(posed(person, 0.01, 0.9)), person.with_levels(np.array([0.1, 0, 0, 0, 0.1, 0.1]))
     )
 
 
@@ -104,7 +104,7 @@ def test_what_levels_lose_is_that_of_the_gain_integrated_out() -> None:
     """Against a grid over the gain, at the levels that were found and at twice the motor noise."""
     person = Observer(cart(), ["x"], motor=0.4, sensory=0.05)
     problem = replace(posed(person, 0.01, 3.0, trials=1), unknown_start=False)
-    fit = fit_person(estimate(problem), person)
+    fit = fit_person(impc.fit(problem), person)
     space, prior, steps = fit.space, fit.prior, np.linspace(-5, 5, 11)
     assert space.own == 2
     change = []

@@ -15,7 +15,7 @@ from impc.checking import replace
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
 from impc.control.simulation import scenario
-from impc.inverse.methods import METHODS, estimate
+from impc.inverse.methods import METHODS, fit
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.weights import Weights
@@ -35,7 +35,7 @@ from impc.studies.methods_table import (
 def fits() -> list[MethodFit]:
     settings = FitSettings(horizon=10, u_max=1.0)
     problem = fit_problem(cart(), [noisy_trial(21, 0.0)], settings)
-    gain = judge(estimate(problem, "feedback_gain"), problem.bounds)
+    gain = judge(fit(problem, "feedback_gain"), problem.bounds)
     none = replace(
         gain.estimate, method="inverse_lqr_lmi", K=None, S=None, reason="it was not tried"
     )

@@ -5,6 +5,7 @@ docs/comparing.md says what each method is and where it breaks.
 
 from __future__ import annotations
 
+import functools
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,14 +16,17 @@ from impc.assess.variance_accounted_for import left_out_vaf
 from impc.checking import replace
 from impc.errors import SolverError, WeightsError
 from impc.inverse.cross_check import cross_checked
-from impc.inverse.groundwork import NaturalUnits, afresh
-from impc.inverse.methods import METHODS, estimate_all
+from impc.inverse.methods import METHODS, fit
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
     from impc.assess.assessments import MethodFit
     from impc.inverse.estimates import Estimate
-    from impc.inverse.groundwork import Remember
     from impc.inverse.problem import Problem
+
+    #: (stage, compute) -> the estimate, from memory or computed now.
+    Remember = Callable[[str, Callable[[], Estimate]], Estimate]
 
 # Needs states to be named; what is compared in its two parts; and what needs a structure, which has
 # a table of its own in `impc fit`.
@@ -40,20 +44,23 @@ def stages(trials: int, *, held_out: bool = True) -> int:
 
 
 def compare_recordings(
-    problem: Problem, settle: float, remember: Remember = afresh, *, held_out: bool = True
+    problem: Problem,
+    settle: float,
+    remember: Remember = lambda _, compute: compute(),
+    *,
+    held_out: bool = True,
 ) -> tuple[MethodFit, ...]:
     """Run every method on all trials, then on all but each one.
 
     `remember` (stage, compute).
     """
     count, names = len(problem.recordings), compared_methods()
-    ground = NaturalUnits(problem, _within("all", remember))
-    _, whole = cross_checked(ground, estimate_all(ground, names))
+    whole = cross_checked(problem, _all(problem, names, "all", remember))
     parts = []
     for index in range(count if held_out and count > 1 else 0):
-        ground = NaturalUnits(problem.leaving_out(index), _within(f"without {index + 1}", remember))
+        stage, others = f"without {index + 1}", problem.leaving_out(index)
         try:
-            parts.append(estimate_all(ground, names))
+            parts.append(_all(others, names, stage, remember))
         except (WeightsError, SolverError):  # nothing fits these trials: NaN in the table
             parts.append({})
     return tuple(
@@ -65,8 +72,17 @@ def compare_recordings(
     )
 
 
-def _within(stage: str, remember: Remember) -> Remember:
-    return lambda name, compute: remember(f"{stage}/{name}", compute)
+def _all(
+    problem: Problem, names: Sequence[str], stage: str, remember: Remember
+) -> dict[str, Estimate]:
+    """Every method on one set of trials, in the order of the names."""
+    start = remember(f"{stage}/inverse_mpc", functools.partial(fit, problem))
+    return {
+        name: start
+        if name == "inverse_mpc"
+        else remember(f"{stage}/{name}", functools.partial(METHODS[name].estimate, problem, start))
+        for name in names
+    }
 
 
 def _held_out(problem: Problem, estimates: list[Estimate | None], settle: float) -> Array:

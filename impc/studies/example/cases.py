@@ -19,11 +19,9 @@ from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
 from impc.control.named_solver import COMPILED
 from impc.control.simulation import Simulation, require_complete, scenario
-from impc.inverse.direct_and_reduced import CONDITION_WEIGHT
-from impc.inverse.groundwork import PlantUnits
-from impc.inverse.methods import METHODS
 from impc.inverse.problem import Problem, misfit
 from impc.inverse.proximal_search import AUXILIARY_CONDITION_WEIGHT
+from impc.inverse.table31 import CONDITION_WEIGHT, table_3_1
 from impc.model.bounds import Bounds
 from impc.model.recordings import Recording
 from impc.model.weights import Weights, weight_error
@@ -133,13 +131,9 @@ def run_case(
         unknown_start=False,
         solver=solver,
     )
-    ground = PlantUnits(problem)
-    results = []
-    for method in EXAMPLE:
-        found = METHODS[method].estimate(ground)
-        results.append(_result(judge(found, bounds), truth_weights))
-        progress(method)
-    branch = "gradient" if ground.lmi.weights is None else "LMI"
+    table = table_3_1(problem, absolute=True, progress=progress)
+    results = [_result(judge(table[name], bounds), truth_weights) for name in EXAMPLE]
+    branch = "gradient" if table["inverse_lqr_lmi"].weights is None else "LMI"
     direct = next(item for item in results if item.name == "inverse_mpc")
     assert direct.weights is not None  # it raises where there are none
     return CaseResult(

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.control.halfspaces import polygon
 from impc.reporting.style import (
     BLUE,
     DOUBLE_COLUMN,
@@ -86,7 +85,7 @@ def _terminal_set(case: CaseResult) -> Figure:
     axes = figure.subplots()
     terminal = case.controller.terminal
     assert terminal is not None  # `run_case` makes its controller with one
-    corners = polygon(terminal)
+    corners = terminal.vertices()
     axes.fill(*corners.T, facecolor=SET_FILL, edgecolor=INK, linewidth=0.9, label="terminal set")
     axes.plot(*case.truth.x.T, "o", color=INK, mfc="white", ms=4.5, label="recorded", zorder=4)
     for (_, name, label), mark in zip(FIGURES, _PATHS, strict=True):

@@ -9,11 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from impc.assess.resampling import Replicate
 from impc.checking import replace
 from impc.files.digests import digest, versions
-from impc.inverse.estimates import (
-    Estimate,
-    decode_estimate,
-    encode_estimate,
-)
+from impc.files.saved_estimates import decode_estimate, encode_estimate
 from impc.inverse.methods import METHODS, Method
 from impc.studies.cache import Cache, Steps, from_json
 
@@ -21,6 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
+    from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
     from impc.studies.fit.settings import FitSettings
 

@@ -35,8 +35,7 @@ from impc.checking import checked, replace
 from impc.errors import DataError, ImpcError, SolverError, WeightsError
 from impc.inverse.cross_check import cross_checked
 from impc.inverse.estimates import Estimate
-from impc.inverse.groundwork import NaturalUnits, Remember, afresh
-from impc.inverse.methods import estimate_all
+from impc.inverse.methods import METHODS, fit
 from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.problem import Problem, simulated
 from impc.inverse.structured_fit import fit_structured
@@ -76,7 +75,7 @@ class FitProgress:
     done: Callable[[str], None] = lambda _: None  # Told the name of each stage when it is done
     # (name of stage, compute) -> the estimate, from memory when it is there
     # (`impc.studies.fit.memory`). By default every one is computed.
-    estimate: Remember = afresh
+    estimate: Callable[[str, Callable[[], Estimate]], Estimate] = lambda _, compute: compute()
     # (name of stage, compute) -> a bootstrap replicate, in the same way
     replicate: Callable[[str, Callable[[], Replicate]], Replicate] = lambda _, compute: compute()
     # (name of stage, compute, encode, decode) -> what an optional subpackage finds, likewise
@@ -153,6 +152,7 @@ def fit_problem(
         unknown_start=True,
         family=family,
         structure=next(iter(fit_structures(plant, settings)), None),
+        feedback_states=settings.feedback_states,
         solver=settings.solver,
     )
 
@@ -191,7 +191,8 @@ def fit_recordings(
     >>> states = law.simulate([0.0], disturbance=push).x[:-1]
     >>> trial = impc.Recording(plant, states + 0.01 * rng.standard_normal(states.shape), push)
     >>> settings = impc.FitSettings(horizon=3, u_max=1.0, intent_draws=False)
-    >>> found = impc.fit_recordings(impc.fit_problem(plant, [trial], settings), settings)
+    >>> from impc.studies.fit.subject import fit_recordings
+    >>> found = fit_recordings(impc.fit_problem(plant, [trial], settings), settings)
     >>> bool(abs(found.estimate.K - law.K).max() < 0.1)
     True
     """
@@ -223,10 +224,10 @@ def _fitted(problem: Problem, settings: FitSettings, progress: FitProgress) -> F
     started = time.perf_counter()
     failures: dict[str, str] = {}
     attempt = functools.partial(_attempt, failures)
-    ground, found = _estimates(problem, settings, progress)
+    found = _estimates(problem, settings, progress)
     fitted = found["inverse_mpc"]
     estimate = gain_estimate(fitted)
-    known, weights = ground.known, fitted.stage_weights
+    known, weights = fitted.problem.known(), fitted.stage_weights
     plant, K, metrics = known.plant, np.array(fitted.gain), np.array(fitted.metrics)
     own = judge(fitted, problem.bounds)
     sizes = state_sizes(own.runs)
@@ -249,7 +250,7 @@ def _fitted(problem: Problem, settings: FitSettings, progress: FitProgress) -> F
         return weights_summary_or_reason(plant, K, metrics, sizes, draws)
 
     methods, held_out, weights_found = _beside_it(
-        ground, own, list(found.values())[:-1], settings, progress, attempt, whole_set
+        problem, own, list(found.values())[:-1], settings, progress, attempt, whole_set
     )
     structures = _structures(problem, settings, fitted, progress)
     after = progress.done, progress.replicate, attempt
@@ -283,16 +284,19 @@ def _fitted(problem: Problem, settings: FitSettings, progress: FitProgress) -> F
 
 def _estimates(
     problem: Problem, settings: FitSettings, progress: FitProgress
-) -> tuple[NaturalUnits, dict[str, Estimate]]:
+) -> dict[str, Estimate]:
     """What every method finds, inverse MPC last, none beaten by another's answer."""
-    ground = NaturalUnits(problem, progress.estimate, settings.feedback_states)
-    _ = ground.fitted
+    fitted = progress.estimate("inverse_mpc", functools.partial(fit, problem))
     progress.done("inverse MPC")
-    return cross_checked(ground, estimate_all(ground, [*_beside(settings), "inverse_mpc"]))
+    found = {
+        name: progress.estimate(name, functools.partial(METHODS[name].estimate, problem, fitted))
+        for name in _beside(settings)
+    }
+    return cross_checked(problem, found | {"inverse_mpc": fitted})
 
 
 def _beside_it(
-    ground: NaturalUnits,
+    problem: Problem,
     own: MethodFit,
     others: list[Estimate],
     settings: FitSettings,
@@ -301,9 +305,9 @@ def _beside_it(
     whole_set: Callable[[], tuple[WeightsSummary | None, str]],
 ) -> tuple[tuple[MethodFit, ...], tuple[HeldOut, ...], tuple[WeightsSummary | None, str]]:
     """The other methods, trials predicted by the rest, and the set of weights, side by side."""
-    problem, methods, held_out = ground.problem, [own], []
+    methods, held_out = [own], []
     with threads(_THREADS) as pool:
-        pending = _left_out(pool, ground, settings)
+        pending = _left_out(pool, own.estimate, settings, progress)
         in_background = pool.submit(whole_set)
         for found in others[::-1]:
             methods.insert(0, judge(found, problem.bounds))
@@ -415,15 +419,15 @@ def _leaves_out(trials: int, settings: FitSettings) -> bool:
 
 
 def _left_out(
-    pool: ThreadPoolExecutor, ground: NaturalUnits, settings: FitSettings
+    pool: ThreadPoolExecutor, fitted: Estimate, settings: FitSettings, progress: FitProgress
 ) -> list[Future[Estimate]]:
     """Controllers fitted to all trials but one, each from where the fit to all has ended."""
-    fitted, pending = ground.fitted, []
+    pending = []
     for index in range(len(fitted.problem.recordings)):
         if _leaves_out(len(fitted.problem.recordings), settings):
             others = fitted.problem.leaving_out(index)
-            fit = functools.partial(fit_controller, others, fitted.stage_weights)
-            pending.append(pool.submit(ground.remember, _without(index), fit))
+            refit = functools.partial(fit_controller, others, fitted.stage_weights)
+            pending.append(pool.submit(progress.estimate, _without(index), refit))
     return pending
 
 

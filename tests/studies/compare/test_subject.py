@@ -19,8 +19,9 @@ from impc.assess.assessments import MethodFit, judge
 from impc.checking import replace
 from impc.cli.main import main
 from impc.control.controller import Controller
+from impc.files.saved_estimates import decode_estimate, encode_estimate
 from impc.inverse import methods
-from impc.inverse.estimates import Estimate, Status, decode_estimate, encode_estimate
+from impc.inverse.estimates import Estimate, Status
 from impc.inverse.problem import Problem
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
@@ -95,7 +96,7 @@ def test_only_samples_that_were_reached_count() -> None:
     wide = Bounds(plant, u_min=-5, u_max=5)
     run = Controller(plant, Weights(1, 1), wide, 3, terminal_set=False).simulate([1.0], steps=400)
     problem = Problem(plant, wide, 3, [Recording(plant, run.x)], terminal_set=False)
-    found = methods.estimate(problem)
+    found = methods.fit(problem)
     tight = Bounds(plant, u_min=-0.1, u_max=0.1)
     fit = judge(replace(found, problem=replace(found.problem, bounds=tight)), wide)
     assert fit.fell[0] is not None
@@ -208,7 +209,9 @@ def test_the_command(tmp_path: Path) -> None:
     assert "inverse MPC, direct (3.6)" in done.stdout
 
 
-def test_a_printed_estimate_says_what_speaks_against_it(compared: dict[str, MethodFit]) -> None:
+def test_a_printed_estimate_says_what_speaks_against_it(
+    compared: dict[str, MethodFit], caplog: pytest.LogCaptureFixture
+) -> None:
     assert "leaves" not in str(compared["inverse_mpc"].estimate).split("noise.", 1)[1]
     clipped = str(compared["inverse_lqr_output"].estimate)
     assert "But another gain leaves less" in clipped
@@ -217,11 +220,9 @@ def test_a_printed_estimate_says_what_speaks_against_it(compared: dict[str, Meth
     plant = Plant(yalmip_example())
     still = np.random.default_rng(1).standard_normal((21, 2))
     bounds = Bounds(plant, u_min=-1, u_max=1)
-    heard: list[str] = []
-    found = methods.estimate(
-        Problem(plant, bounds, 3, [Recording(plant, still)]), progress=heard.append
-    )
-    assert heard == ["inverse_mpc"]
+    with caplog.at_level("INFO", logger="impc"):
+        found = methods.fit(Problem(plant, bounds, 3, [Recording(plant, still)]))
+    assert [item.args for item in caplog.records] == [(found,)]
     share = found.misfit / np.sqrt(still.size)  # outputs are over their root-mean-square
     assert f"It leaves {100 * share:.0f} % of the recordings." in str(found)
 

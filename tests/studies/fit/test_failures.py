@@ -16,6 +16,7 @@ from impc.reporting.provenance import Provenance
 from impc.studies.fit import subject
 from impc.studies.fit.report import fit_report
 from impc.studies.fit.result import FitResult
+from impc.studies.fit.subject import fit_recordings
 from impc.studies.fit.verdict import abstract, remarks, verdict
 
 
@@ -33,7 +34,7 @@ def posed(angle: float, rate: float, noise: float) -> tuple[impc.Problem, impc.F
 
 
 def fitted(angle: float = -25.0, rate: float = -7.0, noise: float = 3e-4) -> FitResult:
-    return impc.fit_recordings(*posed(angle, rate, noise))
+    return fit_recordings(*posed(angle, rate, noise))
 
 
 def data(result: FitResult) -> dict[str, Any]:

@@ -152,7 +152,7 @@ def test_preliminary_gain_without_noise_finds_gains_of_its_own_form() -> None:
         x[k + 1] = (plant.A - plant.B @ K) @ x[k] + plant.E[:, 0] * push[k]
     trial = Recording(plant, (x @ plant.C.T)[:400], push)
     problem = fit_problem(plant, [trial], FitSettings())
-    np.testing.assert_allclose(preliminary_gain(problem, plant.states).K, K, rtol=1e-6)
+    np.testing.assert_allclose(preliminary_gain(problem, plant.states)[0], K, rtol=1e-6)
     with pytest.raises(InputError, match="feedback_states"):
         preliminary_gain(problem, ["speed"])
 

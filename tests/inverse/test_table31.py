@@ -11,22 +11,21 @@ from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
 from impc.control.simulation import Status, require_complete, scenario
 from impc.errors import SolverError
-from impc.inverse.direct_and_reduced import (
-    CONDITION_WEIGHT,
-    infer_weights,
-    inverse_mpc,
-    inverse_mpc_reduced,
-    output_penalty_weights,
-    starting_point,
-)
 from impc.inverse.equivalent_weights import SLACK, least_condition_weights
 from impc.inverse.explaining_weights import weights_behind
 from impc.inverse.gain_search import fit_gain
 from impc.inverse.problem import Problem, controller_for
 from impc.inverse.proximal_search import Residual, weight_jacobian
 from impc.inverse.proximal_step import block_basis
-from impc.inverse.residuals import evaluate, residual_only, verify_hard
+from impc.inverse.residuals import evaluate, keeps_hard, residual_only
 from impc.inverse.solution_set import gain_fibre
+from impc.inverse.table31 import (
+    CONDITION_WEIGHT,
+    inverse_mpc,
+    inverse_mpc_reduced,
+    starting_weights,
+    table_3_1,
+)
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.recordings import Recording
@@ -53,17 +52,13 @@ def test_table_3_1_recovers_the_weights(
     example_plant: Plant, example_bounds: Bounds, case: str
 ) -> None:
     problem = example(example_plant, example_bounds, case)
-    found = infer_weights(problem)
-    assert weight_error(found.fit.weights, IDENTITY) <= 1e-6
-    reduced = inverse_mpc_reduced(problem)
-    assert weight_error(reduced.weights, IDENTITY) <= 1e-6
-    assert reduced.kept_hard
-    squared = inverse_mpc(problem, found.start.weights, squared=True)
-    assert weight_error(squared.weights, IDENTITY) <= 1e-6
-    for run in verify_hard(problem, found.fit.weights):
-        assert run.complete
-    assert (found.start.lmi.weights is None) == (case != "B")
-    assert (found.start.auxiliary is None) == (case == "B")
+    lines = table_3_1(problem)
+    for name in ("inverse_mpc", "inverse_mpc_reduced"):
+        assert weight_error(lines[name].stage_weights, IDENTITY) <= 1e-6
+        assert keeps_hard(problem, lines[name].stage_weights)
+    squared = inverse_mpc(problem, starting_weights(problem), squared=True)
+    assert weight_error(squared.stage_weights, IDENTITY) <= 1e-6
+    assert (lines["inverse_lqr_lmi"].weights is None) == (case != "B")
 
 
 def test_the_dissertations_comparison_shows_in_case_A(example_plant: Plant) -> None:
@@ -148,13 +143,13 @@ def test_output_penalty_reaches_what_a_derivative_free_search_reaches(
         distance = np.linalg.norm(residual_only(linear, solution.K, solution.S))
         return float(distance + CONDITION_WEIGHT * condition_number(weights))
 
-    found = output_penalty_weights(problem, IDENTITY)
+    found = inverse_mpc(linear, IDENTITY, explain=False)
     search = nelder_mead(
         lambda z: objective(weights_from_parameters(z, 2, 1)),
-        cholesky_parameters(found.weights) + 0.03,
+        cholesky_parameters(found.stage_weights) + 0.03,
         1500,
     )
-    assert objective(found.weights) <= search + 1e-8
+    assert objective(found.stage_weights) <= search + 1e-8
 
 
 @pytest.mark.full
@@ -168,11 +163,10 @@ def test_direct_form_tends_to_the_reduced_one_with_noise(
         example_plant, example_bounds, 3, (Recording(example_plant, noisy, x0=[2, 3]),)
     )
     reduced = inverse_mpc_reduced(problem)
-    assert reduced.equivalent is not None
     distances = []
     for weight in (1e-2, 1e-3, 1e-4, 1e-5):
         direct = inverse_mpc(problem, IDENTITY, condition_weight=weight)
-        distances.append(weight_error(direct.weights, reduced.weights))
+        distances.append(weight_error(direct.stage_weights, reduced.stage_weights))
     assert np.all(np.diff(distances) < 0)
     assert distances[-1] < np.sqrt(SLACK)
 
@@ -186,14 +180,14 @@ def test_squared_misfit_trades_and_the_norm_does_not(
     run = require_complete(controller, simulate(controller, scenario(example_plant, [2, 3], 20)))
     problem = Problem(example_plant, example_bounds, 3, (Recording(example_plant, run.x),))
     reduced = inverse_mpc_reduced(problem)
-    assert np.linalg.norm(reduced.gain.K - controller.K) < 1e-9
-    assert condition_number(reduced.weights) <= condition_number(true) * (1 + 2 * SLACK)
+    assert np.linalg.norm(reduced.gain - controller.K) < 1e-9
+    assert condition_number(reduced.stage_weights) <= condition_number(true) * (1 + 2 * SLACK)
     norm = inverse_mpc(problem, IDENTITY)
     square = inverse_mpc(problem, IDENTITY, squared=True)
     assert norm.misfit < 1e-9
-    assert weight_error(norm.weights, reduced.weights) < np.sqrt(SLACK)
+    assert weight_error(norm.stage_weights, reduced.stage_weights) < np.sqrt(SLACK)
     assert square.misfit > 1e-6
-    assert square.condition < norm.condition
+    assert condition_number(square.stage_weights) < condition_number(norm.stage_weights)
 
 
 def test_two_inputs_recover_gain_and_metric_while_bounds_are_active() -> None:
@@ -209,15 +203,15 @@ def test_two_inputs_recover_gain_and_metric_while_bounds_are_active() -> None:
             recordings.append(Recording(plant, run.x))
     problem = Problem(plant, bounds, 4, tuple(recordings))
     found = inverse_mpc_reduced(problem)
-    np.testing.assert_allclose(found.gain.K, controller.K, atol=1e-6)
+    np.testing.assert_allclose(found.gain, controller.K, atol=1e-6)
     assert len(found.metrics) == 1
     np.testing.assert_allclose(
-        found.gain.S / np.trace(found.gain.S), controller.S / np.trace(controller.S), atol=1e-6
+        found.metric / np.trace(found.metric), controller.S / np.trace(controller.S), atol=1e-6
     )
     fibre = gain_fibre(plant, controller.K, solve_lqr(plant, true).S)
     best = least_condition_weights(fibre).condition
-    assert condition_number(found.weights) == pytest.approx(best, rel=1e-4)
-    counts = identifiability(problem, found.weights)
+    assert condition_number(found.stage_weights) == pytest.approx(best, rel=1e-4)
+    counts = identifiability(problem, found.stage_weights)
     assert counts.free == 8
     assert counts.rank == 3 * 2 + 2 - 1  # docs/theory.md, section 2: n m + m - 1
     # Without an active bound the metric stays in the dark: only the gain is determined.
@@ -270,11 +264,11 @@ def test_a_gain_no_weights_have_is_said_and_the_direct_form_continues(
     )
     problem = Problem(example_plant, example_bounds, 3, (Recording(example_plant, run.x),))
     found = inverse_mpc_reduced(problem)
-    np.testing.assert_allclose(found.gain.K, gain, atol=1e-7)
-    assert found.equivalent is None
-    assert found.direct is not None
+    np.testing.assert_allclose(found.gain, gain, atol=1e-7)
     assert "weights" in found.reason
-    assert found.direct.misfit > 1e-3
+    assert not found.explained
+    near = solve_lqr(problem.plant, found.stage_weights)
+    assert np.linalg.norm(residual_only(problem, near.K, near.S)) > 1e-3
 
 
 def test_a_search_steps_back_from_gains_that_do_not_stabilise(
@@ -286,16 +280,6 @@ def test_a_search_steps_back_from_gains_that_do_not_stabilise(
     assert np.all(np.isfinite(found.residual))
     assert np.linalg.norm(found.residual) > 1e3
     assert controller_for(problem, np.array([[1.5, -0.9]]), np.eye(1)).softening is not None
-
-
-def test_starting_point_alone_is_table_3_1_without_its_last_line(
-    example_plant: Plant, example_bounds: Bounds
-) -> None:
-    problem = example(example_plant, example_bounds, "A")
-    start = starting_point(problem)
-    assert start.gradient is not None
-    assert start.auxiliary is not None
-    assert start.weights is start.auxiliary.weights
 
 
 @pytest.mark.full
@@ -313,8 +297,8 @@ def test_a_recording_that_breaks_a_state_bound_is_fitted_softly_and_said_so(
     trial = Recording(plant, run.x, np.append(push, 0.0))
     problem = Problem(plant, bounds, 6, (trial,), softening=1e6)
     found = inverse_mpc_reduced(problem)
-    assert not found.kept_hard
-    np.testing.assert_allclose(found.gain.K, true.K, atol=1e-6)
+    assert not keeps_hard(problem, found.stage_weights)
+    np.testing.assert_allclose(found.gain, true.K, atol=1e-6)
 
 
 def test_an_iterate_that_diverges_is_named_and_finite(

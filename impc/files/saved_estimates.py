@@ -1,0 +1,213 @@
+"""An estimate in a file: JSON, exact to the last digit, with its problem; no code, no pickle.
+
+What is a function of Python is not in the file: a body that is not linear, and a family of plants.
+Whoever loads such an estimate gives the plant or the family again, and it is compared with what
+was saved.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import fields, is_dataclass
+from enum import Enum
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from impc.arrays import frozen
+from impc.checking import checked, replace
+from impc.errors import DataError, ImpcError, InputError
+from impc.files.disk import unwritable, write_whole
+from impc.files.results import SCHEMA, ResultFile, read_content, read_result
+from impc.inverse.estimates import Estimate, Goodness, Status
+from impc.inverse.problem import Problem
+from impc.model.bounds import Bounds
+from impc.model.plant import Plant
+from impc.model.recordings import Label, Recording
+from impc.model.structure import Structure
+from impc.model.weights import Weights
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from impc.model.plant_family import PlantFamily
+
+# A plant that is given again is the one that was saved up to this, of its entries.
+_SAME = 1e-9
+
+
+def save_estimate(estimate: Estimate, path: Path) -> Path:
+    """Write an estimate and its problem into one file, whole or not at all."""
+    content = {
+        "schema": SCHEMA,
+        "problem": _encode(estimate.problem),
+        "estimate": encode_estimate(estimate),
+    }
+    try:
+        write_whole(path, json.dumps(content).encode())
+    except (OSError, ValueError) as error:
+        raise unwritable(f"file {path}", error, "give another file") from None
+    return path
+
+
+@checked
+def load(
+    path: str | Path, *, plant: Plant | None = None, family: PlantFamily | None = None
+) -> Estimate | ResultFile:
+    """Load a saved estimate, or the result of a command.
+
+    Parameters
+    ----------
+    path : str or Path
+        A file of `Estimate.save`; a folder that a command or `impc.report` wrote, or its
+        result.json.
+    plant : Plant, optional
+        Of an estimate, where the plant has a body that is not linear: no file holds it.
+    family : PlantFamily, optional
+        Of an estimate, where physical parameters were fitted: likewise.
+
+    Returns
+    -------
+    Estimate or ResultFile
+
+    Raises
+    ------
+    DataError
+        When the file is missing or damaged, or another version of impc wrote it.
+    InputError
+        When the plant or the family is needed, or is another than was saved.
+
+    Examples
+    --------
+    >>> import pathlib, tempfile
+    >>> import control
+    >>> import impc
+    >>> plant = impc.Plant(control.ss([[0.9]], [[1]], [[1]], 0, 1))
+    >>> bounds = impc.Bounds(plant, u_min=-0.3, u_max=0.3)
+    >>> truth = impc.Controller(plant, impc.Weights(1, 1), bounds, horizon=3)
+    >>> trial = impc.Recording(plant, truth.simulate([1.0], steps=20).x)
+    >>> found = impc.fit(impc.Problem(plant, bounds, 3, [trial]))
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     again = impc.load(found.save(pathlib.Path(folder) / "found.json"))
+    ...     files = impc.report(found, folder)
+    ...     result = impc.load(folder)
+    >>> bool((again.K == found.K).all()), result.methods["inverse_mpc"].status
+    (True, 'explained')
+    """
+    place = Path(path)
+    if os.path.isdir(place):
+        return read_result(place)
+    content = read_content(place)
+    if "estimate" not in content:
+        return read_result(place)
+    try:
+        return decode_estimate(_problem(content["problem"], plant, family), content["estimate"])
+    except ImpcError:
+        raise
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        reason = " ".join(str(error).split())[:80]
+        problem = f"is damaged ({type(error).__name__}: {reason})"
+        raise DataError(f"file {place}", problem, "save the estimate again") from None
+
+
+def encode_estimate(estimate: Estimate) -> dict[str, Any]:
+    """Values that Python's JSON keeps to the last digit; the problem itself is not among them."""
+    kept: dict[str, Any] = _encode(replace(estimate, problem=None))
+    problem = estimate.problem
+    return kept | {
+        "starts": problem.starts.tolist(),
+        "logarithms": problem.logarithms.tolist(),
+        "terminal_set": bool(problem.terminal_set),
+    }
+
+
+def decode_estimate(seen: Problem, kept: Mapping[str, Any]) -> Estimate:
+    """Make an estimate again of the problem as its method saw it."""
+    m, weights = seen.plant.m, kept["weights"]
+    posed = replace(seen, terminal_set=kept["terminal_set"])
+    values = dict(kept) | {
+        "problem": posed.at(np.array(kept["starts"]), np.array(kept["logarithms"], dtype=float)),
+        "weights": None if weights is None else Weights(weights["Q"], weights["R"]),
+        "metrics": frozen(np.reshape(kept["metrics"], (-1, m, m))),
+        "status": Status(kept["status"]),
+        "fit": Goodness(**kept["fit"]),
+        **{
+            name: None if kept[name] is None else frozen(kept[name])
+            for name in ("K", "S", "prices")
+        },
+    }
+    return Estimate(**{item.name: values[item.name] for item in fields(Estimate)})
+
+
+def _encode(value: Any) -> Any:
+    """Fields by name, arrays as lists, an enumeration by its value; no functions."""
+    if isinstance(value, Plant):
+        return _fields(value) | {"body": value.body is not None}
+    if isinstance(value, Problem):
+        names = [] if value.family is None else list(value.family.names)
+        return _fields(replace(value, family=None)) | {"family": names}
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    if isinstance(value, tuple):
+        return [_encode(item) for item in value]
+    if isinstance(value, Enum):
+        return value.value
+    return _fields(value) if is_dataclass(value) else value
+
+
+def _fields(value: Any) -> dict[str, Any]:
+    return {item.name: _encode(getattr(value, item.name)) for item in fields(value)}
+
+
+def _problem(kept: dict[str, Any], plant: Plant | None, family: PlantFamily | None) -> Problem:
+    saved, names = kept["plant"], kept["family"]
+    if names and (family is None or list(family.names) != names):
+        raise InputError("family", f"of {', '.join(names)} is needed", "give load(..., family=...)")
+    if saved["body"] and plant is None and family is None:
+        raise InputError("plant", "has a body that is in no file", "give load(..., plant=...)")
+    if plant is None:
+        fixed = ("states", "controls", "disturbances", "outputs")
+        pairs = {name: tuple(map(tuple, saved[name])) for name in ("units", "words")}
+        given = {name: tuple(saved[name]) for name in fixed}
+        plant = _filled(Plant, saved | given | pairs | {"body": None})
+    for name in "ABEC":
+        if not np.allclose(getattr(plant, name), saved[name], rtol=_SAME, atol=0):
+            raise InputError("plant", f"has another {name} than was saved", "give the same plant")
+    structure = kept["structure"]
+    found: Problem = _filled(
+        Problem,
+        kept
+        | {
+            "plant": plant,
+            "bounds": _filled(Bounds, kept["bounds"]),
+            "recordings": tuple(_recording(item) for item in kept["recordings"]),
+            "family": family if names else None,
+            "structure": None if structure is None else _filled(Structure, _tuples(structure)),
+            "feedback_states": tuple(kept["feedback_states"]),
+        },
+    )
+    return found
+
+
+def _recording(kept: Mapping[str, Any]) -> Recording:
+    label, findings = Label(**kept["label"]), tuple(kept["findings"])
+    found: Recording = _filled(Recording, {**kept, "label": label, "findings": findings})
+    return found
+
+
+def _tuples(kept: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: tuple(item) if name.endswith("labels") else item for name, item in kept.items()}
+
+
+def _filled(kind: Any, values: Mapping[str, Any]) -> Any:
+    """A value of that kind from its fields, each checked."""
+    made = object.__new__(kind)
+    made._fill(**{
+        item.name: frozen(values[item.name])
+        if item.type == "Array"
+        else values[item.name]
+        for item in fields(kind)
+    })  # fmt: skip
+    return made

@@ -1,0 +1,293 @@
+"""Table 3.1 for recordings without noise, in the units of the plant: `impc example` runs it.
+
+    line 1      feedback gain, no bounds (3.12)
+    lines 2-7   inverse LQR: weights with exactly that gain (LMI); where there are none those with
+                the nearest gain (gradient), then these well conditioned (3.7)
+    line 9      inverse MPC (3.6) from there; (3.16) is the same without bounds
+
+The direct form (3.6) searches weights. The reduced form reaches the same weights through the gain:
+what the recordings determine is K (and S), and the weights of least condition number among all
+those with that gain are one semidefinite program.
+"""
+
+from __future__ import annotations
+
+import itertools
+import time
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from impc.checking import checked, replace
+from impc.errors import SolverError
+from impc.inverse.estimates import Estimate, no_estimate, simulated_estimate
+from impc.inverse.explaining_weights import weights_behind
+from impc.inverse.gain_search import fit_gain, refine_gain, regulators
+from impc.inverse.inverse_lqr import inverse_lqr_gradient, inverse_lqr_lmi
+from impc.inverse.problem import EXPLAINED, recorded_size, typical_output, with_or_without_set
+from impc.inverse.proximal_search import (
+    AUXILIARY_CONDITION_WEIGHT,
+    Objective,
+    Residual,
+    auxiliary_weights,
+    conditioned_fit,
+    definite,
+)
+from impc.inverse.residuals import evaluate
+from impc.model.riccati import solve_lqr
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from impc.arrays import Array
+    from impc.control.terminal_set import TerminalSet
+    from impc.inverse.explaining_weights import WeightsBehind
+    from impc.inverse.problem import Problem
+    from impc.model.riccati import LqrSolution
+    from impc.model.weights import Weights
+
+# c of (3.5) to (3.7) is lost. Small enough that the exact fit wins in the 2-norm (docs/theory.md).
+#: Weight of the condition number in (3.6) and (3.16), against 1 for a misfit of a typical output.
+CONDITION_WEIGHT = 1e-4
+# Steps of the direct form inside the reduced one: it need not end, only change the valley.
+_DETOUR = 60
+
+
+@checked
+def table_3_1(
+    problem: Problem,
+    *,
+    absolute: bool = False,
+    progress: Callable[[str], None] = lambda _: None,
+) -> dict[str, Estimate]:
+    """Table 3.1 from end to end, line by line, for recordings without noise.
+
+    Parameters
+    ----------
+    problem : Problem
+    absolute : bool
+        Whether the weights of the condition number are 1e-3 in (3.7) and 1e-4 in (3.6) and (3.16)
+        as they stand, in the units of the plant. By default they are those shares of the size of
+        the gain and of a typical output, so that no answer depends on units.
+    progress : callable, optional
+        Given the name of each line when it is done, such as `print`.
+
+    Returns
+    -------
+    dict of str to Estimate
+        By method, in the order of the table: feedback_gain, inverse_lqr_lmi, inverse_lqr_gradient,
+        inverse_lqr_auxiliary, inverse_lqr_output, inverse_mpc, inverse_mpc_reduced. A line without
+        an answer says why.
+
+    Raises
+    ------
+    WeightsError, SolverError
+        When there is no feedback gain, or no weights to start inverse MPC from.
+
+    Examples
+    --------
+    >>> import impc
+    >>> from plants import yalmip_example
+    >>> plant = impc.Plant(yalmip_example())
+    >>> bounds, weights = impc.Bounds(plant, u_min=-1, u_max=1), impc.Weights([[1, 0], [0, 1]], 1)
+    >>> truth = impc.Controller(plant, weights, bounds, horizon=3)
+    >>> trial = impc.Recording(plant, truth.simulate([1, 3], steps=20).x)
+    >>> found = impc.table_3_1(impc.Problem(plant, bounds, 3, [trial]))["inverse_mpc"]
+    >>> found.explained, impc.weight_error(found.weights, weights) < 1e-6
+    (True, True)
+    """
+    found: dict[str, Estimate] = {}
+    started = time.perf_counter()
+    for line in _lines(problem, absolute):
+        found[line.method] = replace(line, seconds=time.perf_counter() - started)
+        progress(line.method)
+        started = time.perf_counter()
+    return found
+
+
+def _lines(problem: Problem, absolute: bool) -> Iterator[Estimate]:
+    plant, loose = problem.plant, problem.without_bounds()
+    first = fit_gain(loose)
+    K, size = np.array(first.K), float(np.linalg.norm(first.K)) or 1.0
+    yield _simulated("feedback_gain", loose, K, evaluations=first.evaluations)
+    lmi = inverse_lqr_lmi(plant, K)
+    yield _regulator("inverse_lqr_lmi", loose, lmi.weights)
+    gradient = inverse_lqr_gradient(plant, K)
+    yield _regulator("inverse_lqr_gradient", loose, gradient.weights)
+    weight = AUXILIARY_CONDITION_WEIGHT * (1.0 if absolute else size)
+    auxiliary = auxiliary_weights(plant, K, gradient.weights, condition_weight=weight).weights
+    yield _regulator("inverse_lqr_auxiliary", loose, auxiliary)
+    start = auxiliary if lmi.weights is None else lmi.weights
+    given = CONDITION_WEIGHT if absolute else None
+    output = inverse_mpc(loose, start, condition_weight=given, explain=False)
+    yield replace(output, method="inverse_lqr_output")
+    yield inverse_mpc(problem, start, condition_weight=given)
+    yield inverse_mpc_reduced(problem)
+
+
+def _simulated(
+    name: str, problem: Problem, K: Array, S: Array | None = None, **more: Any
+) -> Estimate:
+    metric = np.eye(problem.plant.m) if S is None else S
+    noise = EXPLAINED * recorded_size(problem)
+    return simulated_estimate(name, problem, K, metric, noise=noise, **more)
+
+
+def _regulator(name: str, problem: Problem, weights: Weights | None) -> Estimate:
+    if weights is None:
+        return no_estimate(name, problem, "no weights have the feedback gain")
+    K = np.array(solve_lqr(problem.plant, weights).K)
+    return _simulated(name, problem, K, weights=weights)
+
+
+def starting_weights(problem: Problem) -> Weights:
+    """Lines 2 to 7: where inverse MPC starts."""
+    _, lmi, _, auxiliary = itertools.islice(_lines(problem, absolute=False), 4)
+    return auxiliary.stage_weights if lmi.weights is None else lmi.weights
+
+
+@checked(condition_weight=0, max_iterations=1)
+def inverse_mpc(
+    problem: Problem,
+    start: Weights,
+    *,
+    condition_weight: float | None = None,
+    squared: bool = False,
+    max_iterations: int = 200,
+    explain: bool = True,
+) -> Estimate:
+    """Direct inverse MPC (3.6): misfit of the constrained closed loop plus condition number.
+
+    Terminal weight and terminal set follow (Q, R) at every iterate. Without `explain`, and of a
+    problem without bounds, it is inverse LQR on the outputs (3.16).
+
+    Parameters
+    ----------
+    start : Weights
+        Positive definite, from Table 3.1 for example.
+    condition_weight : float, optional
+        Against a fit weight of 1. By default 1e-4 of a typical output (over its scale), so that the
+        answer does not depend on units.
+    squared : bool
+        Whether the misfit is the square of its 2-norm; see `Objective`.
+    max_iterations : int
+        Steps that are solved at most.
+    explain : bool
+        Whether weights that explain the recordings are looked for where the minimum does not, and
+        taken instead: the minimum at every condition weight that is small enough (docs/theory.md,
+        section 6). Only in the 2-norm, and without a condition weight of the caller's.
+
+    Raises
+    ------
+    WeightsError, SolverError
+        As `conditioned_fit`.
+    """
+    weight = condition_weight
+    if weight is None:
+        weight = CONDITION_WEIGHT * typical_output(problem)
+    explain = explain and not squared and condition_weight is None
+
+    def fit(posed: Problem) -> Estimate:
+        objective = Objective(_closed_loop_residual(posed), 1.0, weight, squared)
+        found = conditioned_fit(
+            posed.plant, objective, definite(start), max_iterations=max_iterations
+        )
+        K, S = np.array(found.solution.K), np.array(found.solution.S)
+        more = {"evaluations": found.evaluations, "settled": found.converged}
+        direct = _simulated("inverse_mpc", posed, K, S, weights=found.weights, **more)
+        if direct.explained or not explain:
+            return direct
+        behind = weights_behind(refine_gain(posed, K, S))
+        spent = found.evaluations + behind.gain.evaluations
+        return _explaining("inverse_mpc", behind, spent) if behind.explained else direct
+
+    return with_or_without_set(problem, fit, lambda found: found.explained)
+
+
+@checked
+def inverse_mpc_reduced(problem: Problem) -> Estimate:
+    """Reduced inverse MPC: fit the gain through the constrained controller, then one program.
+
+    When the gain does not explain the recordings, or no weights have it, a search that stays among
+    weights (the direct form) follows, and goes on as a search for a gain from where that ends. Its
+    answer then is the gain, with the weights that come nearest and the reason why they miss.
+
+    Raises
+    ------
+    SolverError
+        When the recordings cannot be simulated from where any search begins.
+    """
+    return with_or_without_set(problem, _reduced, lambda found: found.explained)
+
+
+def _reduced(problem: Problem) -> Estimate:
+    first = weights_behind(fit_gain(problem))
+    if first.explained:
+        return _explaining("inverse_mpc_reduced", first, first.gain.evaluations)
+    try:
+        direct = inverse_mpc(
+            problem, _most_promising(problem), max_iterations=_DETOUR, explain=False
+        )
+    except SolverError:  # the loop falls with every regulator that a search begins at
+        if first.equivalent is None:
+            raise
+        return _missing(first, first.equivalent.weights)
+    second = weights_behind(refine_gain(problem, direct.gain, direct.metric))
+    best = min(first, second, key=lambda item: item.misfit)
+    if best.explained:
+        return _explaining("inverse_mpc_reduced", best, best.gain.evaluations)
+    if best.misfit <= direct.misfit and best.equivalent is not None:
+        return _missing(best, best.equivalent.weights)
+    return _missing(first, direct.stage_weights)
+
+
+def _explaining(name: str, behind: WeightsBehind, evaluations: int) -> Estimate:
+    """The weights of least condition number that explain the recordings."""
+    assert behind.equivalent is not None  # they explain
+    problem, weights = behind.gain.problem, behind.equivalent.weights
+    solution = solve_lqr(problem.plant, weights)
+    return _simulated(
+        name,
+        problem,
+        np.array(solution.K),
+        np.array(solution.S),
+        weights=weights,
+        metrics=behind.metrics,
+        evaluations=evaluations,
+    )
+
+
+def _missing(behind: WeightsBehind, weights: Weights) -> Estimate:
+    """A gain with weights that come near it."""
+    gain = behind.gain
+    return _simulated(
+        "inverse_mpc_reduced",
+        gain.problem,
+        np.array(gain.K),
+        np.array(gain.S),
+        weights=weights,
+        metrics=behind.metrics,
+        evaluations=gain.evaluations,
+        reason=behind.reason,
+    )
+
+
+def _most_promising(problem: Problem) -> Weights:
+    """Of balanced regulators that of least misfit, whether or not every sample is reached."""
+
+    def distance(solution: LqrSolution) -> float:
+        return float(np.linalg.norm(evaluate(problem, solution.K, solution.S).residual))
+
+    return min(regulators(problem), key=distance).weights
+
+
+def _closed_loop_residual(problem: Problem) -> Callable[[LqrSolution], Residual]:
+    near: TerminalSet | None = None
+
+    def residual(solution: LqrSolution) -> Residual:
+        nonlocal near
+        found = evaluate(problem, solution.K, solution.S, near)
+        near = found.terminal or near
+        return Residual(found.residual, found.dK, found.dS, usable=not found.reason)
+
+    return residual

@@ -1,0 +1,118 @@
+"""What an estimate says in a terminal, in a notebook and in a figure: methods of `Estimate`."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from markupsafe import escape
+
+from impc.errors import InputError
+from impc.inverse.methods import METHODS
+from impc.model.plant import gain_unit
+from impc.reporting.shown_units import axis_label, shown_unit
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.axes import Axes
+
+    from impc.inverse.estimates import Estimate
+
+_WIDTH = 78
+
+
+def summary(estimate: Estimate) -> str:
+    """Method, problem, agreement, gain with intervals, weights and doubts, a line each."""
+    lines = [METHODS[estimate.method].label, "=" * _WIDTH, *_problem(estimate)]
+    if estimate.K is None:
+        return "\n".join([*lines, "-" * _WIDTH, estimate.status.sentence, estimate.reason])
+    plant = estimate.problem.plant
+    shares = zip(plant.outputs, estimate.vaf, strict=True)
+    lines.append("VAF, %:     " + ", ".join(f"{name} {value:.4g}" for name, value in shares))
+    lines += ["-" * _WIDTH, estimate.intervals().round(6).to_string(index=False), "-" * _WIDTH]
+    if estimate.weights is not None:
+        parts = (("Q", estimate.weights.Q), ("R", estimate.weights.R))
+        for name, matrix in parts:
+            text = np.array2string(matrix, precision=4, suppress_small=True)
+            lines.append(f"{name} = " + text.replace("\n", "\n    "))
+    said = [estimate.status.sentence, estimate.reason, *estimate.doubts]
+    return "\n".join([*lines, *(text for text in said if text)])
+
+
+def _problem(estimate: Estimate) -> list[str]:
+    problem = estimate.problem
+    plant, bounds = problem.plant, problem.bounds
+    samples = sum(trial.samples for trial in problem.recordings)
+    limits = [
+        f"{low:g} <= {name} <= {high:g}"
+        for names, lows, highs in (
+            (plant.controls, bounds.u_min, bounds.u_max),
+            (plant.states, bounds.x_min, bounds.x_max),
+        )
+        for name, low, high in zip(names, lows, highs, strict=True)
+        if np.isfinite(low) or np.isfinite(high)
+    ]
+    return [
+        f"Recordings: {len(problem.recordings)} trials, {samples} samples of {plant.dt:g} s",
+        f"Controller: horizon {problem.horizon}, {', '.join(limits) or 'no bounds'}",
+    ]
+
+
+def as_html(estimate: Estimate) -> str:
+    """Status and gain for a notebook; everything is escaped."""
+    head = f"<p>{escape(METHODS[estimate.method].label)}: {escape(estimate.status.sentence)}</p>"
+    if estimate.K is None:
+        return head + f"<p>{escape(estimate.reason)}</p>"
+    table = gain_table(estimate).to_html(index=False, float_format="{:.4g}".format)
+    doubts = "".join(f"<p>{escape(text)}</p>" for text in estimate.doubts)
+    return head + table + doubts
+
+
+def gain_table(estimate: Estimate) -> pd.DataFrame:
+    """The gain of u = -Kx, a row an entry: input, state, unit and value."""
+    import pandas as pd  # noqa: PLC0415  # a third of a second
+
+    plant, K = estimate.problem.plant, estimate.gain
+    rows = [
+        (control, state, gain_unit(plant, control, state), float(K[i, j]))
+        for i, control in enumerate(plant.controls)
+        for j, state in enumerate(plant.states)
+    ]
+    return pd.DataFrame(rows, columns=["input", "state", "unit", "value"])
+
+
+def plot(estimate: Estimate, trial: int = 0, axes: Any = None) -> np.ndarray[Any, Any]:
+    """Outputs, recorded and simulated, and inputs within their bounds, of one trial."""
+    import matplotlib.pyplot as plt  # noqa: PLC0415  # a second
+
+    problem, plant = estimate.problem, estimate.problem.plant
+    if not 0 <= trial < len(problem.recordings):
+        last = len(problem.recordings) - 1
+        raise InputError("trial", f"got {trial}", f"give 0 to {last}")
+    run, recorded = estimate.simulations[trial], problem.recordings[trial].outputs
+    count = len(plant.outputs) + plant.m
+    if axes is None:
+        _, axes = plt.subplots(count, sharex=True, layout="constrained")
+    shown = np.ravel(np.asarray(axes, dtype=object))
+    if len(shown) != count:
+        raise InputError("axes", f"got {len(shown)}", f"give {count}: outputs, then inputs")
+    for k, name in enumerate(plant.outputs):
+        factor, _ = shown_unit(plant, name)
+        shown[k].plot(run.time, factor * recorded[:, k], color="0.6", label="recorded")
+        shown[k].plot(run.time, factor * run.outputs[:, k], label="simulated")
+        shown[k].set_ylabel(axis_label(plant, name))
+    for k, name in enumerate(plant.controls):
+        _input(shown[len(plant.outputs) + k], estimate, trial, k, name)
+    shown[0].legend()
+    shown[-1].set_xlabel("time (s)")
+    return shown
+
+
+def _input(axis: Axes, estimate: Estimate, trial: int, k: int, name: str) -> None:
+    plant, bounds = estimate.problem.plant, estimate.problem.bounds
+    run, (factor, _) = estimate.simulations[trial], shown_unit(plant, name)
+    axis.step(run.time[:-1], factor * run.inputs[:, k], where="post", color="C0")
+    for end in (bounds.u_min[k], bounds.u_max[k]):
+        if np.isfinite(end):
+            axis.axhline(factor * end, color="0.4", linestyle=":")
+    axis.set_ylabel(axis_label(plant, name))
