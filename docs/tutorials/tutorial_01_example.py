@@ -31,14 +31,14 @@ recorded = truth.simulate(x0=[1, 3], steps=20)
 print("steps at the bound:", int(np.sum(np.abs(recorded.u) > 1 - 1e-9)))
 
 # %%
-# Inverse MPC: a start from inverse LQR (Table 3.1 of the dissertation), then the search over
-# weights.
+# Inverse MPC: the gain that explains the recording, then weights that have it.
 problem = impc.Problem(plant, bounds, 3, [impc.Recording(plant, recorded.x)])
-weights = impc.infer_weights(problem).fit.weights
+found = impc.fit(problem)
+weights = found.weights
 print("Q =", np.round(weights.Q, 6).tolist(), " R =", np.round(weights.R, 6).tolist())
 
 # %%
 # And what of that came from the recording. The gain did; that Q is the identity is the choice of
 # the least condition number among all weights with this gain, see :doc:`/equivalent-weights`.
-told = impc.identifiability(problem, weights)
+told = found.identifiability()
 print(f"determined: {told.rank} of {told.free} directions; chosen: {told.chosen}")

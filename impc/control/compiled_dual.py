@@ -267,10 +267,7 @@ def accept_row(count: int, length: float, factor: Buffer, basis: Buffer) -> None
 
 @njit(cache=True)
 def substitute(factor: Buffer, count: int, right: Buffer) -> None:
-    """Solve L L' x = right in place.
-
-    `factor` (count, count); `right` (count,).
-    """
+    """Solve L L' x = right in place; `factor` (count, count); `right` (count,)."""
     for i in range(count):
         total = right[i]
         for k in range(i):

@@ -50,10 +50,7 @@ def compare_recordings(
     *,
     held_out: bool = True,
 ) -> tuple[MethodFit, ...]:
-    """Run every method on all trials, then on all but each one.
-
-    `remember` (stage, compute).
-    """
+    """Run every method on all trials, then on all but each one; `remember` (stage, compute)."""
     count, names = len(problem.recordings), compared_methods()
     whole = cross_checked(problem, _all(problem, names, "all", remember))
     parts = []

@@ -195,10 +195,7 @@ def number_units(plant: Plant) -> dict[str, str]:
 
 
 def read_truth(recordings: Iterable[Path], plant: Plant) -> Array | None:
-    """The gain of the truth.json that lies beside recordings.
-
-    Returns (m, n).
-    """
+    """The gain of the truth.json that lies beside recordings. Returns (m, n)."""
     folders = {path.absolute().parent for path in recordings}
     path = folders.pop() / "truth.json" if len(folders) == 1 else None
     if path is None or not path.is_file() or path.stat().st_size > LARGEST:

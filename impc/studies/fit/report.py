@@ -108,10 +108,7 @@ def fit_report(
     truth: Array | None = None,
     missing: str = "",
 ) -> Report:
-    """Page, result.json, tables and figures.
-
-    `truth` (m, n).
-    """
+    """Page, result.json, tables and figures; `truth` (m, n)."""
     subject = str(result.given.recordings[0].label.subject) or "a subject"
     others: list[Block] = [*residual_findings(result)]
     if missing:

@@ -162,39 +162,9 @@ def fit_recordings(
     settings: FitSettings,
     progress: FitProgress | Callable[[str], None] | bool | None = None,
 ) -> FitResult:
-    """Fit a subject.
+    """Fit a subject: all that `impc fit` says, as values.
 
-    Parameters
-    ----------
-    problem : Problem
-        Of `fit_problem`.
-    settings : FitSettings
-    progress : FitProgress or callable or bool, optional
-        True draws a bar, in a notebook too; a callable is told the name of each stage when it is
-        done: `progress=print`.
-
-    Raises
-    ------
-    WeightsError, SolverError
-        When no regulator can be simulated on these recordings, or no weights are found.
-
-    Examples
-    --------
-    >>> import control
-    >>> import impc
-    >>> import numpy as np
-    >>> rng = np.random.default_rng(1)
-    >>> plant = impc.Plant(control.ss([[1.1]], [[1, 1]], [[1]], 0, 1, inputs=["u", "push"]), ["u"])
-    >>> bounds = impc.Bounds(plant, u_min=-1, u_max=1)
-    >>> law = impc.Controller(plant, impc.Weights(1, 1), bounds, horizon=3)
-    >>> push = rng.choice([-0.5, 0.0, 0.5], 60)
-    >>> states = law.simulate([0.0], disturbance=push).x[:-1]
-    >>> trial = impc.Recording(plant, states + 0.01 * rng.standard_normal(states.shape), push)
-    >>> settings = impc.FitSettings(horizon=3, u_max=1.0, intent_draws=False)
-    >>> from impc.studies.fit.subject import fit_recordings
-    >>> found = fit_recordings(impc.fit_problem(plant, [trial], settings), settings)
-    >>> bool(abs(found.estimate.K - law.K).max() < 0.1)
-    True
+    With True for `progress` a bar is drawn; a callable is given the name of each stage.
     """
     if progress is True:
         with tqdm(total=stages(problem, settings), unit="stage") as bar:

@@ -94,10 +94,7 @@ def designs(amplitudes: Sequence[float], dwells: Sequence[float]) -> tuple[Desig
 def try_design(
     person: Person, design: Design, perturbation: Perturbation, *, trials: int, draws: int
 ) -> Outcome:
-    """Simulate one experiment, and tell what its recordings would.
-
-    `perturbation` (samples, d).
-    """
+    """Simulate one experiment, and tell what its recordings would; `perturbation` (samples, d)."""
     plant, limits = person.controller.plant, person.controller.bounds
     numbers = range(max(draws, trials))
     tried = [_held(person, perturbation(design.amplitude, design.dwell, k)) for k in numbers]

@@ -89,10 +89,7 @@ def make_plan(
     done: Callable[[str], None] = lambda _: None,
     remember: RememberFit = lambda _, compute: compute(),
 ) -> Plan:
-    """Try every experiment on the person.
-
-    `perturbation` (samples, d).
-    """
+    """Try every experiment on the person; `perturbation` (samples, d)."""
     outcomes = []
     for design in _grid(settings):
         outcomes.append(

@@ -161,10 +161,7 @@ class VarianceComponent:
 
 
 def variance_components(scores: Array, level: float = 0.95) -> tuple[VarianceComponent, ...]:
-    """Components of subjects, visits and trials.
-
-    `scores` (subjects, visits, trials).
-    """
+    """Components of subjects, visits and trials; `scores` (subjects, visits, trials)."""
     table = np.asarray(scores, dtype=np.float64)
     if table.ndim != 3 or min(table.shape) < 2:
         raise DataError(

@@ -98,10 +98,7 @@ class MeasurementError:
 
 
 def icc(scores: ArrayLike, form: Form = "A,k", level: float = 0.95, method: Method = "F") -> Icc:
-    """Intraclass correlation of scores.
-
-    `scores` (subjects, occasions).
-    """
+    """Intraclass correlation of scores; `scores` (subjects, occasions)."""
     if form not in FORMS:
         raise InputError(f"ICC form {form!r}", "is not known", f"known: {', '.join(FORMS)}")
     if method != "F" and form not in ("A,1", "A,k"):
@@ -134,10 +131,7 @@ def mean_squares(scores: Array) -> MeanSquares:
 
 
 def measurement_error(scores: ArrayLike, level: float = 0.95) -> MeasurementError:
-    """Error of one measurement, and the change that it hides.
-
-    `scores` (subjects, occasions).
-    """
+    """Error of one measurement, and the change that it hides; `scores` (subjects, occasions)."""
     if not 0 < level < 1:
         raise InputError("level", f"got {level}", "give a share between 0 and 1")
     complete = _complete(scores)[0]

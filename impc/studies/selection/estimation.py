@@ -53,10 +53,7 @@ def estimate(
     *,
     max_evaluations: int = 200,
 ) -> Estimate:
-    """Fit the free parameters to all trials at once.
-
-    `start` (k,).
-    """
+    """Fit the free parameters to all trials at once; `start` (k,)."""
     if not trials:
         raise DataError("trials", "there are none", "give at least one")
     chosen: IntArray = np.asarray(free, dtype=np.int64)

@@ -68,10 +68,7 @@ class NullDirection:
 def fisher_information(
     model: ParametricModel, theta: Array, trials: Sequence[Trial], variance: float | None = None
 ) -> Information:
-    """Information at a point.
-
-    `theta` (k,).
-    """
+    """Information at a point; `theta` (k,)."""
     rows, squares = [], 0.0
     for trial in trials:
         outputs, derivative = sensitivity(model, theta, trial.input)
@@ -185,10 +182,7 @@ def subset_variances(informations: Sequence[Array], subsets: Sequence[Sequence[i
 
 
 def largest_subsets(informations: Sequence[Array], bound: float, least: int = 2) -> Selection:
-    """Largest feasible subsets.
-
-    `informations` (k, k).
-    """
+    """Largest feasible subsets; `informations` (k, k)."""
     if not informations or not bound > 0:
         raise InputError("selection", "needs an information and a positive bound", "give both")
     count = len(informations[0])

@@ -48,10 +48,7 @@ class Lasso(Frozen):
 def proximal_lasso(
     model: ParametricModel, trials: Sequence[Trial], weight: float, start: Array | None = None
 ) -> tuple[Array, float]:
-    """Solve (C.5): normalised parameters (k,) and the objective.
-
-    `start` (k,).
-    """
+    """Solve (C.5): normalised parameters (k,) and the objective; `start` (k,)."""
     typical = normalised(model, np.asarray(model.typical))
     t = typical.copy() if start is None else np.clip(start, -1, 1)
 

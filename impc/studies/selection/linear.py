@@ -41,10 +41,7 @@ def linear_functions(
 ) -> tuple[
     Callable[[Array, Array], Array], Callable[[Array, Array, IntArray], tuple[Array, Array]]
 ]:
-    """Simulation and Jacobian of a `ParametricModel` from rest.
-
-    `dt` in s.
-    """
+    """Simulation and Jacobian of a `ParametricModel` from rest; `dt` in s."""
     symbol = ca.SX.sym("theta", matrices.size1_in(0))
     parts = matrices(symbol)
     derivative = ca.Function(

@@ -83,10 +83,7 @@ def parametric_model(
     meanings: Sequence[str] | None = None,
     jacobian: Callable[[Array, Array, IntArray], tuple[Array, Array]] | None = None,
 ) -> ParametricModel:
-    """Check and freeze a model.
-
-    `low, high, typical` (k,).
-    """
+    """Check and freeze a model; `low, high, typical` (k,)."""
     count = len(names)
     for name, values in (("low", low), ("high", high), ("typical", typical)):
         if len(values) != count:
