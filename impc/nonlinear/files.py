@@ -8,20 +8,19 @@ the recording and is not used. docs/nonlinear.md.
 
 from __future__ import annotations
 
-import difflib
-import math
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+import msgspec
 import numpy as np
 
-from impc.arrays import Array, Frozen, frozen
+from impc.arrays import Array, Frozen
 from impc.checking import replace
 from impc.errors import InputError, brief
 from impc.files import checks
 from impc.files.clock import on_even_instants, read_clock
-from impc.files.configuration import FILL_IN
+from impc.files.configuration import FILL_IN, require_known
 from impc.files.formats import read_table
 from impc.files.reading import (
     channel_of,
@@ -40,7 +39,7 @@ from impc.nonlinear.plan import require_solver
 from impc.studies.fit.settings import read_settings
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     from impc.files.clock import Clock
     from impc.files.configuration import Configuration
@@ -70,19 +69,9 @@ def read_optimal_trials(
     The `configuration` names a column for each disturbance of the `problem`, and for the states and
     inputs that were measured. Without a sample time of the problem that of each file is taken.
     """
-    _require_names(configuration, problem)
-    require_distinct(paths)
-    sheet = configuration.recording.sheet
-    return tuple(_trial(read_table(path, sheet=sheet), configuration, problem) for path in paths)
-
-
-def _require_names(configuration: Configuration, problem: OptimalControlProblem) -> None:
     known = (*problem.state_names, *problem.input_names, *problem.disturbance_names)
+    require_known("signals.{}".format, configuration.signals, known, "is no signal of the problem")
     for name, entry in configuration.signals.items():
-        if name not in known:
-            near = difflib.get_close_matches(name, known, n=1)
-            remedy = f"did you mean {near[0]}?" if near else f"it has {', '.join(known)}"
-            raise InputError(f"signals.{name}", "is no signal of the problem", remedy)
         require_filled_in(name, entry)
         if entry.shift:
             unused = "is not used by an optimal control problem"
@@ -91,6 +80,9 @@ def _require_names(configuration: Configuration, problem: OptimalControlProblem)
     for name in problem.disturbance_names:
         if name not in configuration.signals:
             raise InputError(f"signals.{name}", "is missing", "a disturbance has to be recorded")
+    require_distinct(paths)
+    sheet = configuration.recording.sheet
+    return tuple(_trial(read_table(path, sheet=sheet), configuration, problem) for path in paths)
 
 
 def _trial(
@@ -100,36 +92,29 @@ def _trial(
     label, clock = label_of(table.source, entry), read_clock(table, entry)
     dt = clock.period if problem.dt is None else problem.dt
     checks.comparable_rates(table.source, clock.period, dt)
-    findings = list(clock.findings)
-    columns: dict[str, Array] = {}
+    findings, columns = list(clock.findings), {}
     for name in configuration.signals:
-        values, found = _series(table, clock, configuration, name, problem)
-        columns[name] = values
+        held = name not in problem.state_names
+        columns[name], found = _series(table, clock, configuration, name, dt, held)
         findings += found
     # A configuration names a signal, so there is a column.
     samples = len(next(iter(columns.values())))
     checks.too_few(table.source, samples, 2)
-    absent = np.full(samples, np.nan)
 
     def side_by_side(names: Sequence[str]) -> Array:
-        return np.array([columns.get(name, absent) for name in names]).reshape(-1, samples).T
+        found = np.full((samples, len(names)), np.nan)
+        for index, name in enumerate(names):
+            found[:, index] = columns.get(name, np.nan)
+        return found
 
-    return OptimalTrial(
-        label,
-        frozen(side_by_side(problem.state_names)),
-        frozen(side_by_side(problem.input_names)[:-1]),
-        frozen(side_by_side(problem.disturbance_names)[:-1]),
-        dt,
-        tuple(findings),
+    x, u, d = map(
+        side_by_side, (problem.state_names, problem.input_names, problem.disturbance_names)
     )
+    return OptimalTrial(label, x, u[:-1], d[:-1], dt, tuple(findings))
 
 
 def _series(
-    table: Table,
-    clock: Clock,
-    configuration: Configuration,
-    name: str,
-    problem: OptimalControlProblem,
+    table: Table, clock: Clock, configuration: Configuration, name: str, dt: float, held: bool
 ) -> tuple[Array, list[str]]:
     """A signal on the problem's clock, and what was let pass."""
     entry = configuration.signals[name]
@@ -139,10 +124,8 @@ def _series(
         checks.measurable(channel),
         "" if entry.limit is None else checks.beyond_the_stop(channel, entry.limit),
     ]
-    dt = clock.period if problem.dt is None else problem.dt
     values = channel.values * channel.unit.factor
     if clock.even and same_rate(len(values), clock.period, dt):
-        held = name not in problem.state_names
         lost = ~np.isfinite(values[:-1] if held else values)
         values = np.where(np.isfinite(values), values, np.nan)
         if np.any(lost):
@@ -153,12 +136,9 @@ def _series(
             )
     else:
         found.append(checks.missing(channel, configuration.recording.fill_gaps))
-        resample = instants if name in problem.state_names else held_means
+        resample = held_means if held else instants
         values = resample(on_even_instants(clock, values), clock.period, dt)
     return values, [finding for finding in found if finding]
-
-
-_MOST = {"evaluations": 100_000, "starts": 1000}
 
 
 @dataclass(frozen=True)
@@ -184,23 +164,28 @@ class OptimalFitSettings:
     # Whether initial states are searched, from what was recorded of them and from `x0`
     unknown_start: bool = True
     solver: str = "ipopt"  # One of `impc.nonlinear.plan.SOLVERS`
-    evaluations: int = 200  # After how many a search is stopped
-    starts: int = 5  # From how many starts, where the first explains little or has no plan
+    evaluations: Annotated[int, msgspec.Meta(ge=1, le=100_000)] = (
+        200  # After how many a search is stopped
+    )
+    # From how many starts, where the first explains little or has no plan
+    starts: Annotated[int, msgspec.Meta(ge=1, le=1000)] = 5
 
 
 def optimal_fit_settings(table: Mapping[str, Any]) -> OptimalFitSettings:
     """Read the [fit] table of a configuration."""
-    _require_filled_in("[fit]", table)
     given = table.get("parameters", {})
-    known = [item.name for item in fields(ParameterSettings)]
+    places = {"[fit]": table}
     for name, item in given.items() if isinstance(given, dict) else ():
         place = f"[fit.parameters] {brief(name, 80)}"
         if not isinstance(item, dict):
             raise InputError(place, f"got {brief(item)}", "write it as in { start = 1.0 }")
-        _require_filled_in(place, item)
-        for key in item:  # msgspec passes over keys of inner tables
-            if key not in known:
-                raise InputError(f"{place}.{key}", "is not a setting", f"known: {', '.join(known)}")
+        known = ParameterSettings.__dataclass_fields__
+        require_known(f"{place}.{{}}".format, item, known, "is not a setting")
+        places[place] = item
+    for place, entries in places.items():
+        for key, value in entries.items():
+            if value == FILL_IN:
+                raise InputError(f"{place} {key}", f"is still {FILL_IN!r}", "fill it in")
     settings = read_settings("fit", OptimalFitSettings, table)
     for name, one in settings.parameters.items():
         if (one.start is None) == (one.known is None):
@@ -209,33 +194,26 @@ def optimal_fit_settings(table: Mapping[str, Any]) -> OptimalFitSettings:
                 "has both start and known" if one.known is not None else "has no number",
                 "give start for one that is searched, or known",
             )
-    for key, most in _MOST.items():
-        if not 1 <= getattr(settings, key) <= most:
-            raise InputError(f"[fit] {key}", f"got {getattr(settings, key)}", f"give 1 to {most}")
     require_solver(settings.solver)
     return settings
 
 
-def _require_filled_in(place: str, table: Mapping[str, Any]) -> None:
-    for key, value in table.items():
-        if value == FILL_IN:
-            raise InputError(f"{place} {key}", f"is still {FILL_IN!r}", "fill it in")
+def _require_own(table: str, given: Iterable[str], known: Sequence[str], kind: str) -> None:
+    for name in given:
+        if name not in known:
+            has = f"it has {', '.join(known)}"
+            raise InputError(f"[fit.{table}] {brief(name, 80)}", f"is no {kind}", has)
 
 
 def posed(
     problem: OptimalControlProblem, settings: OptimalFitSettings
 ) -> tuple[OptimalControlProblem, dict[str, float], dict[str, float]]:
     """The problem as it is fitted, where the search begins, and what is known; by name."""
-    units = dict(zip(problem.parameter_names, problem.units, strict=True))
-    for name in settings.parameters:
-        if name not in units:
-            remedy = f"it has {', '.join(units)}"
-            raise InputError(
-                f"[fit.parameters] {brief(name, 80)}", "is no parameter of the problem", remedy
-            )
+    names, kind = problem.parameter_names, "parameter of the problem"
+    _require_own("parameters", settings.parameters, names, kind)
     start: dict[str, float] = {}
     known: dict[str, float] = {}
-    for name, unit in units.items():
+    for name, unit in zip(names, problem.units, strict=True):
         one = settings.parameters.get(name)
         if one is None:
             raise InputError(f"[fit.parameters] {name}", "is missing", "give it start or known")
@@ -253,35 +231,29 @@ def _factor(name: str, written: str, expected: str) -> float:
     """From the unit that is written to that of the problem."""
     if not written:
         return 1.0
-    unit = si_unit(written)
-    if not expected:
-        return unit.factor
-    own = si_unit(expected)
-    if own.base != unit.base:
+    unit, own = si_unit(written), si_unit(expected) if expected else None
+    if own is not None and own.base != unit.base:
         raise InputError(
             f"[fit.parameters] {name}.unit", f"is {written!r}, and the problem has {expected}",
             "correct the unit",
         )  # fmt: skip
-    return unit.factor / own.factor
+    return unit.factor / (1.0 if own is None else own.factor)
 
 
 def recorded(
     problem: OptimalControlProblem, trial: OptimalTrial, settings: OptimalFitSettings
 ) -> OptimalRecording:
     """A file as a recording of the problem."""
-    for name in settings.x0:
-        if name not in problem.state_names:
-            known = ", ".join(problem.state_names)
-            raise InputError(f"[fit.x0] {brief(name, 80)}", "is no state", f"it has {known}")
+    _require_own("x0", settings.x0, problem.state_names, "state")
     first = dict(zip(problem.state_names, trial.x[0], strict=True)) | settings.x0
     for name, value in first.items():
-        if math.isnan(value):
+        if np.isnan(value):
             raise InputError(
                 f"[fit.x0] {name}", "is missing, and was not recorded",
                 "give it, or a guess with unknown_start = true",
             )  # fmt: skip
     make = problem.recorded_plan if settings.recorded == "plan" else problem.recorded_loop
-    x0 = [first[name] for name in problem.state_names]
+    x0 = list(first.values())
     return make(trial.x, trial.u, d=trial.d, x0=x0, unknown_start=settings.unknown_start)
 
 

@@ -10,22 +10,20 @@ smooth over changes of the active rows; at 1e-10 it is the problem itself. docs/
 
 from __future__ import annotations
 
-import itertools
 import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.stats
 
 from impc.arrays import Array, Frozen, IntArray
-from impc.checking import checked, replace
+from impc.checking import checked
 from impc.errors import DataError, InfeasibleError, InputError, SolverError
-from impc.nonlinear.combinations import Combinations, combinations
+from impc.nonlinear.combinations import Combinations, combinations, interval
 from impc.nonlinear.plan import require_solver
 from impc.nonlinear.search import (
     EXPLAINED,
-    Count,
+    Budget,
     along_mu,
     begin,
     first_plan,
@@ -92,16 +90,13 @@ class OptimalControlEstimate(Frozen):
         """
         if not 0 < level < 1:
             raise InputError("level", f"got {level:g}", "give one between 0 and 1")
-        reach = float(scipy.stats.norm.ppf(0.5 + level / 2)) * self.combinations.deviations
-        found = {}
-        for index, (name, value) in enumerate(self.theta.items()):
-            if self.problem.positive[index]:
-                with np.errstate(over="ignore"):
-                    factor = float(np.exp(reach[index]))
-                found[name] = (value / factor, value * factor)
-            else:
-                found[name] = (value - float(reach[index]), value + float(reach[index]))
-        return found
+        rows = zip(
+            self.theta.items(), self.combinations.deviations, self.problem.positive, strict=True
+        )
+        return {
+            name: interval(value, float(deviation), not positive, level)
+            for (name, value), deviation, positive in rows
+        }
 
 
 @checked
@@ -111,7 +106,6 @@ def fit_optimal_control(
     start: Mapping[str, float],
     *,
     solver: str = "ipopt",
-    mu_steps: Sequence[float] | None = None,
     evaluations: int = 200,
     starts: int = 1,
 ) -> OptimalControlEstimate:
@@ -126,11 +120,8 @@ def fit_optimal_control(
         First value of each parameter by its name.
     solver : str
         One of `impc.nonlinear.plan.SOLVERS`.
-    mu_steps : sequence of float, optional
-        Falling, of the dimension of the cost; by default `MU_STEPS` times the mean cost of a
-        recorded stage at the start, at most one, and at least 1e-10.
     evaluations : int
-        After how many a search is stopped; there are at most two from a start, guided and not.
+        After how many a search is stopped; of closed loops there are up to three from a start.
     starts : int
         From how many starts, where the recordings are not explained from the first or it has no
         plan: the others are about it by 0.3 in a logarithm.
@@ -174,32 +165,27 @@ def fit_optimal_control(
     solver = require_solver(solver)
     if not recordings:
         raise DataError("recordings", "there are none", "give at least one")
-    if mu_steps is None:
-        mu_steps = _scaled(recordings, problem.values(start))
-    if not mu_steps or any(b >= a for a, b in itertools.pairwise(mu_steps)):
-        raise InputError("mu_steps", f"got {tuple(mu_steps)!r:.60}", "give falling numbers")
+    if any(one.problem is not problem for one in recordings):
+        raise InputError("recordings", "are of another problem", "record them with this one")
     if isinstance(starts, bool) or not 1 <= starts <= _MOST_STARTS:
         raise InputError("starts", f"got {starts!r:.40}", f"give 1 to {_MOST_STARTS}")
     began = time.perf_counter()
-    theta, count = problem.values(start), Count(evaluations)
-    given = residuals_of(problem, tuple(recordings), solver)
-    if any(one.problem is not problem for one in recordings):
-        raise InputError("recordings", "are of another problem", "record them with this one")
-    held = _at_first_samples(given)
-    best, settled, refused, posed = None, False, None, given
+    theta, budget = problem.values(start), Budget(evaluations)
+    given, mu_steps = residuals_of(problem, tuple(recordings), solver), _scaled(recordings, theta)
+    best, settled, refused = None, False, None
     for begun in _starts(problem, theta, starts):
         try:
-            residuals, found = _held_then_free(held, given, begun, mu_steps, count)
+            found = _from_start(given, begun, mu_steps, budget)
         except (InfeasibleError, SolverError) as error:  # no plan there: said if none has one
             refused = refused or error
             continue
-        if found is not None and (best is None or found[0].loss < best.loss):
-            (best, settled), posed = found, residuals
-        if best is not None and best.loss < EXPLAINED * given.size:
+        if best is None or found[0].loss < best.loss:
+            best, settled = found
+        if best.loss < EXPLAINED * given.size:
             break
     if best is None:
         raise refused or SolverError("start", "no search got away from it", "begin nearer")
-    return _estimate(posed, theta, best, settled, count.all, time.perf_counter() - began)
+    return _estimate(given, theta, best, settled, budget.done, time.perf_counter() - began)
 
 
 def _starts(problem: OptimalControlProblem, theta: Array, count: int) -> Iterator[Array]:
@@ -210,95 +196,57 @@ def _starts(problem: OptimalControlProblem, theta: Array, count: int) -> Iterato
         yield np.where(problem.positive, theta * np.exp(noise), theta * (1 + noise))
 
 
-def _at_first_samples(given: Residuals) -> Residuals | None:
-    """The same with unknown initial states held at their samples; None where none has one.
-
-    Exact recordings are explained so, and of others the parameters are a start for the search of
-    the initial states too, which from afar ends elsewhere.
-    """
-    held = tuple(
-        replace(one, unknown_start=one.unknown_start and not np.array_equal(one.x0, one.x[0]))
-        for one in given.recordings
-    )
-    pairs = zip(held, given.recordings, strict=True)
-    if all(one.unknown_start == two.unknown_start for one, two in pairs):
-        return None
-    return residuals_of(given.problem, held, given.solver)
-
-
-def _held_then_free(
-    held: Residuals | None,
-    given: Residuals,
-    theta: Array,
-    mu_steps: Sequence[float],
-    count: Count,
-) -> tuple[Residuals, tuple[Evaluation, bool] | None]:
-    """What a search from a start finds, and with which initial states."""
-    if held is not None:
-        first = _from_start(held, theta, mu_steps, count)
-        if first is not None and first[0].loss < EXPLAINED * given.size:
-            return held, first
-        theta = theta if first is None else first[0].theta
-    return given, _from_start(given, theta, mu_steps, count)
-
-
 def _from_start(
-    given: Residuals, theta: Array, mu_steps: Sequence[float], count: Count
-) -> tuple[Evaluation, bool] | None:
-    """The better of two searches; the second only where the first explains little."""
+    given: Residuals, theta: Array, mu_steps: Sequence[float], budget: Budget
+) -> tuple[Evaluation, bool]:
+    """The answer from a start and whether it is one; of closed loops guided, and if need be not.
+
+    Initial states stay at their samples until the rest is found: from afar their search ends
+    elsewhere.
+    """
     for one in given.recordings:  # an error at the first parameters is one of the start
         first_plan(one, theta, one.x0, mu_steps[0], given.solver)
-    loops = any(one.closed_loop for one in given.recordings)
-    best: tuple[Evaluation, bool] | None = None
-    for guide in (loops, not loops):
-        count.again()
+    places = [(theta, mu_steps)]
+    if any(one.closed_loop for one in given.recordings):
+        budget.begin()
+        near = guided(given, theta, mu_steps, budget)
+        places = [*([] if near is None else [(near, mu_steps[-2:])]), *places]
+    held, best, refused = given.sampled_starts(), None, None
+    for place, steps in places:
+        budget.begin()
+        budget.take()
         try:
-            found = _attempt(given, theta, mu_steps, count, guide)
-        except (InfeasibleError, SolverError):
-            if best is None:
-                raise
-            break  # the other search got somewhere
-        if found is not None and (best is None or found[0].loss < best[0].loss):
-            best = found
-        if best is not None and best[0].loss < EXPLAINED * given.size:
+            first = begin(given, given.unknowns(place), steps[0])
+        except (InfeasibleError, SolverError) as error:
+            refused = error
+            continue
+        found = along_mu(given, first, steps, budget, held)
+        if found[1] and np.any(held):
+            explained = found[0].loss < EXPLAINED * given.size
+            again = mu_steps[-1:] if explained else mu_steps
+            found = min(found, along_mu(given, found[0], again, budget), key=_loss)
+        best = found if best is None else min(best, found, key=_loss)
+        if best[0].loss < EXPLAINED * given.size:
             break
+    if best is None:
+        raise refused or SolverError("start", "no search got away from it", "begin nearer")
     return best
+
+
+def _loss(found: tuple[Evaluation, bool]) -> float:
+    return found[0].loss
 
 
 def _scaled(recordings: Sequence[OptimalRecording], theta: Array) -> tuple[float, ...]:
     """mu in the size of the cost: at 0.1 of it a limit is felt from afar and moves little else."""
-    costs: list[Array] = []
+    costs: list[float] = []
     for one in recordings:
-        w = np.hstack([one.x[:-1], one.u, one.d])
-        known = np.all(np.isfinite(w), axis=1)
-        if np.any(known):
-            function = one.problem.functions[1].map(int(known.sum()))
-            x, u, d = one.x[:-1][known].T, one.u[known].T, one.d[known].T
-            repeated = np.repeat(theta[:, None], x.shape[1], axis=1)
-            costs.append(np.abs(function(x, u, d, repeated).full().ravel()))
-    mean = float(np.mean(np.concatenate(costs))) if costs else 1.0
+        for x, u, d in zip(one.x[:-1], one.u, one.d, strict=True):
+            if np.all(np.isfinite(x)) and np.all(np.isfinite(u)):
+                costs.append(abs(float(one.problem.functions[1](x, u, d, theta))))
+    mean = float(np.mean(costs)) if costs else 1.0
     size = min(1.0, mean) if np.isfinite(mean) else 1.0
     return tuple(dict.fromkeys(max(mu * size, MU_STEPS[-1]) for mu in MU_STEPS))
-
-
-def _attempt(
-    given: Residuals, theta: Array, mu_steps: Sequence[float], count: Count, guide: bool
-) -> tuple[Evaluation, bool] | None:
-    """From a start, or from what the recorded states' own plans make of it."""
-    loops = any(one.closed_loop for one in given.recordings)
-    if guide:
-        found = guided(given, theta, mu_steps if loops else mu_steps[:1], count)
-        if found is None:
-            return None
-        theta, mu_steps = found, mu_steps[-2:] if loops else mu_steps
-    try:
-        first = begin(given, given.unknowns(theta), mu_steps[0])
-    except (InfeasibleError, SolverError):
-        if not guide:
-            raise
-        return None  # what guided the search may end where the recordings have no plan
-    count.done += 1
-    return along_mu(given, first, mu_steps, count)
 
 
 def _estimate(

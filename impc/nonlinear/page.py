@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import textwrap
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -11,10 +10,10 @@ import pandas as pd
 from markupsafe import Markup
 
 from impc.arrays import Frozen
-from impc.assess.covariance import TWO_SIDED
 from impc.inverse.estimates import Status
+from impc.nonlinear.combinations import interval
 from impc.reporting.document import Block, Details, Lines, Report, Section, Terms, Verdict
-from impc.reporting.finding import Finding, Picture, table_of
+from impc.reporting.finding import Finding, Picture
 from impc.reporting.shown_units import shown_as
 from impc.reporting.style import (
     BLUE,
@@ -33,7 +32,6 @@ if TYPE_CHECKING:
 
     from matplotlib.figure import Figure
 
-    from impc.nonlinear.combinations import Combination
     from impc.nonlinear.fit import OptimalControlEstimate
     from impc.reporting.provenance import Provenance
 
@@ -43,6 +41,18 @@ MOST_TRIALS = 6
 # multiplier of lam is kept at a distance of 1e-10 / lam.
 _AT_LIMIT = 1e-5
 _EXACT = 1e-9
+_LITTLE = 50.0  # % of a signal below which a fit explains less than it leaves
+_LEVEL = 0.95
+_SOFT = "#8C8C8C"
+_ONE_COLUMN = 6  # signals above each other; more stand in two columns
+_FURTHEST = 30.0  # factor at which an interval is cut off
+#: Under which name its numbers stand among the methods of result.json.
+METHOD = "nonlinear_inverse_mpc"
+_TOLD = (
+    "A product that is told has one value whatever the others have. Along a direction that is not "
+    "told the parameters may change together, by any factor a, and the recordings stay what they "
+    "are. This is said of the neighbourhood of the answer."
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,43 +89,32 @@ def signal_vaf(estimate: OptimalControlEstimate) -> dict[str, float]:
     problem = estimate.problem
     recorded = np.vstack([np.hstack([one.x[1:], one.u]) for one in estimate.recordings])
     simulated = np.vstack([np.hstack([x[1:], u]) for x, u in estimate.runs])
-    found = {}
-    for k, name in enumerate((*problem.state_names, *problem.input_names)):
-        kept = np.isfinite(recorded[:, k])
-        size = float(np.sum(recorded[kept, k] ** 2))
-        left = float(np.sum((recorded[kept, k] - simulated[kept, k]) ** 2))
-        found[name] = 100 * (1 - left / size) if size > 0 else np.nan
-    return found
-
-
-def row_name(row: str) -> str:
-    """The name of the constraint that a row is of: "force" of "force[0]"."""
-    return row.rpartition("[")[0] if row.endswith("]") else row
+    size = np.nansum(recorded**2, axis=0)
+    left = np.nansum((recorded - simulated) ** 2, axis=0)
+    values = 100 * (1 - np.divide(left, size, out=np.full_like(size, np.nan), where=size > 0))
+    names = (*problem.state_names, *problem.input_names)
+    return dict(zip(names, map(float, values), strict=True))
 
 
 def reached(estimate: OptimalControlEstimate) -> dict[str, tuple[int, int]]:
     """At how many samples each constraint of the path is at its limit, in the estimate's runs."""
-    problem, theta, parts = estimate.problem, list(estimate.theta.values()), []
+    problem, theta, parts = estimate.problem, np.array([*estimate.theta.values()]), []
     for one, (x, u) in zip(estimate.recordings, estimate.runs, strict=True):
-        repeated = np.repeat(np.array(theta)[:, None], len(u), axis=1)
+        repeated = np.repeat(theta[:, None], len(u), axis=1)
         parts.append(problem.functions[3].map(len(u))(x[:-1].T, u.T, one.d.T, repeated).full().T)
     values = np.vstack(parts).reshape(-1, len(problem.rows))
     size = np.max(np.abs(values), axis=0, initial=0.0)
     at_limit = values > -_AT_LIMIT * np.where(size > 0, size, 1.0)
-    names = np.array([row_name(row) for row in problem.rows])
+    owners = np.array([row.partition("[")[0] for row in problem.rows])
     return {
-        name: (int(at_limit[:, names == name].any(axis=1).sum()), len(values))
-        for name in dict.fromkeys(map(str, names))
+        name: (int(at_limit[:, owners == name].any(axis=1).sum()), len(values))
+        for name in dict.fromkeys(map(str, owners))
     }
-
-
-# % of a signal below which a fit explains less than it leaves.
-_LITTLE = 50.0
 
 
 def verdict(fit: OptimalFit) -> str:
     """The one sentence that says what may be made of the fit; what forbids most comes first."""
-    estimate, told = fit.estimate, fit.estimate.combinations
+    estimate = fit.estimate
     poor = [name for name, value in signal_vaf(estimate).items() if value < _LITTLE]
     if not estimate.settled:
         return (
@@ -127,7 +126,7 @@ def verdict(fit: OptimalFit) -> str:
             f"The problem explains less than half of {', '.join(poor)}: its equations, its cost or "
             "its limits are not those of the recordings."
         )
-    if not told.told:
+    if not estimate.combinations.told:
         return "The recordings tell none of the parameters."
     ends = estimate.intervals().items()
     open_ones = [name for name, (low, high) in ends if not high - low < np.inf]
@@ -143,16 +142,7 @@ def verdict(fit: OptimalFit) -> str:
 
 
 def abstract(fit: OptimalFit) -> tuple[str, ...]:
-    """A few plain sentences with numbers."""
-    return (
-        _what_was_done(fit),
-        _agreement(fit),
-        *_at_the_limit(fit),
-        *fit.estimate.combinations.sentences,
-    )
-
-
-def _what_was_done(fit: OptimalFit) -> str:
+    """A few plain sentences with numbers: what was done, how well it agrees, what is told."""
     estimate, problem = fit.estimate, fit.estimate.problem
     count, loops = len(estimate.recordings), sum(one.closed_loop for one in estimate.recordings)
     samples = sum(len(one.u) for one in estimate.recordings)
@@ -163,35 +153,18 @@ def _what_was_done(fit: OptimalFit) -> str:
     }.get(loops, f"of which {loops} are of a controller that plans anew at every sample")
     ahead = "" if fit.dt is None else f" ({problem.horizon * fit.dt:.3g} s)"
     known = f" (and {len(fit.known)} known)" if fit.known else ""
+    agree = [f"{value:.2f} % of {name}" for name, value in signal_vaf(estimate).items()
+             if not np.isnan(value)]  # fmt: skip
+    limits = [f"{name} at {at} of {of} samples" if at else f"{name} never"
+              for name, (at, of) in reached(estimate).items()]  # fmt: skip
     return (
         f"An optimal control problem over {problem.horizon} samples{ahead} with "
         f"{len(estimate.theta)} unknown parameters{known} was fitted to {each} {kind}, "
-        f"{samples} samples in all."
+        f"{samples} samples in all.",
+        f"It accounts for {', '.join(agree)} (VAF).",
+        *([f"Constraints at their limit: {', '.join(limits)}."] if limits else []),
+        *estimate.combinations.sentences,
     )
-
-
-def _agreement(fit: OptimalFit) -> str:
-    parts = [
-        f"{value:.2f} % of {name}"
-        for name, value in signal_vaf(fit.estimate).items()
-        if not np.isnan(value)
-    ]
-    return f"It accounts for {', '.join(parts)} (VAF)."
-
-
-def _at_the_limit(fit: OptimalFit) -> list[str]:
-    parts = [
-        f"{name} at {samples} of {of} samples" if samples else f"{name} never"
-        for name, (samples, of) in reached(fit.estimate).items()
-    ]
-    return [f"Constraints at their limit: {', '.join(parts)}."] if parts else []
-
-
-_SOFT = "#8C8C8C"
-_ONE_COLUMN = 6  # signals above each other; more stand in two columns
-# Factors beyond which an interval is drawn with an arrow.
-_FURTHEST = 30.0
-_LONGEST = 45  # characters of a legend
 
 
 def optimal_figures(fit: OptimalFit) -> dict[str, bytes]:
@@ -201,9 +174,9 @@ def optimal_figures(fit: OptimalFit) -> dict[str, bytes]:
             f"trajectories-{index + 1}": _draw_run(fit, index)
             for index in range(min(len(fit.trials), MOST_TRIALS))
         }
-        if interval_rows(fit):
+        if _factors(fit):
             figures["parameters"] = _draw_intervals(fit)
-        figures["singular-values"] = _singular_values(fit)
+        figures["singular-values"] = _draw_values(fit)
         return drawn(figures)
 
 
@@ -214,20 +187,15 @@ def _draw_run(fit: OptimalFit, index: int) -> Figure:
     rows = -(-len(names) // columns)
     figure = new_figure(DOUBLE_COLUMN, 0.6 + 1.05 * rows)
     axes = figure.subplots(rows, columns, sharex=True, squeeze=False).T.ravel()
-    step = 1.0 if fit.dt is None else fit.dt
-    for k, name in enumerate(names):
-        recorded, run = (one.x, x) if k < len(x[0]) else (one.u, u)
-        column = k if k < len(x[0]) else k - len(x[0])
+    signals = [*zip(one.x.T, x.T, strict=True), *zip(one.u.T, u.T, strict=True)]
+    for ax, name, (recorded, run) in zip(axes, names, signals, strict=False):
         factor, unit = shown_as(estimate.problem.signal_units.get(name, "-"))
-        time, ax = step * np.arange(len(run)), axes[k]
+        time = (fit.dt or 1.0) * np.arange(len(run))
         ax.plot(
-            time, factor * recorded[:, column], color=_SOFT, marker="o", markersize=2.5,
+            time, factor * recorded, color=_SOFT, marker="o", markersize=2.5,
             markerfacecolor="white", linewidth=1.2, label="recorded",
         )  # fmt: skip
-        ax.plot(
-            time, factor * run[:, column], color=VERMILLION, linestyle="--", linewidth=1.0,
-            label="simulated",
-        )  # fmt: skip
+        ax.plot(time, factor * run, color=VERMILLION, linestyle="--", label="simulated")
         ax.set_ylabel(f"{name} ({unit})")
     for ax in axes[len(names) :]:
         ax.set_visible(False)
@@ -239,56 +207,47 @@ def _draw_run(fit: OptimalFit, index: int) -> Figure:
     return figure
 
 
-def interval_rows(fit: OptimalFit) -> list[tuple[str, float, float]]:
-    """Name, and both ends of the interval over the value, of what may be drawn as a factor.
-
-    Positive parameters that are told by themselves, and the told products of several.
-    """
-    found = []
-    for one in fit.estimate.combinations.told:
-        if not one.difference:
-            factor = float(np.exp(np.minimum(TWO_SIDED * one.deviation, 100.0)))
-            found.append((one.name, 1 / factor, factor))
-    return found
+def _factors(fit: OptimalFit) -> dict[str, tuple[float, float]]:
+    """Both ends over the value, of what is told and may be drawn as a factor, by its name."""
+    told = fit.estimate.combinations.told
+    return {
+        one.name: interval(1.0, one.deviation, False, _LEVEL) for one in told if not one.difference
+    }
 
 
 def _draw_intervals(fit: OptimalFit) -> Figure:
-    rows = interval_rows(fit)
+    rows = _factors(fit)
     figure = new_figure(SINGLE_COLUMN, 0.7 + 0.24 * len(rows))
     ax = figure.subplots()
-    reach = min(max(1.01, *(high for _, _, high in rows)) ** 1.1, _FURTHEST)
-    for place, (_, low, high) in enumerate(rows):
-        ax.plot([max(low, 1 / reach), min(high, reach)], [place, place], color=BLUE, linewidth=1.6)
-        ax.plot(1.0, place, color=BLUE, marker="o", markerfacecolor="white", linestyle="")
-        for end, mark in ((low, "<"), (high, ">")):
-            if not 1 / reach <= end <= reach:
-                ax.plot(np.clip(end, 1 / reach, reach), place, color=BLUE, marker=mark)
+    for place, ends in enumerate(rows.values()):
+        ax.plot(ends, [place, place], color=BLUE, linewidth=1.6)
+        ax.plot(1.0, place, color=BLUE, marker="o", markerfacecolor="white")
     ax.axvline(1.0, color=INK, linewidth=0.6)
-    ax.set_xscale("log")
-    ax.set_xlim(1 / reach**1.05, reach**1.05)
+    reach = min(max(1.01, *(high for _, high in rows.values())) ** 1.1, _FURTHEST)
     ticks = [1 / reach, 1.0, reach]
+    ax.set_xscale("log")
+    ax.set_xlim(ticks[0], ticks[-1])
     ax.set_xticks(ticks, [f"{tick:.4g}" for tick in ticks])
     ax.minorticks_off()
-    ax.set_yticks(range(len(rows)), [name for name, _, _ in rows])
+    ax.set_yticks(range(len(rows)), list(rows))
     ax.set_ylim(len(rows) - 0.5, -0.5)
     ax.set_xlabel("95 % interval over the value (-)")
     ax.set_ylabel("told (-)")
     return figure
 
 
-def _singular_values(fit: OptimalFit) -> Figure:
+def _draw_values(fit: OptimalFit) -> Figure:
     found = fit.estimate.combinations
     values = np.maximum(found.singular_values / found.singular_values[0], 1e-17)
+    place, told = np.arange(1, len(values) + 1), len(found.told)
     figure = new_figure(SINGLE_COLUMN, 2.2)
     ax = figure.subplots()
-    place, told = np.arange(1, len(values) + 1), len(found.told)
     ax.plot(place[:told], values[:told], color=BLUE, marker="o", linestyle="", label="told")
-    if told < len(values):
+    if found.untold:
         ax.axvspan(told + 0.5, len(values) + 0.5, color=FORBIDDEN, linewidth=0)
-        names = "; ".join(" ".join(one.exponents) for one in found.untold)
         ax.plot(
             place[told:], values[told:], color=VERMILLION, marker="s", markerfacecolor="white",
-            linestyle="", label=textwrap.shorten(f"not told: {names}", _LONGEST),
+            linestyle="", label="not told",
         )  # fmt: skip
     ax.set_yscale("log")
     ax.set_ylim(0.3 * float(values[-1]), 3.0)
@@ -299,62 +258,39 @@ def _singular_values(fit: OptimalFit) -> Figure:
     return figure
 
 
-#: Under which name its numbers stand among the methods of result.json.
-METHOD = "nonlinear_inverse_mpc"
-_LEVEL = 0.95
-_INTERVALS = Picture(
-    "parameters",
-    "Intervals of the parameters and products of parameters that the recordings tell",
-    "Parameters, and products of them, that the recordings tell: 95 % intervals over the value. "
-    "An arrow: it goes on.",
-    narrow=True,
-)
-_VALUES = Picture(
-    "singular-values",
-    "Singular values of the derivative of the recordings by the parameters, told and not told",
-    "Singular values: how strongly the recordings move along each direction of the parameters. "
-    "Round: told. Square, on grey: not told, because nothing that was measured moves.",
-    narrow=True,
-)
-_TOLD = (
-    "A product that is told has one value whatever the others have. Along a direction that is not "
-    "told the parameters may change together, by any factor a, and the recordings stay what they "
-    "are. This is said of the neighbourhood of the answer."
-)
-
-
 def optimal_report(fit: OptimalFit, provenance: Provenance) -> Report:
     """Page, result.json, parameters.csv, combinations.csv, trajectories.csv and figures."""
-    told: list[Block] = [_TOLD, _combinations(fit), _VALUES]
+    checks = [(name, found or ("Nothing found.",))
+              for name, found in zip(fit.trials, fit.findings, strict=True)]  # fmt: skip
     return Report(
         f"impc fit: {provenance.plant_name}",
         "The optimal control problem behind the recordings",
         (Verdict(verdict(fit)), Lines(abstract(fit))),
         [
-            Section("1. The parameters", (parameter_finding(fit),), "Parameters", together=True),
-            Section("2. What is told", told, "What is told"),
+            Section("1. The parameters", (_parameters(fit),), "Parameters", together=True),
+            Section("2. What is told", (_TOLD, _combinations(fit)), "What is told"),
             Section("3. Recorded and simulated", _trajectories(fit), "Trajectories"),
-            Section("4. Checks of the recordings", (_checks(fit),), "Checks", folded=True),
-            Section("5. Settings and versions", _made(fit, provenance), "Settings", folded=True),
+            Section("4. Checks of the recordings", (Terms(checks),), "Checks", folded=True),
+            Section("5. Settings and versions", _settings(fit, provenance), "Settings",
+                    folded=True),
         ],
         figures=optimal_figures(fit),
         beside=[_samples(fit)],
         data=_data(fit, provenance),
         provenance=provenance,
-    )
+    )  # fmt: skip
 
 
-def parameter_finding(fit: OptimalFit) -> Finding:
-    """A row a parameter: unit, value, both ends, level, whether it is told, first value."""
-    estimate, problem = fit.estimate, fit.estimate.problem
-    ends = estimate.intervals(_LEVEL)
-    apart = {name for one in estimate.combinations.untold for name in one.exponents}
-    roughly = {one.name for one in estimate.combinations.told if one.rough}
+def _parameters(fit: OptimalFit) -> Finding:
+    estimate = fit.estimate
+    ends, found = estimate.intervals(_LEVEL), estimate.combinations
+    told = {one.name: one.told for one in found.told}
+    told |= {name: "no" for one in found.untold for name in one.exponents}
+    units = zip(estimate.theta.items(), estimate.problem.units, strict=True)
     rows = [
-        (name, unit, value, *ends[name], _LEVEL,
-         "no" if name in apart else "roughly" if name in roughly else "yes", estimate.start[name])
-        for (name, value), unit in zip(estimate.theta.items(), problem.units, strict=True)
-    ]  # fmt: skip
+        (name, unit, value, *ends[name], _LEVEL, told.get(name, "yes"), estimate.start[name])
+        for (name, value), unit in units
+    ]
     rows += [
         (name, unit, value, np.nan, np.nan, np.nan, "known", np.nan)
         for name, (value, unit) in fit.known.items()
@@ -364,113 +300,103 @@ def parameter_finding(fit: OptimalFit) -> Finding:
         "Value with its 95 % interval, and where the search began. One that is not told by itself "
         "stays near its start; section 2 says what of it is told."
     )
-    figure = _INTERVALS if interval_rows(fit) else None
-    return Finding("parameters", pd.DataFrame(rows, columns=heads), caption, figure=figure)
-
-
-def _ends(one: Combination) -> tuple[float, float]:
-    """Both ends of a told product; any positive number for one that is not."""
-    if one.difference:
-        return one.value - TWO_SIDED * one.deviation, one.value + TWO_SIDED * one.deviation
-    with np.errstate(over="ignore"):
-        factor = float(np.exp(TWO_SIDED * one.deviation))
-    return one.value / factor, one.value * factor
+    figure = Picture(
+        "parameters",
+        "Intervals of the parameters and products of parameters that the recordings tell",
+        "Parameters, and products of them, that the recordings tell: 95 % intervals over the "
+        "value. One that ends at the edge goes on.",
+        narrow=True,
+    )
+    table = pd.DataFrame(rows, columns=heads)
+    return Finding("parameters", table, caption, figure=figure if _factors(fit) else None)
 
 
 def _combinations(fit: OptimalFit) -> Finding:
-    found, rows = fit.estimate.combinations, []
-    for one in (*found.told, *found.untold):
-        told = "no" if one in found.untold else "roughly" if one.rough else "yes"
-        free = "" if told != "no" else "any factor of these" if one.scaling else "near these values"
-        rows.append((one.name, one.value, *_ends(one), _LEVEL, told, free))
+    found = fit.estimate.combinations
+    free = {True: "any factor of these", False: "near these values"}
+    rows = [
+        (one.name, one.value, *interval(one.value, one.deviation, one.difference, _LEVEL), _LEVEL,
+         one.told, free[one.scaling] if one.told == "no" else "")
+        for one in (*found.told, *found.untold)
+    ]  # fmt: skip
     heads = ["product", "value", "low", "high", "level", "told", "free"]
     caption = "Products of parameters with their 95 % intervals, in the problem's units."
-    return Finding("combinations", pd.DataFrame(rows, columns=heads), caption)
+    figure = Picture(
+        "singular-values",
+        "Singular values of the derivative of the recordings by the parameters, told and not told",
+        "Singular values: how strongly the recordings move along each direction of the "
+        "parameters. Round: told. Square, on grey: not told, because nothing that was measured "
+        "moves.",
+        narrow=True,
+    )
+    return Finding("combinations", pd.DataFrame(rows, columns=heads), caption, figure=figure)
 
 
 def _trajectories(fit: OptimalFit) -> list[Block]:
     vaf = pd.DataFrame(signal_vaf(fit.estimate).items(), columns=["signal", "vaf_percent"])
-    limits = table_of(
-        reached(fit.estimate).items(),
-        {
-            "constraint": lambda pair: pair[0],
-            "at_its_limit": lambda pair: pair[1][0],
-            "samples": lambda pair: pair[1][1],
-        },
-    )
+    limits = [(name, *counts) for name, counts in reached(fit.estimate).items()]
+    table = pd.DataFrame(limits, columns=["constraint", "at_its_limit", "samples"])
     at_limit = "At how many samples each constraint is at its limit."
-    findings: list[Block] = [
-        Finding("vaf", vaf, "Variance accounted for (3.24), over all recordings.", digits=6),
-        *([Finding("limits", limits, at_limit)] if len(limits) else []),
-    ]
     pictures = [
         Picture(
             f"trajectories-{index + 1}",
-            f"Recorded and simulated states and inputs over time, {fit.trials[index]}",
-            f"{fit.trials[index]}. Rings: recorded. Dashed: simulated from the first state alone.",
+            f"Recorded and simulated states and inputs over time, {name}",
+            f"{name}. Rings: recorded. Dashed: simulated from the first state alone.",
         )
-        for index in range(min(len(fit.trials), MOST_TRIALS))
+        for index, name in enumerate(fit.trials[:MOST_TRIALS])
     ]
-    others = [Details("The other recordings", pictures[1:])] if len(pictures) > 1 else []
-    return [*findings, pictures[0], *others]
-
-
-def _checks(fit: OptimalFit) -> Terms:
-    return Terms(
-        [
-            (name, found or ("Nothing found.",))
-            for name, found in zip(fit.trials, fit.findings, strict=True)
-        ]
-    )
-
-
-def _made(fit: OptimalFit, provenance: Provenance) -> list[Block]:
-    problem, estimate = fit.estimate.problem, fit.estimate
-    arguments = "; ".join(f"{key} = {value}" for key, value in provenance.plant_arguments.items())
-    settings = "; ".join(f"{key} = {value}" for key, value in fit.settings.items())
-    constraints = ", ".join(dict.fromkeys(map(row_name, problem.rows))) or "none"
-    sample = "not said" if fit.dt is None else f"{fit.dt:.6g} s"
     return [
-        Markup("<code>{}</code>").format(provenance.command),
-        Terms(
-            [
-                ("Made", (f"{provenance.made}, in {estimate.seconds:.1f} s of search",)),
-                ("Problem", (Markup("<code>{}</code> <code>{}</code>").format(
-                    provenance.plant_name, arguments),)),
-                ("States, inputs", (f"{', '.join(problem.state_names)}; "
-                                    f"{', '.join(problem.input_names)}",)),
-                ("Constraints", (constraints,)),
-                ("Sample time, horizon", (f"{sample}, {problem.horizon} samples",)),
-                ("Search", (f"{estimate.evaluations} evaluations; {fit.status.value}",)),
-                ("Settings", (Markup("<code>{}</code>").format(settings),)),
-                ("Recordings", (", ".join(provenance.files),)),
-                ("Versions", (provenance.all_versions,)),
-            ]
-        ),
-    ]  # fmt: skip
+        Finding("vaf", vaf, "Variance accounted for (3.24), over all recordings.", digits=6),
+        *([Finding("limits", table, at_limit)] if limits else []),
+        pictures[0],
+        *([Details("The other recordings", pictures[1:])] if pictures[1:] else []),
+    ]
+
+
+def _settings(fit: OptimalFit, provenance: Provenance) -> list[Block]:
+    problem, estimate = fit.estimate.problem, fit.estimate
+    arguments, settings = (
+        "; ".join(f"{key} = {value}" for key, value in given.items())
+        for given in (provenance.plant_arguments, fit.settings)
+    )
+    code = Markup("<code>{}</code>")
+    sample = "not said" if fit.dt is None else f"{fit.dt:.6g} s"
+    terms = {
+        "Made": f"{provenance.made}, in {estimate.seconds:.1f} s of search",
+        "Problem": code.format(f"{provenance.plant_name} {arguments}".strip()),
+        "States, inputs": f"{', '.join(problem.state_names)}; {', '.join(problem.input_names)}",
+        "Constraints": ", ".join(reached(estimate)) or "none",
+        "Sample time, horizon": f"{sample}, {problem.horizon} samples",
+        "Search": f"{estimate.evaluations} evaluations; {fit.status.value}",
+        "Settings": code.format(settings),
+        "Recordings": ", ".join(provenance.files),
+        "Versions": provenance.all_versions,
+    }
+    return [code.format(provenance.command), Terms([(key, (of,)) for key, of in terms.items()])]
 
 
 def _samples(fit: OptimalFit) -> Finding:
     """A row a sample: recorded and simulated signals, and disturbances."""
-    problem, step, blocks = fit.estimate.problem, 1.0 if fit.dt is None else fit.dt, []
-    for index in range(min(len(fit.trials), MOST_TRIALS)):
-        one, (x, u) = fit.estimate.recordings[index], fit.estimate.runs[index]
-        behind = np.full((1, problem.m), np.nan)
-        last = np.full((1, problem.disturbance_count), np.nan)
-        time = step * np.arange(len(x))[:, None]
-        blocks.append(np.hstack([
-            np.full_like(time, index + 1.0), time, one.x, x, np.vstack([one.u, behind]),
-            np.vstack([u, behind]), np.vstack([one.d, last]),
-        ]))  # fmt: skip
-    heads = ["trial", "sample" if fit.dt is None else "time"]
-    for names in (problem.state_names, problem.input_names):
-        heads += [f"{name}_recorded" for name in names] + [f"{name}_simulated" for name in names]
-    table = pd.DataFrame(np.vstack(blocks), columns=[*heads, *problem.disturbance_names])
-    return Finding("trajectories", table)
+    problem, tables = fit.estimate.problem, []
+    runs = zip(fit.estimate.recordings, fit.estimate.runs, strict=True)
+    for index, (one, (x, u)) in enumerate([*runs][:MOST_TRIALS]):
+        columns: dict[str, Any] = {"trial": index + 1.0}
+        columns["sample" if fit.dt is None else "time"] = (fit.dt or 1.0) * np.arange(len(x))
+        for names, recorded, run in (
+            (problem.state_names, one.x, x),
+            (problem.input_names, one.u, u),
+        ):
+            for kind, values in (("recorded", recorded), ("simulated", run)):
+                columns |= {f"{name}_{kind}": pd.Series(item)
+                            for name, item in zip(names, values.T, strict=True)}  # fmt: skip
+        pairs = zip(problem.disturbance_names, one.d.T, strict=True)
+        tables.append(pd.DataFrame(columns | {name: pd.Series(item) for name, item in pairs}))
+    return Finding("trajectories", pd.concat(tables, ignore_index=True))
 
 
 def _data(fit: OptimalFit, provenance: Provenance) -> dict[str, Any]:
     estimate, problem, found = fit.estimate, fit.estimate.problem, fit.estimate.combinations
+    trials = zip(fit.trials, estimate.recordings, fit.findings, strict=True)
     return {
         "verdict": verdict(fit),
         "sentences": abstract(fit),
@@ -487,9 +413,7 @@ def _data(fit: OptimalFit, provenance: Provenance) -> dict[str, Any]:
         "x0": estimate.x0,
         "trials": [
             {"trial": name, "samples": len(one.u), "closed_loop": one.closed_loop, "findings": told}
-            for name, one, told in zip(
-                fit.trials, estimate.recordings, fit.findings, strict=True
-            )
+            for name, one, told in trials
         ],
         "methods": {
             METHOD: {
@@ -506,7 +430,7 @@ def _data(fit: OptimalFit, provenance: Provenance) -> dict[str, Any]:
             "states": problem.state_names,
             "inputs": problem.input_names,
             "disturbances": problem.disturbance_names,
-            "constraints": [*dict.fromkeys(map(row_name, problem.rows))],
+            "constraints": list(reached(estimate)),
             "horizon": problem.horizon,
             "dt": fit.dt,
         },

@@ -272,15 +272,19 @@ WRONG: dict[str, tuple[tuple[str, str], str]] = {
     "a plan of another length": (
         ('"loop"', '"plan"'), "states: has 26 samples; give 13"
     ),
-    "no horizon": (('recorded = "loop"', "horizon = 0"), "horizon: got 0; give 1 to 10000 samples"),
-    "no evaluations": (
-        ('recorded = "loop"', "evaluations = 0"), "[fit] evaluations: got 0; give 1 to 100000"
+    "no horizon": (
+        ('recorded = "loop"', "horizon = 0"), "horizon: got 0; give a whole number of at least 1 "
     ),
-    "no start": (('recorded = "loop"', "starts = 0"), "[fit] starts: got 0; give 1 to 1000"),
+    "no evaluations": (
+        ('recorded = "loop"', "evaluations = 0"), "[fit] evaluations: got 0; give at least 1"
+    ),
+    "no start": (('recorded = "loop"', "starts = 0"), "[fit] starts: got 0; give at least 1"),
     "a setting of the linear fit": (
         ('recorded = "loop"', "u_max = 3.0"), "[fit] u_max: is not a setting; known: parameters"
     ),
-    "a kind that is none": (('"loop"', '"walk"'), "[fit]: Invalid enum value 'walk'"),
+    "a kind that is none": (
+        ('"loop"', '"walk"'), "[fit] recorded: Invalid enum value 'walk'; give loop or plan"
+    ),
     "a parameter without a word": (
         ("drag = { start = 0.5 }", ""), "[fit.parameters] drag: is missing; give it start or known"
     ),

@@ -25,11 +25,7 @@ for one in pkgutil.walk_packages(impc.__path__, "impc."):
 for name in set(impc.__all__) - {"OptimalControlProblem", "fit_optimal_control"}:
     getattr(impc, name)
 plant = impc.Plant(control.ss([[0.9]], [[1]], [[1]], 0, 1))
-bounds = impc.Bounds(plant, u_min=-0.3, u_max=0.3)
-truth = impc.Controller(plant, impc.Weights(1, 1), bounds, horizon=3).simulate([1.0], steps=20)
-found = impc.estimate(impc.Problem(plant, bounds, 3, [impc.Recording(plant, truth.x)]))
-impc.report(found, "page")
-print(found.status.value)
+print(impc.solve_lqr(plant, impc.Weights(1, 1)).K.shape)  # what compiles nothing
 try:
     impc.OptimalControlProblem
 except impc.ImpcError as error:
@@ -68,8 +64,8 @@ def test_the_rest_works_without_the_folder(tmp_path: Path) -> None:
     done = run("-c", f"ROOT = {str(ROOT)!r}\n{EXAMPLE}")
     assert done.returncode == 0, done.stderr
     line = "impc.OptimalControlProblem: needs impc.nonlinear, which is not there; install all"
-    status, told = done.stdout.strip().splitlines()
-    assert status in {"explained", "settled"}
+    shape, told = done.stdout.strip().splitlines()
+    assert shape == "(1, 1)"
     assert line in told
     typed = run("-m", "impc", "fit", "own.csv", "--plant", "own:own", "--config", "own.toml")
     assert typed.returncode == 2

@@ -83,7 +83,7 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
         {"terminal_cost": lambda x, u, p: u**2}, "terminal_cost: depends on an input"
     ),
     "a horizon of half a sample": ({"horizon": 0.5}, "horizon: got 0.5; give a whole number"),
-    "no horizon": ({"horizon": 0}, "horizon: got 0; give 1 to 10000"),
+    "no horizon": ({"horizon": 0}, "horizon: got 0; give a whole number of at least 1"),
     "a comparison": (
         {"constraints": lambda x, u, p: {"force": ca.vertcat(u, -u) <= p["limit"]}},
         "constraint force: is a comparison; write what must not exceed 0: u - 1 for u <= 1",
