@@ -165,19 +165,16 @@ class OptimalControlProblem(Frozen):
         x, u, d = (symbols_of(name, given) for name, given in
                    zip(("states", "inputs", "disturbances"), kinds, strict=True))  # fmt: skip
         theta = [scalar(name, symbol) for name, symbol in dict(parameters).items()]
-        for subject, given in (("states", x), ("inputs", u), ("parameters", theta)):
-            if not given:
-                raise InputError(subject, "there are none", "give at least one")
         names = tuple(dict(parameters))
+        _require_some(states=x, inputs=u, parameters=names)
         path, rows = stacked(constraints or {})
         last, terminal_rows = stacked(terminal_constraints or {})
         symbols = (x, u, d, theta)
         signals = [names_of(item) for item in (x, u, d)]
-        following = next_state
         if is_system(next_state):
-            following = system_equations(next_state, (x, u, d), signals, dict(parameters), dt)
+            next_state = system_equations(next_state, (x, u, d), signals, dict(parameters), dt)
         functions = (
-            function_of("next_state", following, symbols, (len(signals[0]),)),
+            function_of("next_state", next_state, symbols, (len(signals[0]),)),
             function_of("stage_cost", stage_cost, symbols, (1,)),
             function_of("terminal_cost", terminal_cost, symbols, (1,), alone=True),
             function_of("constraints", path, symbols, (len(rows),)),
@@ -190,7 +187,7 @@ class OptimalControlProblem(Frozen):
                 problem = "is not among the parameters"
                 raise InputError(f"parameter {name}", problem, f"known: {', '.join(names)}")
         moved = ca.DM(functions[3].jac_sparsity(0, 1), 1).full()
-        fields = {
+        vars(self).update({
             "horizon": horizon,
             "state_names": signals[0],
             "input_names": signals[1],
@@ -204,8 +201,7 @@ class OptimalControlProblem(Frozen):
             "signal_units": {name: told[name] for name in flat if name in told},
             "dt": dt,
             "functions": functions,
-        }
-        vars(self).update(fields)
+        })  # fmt: skip
 
     @property
     def n(self) -> int:
@@ -337,6 +333,12 @@ class OptimalControlProblem(Frozen):
     def recorded_loop(self, x: Any, u: Any = None, **more: Any) -> OptimalRecording:
         """A recording of the closed loop: x (steps + 1, n), u (steps, m), as `recorded_plan`."""
         return optimal_recording(self, x, u, closed_loop=True, **more)
+
+
+def _require_some(**given: Sequence[Any]) -> None:
+    for subject, symbols in given.items():
+        if not symbols:
+            raise InputError(subject, "there are none", "give at least one")
 
 
 def _fixed(values: Any) -> BoolArray:

@@ -272,8 +272,11 @@ def guided(
 ) -> Array | None:
     """Parameters (p,) by each recorded state's own plan, from theta (p,) along falling `mu_steps`.
 
-    States from which theta has no plan are left out; None when none is left.
+    States from which theta has no plan are left out; None when none is left, or no input of a loop
+    was measured.
     """
+    if not any(one.closed_loop and np.any(np.isfinite(one.u)) for one in given.recordings):
+        return None
     problem, parts, runs = given.problem, [], []
     for one in given.recordings:
         old: Plan | None = None
