@@ -89,12 +89,10 @@ class OptimalControlEstimate(Frozen):
         """
         if not 0 < level < 1:
             raise InputError("level", f"got {level:g}", "give one between 0 and 1")
-        rows = zip(
-            self.theta.items(), self.combinations.deviations, self.problem.positive, strict=True
-        )
+        rows = zip(self.combinations.deviations, self.problem.positive, strict=True)
         return {
             name: interval(value, float(deviation), not positive, level)
-            for (name, value), deviation, positive in rows
+            for (name, value), (deviation, positive) in zip(self.theta.items(), rows, strict=True)
         }
 
 

@@ -347,12 +347,11 @@ def _require_finite_start(
     problem: OptimalControlProblem, theta: Array, d: Array, x: Array, u: Array
 ) -> None:
     """Require that every function is finite along a guess x (N + 1, n), u (N, m)."""
-    none = np.zeros(problem.m), np.zeros(problem.disturbance_count)
-    for function in problem.functions:
-        at_end = function.name() in ("terminal_cost", "terminal_constraints")
-        for k in [problem.horizon] if at_end else range(problem.horizon):
-            found = function(x[k], *(none if at_end else (u[k], d[k])), theta)
-            if not np.all(np.isfinite(found.full())):
+    stages = zip(x, [*u, np.zeros(problem.m)], [*d, np.zeros(d.shape[1])], strict=True)
+    for k, stage in enumerate(stages):
+        for function in problem.functions:
+            at_end = function.name().startswith("terminal")
+            if at_end == (k == len(u)) and not np.all(np.isfinite(function(*stage, theta).full())):
                 raise InputError(
                     function.name(), f"is not finite at sample {k} of the start",
                     "check the expression, the first parameters and the initial state",

@@ -44,16 +44,6 @@ def point(fault="", horizon=12):
     cost = p["price"] * x[0] ** 2 + u**2
     following = x + 0.1 * ca.vertcat(x[1], (u + d - p["drag"] * x[1] * ca.fabs(x[1])) / p["mass"])
     rows = {"force": ca.vertcat(u - p["limit"], -u - p["limit"]), "place": x[0] - p["far"]}
-    if fault == "symbol":
-        cost = cost * ca.SX.sym("w")
-    if fault == "size":
-        following = following[0]
-    if fault == "nan":
-        cost = cost + ca.log(x[0] - 50) ** 2
-    if fault == "infeasible":
-        rows["near"] = x[0] - 0.5
-    if fault == "influence":
-        p["colour"] = ca.SX.sym("colour")
     if fault == "text":
         return "no problem"
     if fault == "raises":
@@ -258,11 +248,6 @@ def fault(name: str) -> tuple[str, str]:
 
 
 WRONG: dict[str, tuple[tuple[str, str], str]] = {
-    "a free symbol": (fault("symbol"), "stage_cost: has the symbol w; which is neither a state"),
-    "a wrong size": (fault("size"), "next_state: has shape (1, 1); give (2, 1)"),
-    "not finite": (fault("nan"), "stage_cost: is not finite at sample 0 of the start"),
-    "no plan": (fault("infeasible"), "constraint near: no plan was found that keeps it at samp"),
-    "a parameter in nothing": (fault("influence"), "parameter colour: is in no expression"),
     "a function that fails": (
         fault("raises"), "plant own_point:point: ends in RuntimeError (the sensor is\\nbroken)"
     ),
@@ -304,7 +289,6 @@ WRONG: dict[str, tuple[tuple[str, str], str]] = {
     "another kind of unit": (
         ('"gram"', '"cm"'), "mass.unit: is 'cm', and the problem has kg; correct the unit"
     ),
-    "a negative start": (("start = 0.5", "start = -0.5"), "parameter drag: got -0.5; give a posit"),
     "all are known": (
         (CONFIG[CONFIG.index("drag =") :],
          "".join(f"{name} = {{ known = 1.0 }}\n" for name in ("drag", "price", "limit", "far"))),
