@@ -141,8 +141,7 @@ for one in impc.load(RESULTS / "swing-fit").table("parameters").itertuples():
 
 # %%
 # **What a recording cannot say.** With the length free as well, the page would tell which
-# combinations are known and which are not (:doc:`/nonlinear`). The equations may also be a
-# ``control.nlsys``: ``next_state=system`` takes its function, written with numpy, as it is.
+# combinations are known and which are not (:doc:`/nonlinear`).
 # A wrong file, a wrong expression or a start without a plan ends in one line:
 (RESULTS / "far.toml").write_text(
     (RESULTS / "swing.toml").read_text().replace("angle = 0.0", "angel = 0.0")

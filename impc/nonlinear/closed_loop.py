@@ -10,15 +10,16 @@ disturbance.
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import casadi as ca
 import numpy as np
 
 from impc.arrays import Array, Frozen
 from impc.errors import SolverError
-from impc.nonlinear.plan import Plan, nearby_plan, solve_plan, solved_plan
-from impc.nonlinear.problem import slopes
+from impc.nonlinear.plan import Plan, nearby_plan, solved_plan
 
 if TYPE_CHECKING:
     from impc.nonlinear.problem import OptimalControlProblem
@@ -35,29 +36,6 @@ class ClosedLoop(Frozen):
     plans: tuple[Plan, ...]  # T of them
 
 
-def simulate_receding(
-    problem: OptimalControlProblem,
-    theta: Array,
-    x0: Array,
-    d: Array,
-    *,
-    solver: str = "ipopt",
-    mu: float = 1e-10,
-) -> ClosedLoop:
-    """Simulate from nothing, at theta (p,), from x0 (n,), disturbed by d of shape (steps, d).
-
-    `solver` and `mu` are those of `impc.nonlinear.plan.solve_plan`.
-    """
-    first = solve_plan(problem, theta, x0, solver=solver, mu=mu)
-    found = closed_loop_from(first, theta, x0, d, mu)
-    if isinstance(found, int):
-        raise SolverError(
-            f"sample {found}", "no plan was found from the state reached",
-            "soften the constraints, or give other parameters",
-        )  # fmt: skip
-    return found
-
-
 def closed_loop_from(
     first: Plan,
     theta: Array,
@@ -65,10 +43,10 @@ def closed_loop_from(
     d: Array,
     mu: float,
     before: ClosedLoop | None = None,
-) -> ClosedLoop | int:
+) -> ClosedLoop:
     """Simulate, beginning at a plan near the first, and near those of a simulation before.
 
-    `theta` (p,); `x0` (n,); `d` (steps, d). The sample where no plan is found instead.
+    `theta` (p,); `x0` (n,); `d` (steps, d). Raises SolverError at a sample without a plan.
     """
     problem, steps, p = first.problem, len(d), len(theta)
     x, u = np.zeros((steps + 1, problem.n)), np.zeros((steps, problem.m))
@@ -77,22 +55,33 @@ def closed_loop_from(
     x[0], dx[0, :, p:] = x0, np.eye(problem.n)
     plans: list[Plan] = []
     for t in range(steps):
-        near = [] if before is None else [before.plans[t]]
-        near += [plans[-1] if plans else first]
+        last = plans[-1] if plans else first
+        near = [last] if before is None else [before.plans[t], last]
         found = (nearby_plan(one, theta, x[t], mu) for one in near)
         plan = next((one for one in found if one is not None), None)
         if plan is None:  # from the last sample's plan, a sample later
-            last = plans[-1] if plans else first
             ahead = np.vstack([x[t], last.x[2:], last.x[-1:]])
             later = np.vstack([last.u[1:], last.u[-1:]])
             plan = solved_plan(problem, theta, first.d, ahead, later, "ipopt", mu)
         if plan is None:
-            return t
+            raise SolverError(
+                f"sample {t}", "no plan was found from the state reached",
+                "soften the constraints, or give other parameters",
+            )  # fmt: skip
         u[t] = plan.u[0]
-        own = np.vstack([np.hstack([np.eye(p), np.zeros((p, problem.n))]), dx[t]])
-        du[t] = plan.du[0] @ own
-        x[t + 1], f_w, f_theta = slopes(problem, x[t], u[t], d[t], theta)
-        dx[t + 1] = f_w @ np.concatenate([dx[t], du[t]])
-        dx[t + 1, :, :p] += f_theta
+        du[t] = plan.du[0] @ np.vstack([np.eye(p, p + problem.n), dx[t]])
+        ahead, slope = (item.full() for item in _slopes(problem)(x[t], u[t], d[t], theta))
+        x[t + 1] = ahead.ravel()
+        dx[t + 1] = slope @ np.vstack([dx[t], du[t], np.eye(p, p + problem.n)])
         plans.append(plan)
     return ClosedLoop(x, u, dx, du, tuple(plans))
+
+
+@functools.lru_cache(maxsize=16)
+def _slopes(problem: OptimalControlProblem) -> Any:
+    """The next state, and its derivative by (x, u, theta)."""
+    f = problem.functions[0]
+    x, u, d, theta = (ca.SX.sym("s", f.numel_in(index)) for index in range(4))
+    following = f(x, u, d, theta)
+    slope = ca.jacobian(following, ca.vertcat(x, u, theta))
+    return ca.Function("slopes", [x, u, d, theta], [following, slope])

@@ -14,6 +14,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy.linalg
+import scipy.stats
 
 from impc.arrays import Array, BoolArray, Frozen, IntArray
 
@@ -32,6 +34,16 @@ _LARGEST = 4.0  # exponent of a scaling: larger ones are of tangents
 _FACTORS = (1.2, 2.0)
 
 
+def interval(value: float, deviation: float, additive: bool, level: float) -> tuple[float, float]:
+    """Normal, of a value or of its logarithm."""
+    reach = float(scipy.stats.norm.ppf(0.5 + level / 2)) * deviation
+    if additive:
+        return value - reach, value + reach
+    with np.errstate(over="ignore"):
+        factor = float(np.exp(reach))
+    return value / factor, value * factor
+
+
 @dataclass(frozen=True)
 class Combination:
     """A product of powers of parameters."""
@@ -46,14 +58,11 @@ class Combination:
     scaling: bool = True
 
     @property
-    def rough(self) -> bool:
-        """Whether it is told to a factor of more than e only, at 95 %."""
-        return self.deviation > _ROUGH and not self.difference
-
-    @property
-    def printable(self) -> bool:
-        """Whether its exponents are those of a product that somebody could mean."""
-        return all(abs(item) <= _LARGEST for item in self.exponents.values())
+    def told(self) -> str:
+        """Whether it is: "yes", "roughly" (to a factor of more than e only, at 95 %) or "no"."""
+        if np.isinf(self.deviation):
+            return "no"
+        return "roughly" if self.deviation > _ROUGH and not self.difference else "yes"
 
     @property
     def name(self) -> str:
@@ -61,6 +70,20 @@ class Combination:
         over = [_power(name, item) for name, item in self.exponents.items() if item > 0]
         under = [_power(name, -item) for name, item in self.exponents.items() if item < 0]
         return " / ".join([" ".join(over) or "1", *under])
+
+    @property
+    def sentence(self) -> str:
+        """What an untold one leaves open."""
+        if len(self.exponents) == 1:
+            (name,) = self.exponents
+            return (
+                f"{name} is not identified: near its value nothing that was measured depends on it."
+            )
+        if not self.scaling:
+            named = ", ".join(self.exponents)
+            return f"Near these values the recordings cannot distinguish {named}."
+        parts = ", ".join(f"{name} by {_power('a', item)}" for name, item in self.exponents.items())
+        return f"Together any factor a is possible: {parts}."
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,15 +100,14 @@ class Combinations(Frozen):
     @property
     def sentences(self) -> tuple[str, ...]:
         """One for each untold combination, one for those told, and one for those told roughly."""
-        found = [_untold_sentence(one) for one in self.untold]
-        for rough, words in (
-            (False, "Identified"),
-            (True, "Identified roughly (see the intervals)"),
-        ):
+        found = [one.sentence for one in self.untold]
+        kinds = {"yes": "Identified", "roughly": "Identified roughly (see the intervals)"}
+        for kind, words in kinds.items():
             values = [
                 f"{one.name} = {one.value:.6g}"
                 for one in self.told
-                if one.rough is rough and one.printable
+                # Of larger exponents nobody could mean the product.
+                if one.told == kind and np.max(np.abs([*one.exponents.values()])) <= _LARGEST
             ]
             found += [f"{words}: {', '.join(values)}."] if values else []
         return (*found, *(() if self.told else ("Nothing is identified.",)))
@@ -97,13 +119,13 @@ def combinations(
     jacobian: Array,
     residual: Array,
     signals: IntArray,
-    holds: Callable[[Array], bool] = lambda _: True,
+    holds: Callable[[Array], bool],
 ) -> Combinations:
     """Split the parameters.
 
     `theta` (p,); `jacobian` (r, k); `residual` (r,); `signals` (r,); `holds` (p,).
     """
-    p = len(theta)
+    p, positive = len(theta), problem.positive
     own, rest = jacobian[:, :p], jacobian[:, p:]
     if rest.shape[1]:
         own = own - rest @ np.linalg.lstsq(rest, own, rcond=None)[0]
@@ -112,34 +134,30 @@ def combinations(
     # Not by the noise: what it leaves open by a factor of ten is told that roughly, and which
     # products are told does not change from one recording to the next (docs/nonlinear.md).
     told = values > _NOTHING * values[0]
-    covariance = _covariance(jacobian, residual, signals, told)[:p, :p]
-    basis = _sparse(right[~told])
-    pivots = [int(np.flatnonzero(np.isclose(row, 1.0))[0]) for row in basis]
-    names = problem.parameter_names
-    rows = [row / np.min(np.abs(row[row != 0])) for row in basis]
-    untold = tuple(
-        Combination(
-            _named(row, names),
-            1.0,
-            np.inf,
-            scaling=_is_scaling(row, theta, problem.positive, holds),
-        )
-        for row in rows
-    )
+    covariance = _covariance(jacobian, residual, signals, int(np.sum(~told)))[:p, :p]
+    basis, pivots = _sparse(right[~told])
+
+    def named(row: Array) -> dict[str, float]:
+        pairs = zip(problem.parameter_names, row, strict=True)
+        return {name: float(item) for name, item in pairs if item != 0}
+
+    untold = []
+    for row in basis:
+        scaled = row / np.min(np.abs(row[row != 0]))
+        scaling = _is_scaling(scaled, theta, positive, holds)
+        untold.append(Combination(named(scaled), 1.0, np.inf, scaling=scaling))
     kept = []
-    for index in range(p):
-        if index in pivots:
-            continue
+    logarithms = np.where(positive, np.log(np.abs(theta)), theta)
+    for index in sorted(set(range(p)) - set(pivots)):
         exponents = np.eye(p)[index]
         exponents[pivots] = -basis[:, index]
         deviation = float(np.sqrt(max(exponents @ covariance @ exponents, 0.0)))
-        logarithms = np.where(problem.positive, np.log(np.abs(theta)), theta)
-        single = np.count_nonzero(exponents) == 1 and not problem.positive[index]
+        single = bool(np.count_nonzero(exponents) == 1 and not positive[index])
         value = float(theta[index] if single else np.exp(exponents @ logarithms))
-        kept.append(Combination(_named(exponents, names), value, deviation, bool(single)))
-    involved = np.any(basis != 0, axis=0) if len(basis) else np.zeros(p, dtype=bool)
-    deviations = np.where(involved, np.inf, np.sqrt(np.maximum(np.diag(covariance), 0.0)))
-    return Combinations(tuple(kept), untold, values, deviations)
+        kept.append(Combination(named(exponents), value, deviation, single))
+    deviations = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    deviations[np.any(basis != 0, axis=0)] = np.inf
+    return Combinations(tuple(kept), tuple(untold), values, deviations)
 
 
 def _is_scaling(
@@ -152,10 +170,10 @@ def _is_scaling(
     return all(holds(theta * factor**row) for factor in _FACTORS)
 
 
-def _covariance(jacobian: Array, residual: Array, signals: IntArray, told: BoolArray) -> Array:
+def _covariance(jacobian: Array, residual: Array, signals: IntArray, untold: int) -> Array:
     """Of the estimate along told directions, each signal with the noise that is left of it."""
     left, values, right = np.linalg.svd(jacobian, full_matrices=False)
-    rank = len(values) - int(np.count_nonzero(~told))
+    rank = len(values) - untold
     gains = right[:rank].T @ (left[:, :rank] / values[:rank]).T
     freedom = max(len(residual) - rank, 1)
     variance = np.zeros(len(residual))
@@ -165,49 +183,19 @@ def _covariance(jacobian: Array, residual: Array, signals: IntArray, told: BoolA
     return np.asarray((gains * variance) @ gains.T)
 
 
-def _sparse(basis: Array) -> Array:
+def _sparse(basis: Array) -> tuple[Array, list[int]]:
     """The same space (k, p) by rows that are one in a column where the others are zero."""
-    rows, taken = basis.copy(), []
-    for index in range(len(rows)):
-        free = np.abs(rows[index:])
-        place = np.unravel_index(int(np.argmax(free)), free.shape)
-        row, column = index + int(place[0]), int(place[1])
-        rows[[index, row]] = rows[[row, index]]
-        rows[index] /= rows[index, column]
-        for other in range(len(rows)):
-            if other != index:
-                rows[other] -= rows[other, column] * rows[index]
-        taken.append(column)
+    columns = scipy.linalg.qr(basis, mode="r", pivoting=True)[1][: len(basis)]
+    rows, pivots = np.linalg.solve(basis[:, columns], basis), []
     rows[np.abs(rows) < _ROUND] = 0.0
-    for index, row in enumerate(rows):  # the column with the smallest entry: exponents are whole
-        alone = (row != 0) & (np.count_nonzero(rows, axis=0) == 1)
-        if np.any(alone):
-            columns = np.flatnonzero(alone)
-            smallest = np.min(np.abs(row[columns]))
-            nearly = columns[np.abs(row[columns]) < smallest * (1 + _ROUND)]
-            rows[index] = row / row[int(nearly[0])]
-    return np.where(
-        np.abs(6 * rows - np.round(6 * rows)) < 6 * _ROUND, np.round(6 * rows) / 6, rows
-    )
-
-
-def _named(row: Array, names: tuple[str, ...]) -> dict[str, float]:
-    return {name: float(item) for name, item in zip(names, row, strict=True) if item != 0}
+    for index, row in enumerate(rows):  # by the smallest entry: exponents are whole
+        alone = np.flatnonzero((row != 0) & (np.count_nonzero(rows, axis=0) == 1))
+        sizes = np.abs(row[alone])
+        pivots.append(int(alone[sizes < np.min(sizes) * (1 + _ROUND)][0]))
+        rows[index] = row / row[pivots[-1]]
+    whole = np.round(6 * rows) / 6
+    return np.where(np.abs(rows - whole) < _ROUND, whole, rows), pivots
 
 
 def _power(name: str, exponent: float) -> str:
     return name if exponent == 1 else f"{name}^{exponent:.3g}"
-
-
-def _untold_sentence(one: Combination) -> str:
-    if len(one.exponents) == 1:
-        name = next(iter(one.exponents))
-        return f"{name} is not identified: near its value nothing that was measured depends on it."
-    if not one.scaling:
-        named = ", ".join(one.exponents)
-        return f"Near these values the recordings cannot distinguish {named}."
-    parts = ", ".join(
-        f"{name} by a" if item == 1 else f"{name} by a^{item:.3g}"
-        for name, item in one.exponents.items()
-    )
-    return f"Together any factor a is possible: {parts}."

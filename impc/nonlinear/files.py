@@ -8,20 +8,20 @@ the recording and is not used. docs/nonlinear.md.
 
 from __future__ import annotations
 
-import difflib
-import math
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+import msgspec
 import numpy as np
+from msgspec import Meta
 
-from impc.arrays import Array, Frozen, frozen
+from impc.arrays import Array
 from impc.checking import replace
 from impc.errors import InputError, brief
 from impc.files import checks
 from impc.files.clock import on_even_instants, read_clock
-from impc.files.configuration import FILL_IN
+from impc.files.configuration import converted, require_known
 from impc.files.formats import read_table
 from impc.files.reading import (
     channel_of,
@@ -40,96 +40,156 @@ from impc.nonlinear.plan import require_solver
 from impc.studies.fit.settings import read_settings
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     from impc.files.clock import Clock
     from impc.files.configuration import Configuration
     from impc.files.table import Table
-    from impc.model.recordings import Label
     from impc.nonlinear.problem import OptimalControlProblem
     from impc.nonlinear.recordings import OptimalRecording
 
 
-@dataclass(frozen=True, eq=False)
-class OptimalTrial(Frozen):
-    """One file, in SI units on the problem's clock."""
+class ParameterSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A parameter of the problem: where its search begins, or its value."""
 
-    label: Label
-    x: Array  # States (steps + 1, n); NaN where they were not measured
-    u: Array  # Inputs (steps, m); NaN where they were not measured
-    d: Array  # Disturbances, of shape (steps, d)
-    dt: float  # Sample time, s
-    findings: tuple[str, ...]  # What was let pass
+    start: float | None = None  # First value of a search
+    known: float | None = None  # Its value, when it is not searched
+    unit: str = ""  # Of the number; that of the problem where it is empty
 
-
-def read_optimal_trials(
-    paths: Sequence[Path], configuration: Configuration, problem: OptimalControlProblem
-) -> tuple[OptimalTrial, ...]:
-    """Read one recording from each of the `paths`.
-
-    The `configuration` names a column for each disturbance of the `problem`, and for the states and
-    inputs that were measured. Without a sample time of the problem that of each file is taken.
-    """
-    _require_names(configuration, problem)
-    require_distinct(paths)
-    sheet = configuration.recording.sheet
-    return tuple(_trial(read_table(path, sheet=sheet), configuration, problem) for path in paths)
+    def __post_init__(self) -> None:
+        if (self.start is None) == (self.known is None):
+            raise ValueError("has no number" if self.known is None else "has both start and known")
 
 
-def _require_names(configuration: Configuration, problem: OptimalControlProblem) -> None:
-    known = (*problem.state_names, *problem.input_names, *problem.disturbance_names)
-    for name, entry in configuration.signals.items():
+@dataclass(frozen=True)
+class OptimalFitSettings:
+    """What a user may set of the fit of an optimal control problem."""
+
+    # Every parameter of the problem by its name: `ParameterSettings`
+    parameters: dict[str, Any] = field(default_factory=dict)
+    # Whether a recording is of a controller that plans anew at every sample, or is one plan
+    recorded: Literal["loop", "plan"] = "loop"
+    horizon: int | None = None  # In samples, in place of the problem's
+    # Initial values of states, in SI units, in place of what was recorded
+    x0: dict[str, float] = field(default_factory=dict)
+    # Whether initial states are searched, from what was recorded of them and from `x0`
+    unknown_start: bool = True
+    solver: str = "ipopt"  # One of `impc.nonlinear.plan.SOLVERS`
+    evaluations: Annotated[int, Meta(ge=1)] = 200  # After how many the search from a start stops
+    # From how many starts, where the first explains little or has no plan
+    starts: Annotated[int, Meta(ge=1, le=1000)] = 5
+
+
+def optimal_fit_settings(table: Mapping[str, Any]) -> OptimalFitSettings:
+    """Read the [fit] table of a configuration."""
+    settings = read_settings("fit", OptimalFitSettings, table)
+    require_solver(settings.solver)
+    parameters = {}
+    for name, item in settings.parameters.items():
+
+        def where(path: str, name: str = name) -> str:
+            return f"[fit.parameters] {brief(name, 80)} {path.lstrip('.')}".rstrip()
+
+        remedy = "write { start = 1.0 }, or { known = 1.0 }"
+        parameters[name] = converted(where, item, ParameterSettings, remedy)
+    return replace(settings, parameters=parameters)
+
+
+def posed(
+    problem: OptimalControlProblem, settings: OptimalFitSettings
+) -> tuple[OptimalControlProblem, dict[str, float], dict[str, float]]:
+    """The problem as it is fitted, where the search begins, and what is known; by name."""
+    _require_own("parameters", settings.parameters, problem.parameter_names, "parameter")
+    start: dict[str, float] = {}
+    known: dict[str, float] = {}
+    for name in problem.parameter_names:
+        if (one := settings.parameters.get(name)) is None:
+            raise InputError(f"[fit.parameters] {name}", "is missing", "give it start or known")
+        factor = _factor(name, one.unit, problem.units.get(name, "")) if one.unit else 1.0
+        if one.known is None:
+            start[name] = factor * one.start
+        else:
+            known[name] = factor * one.known
+    if settings.horizon is not None:
+        problem = problem.with_horizon(settings.horizon)
+    return (problem.with_known(known) if known else problem), start, known
+
+
+def _factor(name: str, written: str, expected: str) -> float:
+    """From the unit that is written to that of the problem."""
+    unit, own = si_unit(written), si_unit(expected or written)
+    if own.base != unit.base:
+        raise InputError(
+            f"[fit.parameters] {name}.unit", f"is {written!r}, and the problem has {expected}",
+            "correct the unit",
+        )  # fmt: skip
+    return unit.factor / (own.factor if expected else 1.0)
+
+
+def _require_own(table: str, given: Iterable[str], known: Sequence[str], kind: str) -> None:
+    for name in given:
         if name not in known:
-            near = difflib.get_close_matches(name, known, n=1)
-            remedy = f"did you mean {near[0]}?" if near else f"it has {', '.join(known)}"
-            raise InputError(f"signals.{name}", "is no signal of the problem", remedy)
+            has = f"it has {', '.join(known)}"
+            raise InputError(
+                f"[fit.{table}] {brief(name, 80)}", f"is no {kind} of the problem", has
+            )
+
+
+def require_signals(configuration: Configuration, problem: OptimalControlProblem) -> None:
+    """The `configuration` names signals of the `problem`, and each of its disturbances."""
+    known = (*problem.state_names, *problem.input_names, *problem.disturbance_names)
+    require_known("signals.{}".format, configuration.signals, known, "is no signal of the problem")
+    for name, entry in configuration.signals.items():
         require_filled_in(name, entry)
         if entry.shift:
             unused = "is not used by an optimal control problem"
             raise InputError(f"signals.{name}.shift", unused, "shift the column in the file")
-        require_kind(name, entry.unit, problem.signal_units.get(name, UNKNOWN))
+        require_kind(name, entry.unit, problem.units.get(name, UNKNOWN))
     for name in problem.disturbance_names:
         if name not in configuration.signals:
             raise InputError(f"signals.{name}", "is missing", "a disturbance has to be recorded")
 
 
-def _trial(
-    table: Table, configuration: Configuration, problem: OptimalControlProblem
-) -> OptimalTrial:
-    entry = configuration.recording
-    label, clock = label_of(table.source, entry), read_clock(table, entry)
-    dt = clock.period if problem.dt is None else problem.dt
+def read_recording(
+    table: Table, clock: Clock, configuration: Configuration, problem: OptimalControlProblem,
+    settings: OptimalFitSettings,
+) -> tuple[OptimalRecording, list[str]]:  # fmt: skip
+    """A file as a recording of the problem in SI units on its clock, and what was let pass."""
+    dt = problem.dt or clock.period
     checks.comparable_rates(table.source, clock.period, dt)
-    findings = list(clock.findings)
-    columns: dict[str, Array] = {}
+    findings, columns = list(clock.findings), {}
     for name in configuration.signals:
-        values, found = _series(table, clock, configuration, name, problem)
-        columns[name] = values
+        held = name not in problem.state_names
+        columns[name], found = _series(table, clock, configuration, name, dt, held)
         findings += found
     # A configuration names a signal, so there is a column.
-    samples = len(next(iter(columns.values())))
-    checks.too_few(table.source, samples, 2)
-    absent = np.full(samples, np.nan)
+    nothing = np.full(len(next(iter(columns.values()))), np.nan)
+    checks.too_few(table.source, len(nothing), 2)
+    groups = (problem.state_names, problem.input_names, problem.disturbance_names)
+    x, u, d = (np.array([columns.get(name, nothing) for name in group]).reshape(-1, len(nothing)).T
+               for group in groups)  # fmt: skip
+    make = problem.recorded_plan if settings.recorded == "plan" else problem.recorded_loop
+    start = {"x0": first_state(problem, x[0], settings), "unknown_start": settings.unknown_start}
+    return make(x, u[:-1], d=d[:-1], **start), findings
 
-    def side_by_side(names: Sequence[str]) -> Array:
-        return np.array([columns.get(name, absent) for name in names]).reshape(-1, samples).T
 
-    return OptimalTrial(
-        label,
-        frozen(side_by_side(problem.state_names)),
-        frozen(side_by_side(problem.input_names)[:-1]),
-        frozen(side_by_side(problem.disturbance_names)[:-1]),
-        dt,
-        tuple(findings),
-    )
+def first_state(
+    problem: OptimalControlProblem, recorded: Array, settings: OptimalFitSettings
+) -> list[float]:
+    """The first state as it was `recorded` (n,), or as the settings have it."""
+    _require_own("x0", settings.x0, problem.state_names, "state")
+    first = dict(zip(problem.state_names, recorded, strict=True)) | settings.x0
+    for name, value in first.items():
+        if np.isnan(value):
+            raise InputError(
+                f"[fit.x0] {name}", "is missing, and was not recorded",
+                "give it, or a guess with unknown_start = true",
+            )  # fmt: skip
+    return list(first.values())
 
 
 def _series(
-    table: Table,
-    clock: Clock,
-    configuration: Configuration,
-    name: str,
-    problem: OptimalControlProblem,
+    table: Table, clock: Clock, configuration: Configuration, name: str, dt: float, held: bool
 ) -> tuple[Array, list[str]]:
     """A signal on the problem's clock, and what was let pass."""
     entry = configuration.signals[name]
@@ -139,10 +199,8 @@ def _series(
         checks.measurable(channel),
         "" if entry.limit is None else checks.beyond_the_stop(channel, entry.limit),
     ]
-    dt = clock.period if problem.dt is None else problem.dt
     values = channel.values * channel.unit.factor
     if clock.even and same_rate(len(values), clock.period, dt):
-        held = name not in problem.state_names
         lost = ~np.isfinite(values[:-1] if held else values)
         values = np.where(np.isfinite(values), values, np.nan)
         if np.any(lost):
@@ -153,136 +211,9 @@ def _series(
             )
     else:
         found.append(checks.missing(channel, configuration.recording.fill_gaps))
-        resample = instants if name in problem.state_names else held_means
+        resample = held_means if held else instants
         values = resample(on_even_instants(clock, values), clock.period, dt)
     return values, [finding for finding in found if finding]
-
-
-_MOST = {"evaluations": 100_000, "starts": 1000}
-
-
-@dataclass(frozen=True)
-class ParameterSettings:
-    """A parameter of the problem: where its search begins, or its value."""
-
-    start: float | None = None  # First value of a search
-    known: float | None = None  # Its value, when it is not searched
-    unit: str = ""  # Of the number; that of the problem where it is empty
-
-
-@dataclass(frozen=True)
-class OptimalFitSettings:
-    """What a user may set of the fit of an optimal control problem."""
-
-    # Every parameter of the problem by its name
-    parameters: dict[str, ParameterSettings] = field(default_factory=dict)
-    # Whether a recording is of a controller that plans anew at every sample, or is one plan
-    recorded: Literal["loop", "plan"] = "loop"
-    horizon: int | None = None  # In samples, in place of the problem's
-    # Initial values of states, in SI units, in place of what was recorded
-    x0: dict[str, float] = field(default_factory=dict)
-    # Whether initial states are searched, from what was recorded of them and from `x0`
-    unknown_start: bool = True
-    solver: str = "ipopt"  # One of `impc.nonlinear.plan.SOLVERS`
-    evaluations: int = 200  # After how many a search is stopped
-    starts: int = 5  # From how many starts, where the first explains little or has no plan
-
-
-def optimal_fit_settings(table: Mapping[str, Any]) -> OptimalFitSettings:
-    """Read the [fit] table of a configuration."""
-    _require_filled_in("[fit]", table)
-    given = table.get("parameters", {})
-    known = [item.name for item in fields(ParameterSettings)]
-    for name, item in given.items() if isinstance(given, dict) else ():
-        place = f"[fit.parameters] {brief(name, 80)}"
-        if not isinstance(item, dict):
-            raise InputError(place, f"got {brief(item)}", "write it as in { start = 1.0 }")
-        _require_filled_in(place, item)
-        for key in item:  # msgspec passes over keys of inner tables
-            if key not in known:
-                raise InputError(f"{place}.{key}", "is not a setting", f"known: {', '.join(known)}")
-    settings = read_settings("fit", OptimalFitSettings, table)
-    for name, one in settings.parameters.items():
-        if (one.start is None) == (one.known is None):
-            raise InputError(
-                f"[fit.parameters] {brief(name, 80)}",
-                "has both start and known" if one.known is not None else "has no number",
-                "give start for one that is searched, or known",
-            )
-    for key, most in _MOST.items():
-        if not 1 <= getattr(settings, key) <= most:
-            raise InputError(f"[fit] {key}", f"got {getattr(settings, key)}", f"give 1 to {most}")
-    require_solver(settings.solver)
-    return settings
-
-
-def _require_filled_in(place: str, table: Mapping[str, Any]) -> None:
-    for key, value in table.items():
-        if value == FILL_IN:
-            raise InputError(f"{place} {key}", f"is still {FILL_IN!r}", "fill it in")
-
-
-def posed(
-    problem: OptimalControlProblem, settings: OptimalFitSettings
-) -> tuple[OptimalControlProblem, dict[str, float], dict[str, float]]:
-    """The problem as it is fitted, where the search begins, and what is known; by name."""
-    units = dict(zip(problem.parameter_names, problem.units, strict=True))
-    for name in settings.parameters:
-        if name not in units:
-            remedy = f"it has {', '.join(units)}"
-            raise InputError(
-                f"[fit.parameters] {brief(name, 80)}", "is no parameter of the problem", remedy
-            )
-    start: dict[str, float] = {}
-    known: dict[str, float] = {}
-    for name, unit in units.items():
-        one = settings.parameters.get(name)
-        if one is None:
-            raise InputError(f"[fit.parameters] {name}", "is missing", "give it start or known")
-        factor = _factor(name, one.unit, unit)
-        if one.known is not None:
-            known[name] = factor * one.known
-        elif one.start is not None:
-            start[name] = factor * one.start
-    if settings.horizon is not None:
-        problem = problem.with_horizon(settings.horizon)
-    return (problem.with_known(known) if known else problem), start, known
-
-
-def _factor(name: str, written: str, expected: str) -> float:
-    """From the unit that is written to that of the problem."""
-    if not written:
-        return 1.0
-    unit = si_unit(written)
-    if not expected:
-        return unit.factor
-    own = si_unit(expected)
-    if own.base != unit.base:
-        raise InputError(
-            f"[fit.parameters] {name}.unit", f"is {written!r}, and the problem has {expected}",
-            "correct the unit",
-        )  # fmt: skip
-    return unit.factor / own.factor
-
-
-def recorded(
-    problem: OptimalControlProblem, trial: OptimalTrial, settings: OptimalFitSettings
-) -> OptimalRecording:
-    """A file as a recording of the problem."""
-    for name in settings.x0:
-        if name not in problem.state_names:
-            known = ", ".join(problem.state_names)
-            raise InputError(f"[fit.x0] {brief(name, 80)}", "is no state", f"it has {known}")
-    first = dict(zip(problem.state_names, trial.x[0], strict=True)) | settings.x0
-    for name, value in first.items():
-        if math.isnan(value):
-            raise InputError(
-                f"[fit.x0] {name}", "is missing, and was not recorded",
-                "give it, or a guess with unknown_start = true",
-            )  # fmt: skip
-    make = problem.recorded_plan if settings.recorded == "plan" else problem.recorded_loop
-    x0 = [first[name] for name in problem.state_names]
-    return make(trial.x, trial.u, d=trial.d, x0=x0, unknown_start=settings.unknown_start)
 
 
 def fit_files(
@@ -294,25 +225,23 @@ def fit_files(
     """Read recordings of a problem from files, and fit it as the configuration says."""
     settings = optimal_fit_settings(configuration.fit)
     if solver is not None:
-        require_solver(solver)
-        settings = replace(settings, solver=solver)
-    units = dict(zip(problem.parameter_names, problem.units, strict=True))
+        settings = replace(settings, solver=require_solver(solver))
     fitted, start, known = posed(problem, settings)
-    trials = read_optimal_trials(files, configuration, fitted)
-    recordings = [recorded(fitted, trial, settings) for trial in trials]
+    require_signals(configuration, fitted)
+    require_distinct(files)
+    entry, recordings, labels, findings, dt = configuration.recording, [], [], [], problem.dt
+    for path in files:
+        table = read_table(path, sheet=entry.sheet)
+        label, clock = label_of(table.source, entry), read_clock(table, entry)
+        recording, found = read_recording(table, clock, configuration, fitted, settings)
+        recordings.append(recording)
+        labels.append(str(label))
+        findings.append(tuple(found))
+        dt = dt or clock.period
     estimate = fit_optimal_control(
-        fitted,
-        recordings,
-        start,
-        solver=settings.solver,
-        evaluations=settings.evaluations,
+        fitted, recordings, start, solver=settings.solver, evaluations=settings.evaluations,
         starts=settings.starts,
-    )
-    return OptimalFit(
-        estimate,
-        tuple(str(trial.label) for trial in trials),
-        tuple(trial.findings for trial in trials),
-        trials[0].dt,
-        {name: (value, units[name]) for name, value in known.items()},
-        asdict(settings),
-    )
+    )  # fmt: skip
+    units = {name: (value, problem.units.get(name, "")) for name, value in known.items()}
+    made = msgspec.to_builtins(settings)
+    return OptimalFit(estimate, tuple(labels), tuple(findings), dt, units, made)

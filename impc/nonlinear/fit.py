@@ -10,27 +10,25 @@ smooth over changes of the active rows; at 1e-10 it is the problem itself. docs/
 
 from __future__ import annotations
 
-import itertools
 import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.stats
 
 from impc.arrays import Array, Frozen, IntArray
-from impc.checking import checked, replace
+from impc.checking import checked
 from impc.errors import DataError, InfeasibleError, InputError, SolverError
-from impc.nonlinear.combinations import Combinations, combinations
+from impc.nonlinear.combinations import Combinations, combinations, interval
 from impc.nonlinear.plan import require_solver
 from impc.nonlinear.search import (
     EXPLAINED,
-    Count,
+    Budget,
+    Residuals,
     along_mu,
     begin,
-    first_plan,
     guided,
-    residuals_of,
+    scales_of,
 )
 
 if TYPE_CHECKING:
@@ -38,13 +36,12 @@ if TYPE_CHECKING:
 
     from impc.nonlinear.problem import OptimalControlProblem
     from impc.nonlinear.recordings import OptimalRecording
-    from impc.nonlinear.search import Evaluation, Residuals
+    from impc.nonlinear.search import Evaluation
     from impc.reporting.document import Report
     from impc.reporting.provenance import Provenance
 
 #: The falling sequence of mu, over the mean cost of a recorded stage where that is below one.
 MU_STEPS = (1e-1, 1e-2, 1e-4, 1e-10)
-_MOST_STARTS = 1000
 _SPREAD = 0.3  # of further starts, in a logarithm
 # A scaling holds while it moves all trajectories by less than this share of them, or of the noise
 # of one number.
@@ -92,26 +89,20 @@ class OptimalControlEstimate(Frozen):
         """
         if not 0 < level < 1:
             raise InputError("level", f"got {level:g}", "give one between 0 and 1")
-        reach = float(scipy.stats.norm.ppf(0.5 + level / 2)) * self.combinations.deviations
-        found = {}
-        for index, (name, value) in enumerate(self.theta.items()):
-            if self.problem.positive[index]:
-                with np.errstate(over="ignore"):
-                    factor = float(np.exp(reach[index]))
-                found[name] = (value / factor, value * factor)
-            else:
-                found[name] = (value - float(reach[index]), value + float(reach[index]))
-        return found
+        rows = zip(self.combinations.deviations, self.problem.positive, strict=True)
+        return {
+            name: interval(value, float(deviation), not positive, level)
+            for (name, value), (deviation, positive) in zip(self.theta.items(), rows, strict=True)
+        }
 
 
-@checked
+@checked(evaluations=1, starts=(1, 1000))
 def fit_optimal_control(
     problem: OptimalControlProblem,
     recordings: Sequence[OptimalRecording],
     start: Mapping[str, float],
     *,
     solver: str = "ipopt",
-    mu_steps: Sequence[float] | None = None,
     evaluations: int = 200,
     starts: int = 1,
 ) -> OptimalControlEstimate:
@@ -126,11 +117,8 @@ def fit_optimal_control(
         First value of each parameter by its name.
     solver : str
         One of `impc.nonlinear.plan.SOLVERS`.
-    mu_steps : sequence of float, optional
-        Falling, of the dimension of the cost; by default `MU_STEPS` times the mean cost of a
-        recorded stage at the start, at most one, and at least 1e-10.
     evaluations : int
-        After how many a search is stopped; there are at most two from a start, guided and not.
+        After how many the search from a start is stopped.
     starts : int
         From how many starts, where the recordings are not explained from the first or it has no
         plan: the others are about it by 0.3 in a logarithm.
@@ -174,131 +162,74 @@ def fit_optimal_control(
     solver = require_solver(solver)
     if not recordings:
         raise DataError("recordings", "there are none", "give at least one")
-    if mu_steps is None:
-        mu_steps = _scaled(recordings, problem.values(start))
-    if not mu_steps or any(b >= a for a, b in itertools.pairwise(mu_steps)):
-        raise InputError("mu_steps", f"got {tuple(mu_steps)!r:.60}", "give falling numbers")
-    if isinstance(starts, bool) or not 1 <= starts <= _MOST_STARTS:
-        raise InputError("starts", f"got {starts!r:.40}", f"give 1 to {_MOST_STARTS}")
-    began = time.perf_counter()
-    theta, count = problem.values(start), Count(evaluations)
-    given = residuals_of(problem, tuple(recordings), solver)
     if any(one.problem is not problem for one in recordings):
         raise InputError("recordings", "are of another problem", "record them with this one")
-    held = _at_first_samples(given)
-    best, settled, refused, posed = None, False, None, given
-    for begun in _starts(problem, theta, starts):
+    began = time.perf_counter()
+    theta, budget = problem.values(start), Budget()
+    given = Residuals(problem, tuple(recordings), solver, scales_of(recordings))
+    mu_steps, explained = _scaled(recordings, theta), EXPLAINED * given.size
+    best: tuple[Evaluation, bool] | None = None
+    refused: Exception = SolverError("start", "no search got away from it", "begin nearer")
+    for place, steps in _places(given, theta, mu_steps, starts, evaluations, budget):
+        budget.take()
         try:
-            residuals, found = _held_then_free(held, given, begun, mu_steps, count)
-        except (InfeasibleError, SolverError) as error:  # no plan there: said if none has one
-            refused = refused or error
+            first = begin(given, given.unknowns(place), steps[0])
+        except (InfeasibleError, SolverError) as error:  # said if no place has a plan
+            refused = error if best is None and place is theta else refused
             continue
-        if found is not None and (best is None or found[0].loss < best.loss):
-            (best, settled), posed = found, residuals
-        if best is not None and best.loss < EXPLAINED * given.size:
+        # Initial states stay at their samples until the rest is found: from afar their search ends
+        # elsewhere.
+        held, free = given.free(sampled=False), given.free()
+        found = along_mu(given, first, steps, held, budget)
+        if found[1] and not np.array_equal(held, free):
+            again = mu_steps[-1:] if found[0].loss < explained else mu_steps
+            found = min(found, along_mu(given, found[0], again, free, budget), key=_loss)
+        best = found if best is None else min(best, found, key=_loss)
+        if best[0].loss < explained:
             break
     if best is None:
-        raise refused or SolverError("start", "no search got away from it", "begin nearer")
-    return _estimate(posed, theta, best, settled, count.all, time.perf_counter() - began)
+        raise refused
+    return _estimate(given, theta, *best, budget.done, time.perf_counter() - began)
 
 
-def _starts(problem: OptimalControlProblem, theta: Array, count: int) -> Iterator[Array]:
-    """The start itself, then others about it: the same for the same start."""
-    yield theta
-    for index in range(1, count):
-        noise = _SPREAD * np.random.default_rng(index).normal(size=len(theta))
-        yield np.where(problem.positive, theta * np.exp(noise), theta * (1 + noise))
+def _loss(found: tuple[Evaluation, bool]) -> float:
+    return found[0].loss
 
 
-def _at_first_samples(given: Residuals) -> Residuals | None:
-    """The same with unknown initial states held at their samples; None where none has one.
-
-    Exact recordings are explained so, and of others the parameters are a start for the search of
-    the initial states too, which from afar ends elsewhere.
-    """
-    held = tuple(
-        replace(one, unknown_start=one.unknown_start and not np.array_equal(one.x0, one.x[0]))
-        for one in given.recordings
-    )
-    pairs = zip(held, given.recordings, strict=True)
-    if all(one.unknown_start == two.unknown_start for one, two in pairs):
-        return None
-    return residuals_of(given.problem, held, given.solver)
-
-
-def _held_then_free(
-    held: Residuals | None,
+def _places(
     given: Residuals,
     theta: Array,
     mu_steps: Sequence[float],
-    count: Count,
-) -> tuple[Residuals, tuple[Evaluation, bool] | None]:
-    """What a search from a start finds, and with which initial states."""
-    if held is not None:
-        first = _from_start(held, theta, mu_steps, count)
-        if first is not None and first[0].loss < EXPLAINED * given.size:
-            return held, first
-        theta = theta if first is None else first[0].theta
-    return given, _from_start(given, theta, mu_steps, count)
+    starts: int,
+    evaluations: int,
+    budget: Budget,
+) -> Iterator[tuple[Array, Sequence[float]]]:
+    """The start and others about it, each after where closed loops guide from there, with their mu.
+
+    They are the same for the same start.
+    """
+    for index in range(starts):
+        budget.left, here = evaluations, theta
+        if index:
+            noise = _SPREAD * np.random.default_rng(index).normal(size=len(theta))
+            here = np.where(given.problem.positive, theta * np.exp(noise), theta * (1 + noise))
+        near = guided(given, here, mu_steps, budget)
+        if near is not None:
+            yield near, mu_steps[-2:]
+        yield here, mu_steps
 
 
-def _from_start(
-    given: Residuals, theta: Array, mu_steps: Sequence[float], count: Count
-) -> tuple[Evaluation, bool] | None:
-    """The better of two searches; the second only where the first explains little."""
-    for one in given.recordings:  # an error at the first parameters is one of the start
-        first_plan(one, theta, one.x0, mu_steps[0], given.solver)
-    loops = any(one.closed_loop for one in given.recordings)
-    best: tuple[Evaluation, bool] | None = None
-    for guide in (loops, not loops):
-        count.again()
-        try:
-            found = _attempt(given, theta, mu_steps, count, guide)
-        except (InfeasibleError, SolverError):
-            if best is None:
-                raise
-            break  # the other search got somewhere
-        if found is not None and (best is None or found[0].loss < best[0].loss):
-            best = found
-        if best is not None and best[0].loss < EXPLAINED * given.size:
-            break
-    return best
-
-
-def _scaled(recordings: Sequence[OptimalRecording], theta: Array) -> tuple[float, ...]:
+def _scaled(recordings: Sequence[OptimalRecording], theta: Array) -> Sequence[float]:
     """mu in the size of the cost: at 0.1 of it a limit is felt from afar and moves little else."""
-    costs: list[Array] = []
-    for one in recordings:
-        w = np.hstack([one.x[:-1], one.u, one.d])
-        known = np.all(np.isfinite(w), axis=1)
-        if np.any(known):
-            function = one.problem.functions[1].map(int(known.sum()))
-            x, u, d = one.x[:-1][known].T, one.u[known].T, one.d[known].T
-            repeated = np.repeat(theta[:, None], x.shape[1], axis=1)
-            costs.append(np.abs(function(x, u, d, repeated).full().ravel()))
-    mean = float(np.mean(np.concatenate(costs))) if costs else 1.0
+    costs = [
+        abs(float(one.problem.functions[1](x, u, d, theta)))
+        for one in recordings
+        for x, u, d in zip(one.x[:-1], one.u, one.d, strict=True)
+        if np.all(np.isfinite(x)) and np.all(np.isfinite(u))
+    ]
+    mean = float(np.mean(costs)) if costs else 1.0
     size = min(1.0, mean) if np.isfinite(mean) else 1.0
     return tuple(dict.fromkeys(max(mu * size, MU_STEPS[-1]) for mu in MU_STEPS))
-
-
-def _attempt(
-    given: Residuals, theta: Array, mu_steps: Sequence[float], count: Count, guide: bool
-) -> tuple[Evaluation, bool] | None:
-    """From a start, or from what the recorded states' own plans make of it."""
-    loops = any(one.closed_loop for one in given.recordings)
-    if guide:
-        found = guided(given, theta, mu_steps if loops else mu_steps[:1], count)
-        if found is None:
-            return None
-        theta, mu_steps = found, mu_steps[-2:] if loops else mu_steps
-    try:
-        first = begin(given, given.unknowns(theta), mu_steps[0])
-    except (InfeasibleError, SolverError):
-        if not guide:
-            raise
-        return None  # what guided the search may end where the recordings have no plan
-    count.done += 1
-    return along_mu(given, first, mu_steps, count)
 
 
 def _estimate(
@@ -309,27 +240,27 @@ def _estimate(
     evaluations: int,
     seconds: float,
 ) -> OptimalControlEstimate:
-    problem, signals = given.problem, given.signals()
-    loss = float(np.sum((found.residual * given.scales[signals]) ** 2))
+    problem, signals, p = given.problem, given.signals(), len(start)
+    (theta, starts), jacobian = given.split(found.unknowns), found.jacobian[:, given.free()]
+    noise = float(np.sqrt(np.mean(found.residual**2)))
 
     def holds(theta: Array) -> bool:
-        unknowns = found.unknowns.copy()
-        unknowns[: len(theta)] = np.where(problem.positive, np.log(np.abs(theta)), theta)
+        unknowns = np.append(given.unknowns(theta)[:p], found.unknowns[p:])
         try:
             there = begin(given, unknowns, found.mu)
         except (InputError, InfeasibleError, SolverError):
             return False
         moved = float(np.linalg.norm(there.residual - found.residual))
-        noise = float(np.sqrt(np.mean(found.residual**2)))
         return bool(moved <= max(_UNMOVED * np.sqrt(given.size), _LITTLE * noise))
 
-    told = combinations(problem, found.theta, found.jacobian, found.residual, signals, holds)
     begun, named = (
         dict(zip(problem.parameter_names, map(float, values), strict=True))
-        for values in (start, found.theta)
+        for values in (start, theta)
     )
     return OptimalControlEstimate(
-        problem, given.recordings, begun, named, loss, found.residual, found.jacobian, signals,
-        given.scales, told, tuple(given.split(found.unknowns)[1]),
+        problem, given.recordings, begun, named,
+        float(np.sum((found.residual * given.scales[signals]) ** 2)), found.residual, jacobian,
+        signals, given.scales,
+        combinations(problem, theta, jacobian, found.residual, signals, holds), tuple(starts),
         tuple((run.x, run.u) for run in found.runs), settled, evaluations, seconds,
     )  # fmt: skip

@@ -29,10 +29,10 @@ from impc.errors import InfeasibleError, InputError, SolverError
 from impc.settings_files import IPOPT_ALONE
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from impc.nonlinear.problem import OptimalControlProblem
 
-#: Interior points, sequential quadratic programs, structured interior points.
-SOLVERS = ("ipopt", "sqpmethod", "fatrop")
 # Of the conditions, relative to the largest multiplier (gradient) or as they are (c and h + s).
 _TOLERANCE = 1e-10
 _PRODUCT = 1e-3  # of s lam - mu, relative to mu
@@ -42,10 +42,22 @@ _EXCESS = 1e-6  # of a row, above which a problem without a plan is called infea
 # Multiplier over slack: at mu = 1e-10 an active row with a multiplier of one has 1e10.
 _WEAK = (1e-3, 1e3)
 _SILENT: dict[str, Any] = {"print_time": False, "error_on_fail": False}
+# mu means the same as in the conditions only if IPOPT scales and relaxes nothing.
+_IPOPT = IPOPT_ALONE | {
+    "max_iter": 300, "tol": 1e-8, "nlp_scaling_method": "none", "bound_relax_factor": 0.0,
+}  # fmt: skip
 _NEAR = dict.fromkeys(
     ("warm_start_bound_push", "warm_start_bound_frac", "warm_start_slack_bound_push",
      "warm_start_slack_bound_frac", "warm_start_mult_bound_push"), 1e-16,
-) | {"warm_start_init_point": "yes"}  # fmt: skip
+) | {"warm_start_init_point": "yes", "max_iter": 60}  # fmt: skip
+_OPTIONS: dict[str, dict[str, Any]] = {
+    "ipopt": {},
+    "fatrop": {
+        "structure_detection": "auto", "fatrop": {"print_level": 0, "tol": 1e-8, "max_iter": 300},
+    },
+}  # fmt: skip
+#: Interior points, with the structure of the stages or without.
+SOLVERS = tuple(_OPTIONS)
 
 
 def require_solver(name: str) -> str:
@@ -66,87 +78,68 @@ class Program:
 
     def __init__(self, problem: OptimalControlProblem) -> None:
         f, cost, e, h, h_end = problem.functions
-        plain = all(item.is_a("SXFunction") for item in problem.functions)
-        kind: Any = ca.SX if plain else ca.MX
         n, m, N = problem.n, problem.m, problem.horizon
-        x0, d = kind.sym("x0", n), kind.sym("d", problem.disturbance_count, N)
-        theta, x = kind.sym("theta", len(problem.parameter_names)), kind.sym("x", n)
-        w, g, total = [], [], kind(0)
+        x0, d = ca.SX.sym("x0", n), ca.SX.sym("d", problem.disturbance_count, N)
+        theta, x = ca.SX.sym("theta", len(problem.parameter_names)), ca.SX.sym("x", n)
+        # Rows that no input moves: at the first sample nothing can be done about them.
+        movable = ca.DM(h.jac_sparsity(0, 1), 1).full().any(axis=1)
+        w, g, total = [], [], ca.SX(0)
         equal: list[bool] = []
         #: Name and sample of each row of h.
         self.labels: list[tuple[str, int]] = []
         for k in range(N):
-            u, following = kind.sym("u", m), kind.sym("x", n)
+            u, following = ca.SX.sym("u", m), ca.SX.sym("x", n)
             given = (x, u, d[:, k], theta)
+            kept = np.flatnonzero(movable) if k == 0 else np.arange(len(problem.rows))
             w += [x, u]
             g += [following - f(*given), *([x - x0] if k == 0 else [])]
-            kept = np.flatnonzero(problem.movable) if k == 0 else np.arange(len(problem.rows))
-            rows = h(*given)
-            g += [rows[int(row)] for row in kept]
+            g += [h(*given)[kept.tolist()]] if len(kept) else []
             equal += [True] * (n + n * (k == 0)) + [False] * len(kept)
             self.labels += [(problem.rows[row], k) for row in kept]
             total += cost(*given)
             x = following
-        last = (x, kind.zeros(m), kind.zeros(problem.disturbance_count), theta)
+        last = (x, ca.SX.zeros(m), ca.SX.zeros(problem.disturbance_count), theta)
         self.equal = np.array(equal + [False] * len(problem.terminal_rows))
         self.labels += [(name, N) for name in problem.terminal_rows]
         unknowns, rows = ca.vertcat(*w, x), ca.vertcat(*g, h_end(*last))
-        cost_all, given = total + e(*last), ca.vertcat(x0, ca.vec(d), theta)
-        y, own = kind.sym("y", rows.numel()), ca.vertcat(theta, x0)
-        gradient = ca.gradient(cost_all, unknowns)
-        H, slope = ca.hessian(cost_all + ca.dot(y, rows), unknowns)
-        A = ca.jacobian(rows, unknowns)
-        self.nlp = {"x": unknowns, "p": given, "f": cost_all, "g": rows}
-        self.conditions = ca.Function("conditions", [unknowns, y, given], [slope, rows, H, A])
-        self.sides = ca.Function("sides", [unknowns, y, given],
-                                 [ca.jacobian(slope, own), ca.jacobian(rows, own)])  # fmt: skip
-        self.cost = ca.Function("cost", [unknowns, given], [cost_all])
-        price = kind.sym("price")
-        bent = ca.hessian(price * cost_all + ca.dot(y, rows), unknowns)[0]
+        total += e(*last)
+        p, own = ca.vertcat(x0, ca.vec(d), theta), ca.vertcat(theta, x0)
+        y, price = ca.SX.sym("y", rows.numel()), ca.SX.sym("price")
+        A, gradient = ca.jacobian(rows, unknowns), ca.gradient(total, unknowns)
+        H = ca.hessian(price * total + ca.dot(y, rows), unknowns)[0]
+        slope = gradient + A.T @ y
+        self.nlp = {"x": unknowns, "p": p, "f": total, "g": rows}
+        #: At a price of 1.
+        self.conditions = ca.Function("c", [unknowns, y, p, price], [slope, rows, H, A])
+        sides = ca.jacobian(ca.vertcat(slope, rows), own)
+        self.sides = ca.Function("sides", [unknowns, y, p], [sides])
         #: Made once, for IPOPT at every mu.
         self.derivatives = {
-            "grad_f": ca.Function("g", [unknowns, given], [cost_all, gradient]),
-            "jac_g": ca.Function("j", [unknowns, given], [rows, A]),
-            "hess_lag": ca.Function("h", [unknowns, given, price, y], [ca.triu(bent)]),
+            "grad_f": ca.Function("g", [unknowns, p], [total, gradient]),
+            "jac_g": ca.Function("j", [unknowns, p], [rows, A]),
+            "hess_lag": ca.Function("h", [unknowns, p, price, y], [ca.triu(H)]),
         }
         self._solvers: dict[tuple[str, float, bool], Any] = {}
 
-    def solver(self, name: str, mu: float, near: bool) -> Any:
+    def _solver(self, name: str, mu: float, near: bool) -> Any:
         """CasADi's solver by its name; of IPOPT for a target mu, begun far from a plan or near."""
-        key = (name, mu, near)
-        if key not in self._solvers:
-            self._solvers[key] = ca.nlpsol("plan", name, self.nlp, self._options(*key))
-        return self._solvers[key]
-
-    def _options(self, name: str, mu: float, near: bool) -> dict[str, Any]:
+        options = _SILENT | _OPTIONS[name]
+        if name == "fatrop":
+            options["equality"] = self.equal.tolist()
         if name == "ipopt":
-            # mu means the same as in the conditions only if IPOPT scales and relaxes nothing.
-            ipopt = IPOPT_ALONE | {
-                "max_iter": 60 if near else 300, "tol": 1e-8, "mu_target": mu,
-                "nlp_scaling_method": "none", "bound_relax_factor": 0.0,
-            }  # fmt: skip
-            return _SILENT | self.derivatives | {
-                "ipopt": ipopt | (_NEAR | {"mu_init": mu} if near else {})
-            }  # fmt: skip
-        if name == "sqpmethod":
-            return _SILENT | {
-                "print_header": False, "print_iteration": False, "print_status": False,
-                "qpsol": "proxqp", "qpsol_options": {"error_on_fail": False},
-                "convexify_strategy": "eigen-clip", "max_iter": 300, "tol_du": 1e-8, "tol_pr": 1e-8,
-            }  # fmt: skip
-        return _SILENT | {
-            "structure_detection": "auto", "equality": self.equal.tolist(),
-            "fatrop": {"print_level": 0, "tol": 1e-8, "max_iter": 300},
-        }  # fmt: skip
+            there = _NEAR | {"mu_init": mu} if near else {}
+            options |= self.derivatives | {"ipopt": _IPOPT | {"mu_target": mu} | there}
+        return ca.nlpsol("plan", name, self.nlp, options)
 
     def answer(
         self, name: str, p: Array, w: Array, y: Array | None, mu: float
     ) -> tuple[Array, Array]:
         """What a solver makes of a guess w, and y if it is near: no claim, it may be anything."""
+        key = (name, mu if name == "ipopt" else 0.0, y is not None)
+        if key not in self._solvers:
+            self._solvers[key] = self._solver(*key)
         given = {"x0": w, "p": p, "lbg": np.where(self.equal, 0.0, -np.inf), "ubg": 0.0}
-        if y is not None:
-            given["lam_g0"] = y
-        found = self.solver(name, mu if name == "ipopt" else 0.0, y is not None)(**given)
+        found = self._solvers[key](**given, **({} if y is None else {"lam_g0": y}))
         return found["x"].full().ravel(), found["lam_g"].full().ravel()
 
 
@@ -161,34 +154,26 @@ class Plan(Frozen):
     """A solution of the relaxed conditions, with its derivatives by theta and x_0."""
 
     problem: OptimalControlProblem
-    theta: Array  # Parameters (p,)
-    d: Array  # Disturbances that the plan reckons with (N, d)
-    mu: float  # Product of slack and multiplier of every row
+    p: Array  # x_0, disturbances and parameters
     w: Array  # States and inputs, x_0, u_0, x_1, ...
     y: Array  # Multipliers of equations and rows
     s: Array  # Slacks of the rows
-    cost: float  # Without the relaxation
     slope: Array  # Derivative of (w, y), each (p + n,)
+    x: Array  # States (N + 1, n)
+    u: Array  # Inputs (N, m)
+    dx: Array  # Derivative of the states (N + 1, n, p + n)
+    du: Array  # Derivative of the inputs (N, m, p + n)
 
     @property
-    def x(self) -> Array:
-        """States (N + 1, n)."""
-        return self._states(self.w)
+    def theta(self) -> Array:
+        """Parameters (p,)."""
+        return self.p[-len(self.problem.parameter_names) :]
 
     @property
-    def u(self) -> Array:
-        """Inputs (N, m)."""
-        return self._inputs(self.w)
-
-    @property
-    def dx(self) -> Array:
-        """Derivative of the states (N + 1, n, p + n)."""
-        return self._states(self.slope[: len(self.w)])
-
-    @property
-    def du(self) -> Array:
-        """Derivative of the inputs (N, m, p + n)."""
-        return self._inputs(self.slope[: len(self.w)])
+    def d(self) -> Array:
+        """Disturbances that the plan reckons with (N, d)."""
+        known = self.p[self.problem.n : -len(self.problem.parameter_names)]
+        return known.reshape(self.problem.horizon, -1)
 
     @property
     def active(self) -> tuple[tuple[str, int], ...]:
@@ -205,15 +190,6 @@ class Plan(Frozen):
         ratio = self.y[~program.equal] / self.s
         return tuple(program.labels[k] for k in np.flatnonzero((ratio > low) & (ratio < high)))
 
-    def _states(self, w: Array) -> Array:
-        n, m = self.problem.n, self.problem.m
-        stages = w[:-n].reshape(self.problem.horizon, n + m, *w.shape[1:])
-        return np.concatenate([stages[:, :n], w[None, -n:]])
-
-    def _inputs(self, w: Array) -> Array:
-        n, m = self.problem.n, self.problem.m
-        return w[:-n].reshape(self.problem.horizon, n + m, *w.shape[1:])[:, n:]
-
 
 def solve_plan(
     problem: OptimalControlProblem,
@@ -223,25 +199,23 @@ def solve_plan(
     d: Array | None = None,
     solver: str = "ipopt",
     mu: float = 1e-10,
-    guesses: tuple[tuple[Array, Array], ...] = (),
+    guess: tuple[Array, Array] | None = None,
 ) -> Plan:
-    """Solve from nothing, at `theta` (p,), `x0` (n,) and `d` (N, d)."""
+    """Solve from nothing or a guess, at `theta` (p,), `x0` (n,) and `d` (N, d); raise if none."""
     solver = require_solver(solver)
     if not 1e-12 <= mu <= 1e6:
         raise InputError("mu", f"got {mu:g}", "give 1e-12 to 1e6")
     N = problem.horizon
+    d = np.zeros((N, problem.disturbance_count)) if d is None else d
     held, still = np.repeat(x0[None], N + 1, axis=0), np.zeros((N, problem.m))
-    known = np.zeros((N, problem.disturbance_count)) if d is None else d
-    trials = [*guesses, (held, still), (np.zeros_like(held), still)]
-    _require_finite_start(problem, theta, known, *trials[0])
-    for x, u in trials:
-        found = solved_plan(problem, theta, known, np.vstack([x0, x[1:]]), u, solver, mu)
-        if found is not None:
-            p, rows = _parameters(x0, known, theta), ~program_of(problem).equal
-            if not _flat(problem, p, found.w, found.y, found.y[rows] / found.s):
-                return found
-    x = np.vstack([x0, trials[0][0][1:]])
-    raise _no_plan(problem, _parameters(x0, known, theta), _stages(x, trials[0][1]))
+    guesses = [*([] if guess is None else [guess]), (held, still), (0 * held, still)]
+    _require_finite_start(problem, theta, d, *guesses[0])
+    for x, u in guesses:
+        found = solved_plan(problem, theta, d, np.vstack([x0, x[1:]]), u, solver, mu)
+        if found is not None and not _flat(problem, found.p, found.w, found.y, found.s):
+            return found
+    x, u = guesses[0]
+    raise _no_plan(problem, _parameters(x0, d, theta), _stages(np.vstack([x0, x[1:]]), u))
 
 
 def solved_plan(
@@ -258,17 +232,9 @@ def solved_plan(
     None where there is none. It is tried at a large mu too: far from every bound the program is
     easier.
     """
-    program, p, w = program_of(problem), _parameters(x[0], d, theta), _stages(x, u)
-    for first in dict.fromkeys([mu, max(mu, 1e-1)]):
-        begun = program.answer(solver, p, w, None, first)
-        if not all(np.all(np.isfinite(item)) for item in begun):
-            continue
-        if solver != "ipopt" or first != mu:
-            begun = program.answer("ipopt", p, *begun, mu)
-        found = _ended(problem, theta, d, p, *begun, mu)
-        if found is not None:
-            return found
-    return None
+    p, w = _parameters(x[0], d, theta), _stages(x, u)
+    paths = ([(solver, first), ("ipopt", mu)] for first in dict.fromkeys([mu, max(mu, 1e-1)]))
+    return _first(problem, p, w, None, paths)
 
 
 def nearby_plan(plan: Plan, theta: Array, x0: Array, mu: float) -> Plan | None:
@@ -277,18 +243,12 @@ def nearby_plan(plan: Plan, theta: Array, x0: Array, mu: float) -> Plan | None:
     IPOPT begins at the plan moved along its derivative.
     """
     change = np.concatenate([theta - plan.theta, x0 - plan.x[0]])
-    program, p = program_of(plan.problem), _parameters(x0, plan.d, theta)
-    w, y = np.split(np.concatenate([plan.w, plan.y]) + plan.slope @ change, [len(plan.w)])
-    lowest = np.where(program.equal, -np.inf, 0.1 * plan.y)
+    moved = np.concatenate([plan.w, plan.y]) + plan.slope @ change
+    w, y = np.split(moved, [len(plan.w)])
+    y = np.where(program_of(plan.problem).equal, y, np.maximum(y, 0.1 * plan.y))
     # From a larger mu where a multiplier must come off: at 1e-10 its slack holds it there.
-    for path in dict.fromkeys([(mu,), (max(mu, _CENTRAL), mu)]):
-        begun = w, np.maximum(y, lowest)
-        for stage in path:
-            begun = program.answer("ipopt", p, *begun, stage)
-        found = _ended(plan.problem, theta, plan.d, p, *begun, mu)
-        if found is not None:
-            return found
-    return None
+    paths = [[("ipopt", mu)], [("ipopt", max(mu, _CENTRAL)), ("ipopt", mu)]]
+    return _first(plan.problem, _parameters(x0, plan.d, theta), w, y, paths)
 
 
 def _parameters(x0: Array, d: Array, theta: Array) -> Array:
@@ -299,45 +259,59 @@ def _stages(x: Array, u: Array) -> Array:
     return np.concatenate([np.hstack([x[:-1], u]).ravel(), x[-1]])
 
 
-def _ended(
+def _states_and_inputs(problem: OptimalControlProblem, w: Array) -> tuple[Array, Array]:
+    """Of stages (N (n + m) + n, ...), each (N + 1, n, ...) and (N, m, ...)."""
+    n = problem.n
+    stages = w[:-n].reshape(problem.horizon, n + problem.m, *w.shape[1:])
+    return np.concatenate([stages[:, :n], w[None, -n:]]), stages[:, n:]
+
+
+def _first(
     problem: OptimalControlProblem,
-    theta: Array,
-    d: Array,
     p: Array,
     w: Array,
-    y: Array,
-    mu: float,
+    y: Array | None,
+    paths: Iterable[list[tuple[str, float]]],
 ) -> Plan | None:
+    """The first plan that solvers find, each after the other along a path of names and mu."""
+    for path in paths:
+        found: tuple[Array, Any] = w, y
+        for solver, mu in dict.fromkeys(path):
+            found = program_of(problem).answer(solver, p, *found, mu)
+        ended = _ended(problem, p, *found, path[-1][1])
+        if ended is not None:
+            return ended
+    return None
+
+
+def _ended(problem: OptimalControlProblem, p: Array, w: Array, y: Array, mu: float) -> Plan | None:
     """The plan that Newton's method makes of a solver's answer w, y; None if it was none."""
     program = program_of(problem)
     rows, y, s = ~program.equal, y.copy(), np.zeros(0)
     for step in range(_STEPS):
-        gradient, g, H, A = program.conditions(w, y, p)
-        gradient, g = gradient.full().ravel(), g.full().ravel()
+        gradient, g, H, A = program.conditions(w, y, p, 1)
+        gradient, g, A = gradient.full().ravel(), g.full().ravel(), A.sparse()
         if step == 0:  # of each pair (s, lam) the larger is believed
-            lam, s = y[rows], np.maximum(-g[rows], np.sqrt(mu))
-            held = lam > s
-            y[rows] = lam = np.where(held, lam, mu / s)
-            s = np.where(held, mu / lam, s)
-        lam, left = y[rows], g.copy()
+            s = np.maximum(-g[rows], np.sqrt(mu))
+            held = y[rows] > s
+            y[rows] = np.where(held, y[rows], mu / s)
+            s = np.where(held, mu / y[rows], s)
+        lam, left, left_y, damping = y[rows], g.copy(), g.copy(), np.zeros(len(y))
         left[rows] += s
+        left_y[rows] += mu / lam
+        damping[rows] = s / lam
         size = max(1.0, float(np.max(np.abs(y))))
         off = float(np.max(np.abs(s * lam - mu), initial=0.0)) / mu * _TOLERANCE / _PRODUCT
         error = max(np.max(np.abs(gradient)) / size, np.max(np.abs(left)), off)
-        damping = np.zeros(len(y))
-        damping[rows] = s / lam
-        A = A.sparse()
         K = scipy.sparse.bmat([[H.sparse(), A.T], [A, scipy.sparse.diags(-damping)]], format="csc")
         try:
             factors = splu(K)
         except (RuntimeError, ValueError):  # singular, or not finite
             return None
         if error < _TOLERANCE:
-            sides = np.vstack([item.full() for item in program.sides(w, y, p)])
-            cost = float(program.cost(w, p))
-            return Plan(problem, theta, d, mu, w, y, s, cost, factors.solve(-sides))
-        left_y = g.copy()
-        left_y[rows] += mu / lam
+            slope = factors.solve(-program.sides(w, y, p).full())
+            found = _states_and_inputs(problem, w), _states_and_inputs(problem, slope[: len(w)])
+            return Plan(problem, p, w, y, s, slope, *found[0], *found[1])
         dw, dy = np.split(factors.solve(-np.concatenate([gradient, left_y])), [len(w)])
         ds = -(left + A @ dw)[rows]
         fall = max(np.max(-ds / s, initial=0.0), np.max(-dy[rows] / lam, initial=0.0))
@@ -346,17 +320,16 @@ def _ended(
     return None
 
 
-def _flat(problem: OptimalControlProblem, p: Array, w: Array, y: Array, weight: Array) -> str:
+def _flat(problem: OptimalControlProblem, p: Array, w: Array, y: Array, s: Array) -> str:
     """Where the second derivative along the dynamics is not positive, in words; or nothing.
 
-    It is positive when the Riccati recursion over the stages has positive pivots. `weight` has the
-    multiplier over the slack of each row.
+    It is positive when the Riccati recursion over the stages has positive pivots; rows count with
+    their multiplier over their slack s.
     """
     program, n, size = program_of(problem), problem.n, problem.n + problem.m
-    _, _, H, A = program.conditions(w, y, p)
-    A = A.sparse().tocsr()
+    H, A = (item.sparse().tocsr() for item in program.conditions(w, y, p, 1)[2:])
     equations, G = A[program.equal], A[~program.equal]
-    H = (H.sparse() + G.T.multiply(weight).tocsr() @ G).tocsr()
+    H = (H + G.T.multiply(y[~program.equal] / s).tocsr() @ G).tocsr()
     P = H[-n:, -n:].toarray()
     for k in range(problem.horizon - 1, -1, -1):
         here, rows = slice(k * size, (k + 1) * size), (k + 1) * n if k else 0
@@ -374,12 +347,11 @@ def _require_finite_start(
     problem: OptimalControlProblem, theta: Array, d: Array, x: Array, u: Array
 ) -> None:
     """Require that every function is finite along a guess x (N + 1, n), u (N, m)."""
-    none = np.zeros(problem.m), np.zeros(problem.disturbance_count)
-    for function in problem.functions:
-        at_end = function.name() in ("terminal_cost", "terminal_constraints")
-        for k in [problem.horizon] if at_end else range(problem.horizon):
-            found = function(x[k], *(none if at_end else (u[k], d[k])), theta)
-            if not np.all(np.isfinite(found.full())):
+    stages = zip(x, [*u, np.zeros(problem.m)], [*d, np.zeros(d.shape[1])], strict=True)
+    for k, stage in enumerate(stages):
+        for function in problem.functions:
+            at_end = function.name().startswith("terminal")
+            if at_end == (k == len(u)) and not np.all(np.isfinite(function(*stage, theta).full())):
                 raise InputError(
                     function.name(), f"is not finite at sample {k} of the start",
                     "check the expression, the first parameters and the initial state",
@@ -389,20 +361,18 @@ def _require_finite_start(
 def _no_plan(problem: OptimalControlProblem, p: Array, w: Array) -> InfeasibleError | SolverError:
     """Why there is none: the row that a plan of least total excess exceeds most, or its cost."""
     program = program_of(problem)
-    rows, everything = np.flatnonzero(~program.equal), program.nlp
+    rows, nlp = np.flatnonzero(~program.equal), program.nlp
     if len(rows):
-        excess = type(everything["f"]).sym("excess", len(rows))
-        placed = ca.DM(program.equal.size, len(rows))
-        placed[rows.tolist(), :] = ca.DM.eye(len(rows))
-        soft = everything | {
-            "x": ca.vertcat(everything["x"], excess), "f": ca.sum1(excess),
-            "g": everything["g"] - placed @ excess,
+        excess = type(nlp["f"]).sym("excess", len(rows))
+        placed = ca.DM.eye(len(program.equal))[:, rows.tolist()]
+        soft = {
+            "x": ca.vertcat(nlp["x"], excess), "p": nlp["p"], "f": ca.sum1(excess),
+            "g": nlp["g"] - placed @ excess,
         }  # fmt: skip
-        ipopt = {"ipopt": IPOPT_ALONE | {"max_iter": 500}}
-        answer = ca.nlpsol("worst", "ipopt", soft, _SILENT | ipopt)(
-            x0=np.r_[w, np.ones(len(rows))], p=p,
+        answer = ca.nlpsol("worst", "ipopt", soft, _SILENT | {"ipopt": IPOPT_ALONE})(
+            x0=np.r_[w, np.ones(len(rows))], p=p, ubg=0.0,
             lbx=np.r_[np.full(len(w), -np.inf), np.zeros(len(rows))],
-            lbg=np.where(program.equal, 0.0, -np.inf), ubg=0.0,
+            lbg=np.where(program.equal, 0.0, -np.inf),
         )  # fmt: skip
         left = answer["x"].full().ravel()[len(w) :]
         name, sample = program.labels[int(np.argmax(left))]
@@ -413,8 +383,9 @@ def _no_plan(problem: OptimalControlProblem, p: Array, w: Array) -> InfeasibleEr
                 "give other first parameters or another initial state",
             )  # fmt: skip
     w, y = program.answer("ipopt", p, w, None, 1e-10)
-    slack = np.maximum(-program.conditions(w, y, p)[1].full().ravel()[rows], 1e-10)
-    reason = _flat(problem, p, w, y, np.maximum(y[rows], 0) / slack) if np.isfinite(w).all() else ""
+    y = np.where(program.equal, y, np.maximum(y, 0))
+    s = np.maximum(-program.conditions(w, y, p, 1)[1].full().ravel()[rows], 1e-10)
+    reason = _flat(problem, p, w, y, s) if np.isfinite(w).all() else ""
     return SolverError(
         "plan", reason or "the search for a plan did not end",
         "give every input a price" if reason else "begin nearer, or try another solver",

@@ -10,10 +10,9 @@ docs/nonlinear.md has the derivation and an example.
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass
 from numbers import Real
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
@@ -25,16 +24,13 @@ from impc.nonlinear.expressions import (
     function_of,
     names_of,
     require_influence,
-    scalar,
     stacked,
     symbols_of,
-    with_values,
 )
 from impc.nonlinear.recordings import optimal_recording
-from impc.nonlinear.systems import is_system, system_equations
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
 
     from impc.nonlinear.closed_loop import ClosedLoop
     from impc.nonlinear.plan import Plan
@@ -53,9 +49,8 @@ class OptimalControlProblem(Frozen):
         Symbols x (n) and u (m): one vector, or scalars whose names are those of the signals.
     parameters : dict
         Name of each unknown -> its scalar symbol in the expressions.
-    next_state : casadi expression or control.NonlinearIOSystem
-        f(x, u, d; theta) (n); of a system its own equations, with the symbols in the place of its
-        parameters of those names (`impc.nonlinear.systems`).
+    next_state : casadi expression
+        f(x, u, d; theta) (n).
     stage_cost : casadi expression
         l(x, u; theta), a number; as a rule prices times features, one price a known number.
     horizon : int
@@ -72,28 +67,20 @@ class OptimalControlProblem(Frozen):
     units : dict
         Unit of a parameter, a state, an input or a disturbance by its name, for tables.
     dt : float
-        Sample time, s: of recordings in files, and of a system that is continuous.
+        Sample time, s, of recordings in files.
 
     Attributes
     ----------
-    no_plant : tuple of str
-        Why commands for linear plants refuse it, and what to do.
     horizon : int
         N.
-    state_names, input_names, parameter_names : tuple of str
-        n, m and p of them.
+    state_names, input_names, disturbance_names, parameter_names : tuple of str
+        n, m, d and p of them.
     rows, terminal_rows : tuple of str
         A name for each row of h and h_N.
-    movable : BoolArray
-        Which rows of h an input moves (q,): the others are not asked for at k = 0.
     positive : BoolArray
         Which parameters are (p,).
-    units : tuple of str
-        (p,), empty where none is given.
-    disturbance_names : tuple of str
-        Of disturbances.
-    signal_units : dict
-        Units of states, inputs and disturbances by name, where they are given.
+    units : dict
+        Units of parameters and signals by name, where they are given.
     dt : float or None
         Sample time, s; None where it is not said.
     functions : tuple
@@ -103,8 +90,7 @@ class OptimalControlProblem(Frozen):
     ------
     InputError
         When an expression has a symbol that is not among states, inputs, disturbances and
-        parameters, or the wrong size; when a parameter is in no expression; when the equations of
-        a system cannot be written with symbols.
+        parameters, or the wrong size; when a parameter is in no expression.
 
     Examples
     --------
@@ -128,23 +114,21 @@ class OptimalControlProblem(Frozen):
     """
 
     #: Why commands for linear plants refuse it.
-    no_plant: ClassVar = ("is an optimal control problem", "impc fit takes one, this does not")
+    no_plant = ("is an optimal control problem", "impc fit takes one, this does not")
 
     horizon: int
     state_names: tuple[str, ...]
     input_names: tuple[str, ...]
+    disturbance_names: tuple[str, ...]
     parameter_names: tuple[str, ...]
     rows: tuple[str, ...]
     terminal_rows: tuple[str, ...]
-    movable: BoolArray
     positive: BoolArray
-    units: tuple[str, ...]
-    disturbance_names: tuple[str, ...]
-    signal_units: dict[str, str]
+    units: dict[str, str]
     dt: float | None
     functions: tuple[Any, ...]
 
-    @checked
+    @checked(horizon=(1, _LONGEST))
     def __init__(
         self,
         states: Any,
@@ -162,48 +146,43 @@ class OptimalControlProblem(Frozen):
         units: Mapping[str, str] | None = None,
         dt: float | None = None,
     ) -> None:
-        _require_horizon(horizon)
-        kinds = (states, inputs, [] if disturbances is None else disturbances)
-        x, u, d = (symbols_of(name, given) for name, given in
-                   zip(("states", "inputs", "disturbances"), kinds, strict=True))  # fmt: skip
-        theta = [scalar(name, symbol) for name, symbol in dict(parameters).items()]
-        _require_some(states=x, inputs=u, parameters=theta)
-        names = tuple(dict(parameters))
+        if dt is not None and not 0 < dt < np.inf:
+            raise InputError("dt", f"got {dt}", "give a sample time above 0, s")
+        if hasattr(next_state, "updfcn"):
+            raise InputError("next_state", "is a system of python-control", "call its function"
+                             " with the symbols, as docs/nonlinear.md does")  # fmt: skip
+        x, u = symbols_of("states", states), symbols_of("inputs", inputs)
+        d = [] if disturbances is None else symbols_of("disturbances", disturbances)
+        theta = []
+        for name, symbol in parameters.items():
+            theta += symbols_of(f"parameter {name}", symbol)
+            if len(names_of(theta)) != len(theta) or symbol.numel() != 1:
+                raise InputError(f"parameter {name}", "is not a scalar symbol", "give each a name")
+        for subject, symbols in {"states": x, "inputs": u, "parameters": theta}.items():
+            if not symbols:
+                raise InputError(subject, "there are none", "give at least one")
         path, rows = stacked(constraints or {})
         last, terminal_rows = stacked(terminal_constraints or {})
-        symbols = (x, u, d, theta)
-        signals = [names_of(item) for item in (x, u, d)]
-        step, following = _sample_time(dt), next_state
-        if is_system(next_state):
-            following = system_equations(next_state, (x, u, d), signals, dict(parameters), step)
+        groups, signals = (x, u, d, theta), [names_of(item) for item in (x, u, d)]
         functions = (
-            function_of("next_state", following, symbols, (len(signals[0]),)),
-            function_of("stage_cost", stage_cost, symbols, (1,)),
-            function_of("terminal_cost", terminal_cost, symbols, (1,), alone=True),
-            function_of("constraints", path, symbols, (len(rows),)),
-            function_of("terminal_constraints", last, symbols, (len(terminal_rows),), alone=True),
+            function_of("next_state", next_state, groups, len(signals[0])),
+            function_of("stage_cost", stage_cost, groups, 1),
+            function_of("terminal_cost", terminal_cost, groups, 1, alone=True),
+            function_of("constraints", path, groups, len(rows)),
+            function_of("terminal_constraints", last, groups, len(terminal_rows), alone=True),
         )
+        names, given = tuple(parameters), dict(units or {})
         require_influence(names, functions)
-        told, flat = dict(units or {}), [name for group in signals for name in group]
-        _require_named((*signed, *(key for key in told if key not in flat)), names)
-        moved = ca.DM(functions[3].jac_sparsity(0, 1), 1).full()
-        fields = {
-            "horizon": int(horizon),
-            "state_names": signals[0],
-            "input_names": signals[1],
-            "parameter_names": names,
-            "rows": rows,
-            "terminal_rows": terminal_rows,
-            "movable": _fixed(moved.any(axis=1)),
+        for name in (*signed, *(set(given).difference(*signals))):
+            if name not in names:
+                problem = "is not among the parameters"
+                raise InputError(f"parameter {name}", problem, f"known: {', '.join(names)}")
+        vars(self).update({
+            "horizon": horizon, "state_names": signals[0], "input_names": signals[1],
+            "disturbance_names": signals[2], "parameter_names": names, "rows": rows,
+            "terminal_rows": terminal_rows, "units": given, "dt": dt, "functions": functions,
             "positive": _fixed([name not in signed for name in names]),
-            "units": tuple(told.get(name, "") for name in names),
-            "disturbance_names": signals[2],
-            "signal_units": {name: told[name] for name in flat if name in told},
-            "dt": step,
-            "functions": functions,
-        }
-        for field, value in fields.items():
-            object.__setattr__(self, field, value)
+        })  # fmt: skip
 
     @property
     def n(self) -> int:
@@ -220,42 +199,39 @@ class OptimalControlProblem(Frozen):
         """Number of disturbances."""
         return len(self.disturbance_names)
 
+    @checked(horizon=(1, _LONGEST))
     def with_horizon(self, horizon: int) -> OptimalControlProblem:
-        """The same problem over another `horizon` in samples.
-
-        Raises
-        ------
-        InputError
-            When it is no such number.
-        """
-        _require_horizon(horizon)
-        return self._changed(horizon=int(horizon))
+        """The same problem over another `horizon` in samples."""
+        return self._changed(horizon=horizon)
 
     @checked
     def with_known(self, known: Mapping[str, float]) -> OptimalControlProblem:
-        """The same problem with the values of some parameters `known` by name: the others are left.
+        """The same problem with the values of some parameters `known` by name.
 
         Raises
         ------
         InputError
-            When a parameter is unknown, its value is none, or no parameter is left.
+            When one is unknown or has no such value, or when none is left.
         """
         numbers = {name: self._value(name, value) for name, value in known.items()}
         free = [k for k, name in enumerate(self.parameter_names) if name not in numbers]
         if not free:
             raise InputError("parameters", "are all known", "leave one to be searched")
-        values = np.array([numbers.get(name, 0.0) for name in self.parameter_names])
+        theta = ca.SX(ca.DM([numbers.get(name, 0.0) for name in self.parameter_names]))
+        theta[free] = left = ca.SX.sym("theta", len(free))
+        given = [ca.SX.sym(key, self.functions[0].numel_in(k)) for k, key in enumerate("xud")]
         return self._changed(
             parameter_names=tuple(self.parameter_names[k] for k in free),
             positive=_fixed(self.positive[free]),
-            units=tuple(self.units[k] for k in free),
-            functions=tuple(with_values(item, free, values) for item in self.functions),
+            functions=tuple(
+                ca.Function(one.name(), [*given, left], [one(*given, theta)])
+                for one in self.functions
+            ),
         )
 
     def _changed(self, **fields: Any) -> OptimalControlProblem:
         made = object.__new__(OptimalControlProblem)
-        for name, value in {**vars(self), **fields}.items():
-            object.__setattr__(made, name, value)
+        vars(made).update({**vars(self), **fields})
         return made
 
     @checked
@@ -275,7 +251,8 @@ class OptimalControlProblem(Frozen):
 
     def _value(self, name: str, value: object) -> float:
         if name not in self.parameter_names:
-            raise InputError(f"parameter {name}", "is not known", _among(self.parameter_names))
+            known = f"known: {', '.join(self.parameter_names)}"
+            raise InputError(f"parameter {name}", "is not known", known)
         if isinstance(value, bool) or not isinstance(value, Real):
             raise InputError(f"parameter {name}", f"got {value!r:.40}", "give a number")
         positive, number = self.positive[self.parameter_names.index(name)], float(value)
@@ -288,31 +265,17 @@ class OptimalControlProblem(Frozen):
     def plan(
         self, theta: Mapping[str, float], x0: Any, *, solver: str = "ipopt", mu: float = 1e-10
     ) -> Plan:
-        """The optimal plan from a state, as `impc.nonlinear.plan.solve_plan`.
+        """The optimal plan from a state x0 (n,), at values theta of the parameters by name.
 
-        Parameters
-        ----------
-        theta : dict
-            Value of each parameter by its name.
-        x0 : array_like
-            (n,).
-        solver : str
-            One of `impc.nonlinear.plan.SOLVERS`.
-        mu : float
-            Of the relaxed conditions lam g = -mu.
-
-        Raises
-        ------
-        InfeasibleError, SolverError
-            As `impc.nonlinear.plan.solve_plan`.
+        `solver` is one of `impc.nonlinear.plan.SOLVERS`, and mu that of the relaxed conditions
+        lam g = -mu. Raises InfeasibleError or SolverError where there is none.
         """
         from impc.nonlinear.plan import solve_plan  # noqa: PLC0415 - it stands on this module
 
-        return solve_plan(
-            self, self.values(theta), finite_array("x0", x0, (self.n,)), solver=solver, mu=mu
-        )
+        start = finite_array("x0", x0, (self.n,))
+        return solve_plan(self, self.values(theta), start, solver=solver, mu=mu)
 
-    @checked
+    @checked(steps=1)
     def closed_loop(
         self,
         theta: Mapping[str, float],
@@ -325,116 +288,27 @@ class OptimalControlProblem(Frozen):
     ) -> ClosedLoop:
         """The closed loop of `steps` samples: at each the first input of the plan from there.
 
-        Parameters
-        ----------
-        theta, x0, solver, mu
-            As `plan`.
-        steps : int
-            Samples.
-        d : array_like, optional
-            Disturbances (steps, d) that the plant sees and the controller does not.
-
-        Raises
-        ------
-        InputError, DataError
-            When `steps` or `d` are not such.
-        InfeasibleError, SolverError
-            As `impc.nonlinear.closed_loop.simulate_receding`.
+        Disturbances d (steps, d) are seen by the plant and not by the controller; theta, x0 (n,),
+        solver and mu are as in `plan`.
         """
-        from impc.nonlinear.closed_loop import simulate_receding  # noqa: PLC0415 - see plan
+        from impc.nonlinear.closed_loop import closed_loop_from  # noqa: PLC0415 - see plan
 
-        if isinstance(steps, bool) or not isinstance(steps, int | np.integer) or steps < 1:
-            raise InputError("steps", f"got {steps!r:.40}", "give a whole number of samples")
-        shape = (int(steps), self.disturbance_count)
+        shape = (steps, self.disturbance_count)
         known = finite_array("d", np.zeros(shape) if d is None else d, shape)
-        return simulate_receding(
-            self, self.values(theta), finite_array("x0", x0, (self.n,)), known, solver=solver, mu=mu
-        )
+        first = self.plan(theta, x0, solver=solver, mu=mu)
+        return closed_loop_from(first, first.theta, first.x[0], known, mu)
 
-    def recorded_plan(
-        self,
-        x: Any,
-        u: Any = None,
-        *,
-        d: Any = None,
-        x0: Any = None,
-        unknown_start: bool | None = None,
-    ) -> OptimalRecording:
-        """A recording that is one plan: `impc.nonlinear.recordings.optimal_recording`.
+    def recorded_plan(self, x: Any, u: Any = None, **more: Any) -> OptimalRecording:
+        """A recording that is one plan: x (N + 1, n), u (N, m); NaN is not measured.
 
-        x (N + 1, n), u (N, m), d (N, d), x0 (n,); NaN is not measured. With
-        `unknown_start` x0 is searched from what is given: by default where it is the first of x.
+        More may be d (N, d), x0 (n,) and `unknown_start`: whether x0 is searched from what is
+        given, by default where it is the first of x.
         """
-        return optimal_recording(
-            self, x, u, closed_loop=False, d=d, x0=x0, unknown_start=unknown_start
-        )
+        return optimal_recording(self, x, u, closed_loop=False, **more)
 
-    def recorded_loop(
-        self,
-        x: Any,
-        u: Any = None,
-        *,
-        d: Any = None,
-        x0: Any = None,
-        unknown_start: bool | None = None,
-    ) -> OptimalRecording:
-        """A recording of the closed loop: `impc.nonlinear.recordings.optimal_recording`.
-
-        x (steps + 1, n), u (steps, m), d (steps, d), x0 (n,); NaN is not measured. With
-        `unknown_start` x0 is searched from what is given: by default where it is the first of x.
-        """
-        return optimal_recording(
-            self, x, u, closed_loop=True, d=d, x0=x0, unknown_start=unknown_start
-        )
-
-
-def slopes(
-    problem: OptimalControlProblem, x: Array, u: Array, d: Array, theta: Array
-) -> tuple[Array, Array, Array]:
-    """f (n,), and its derivatives by (x, u) (n, n + m) and theta (n, p), at one sample."""
-    following, f_w, f_theta = _slopes(problem)(x, u, d, theta)
-    return following.full().ravel(), f_w.full(), f_theta.full()
-
-
-@functools.lru_cache(maxsize=16)
-def _slopes(problem: OptimalControlProblem) -> Any:
-    f = problem.functions[0]
-    kind: Any = ca.SX if f.is_a("SXFunction") else ca.MX
-    given = [kind.sym(letter, f.numel_in(index)) for index, letter in enumerate("xudt")]
-    following = f(*given)
-    by_x, by_u, _, by_theta = (ca.jacobian(following, item) for item in given)
-    return ca.Function("slopes", given, [following, ca.horzcat(by_x, by_u), by_theta])
-
-
-def _require_horizon(horizon: Any) -> None:
-    if isinstance(horizon, bool) or not isinstance(horizon, int | np.integer):
-        raise InputError("horizon", f"got {horizon!r:.40}", "give a whole number of samples")
-    if not 1 <= horizon <= _LONGEST:
-        raise InputError("horizon", f"got {horizon}", f"give 1 to {_LONGEST} samples")
-
-
-def _sample_time(dt: Any) -> float | None:
-    if dt is None:
-        return None
-    if isinstance(dt, bool) or not isinstance(dt, Real) or not 0 < float(dt) < np.inf:
-        raise InputError("dt", f"got {dt!r:.40}", "give a sample time above 0, s")
-    return float(dt)
-
-
-def _require_some(**given: Sequence[Any]) -> None:
-    for subject, symbols in given.items():
-        if not symbols:
-            raise InputError(subject, "there are none", "give at least one")
-
-
-def _require_named(given: Iterable[str], names: Sequence[str]) -> None:
-    for name in given:
-        if name not in names:
-            raise InputError(f"parameter {name}", "is not among the parameters", _among(names))
-
-
-def _among(names: Sequence[str]) -> str:
-    return f"known: {', '.join(names)}"
+    def recorded_loop(self, x: Any, u: Any = None, **more: Any) -> OptimalRecording:
+        """A recording of the closed loop: x (steps + 1, n), u (steps, m), as `recorded_plan`."""
+        return optimal_recording(self, x, u, closed_loop=True, **more)
 
 
 def _fixed(values: Any) -> BoolArray:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from impc.arrays import Array, Frozen, frozen
+from impc.arrays import Array, Frozen, as_numbers, finite_array, frozen, with_shape
 from impc.errors import DataError
 
 if TYPE_CHECKING:
@@ -45,22 +45,15 @@ def optimal_recording(
 
     `x` (steps + 1, n); `u` (steps, m); `d` (steps, d); `x0` (n,).
     """
-    states = _table("states", x, problem.n)
+    states = _table("states", x, None, problem.n)
     T = len(states) - 1
     if T < 1 or (not closed_loop and problem.horizon != T):
         wanted = "at least 2" if closed_loop else str(problem.horizon + 1)
         raise DataError("states", f"has {T + 1} samples", f"give {wanted}")
-    inputs = np.full((T, problem.m), np.nan) if u is None else _table("inputs", u, problem.m)
-    count = problem.disturbance_count
-    known = np.zeros((T, count)) if d is None else _table("disturbances", d, count)
-    for name, values in (("inputs", inputs), ("disturbances", known)):
-        if len(values) != T:
-            raise DataError(name, f"has {len(values)} samples", f"give {T}, one fewer than states")
-    start = states[0] if x0 is None else np.asarray(x0, dtype=np.float64).ravel()
-    if start.shape != (problem.n,) or not np.all(np.isfinite(start)):
-        raise DataError("x0", "is not known", f"give {problem.n} finite numbers as x0")
-    if not np.all(np.isfinite(known)):
-        raise DataError("disturbances", "are not all known", "give finite numbers")
+    inputs = _table("inputs", np.full((T, problem.m), np.nan) if u is None else u, T, problem.m)
+    shape = (T, problem.disturbance_count)
+    known = finite_array("disturbances", np.zeros(shape) if d is None else d, shape)
+    start = finite_array("x0", states[0] if x0 is None else x0, (problem.n,))
     if not np.any(np.isfinite(states[1:])) and not np.any(np.isfinite(inputs)):
         raise DataError("recording", "has nothing that was measured", "give states or inputs")
     return OptimalRecording(
@@ -69,15 +62,10 @@ def optimal_recording(
     )  # fmt: skip
 
 
-def _table(name: str, values: Any, columns: int) -> Array:
-    try:
-        table = np.array(values, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise DataError(name, "are not numbers", "give an array") from None
-    if table.ndim == 1 and columns == 1:
-        table = table[:, None]
-    if table.ndim != 2 or table.shape[1] != columns:
-        raise DataError(name, f"has shape {table.shape}", f"give (samples, {columns})")
+def _table(name: str, values: Any, samples: int | None, columns: int) -> Array:
+    table = as_numbers(name, values)
+    table = with_shape(name, table[:, None] if table.ndim == columns == 1 else table,
+                       (samples, columns))  # fmt: skip
     if np.any(np.isinf(table)):
         raise DataError(name, "has infinite entries", "give NaN where nothing was measured")
     return table

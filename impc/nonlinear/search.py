@@ -2,12 +2,11 @@
 
     r = ((x_sim(theta) - x) / scale, (u_sim(theta) - u) / scale),        dr / dphi
 
-phi the logarithms of positive parameters, the signed ones themselves, and initial states that are
-not known, over their scales: root mean squares of the signals in the recordings. They are searched
-over a falling sequence of mu (docs/nonlinear.md). `guided` takes every recorded state for the start
-of a plan of its own, of which the first input and the next state were recorded: of a closed loop
-that is what it is; of one plan it holds because the rest of an optimal plan is optimal (Bellman
-1957). Such plans do not run away from the recording where theta is wrong.
+phi the logarithms of positive parameters, the signed ones themselves, and the initial state of
+every recording, over their scales: root mean squares of the signals in the recordings. They are
+searched over a falling sequence of mu (docs/nonlinear.md). `guided` takes every recorded state of a
+closed loop for the start of a plan of its own, of which the first input and the next state were
+recorded. Such plans do not run away from the recording where theta is wrong.
 """
 
 from __future__ import annotations
@@ -46,35 +45,46 @@ class Residuals:
     recordings: tuple[OptimalRecording, ...]
     solver: str  # One of `impc.nonlinear.plan.SOLVERS`
     scales: Array  # Of states and inputs (n + m,)
-    size: float  # Sum of squares of all that was measured, over the scales
+
+    @property
+    def size(self) -> float:
+        """Sum of squares of all that was measured, over the scales."""
+        recorded = np.vstack([np.hstack([one.x[1:], one.u]) for one in self.recordings])
+        return float(np.nansum((recorded / self.scales) ** 2))
+
+    def free(self, sampled: bool = True) -> BoolArray:
+        """Which unknowns are searched (k,); not `sampled`: no initial state that has a sample."""
+        states = [one.unknown_start and (sampled or not np.array_equal(one.x0, one.x[0]))
+                  for one in self.recordings]  # fmt: skip
+        return np.append(np.ones_like(self.problem.positive), np.repeat(states, self.problem.n))
 
     def unknowns(self, theta: Array) -> Array:
         """Unknowns (k,) at parameters theta (p,)."""
         logarithms = np.where(self.problem.positive, np.log(np.abs(theta)), theta)
-        own = [one.x0 / self.scales[: self.problem.n] for one in self.recordings
-               if one.unknown_start]  # fmt: skip
+        own = [one.x0 / self.scales[: self.problem.n] for one in self.recordings]
         return np.concatenate([logarithms, *own])
 
-    def split(self, unknowns: Array) -> tuple[Array, list[Array]]:
+    def split(self, unknowns: Array) -> tuple[Array, Array]:
         """Parameters (p,), and the initial state (n,) of each recording, of unknowns (k,)."""
-        n, place = self.problem.n, len(self.problem.parameter_names)
-        theta = np.where(self.problem.positive, np.exp(unknowns[:place]), unknowns[:place])
-        starts = []
-        for one in self.recordings:
-            if one.unknown_start:
-                starts.append(unknowns[place : place + n] * self.scales[:n])
-                place += n
-            else:
-                starts.append(one.x0)
-        return theta, starts
+        n, p = self.problem.n, len(self.problem.parameter_names)
+        theta = np.where(self.problem.positive, np.exp(unknowns[:p]), unknowns[:p])
+        return theta, unknowns[p:].reshape(-1, n) * self.scales[:n]
 
     def signals(self) -> IntArray:
         """Of each residual the column of its state or input (r,)."""
-        found = []
-        for one in self.recordings:
-            kept, first = _measured(one)
-            found += [np.flatnonzero(first), np.nonzero(kept)[1]]
-        return np.concatenate(found)
+        pairs = [_measured(one) for one in self.recordings]
+        parts = [(np.flatnonzero(first), np.nonzero(kept)[1]) for kept, first in pairs]
+        return np.concatenate([item for pair in parts for item in pair])
+
+
+def scales_of(recordings: Sequence[OptimalRecording]) -> Array:
+    """Root mean square of each state and input in the recordings (n + m,)."""
+    columns = [column[np.isfinite(column)] for kind in ("x", "u")
+               for column in np.vstack([getattr(one, kind) for one in recordings]).T]  # fmt: skip
+    sizes = np.array([np.sqrt(np.mean(one**2)) if len(one) else 0.0 for one in columns])
+    # A signal that stands still has no size of its own: it is measured by the largest.
+    largest = float(np.max(sizes)) or 1.0
+    return np.where(sizes > _STILL * largest, sizes, largest)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +92,6 @@ class Evaluation:
     """The residual somewhere."""
 
     unknowns: Array  # (k,)
-    theta: Array  # Parameters (p,)
     mu: float  # Of the relaxed conditions
     residual: Array  # (r,)
     jacobian: Array  # (r, k)
@@ -94,93 +103,61 @@ class Evaluation:
         return float(self.residual @ self.residual)
 
 
-def residuals_of(
-    problem: OptimalControlProblem,
-    recordings: tuple[OptimalRecording, ...],
-    solver: str,
-    scales: Array | None = None,
-) -> Residuals:
-    """Recordings, the `solver` of their plans, and scales (n + m,), made if they are not given."""
-    if scales is None:
-        x = np.concatenate([one.x for one in recordings])
-        u = np.concatenate([one.u for one in recordings])
-        sizes = np.array([_root_mean_square(column) for column in (*x.T, *u.T)])
-        # A signal that stands still has no size of its own: it is measured by the largest.
-        largest = float(np.max(sizes, initial=0.0)) or 1.0
-        scales = np.where(sizes > _STILL * largest, sizes, largest)
-    size = sum(
-        float(np.nansum((np.hstack([one.x[1:], one.u]) / scales) ** 2)) for one in recordings
-    )
-    return Residuals(problem, recordings, solver, scales, size)
-
-
 def begin(given: Residuals, unknowns: Array, mu: float) -> Evaluation:
     """Solve every recording from what was recorded, at unknowns (k,) and mu."""
     theta, starts = given.split(unknowns)
     runs: list[Plan | ClosedLoop] = []
     for one, x0 in zip(given.recordings, starts, strict=True):
-        plan = first_plan(one, theta, x0, mu, given.solver)
-        run = closed_loop_from(plan, theta, x0, one.d, mu) if one.closed_loop else plan
-        if isinstance(run, int):
-            raise SolverError(f"sample {run}", "no plan was found in the loop", "begin nearer")
-        runs.append(run)
-    return assembled(given, unknowns, theta, mu, tuple(runs))
+        whole = not one.closed_loop and np.all(np.isfinite(one.x)) and np.all(np.isfinite(one.u))
+        plan = solve_plan(
+            one.problem, theta, x0, d=None if one.closed_loop else one.d, solver=given.solver,
+            mu=mu, guess=(one.x, one.u) if whole else None,
+        )  # fmt: skip
+        runs.append(closed_loop_from(plan, theta, x0, one.d, mu) if one.closed_loop else plan)
+    return _assembled(given, unknowns, mu, tuple(runs))
 
 
-def first_plan(one: OptimalRecording, theta: Array, x0: Array, mu: float, solver: str) -> Plan:
-    """The plan from a recording's initial state x0 (n,) at theta (p,) and mu, by a `solver`."""
-    problem = one.problem
-    whole = bool(np.all(np.isfinite(one.x)) and np.all(np.isfinite(one.u)))
-    guesses = ((one.x, one.u),) if whole and not one.closed_loop else ()
-    d = np.zeros((problem.horizon, problem.disturbance_count)) if one.closed_loop else one.d
-    return solve_plan(problem, theta, x0, d=d, solver=solver, mu=mu, guesses=guesses)
-
-
-def evaluate(given: Residuals, unknowns: Array, mu: float, before: Evaluation) -> Evaluation | None:
+def _evaluate(
+    given: Residuals, unknowns: Array, mu: float, before: Evaluation
+) -> Evaluation | None:
     """Solve every recording at unknowns (k,) and mu near a solution; None where one has none."""
     theta, starts = given.split(unknowns)
-    runs: list[Plan | ClosedLoop] = []
+    runs: list[Plan | ClosedLoop | None] = []
     for one, old, x0 in zip(given.recordings, before.runs, starts, strict=True):
-        run: Plan | ClosedLoop | int | None
         if isinstance(old, ClosedLoop):
-            run = closed_loop_from(old.plans[0], theta, x0, one.d, mu, old)
-        else:
-            run = nearby_plan(old, theta, x0, mu)
-            if run is None and before.loss > EXPLAINED * given.size:
-                # Plans of this kind do not explain the recording: another one may.
-                guess = np.vstack([x0, old.x[1:]])
-                run = solved_plan(old.problem, theta, old.d, guess, old.u, given.solver, mu)
-        if run is None or isinstance(run, int):
-            return None
+            try:
+                runs.append(closed_loop_from(old.plans[0], theta, x0, one.d, mu, old))
+            except SolverError:
+                return None
+            continue
+        run = nearby_plan(old, theta, x0, mu)
+        if run is None and before.loss > EXPLAINED * given.size:
+            # Plans of this kind do not explain the recording: another one may.
+            guess = np.vstack([x0, old.x[1:]])
+            run = solved_plan(old.problem, theta, old.d, guess, old.u, given.solver, mu)
         runs.append(run)
-    return assembled(given, unknowns, theta, mu, tuple(runs))
+    found = tuple(run for run in runs if run is not None)
+    return _assembled(given, unknowns, mu, found) if len(found) == len(runs) else None
 
 
-def assembled(
-    given: Residuals,
-    unknowns: Array,
-    theta: Array,
-    mu: float,
-    runs: tuple[Plan | ClosedLoop, ...],
+def _assembled(
+    given: Residuals, unknowns: Array, mu: float, runs: tuple[Plan | ClosedLoop, ...]
 ) -> Evaluation:
-    """Residual and derivative of solved recordings, at unknowns (k,), theta (p,) and mu."""
-    n, p, place = given.problem.n, len(theta), len(theta)
+    """Residual and derivative of solved recordings, at unknowns (k,) and mu."""
+    n, p, (theta, _) = given.problem.n, len(given.problem.positive), given.split(unknowns)
     chain = np.where(given.problem.positive, theta, 1.0)
     parts, slopes = [], []
-    for one, run in zip(given.recordings, runs, strict=True):
-        x, u, dx, du = run.x, run.u, run.dx, run.du
+    for index, (one, run) in enumerate(zip(given.recordings, runs, strict=True)):
         kept, first = _measured(one)
-        scaled = np.hstack([x[1:] - one.x[1:], u - one.u]) / given.scales
-        slope = np.concatenate([dx[1:], du], axis=1) / given.scales[:, None]
-        parts += [((x[0] - one.x[0]) / given.scales[:n])[first], scaled[kept]]
-        rows = np.concatenate([(dx[0] / given.scales[:n, None])[first], slope[kept]])
-        whole = np.zeros((len(rows), len(unknowns)))
+        scaled = np.hstack([run.x[1:] - one.x[1:], run.u - one.u]) / given.scales
+        slope = np.concatenate([run.dx[1:], run.du], axis=1) / given.scales[:, None]
+        parts += [((run.x[0] - one.x[0]) / given.scales[:n])[first], scaled[kept]]
+        rows = np.concatenate([(run.dx[0] / given.scales[:n, None])[first], slope[kept]])
+        whole, place = np.zeros((len(rows), len(unknowns))), p + index * n
         whole[:, :p] = rows[:, :p] * chain
-        if one.unknown_start:
-            whole[:, place : place + n] = rows[:, p:] * given.scales[:n]
-            place += n
+        whole[:, place : place + n] = rows[:, p:] * given.scales[:n]
         slopes.append(whole)
-    return Evaluation(unknowns, theta, mu, np.concatenate(parts), np.concatenate(slopes), runs)
+    return Evaluation(unknowns, mu, np.concatenate(parts), np.concatenate(slopes), runs)
 
 
 def _measured(one: OptimalRecording) -> tuple[BoolArray, BoolArray]:
@@ -188,47 +165,44 @@ def _measured(one: OptimalRecording) -> tuple[BoolArray, BoolArray]:
     return np.isfinite(np.hstack([one.x[1:], one.u])), np.isfinite(one.x[0]) & one.unknown_start
 
 
-def _root_mean_square(column: Array) -> float:
-    known = column[np.isfinite(column)]
-    return float(np.sqrt(np.mean(known**2))) if len(known) else 0.0
+@dataclass
+class Budget:
+    """How many evaluations are left of a start's, and how many there were of all."""
 
+    left: int = 0
+    done: int = 0
 
-class Count:
-    """Evaluations that are done, and how many may be in a search."""
-
-    def __init__(self, most: int) -> None:
-        self.most, self.done, self.before = most, 0, 0
-
-    @property
-    def all(self) -> int:
-        """Those of earlier searches too."""
-        return self.before + self.done
-
-    def again(self) -> None:
-        """Begin another search."""
-        self.before, self.done = self.all, 0
+    def take(self) -> bool:
+        """Count one more, if one is left."""
+        some = self.left > 0
+        self.left, self.done = self.left - some, self.done + some
+        return some
 
 
 def along_mu(
-    given: Residuals, current: Evaluation, mu_steps: Sequence[float], count: Count
+    given: Residuals,
+    current: Evaluation,
+    mu_steps: Sequence[float],
+    free: BoolArray,
+    budget: Budget,
 ) -> tuple[Evaluation, bool]:
-    """Search at each of the falling `mu_steps`; whether the last search ended by itself."""
+    """Search the `free` unknowns (k,) at each of the falling `mu_steps`.
+
+    Whether the last search ended by itself is the second value.
+    """
     settled = True
     for mu in mu_steps:
         if mu != current.mu:
-            if count.done >= count.most:
+            there = _evaluate(given, current.unknowns, mu, current) if budget.take() else None
+            if there is None:
                 return current, False
-            count.done += 1
-            followed = evaluate(given, current.unknowns, mu, current)
-            if followed is None:
-                return current, False
-            current = followed
-        current, settled = _levenberg(given, current, mu == mu_steps[-1], count)
+            current = there
+        current, settled = _levenberg(given, current, mu == mu_steps[-1], free, budget)
     return current, settled
 
 
 def _levenberg(
-    given: Residuals, current: Evaluation, last: bool, count: Count
+    given: Residuals, current: Evaluation, last: bool, free: BoolArray, budget: Budget
 ) -> tuple[Evaluation, bool]:
     """Levenberg and Marquardt's steps until the loss no longer falls; on the way a rough answer.
 
@@ -237,20 +211,19 @@ def _levenberg(
     """
     damping, patience, enough = (1e-3, 60, 1e-13) if last else (1e-2, 12, 1e-2)
     for _ in range(patience):
-        left, values, right = np.linalg.svd(current.jacobian, full_matrices=False)
+        left, values, right = np.linalg.svd(current.jacobian[:, free], full_matrices=False)
         drive = left.T @ current.residual
         while True:
-            gain = values / (values**2 + damping * values[0] ** 2)
-            step = -right.T @ (gain * drive)
+            gain, step = values / (values**2 + damping * values[0] ** 2), np.zeros(len(free))
+            step[free] = -right.T @ (gain * drive)
             step *= min(1.0, _LONGEST_STEP / max(float(np.max(np.abs(step))), 1e-300))
             if current.loss == 0 or np.max(np.abs(step)) < _SMALL_STEP:
                 return current, True
-            if count.done >= count.most:
+            if not budget.take():
                 return current, False
             expected = current.residual + current.jacobian @ step
             predicted = current.loss - float(expected @ expected)
-            count.done += 1
-            tried = evaluate(given, current.unknowns + step, current.mu, current)
+            tried = _evaluate(given, current.unknowns + step, current.mu, current)
             ratio = -1.0 if tried is None else (current.loss - tried.loss) / max(predicted, 1e-300)
             if tried is not None and ratio > 1e-4:
                 break
@@ -265,55 +238,47 @@ def _levenberg(
     return current, not last
 
 
-def guided(given: Residuals, theta: Array, mu_steps: Sequence[float], count: Count) -> Array | None:
+def guided(
+    given: Residuals, theta: Array, mu_steps: Sequence[float], budget: Budget
+) -> Array | None:
     """Parameters (p,) by each recorded state's own plan, from theta (p,) along falling `mu_steps`.
 
-    States from which theta has no plan are left out; None when none is left.
+    States from which theta has no plan are left out; None when none is left, or no input of a loop
+    was measured.
     """
-    parts: list[OptimalRecording] = []
-    runs = []
+    if not any(one.closed_loop and np.any(np.isfinite(one.u)) for one in given.recordings):
+        return None
+    problem, parts, runs = given.problem, [], []
     for one in given.recordings:
         old: Plan | None = None
-        for part in _parts(one):
-            problem, still = part.problem, np.zeros((part.problem.horizon, part.problem.m))
-            x, u = np.repeat(part.x0[None], problem.horizon + 1, axis=0), still
-            if old is not None:
-                size = problem.horizon
-                later = np.concatenate([old.x[1:], old.x[-1:]])[: size + 1]
-                x, u = np.vstack([part.x0, later[1:]]), np.vstack([old.u[1:], old.u[-1:]])[:size]
-            if not one.closed_loop:
-                t = len(one.u) - problem.horizon
-                x, u = one.x[t:], one.u[t:]
-            found = solved_plan(problem, theta, part.d, x, u, given.solver, mu_steps[0])
-            if isinstance(found, Plan):
+        for part in _first_steps(one) if one.closed_loop else [replace(one, unknown_start=False)]:
+            found = None if old is None else nearby_plan(old, theta, part.x0, mu_steps[0])
+            if found is None:
+                x, u = np.repeat(part.x0[None], problem.horizon + 1, axis=0), np.zeros_like(part.u)
+                found = solved_plan(problem, theta, part.d, x, u, given.solver, mu_steps[0])
+            if found is not None:
                 parts.append(part)
                 runs.append(found)
                 old = found
     if not parts:
         return None
-    own = residuals_of(given.problem, tuple(parts), given.solver, given.scales)
-    first = assembled(own, own.unknowns(theta), theta, mu_steps[0], tuple(runs))
-    count.done += 1
-    return along_mu(own, first, mu_steps, count)[0].theta
+    own = replace(given, recordings=tuple(parts))
+    first = _assembled(own, own.unknowns(theta), mu_steps[0], tuple(runs))
+    return own.split(along_mu(own, first, mu_steps, own.free(), budget)[0].unknowns)[0]
 
 
-def _parts(one: OptimalRecording) -> list[OptimalRecording]:
-    """A recording of one step from every state that was measured whole, and its plan's problem."""
-    found = []
-    T, n, m = len(one.u), one.problem.n, one.problem.m
-    for t in range(T):
+def _first_steps(one: OptimalRecording) -> list[OptimalRecording]:
+    """Of a closed loop the first step of a plan from every state that was measured whole."""
+    found, N, (steps, m) = [], one.problem.horizon, one.u.shape
+    for t in range(steps):
         if not np.all(np.isfinite(one.x[t])) or not np.any(np.isfinite(one.u[t])):
             continue
-        problem = one.problem if one.closed_loop else one.problem.with_horizon(T - t)
-        N = problem.horizon
-        x, u = np.full((N + 1, n), np.nan), np.full((N, m), np.nan)
+        x, u = np.full((N + 1, one.problem.n), np.nan), np.full((N, m), np.nan)
         x[0], u[0] = one.x[t], one.u[t]
-        # The plan of a controller that knows no disturbance does not say where the plant goes.
-        if not one.closed_loop or not np.any(one.d[t]):
+        if not np.any(one.d[t]):  # the controller knew where the plant would go
             x[1] = one.x[t + 1]
-        d = np.zeros((N, one.d.shape[1])) if one.closed_loop else np.array(one.d[t:])
         found.append(replace(
-            one, problem=problem, x=frozen(x), u=frozen(u), d=frozen(d), x0=frozen(one.x[t]),
+            one, x=frozen(x), u=frozen(u), d=np.zeros((N, one.d.shape[1])), x0=frozen(one.x[t]),
             closed_loop=False, unknown_start=False,
         ))  # fmt: skip
     return found

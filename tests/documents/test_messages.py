@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import datetime
 import json
-import math
 import os
 import re
 import resource
@@ -49,16 +48,15 @@ from impc.inverse.structured_fit import fit_structure
 from impc.jit import keep_caches
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
-from impc.model.recordings import Label, Recording
+from impc.model.recordings import Recording
 from impc.model.riccati import solve_lqr
 from impc.model.structure import Structure
 from impc.model.weights import Weights
 from impc.nonlinear.files import (
-    OptimalTrial,
+    first_state,
     optimal_fit_settings,
     posed,
-    read_optimal_trials,
-    recorded,
+    require_signals,
 )
 from impc.nonlinear.plan import require_solver as require_nlp_solver
 from impc.nonlinear.problem import OptimalControlProblem
@@ -527,11 +525,6 @@ def own_problem(**changes: Any) -> OptimalControlProblem:
     return OptimalControlProblem(x, u, parameters, **given)  # type: ignore[arg-type]
 
 
-def own_system(update: Callable[..., Any]) -> Callable[[Path], object]:
-    system = control.nlsys(update, states=["x"], inputs=["u"], dt=0.1)
-    return lambda _: own_problem(next_state=lambda x, u, p: system)
-
-
 def without_fatrop(_: Path) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(casadi, "has_nlpsol", lambda _: False)
@@ -540,13 +533,11 @@ def without_fatrop(_: Path) -> None:
 
 def signal_of_no_problem(folder: Path) -> None:
     (folder / "own.toml").write_text('[signals.y]\ncolumn = "y"\nunit = "m"\n', encoding="utf-8")
-    read_optimal_trials([], read_configuration(folder / "own.toml"), own_problem())
+    require_signals(read_configuration(folder / "own.toml"), own_problem())
 
 
 def unknown_first_value(_: Path) -> None:
-    nothing = np.full((5, 1), np.nan)
-    trial = OptimalTrial(Label(), nothing, np.zeros((4, 1)), np.zeros((4, 0)), 0.1, ())
-    recorded(own_problem(), trial, optimal_fit_settings({}))
+    first_state(own_problem(), np.array([np.nan]), optimal_fit_settings({}))
 
 
 def integrator() -> Plant:
@@ -619,11 +610,8 @@ PROVOKED: dict[str, Callable[[Path], object]] = {
         lambda _: own_problem(stage_cost=lambda x, u, p: p * x**2 + casadi.SX.sym("w") * u**2)
     ),
     "parameter ...: is in no expression; take it out": lambda _: own_problem(w=1),
-    "next_state: is a system whose function takes no symbols (...)": own_system(
-        lambda t, x, u, params: x + u if x[0] > 0 else x
-    ),
-    "next_state: is a system whose function is another on symbols than on numbers": own_system(
-        lambda t, x, u, params: [math.sin(x[0]) + u[0]]
+    "next_state: is a system of python-control; call its function with the symbols": lambda _: (
+        own_problem(next_state=lambda x, u, p: control.nlsys(lambda t, x, u, _: x, states=1))
     ),
     "... is not finite at sample ... of the start": lambda _: own_problem(
         stage_cost=lambda x, u, p: p * casadi.log(x) ** 2 + u**2

@@ -141,7 +141,7 @@ def test_solvers_find_the_same() -> None:
     recording = problem.recorded_plan(plan.x, plan.u)
     found = [
         fit_optimal_control(problem, [recording], START, solver=name).theta
-        for name in ("ipopt", "sqpmethod", "fatrop")
+        for name in ("ipopt", "fatrop")
     ]
     for other in found[1:]:
         assert other == pytest.approx(found[0], rel=1e-8)
@@ -157,8 +157,8 @@ def test_what_cannot_be_fitted_is_refused_in_a_line() -> None:
         fit_optimal_control(point(), [recording], START)
     with pytest.raises(InputError, match="solver: got 'knitro'; choose one of"):
         fit_optimal_control(problem, [recording], START, solver="knitro")
-    with pytest.raises(InputError, match=r"mu_steps: got \(0.1, 0.1\); give falling"):
-        fit_optimal_control(problem, [recording], START, mu_steps=(0.1, 0.1))
+    with pytest.raises(InputError, match="'mu_steps'; its arguments are problem, recordings, sta"):
+        fit_optimal_control(problem, [recording], START, mu_steps=(0.1,))  # type: ignore[call-arg]
     with pytest.raises(InputError, match="level: got 95; give one between 0 and 1"):
         fit_optimal_control(problem, [recording], TRUTH).intervals(95)
 
@@ -181,7 +181,7 @@ def test_another_start_is_tried_where_the_first_has_no_plan() -> None:
     found = fit_optimal_control(arm.problem, [recording], start, starts=4)
     assert found.loss < 1e-10
     assert found.start == start
-    with pytest.raises(InputError, match="starts: got 0; give 1 to 1000"):
+    with pytest.raises(InputError, match="starts: got 0; give a whole number of at least"):
         fit_optimal_control(arm.problem, [recording], start, starts=0)
 
 
@@ -208,7 +208,7 @@ def test_a_search_that_is_stopped_says_so() -> None:
         problem, [problem.recorded_plan(plan.x, plan.u)], START, evaluations=3
     )
     assert not found.settled
-    assert found.evaluations <= 6  # three guided, three not
+    assert found.evaluations <= 3
 
 
 def turned(bend: float) -> tuple[OptimalControlProblem, dict[str, float]]:

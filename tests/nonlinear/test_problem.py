@@ -6,6 +6,7 @@ import pickle
 from typing import Any
 
 import casadi as ca
+import control
 import numpy as np
 import pytest
 
@@ -37,9 +38,9 @@ def test_names_sizes_and_units() -> None:
     assert problem.state_names == ("x_0", "x_1")
     assert problem.input_names == ("force",)
     assert problem.rows == ("force[0]", "force[1]", "speed")
-    assert problem.movable.tolist() == [True, True, False]
     assert problem.positive.tolist() == [True, False, True]
-    assert problem.units == ("kg", "", "")
+    assert problem.units == {"mass": "kg"}
+    assert made(ca.MX).state_names == ("x[0]", "x[1]")
     assert problem.values({"limit": 1, "mass": 2, "price": -3}).tolist() == [2.0, -3.0, 1.0]
 
 
@@ -47,6 +48,17 @@ def test_expressions_of_MX_give_the_same_plan_and_a_copy_of_a_pickle_too() -> No
     plan = made().plan(TRUTH, [1, 0])
     for other in (made(ca.MX), pickle.loads(pickle.dumps(made()))):
         np.testing.assert_allclose(other.plan(TRUTH, [1, 0]).u, plan.u, atol=1e-10)
+
+
+def test_values_take_the_place_of_parameters() -> None:
+    whole = made()
+    left = whole.with_known({"mass": 1.5, "limit": 1.0})
+    assert left.parameter_names == ("price",)
+    np.testing.assert_allclose(
+        left.plan({"price": 10.0}, [1, 0]).u, whole.plan(TRUTH, [1, 0]).u, atol=1e-12
+    )
+    for function, given in zip(left.functions, whole.functions, strict=True):
+        assert function.name() == given.name()
 
 
 def test_a_controller_does_not_reckon_with_disturbances() -> None:
@@ -63,6 +75,10 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
     "a free symbol": (
         {"stage_cost": lambda x, u, p: ca.sumsqr(x) + u**2 * ca.SX.sym("w") * p["price"]},
         "stage_cost: has the symbol w; which is neither a state",
+    ),
+    "a system of python-control": (
+        {"next_state": lambda x, u, p: control.nlsys(lambda t, x, u, params: x, states=2)},
+        "next_state: is a system of python-control; call its function with the symbols, as docs/",
     ),
     "a wrong size": (
         {"next_state": lambda x, u, p: x[0] + u}, r"next_state: has shape \(1, 1\); give \(2, 1\)"
@@ -83,7 +99,7 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
         {"terminal_cost": lambda x, u, p: u**2}, "terminal_cost: depends on an input"
     ),
     "a horizon of half a sample": ({"horizon": 0.5}, "horizon: got 0.5; give a whole number"),
-    "no horizon": ({"horizon": 0}, "horizon: got 0; give 1 to 10000"),
+    "no horizon": ({"horizon": 0}, "horizon: got 0; give a whole number"),
     "a comparison": (
         {"constraints": lambda x, u, p: {"force": ca.vertcat(u, -u) <= p["limit"]}},
         "constraint force: is a comparison; write what must not exceed 0: u - 1 for u <= 1",
@@ -135,9 +151,9 @@ def test_initial_states_solvers_and_mu_are_checked() -> None:
             problem.plan(TRUTH, x0)
     with pytest.raises(DataError, match=r"d: expected shape \(3, 0\), got \(2, 1\)"):
         problem.closed_loop(TRUTH, [1, 0], 3, d=[[1.0], [0.0]])
-    with pytest.raises(InputError, match="steps: got 0; give a whole number of samples"):
+    with pytest.raises(InputError, match="steps: got 0; give a whole number of at least 1"):
         problem.closed_loop(TRUTH, [1, 0], 0)
-    with pytest.raises(InputError, match=r"solver: got 'snopt'; choose one of ipopt, sqpmethod"):
+    with pytest.raises(InputError, match=r"solver: got 'snopt'; choose one of ipopt, fatrop"):
         problem.plan(TRUTH, [1, 0], solver="snopt")
     with pytest.raises(InputError, match="mu: got 0; give 1e-12 to 1e"):
         problem.plan(TRUTH, [1, 0], mu=0)
@@ -185,12 +201,12 @@ def test_recordings_are_checked() -> None:
     x, u = np.zeros((21, 2)), np.zeros((20, 1))
     refused: list[tuple[Any, str]] = [
         (lambda: problem.recorded_plan(x[:-1], u), "states: has 20 samples; give 21"),
-        (lambda: problem.recorded_loop(x, u[:-1]), "inputs: has 19 samples; give 20"),
-        (lambda: problem.recorded_plan(x.T, u), r"states: has shape \(2, 21\); give"),
+        (lambda: problem.recorded_loop(x, u[:-1]), r"inputs: expected shape \(20, 1\), got"),
+        (lambda: problem.recorded_plan(x.T, u), "states: expected .*; transpose it: states.T"),
         (lambda: problem.recorded_plan(x, u + np.inf), "inputs: has infinite entries"),
-        (lambda: problem.recorded_plan(x * np.nan, u), "x0: is not known; give 2 finite"),
+        (lambda: problem.recorded_plan(x * np.nan, u), "x0: 2 of 2 entries are NaN"),
         (lambda: problem.recorded_loop(x[:1]), "states: has 1 samples; give at least 2"),
-        (lambda: problem.recorded_plan("x"), "states: are not numbers"),
+        (lambda: problem.recorded_plan("x"), "states: expected real numbers"),
         (
             lambda: problem.recorded_plan(x * np.nan, x0=[0, 0]),
             "recording: has nothing that was measured",
