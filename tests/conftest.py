@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator
+from typing import Any
 
 import control
 import numpy as np
@@ -15,10 +16,6 @@ from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from tests.labelled_axes import require_labels
 from tests.support import SEARCH, leave_blank
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
 
 # What a command says must not depend on how fast it was; tests of progress ask for it.
 os.environ["IMPC_QUIET"] = "1"

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import copy
 import pickle
+from collections.abc import Callable
 from dataclasses import fields
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import control
 import numpy as np
@@ -28,9 +29,6 @@ from impc.model.recordings import Recording
 from impc.model.structure import Structure
 from impc.model.weights import Weights
 from tests.wrong_arguments import calls, values, wrong_values
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 # Calls of more than half a second: numbers that mean something are left out.
 SLOW = (

@@ -17,7 +17,6 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -29,14 +28,12 @@ from impc.control.simulation import scenario
 from impc.errors import InfeasibleError
 from impc.files.formats import write_table
 from impc.files.table import make_table
+from impc.model.bounds import Bounds
+from impc.model.plant import Plant
 from impc.model.weights import Weights
 from tests.experiments.test_nonlinear_mpc import linear_step
 from tests.nonlinear.test_problem import TRUTH, made
 from tests.studies.cohort.carts import cart_plant, subject_trial
-
-if TYPE_CHECKING:
-    from impc.model.bounds import Bounds
-    from impc.model.plant import Plant
 
 ROOT = Path(__file__).parents[1]
 # Python runs it in each process, before anything else.

@@ -5,9 +5,10 @@ from __future__ import annotations
 import atexit
 import dataclasses
 import tempfile
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import control
@@ -41,9 +42,6 @@ from impc.model import riccati as lqr
 from impc.nonlinear import fit as nonlinear_fit
 from impc.nonlinear import problem as nonlinear_problem
 from impc.output_feedback import observer
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 __all__ = ["calls", "wrong_values"]
 

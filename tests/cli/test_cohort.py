@@ -9,9 +9,10 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pandas as pd
 import psutil
@@ -24,9 +25,6 @@ from impc.studies import scheduler
 from tests.studies.cohort.carts import write_study
 from tests.studies.test_scheduler import certificates
 from tests.support import leave_blank
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 ROOT = Path(__file__).parents[2]
 SEED = 8

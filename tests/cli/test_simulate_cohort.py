@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,9 +15,6 @@ from impc.errors import FallError
 from impc.files.plant_sources import make_plant, plant_source
 from impc.files.reading import read_recordings, read_unit
 from impc.studies.cohort.study import read_study
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 @pytest.mark.parametrize(("noise", "least", "most"), [("0", 0.93, 1.07), ("3", 2.0, 6.0)])

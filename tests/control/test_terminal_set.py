@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pickle
 import sys
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import control
 import numpy as np
@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from scipy.optimize import linprog
 
 from experiments.certificates import invariance_violation, maximality_violation
+from impc.arrays import Array
 from impc.checking import replace
 from impc.control.halfspaces import as_pytope, polygon, supports
 from impc.control.terminal_set import (
@@ -29,9 +30,6 @@ from impc.model.riccati import solve_lqr
 from impc.model.weights import Weights
 from plants.seated_balance import seated_balance_plant
 from tests.support import draws
-
-if TYPE_CHECKING:
-    from impc.arrays import Array
 
 Case = tuple[Plant, Any, "Bounds"]
 

@@ -9,14 +9,7 @@ __all__ = ["NOT_RUN", "PREPARED", "SMALLER", "Smaller"]
 
 @dataclass(frozen=True)
 class Smaller:
-    """What is run instead of a line of a page.
-
-    Attributes
-    ----------
-    lines : tuple of str
-        Command lines; `edit FILE OLD NEW` does what an editor would do.
-    reason : str
-    """
+    """What is run instead of a line of a page."""
 
     lines: tuple[str, ...]
     reason: str

@@ -13,17 +13,13 @@ import io
 import json
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.documents.blocks import PAGES, blocks, command_lines
+from tests.documents.blocks import PAGES, Block, blocks, command_lines
 from tests.documents.settings import require_valid
 from tests.documents.shell import run_line, working_in
 from tests.documents.tables import NOT_RUN, PREPARED, SMALLER
-
-if TYPE_CHECKING:
-    from tests.documents.blocks import Block
 
 _SILENT = {"text", "bibtex", "matlab"}
 _NUMBER = re.compile(r"[-+]?\d+(\.\d*)?(e[-+]?\d+)?")

@@ -5,15 +5,12 @@ from __future__ import annotations
 import importlib
 import subprocess
 import sys
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
 from tests.documents.blocks import ROOT, blocks
 from tests.documents.test_docstrings import faults
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 FILES = {
     block.file: block.text

@@ -31,8 +31,10 @@ import pkgutil
 import re
 import sys
 import textwrap
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from types import ModuleType
+from typing import Any
 
 import click
 import pytest
@@ -40,12 +42,7 @@ from numpydoc.docscrape import NumpyDocString
 
 import impc.errors
 import plants
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from types import ModuleType
-
-    from impc.arrays import Array
+from impc.arrays import Array
 
 ROOT = Path(__file__).parents[2]
 
@@ -225,39 +222,12 @@ def test_the_docstring_says_it_all(key: str) -> None:
 
 
 def poor(gain: Array, sample_time: float, count: int) -> Array:
-    """Return something (docs/theory.md, section 99).
-
-    Parameters
-    ----------
-    gain : Array
-        Of the regulator.
-    sample_time : float
-        Between samples.
-    other : int
-
-    Raises
-    ------
-    NoSuchError
-        Never.
-    """
+    """Return something (docs/theory.md, section 99)."""
     return _scaled(gain, sample_time)
 
 
 def rich(gain: Array, sample_time: float, count: int) -> Array:
-    """(3.3) as an array (m, n), `count` times.
-
-    Parameters
-    ----------
-    gain : Array
-        Of the regulator (m, n).
-    sample_time : float
-        Between samples, s.
-
-    Raises
-    ------
-    ValueError
-        When the sample time is zero.
-    """
+    """(3.3) as an array (m, n), `count` times."""
     return _scaled(gain, sample_time)
 
 

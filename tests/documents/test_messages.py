@@ -13,8 +13,9 @@ import shutil
 import sys
 import tempfile
 import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi
 import control
@@ -84,9 +85,6 @@ from tests.files.hostile_files import HOSTILE
 from tests.files.samples import csv_text, hdf5_mat, pushed_seat, settings
 from tests.files.test_blocks import DATA, book
 from tests.files.test_one_step import balanced, fallen, read, stick
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
 
 PAGE = PAGES["docs/troubleshooting.md"].read_text(encoding="utf-8")
 MESSAGES = re.findall(r"\*\*`([^`]+)`\*\*", PAGE)

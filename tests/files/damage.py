@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from impc.files.formats import write_table
 from impc.files.table import make_table
 from tests.files.samples import pushed_seat
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 __all__ = ["OWN_RATE", "Damage", "Made", "register", "written", "written_by_impc"]
 

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import warnings
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from pathlib import Path
 
 import c3d
 import h5py
 import numpy as np
 from nptdms import ChannelObject, TdmsWriter
 
-from tests.files.damage import OWN_RATE, Damage, register, written, written_by_impc
+from tests.files.damage import OWN_RATE, Damage, Made, register, written, written_by_impc
 from tests.files.samples import (
     csv_text,
     hdf5_mat,
@@ -19,12 +20,6 @@ from tests.files.samples import (
     save_mat,
     settings,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from tests.files.damage import Made
 
 __all__ = ["DAMAGED_FILES"]
 

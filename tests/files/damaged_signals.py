@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 
-from tests.files.damage import OWN_RATE, Damage, register, written
+from impc.arrays import Array
+from tests.files.damage import OWN_RATE, Damage, Made, register, written
 from tests.files.samples import csv_text, pushed_seat, settings
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from impc.arrays import Array
-    from tests.files.damage import Made
 
 __all__ = ["DAMAGED_SIGNALS"]
 

@@ -11,18 +11,16 @@ import itertools
 import struct
 import zipfile
 import zlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import h5py
 import numpy as np
 
 from tests.files.damage import written, written_by_impc
 from tests.files.samples import hdf5_mat, mat5_array, mat5_element, mat5_file, ods_file
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 __all__ = ["HOSTILE", "Hostile"]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
@@ -13,13 +13,9 @@ from impc.errors import InputError
 from impc.files.configuration import read_configuration
 from impc.files.plant_sources import make_plant
 from impc.files.reading import read_recordings
+from impc.model.plant import Plant
 from tests.files.damaged import DAMAGED, PLANT
 from tests.files.samples import csv_text, pushed_seat, settings
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from impc.model.plant import Plant
 
 
 @pytest.fixture(scope="module")

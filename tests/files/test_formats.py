@@ -5,8 +5,9 @@ from __future__ import annotations
 import importlib.util
 import re
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import c3d
 import h5py
@@ -14,17 +15,13 @@ import numpy as np
 import pytest
 import scipy.io
 from nptdms import ChannelObject, TdmsFile, TdmsWriter
+from numpy.typing import ArrayLike
 
 from impc.errors import DataError, OutputError
 from impc.files.formats import read_table, write_matlab73, write_table
 from impc.files.layout import split_heading
 from impc.files.table import Table, make_table
 from tests.files.samples import csv_text, hdf5_mat, opaque_variable, pushed_seat, save_mat
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from numpy.typing import ArrayLike
 
 SEAT = pushed_seat(200)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import tracemalloc
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -16,9 +16,6 @@ from impc.files.formats import read_table, write_table
 from impc.files.inspection import draft_configuration, summary
 from impc.files.table import make_table
 from tests.files.samples import hdf5_mat
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 def test_a_sparse_file_of_two_gigabytes_is_refused_unread(tmp_path: Path) -> None:

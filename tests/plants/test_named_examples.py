@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
 import scipy.linalg
 
 import plants
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 CASES = [
     # function, poles (descending modulus), rank of the controllability matrix, outputs

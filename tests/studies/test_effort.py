@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import tracemalloc
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import psutil
@@ -14,6 +14,7 @@ from click.testing import CliRunner
 import impc.cli.console
 import impc.studies.cohort.engine
 import impc.studies.fit.subject
+from impc.arrays import Array, IntArray
 from impc.checking import replace
 from impc.cli.console import require_consent
 from impc.cli.main import main
@@ -46,11 +47,6 @@ from tests.studies.selection.dosing import in_turn
 from tests.studies.selection.heads import head_model, head_trials
 from tests.studies.selection.test_methods import blood_study
 from tests.support import random_plant
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from impc.arrays import Array, IntArray
 
 
 def test_each_structure_is_a_fit_more_and_one_for_each_trial_left_out() -> None:

@@ -8,8 +8,9 @@ import subprocess
 import sys
 import time
 from collections import deque
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import distributed
 import pytest
@@ -20,9 +21,6 @@ from impc.studies import scheduler as module
 from impc.studies.cache import Cache
 from impc.studies.pool import Task, run
 from impc.studies.scheduler import Cluster, connected
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 # A client whose scheduler is gone leaves its socket to the garbage collector, at any later time.
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")

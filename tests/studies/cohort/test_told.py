@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -16,9 +16,6 @@ from impc.studies.cohort.engine import Failures, Store
 from impc.studies.cohort.report import write_report
 from impc.studies.cohort.told import not_told, not_told_sentences, only_told
 from tests.studies.cohort.made_up import fit_of, made_up_study, tasks_of
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 def gains(deviations: dict[int, float]) -> pd.DataFrame:
