@@ -20,7 +20,7 @@ from impc.files.plant_sources import make_plant
 from impc.files.reading import read_recordings, recording_of
 from impc.files.table import make_table
 from impc.model.plant import Plant
-from tests.files.damaged import PLANT
+from tests.files.damaged_files import PLANT
 from tests.files.samples import csv_text, pushed_seat, settings
 
 BASE = pushed_seat()

@@ -23,7 +23,7 @@ from impc.files.table import make_table
 from impc.model.plant import Plant
 from impc.studies.fit.settings import fit_settings
 from plants import seated_balance_plant
-from tests.files.damaged import PLANT
+from tests.files.damaged_files import PLANT
 from tests.files.samples import csv_text, pushed_seat, settings
 
 ROOT = Path(__file__).parents[2]
