@@ -104,18 +104,13 @@ def test_the_tables_have_no_stale_entries() -> None:
     assert all(entry.reason for entry in SMALLER.values())
 
 
-@pytest.mark.parametrize("page", list(PAGES))
-def test_no_block_is_overlooked(page: str) -> None:
-    content = PAGES[page].read_text(encoding="utf-8")
-    fences = re.findall(r"^ *```(.*)$", content, flags=re.M)
-    assert "~~~" not in content
-    opened = [fence for fence in fences[::2] if not fence.startswith("{")]
-    assert opened == [block.language for block in blocks(page)]
-
-
-@pytest.mark.parametrize("page", list(PAGES))
-def test_links_lead_somewhere(page: str) -> None:
-    folder = PAGES[page].parent
-    links = re.findall(r"\]\(([^)#]+)[^)]*\)", PAGES[page].read_text(encoding="utf-8"))
-    local = [link for link in links if "://" not in link]
-    assert [link for link in local if not (folder / link).exists()] == []
+def test_no_block_is_overlooked_and_links_lead_somewhere() -> None:
+    for page, path in PAGES.items():
+        content = path.read_text(encoding="utf-8")
+        fences = re.findall(r"^ *```(.*)$", content, flags=re.M)
+        assert "~~~" not in content
+        opened = [fence for fence in fences[::2] if not fence.startswith("{")]
+        assert opened == [block.language for block in blocks(page)]
+        links = re.findall(r"\]\(([^)#]+)[^)]*\)", content)
+        local = [link for link in links if "://" not in link]
+        assert [link for link in local if not (path.parent / link).exists()] == [], page

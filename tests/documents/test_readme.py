@@ -20,13 +20,6 @@ def close(shown: str, found: str) -> bool:
         return shown == found
 
 
-def test_the_first_lines_are_the_two_commands() -> None:
-    first = README.split("```")[1].split()
-    assert first[:3] == ["sh", "make", "demo"]
-    assert "make test" in README.split("```")[1]
-    assert README.index("make demo") < 200
-
-
 def test_the_table_is_what_comes_out(example_plant: Plant) -> None:
     texts = (block.text for block in blocks("README.md") if block.language == "text")
     shown = next(text for text in texts if "feedback_gain" in text)

@@ -215,7 +215,11 @@ def cells_repeated(folder: Path) -> Path:
 
 def later(make: Callable[[], Make]) -> Make:
     """Packing takes seconds: not before it is asked for."""
-    return lambda folder: make()(folder)
+
+    def run(folder: Path) -> Path:
+        return make()(folder)
+
+    return run
 
 
 def text(content: str) -> Make:
