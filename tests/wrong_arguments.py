@@ -21,13 +21,7 @@ from impc.assess import variance_accounted_for as agreement
 from impc.assess import weights_test as identifiability
 from impc.checking import replace
 from impc.control import casadi_controller as mpc
-from impc.control import (
-    closed_loop,
-    constraint_rows,
-    controller,
-    simulation,
-    terminal_set,
-)
+from impc.control import closed_loop, constraint_rows, controller, simulation, terminal_set
 from impc.files import configuration, formats, reading, table, units
 from impc.files import plant_sources as plant_source
 from impc.inverse import direct_and_reduced as inverse_mpc
@@ -243,10 +237,7 @@ def calls() -> list[Call]:
             },
         ),
         (terminal_set.contains, {"terminal": v["terminal"], "x": size}),
-        (
-            controller.Controller,
-            {**limits, "horizon": 4, "terminal_set": True, "softening": 1e6},
-        ),
+        (controller.Controller, {**limits, "horizon": 4, "terminal_set": True, "softening": 1e6}),
         (
             controller.Controller.from_gain,
             {
@@ -296,10 +287,7 @@ def calls() -> list[Call]:
         (bounded_weights.linear_maxima, {"found": v["set"], "directions": np.eye(4)[None]}),
         (bounded_weights.entry_ranges, {"found": v["set"], "states": [0]}),
         (inverse_lqr.inverse_lqr_lmi, about),
-        (
-            inverse_lqr.inverse_lqr_gradient,
-            {**about, "start": v["weights"], "max_evaluations": 3},
-        ),
+        (inverse_lqr.inverse_lqr_gradient, {**about, "start": v["weights"], "max_evaluations": 3}),
         (inverse_lqr.inverse_lqr_cross_term, about),
         (inverse_mpc.infer_weights, problem),
         (inverse_mpc.starting_point, problem),

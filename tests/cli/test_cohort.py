@@ -99,10 +99,7 @@ def workers_of(process: psutil.Process) -> list[psutil.Process]:
 
 @pytest.mark.parametrize(
     "kills",
-    [
-        pytest.param((1, 1), marks=pytest.mark.full),
-        pytest.param((3, 2), marks=pytest.mark.full),
-    ],
+    [pytest.param((1, 1), marks=pytest.mark.full), pytest.param((3, 2), marks=pytest.mark.full)],
 )
 def test_workers_and_client_may_die(
     study: Path, undisturbed: Path, tmp_path: Path, kills: tuple[int, int]

@@ -104,9 +104,7 @@ def test_a_result_names_the_recordings_that_count(study: Path, tmp_path: Path) -
     assert found["before"]["all"] != found["after"]["all"]
 
 
-def test_the_page_marks_findings_and_quotes_the_dissertation(
-    analysed: tuple[Result, Path],
-) -> None:
+def test_the_page_marks_findings_and_quotes_the_dissertation(analysed: tuple[Result, Path]) -> None:
     page = (analysed[1] / "report.html").read_text()
     assert page.count("ound:</strong>") == 3
     assert "Quoted from the dissertation, of its own subjects and not of these" in page

@@ -29,9 +29,7 @@ from tests.support import random_plant, random_weights
 STEPS = 12
 
 
-def test_softening_changes_nothing_where_the_hard_program_is_feasible(
-    example_plant: Plant,
-) -> None:
+def test_softening_changes_nothing_where_the_hard_program_is_feasible(example_plant: Plant) -> None:
     bounds = Bounds(example_plant, u_min=-1, u_max=1, x_min=-3.1, x_max=3.1)
     weights = Weights(np.eye(2), 1)
     drive = scenario(example_plant, [2, 3], STEPS)

@@ -188,11 +188,7 @@ print("done")
 def test_solvers_are_silent() -> None:
     """In a process of its own: what a library in C writes passes Python by."""
     done = subprocess.run(
-        [sys.executable, "-c", _EVERY_SOLVER],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=True,
+        [sys.executable, "-c", _EVERY_SOLVER], cwd=ROOT, capture_output=True, text=True, check=True
     )
     assert done.stdout == "done\n"
     assert done.stderr == ""

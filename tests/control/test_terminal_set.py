@@ -18,11 +18,7 @@ from experiments.certificates import invariance_violation, maximality_violation
 from impc.arrays import Array
 from impc.checking import replace
 from impc.control.halfspaces import as_pytope, polygon, supports
-from impc.control.terminal_set import (
-    TerminalSet,
-    contains,
-    maximal_invariant_set,
-)
+from impc.control.terminal_set import TerminalSet, contains, maximal_invariant_set
 from impc.errors import DataError, ImpcError, InputError, PlantError, SolverError
 from impc.model.bounds import Bounds, bound_rows
 from impc.model.plant import Plant

@@ -18,14 +18,7 @@ from nptdms import ChannelObject, TdmsWriter
 
 from impc.files.formats import write_table
 from impc.files.table import make_table
-from tests.files.samples import (
-    csv_text,
-    hdf5_mat,
-    opaque_variable,
-    pushed_seat,
-    save_mat,
-    settings,
-)
+from tests.files.samples import csv_text, hdf5_mat, opaque_variable, pushed_seat, save_mat, settings
 
 __all__ = ["DAMAGED", "PLANT", "written", "written_by_impc"]
 

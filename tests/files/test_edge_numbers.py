@@ -142,14 +142,6 @@ def test_a_pattern_that_never_ends(
     assert trial.label.trial == "a" * 60
 
 
-def test_a_circle_of_links(tmp_path: Path, seat: Plant) -> None:
-    path = tmp_path / "trial.csv"
-    path.symlink_to(path)
-    (tmp_path / "subject.toml").write_text(settings())
-    with pytest.raises(InputError, match="cannot be opened"):
-        read_recordings([path], read_configuration(tmp_path / "subject.toml"), seat)
-
-
 def test_a_name_that_is_not_utf_8(tmp_path: Path) -> None:
     for ending, content in ((".csv", csv_text(BASE).encode()), (".tdms", b"TDSm")):
         path = tmp_path / os.fsdecode(b"trial\xff\n" + ending.encode())

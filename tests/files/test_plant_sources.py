@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 import scipy.io
 
-import plants
 from impc.errors import ImpcError, InputError, PlantError
 from impc.files.plant_sources import (
     PlantSource,
@@ -21,7 +20,6 @@ from impc.files.plant_sources import (
     plant_family_of,
     plant_source,
 )
-from impc.studies.selection.model_source import model_source
 from tests.files.samples import mat5_array, mat5_element, mat5_file
 
 A, B, C = [[1.0, 0.1], [0.0, 1.0]], [[0.005, 0.0], [0.1, 0.1]], [[1.0, 0.0]]
@@ -111,13 +109,6 @@ def test_a_module_that_ends_the_program(tmp_path: Path, monkeypatch: pytest.Monk
         plant_source("broken_plant:x", {})
 
 
-def test_a_model_that_ends_the_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "ending_model.py").write_text("def model(): raise SystemExit(0)\n")
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(InputError, match="model ending_model:model: ends in SystemExit"):
-        model_source("ending_model:model", {})
-
-
 @pytest.mark.parametrize("suffix", ["mat", "npz", "json"])
 def test_a_saved_state_space(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"plant.{suffix}"
@@ -135,17 +126,6 @@ def test_a_saved_state_space(tmp_path: Path, suffix: str) -> None:
     np.testing.assert_array_equal(plant.E[:, 0], np.array(B)[:, 1])
     assert plant.controls == ("force",)
     assert plant.dt == 0.1
-
-
-def test_a_free_parameter_of_the_seat() -> None:
-    def make(J2: float = 1.0) -> object:
-        return plants.seated_balance_plant(plants.SeatedBalanceParameters(J2=J2))
-
-    source = plant_source("plants:seated_balance_plant", {})
-    moving = type(source)("seat", make, {"J2": 1.3})
-    family = plant_family_of(moving, ("perturbation",), ["J2"])
-    assert family is not None
-    assert family.nominal.tolist() == [1.3]
 
 
 @pytest.mark.parametrize(

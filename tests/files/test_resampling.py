@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from impc.assess.variance_accounted_for import whiteness
 from impc.files.resampling import held_means, instants, resampled_samples, same_rate
 
 DT = 0.01
@@ -51,14 +50,6 @@ def test_a_straight_line_stays_one_up_to_both_ends(rate: float) -> None:
     time = np.arange(int(6 * rate)) / rate
     result = instants(3.0 - 2.0 * time, 1 / rate, DT)
     np.testing.assert_allclose(result, 3.0 - 2.0 * DT * np.arange(len(result)), atol=1e-3)
-
-
-def test_the_ends_do_not_ring() -> None:
-    # A slow movement that begins and ends within the edge: 1 Hz, from its steepest point on.
-    time = np.arange(3000) / 1000
-    result = instants(np.sin(2 * np.pi * time), 1 / 1000, DT)
-    exact = np.sin(2 * np.pi * DT * np.arange(len(result)))
-    assert np.abs(result - exact).max() < 1e-3
 
 
 def test_the_same_rate_passes_unchanged() -> None:
@@ -113,16 +104,3 @@ def test_number_of_samples(samples: int, rate: float, expected: int) -> None:
     assert resampled_samples(samples, 1 / rate, DT) == expected
     assert len(instants(np.ones(samples), 1 / rate, DT)) == expected
     assert len(held_means(np.ones(samples), 1 / rate, DT)) == expected
-
-
-def test_a_recording_shorter_than_the_filter() -> None:
-    np.testing.assert_allclose(instants(np.full(30, 2.5), 1e-3, DT), 2.5, rtol=1e-12)
-
-
-def test_white_noise_of_a_faster_recorder_is_not_white_at_the_slower_rate() -> None:
-    """What the page of a person says of residuals that are not white (docs/noisy-people.md)."""
-    noise = np.random.default_rng(0).standard_normal(90_000)
-    slower = instants(noise, 0.001, 0.01)
-    assert slower[1:] @ slower[:-1] / (slower @ slower) == pytest.approx(0.15, abs=0.03)
-    assert whiteness(slower[:, None], 100)[0] < 1e-6
-    assert whiteness(instants(noise[:9000], 0.01, 0.01)[:, None], 100)[0] > 1e-3

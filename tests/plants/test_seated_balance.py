@@ -135,9 +135,7 @@ def test_four_state_numbers_of_the_reference() -> None:
     plant = continuous_seated_balance_plant()
     A, Bu, Bd = plant.A[:4, :4], plant.A[:4, -1], plant.B[:4, 1]
     np.testing.assert_allclose(
-        A[2:],
-        [[-7.959, -5.419, -2.478, 1.1419], [13.0633, 21.3689, 2.376, -1.4282]],
-        atol=5.1e-5,
+        A[2:], [[-7.959, -5.419, -2.478, 1.1419], [13.0633, 21.3689, 2.376, -1.4282]], atol=5.1e-5
     )
     np.testing.assert_allclose(Bu, [0, 0, -0.4568, 0.5713], atol=5e-5)
     np.testing.assert_allclose(Bd, [0, 0, 0.2672, -0.1896], atol=5e-5)
