@@ -12,8 +12,6 @@ import hashlib
 import json
 import os
 import pickle
-import re
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -205,20 +203,6 @@ def test_results_are_those_of_the_folder_without(runs: tuple[Path, Path, list[st
     assert pictures
     for name in (*pictures, Path("out", "units.csv")):
         assert (plain / name).read_bytes() == (trapped / name).read_bytes(), name
-
-
-@pytest.mark.full
-@pytest.mark.skipif(shutil.which("strace") is None, reason="strace is not installed")
-def test_no_library_opens_anything_of_the_folder(runs: tuple[Path, Path, list[str]]) -> None:
-    """Those in C too, which tell Python nothing."""
-    trapped = runs[1]
-    log = trapped.parent / "strace"
-    calls = ("-f", "-qq", "--seccomp-bpf", "-e", "trace=open,openat,execve", "-o", str(log))
-    run(trapped, "again", "strace", *calls)
-    named = re.findall(r'(?:open|openat|execve)\((?:AT_FDCWD, )?"([^"]+)"', log.read_text())
-    opened = {os.path.normpath(trapped / name) for name in named}
-    assert f"{trapped}/sub-1.mat" in opened
-    assert sprung(trapped, opened) == set()
 
 
 def test_ipopt_obeys_no_file(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import re
 import shutil
 from pathlib import Path
 
@@ -18,7 +17,6 @@ from impc.files.plant_sources import make_plant, plant_source
 from impc.files.reading import read_recordings
 from impc.studies.cohort.study import read_study
 from impc.studies.reliability.icc import icc
-from impc.studies.reliability.verdict import QUOTED, band_of
 
 pytestmark = pytest.mark.full
 
@@ -45,12 +43,6 @@ def analysed(study: Path) -> tuple[Result, Path]:
     done = run("reliability", str(study / "study.toml"), "--out", str(out))
     assert done.exit_code == 0, done.stderr
     return done, out
-
-
-def test_files(study: Path, analysed: tuple[Result, Path]) -> None:
-    assert len(list(study.rglob("sub-*_motion.csv"))) == 5 * 2 * 3 * 2
-    names = {path.name for path in analysed[1].iterdir()}
-    assert {"report.html", "result.json", "cmc.csv", "icc-rms.csv", "spectra.pdf"} <= names
 
 
 def test_icc_is_that_of_the_recordings(study: Path, analysed: tuple[Result, Path]) -> None:
@@ -102,17 +94,6 @@ def test_a_result_names_the_recordings_that_count(study: Path, tmp_path: Path) -
     same = ("configuration", "plant", "versions")
     assert all(found["before"][key] == found["after"][key] for key in same)
     assert found["before"]["all"] != found["after"]["all"]
-
-
-def test_the_page_marks_findings_and_quotes_the_dissertation(analysed: tuple[Result, Path]) -> None:
-    page = (analysed[1] / "report.html").read_text()
-    assert page.count("ound:</strong>") == 3
-    assert "Quoted from the dissertation, of its own subjects and not of these" in page
-    assert not re.search("https?:", page)
-    quoted = (analysed[1] / "dissertation.csv").read_text()
-    for conditions in QUOTED.values():
-        for lower, upper in conditions.values():
-            assert f"{lower},{upper}" in quoted
 
 
 def copy(study: Path, folder: Path) -> Path:
@@ -179,9 +160,3 @@ def test_an_empty_passband_is_one_line(study: Path, tmp_path: Path) -> None:
     assert done.exit_code == 2
     assert len(done.stderr.strip().splitlines()) == 1
     assert not (tmp_path / "o").exists()
-
-
-def test_bands() -> None:
-    """Cicchetti's limits."""
-    words = [band_of(value) for value in (-0.2, 0.39, 0.4, 0.6, 0.75, 1.0, float("nan"))]
-    assert words == ["poor", "poor", "fair", "good", "excellent", "excellent", "not defined"]

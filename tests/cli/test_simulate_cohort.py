@@ -44,13 +44,6 @@ def test_the_truth_moved_by_what_is_recorded_leaves_the_noise_of_the_recorder(
         assert least < np.sqrt(np.mean(left**2)) / 0.03 < most
 
 
-def test_the_next_command_is_said(tmp_path: Path) -> None:
-    out = tmp_path / "my data"
-    given = ("--subjects", "2", "--trials", "1", "--duration", "5", "--out", str(out))
-    done = CliRunner().invoke(main, ["simulate", "cohort", *given])
-    assert done.stdout.splitlines()[-1] == f"next: impc cohort '{out}'/study.toml"
-
-
 def test_falls_are_said_and_their_trials_left_out(tmp_path: Path) -> None:
     """A torque of 1.8 N m is too little for a subject: the other trial of the unit stays."""
     given = ("--subjects", "2", "--trials", "2", "--duration", "8", "--replicates", "0")

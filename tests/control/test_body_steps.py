@@ -196,13 +196,6 @@ def test_a_sample_of_the_seat_is_that_of_another_integrator() -> None:
     assert np.max(np.abs(drift)) > 1e-3
 
 
-def test_the_linearisation_of_the_seats_body_is_its_plant() -> None:
-    plant = seat_controller({}, 6.0).plant
-    still = np.zeros((1, plant.n)), np.zeros((1, plant.m)), np.zeros((1, 1))
-    for found, exact in zip(slopes_along(plant, *still), (plant.A, plant.B, plant.E), strict=True):
-        assert np.allclose(found[0], exact, rtol=0, atol=1e-14)
-
-
 def test_other_solvers_and_casadis_controller_move_the_same_body() -> None:
     plant = pendulum()
     controller = law(plant)

@@ -11,7 +11,6 @@ import plants
 from experiments.benchmarks.workloads import seat
 from impc.arrays import Array
 from impc.control.closed_loop import simulate
-from impc.errors import InputError
 from impc.output_feedback.observer import Observer
 from impc.output_feedback.simulation import simulate_person
 from impc.studies.simulated_people import simulate_subject
@@ -70,13 +69,6 @@ def test_noise_of_a_person_is_that_of_the_linear_loop() -> None:
     np.testing.assert_allclose(spread[0], spread[1], rtol=0.5)
 
 
-def test_process_noise_has_no_place_on_a_nonlinear_plant() -> None:
-    controller = seat(1, 1.0, 6.0).controller
-    with pytest.raises(InputError, match="process: cannot be simulated here"):
-        simulate_subject(controller, STEP, np.zeros(100),
-                         person=Observer(controller.plant, process=1e-3))  # fmt: skip
-
-
 def test_ranges_and_saturation_of_the_reference() -> None:
     """30 s at 6 Nm on the nonlinear plant: 12.3 %, 6.90 and 5.19 degrees; at 4.5 Nm 33.9 %."""
     torque = plants.ternary_torque(duration=30.0, rate=1000.0)
@@ -126,11 +118,6 @@ def test_a_fall_is_told() -> None:
     assert trial.fell is not None
     assert 0 < trial.fell < 5
     assert np.all(np.isfinite(trial.outputs))
-
-
-def test_a_rate_that_does_not_fit_is_said() -> None:
-    with pytest.raises(InputError, match="rate"):
-        simulate_subject(seat(1, 1.0).controller, STEP, np.zeros(100), rate=150.0)
 
 
 def test_a_person_by_mass_and_height() -> None:

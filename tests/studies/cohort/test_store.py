@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import resource
 import shutil
 from pathlib import Path
 from typing import Any
@@ -79,26 +78,6 @@ def test_a_flipped_byte_anywhere_is_told(tmp_path: Path) -> None:
     assert all_kept(store) == right
 
 
-@pytest.mark.parametrize("text", ["", "{}", "[]", "null", "3", '"x"', "[" * 100_000, "\udcff{}"])
-def test_what_is_no_result_is_computed_again(
-    tmp_path: Path, text: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    store = filled(tmp_path)
-    right = all_kept(store)
-    again = [tmp_path / "units" / NAMES[0] / f"{name}.json" for name in ("fit", "replicate-0001")]
-    for path in again:
-        path.write_bytes(text.encode("utf-8", "surrogateescape"))
-    monkeypatch.setattr(engine, "fit_unit", lambda _: fit_of(0))
-    monkeypatch.setattr(engine, "replicate_unit", lambda _task, _fit, index: replicate_of(index))
-    computed = []
-    run_study(
-        STUDY, TASKS, store, ThisProcess(),
-        lambda result: None if result.found else computed.append(result.task.name),
-    )  # fmt: skip
-    assert [store.cache.path(name) for name in computed] == again
-    assert all_kept(store) == right
-
-
 def test_results_of_another_subject_or_number_are_not_used(tmp_path: Path) -> None:
     store = filled(tmp_path)
     one, other = (tmp_path / "units" / name for name in NAMES)
@@ -121,11 +100,6 @@ def test_other_settings_are_refused_before_anything_is_done(
         run_study(STUDY, TASKS, later, ThisProcess())
     later.cache.discard(f"{NAMES[1]}/fit")
     require_same(later)
-
-
-def test_a_unit_whose_recording_is_gone_has_no_result(tmp_path: Path) -> None:
-    filled(tmp_path)
-    assert Store(tmp_path, {NAMES[1]: DIGESTS[NAMES[1]]}).fit(NAMES[0]) is None
 
 
 def refusing(*_: Any) -> dict[str, Any]:
@@ -222,30 +196,3 @@ def test_what_stands_in_the_place_of_the_log_is_to_be_moved(what: str, tmp_path:
         Store(tmp_path, DIGESTS).log("run")
     assert "\n" not in str(caught.value)
     assert caught.value.remedy == "move what is in its place, or give another folder"
-
-
-@pytest.mark.skipif(os.name != "posix", reason="a limit that the system keeps")
-def test_no_room_for_the_log(tmp_path: Path) -> None:
-    """A line may be cut; the run ends in one line, and the next one goes on below it."""
-    store, said = Store(tmp_path), ""
-    limit = resource.getrlimit(resource.RLIMIT_FSIZE)
-    try:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (50, limit[1]))
-        for _ in range(9):
-            store.log("a line of twenty")
-    except OutputError as error:
-        said = str(error)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
-    assert "cohort.log: cannot be written (File too large); make room" in said
-    assert "\n" not in said
-    store.log("later")
-    assert (tmp_path / "cohort.log").read_text().endswith("later\n")
-
-
-def test_formulas_are_no_cells() -> None:
-    table = pd.DataFrame(
-        {"unit": ["=HYPERLINK(1)", "@SUM(1)", "-2", "sub-1"], "=K": [-1.5, 2, 3, 4]}
-    )
-    text = csv_bytes(table).decode()
-    assert text == "unit,'=K\n'=HYPERLINK(1),-1.5\n'@SUM(1),2.0\n-2,3.0\nsub-1,4.0\n"

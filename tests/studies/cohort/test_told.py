@@ -2,20 +2,13 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
-
 import numpy as np
 import pandas as pd
 import pytest
 import scipy.stats
 
-from impc.reporting.writer import owned
 from impc.studies.cohort.comparison import compare_cohort
-from impc.studies.cohort.engine import Failures, Store
-from impc.studies.cohort.report import write_report
-from impc.studies.cohort.told import not_told, not_told_sentences, only_told
-from tests.studies.cohort.made_up import fit_of, made_up_study, tasks_of
+from impc.studies.cohort.told import not_told, not_told_sentences
 
 
 def gains(deviations: dict[int, float]) -> pd.DataFrame:
@@ -60,34 +53,8 @@ def test_nothing_told_is_nothing_compared() -> None:
     assert {item.note for item in both} == {"too few subjects (0)"}
 
 
-def test_all_told_is_all_compared() -> None:
-    units = gains({})
-    pd.testing.assert_frame_equal(only_told(units), units)
-    assert not_told(units) == {}
-    assert not_told_sentences({}, len(units)) == []
-
-
 def test_a_gain_about_zero_is_told_where_all_are_told_as_well() -> None:
     """A deviation above the size of every entry is no reason: twenty draws about zero, seed 3."""
     units = gains({})
     units["K.u.x"] = 20 * np.random.default_rng(3).standard_normal(10)
     assert not_told(units) == {}
-
-
-@pytest.mark.full
-def test_the_page_says_how_many_are_left_out(tmp_path: Path) -> None:
-    study = made_up_study(8)
-    digests = {name: task.digest for name, task in tasks_of(study).items()}
-    store = Store(tmp_path, digests)
-    with owned(tmp_path, "cohort"):
-        for number, unit in enumerate(study.units):
-            fit = fit_of(number)
-            fit["readings"]["analytic centre (no units)"]["Q"] = [[1.0 + number, 0.0], [0.0, 2.0]]
-            if number == 2:
-                fit["K"], fit["K_deviation"] = [[0.6, 0.1]], [[1700.0, None]]
-            store.cache.keep(f"{unit.name}/fit", digests[unit.name], fit)
-        write_report(study, store, Failures({}, {}), "impc cohort study.toml")
-    page = (tmp_path / "report.html").read_text()
-    assert "of 8 units the gain of position to force of 1; the gain of position_rate" in page
-    told = json.loads((tmp_path / "result.json").read_text())["not_told"]
-    assert told == {"K.force.position": 1, "K.force.position_rate": 8}

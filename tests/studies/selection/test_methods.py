@@ -12,8 +12,7 @@ from click.testing import CliRunner, Result
 from impc.assess.resampling import block_residuals
 from impc.cli.main import main
 from impc.studies.selection.analysis import bootstrap_subset, draw_single
-from impc.studies.selection.estimation import estimate, free_indices
-from impc.studies.selection.fisher import fisher_information
+from impc.studies.selection.estimation import estimate
 from impc.studies.selection.key_parameters import key_parameters
 from impc.studies.selection.lasso import proximal_lasso, table_c1
 from impc.studies.selection.model import ParametricModel, Trial, normalised, parametric_model
@@ -222,10 +221,3 @@ def test_faults_are_one_line(tmp_path: Path) -> None:
         assert match in done.stderr
         assert len(done.stderr.strip().splitlines()) == 1
         assert not (tmp_path / "out").exists()
-
-
-def test_fisher_of_the_line() -> None:
-    trial = line_trial(0.5)
-    found = fisher_information(line_model(), np.array([2.0, 0, -1]), [trial], 0.25)
-    np.testing.assert_allclose(found.F, 25 * trial.input.T @ trial.input / 0.25, rtol=1e-6)
-    assert free_indices(line_model(), ["b"]) == (1,)
