@@ -258,17 +258,6 @@ def test_a_report_is_its_files() -> None:
     assert b"\n'=1+1," in files["numbers.csv"]
 
 
-def test_columns_for_a_terminal() -> None:
-    table = pd.DataFrame(
-        [("a", 1.0, "falls"), ("longer", -10.0, "")], columns=["method", "VAF", "n"]
-    )
-    assert Finding("a", table).text().splitlines() == [
-        "method  VAF      n",
-        "a         1  falls",
-        "longer  -10",
-    ]
-
-
 # Writing
 
 
@@ -290,15 +279,6 @@ def test_a_file_in_the_way_is_told_before_and_after_the_work(tmp_path: Path, bel
             attempt(tmp_path / "file" / below)
         assert "\n" not in str(error.value)
     assert snapshot(tmp_path) == {"file": b"mine"}
-
-
-def test_a_failure_half_way_puts_everything_back(tmp_path: Path) -> None:
-    write_files(tmp_path, {"a": b"old"})
-    (tmp_path / "c").mkdir()  # a folder where a file should go
-    with pytest.raises(OutputError, match="cannot be written"):
-        write_files(tmp_path, {"a": b"new", "b": b"new", "c": b"new"})
-    assert snapshot(tmp_path) == {"a": b"old"}
-    assert sorted(os.listdir(tmp_path)) == ["a", "c"]
 
 
 def test_an_interruption_leaves_no_new_folder(

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from experiments.benchmarks.workloads import Workload, seat
-from impc.assess.weights_test import identifiability
 from impc.control.closed_loop import simulate, simulate_and_differentiate
 from impc.control.constraint_rows import directions
 from impc.control.controller import Controller
@@ -65,11 +64,3 @@ def test_the_whole_fit_reaches_the_true_gain(limit: float) -> None:
     assert error < 1e-8
     size = np.linalg.norm(work.problem.recordings[0].outputs)
     assert found.gain.misfit < 1e-9 * size
-
-
-def test_the_recording_determines_ten_of_fifty_five_directions(work: Workload) -> None:
-    counts = identifiability(work.problem, work.weights)
-    assert counts.free == 55
-    assert counts.rank == 10
-    for item in counts.others:
-        assert item.misfit < 1e-6

@@ -9,7 +9,7 @@ import pytest
 import scipy.stats
 
 import plants
-from experiments.cursor_data import RATE, Condition, data_file, read_conditions
+from experiments.cursor_data import RATE, Condition
 from experiments.cursor_people import FIRST, Follower, fit_follower, judged, nats, regression_nats
 from impc.control.controller import Controller
 from impc.model.bounds import Bounds
@@ -19,7 +19,6 @@ from impc.output_feedback.covariance import person_covariance
 from impc.output_feedback.observer import Observer
 from impc.output_feedback.profile import level_interval
 from impc.output_feedback.simulation import simulate_person
-from tests.experiments.recordings import recorded
 from tests.support import nelder_mead
 
 pytestmark = pytest.mark.full
@@ -92,18 +91,6 @@ def test_an_interval_ends_where_a_level_that_is_all_but_none_lets_it() -> None:
     rest = np.delete(np.array(fit.theta), index)
     # Half of 1.96^2; the root of what has fallen is found to .04 of 1.39.
     assert nelder_mead(lower, rest, 400) == pytest.approx(1.92, abs=0.15)
-
-
-@pytest.mark.full
-@recorded
-def test_a_noisy_sense_is_not_taken_for_a_low_price() -> None:
-    """The most blurred target: from the price of least squares the search ends at 2, and 4 px."""
-    condition = read_conditions(data_file())[5]
-    found = fit_follower(condition, np.arange(len(condition.target)), (14,)).fit
-    levels = dict(zip(found.space.names, found.levels, strict=True))
-    assert found.prices is not None
-    assert np.exp(found.prices[0]) > 20
-    assert levels["sensory error"] > 20
 
 
 def test_a_free_regression_is_that_of_its_normal_equations() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from experiments.noisy_people import recorded, subject
-from experiments.noisy_people_score import Score, above_truth, blind, falls, passed_over, score
+from experiments.noisy_people_score import Score, above_truth, blind, score
 from impc.inverse.methods import estimate
 from impc.output_feedback.covariance import person_covariance
 from impc.output_feedback.fit import fit_person
@@ -32,16 +32,6 @@ def test_a_subject_is_scored_against_its_truth() -> None:
     for error, deviation in found.expected:
         assert abs(error) < 4 * deviation  # seed 0
     assert np.log(found.found[0] / found.levels[0]) == pytest.approx(0, abs=0.3)
-
-
-def test_who_falls_where_nobody_records_is_no_subject_either() -> None:
-    """None of three trials ends in a fall, of sixty others some do."""
-    who = subject("seat", 4, "sensory", 70.0, 9.0)
-    trials = recorded(who, 4)
-    assert trials.largest < 1
-    assert 0.12 < trials.saturated < 0.4
-    assert 1 <= falls(who, 4) < 20
-    assert passed_over(who, trials, 4, met=True) == "falls"
 
 
 @pytest.mark.full

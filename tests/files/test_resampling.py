@@ -89,16 +89,6 @@ def test_the_impulse_of_a_push_is_kept(rate: float) -> None:
     assert DT * result.sum() == pytest.approx(values.sum() / rate, rel=1e-9)
 
 
-def test_the_held_plant_moves_as_under_the_recorded_push() -> None:
-    # A mass pushed at 1 kHz and at 100 Hz by the means: velocities agree at every instant.
-    rng = np.random.default_rng(2)
-    fine = rng.normal(size=5000)
-    coarse = held_means(fine, 1e-3, DT)
-    linear = np.concatenate([[0.0], np.cumsum((fine[1:] + fine[:-1]) / 2)]) * 1e-3
-    velocity = np.concatenate([[0.0], np.cumsum(coarse)]) * DT
-    np.testing.assert_allclose(velocity[:-1], linear[::10], atol=1e-12)
-
-
 @pytest.mark.parametrize(("samples", "rate", "expected"), [(1000, 1000, 100), (1001, 1000, 101)])
 def test_number_of_samples(samples: int, rate: float, expected: int) -> None:
     assert resampled_samples(samples, 1 / rate, DT) == expected

@@ -8,7 +8,6 @@ import pytest
 import scipy.stats
 
 from experiments.coverage import cart
-from impc.errors import DataError
 from impc.inverse.noisy_fit import fit_controller
 from impc.studies.cohort.comparison import compare_cohort
 from impc.studies.cohort.told import not_told, not_told_sentences
@@ -66,13 +65,6 @@ def test_a_different_change_is_found_and_reliability_too() -> None:
     assert found["change", "K.u.x"].p < 1e-6
     assert found["change", "vaf.y"].p > 1e-3
     assert found["reliability", "vaf.y"].low < 0 < found["reliability", "vaf.y"].high
-
-
-def test_few_subjects_are_said() -> None:
-    found = compare_cohort(table(4, 1))
-    assert {item.note for item in found} == {"too few subjects (4)"}
-    with pytest.raises(DataError, match="no unit"):
-        compare_cohort(table(0, 1))
 
 
 def cohort_p(seed: int, difference: float, subjects: int = 10) -> float:

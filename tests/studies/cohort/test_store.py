@@ -53,31 +53,6 @@ def test_tables_hold_what_was_kept(tmp_path: Path) -> None:
     assert work_kept(STUDY, Store(tmp_path, DIGESTS)) == (8, 8)
 
 
-def all_kept(store: Store) -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    for name in NAMES:
-        found[name] = store.fit(name)
-        found |= {f"{name} {k}": store.replicate(name, k) for k in range(REPLICATES)}
-    return found
-
-
-def test_a_flipped_byte_anywhere_is_told(tmp_path: Path) -> None:
-    """Every file, forty places each: that result is not used, and the others are."""
-    store = filled(tmp_path)
-    right = all_kept(store)
-    for path in sorted((tmp_path / "units").rglob("*.json")):
-        whole = path.read_bytes()
-        for place in range(0, len(whole), max(len(whole) // 40, 1)):
-            changed = bytearray(whole)
-            changed[place] ^= 1 << (place % 8)
-            path.write_bytes(changed)
-            found = all_kept(store)
-            lost = [name for name in right if found[name] != right[name]]
-            assert [found[name] for name in lost] == [None], (path, place)
-        path.write_bytes(whole)
-    assert all_kept(store) == right
-
-
 def test_results_of_another_subject_or_number_are_not_used(tmp_path: Path) -> None:
     store = filled(tmp_path)
     one, other = (tmp_path / "units" / name for name in NAMES)
