@@ -34,23 +34,17 @@ from impc.reporting.document import (
 from impc.reporting.finding import Chart, Finding, Picture, Severity
 from impc.reporting.provenance import Provenance
 from impc.reporting.writer import require_writable, write_files
-from impc.studies.example.cases import CASES, EXAMPLE, SETTINGS, CaseResult, run_case
+from impc.studies.example.cases import CASES, EXAMPLE, SETTINGS, CaseResult
 from impc.studies.example.report import (
     example_data,
     example_report,
     methods_finding,
 )
-from plants import yalmip_example
 
 
 @pytest.fixture(scope="module")
 def provenance() -> Provenance:
     return Provenance("plants:yalmip_example")
-
-
-@pytest.fixture(scope="module")
-def case_a() -> CaseResult:
-    return run_case(Plant(yalmip_example()), "A")
 
 
 @pytest.fixture(scope="module")
